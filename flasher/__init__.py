@@ -1,0 +1,1 @@
+"""Firmware upgrades for the Welling mid-drive e-bike system over CAN."""

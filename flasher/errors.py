@@ -1,0 +1,119 @@
+"""Every way in which flasher can fail, with its exit code and what to do about it.
+
+One tree. Each class carries the exit code of the command-line contract; each instance says what
+happened, where (phase, packet), the likely cause, and what to do next. Nothing here prints or
+exits: that is the command line's business.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import ClassVar
+
+
+class ExitCode(IntEnum):
+    """Exit codes of the command line (README, "Exit codes")."""
+
+    OK = 0
+    INTERNAL = 1
+    USAGE = 2
+    IMAGE = 3
+    BUS = 4
+    NO_ANSWER = 5
+    WRONG_DEVICE = 6
+    TRANSFER = 7
+    REFUSED = 8
+    UNCONFIRMED = 9
+    VERIFICATION = 10
+    INTERRUPTED = 130
+
+
+class FlasherError(Exception):
+    """Base of all errors that flasher raises on purpose.
+
+    `what` is one sentence; `where`, `cause` and `remedy` complete it and may be empty.
+    """
+
+    exit_code: ClassVar[ExitCode] = ExitCode.INTERNAL
+
+    def __init__(self, what: str, *, where: str = "", cause: str = "", remedy: str = "") -> None:
+        super().__init__(what)
+        self.what = what
+        self.where = where
+        self.cause = cause
+        self.remedy = remedy
+
+    def __str__(self) -> str:
+        """The whole message, one part a line, as a person reads it."""
+        lines = [self.what]
+        if self.where:
+            lines.append(f"  where: {self.where}")
+        if self.cause:
+            lines.append(f"  likely cause: {self.cause}")
+        if self.remedy:
+            lines.append(f"  what to do: {self.remedy}")
+        return "\n".join(lines)
+
+
+class UsageError(FlasherError):
+    """An argument or option makes no sense."""
+
+    exit_code = ExitCode.USAGE
+
+
+class ImageError(FlasherError):
+    """The image cannot be used: unreadable, damaged, empty, too large, wrong range."""
+
+    exit_code = ExitCode.IMAGE
+
+
+class BusError(FlasherError):
+    """The adapter or the bus failed."""
+
+    exit_code = ExitCode.BUS
+
+
+class TransmitBlockedError(BusError):
+    """The adapter took no further frame within the time allowed for it."""
+
+
+class NoAnswerError(FlasherError):
+    """The device did not answer."""
+
+    exit_code = ExitCode.NO_ANSWER
+
+
+class WrongDeviceError(FlasherError):
+    """Another device answers than the one that was asked for."""
+
+    exit_code = ExitCode.WRONG_DEVICE
+
+
+class TransferError(FlasherError):
+    """The transfer failed: tries or attempts exhausted, or the device broke the protocol."""
+
+    exit_code = ExitCode.TRANSFER
+
+
+class RefusedError(FlasherError):
+    """The device received everything and refused the image at the end."""
+
+    exit_code = ExitCode.REFUSED
+
+
+class UnconfirmedError(FlasherError):
+    """Everything was sent and acknowledged, but the final answer never came."""
+
+    exit_code = ExitCode.UNCONFIRMED
+
+
+class VerificationError(FlasherError):
+    """The application that runs after the upgrade is not the one that was sent."""
+
+    exit_code = ExitCode.VERIFICATION
+
+
+class InterruptedByUserError(FlasherError):
+    """The user stopped the command."""
+
+    exit_code = ExitCode.INTERRUPTED

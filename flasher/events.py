@@ -1,0 +1,84 @@
+"""What flasher reports while it works: frozen dataclasses, one a kind of event.
+
+The engines make them, the driver hands them on, and whoever called (the command line, a station, a
+program) decides what to show. Times are seconds on the clock that the engine was given.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+# -- the host -------------------------------------------------------------------------------------
+
+
+class Phase(Enum):
+    """Where an upgrade stands, in the words of the protocol."""
+
+    RESET = "resetting the application"
+    BOOT = "waiting for the boot version"
+    UPDATE = "waiting for request transfer"
+    TRANSFER = "transferring"
+    END = "waiting for the final answer"
+    CONFIRM = "asking the new application for its version"
+
+
+@dataclass(frozen=True)
+class PhaseEntered:
+    """The upgrade entered a phase; attempts count from 1."""
+
+    phase: Phase
+    attempt: int
+
+
+@dataclass(frozen=True)
+class BootVersionSeen:
+    """The bootloader announced itself for the first time in this attempt. Texts are escaped."""
+
+    name: str
+    version: str
+
+
+@dataclass(frozen=True)
+class PacketAcknowledged:
+    """The device has packet `number` of `total`; it was sent `tries` times."""
+
+    number: int
+    total: int
+    tries: int
+
+
+@dataclass(frozen=True)
+class MessageRepeated:
+    """A message is sent again; `what` names it, `reason` says why."""
+
+    what: str
+    reason: str
+    tries: int
+
+
+@dataclass(frozen=True)
+class Reported:
+    """Something unexpected that does not stop the upgrade; one sentence."""
+
+    what: str
+
+
+@dataclass(frozen=True)
+class AttemptStarted:
+    """The transfer starts over; attempts count from 1."""
+
+    attempt: int
+    reason: str
+
+
+# -- both sides -----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class BytesDamaged:
+    """Received bytes on a CAN id that made no message."""
+
+    can_id: int
+    reason: str
+    data: bytes

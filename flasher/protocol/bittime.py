@@ -1,0 +1,171 @@
+"""Exact length of classic CAN frames on the wire, in bit times.
+
+A frame (ISO 11898-1, base format) is: SOF, 11 id bits, RTR, IDE, r0, 4 DLC bits, the data, 15 CRC
+bits; these are stuffed: after five equal bits the complement is inserted, and counts for the next
+run. Then follow, unstuffed, CRC delimiter, ACK slot, ACK delimiter, 7 bits of EOF and 3 bits of
+interframe space.
+
+Everything is done a nibble at a time by tables, on one frame in a loop, or on very many frames at
+once: a column of bytes (one byte a frame) goes through the same tables by `bytes.translate`, and
+columns are combined as big integers, so that the C library does the work for a whole image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cache
+from typing import Final
+
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import FRAME_DATA_SIZE
+
+_CRC_POLYNOMIAL: Final = 0x4599
+_CRC_BITS: Final = 15
+_UNSTUFFED_TAIL_BITS: Final = 1 + 1 + 1 + 7 + 3
+_HEAD_BITS: Final = 1 + 11 + 1 + 1 + 1 + 4
+_RUN_BEFORE_STUFFING: Final = 5
+
+# The state of the stuffing is the value of the last bit and how often it stands in a row (1 to 5);
+# it fits a nibble, so that state and next nibble together index a table of 256 bytes.
+
+
+def _stuff(state: int, bits: int, width: int) -> tuple[int, int]:
+    """Send `width` bits from a state; the new state and the number of bits inserted."""
+    last, run = state >> 3, state & 7
+    inserted = 0
+    for shift in range(width - 1, -1, -1):
+        if run == _RUN_BEFORE_STUFFING:
+            last, run, inserted = last ^ 1, 1, inserted + 1
+        bit = bits >> shift & 1
+        last, run = bit, run + 1 if bit == last else 1
+    return last << 3 | run, inserted
+
+
+_STATES: Final = [_stuff(index >> 4, index & 15, 4) for index in range(256)]
+_NEXT_STATE: Final = bytes(state & 15 for state, _ in _STATES)
+_INSERTED: Final = bytes(inserted for _, inserted in _STATES)
+
+
+def _crc_steps(register: int, steps: int) -> int:
+    for _ in range(steps):
+        register <<= 1
+        if register >> _CRC_BITS:
+            register ^= 1 << _CRC_BITS | _CRC_POLYNOMIAL
+    return register
+
+
+_CRC_BYTE: Final = [_crc_steps(byte << _CRC_BITS - 8, 8) for byte in range(256)]
+_CRC_HIGH: Final = bytes(value >> 8 for value in _CRC_BYTE)
+_CRC_LOW: Final = bytes(value & 0xFF for value in _CRC_BYTE)
+_HIGH_NIBBLE: Final = bytes(byte >> 4 for byte in range(256))
+_LOW_NIBBLE: Final = bytes(byte & 15 for byte in range(256))
+
+
+@cache
+def _head(can_id: int, size: int) -> tuple[int, int, int]:
+    """Stuffing state, inserted bits and CRC register after SOF .. DLC of a frame."""
+    bits = can_id << 7 | size
+    state, inserted = _stuff(0, bits, _HEAD_BITS)
+    crc = 0
+    for shift in range(_HEAD_BITS - 1, -1, -1):
+        crc = _crc_steps(crc ^ (bits >> shift & 1) << _CRC_BITS - 1, 1)
+    return state, inserted, crc
+
+
+_TOP_CRC: Final = [_stuff(index >> 3, index & 7, 3) for index in range(128)]
+"""The CRC is three bits and three nibbles: the three bits first."""
+_TOP_NEXT_STATE: Final = bytes(state & 15 for state, _ in _TOP_CRC).ljust(256, b"\0")
+_TOP_INSERTED: Final = bytes(inserted for _, inserted in _TOP_CRC).ljust(256, b"\0")
+_FULL_RUN: Final = bytes(state & 7 == _RUN_BEFORE_STUFFING for state in range(256))
+"""A run of five that ends with the CRC is followed by a stuff bit too."""
+
+
+def fixed_bits(size: int) -> int:
+    """Bits of a frame with `size` data bytes before stuffing, interframe space included."""
+    return _HEAD_BITS + 8 * size + _CRC_BITS + _UNSTUFFED_TAIL_BITS
+
+
+def frame_bits(frame: Frame) -> int:
+    """Bit times of one frame, interframe space included."""
+    can_id, data = frame[0], frame[1]
+    state, inserted, crc = _head(can_id, len(data))
+    for byte in data:
+        index = state << 4 | byte >> 4
+        inserted += _INSERTED[index]
+        index = _NEXT_STATE[index] << 4 | byte & 15
+        inserted += _INSERTED[index]
+        state = _NEXT_STATE[index]
+        crc = (crc << 8 & 0x7FFF) ^ _CRC_BYTE[crc >> 7 ^ byte]
+    index = state << 3 | crc >> 12
+    inserted += _TOP_INSERTED[index]
+    state = _TOP_NEXT_STATE[index]
+    for shift in (8, 4, 0):
+        index = state << 4 | crc >> shift & 15
+        inserted += _INSERTED[index]
+        state = _NEXT_STATE[index]
+    return fixed_bits(len(data)) + inserted + _FULL_RUN[state]
+
+
+def message_bits(frames: Iterable[Frame]) -> int:
+    """Bit times of a message's frames one right after the other."""
+    return sum(map(frame_bits, frames))
+
+
+class _Columns:
+    """The same state machine for `count` frames of one id and size, fed a byte column at a time."""
+
+    def __init__(self, can_id: int, size: int, count: int) -> None:
+        state, inserted, crc = _head(can_id, size)
+        self._count = count
+        self._state = bytes((state,)) * count
+        self._bits = self._number(bytes((fixed_bits(size) + inserted,)) * count)
+        self._crc_high = bytes((crc >> 8,)) * count
+        self._crc_low = bytes((crc & 0xFF,)) * count
+
+    def feed(self, column: bytes) -> None:
+        """Take the next data byte of every frame."""
+        self._nibbles(column.translate(_HIGH_NIBBLE))
+        self._nibbles(column.translate(_LOW_NIBBLE))
+        high, low = self._number(self._crc_high), self._number(self._crc_low)
+        ones = self._number(b"\1" * self._count)
+        index = self._column(high << 1 ^ low >> 7 & ones ^ self._number(column))
+        shifted = low & ones * 0x7F
+        self._crc_high = self._column(shifted ^ self._number(index.translate(_CRC_HIGH)))
+        self._crc_low = index.translate(_CRC_LOW)
+
+    def finish(self) -> bytes:
+        """Bit times of every frame, one byte each."""
+        high, low = self._crc_high, self._crc_low
+        top = self._number(high.translate(_HIGH_NIBBLE))
+        index = self._column(self._number(self._state) << 3 | top)
+        self._bits += self._number(index.translate(_TOP_INSERTED))
+        self._state = index.translate(_TOP_NEXT_STATE)
+        self._nibbles(high.translate(_LOW_NIBBLE))
+        self._nibbles(low.translate(_HIGH_NIBBLE))
+        self._nibbles(low.translate(_LOW_NIBBLE))
+        self._bits += self._number(self._state.translate(_FULL_RUN))
+        return self._column(self._bits)
+
+    def _nibbles(self, nibbles: bytes) -> None:
+        index = self._column(self._number(self._state) << 4 | self._number(nibbles))
+        self._bits += self._number(index.translate(_INSERTED))
+        self._state = index.translate(_NEXT_STATE)
+
+    def _number(self, column: bytes) -> int:
+        return int.from_bytes(column, "little")
+
+    def _column(self, number: int) -> bytes:
+        return number.to_bytes(self._count, "little")
+
+
+def stream_bits(can_id: int, stream: bytes) -> bytes:
+    """Bit times of every frame of a stream cut into full frames of 8 bytes, one byte each.
+
+    Raises ValueError when the stream is not a whole number of frames.
+    """
+    if len(stream) % FRAME_DATA_SIZE:
+        raise ValueError(f"{len(stream)} bytes are no whole number of full frames")
+    columns = _Columns(can_id, FRAME_DATA_SIZE, len(stream) // FRAME_DATA_SIZE)
+    for position in range(FRAME_DATA_SIZE):
+        columns.feed(stream[position::FRAME_DATA_SIZE])
+    return columns.finish()

@@ -1,0 +1,131 @@
+"""What every engine is, host or device: a pure machine that is told frames and the time.
+
+`now` is seconds on a monotonic clock, given from outside; an engine never sleeps and never reads a
+clock. `Transmitter` is the part that all engines share: messages out, one frame at a time.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+from flasher.protocol.bittime import frame_bits, message_bits
+from flasher.protocol.frame import Frame
+
+
+class Engine(Protocol):
+    """The interface between a machine and the one loop that connects it to the world."""
+
+    @property
+    def done(self) -> bool:
+        """True when the engine has nothing left to do."""
+        ...
+
+    def receive(self, frame: Frame, now: float) -> None:
+        """A CAN frame arrived."""
+        ...
+
+    def tick(self, now: float) -> None:
+        """The time that `deadline` asked for has come."""
+        ...
+
+    def deadline(self) -> float | None:
+        """When the engine next wants `tick`, or a frame of its own to be asked for."""
+        ...
+
+    def next_frame(self, now: float) -> Frame | None:
+        """The next frame to send; the same one until `frame_sent` is called."""
+        ...
+
+    def frame_sent(self, now: float) -> None:
+        """The adapter has accepted the frame that `next_frame` gave."""
+        ...
+
+    def cancel(self, now: float) -> None:
+        """End at the next message boundary."""
+        ...
+
+    def take_events(self) -> Sequence[object]:
+        """What happened since the last call: frozen dataclasses of `flasher.events`."""
+        ...
+
+
+class _Outgoing(NamedTuple):
+    frames: Sequence[Frame]
+    wire_s: float
+    not_before: float
+
+
+class Transmitter:
+    """Messages waiting to be sent, whole and in order: a message is finished before the next one
+    starts, so it is never interleaved with its own repetition.
+
+    `frame_gap_s` keeps frames of one message apart for receivers that cannot take them at once.
+    """
+
+    def __init__(self, bitrate_bps: int, frame_gap_s: float = 0.0) -> None:
+        self._bitrate_bps = bitrate_bps
+        self._frame_gap_s = frame_gap_s
+        self._queue: deque[_Outgoing] = deque()
+        self._sent_frames = 0
+        self._not_before = 0.0
+        self._message_began_at = 0.0
+        self.left_at = float("-inf")
+        """When the last frame of the last message has left: accepted by the adapter plus its time
+        on the wire (R12)."""
+
+    @property
+    def idle(self) -> bool:
+        """True when nothing waits to be sent."""
+        return not self._queue
+
+    def queue(
+        self, frames: Sequence[Frame], *, wire_s: float | None = None, not_before: float = 0.0
+    ) -> None:
+        """Send a message after those before it, its first frame not sooner than `not_before`.
+
+        `wire_s` is its time on the wire where the caller knows it, else it is computed.
+        """
+        if wire_s is None:
+            wire_s = message_bits(frames) / self._bitrate_bps
+        if not self._queue:
+            self._not_before = not_before
+        self._queue.append(_Outgoing(frames, wire_s, not_before))
+
+    def drop_unstarted(self) -> None:
+        """Forget the messages of which no frame was accepted yet."""
+        started = self._queue[0] if self._sent_frames else None
+        self._queue.clear()
+        if started is not None:
+            self._queue.append(started)
+
+    def deadline(self) -> float | None:
+        """When `next_frame` has something to give; None when nothing waits."""
+        return self._not_before if self._queue else None
+
+    def next_frame(self, now: float) -> Frame | None:
+        """The next frame to send, or None while a gap lasts or nothing waits."""
+        if not self._queue or now < self._not_before:
+            return None
+        return self._queue[0].frames[self._sent_frames]
+
+    def frame_sent(self, now: float) -> bool:
+        """The adapter has accepted the frame; True when it was the last one of its message."""
+        message = self._queue[0]
+        if not self._sent_frames:
+            self._message_began_at = max(now, self.left_at)
+        self._sent_frames += 1
+        if self._sent_frames < len(message.frames):
+            if self._frame_gap_s:
+                self._not_before = now + self._frame_gap_s
+            return False
+        self._queue.popleft()
+        self._sent_frames = 0
+        # An adapter may take a message at once and send it at the bus's pace, or take each frame
+        # when it sends it: the later of the two tells when the last frame is gone.
+        last_frame_s = frame_bits(message.frames[-1]) / self._bitrate_bps
+        self.left_at = max(self._message_began_at + message.wire_s, now + last_frame_s)
+        if self._queue:
+            self._not_before = self._queue[0].not_before
+        return True

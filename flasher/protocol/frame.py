@@ -1,0 +1,25 @@
+"""A CAN frame as flasher's engines see it, free of any adapter's library."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Frame(NamedTuple):
+    """One CAN frame: 11-bit `can_id` and 0 to 8 bytes of `data`.
+
+    A named tuple, not a dataclass: a packet is 18 of them and they are made in the hot path.
+    """
+
+    can_id: int
+    data: bytes
+    is_extended: bool = False
+    is_remote: bool = False
+    is_error: bool = False
+
+    @property
+    def is_payload(self) -> bool:
+        """True for a classic data frame with at least one byte: the only kind that carries the
+        protocol.
+        """
+        return not (self.is_extended or self.is_remote or self.is_error) and bool(self.data)

@@ -1,0 +1,309 @@
+"""Typed messages: the upgrade of appendix 3, and the version query that an upgrade relies on.
+
+Each class is one row of the document. `to_message` gives the wire form on a CAN id, `decode` the
+way back. Decoding is strict: mode, size and every constant byte must be the document's; what does
+not fit comes back as `Malformed`, what is not in the table as `Unknown`, both as values.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from struct import Struct
+from typing import ClassVar, Final, Self
+
+from flasher.protocol.spec import (
+    END_OF_TRANSFER_MARK,
+    PACKET_DATA_SIZE,
+    PACKET_START,
+    TARGETS,
+    VERSION_FIELD_SIZE,
+    Command,
+    Mode,
+    data_size,
+)
+from flasher.protocol.wire import Message
+
+_UINT16: Final = Struct("<H")
+_UPDATE: Final = Struct("<7sI")
+_BOOT_VERSION: Final = Struct("3s6s")
+_PACKET: Final = Struct(f"<BHH{PACKET_DATA_SIZE}s")
+_VERSION: Final = Struct(f"{VERSION_FIELD_SIZE}s" * 4)
+assert _UPDATE.size == data_size(Command.UPDATE)
+assert _BOOT_VERSION.size == data_size(Command.BOOT_VERSION)
+assert _PACKET.size == data_size(Command.PACKET)
+assert _VERSION.size == data_size(Command.VERSION_INFORMATION)
+
+_BOOT_VERSION_TEXT: Final = re.compile(r"V[0-9]\.[0-9]\.[0-9]")
+
+
+@dataclass(frozen=True)
+class Malformed:
+    """A message with a known command whose mode or data break the document's row."""
+
+    message: Message
+    problem: str
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """An intact message with a command that this table does not hold."""
+
+    message: Message
+
+
+@dataclass(frozen=True)
+class _Row:
+    """What all rows share: their mode and command, and the way to a message."""
+
+    MODE: ClassVar[Mode]
+    COMMAND: ClassVar[Command]
+
+    def data(self) -> bytes:
+        """The data field."""
+        raise NotImplementedError
+
+    @classmethod
+    def from_data(cls, data: bytes) -> Self:
+        """The way back; `data` has the command's size. Raises ValueError naming the problem."""
+        raise NotImplementedError
+
+    def to_message(self, can_id: int) -> Message:
+        """This message as it goes out on `can_id`."""
+        return Message(can_id, self.MODE, self.COMMAND, self.data())
+
+
+@dataclass(frozen=True)
+class _Constant(_Row):
+    """A row whose data never change."""
+
+    DATA: ClassVar[bytes]
+
+    def data(self) -> bytes:
+        return self.DATA
+
+    @classmethod
+    def from_data(cls, data: bytes) -> Self:
+        if data != cls.DATA:
+            raise ValueError(f"data are {data.hex(' ')}, not {cls.DATA.hex(' ')}")
+        return cls()
+
+
+@dataclass(frozen=True)
+class _Numbered(_Row):
+    """A row that holds one packet number (little-endian, R4)."""
+
+    number: int
+
+    def data(self) -> bytes:
+        return _UINT16.pack(self.number)
+
+    @classmethod
+    def from_data(cls, data: bytes) -> Self:
+        return cls(*_UINT16.unpack(data))
+
+
+@dataclass(frozen=True)
+class Reset(_Constant):
+    """Tool to application: restart into the bootloader."""
+
+    MODE = Mode.WRITE
+    COMMAND = Command.RESET
+    DATA = b"RESET"
+
+
+@dataclass(frozen=True)
+class GeneralFeedback(_Constant):
+    """Application to tool: the write was received."""
+
+    MODE = Mode.REPORT
+    COMMAND = Command.GENERAL_FEEDBACK
+    DATA = b"ACK"
+
+
+@dataclass(frozen=True)
+class BootVersion(_Row):
+    """Bootloader to tool: who it is. Texts are kept as received, well formed or not (SE-02)."""
+
+    MODE = Mode.REPORT
+    COMMAND = Command.BOOT_VERSION
+
+    name: str
+    version: str
+
+    @property
+    def is_version(self) -> bool:
+        """True when the version text has the document's form Vx.x.x."""
+        return _BOOT_VERSION_TEXT.fullmatch(self.version) is not None
+
+    def data(self) -> bytes:
+        return _BOOT_VERSION.pack(self.name.encode("latin-1"), self.version.encode("latin-1"))
+
+    @classmethod
+    def from_data(cls, data: bytes) -> Self:
+        return cls(*(text.decode("latin-1") for text in _BOOT_VERSION.unpack(data)))
+
+
+@dataclass(frozen=True)
+class UpdateCommand(_Row):
+    """Tool to bootloader: prepare for an image of `size_bytes`; the text names the target."""
+
+    MODE = Mode.WRITE
+    COMMAND = Command.UPDATE
+
+    text: str
+    size_bytes: int
+
+    def data(self) -> bytes:
+        return _UPDATE.pack(self.text.encode("ascii"), self.size_bytes)
+
+    @classmethod
+    def from_data(cls, data: bytes) -> Self:
+        raw, size_bytes = _UPDATE.unpack(data)
+        text = raw.decode("latin-1")
+        if text not in {target.update_text for target in TARGETS.values()}:
+            raise ValueError(f"no target is updated by the text {text!a}")
+        return cls(text, size_bytes)
+
+
+@dataclass(frozen=True)
+class RequestTransfer(_Constant):
+    """Bootloader to tool: ready for packet 1."""
+
+    MODE = Mode.REPORT
+    COMMAND = Command.REQUEST_TRANSFER
+    DATA = b"\x00\x00"
+
+
+@dataclass(frozen=True)
+class Packet(_Row):
+    """Tool to bootloader: packet `number` of `total`, 128 bytes of the image."""
+
+    MODE = Mode.WRITE
+    COMMAND = Command.PACKET
+
+    number: int
+    total: int
+    payload: bytes
+
+    def data(self) -> bytes:
+        return _PACKET.pack(PACKET_START, self.number, self.total, self.payload)
+
+    @classmethod
+    def from_data(cls, data: bytes) -> Self:
+        start, number, total, payload = _PACKET.unpack(data)
+        if start != PACKET_START:
+            raise ValueError(f"a packet starts with {PACKET_START:02X}, not {start:02X}")
+        if not number or not total:
+            raise ValueError(f"packet {number} of {total}: numbers start at 1")
+        return cls(number, total, payload)
+
+
+@dataclass(frozen=True)
+class Ack(_Numbered):
+    """Bootloader to tool: packet received."""
+
+    MODE = Mode.REPORT
+    COMMAND = Command.ACK
+
+
+@dataclass(frozen=True)
+class Nak(_Numbered):
+    """Bootloader to tool: packet not received rightly; after the end of transfer: refused (R6)."""
+
+    MODE = Mode.REPORT
+    COMMAND = Command.NAK
+
+
+@dataclass(frozen=True)
+class EndOfTransfer(_Constant):
+    """Tool to bootloader: that was the last packet."""
+
+    MODE = Mode.WRITE
+    COMMAND = Command.END_OF_TRANSFER
+    DATA = bytes((END_OF_TRANSFER_MARK,))
+
+
+@dataclass(frozen=True)
+class Complete(_Constant):
+    """Bootloader to tool: the image is whole."""
+
+    MODE = Mode.REPORT
+    COMMAND = Command.COMPLETE
+    DATA = b"\x00\x00"
+
+
+@dataclass(frozen=True)
+class ReadVersion(_Constant):
+    """Tool to the BMS's application: version information, please."""
+
+    MODE = Mode.READ
+    COMMAND = Command.READ_VERSION
+    DATA = b""
+
+
+@dataclass(frozen=True)
+class VersionInformation(_Row):
+    """BMS to all: model, serial number, hardware and firmware version, 16 bytes of text each."""
+
+    MODE = Mode.REPORT
+    COMMAND = Command.VERSION_INFORMATION
+
+    model: bytes
+    serial_number: bytes
+    hardware: bytes
+    firmware: bytes
+
+    def data(self) -> bytes:
+        return _VERSION.pack(self.model, self.serial_number, self.hardware, self.firmware)
+
+    @classmethod
+    def from_data(cls, data: bytes) -> Self:
+        return cls(*_VERSION.unpack(data))
+
+
+Row = (
+    Reset
+    | GeneralFeedback
+    | BootVersion
+    | UpdateCommand
+    | RequestTransfer
+    | Packet
+    | Ack
+    | Nak
+    | EndOfTransfer
+    | Complete
+    | ReadVersion
+    | VersionInformation
+)
+
+_ROWS: Final[dict[int, type[Row]]] = {
+    row.COMMAND: row
+    for row in (
+        Reset,
+        GeneralFeedback,
+        BootVersion,
+        UpdateCommand,
+        RequestTransfer,
+        Packet,
+        Ack,
+        Nak,
+        EndOfTransfer,
+        Complete,
+        ReadVersion,
+        VersionInformation,
+    )
+}
+
+
+def decode(message: Message) -> Row | Malformed | Unknown:
+    """The typed form of an intact message. Never raises."""
+    row = _ROWS.get(message.command)
+    if row is None:
+        return Unknown(message)
+    if message.mode != row.MODE:
+        return Malformed(message, f"mode is {message.mode:02X}, not {row.MODE:02X}")
+    try:
+        return row.from_data(message.data)
+    except ValueError as error:
+        return Malformed(message, str(error))

@@ -1,0 +1,192 @@
+"""Facts of the protocol documents, each stated once: nodes, ids, dialects, framing, commands.
+
+Source: Welling protocol (BMS) V1.0.0 and MOTINOVA protocol (BMS) V2.7.1, chapters 1 to 3 and
+appendix 3. Timings are in `timing`, layouts of messages in `messages`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+from typing import Final
+
+# -- framing (2.2.1) ---------------------------------------------------------------------------
+
+HEADER: Final = b"\x55\xaa"
+TAIL: Final = b"\xf0"
+MODE_SIZE: Final = 1
+LENGTH_SIZE: Final = 1
+COMMAND_SIZE: Final = 2
+CRC_SIZE: Final = 4
+LENGTH_MIN: Final = COMMAND_SIZE
+LENGTH_MAX: Final = 0xFF
+PREFIX_SIZE: Final = len(HEADER) + MODE_SIZE + LENGTH_SIZE
+"""Bytes before the part that the length field counts."""
+OVERHEAD_SIZE: Final = PREFIX_SIZE + CRC_SIZE + len(TAIL)
+"""Bytes of a message that the length field does not count."""
+MESSAGE_MIN_SIZE: Final = OVERHEAD_SIZE + LENGTH_MIN
+MESSAGE_MAX_SIZE: Final = OVERHEAD_SIZE + LENGTH_MAX
+FRAME_DATA_SIZE: Final = 8
+"""Bytes in every CAN frame of a message but the last (2.2.3)."""
+
+
+class Mode(IntEnum):
+    """Mode byte of a message (2.2.1)."""
+
+    READ = 0x11
+    WRITE = 0x16
+    REPORT = 0x0C
+
+
+# -- nodes and ids (1, 2.2.2) -------------------------------------------------------------------
+
+
+class Node(Enum):
+    """A participant on the bus; the value is its digit in CAN ids."""
+
+    WMC = 1
+    BMS = 2
+    OBC = 3
+    HMI = 4
+    CDL = 5
+
+
+BROADCAST_DIGIT: Final = 0
+_ID_BASE: Final = 0x700
+
+
+def can_id(sender: Node, receiver: Node | None) -> int:
+    """The 11-bit CAN id of messages from `sender` to `receiver`; None is broadcast."""
+    receiver_digit = BROADCAST_DIGIT if receiver is None else receiver.value
+    return _ID_BASE | sender.value << 4 | receiver_digit
+
+
+# -- commands (chapter 3, appendix 3) -----------------------------------------------------------
+
+
+class Command(IntEnum):
+    """Commands in wire order: first byte the serial number, second byte the size of the data."""
+
+    RESET = 0x4205
+    GENERAL_FEEDBACK = 0x5503
+    BOOT_VERSION = 0xC109
+    UPDATE = 0xA10B
+    REQUEST_TRANSFER = 0xC402
+    PACKET = 0xA385
+    ACK = 0xC202
+    NAK = 0xC302
+    END_OF_TRANSFER = 0xA401
+    COMPLETE = 0xC502
+    READ_VERSION = 0x3300
+    VERSION_INFORMATION = 0x1540
+
+
+def data_size(command: int) -> int:
+    """Size in bytes of a command's data: its second byte (2.2.1)."""
+    return command & 0xFF
+
+
+# -- upgrade (appendix 3) -----------------------------------------------------------------------
+
+PACKET_START: Final = 0x01
+"""SOH, first data byte of a packet."""
+END_OF_TRANSFER_MARK: Final = 0x04
+"""EOT, the data of the end of transfer."""
+PACKET_DATA_SIZE: Final = 128
+PACKET_FILLER: Final = 0xFF
+PACKET_COUNT_MAX: Final = 0xFFFF
+IMAGE_MAX_SIZE: Final = PACKET_COUNT_MAX * PACKET_DATA_SIZE
+"""Largest image in bytes (R9)."""
+BOOT_VERSION_BURST: Final = 4
+"""How often a bootloader announces its version (figure 2)."""
+FRAMES_PER_PACKET: Final = (
+    OVERHEAD_SIZE + COMMAND_SIZE + data_size(Command.PACKET)
+) // FRAME_DATA_SIZE
+
+
+def packet_count(size_bytes: int) -> int:
+    """Packets that an image of `size_bytes` takes; the last one is padded (R9)."""
+    return -(-size_bytes // PACKET_DATA_SIZE)
+
+
+# -- application data that the upgrade needs ------------------------------------------------------
+
+TEXT_END: Final = b"."
+TEXT_FILLER: Final = b" "
+VERSION_FIELD_SIZE: Final = 16
+
+
+# -- targets and dialects -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Target:
+    """A device that the upgrade of appendix 3 knows, with its names on the wire (tables 8, 9)."""
+
+    node: Node
+    update_text: str
+    boot_name: str
+    has_version_query: bool
+    """True where the document gives a query for version information (chapter 3: the BMS only)."""
+
+    @property
+    def name(self) -> str:
+        return self.node.name.lower()
+
+    @property
+    def request_id(self) -> int:
+        """CAN id of the tool's messages to this device."""
+        return can_id(Node.CDL, self.node)
+
+    @property
+    def answer_id(self) -> int:
+        """CAN id of this device's messages to the tool."""
+        return can_id(self.node, Node.CDL)
+
+    @property
+    def broadcast_id(self) -> int:
+        """CAN id of this device's broadcasts."""
+        return can_id(self.node, None)
+
+
+WMC: Final = Target(Node.WMC, "WMC_UPD", "WMC", has_version_query=False)
+BMS: Final = Target(Node.BMS, "BMS_UPD", "BMS", has_version_query=True)
+OBC: Final = Target(Node.OBC, "OBC_UPD", "PBU", has_version_query=False)
+
+TARGETS: Final = {target.name: target for target in (WMC, BMS, OBC)}
+TARGET_ALIASES: Final = {"mc": WMC, "pbu": OBC}
+"""The documents' other names for the same devices."""
+
+
+def find_target(name: str) -> Target | None:
+    """The target with this name or alias, in either case; None when there is none."""
+    lower = name.lower()
+    return TARGETS.get(lower) or TARGET_ALIASES.get(lower)
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """One of the two protocol documents, with what it decides differently from the other."""
+
+    name: str
+    version: str
+    bitrate_bps: int
+    nodes: tuple[Node, ...]
+    has_upgrade: bool
+
+
+WELLING: Final = Dialect(
+    name="welling",
+    version="V1.0.0",
+    bitrate_bps=250_000,
+    nodes=(Node.WMC, Node.BMS, Node.OBC, Node.CDL),
+    has_upgrade=True,
+)
+MOTINOVA: Final = Dialect(
+    name="motinova",
+    version="V2.7.1",
+    bitrate_bps=125_000,
+    nodes=(Node.WMC, Node.BMS, Node.OBC, Node.HMI, Node.CDL),
+    has_upgrade=False,
+)
+DIALECTS: Final = {dialect.name: dialect for dialect in (WELLING, MOTINOVA)}

@@ -1,0 +1,219 @@
+"""Messages to CAN payloads and back (2.2.1, 2.2.3).
+
+Sending is a pure function. Receiving is a `Reassembler` for each CAN id: a byte stream in, intact
+messages and named damage out. It never raises on what it is fed and never holds more than one
+message and one frame. After damage it skips the header that misled it and scans what it holds
+again, so the next intact message is found wherever it starts.
+
+What tells a header from the same two bytes inside data is the redundancy of 2.2.1: the length must
+be at least 2 and the command's second byte must be the length minus 2. CRC and tail decide then.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, NamedTuple
+
+from flasher.protocol.crc import crc32
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import (
+    COMMAND_SIZE,
+    CRC_SIZE,
+    FRAME_DATA_SIZE,
+    HEADER,
+    LENGTH_MAX,
+    LENGTH_MIN,
+    MESSAGE_MAX_SIZE,
+    OVERHEAD_SIZE,
+    PREFIX_SIZE,
+    TAIL,
+    data_size,
+)
+
+
+class Message(NamedTuple):
+    """An intact message: who to whom (`can_id`), mode byte, 16-bit command, data."""
+
+    can_id: int
+    mode: int
+    command: int
+    data: bytes
+
+
+class DamageReason(Enum):
+    """Why received bytes were not taken for a message."""
+
+    JUNK = "bytes outside of any message"
+    BAD_LENGTH = "length field does not fit the command"
+    BAD_CRC = "wrong CRC"
+    BAD_TAIL = "wrong tail"
+    INCOMPLETE = "the rest of the message did not come in time"
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Bytes on one CAN id that were no message; `data` is what was judged, from its header on."""
+
+    can_id: int
+    reason: DamageReason
+    data: bytes
+
+
+# -- sending ------------------------------------------------------------------------------------
+
+
+def encode(message: Message) -> bytes:
+    """The complete message, header to tail.
+
+    Raises ValueError when the size of the data is not the one that the command names.
+    """
+    can_id, mode, command, data = message
+    if len(data) != data_size(command):
+        raise ValueError(
+            f"command {command:04X} carries {data_size(command)} data bytes, not {len(data)}"
+        )
+    length = COMMAND_SIZE + len(data)
+    if length > LENGTH_MAX:
+        raise ValueError(f"command {command:04X} is longer than the length field can say")
+    body = bytes((mode, length)) + command.to_bytes(2, "big") + data
+    crc = crc32(HEADER + can_id.to_bytes(2, "big") + body)
+    return HEADER + body + crc.to_bytes(CRC_SIZE, "big") + TAIL
+
+
+def split(can_id: int, wire: bytes) -> list[Frame]:
+    """The CAN frames of an encoded message: 8 bytes each, the last one shorter (2.2.3)."""
+    return [
+        Frame(can_id, wire[start : start + FRAME_DATA_SIZE])
+        for start in range(0, len(wire), FRAME_DATA_SIZE)
+    ]
+
+
+# -- receiving ----------------------------------------------------------------------------------
+
+_HEAD_SIZE: Final = PREFIX_SIZE + COMMAND_SIZE
+"""Bytes needed to judge a header."""
+_NOTHING: Final[tuple[Message | Damage, ...]] = ()
+
+
+class Reassembler:
+    """Messages of one CAN id out of its frames' payloads.
+
+    Feed payloads as they arrive, call `tick` at `deadline` or later. Bytes of an unfinished message
+    are dropped `inter_frame_timeout_s` after the last payload (R12), and only by `tick`: payloads
+    that waited in a queue while the computer was busy do not count as late.
+    """
+
+    def __init__(self, can_id: int, inter_frame_timeout_s: float) -> None:
+        self.can_id = can_id
+        self._timeout_s = inter_frame_timeout_s
+        self._buffer = bytearray()
+        self._junk = bytearray()
+        self._needed = len(HEADER)
+        self._last_at = 0.0
+
+    @property
+    def held_size(self) -> int:
+        """Bytes held, for those who watch memory."""
+        return len(self._buffer) + len(self._junk)
+
+    def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
+        """Take the payload of one frame; returns what it completed, usually nothing."""
+        self._buffer += payload
+        self._last_at = now
+        if len(self._buffer) < self._needed:
+            return _NOTHING
+        return self._scan()
+
+    def deadline(self) -> float | None:
+        """When `tick` has to be called next; None while nothing is held."""
+        return self._last_at + self._timeout_s if self._buffer or self._junk else None
+
+    def tick(self, now: float) -> Sequence[Message | Damage]:
+        """Drop what has waited too long; returns what was found in it."""
+        deadline = self.deadline()
+        if deadline is None or now < deadline:
+            return _NOTHING
+        found: list[Message | Damage] = []
+        while self._buffer:
+            if len(self._buffer) > len(HEADER):
+                self._damage(DamageReason.INCOMPLETE, len(self._buffer), found)
+                found += self._scan()
+            else:
+                self._junk += self._buffer
+                self._buffer.clear()
+        self._flush_junk(found)
+        return found
+
+    def reset(self) -> None:
+        """Forget everything held."""
+        self._buffer.clear()
+        self._junk.clear()
+
+    def _scan(self) -> list[Message | Damage]:
+        found: list[Message | Damage] = []
+        while self._align() and len(self._buffer) >= self._needed:
+            if not self._judge_head(found):
+                continue
+            size = OVERHEAD_SIZE + self._buffer[PREFIX_SIZE - 1]
+            if len(self._buffer) < size:
+                self._needed = size
+                break
+            self._judge_message(size, found)
+        if len(self._junk) >= MESSAGE_MAX_SIZE:
+            self._flush_junk(found)
+        return found
+
+    def _align(self) -> bool:
+        """Move everything before the next header to the junk; False when no header may be left."""
+        buffer = self._buffer
+        if not buffer.startswith(HEADER):
+            start = buffer.find(HEADER)
+            if start < 0:
+                start = len(buffer) - buffer.endswith(HEADER[:1])
+            self._junk += buffer[:start]
+            del buffer[:start]
+        self._needed = _HEAD_SIZE if len(buffer) >= len(HEADER) else len(HEADER)
+        return bool(buffer)
+
+    def _judge_head(self, found: list[Message | Damage]) -> bool:
+        buffer = self._buffer
+        length = buffer[PREFIX_SIZE - 1]
+        if length >= LENGTH_MIN and buffer[PREFIX_SIZE + 1] == length - COMMAND_SIZE:
+            return True
+        self._damage(DamageReason.BAD_LENGTH, _HEAD_SIZE, found)
+        return False
+
+    def _judge_message(self, size: int, found: list[Message | Damage]) -> None:
+        wire = bytes(self._buffer[:size])
+        if wire[-1:] != TAIL:
+            self._damage(DamageReason.BAD_TAIL, size, found)
+            return
+        body = wire[len(HEADER) : -CRC_SIZE - len(TAIL)]
+        crc = crc32(HEADER + self.can_id.to_bytes(2, "big") + body)
+        if crc != int.from_bytes(wire[-CRC_SIZE - len(TAIL) : -len(TAIL)], "big"):
+            self._damage(DamageReason.BAD_CRC, size, found)
+            return
+        self._flush_junk(found)
+        del self._buffer[:size]
+        command = int.from_bytes(wire[PREFIX_SIZE:_HEAD_SIZE], "big")
+        data = wire[_HEAD_SIZE : -CRC_SIZE - len(TAIL)]
+        found.append(Message(self.can_id, wire[len(HEADER)], command, data))
+
+    def _damage(self, reason: DamageReason, size: int, found: list[Message | Damage]) -> None:
+        """Report the candidate of `size` bytes at the front and give up its header only, so that
+        the rest is scanned.
+
+        What lies between that header and the next one belongs to this report.
+        """
+        self._flush_junk(found)
+        found.append(Damage(self.can_id, reason, bytes(self._buffer[:size])))
+        del self._buffer[: len(HEADER)]
+        self._align()
+        self._junk.clear()
+
+    def _flush_junk(self, found: list[Message | Damage]) -> None:
+        if self._junk:
+            found.append(Damage(self.can_id, DamageReason.JUNK, bytes(self._junk)))
+            self._junk.clear()
