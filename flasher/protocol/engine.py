@@ -55,6 +55,7 @@ class _Outgoing(NamedTuple):
     frames: Sequence[Frame]
     wire_s: float
     not_before: float
+    tag: object
 
 
 class Transmitter:
@@ -74,6 +75,8 @@ class Transmitter:
         self.left_at = float("-inf")
         """When the last frame of the last message has left: accepted by the adapter plus its time
         on the wire (R12)."""
+        self.left_tag: object = None
+        """The tag of that message."""
 
     @property
     def idle(self) -> bool:
@@ -81,17 +84,23 @@ class Transmitter:
         return not self._queue
 
     def queue(
-        self, frames: Sequence[Frame], *, wire_s: float | None = None, not_before: float = 0.0
+        self,
+        frames: Sequence[Frame],
+        *,
+        wire_s: float | None = None,
+        not_before: float = 0.0,
+        tag: object = None,
     ) -> None:
         """Send a message after those before it, its first frame not sooner than `not_before`.
 
-        `wire_s` is its time on the wire where the caller knows it, else it is computed.
+        `wire_s` is its time on the wire where the caller knows it, else it is computed; `tag` is
+        for the caller to know it again when it has left.
         """
         if wire_s is None:
             wire_s = message_bits(frames) / self._bitrate_bps
         if not self._queue:
             self._not_before = not_before
-        self._queue.append(_Outgoing(frames, wire_s, not_before))
+        self._queue.append(_Outgoing(frames, wire_s, not_before, tag))
 
     def drop_unstarted(self) -> None:
         """Forget the messages of which no frame was accepted yet."""
@@ -125,6 +134,7 @@ class Transmitter:
         # An adapter may take a message at once and send it at the bus's pace, or take each frame
         # when it sends it: the later of the two tells when the last frame is gone.
         last_frame_s = frame_bits(message.frames[-1]) / self._bitrate_bps
+        self.left_tag = message.tag
         self.left_at = max(self._message_began_at + message.wire_s, now + last_frame_s)
         if self._queue:
             self._not_before = self._queue[0].not_before

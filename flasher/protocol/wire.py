@@ -24,7 +24,6 @@ from flasher.protocol.spec import (
     FRAME_DATA_SIZE,
     HEADER,
     LENGTH_MAX,
-    LENGTH_MIN,
     MESSAGE_MAX_SIZE,
     OVERHEAD_SIZE,
     PREFIX_SIZE,
@@ -144,12 +143,14 @@ class Reassembler:
                 self._junk += self._buffer
                 self._buffer.clear()
         self._flush_junk(found)
+        self._needed = len(HEADER)
         return found
 
     def reset(self) -> None:
         """Forget everything held."""
         self._buffer.clear()
         self._junk.clear()
+        self._needed = len(HEADER)
 
     def _scan(self) -> list[Message | Damage]:
         found: list[Message | Damage] = []
@@ -180,7 +181,7 @@ class Reassembler:
     def _judge_head(self, found: list[Message | Damage]) -> bool:
         buffer = self._buffer
         length = buffer[PREFIX_SIZE - 1]
-        if length >= LENGTH_MIN and buffer[PREFIX_SIZE + 1] == length - COMMAND_SIZE:
+        if buffer[PREFIX_SIZE + 1] == length - COMMAND_SIZE:  # so the length is not 0 or 1
             return True
         self._damage(DamageReason.BAD_LENGTH, _HEAD_SIZE, found)
         return False

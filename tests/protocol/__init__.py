@@ -1,0 +1,1 @@
+"""What flasher.protocol promises, held against the documents' own bytes and plain references."""
