@@ -1,0 +1,144 @@
+"""Whether an image looks like a program for a Cortex-M, and whether it starts inside itself.
+
+The first word of such a program is its initial stack pointer, the second its reset vector: an
+address with bit 0 set, for Thumb. Nothing in the protocol says that a device has such a processor,
+so what does not look like one is told, not refused. What does look like one and starts somewhere
+else is refused (R8): a part of a program, or the wrong part of a merged file.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from struct import Struct
+from typing import Final
+
+from flasher.errors import ImageError
+from flasher.image.image import Image
+
+_VECTORS: Final = Struct("<4I")
+"""Initial stack pointer, then reset, NMI and hard fault."""
+_FIRST_TWO_SIZE: Final = 8
+_RAM_AREAS: Final = ((0x1000_0000, 0x2000_0000), (0x2000_0000, 0x4000_0000))
+"""RAM in the code region (core-coupled, or of some makers) and the SRAM region. A stack pointer
+starts at the end of a RAM and grows down, so the start of an area is outside, its end inside."""
+_THUMB: Final = 1
+_BASE_ALIGNMENT: Final = 128
+"""The least alignment of a vector table."""
+_INNER_ALIGNMENT: Final = 512
+"""Alignment at which a second vector table is looked for: applications start at a flash page."""
+_INNER_NAMED_MAX: Final = 4
+_HINT: Final = "an encrypted image, a header in front, or another kind of processor"
+
+
+@dataclass(frozen=True)
+class VectorTable:
+    """The first two words of an image and what speaks against them, in sentences."""
+
+    stack_pointer: int
+    reset_vector: int
+    plausible: bool
+    """Both words look like a Cortex-M's. Whether they fit this place is in `problems` too."""
+    problems: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    """What could not be judged, and why."""
+
+    @property
+    def stack_pointer_plausible(self) -> bool:
+        return _is_stack_pointer(self.stack_pointer)
+
+    @property
+    def entry(self) -> int:
+        """The address that the processor starts at: the reset vector without its Thumb bit."""
+        return self.reset_vector & ~_THUMB
+
+
+def vector_table(image: Image) -> VectorTable | None:
+    """The vector table at the start of an image; None when it is too short to have one."""
+    if image.size_bytes < _FIRST_TWO_SIZE:
+        return None
+    head = image.data[: _VECTORS.size]
+    stack_pointer, reset, *others = _VECTORS.unpack(head.ljust(_VECTORS.size, b"\0"))
+    problems = []
+    if not _is_stack_pointer(stack_pointer):
+        problems.append(
+            f"the first word, 0x{stack_pointer:08X}, is no stack pointer of a Cortex-M ({_HINT})"
+        )
+    if not reset & _THUMB:
+        problems.append(f"the reset vector, 0x{reset:08X}, has no Thumb bit")
+    elif reset in (_THUMB, 0xFFFF_FFFF):
+        problems.append(f"the reset vector, 0x{reset:08X}, is empty")
+    plausible = not problems
+    notes = []
+    inner = _inner_tables(image)
+    if plausible and inner:
+        notes.append(
+            f"another vector table stands at {', '.join(f'0x{address:08X}' for address in inner)}: "
+            "if that is the application, the file holds more than it (--range START:END)"
+        )
+    entry = reset & ~_THUMB
+    if image.base is not None:
+        if not image.base <= entry < image.base + image.size_bytes:
+            problems.append(
+                f"the reset vector, 0x{reset:08X}, points outside of the image, "
+                f"0x{image.base:08X}..0x{image.base + image.size_bytes - 1:08X}"
+            )
+        if plausible and image.base % _BASE_ALIGNMENT:
+            problems.append(f"a vector table cannot stand at 0x{image.base:08X}")
+    elif plausible:
+        notes.append(
+            "a raw binary has no address: whether its reset vector points into it "
+            "can be judged with --base only"
+        )
+        vectors = [reset, *(vector for vector in others if vector & _THUMB)]
+        if max(vectors) - min(vectors) >= image.size_bytes:
+            problems.append(
+                "its reset, NMI and hard fault vectors lie further apart than the image is long: "
+                "it is a part of a program"
+            )
+    return VectorTable(stack_pointer, reset, plausible, tuple(problems), tuple(notes))
+
+
+def check_starts_inside(image: Image) -> None:
+    """The rule of R8 for a merged file.
+
+    Raises ImageError when the image has a Cortex-M's stack pointer and a known base, but its reset
+    vector points outside of it. Without a base nothing can be said, and nothing is.
+    """
+    table = vector_table(image)
+    if table is None or image.base is None or not table.stack_pointer_plausible:
+        return
+    end = image.base + image.size_bytes
+    if image.base <= table.entry < end:
+        return
+    raise ImageError(
+        f"{image.source} does not start inside itself: its reset vector is "
+        f"0x{table.reset_vector:08X}",
+        where=f"what would be sent lies at 0x{image.base:08X}..0x{end - 1:08X}",
+        cause="a part of a program, or a file merged of bootloader and application, of which the "
+        "wrong part would be sent",
+        remedy="choose the application with --range START:END, or waive this check with "
+        "--allow-outside-vector",
+    )
+
+
+def _inner_tables(image: Image) -> list[int]:
+    """Where in an image of known base a second program seems to start, as in a merged file."""
+    if image.base is None:
+        return []
+    found = []
+    end = image.base + image.size_bytes
+    last = image.size_bytes - _VECTORS.size
+    for offset in range(_INNER_ALIGNMENT, last + 1, _INNER_ALIGNMENT):
+        stack_pointer, *vectors = _VECTORS.unpack_from(image.data, offset)
+        start = image.base + offset
+        if _is_stack_pointer(stack_pointer) and all(
+            vector & _THUMB and start < vector < end for vector in vectors
+        ):
+            found.append(start)
+            if len(found) == _INNER_NAMED_MAX:
+                break
+    return found
+
+
+def _is_stack_pointer(word: int) -> bool:
+    return word % 4 == 0 and any(start < word <= end for start, end in _RAM_AREAS)

@@ -1,0 +1,85 @@
+"""What a firmware file comes down to: the bytes to be sent, and where they came from."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Final, Self
+
+ADDRESS_SPACE: Final = 1 << 32
+"""One past the highest address that a file can name."""
+
+_VERSION: Final = re.compile(
+    rb"V[0-9]r[0-9]r[0-9]_[0-9]{4}(?:0[1-9]|1[0-2])(?:0[1-9]|[12][0-9]|3[01])"
+)
+"""`Vxrxrx_YYYYMMDD`, the naming rule of firmware versions (3.1, version information)."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """A stretch of addresses without gaps; `end` is one past the last."""
+
+    start: int
+    size_bytes: int
+
+    @property
+    def end(self) -> int:
+        return self.start + self.size_bytes
+
+    def __str__(self) -> str:
+        last = self.end - 1
+        return f"0x{self.start:08X}..0x{last:08X} ({self.size_bytes} bytes)"
+
+
+@dataclass(frozen=True)
+class Image:
+    """The bytes to be sent, from the first to the last (R8), and what is known about them."""
+
+    data: bytes = field(repr=False)
+    """The very bytes to be sent; gaps are filled."""
+    base: int | None
+    """Address of `data[0]`; None for a raw binary whose base nobody told."""
+    format: str
+    """The format that the file was read as, in words: "Intel HEX", "raw binary", ..."""
+    source: str
+    """File name as given, for messages."""
+    segments: tuple[Span, ...]
+    """Where the file has bytes; offsets instead of addresses when `base` is None."""
+    filled_bytes: int
+    """How many bytes of `data` are filler and not from the file."""
+    version: str | None = None
+    """The firmware version `Vxrxrx_YYYYMMDD` inside; None when there is none, or several."""
+
+    @classmethod
+    def from_bytes(cls, data: bytes, *, base: int | None = None, source: str = "(memory)") -> Self:
+        """An image of bytes that are at hand, as a raw binary of them would load."""
+        return cls(
+            data=data,
+            base=base,
+            format="raw binary",
+            source=source,
+            segments=(Span(base or 0, len(data)),),
+            filled_bytes=0,
+            version=find_version(data),
+        )
+
+    @property
+    def size_bytes(self) -> int:
+        return len(self.data)
+
+    @cached_property
+    def sha256(self) -> str:
+        """SHA-256 of `data`, in hex digits."""
+        return hashlib.sha256(self.data).hexdigest()
+
+
+def find_version(data: bytes) -> str | None:
+    """The firmware version text inside `data`; None when there is none or more than one different.
+
+    It is looked for without regard to its surroundings: in a packed structure there is no
+    separator before or behind it.
+    """
+    found = set(_VERSION.findall(data))
+    return found.pop().decode("ascii") if len(found) == 1 else None

@@ -1,0 +1,168 @@
+"""A file to an `Image`: choose the format, read it sparse, check it, join it."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import BinaryIO, Final
+
+from flasher.errors import ImageError, UsageError
+from flasher.image import elf, hexfile, srec
+from flasher.image.cortexm import check_starts_inside
+from flasher.image.detect import HEAD_SIZE, Format, detect
+from flasher.image.image import ADDRESS_SPACE, Image, find_version
+from flasher.image.segments import SparseBytes, too_large
+from flasher.protocol.spec import IMAGE_MAX_SIZE
+
+DEFAULT_FILL_GAPS_UP_TO: Final = 4096
+"""In bytes. Covers the room between a vector table and the code; a larger gap is another part."""
+FILE_MAX_SIZE: Final = 128 * 1024 * 1024
+"""In bytes: the largest image in the most wasteful records; a larger file is not read at all."""
+FORMATS: Final = tuple(form.value for form in Format)
+"""The words that `format` takes."""
+_READERS: Final = {Format.HEX: hexfile.read, Format.SREC: srec.read, Format.ELF: elf.read}
+
+
+def load(
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,  # noqa: A002  the option's own name
+    base: int | None = None,
+    range_: tuple[int, int] | None = None,
+    fill_gaps_up_to: int = DEFAULT_FILL_GAPS_UP_TO,
+    allow_outside_vector: bool = False,
+) -> Image:
+    """The image in a firmware file, checked (R8, R9).
+
+    `format` is one of `FORMATS`, None finds out. `base` is the address of the first byte of a raw
+    binary. `range_` is the address of the first byte to send, and one past the last that may be
+    sent; other bytes of the file are left out. Gaps up to `fill_gaps_up_to` bytes are filled with
+    FF, from the range's start on. `allow_outside_vector` waives the merged-file rule of R8.
+
+    Raises ImageError when the file cannot be used, UsageError when there is no such file or the
+    options make no sense.
+    """
+    _check_options(format, base, range_, fill_gaps_up_to)
+    source = os.fspath(path)
+    with _opened(path, source) as (file, size_bytes):
+        form = Format(format) if format else _detect(file, source)
+        sparse = SparseBytes(source, range_)
+        if form is Format.BIN:
+            image = _binary(file, size_bytes, sparse, base, fill_gaps_up_to)
+        else:
+            if base is not None:
+                raise UsageError(
+                    f"--base is for a raw binary, and {source} is an {form.title} file",
+                    where="the file says itself where its bytes lie",
+                    remedy="leave --base out; choose a part of the file with --range START:END",
+                )
+            if size_bytes > FILE_MAX_SIZE:
+                raise ImageError(
+                    f"{source} is too large for an {form.title} file: {size_bytes} bytes",
+                    cause="an ELF file full of debug information, or no firmware",
+                    remedy="strip it, or convert it to a raw binary: objcopy -O binary",
+                )
+            _READERS[form](file, source, sparse)
+            image = _joined(sparse, form, fill_gaps_up_to)
+    if not allow_outside_vector:
+        check_starts_inside(image)
+    return image
+
+
+def _check_options(
+    form: str | None, base: int | None, range_: tuple[int, int] | None, fill_gaps_up_to: int
+) -> None:
+    if form is not None and form not in FORMATS:
+        raise UsageError(f"there is no image format {form!r}", remedy=f"one of {FORMATS}")
+    if base is not None and not 0 <= base < ADDRESS_SPACE:
+        raise UsageError(f"the base {base:#x} is no 32-bit address")
+    if range_ is not None and not 0 <= range_[0] < range_[1] <= ADDRESS_SPACE:
+        raise UsageError(
+            f"the range {range_[0]:#x}:{range_[1]:#x} is empty or not inside 32-bit addresses",
+            remedy="give START:END with END one past the last byte",
+        )
+    if fill_gaps_up_to < 0:
+        raise UsageError(f"gaps cannot be filled up to {fill_gaps_up_to} bytes")
+
+
+@contextmanager
+def _opened(path: str | os.PathLike[str], source: str) -> Iterator[tuple[BinaryIO, int]]:
+    """The open file and its size in bytes; only a regular file is ever opened."""
+    try:
+        status = Path(path).stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise ImageError(
+                f"{source} is {'a directory' if stat.S_ISDIR(status.st_mode) else 'no file'}",
+                remedy="name a firmware file; what comes through a pipe has to be saved first",
+            )
+        opened = Path(path).open("rb")  # noqa: SIM115  closed below, where reading may fail too
+    except (FileNotFoundError, NotADirectoryError, ValueError) as error:
+        raise UsageError(f"there is no file {source!r}", remedy="correct the name") from error
+    except OSError as error:
+        raise _unreadable(source, error) from error
+    try:
+        with opened as file:
+            yield file, status.st_size
+    except OSError as error:
+        raise _unreadable(source, error) from error
+
+
+def _unreadable(source: str, error: OSError) -> ImageError:
+    return ImageError(
+        f"{source} cannot be read: {error.strerror or error}",
+        remedy="make the file readable for this user, or copy it to this computer",
+    )
+
+
+def _detect(file: BinaryIO, source: str) -> Format:
+    head = file.read(HEAD_SIZE)
+    file.seek(0)
+    return detect(head, source)
+
+
+def _binary(
+    file: BinaryIO,
+    size_bytes: int,
+    sparse: SparseBytes,
+    base: int | None,
+    fill_gaps_up_to: int,
+) -> Image:
+    """A raw binary, or the part of it in the range; not more is ever read."""
+    source, window = sparse.source, sparse.window
+    if window and base is None:
+        raise UsageError(
+            f"--range chooses addresses, and {source} is a raw binary, which has none",
+            remedy="say with --base which address its first byte has",
+        )
+    start = base or 0
+    end = start + size_bytes
+    low, high = window or (start, end)
+    low, high = max(low, start), min(high, end)
+    if high - low > IMAGE_MAX_SIZE:
+        raise too_large(source, high - low)
+    if end > ADDRESS_SPACE:
+        raise UsageError(f"{source} does not end below 4 GiB with the base 0x{start:08X}")
+    if size_bytes:
+        sparse.note(start, end)
+    if low < high:
+        file.seek(low - start)
+        sparse.add(low, file.read(high - low), str)
+    image = _joined(sparse, Format.BIN, fill_gaps_up_to)
+    return image if base is not None else replace(image, base=None)
+
+
+def _joined(sparse: SparseBytes, form: Format, fill_gaps_up_to: int) -> Image:
+    data, base = sparse.join(fill_gaps_up_to)
+    return Image(
+        data=data,
+        base=base,
+        format=form.title,
+        source=sparse.source,
+        segments=sparse.spans(),
+        filled_bytes=len(data) - sparse.size_bytes,
+        version=find_version(data),
+    )

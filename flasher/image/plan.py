@@ -1,0 +1,185 @@
+"""What an upgrade with an image comes to, before anything is sent: packets, frames, seconds.
+
+Seconds are those on the wire: the exact bits of the very frames, stuff bits included, one right
+after the other. What a device takes to restart, to erase and to answer comes on top.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Final
+
+from flasher.errors import UsageError
+from flasher.image.image import Image
+from flasher.image.segments import empty, too_large
+from flasher.protocol.bittime import message_bits, stream_bits
+from flasher.protocol.frame import Frame
+from flasher.protocol.messages import (
+    Ack,
+    BootVersion,
+    Complete,
+    EndOfTransfer,
+    GeneralFeedback,
+    Packet,
+    RequestTransfer,
+    Reset,
+    UpdateCommand,
+)
+from flasher.protocol.spec import (
+    FRAME_DATA_SIZE,
+    FRAMES_PER_PACKET,
+    IMAGE_MAX_SIZE,
+    PACKET_DATA_SIZE,
+    PACKET_FILLER,
+    Target,
+    packet_count,
+)
+from flasher.protocol.wire import Message, encode, split
+
+_FILLER: Final = bytes((PACKET_FILLER,))
+_NOMINAL_BOOT_VERSION: Final = "V1.0.0"
+"""Another version differs by a few stuff bits at the most."""
+_CHUNK_PACKETS: Final = 1024
+"""Packets encoded at once: enough for the C library to have work, little enough to hold."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """An upgrade without faults: every message of both directions once."""
+
+    image: Image
+    target: Target
+    bitrate_bps: int
+    total_packets: int
+    host_frames: int
+    """CAN frames of the tool: reset, update command, packets, end of transfer."""
+    device_frames: int
+    """CAN frames of the device: general feedback, one boot version, request transfer, an ACK for
+    each packet, complete."""
+    bytes_on_wire: int
+    """Data bytes in all those frames."""
+    wire_s: float
+    """All those frames on the bus one right after the other."""
+    transfer_wire_s: float
+    """The packets and their ACKs alone."""
+    packet_bits: array[int] = field(repr=False, compare=False)
+    """Bit times of each packet's frames, packet 1 first."""
+
+    @property
+    def frames(self) -> int:
+        """All CAN frames, the tool's and the device's."""
+        return self.host_frames + self.device_frames
+
+    @property
+    def payload_bytes(self) -> int:
+        """Bytes of the image itself, without filler: what the update command says (R9)."""
+        return self.image.size_bytes
+
+    def packet_frames(self, number: int) -> list[Frame]:
+        """The CAN frames of packet `number`, from 1; raises IndexError for any other."""
+        return split(self.target.request_id, self._packet_wire(number))
+
+    def packet_wire_s(self, number: int) -> float:
+        """Seconds of packet `number`, from 1, on the wire; raises IndexError for any other."""
+        self._check(number)
+        return self.packet_bits[number - 1] / self.bitrate_bps
+
+    def _packet_wire(self, number: int) -> bytes:
+        self._check(number)
+        return _packet_wire(self.image.data, number, self.total_packets, self.target.request_id)
+
+    def _check(self, number: int) -> None:
+        if not 1 <= number <= self.total_packets:
+            raise IndexError(f"there is no packet {number} of {self.total_packets}")
+
+
+def plan(image: Image, target: Target, bitrate_bps: int) -> Plan:
+    """The upgrade of `target` with `image` at `bitrate_bps`.
+
+    Raises ImageError when the image is empty or takes more than 65535 packets (R9), UsageError
+    when the bit rate is none.
+    """
+    if bitrate_bps <= 0:
+        raise UsageError(f"{bitrate_bps} bit/s is no bit rate")
+    if not image.size_bytes:
+        raise empty(image.source)
+    if image.size_bytes > IMAGE_MAX_SIZE:
+        raise too_large(image.source, image.size_bytes)
+    total = packet_count(image.size_bytes)
+    packet_bits = _packet_bits(image.data, total, target.request_id)
+    acks = _Traffic()
+    acks.add(Ack(number).to_message(target.answer_id) for number in range(1, total + 1))
+    host = _Traffic()
+    host.add(
+        row.to_message(target.request_id)
+        for row in (
+            Reset(),
+            UpdateCommand(target.update_text, image.size_bytes),
+            EndOfTransfer(),
+        )
+    )
+    device = _Traffic()
+    device.add(
+        row.to_message(target.answer_id)
+        for row in (
+            GeneralFeedback(),
+            BootVersion(target.boot_name, _NOMINAL_BOOT_VERSION),
+            RequestTransfer(),
+            Complete(),
+        )
+    )
+    transfer_bits = sum(packet_bits) + acks.bits
+    packet_frames = total * FRAMES_PER_PACKET
+    packet_bytes = packet_frames * FRAME_DATA_SIZE
+    return Plan(
+        image=image,
+        target=target,
+        bitrate_bps=bitrate_bps,
+        total_packets=total,
+        host_frames=host.frames + packet_frames,
+        device_frames=device.frames + acks.frames,
+        bytes_on_wire=packet_bytes + host.size_bytes + device.size_bytes + acks.size_bytes,
+        wire_s=(transfer_bits + host.bits + device.bits) / bitrate_bps,
+        transfer_wire_s=transfer_bits / bitrate_bps,
+        packet_bits=packet_bits,
+    )
+
+
+class _Traffic:
+    """Sums over messages."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.size_bytes = 0
+        self.bits = 0
+
+    def add(self, messages: Iterable[Message]) -> None:
+        for message in messages:
+            wire = encode(message)
+            frames = split(message.can_id, wire)
+            self.frames += len(frames)
+            self.size_bytes += len(wire)
+            self.bits += message_bits(frames)
+
+
+def _packet_wire(data: bytes, number: int, total: int, can_id: int) -> bytes:
+    """The encoded message of a packet; the last one is filled up with FF (R9)."""
+    end = number * PACKET_DATA_SIZE
+    payload = data[end - PACKET_DATA_SIZE : end].ljust(PACKET_DATA_SIZE, _FILLER)
+    return encode(Packet(number, total, payload).to_message(can_id))
+
+
+def _packet_bits(data: bytes, total: int, can_id: int) -> array[int]:
+    """Bit times of each packet; packets are whole frames, so they run on as one stream."""
+    bits = array("H")
+    for first in range(1, total + 1, _CHUNK_PACKETS):
+        numbers = range(first, min(first + _CHUNK_PACKETS, total + 1))
+        stream = b"".join(_packet_wire(data, number, total, can_id) for number in numbers)
+        frame_bits = stream_bits(can_id, stream)
+        bits.extend(
+            sum(frame_bits[at : at + FRAMES_PER_PACKET])
+            for at in range(0, len(frame_bits), FRAMES_PER_PACKET)
+        )
+    return bits

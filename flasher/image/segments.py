@@ -1,0 +1,184 @@
+"""Bytes at addresses, kept sparse until it is certain that they make an image.
+
+Nothing here is ever as large as the span of the addresses: two bytes four gigabytes apart take two
+bytes. Pieces may arrive in any order and may repeat each other, but not contradict each other.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Callable
+from typing import Final
+
+from flasher.errors import ImageError
+from flasher.image.image import Span
+from flasher.protocol.spec import IMAGE_MAX_SIZE, PACKET_COUNT_MAX, PACKET_FILLER
+
+PIECES_MAX: Final = 32_768
+"""Far more than any linker makes; bounds time and memory for a file of scattered bytes."""
+_NAMED_SPANS_MAX: Final = 8
+
+
+class SparseBytes:
+    """Sorted pieces of bytes, none overlapping; only those inside `window` are kept."""
+
+    def __init__(self, source: str, window: tuple[int, int] | None = None) -> None:
+        self.source = source
+        self.window = window
+        self._starts: list[int] = []
+        self._pieces: list[bytearray] = []
+        self._seen: tuple[int, int] | None = None
+        self.size_bytes = 0
+
+    def add(self, start: int, data: bytes, place: Callable[[int], str]) -> None:
+        """Take `data` at address `start`; `place` tells where in the file an address stands.
+
+        Raises ImageError where other bytes are there already, or when it gets too much.
+        """
+        if not data:
+            return
+        self.note(start, start + len(data))
+        if self.window:
+            data = data[max(0, self.window[0] - start) : max(0, self.window[1] - start)]
+            start = max(start, self.window[0])
+        end = start + len(data)
+        index = max(0, bisect_right(self._starts, start) - 1)
+        while start < end:
+            if index < len(self._starts) and self._end(index) <= start:
+                index += 1
+                continue
+            if index == len(self._starts) or self._starts[index] >= end:
+                free = end
+            else:
+                free = self._starts[index]
+            if free > start:
+                index = self._insert(index, start, data[: free - start])
+                data = data[free - start :]
+                start = free
+            else:
+                common = min(end, self._end(index)) - start
+                self._compare(index, start, data[:common], place)
+                data = data[common:]
+                start += common
+
+    def note(self, start: int, end: int) -> None:
+        """The file has bytes from `start` to before `end`, whether they are wanted or not."""
+        low, high = self._seen or (start, end)
+        self._seen = min(low, start), max(high, end)
+
+    def spans(self) -> tuple[Span, ...]:
+        """Where there are bytes, ascending, neighbours joined."""
+        spans: list[Span] = []
+        for start, piece in zip(self._starts, self._pieces, strict=True):
+            if spans and spans[-1].end == start:
+                spans[-1] = Span(spans[-1].start, spans[-1].size_bytes + len(piece))
+            else:
+                spans.append(Span(start, len(piece)))
+        return tuple(spans)
+
+    def join(self, fill_gaps_up_to: int) -> tuple[bytes, int]:
+        """All bytes from the first address (the window's, if there is one) to the last, gaps
+        filled with FF (R8), and that first address.
+
+        Raises ImageError when there are no bytes, when a gap is larger than `fill_gaps_up_to`
+        bytes, or when the whole is larger than the largest image.
+        """
+        spans = self.spans()
+        if not spans:
+            raise self._empty()
+        first = self.window[0] if self.window else spans[0].start
+        end = first
+        for span in spans:
+            if span.start - end > fill_gaps_up_to:
+                raise self._gap(end, span.start, spans)
+            end = span.end
+        if end - first > IMAGE_MAX_SIZE:
+            raise too_large(self.source, end - first)
+        parts: list[bytes | bytearray] = []
+        end = first
+        for start, piece in zip(self._starts, self._pieces, strict=True):
+            parts += (bytes((PACKET_FILLER,)) * (start - end), piece)
+            end = start + len(piece)
+        return b"".join(parts), first
+
+    def _end(self, index: int) -> int:
+        return self._starts[index] + len(self._pieces[index])
+
+    def _insert(self, index: int, start: int, data: bytes) -> int:
+        """Put `data` before piece `index`, or on the end of the one before; where to go on."""
+        self.size_bytes += len(data)
+        if self.size_bytes > IMAGE_MAX_SIZE:
+            raise too_large(self.source, self.size_bytes, more=True)
+        if index and self._end(index - 1) == start:
+            self._pieces[index - 1] += data
+            return index
+        if len(self._pieces) == PIECES_MAX:
+            raise ImageError(
+                f"{self.source} holds more than {PIECES_MAX} separate pieces of data",
+                cause="a damaged file, or none that a linker made",
+                remedy="make the file again, or choose a part of it with --range START:END",
+            )
+        # A piece that ends where the next one starts is left apart: joining it would copy the next
+        # one, again and again for a file in descending order.
+        self._starts.insert(index, start)
+        self._pieces.insert(index, bytearray(data))
+        return index + 1
+
+    def _compare(self, index: int, start: int, data: bytes, place: Callable[[int], str]) -> None:
+        offset = start - self._starts[index]
+        there = self._pieces[index][offset : offset + len(data)]
+        if there == data:
+            return
+        at = next(at for at, (old, new) in enumerate(zip(there, data, strict=True)) if old != new)
+        address = start + at
+        raise ImageError(
+            f"{self.source} has different bytes for the same address 0x{address:08X}: "
+            f"first {there[at]:02X}, then {data[at]:02X}",
+            where=place(address),
+            cause="two builds or two parts merged into one file that overlap",
+            remedy="make the file again from one build",
+        )
+
+    def _empty(self) -> ImageError:
+        if not (self._seen and self.window):
+            return empty(self.source)
+        start, end = self.window
+        low, high = self._seen
+        return ImageError(
+            f"{self.source} holds no bytes in the range 0x{start:08X}:0x{end:08X}",
+            where=f"its bytes lie between 0x{low:08X} and 0x{high:08X}",
+            remedy="correct --range START:END",
+        )
+
+    def _gap(self, start: int, end: int, spans: tuple[Span, ...]) -> ImageError:
+        named = ", ".join(str(span) for span in spans[:_NAMED_SPANS_MAX])
+        if len(spans) > _NAMED_SPANS_MAX:
+            named += f" and {len(spans) - _NAMED_SPANS_MAX} more"
+        remedy = "choose the application with --range START:END"
+        if spans[-1].end - min(start, spans[0].start) <= IMAGE_MAX_SIZE:
+            remedy += f", or fill the gap with FF by --fill-gaps-up-to {end - start}"
+        return ImageError(
+            f"{self.source} has a gap of {end - start} bytes between 0x{start:08X} and 0x{end:08X}",
+            where=f"segments {named}",
+            cause="option bytes, external flash or a bootloader beside the application",
+            remedy=remedy,
+        )
+
+
+def empty(source: str) -> ImageError:
+    """The refusal of an image without bytes (R9)."""
+    return ImageError(
+        f"{source} is empty: it holds no bytes to send",
+        cause="the build or the conversion that made it failed",
+        remedy="make the file again",
+    )
+
+
+def too_large(source: str, size_bytes: int, *, more: bool = False) -> ImageError:
+    """The refusal of more than 65535 packets (R9); `more`: the size is a lower bound."""
+    return ImageError(
+        f"{source} is too large: {'at least ' if more else ''}{size_bytes} bytes to send, "
+        f"and {PACKET_COUNT_MAX} packets hold {IMAGE_MAX_SIZE}",
+        cause="not a firmware image, or more than the application in one file",
+        remedy="choose the application with --range START:END (a raw binary needs --base too)",
+    )

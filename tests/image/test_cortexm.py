@@ -1,0 +1,165 @@
+"""The vector table at the start of an image, and the merged-file rule of R8."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import pytest
+
+from flasher.errors import ImageError
+from flasher.image.cortexm import check_starts_inside, vector_table
+from flasher.image.image import Image
+from flasher.image.load import load
+
+SAMPLES = Path(__file__).parents[2] / "firmware_samples"
+BASE = 0x0800_4000
+STACK = 0x2000_5000
+
+
+def image(*words: int, base: int | None = BASE, size: int = 0x1000) -> Image:
+    data = struct.pack(f"<{len(words)}I", *words).ljust(size, b"\0")
+    return Image.from_bytes(data, base=base, source="app.bin")
+
+
+@pytest.mark.parametrize("name", ["wmc.hex", "obc.elf"])
+def test_the_samples_look_like_programs(name: str) -> None:
+    table = vector_table(load(SAMPLES / name))
+    assert table is not None
+    assert table.plausible
+    assert not table.problems
+    assert table.stack_pointer == STACK
+
+
+def test_an_image_shorter_than_two_words_has_no_vector_table() -> None:
+    assert vector_table(Image.from_bytes(bytes(7), base=BASE)) is None
+    check_starts_inside(Image.from_bytes(bytes(7), base=BASE))
+
+
+def test_two_words_are_enough() -> None:
+    table = vector_table(image(STACK, BASE + 5, size=8))
+    assert table is not None
+    assert table.plausible
+    assert not table.problems
+    assert table.entry == BASE + 4
+
+
+@pytest.mark.parametrize(
+    ("stack_pointer", "plausible"),
+    [
+        (0x2000_0004, True),
+        (0x2000_0000, True),  # the end of a RAM in the code region
+        (0x1000_2000, True),
+        (0x3800_0000, True),
+        (0x4000_0000, True),
+        (0x4000_0004, False),
+        (0x1000_0000, False),
+        (0x2000_0FFF, False),
+        (0x0800_4000, False),
+        (0, False),
+        (0xFFFF_FFFF, False),
+    ],
+)
+def test_a_stack_pointer_is_an_aligned_end_of_a_ram(stack_pointer: int, *, plausible: bool) -> None:
+    table = vector_table(image(stack_pointer, BASE + 0x101))
+    assert table is not None
+    assert table.stack_pointer_plausible is plausible
+    assert table.plausible is plausible
+    assert any("stack pointer" in problem for problem in table.problems) is not plausible
+
+
+@pytest.mark.parametrize(
+    ("reset", "words"),
+    [(BASE + 0x100, "no Thumb bit"), (0xFFFF_FFFF, "is empty"), (1, "is empty")],
+)
+def test_a_reset_vector_is_a_thumb_address(reset: int, words: str) -> None:
+    table = vector_table(image(STACK, reset))
+    assert table is not None
+    assert not table.plausible
+    assert words in table.problems[0]
+
+
+@pytest.mark.parametrize("reset", [BASE + 1, BASE + 0xFFF])
+def test_a_program_that_starts_at_its_first_or_last_halfword_is_accepted(reset: int) -> None:
+    program = image(STACK, reset)
+    check_starts_inside(program)
+    table = vector_table(program)
+    assert table is not None
+    assert not table.problems
+
+
+@pytest.mark.parametrize("reset", [BASE - 1, BASE + 0x1001, 0x0800_0101, 0])
+def test_a_program_that_starts_outside_of_itself_is_refused(reset: int) -> None:
+    with pytest.raises(ImageError) as caught:
+        check_starts_inside(image(STACK, reset))
+    message = str(caught.value)
+    assert f"0x{reset:08X}" in message
+    assert "0x08004000..0x08004FFF" in message
+    assert "--allow-outside-vector" in message
+    table = vector_table(image(STACK, reset))
+    assert table is not None
+    assert any("points outside" in problem for problem in table.problems)
+
+
+def test_what_does_not_look_like_a_cortex_m_is_not_refused() -> None:
+    check_starts_inside(image(0xDEAD_BEEF, 0x0800_0101))
+
+
+def test_without_a_base_nothing_is_refused_and_that_is_said() -> None:
+    program = image(STACK, 0x0800_0101, base=None)
+    check_starts_inside(program)
+    table = vector_table(program)
+    assert table is not None
+    assert table.plausible
+    assert not table.problems
+    assert "--base" in table.notes[0]
+
+
+def test_without_a_base_vectors_further_apart_than_the_image_is_long_are_told() -> None:
+    near = vector_table(image(STACK, BASE + 1, BASE + 0x1001 - 2, 0, base=None))
+    far = vector_table(image(STACK, BASE + 1, 0, BASE + 0x1001, base=None))
+    assert near is not None
+    assert far is not None
+    assert not near.problems
+    assert "further apart" in far.problems[0]
+
+
+def test_a_vector_table_at_an_odd_place_is_told() -> None:
+    table = vector_table(image(STACK, BASE + 0x101, base=BASE + 0x10))
+    assert table is not None
+    assert table.plausible
+    assert "cannot stand at 0x08004010" in table.problems[0]
+
+
+def merged(count: int) -> Image:
+    """A boot loader and `count` more programs behind it."""
+    data = bytearray()
+    for index in range(count + 1):
+        at = BASE + index * 0x400
+        data += struct.pack("<4I", STACK, *(at + 0x101 + 4 * n for n in range(3))).ljust(0x400)
+    return Image.from_bytes(bytes(data), base=BASE)
+
+
+def test_a_second_program_inside_the_image_is_told() -> None:
+    table = vector_table(merged(1))
+    assert table is not None
+    assert not table.problems
+    assert "another vector table stands at 0x08004400:" in table.notes[0]
+    alone = vector_table(merged(0))
+    assert alone is not None
+    assert not alone.notes
+
+
+def test_a_vector_table_in_the_last_bytes_is_seen() -> None:
+    at = BASE + 0x200
+    first = struct.pack("<2I", STACK, BASE + 0x101).ljust(0x200, b"\0")
+    last = struct.pack("<4I", STACK, at + 5, at + 9, at + 13)
+    table = vector_table(Image.from_bytes(first + last, base=BASE))
+    assert table is not None
+    assert "0x08004200" in table.notes[0]
+
+
+def test_no_more_than_four_further_programs_are_named() -> None:
+    table = vector_table(merged(6))
+    assert table is not None
+    assert table.notes[0].count("0x") == 4
