@@ -82,3 +82,39 @@ class BytesDamaged:
     can_id: int
     reason: str
     data: bytes
+
+
+# -- the device model -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class DeviceStateEntered:
+    """The device model is in another state. Storing a packet and waiting for the next one take
+    turns unreported: `PacketStored` tells.
+    """
+
+    state: str
+    detail: str
+
+
+@dataclass(frozen=True)
+class PacketStored:
+    """The device model has packet `number` of `total` in its flash."""
+
+    number: int
+    total: int
+
+
+@dataclass(frozen=True)
+class ImageStored:
+    """The device model has a whole new image of `size_bytes`; SHA-256 in hexadecimal."""
+
+    size_bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class DeviceReported:
+    """The device model refused or ignored something; one sentence."""
+
+    what: str

@@ -1,0 +1,267 @@
+"""From received messages and expired timers to events of the table.
+
+Here stand the readings that tell one ACK from another: R2 (boot versions before the transfer), R6
+(NAK after the end), R10 (copies, stale answers), R11 (restart or leftover), R16 (request transfer
+again). `Situation` is what they rest on; noting an answer in it is part of classifying it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flasher.host.options import UpgradeOptions
+from flasher.host.table import Event, State
+from flasher.image.plan import Plan
+from flasher.protocol.engine import Transmitter
+from flasher.protocol.messages import (
+    Ack,
+    BootVersion,
+    Complete,
+    GeneralFeedback,
+    Malformed,
+    Nak,
+    RequestTransfer,
+    Row,
+    Unknown,
+    VersionInformation,
+)
+from flasher.protocol.spec import BOOT_VERSION_BURST
+from flasher.protocol.text import decode_text
+from flasher.protocol.timing import Timings
+
+_NEVER = float("-inf")
+_IN_TRANSFER = frozenset({State.TRANSFERRING, State.SETTLING})
+_AFTER_END = frozenset({State.ENDING, State.CONFIRMING})
+
+
+@dataclass
+class Situation:
+    """Where one attempt stands; all times in seconds on the engine's clock."""
+
+    tx: Transmitter
+    state: State = State.RESETTING
+    state_since: float = 0.0
+    attempt: int = 1
+
+    boot: BootVersion | None = None
+    """The first boot version of the attempt."""
+    update_left_at: float = _NEVER
+    """When the last update command left, of this or an earlier attempt."""
+    first_update_left_at: float | None = None
+    request_at: float = 0.0
+
+    number: int = 0
+    """The packet in work, 1-based."""
+    tries: int = 0
+    """How often it was begun to be sent."""
+    copies_unanswered: int = 0
+    """Copies of it that have left and were not answered."""
+    accepted: bool = False
+    """One of its copies was acknowledged."""
+    nak_next_seen: bool = False
+    """A repeated packet n was answered with NAK n+1, and that was not taken for an ACK (R10)."""
+
+    end_tries: int = 0
+    end_copies_left: int = 0
+    end_naks: int = 0
+    burst_count: int = 0
+    """Boot versions since end of transfer, in one burst."""
+    burst_last_at: float = 0.0
+    running_version: str | None = None
+
+    @property
+    def update_left(self) -> bool:
+        """True when an update command was sent: the device may have erased its application."""
+        return self.update_left_at > _NEVER
+
+    def next_attempt(self) -> Situation:
+        """The situation when the device starts over."""
+        return Situation(
+            tx=self.tx,
+            state=self.state,
+            state_since=self.state_since,
+            attempt=self.attempt + 1,
+            update_left_at=self.update_left_at,
+        )
+
+    def next_packet(self, number: int) -> None:
+        """Begin the work on another packet."""
+        self.number, self.tries = number, 0
+        self.copies_unanswered, self.accepted = 0, False
+
+
+class Classifier:
+    """Gives every message and every expired timer its event."""
+
+    def __init__(self, plan: Plan, options: UpgradeOptions) -> None:
+        self._plan = plan
+        self._options = options
+        self._timings: Timings = options.timings
+        self._burst_gap_s = BOOT_VERSION_BURST * self._timings.boot_version_spacing_s
+        """Announcements further apart than a whole burst takes are not of one burst."""
+
+    def message(self, row: Row | Malformed | Unknown, at: Situation, now: float) -> Event:
+        """The event that a received message is."""
+        match row:
+            case Ack() | Nak():
+                if at.state in _IN_TRANSFER:
+                    return self._answer(row, at)
+                if at.state in _AFTER_END:
+                    return self._end_answer(row, at)
+                return Event.UNEXPECTED
+            case BootVersion():
+                return self._boot_version(row, at, now)
+            case RequestTransfer():
+                return self._request(at)
+            case Complete():
+                return self._complete(at)
+            case GeneralFeedback():
+                return Event.FEEDBACK
+            case VersionInformation():
+                return self._version(row, at)
+            case _:
+                return Event.UNEXPECTED
+
+    def timer(self, at: Situation, now: float) -> Event:
+        """The event that the expired timer of the state is."""
+        timings = self._timings
+        in_state_s = now - at.state_since
+        match at.state:
+            case State.RESETTING:
+                given_up = in_state_s >= timings.command_timeout_s
+                return Event.RESET_UNANSWERED if given_up else Event.RESET_DUE
+            case State.AWAITING_BOOT:
+                return Event.BOOT_MISSING
+            case State.AWAITING_REQUEST:
+                return Event.REQUEST_MISSING
+            case State.TRANSFERRING:
+                exhausted = at.tries >= timings.packet_tries
+                return Event.PACKET_LOST if exhausted else Event.PACKET_UNANSWERED
+            case State.SETTLING:
+                return self._settled(at)
+            case State.ENDING:
+                return self._end_timer(at)
+            case _:
+                given_up = in_state_s >= timings.application_start_timeout_s
+                return Event.QUERY_UNANSWERED if given_up else Event.QUERY_DUE
+
+    # -- ACK and NAK ------------------------------------------------------------------------------
+
+    def _answer(self, answer: Ack | Nak, at: Situation) -> Event:
+        """During the transfer (R10)."""
+        accepts = isinstance(answer, Ack)
+        if answer.number == at.number + 1 and not accepts and at.tries > 1:
+            # "I want n+1": some bootloaders answer a repeated n so.
+            if not self._options.nak_next_is_ack:
+                at.nak_next_seen = True
+                return Event.ANSWER_UNEXPECTED
+            accepts = True
+        elif answer.number > at.number:
+            return Event.ANSWER_UNEXPECTED
+        elif answer.number < at.number:
+            return Event.ANSWER_STALE
+        still_sending = not at.tx.idle
+        first_copy_out = at.tries > 1 or not still_sending
+        if not at.copies_unanswered and not (accepts and first_copy_out):
+            # It answers a copy that is answered already, or none at all.
+            return Event.ANSWER_STALE
+        at.copies_unanswered = max(0, at.copies_unanswered - 1)
+        at.accepted = at.accepted or accepts
+        if at.copies_unanswered or still_sending:
+            return Event.COPY_OUTSTANDING
+        return self._settled(at)
+
+    def _settled(self, at: Situation) -> Event:
+        """Every copy of the packet is answered, or will not be any more."""
+        if not at.accepted:
+            exhausted = at.tries >= self._timings.packet_tries
+            return Event.PACKET_LOST if exhausted else Event.PACKET_REFUSED
+        last = at.number == self._plan.total_packets
+        return Event.LAST_PACKET_DONE if last else Event.PACKET_DONE
+
+    def _end_answer(self, answer: Ack | Nak, at: Situation) -> Event:
+        """After end of transfer; the number of a NAK does not matter (R6)."""
+        if isinstance(answer, Ack) or at.end_copies_left <= at.end_naks:
+            return Event.ANSWER_STALE
+        at.end_naks += 1
+        return Event.END_NAK if at.end_naks == 1 else Event.END_REFUSED
+
+    # -- boot version -----------------------------------------------------------------------------
+
+    def _boot_version(self, boot: BootVersion, at: Situation, now: float) -> Event:
+        if at.state in _AFTER_END:
+            return self._boot_after_end(at, now)
+        if at.state in _IN_TRANSFER:
+            if now - at.request_at <= self._timings.leftover_boot_version_s:
+                return Event.BOOT_LEFTOVER
+            return Event.BOOT_WRONG if self._is_foreign(boot) else self._restarted(at)
+        if self._is_foreign(boot):
+            return Event.BOOT_WRONG
+        if at.state is State.AWAITING_REQUEST:
+            return self._boot_again(boot, at, now)
+        return Event.BOOT_VERSION
+
+    def _boot_again(self, boot: BootVersion, at: Situation, now: float) -> Event:
+        """After an update command was sent, before request transfer (R2)."""
+        timings = self._timings
+        if at.boot is not None and boot != at.boot:
+            return Event.BOOT_CHANGED
+        if not at.tx.idle or now - at.update_left_at < timings.update_spacing_s:
+            return Event.BOOT_TOO_SOON
+        first_at = at.first_update_left_at
+        if first_at is not None and now - first_at > timings.request_transfer_timeout_s:
+            return Event.BOOT_UNHEARING
+        return Event.BOOT_VERSION
+
+    def _boot_after_end(self, at: Situation, now: float) -> Event:
+        """A burst is the new application starting; beyond a burst, the device did not accept."""
+        if now - at.burst_last_at > self._burst_gap_s:
+            at.burst_count = 0
+        at.burst_count += 1
+        at.burst_last_at = now
+        return self._restarted(at) if at.burst_count > BOOT_VERSION_BURST else Event.BOOT_AFTER_END
+
+    def _is_foreign(self, boot: BootVersion) -> bool:
+        if self._options.allow_boot_name:
+            return False
+        return boot.name != self._plan.target.boot_name or not boot.is_version
+
+    def _restarted(self, at: Situation) -> Event:
+        exhausted = at.attempt >= self._options.attempts
+        return Event.RESTARTS_EXHAUSTED if exhausted else Event.BOOT_RESTARTED
+
+    # -- the other messages -----------------------------------------------------------------------
+
+    def _request(self, at: Situation) -> Event:
+        if at.state is State.AWAITING_REQUEST:
+            return Event.REQUEST
+        if at.state not in _IN_TRANSFER:
+            return Event.UNEXPECTED
+        if at.number > 1 or at.accepted:
+            exhausted = at.attempt >= self._options.attempts
+            return Event.RESTARTS_EXHAUSTED if exhausted else Event.REQUEST_LATE
+        if not at.tx.idle:
+            return Event.COPY_OUTSTANDING
+        exhausted = at.tries >= self._timings.packet_tries
+        return Event.PACKET_LOST if exhausted else Event.REQUEST_AGAIN
+
+    def _complete(self, at: Situation) -> Event:
+        if at.state in _AFTER_END and at.end_copies_left:
+            return Event.COMPLETE
+        return Event.COMPLETE_EARLY if at.state in _IN_TRANSFER | _AFTER_END else Event.UNEXPECTED
+
+    def _version(self, version: VersionInformation, at: Situation) -> Event:
+        if at.state is not State.CONFIRMING:
+            return Event.UNEXPECTED
+        at.running_version = decode_text(version.firmware)
+        expected = self._plan.image.version
+        if expected is None:
+            return Event.VERSION_UNJUDGED
+        return Event.VERSION_RIGHT if at.running_version == expected else Event.VERSION_OTHER
+
+    def _end_timer(self, at: Situation) -> Event:
+        if not at.burst_count and at.end_tries < self._timings.end_tries:
+            return Event.END_UNANSWERED
+        if not self._plan.target.has_version_query:
+            return Event.END_UNCONFIRMABLE
+        return Event.BURST_ENDED if at.burst_count else Event.END_LOST

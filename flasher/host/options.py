@@ -1,0 +1,44 @@
+"""What a user or a product may set for an upgrade, and the overall deadline that follows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+from flasher.image.plan import Plan
+from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
+
+DEFAULT_ATTEMPTS: Final = 3
+_PACKET_ALLOWANCE_S: Final = 0.1
+"""Time for storing one packet in the default deadline: ten times what a flash row takes."""
+
+
+@dataclass(frozen=True)
+class UpgradeOptions:
+    """What a user or a product may set for an upgrade; the defaults are the document's readings."""
+
+    timings: Timings = DEFAULT_TIMINGS
+    attempts: int = DEFAULT_ATTEMPTS
+    """How often the transfer may begin, restarts of the device included."""
+    timeout_s: float | None = None
+    """Overall deadline; None computes one from the plan."""
+    frame_gap_s: float = 0.0
+    """Silence between the frames of one message, for slow receivers."""
+    packet_gap_s: float = 0.0
+    """Silence between an answer and the next packet, for slow receivers."""
+    nak_next_is_ack: bool = False
+    """Take NAK n+1 for ACK n when n was sent more than once (R10)."""
+    allow_boot_name: bool = False
+    """Upgrade a device whose bootloader gives another name, or no version, than the target's."""
+
+
+def default_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
+    """The overall deadline for a plan: every attempt with every wait at its limit, but packets
+    answered within `_PACKET_ALLOWANCE_S` of their time on the wire.
+    """
+    timings = options.timings
+    gaps_s = options.packet_gap_s * plan.total_packets + options.frame_gap_s * plan.frames
+    begin_s = timings.boot_version_timeout_s + timings.request_transfer_timeout_s
+    transfer_s = plan.wire_s + gaps_s + _PACKET_ALLOWANCE_S * plan.total_packets
+    end_s = timings.complete_timeout_s * timings.end_tries + timings.application_start_timeout_s
+    return options.attempts * (begin_s + transfer_s) + end_s

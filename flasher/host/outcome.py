@@ -1,0 +1,192 @@
+"""How an upgrade ended, what state it left the device in, and the error to raise for it.
+
+Three claims are kept apart: "transferred" (every packet acknowledged), "completed" (the device said
+so), and "running version X" (the new application answered).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, NamedTuple, assert_never
+
+from flasher.errors import (
+    FlasherError,
+    InterruptedByUserError,
+    NoAnswerError,
+    RefusedError,
+    TransferError,
+    UnconfirmedError,
+    VerificationError,
+    WrongDeviceError,
+)
+from flasher.events import Phase
+from flasher.host.table import Ending
+from flasher.protocol.spec import Target
+
+
+class DeviceLeft(Enum):
+    """The state in which the device was left, as far as the host can know."""
+
+    UNTOUCHED = "nothing was erased: the device runs, or starts again, what it ran before"
+    NO_APPLICATION = (
+        "its application is erased or half written: it stays in its bootloader until an image is "
+        "flashed completely"
+    )
+    UNKNOWN = "it has every byte of the image; whether it runs it is not known"
+    NEW = "it has the new image"
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Figures of one upgrade; times in seconds."""
+
+    attempts: int = 0
+    packets_acknowledged: int = 0
+    repetitions: int = 0
+    naks: int = 0
+    timeouts: int = 0
+    duration_s: float = 0.0
+    """From the first reset to the end."""
+    transfer_s: float | None = None
+    """From request transfer to the ACK of the last packet, in the last attempt that got there."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The typed result of an upgrade."""
+
+    ending: Ending
+    phase: Phase
+    device_left: DeviceLeft
+    target: Target
+    total_packets: int
+    packet: int | None
+    """The packet that was in work, 1-based; None outside of the transfer."""
+    boot_version: str | None
+    """Name and version as the bootloader announced them, escaped; None when it never did."""
+    running_version: str | None
+    """What the application answered, escaped; None when it was not asked or did not answer."""
+    statistics: Statistics
+    detail: str = ""
+    """What was seen, where the ending alone does not say it."""
+
+    @property
+    def ok(self) -> bool:
+        """True when the device has the new image, by its own word."""
+        return self.ending in {Ending.COMPLETED, Ending.CONFIRMED_BY_VERSION}
+
+    @property
+    def where(self) -> str:
+        """Phase, packet and attempt in words."""
+        packet = f", packet {self.packet} of {self.total_packets}" if self.packet else ""
+        attempt = self.statistics.attempts
+        return f"{self.phase.value}{packet}" + (f", attempt {attempt}" if attempt > 1 else "")
+
+    def error(self) -> FlasherError | None:
+        """The error that stands for this outcome; None when it is a good one."""
+        if self.ok:
+            return None
+        kind, cause, remedy = (
+            _late(self.phase) if self.ending is Ending.OUT_OF_TIME else _EXPLANATIONS[self.ending]
+        )
+        what = f"{self.target.node.name}: {self.ending.value}"
+        if self.detail:
+            what += f" ({self.detail})"
+        names = {"node": self.target.node.name, "boot_name": self.target.boot_name}
+        return kind(
+            f"{what}.",
+            where=self.where,
+            cause=cause.format(**names),
+            remedy=f"{remedy.format(**names)} State of the device: {self.device_left.value}.",
+        )
+
+
+class _Explanation(NamedTuple):
+    """The error class of a bad ending, its likely cause and what to do."""
+
+    kind: type[FlasherError]
+    cause: str
+    remedy: str
+
+
+_AGAIN: Final = "Run the same command again."
+
+_EXPLANATIONS: Final = {
+    Ending.NO_BOOT_VERSION: _Explanation(
+        NoAnswerError,
+        "the device has no power, sleeps, is not on this bus, the bit rate differs, or its "
+        "bootloader announces itself only at power-up",
+        "Check supply, wiring, termination and bit rate. Else switch the device off, start the "
+        "same command and switch it on at once: its announcement at power-up is answered.",
+    ),
+    Ending.NO_REQUEST: _Explanation(
+        NoAnswerError,
+        "erasing takes longer than allowed, or the device refuses this size or target",
+        f"Power-cycle the device. {_AGAIN}",
+    ),
+    Ending.UNHEARING: _Explanation(
+        NoAnswerError,
+        "it is another kind of device than the target, it refuses this size, or it does not hear",
+        "Check that the device is a {node} and that the image fits it.",
+    ),
+    Ending.WRONG_DEVICE: _Explanation(
+        WrongDeviceError,
+        "the connected device is no {node}, whose bootloader calls itself {boot_name} Vx.x.x",
+        "Check -t/--target and what is connected; --allow-boot-name takes the device as it is.",
+    ),
+    Ending.TWO_DEVICES: _Explanation(
+        WrongDeviceError,
+        "two devices of the same kind are on the bus",
+        f"Disconnect one of them. {_AGAIN}",
+    ),
+    Ending.PACKET_FAILED: _Explanation(
+        TransferError,
+        "the device lost power or contact, the line is disturbed, or the device cannot store this "
+        "packet",
+        f"Check supply and wiring. {_AGAIN}",
+    ),
+    Ending.RESTARTED: _Explanation(
+        TransferError,
+        "its supply drops, its watchdog bites, or it does not accept what it is sent",
+        f"Check the supply. {_AGAIN}",
+    ),
+    Ending.BROKEN_PROTOCOL: _Explanation(
+        TransferError,
+        "its bootloader does not follow the protocol",
+        f"Report the boot version to its maker. {_AGAIN}",
+    ),
+    Ending.REFUSED: _Explanation(
+        RefusedError,
+        "the image is not meant for this device, or the checksum that it carries is wrong",
+        "Look at the image (flasher image-info) and flash one that the device accepts.",
+    ),
+    Ending.UNCONFIRMED: _Explanation(
+        UnconfirmedError,
+        "the answer was lost, or the device restarted without sending it",
+        "Unconfirmed is not done: see whether the new application runs, or flash again.",
+    ),
+    Ending.OTHER_VERSION: _Explanation(
+        VerificationError,
+        "the device runs another image than the one sent, or the image names its version wrongly",
+        "Compare with flasher image-info, then flash the right image.",
+    ),
+    Ending.CANCELLED: _Explanation(InterruptedByUserError, "", _AGAIN),
+}
+
+
+def _late(phase: Phase) -> _Explanation:
+    """The explanation of a passed deadline, by what had been reached."""
+    remedy = f"Allow more time with --timeout, or find what is slow. {_AGAIN}"
+    match phase:
+        case Phase.RESET | Phase.BOOT | Phase.UPDATE:
+            cause = "the device is not there, or not ready in the time allowed"
+            return _Explanation(NoAnswerError, cause, remedy)
+        case Phase.TRANSFER:
+            cause = "the device answers late again and again, or the bus is congested"
+            return _Explanation(TransferError, cause, remedy)
+        case Phase.END | Phase.CONFIRM:
+            cause = "the final answer did not come in the time allowed"
+            return _Explanation(UnconfirmedError, cause, remedy)
+        case _:
+            assert_never(phase)

@@ -1,0 +1,447 @@
+"""The upgrade of appendix 3 as the tool sees it: a pure machine (see `flasher.protocol.engine`).
+
+How to read it: frames become messages (`receive`), messages and expired timers become an event
+(`classify`), `table.TABLE` says which action follows, and the actions are the short methods below.
+The classification holds the readings, the table the flow; here is only what is sent, and when a
+timer starts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import ClassVar, Final
+
+from flasher import events
+from flasher.events import Phase
+from flasher.host.classify import Classifier, Situation
+from flasher.host.options import UpgradeOptions, default_timeout_s
+from flasher.host.outcome import DeviceLeft, Outcome, Statistics
+from flasher.host.table import TABLE, Action, Ending, Event, State
+from flasher.image.plan import Plan
+from flasher.protocol.engine import Transmitter
+from flasher.protocol.frame import Frame
+from flasher.protocol.messages import (
+    BootVersion,
+    EndOfTransfer,
+    Malformed,
+    Nak,
+    ReadVersion,
+    Reset,
+    Row,
+    Unknown,
+    UpdateCommand,
+    decode,
+)
+from flasher.protocol.spec import BOOT_VERSION_BURST, Command
+from flasher.protocol.text import printable
+from flasher.protocol.wire import Damage, Message, Reassembler, encode, split
+
+_PHASES: Final = {
+    State.RESETTING: Phase.RESET,
+    State.AWAITING_BOOT: Phase.BOOT,
+    State.AWAITING_REQUEST: Phase.UPDATE,
+    State.TRANSFERRING: Phase.TRANSFER,
+    State.SETTLING: Phase.TRANSFER,
+    State.ENDING: Phase.END,
+    State.CONFIRMING: Phase.CONFIRM,
+}
+
+_TIMEOUTS: Final = frozenset(
+    {Event.PACKET_UNANSWERED, Event.PACKET_LOST, Event.END_UNANSWERED, Event.END_LOST}
+)
+
+_BEGINNINGS: Final = frozenset({Action.SEND_UPDATE, Action.START_OVER})
+
+_Received = Row | Malformed | Unknown | None
+"""The message behind an event; None for a timer or the user's word."""
+
+
+class Upgrade:
+    """One upgrade of one device with one plan. Begins with the first `tick`."""
+
+    def __init__(self, plan: Plan, options: UpgradeOptions | None = None) -> None:
+        self._plan = plan
+        self._options = options or UpgradeOptions()
+        self._timings = self._options.timings
+        self._classifier = Classifier(plan, self._options)
+        inter_frame_s = self._timings.inter_frame_timeout_s
+        self._answers = Reassembler(plan.target.answer_id, inter_frame_s)
+        self._broadcasts = Reassembler(plan.target.broadcast_id, inter_frame_s)
+        self._tx = Transmitter(plan.bitrate_bps, self._options.frame_gap_s)
+        self._at = Situation(self._tx)
+        self._phase = Phase.RESET
+        self._events: list[object] = []
+
+        self._began_at: float | None = None
+        self._deadline_at = 0.0
+        self._timer_at: float | None = None
+        self._ending: tuple[Ending, str] | None = None
+        self._outcome: Outcome | None = None
+
+        self._acknowledged = 0
+        self._repetitions = 0
+        self._naks = 0
+        self._timeouts = 0
+        self._transfer_s: float | None = None
+
+    # -- the engine interface -------------------------------------------------------------------
+
+    @property
+    def done(self) -> bool:
+        """True when the outcome is known and the last message begun has left."""
+        return self._outcome is not None
+
+    @property
+    def outcome(self) -> Outcome:
+        """How it ended. Raises RuntimeError while it has not."""
+        if self._outcome is None:
+            raise RuntimeError("the upgrade has not ended yet")
+        return self._outcome
+
+    @property
+    def state(self) -> State:
+        """The row of the table that is in force."""
+        return self._at.state
+
+    def receive(self, frame: Frame, now: float) -> None:
+        """A CAN frame arrived."""
+        can_id = frame[0]
+        if can_id == self._answers.can_id:
+            reassembler = self._answers
+        elif can_id == self._broadcasts.can_id and self._at.state is State.CONFIRMING:
+            reassembler = self._broadcasts
+        else:
+            return
+        if frame.is_payload:
+            for found in reassembler.feed(frame[1], now):
+                self._take(found, now)
+
+    def tick(self, now: float) -> None:
+        """The time that `deadline` asked for has come."""
+        if self._began_at is None:
+            self._begin(now)
+            return
+        for found in (*self._answers.tick(now), *self._broadcasts.tick(now)):
+            self._take(found, now)
+        if self._ending is not None:
+            return
+        if now >= self._deadline_at:
+            self._dispatch(Event.OUT_OF_TIME, now)
+        elif self._timer_at is not None and now >= self._timer_at:
+            self._timer_at = None
+            event = self._classifier.timer(self._at, now)
+            self._timeouts += event in _TIMEOUTS
+            self._dispatch(event, now)
+
+    def deadline(self) -> float | None:
+        """When `tick` or `next_frame` is wanted next; at once before the beginning."""
+        if self._began_at is None:
+            return 0.0
+        if self.done:
+            return None
+        times = (
+            self._deadline_at if self._ending is None else None,
+            self._timer_at,
+            self._tx.deadline(),
+            self._answers.deadline(),
+            self._broadcasts.deadline(),
+        )
+        return min((time for time in times if time is not None), default=None)
+
+    def next_frame(self, now: float) -> Frame | None:
+        """The next frame to send."""
+        return self._tx.next_frame(now)
+
+    def frame_sent(self, now: float) -> None:
+        """The adapter has accepted the frame."""
+        if self._tx.frame_sent(now):
+            self._message_left(now)
+
+    def cancel(self, now: float) -> None:
+        """End at the next message boundary."""
+        if self._began_at is None:
+            self._began_at = now
+        if self._ending is None:
+            self._dispatch(Event.CANCEL, now)
+
+    def take_events(self) -> Sequence[object]:
+        """What happened since the last call."""
+        taken, self._events = self._events, []
+        return taken
+
+    # -- the table ------------------------------------------------------------------------------
+
+    def _take(self, found: Message | Damage, now: float) -> None:
+        if self._ending is not None:
+            return
+        if isinstance(found, Damage):
+            damaged = events.BytesDamaged(found.can_id, found.reason.value, found.data)
+            self._events.append(damaged)
+            return
+        row = decode(found)
+        self._naks += isinstance(row, Nak)
+        self._dispatch(self._classifier.message(row, self._at, now), now, row)
+
+    def _dispatch(self, event: Event, now: float, row: _Received = None) -> None:
+        action, state = TABLE[self._at.state][event]
+        if action is Action.START_OVER:
+            self._at = self._at.next_attempt()
+            self._events.append(events.AttemptStarted(self._at.attempt, event.value))
+        if isinstance(row, BootVersion) and action in _BEGINNINGS and self._at.boot is None:
+            self._at.boot = row
+            seen = events.BootVersionSeen(printable(row.name), printable(row.version))
+            self._events.append(seen)
+        if state is not self._at.state:
+            self._enter(state, now)
+        if isinstance(action, Ending):
+            self._end(action, self._detail(action, row), now)
+        elif action is Action.IMPOSSIBLE:
+            raise RuntimeError(f"{event} cannot happen in {self._at.state}")
+        else:
+            self._ACTIONS[action](self, now, event, row)
+
+    def _enter(self, state: State, now: float) -> None:
+        self._at.state = state
+        self._at.state_since = now
+        self._timer_at = None
+        phase = _PHASES.get(state, self._phase)
+        if phase is not self._phase:
+            self._phase = phase
+            self._events.append(events.PhaseEntered(phase, self._at.attempt))
+
+    # -- timers that start when a message has left -----------------------------------------------
+
+    def _message_left(self, now: float) -> None:
+        at, left_at = self._at, self._tx.left_at
+        match self._tx.left_tag:
+            case Command.UPDATE:
+                at.update_left_at = left_at
+                if at.first_update_left_at is None:
+                    at.first_update_left_at = left_at
+            case Command.PACKET:
+                at.copies_unanswered += 1
+            case Command.END_OF_TRANSFER:
+                at.end_copies_left += 1
+        if at.state is State.STOPPING:
+            self._finish(now)
+            return
+        wait_s = self._wait_s()
+        if wait_s is not None:
+            self._timer_at = left_at + wait_s
+
+    def _wait_s(self) -> float | None:
+        """How long the state waits for an answer to the message that has just left; None when the
+        message belongs to an earlier state.
+        """
+        timings = self._timings
+        match self._tx.left_tag, self._at.state:
+            case (Command.RESET, State.RESETTING) | (Command.READ_VERSION, State.CONFIRMING):
+                return timings.command_repeat_s
+            case Command.RESET, State.AWAITING_BOOT:
+                return timings.boot_version_timeout_s
+            case Command.UPDATE, State.AWAITING_REQUEST:
+                return timings.request_transfer_timeout_s
+            case Command.PACKET, State.TRANSFERRING:
+                return timings.ack_timeout_s
+            case Command.PACKET, State.SETTLING:
+                return timings.quiet_after_repeat_s
+            case Command.END_OF_TRANSFER, State.ENDING if not self._at.burst_count:
+                return timings.complete_timeout_s
+            case _:
+                return None
+
+    # -- actions ----------------------------------------------------------------------------------
+
+    def _begin(self, now: float) -> None:
+        self._began_at = self._at.state_since = now
+        timeout_s = self._options.timeout_s
+        if timeout_s is None:
+            timeout_s = default_timeout_s(self._plan, self._options)
+        self._deadline_at = now + timeout_s
+        self._events.append(events.PhaseEntered(self._phase, self._at.attempt))
+        self._send(Reset())
+
+    def _nothing(self, now: float, event: Event, row: _Received) -> None:
+        """Ignored by the table."""
+
+    def _report(self, now: float, event: Event, row: _Received) -> None:
+        self._events.append(events.Reported(_describe(event, row)))
+
+    def _send_reset(self, now: float, event: Event, row: _Received) -> None:
+        self._send(Reset())
+
+    def _await_boot(self, now: float, event: Event, row: _Received) -> None:
+        self._tx.drop_unstarted()
+        self._timer_at = max(now, self._tx.left_at) + self._timings.boot_version_timeout_s
+
+    def _send_update(self, now: float, event: Event, row: _Received) -> None:
+        self._tx.drop_unstarted()
+        target = self._plan.target
+        self._send(
+            UpdateCommand(target.update_text, self._plan.image.size_bytes),
+            not_before=self._at.update_left_at + self._timings.update_spacing_s,
+        )
+
+    def _send_first_packet(self, now: float, event: Event, row: _Received) -> None:
+        self._tx.drop_unstarted()
+        self._at.request_at = now
+        self._at.next_packet(1)
+        self._send_packet(now)
+
+    def _send_next_packet(self, now: float, event: Event, row: _Received) -> None:
+        self._packet_done()
+        self._at.next_packet(self._at.number + 1)
+        self._send_packet(now)
+
+    def _repeat_packet(self, now: float, event: Event, row: _Received) -> None:
+        self._repetitions += 1
+        self._send_packet(now)
+        what = f"packet {self._at.number}"
+        self._events.append(events.MessageRepeated(what, event.value, self._at.tries))
+
+    def _packet_done(self) -> None:
+        at = self._at
+        self._acknowledged = at.number
+        done = events.PacketAcknowledged(at.number, self._plan.total_packets, at.tries)
+        self._events.append(done)
+
+    def _send_packet(self, now: float) -> None:
+        number = self._at.number
+        self._at.tries += 1
+        self._queue(
+            self._plan.packet_frames(number),
+            Command.PACKET,
+            wire_s=self._plan.packet_wire_s(number),
+            not_before=self._after_packet_gap(now),
+        )
+
+    def _await_quiet(self, now: float, event: Event, row: _Received) -> None:
+        # While a copy is still leaving, the time starts when it has (see _message_left).
+        if self._tx.idle:
+            self._timer_at = max(now, self._tx.left_at) + self._timings.quiet_after_repeat_s
+
+    def _send_end(self, now: float, event: Event, row: _Received) -> None:
+        self._packet_done()
+        self._transfer_s = now - self._at.request_at
+        self._at.end_tries += 1
+        self._send(EndOfTransfer(), not_before=self._after_packet_gap(now))
+
+    def _repeat_end(self, now: float, event: Event, row: _Received) -> None:
+        self._repetitions += 1
+        self._at.end_tries += 1
+        repeated = events.MessageRepeated("end of transfer", event.value, self._at.end_tries)
+        self._events.append(repeated)
+        self._send(EndOfTransfer())
+
+    def _await_burst_end(self, now: float, event: Event, row: _Received) -> None:
+        self._tx.drop_unstarted()
+        self._timer_at = now + BOOT_VERSION_BURST * self._timings.boot_version_spacing_s
+        self._report(now, event, row)
+
+    def _query_version(self, now: float, event: Event, row: _Received) -> None:
+        self._send(ReadVersion())
+
+    def _send(self, row: Row, *, not_before: float = 0.0) -> None:
+        request_id = self._plan.target.request_id
+        frames = split(request_id, encode(row.to_message(request_id)))
+        self._queue(frames, row.COMMAND, not_before=not_before)
+
+    def _queue(
+        self,
+        frames: Sequence[Frame],
+        command: Command,
+        *,
+        wire_s: float | None = None,
+        not_before: float = 0.0,
+    ) -> None:
+        self._timer_at = None  # it starts when the message has left
+        self._tx.queue(frames, wire_s=wire_s, not_before=not_before, tag=command)
+
+    def _after_packet_gap(self, now: float) -> float:
+        gap_s = self._options.packet_gap_s
+        return now + gap_s if gap_s else 0.0
+
+    # -- the end ----------------------------------------------------------------------------------
+
+    def _end(self, ending: Ending, detail: str, now: float) -> None:
+        self._ending = (ending, detail)
+        self._timer_at = None
+        self._tx.drop_unstarted()
+        if self._tx.idle:
+            self._finish(now)
+
+    def _finish(self, now: float) -> None:
+        if self._ending is None:
+            raise RuntimeError("stopping without an ending")
+        ending, detail = self._ending
+        at = self._at
+        at.state = State.DONE
+        self._outcome = Outcome(
+            ending=ending,
+            phase=self._phase,
+            device_left=self._device_left(ending),
+            target=self._plan.target,
+            total_packets=self._plan.total_packets,
+            packet=at.number if self._phase is Phase.TRANSFER else None,
+            boot_version=printable(f"{at.boot.name} {at.boot.version}") if at.boot else None,
+            running_version=at.running_version,
+            statistics=Statistics(
+                attempts=at.attempt,
+                packets_acknowledged=self._acknowledged,
+                repetitions=self._repetitions,
+                naks=self._naks,
+                timeouts=self._timeouts,
+                duration_s=now - (self._began_at or 0.0),
+                transfer_s=self._transfer_s,
+            ),
+            detail=detail,
+        )
+
+    def _detail(self, ending: Ending, row: _Received) -> str:
+        """What was seen, where the ending alone does not say it."""
+        if isinstance(row, BootVersion):
+            return f"boot version {printable(row.name)!r} {printable(row.version)!r}"
+        if ending is Ending.OTHER_VERSION:
+            return f"{self._at.running_version} instead of {self._plan.image.version}"
+        if ending is Ending.PACKET_FAILED and self._at.nak_next_seen:
+            return "it answers NAK n+1 to a repeated n; --nak-next-is-ack takes that for an ACK"
+        return ""
+
+    def _device_left(self, ending: Ending) -> DeviceLeft:
+        if ending in {Ending.COMPLETED, Ending.CONFIRMED_BY_VERSION}:
+            return DeviceLeft.NEW
+        if ending is Ending.REFUSED:
+            return DeviceLeft.NO_APPLICATION
+        if self._at.end_copies_left:
+            return DeviceLeft.UNKNOWN
+        return DeviceLeft.NO_APPLICATION if self._at.update_left else DeviceLeft.UNTOUCHED
+
+    _ACTIONS: ClassVar[Mapping[Action, Callable[[Upgrade, float, Event, _Received], None]]] = {
+        Action.NOTHING: _nothing,
+        Action.REPORT: _report,
+        Action.SEND_RESET: _send_reset,
+        Action.AWAIT_BOOT: _await_boot,
+        Action.SEND_UPDATE: _send_update,
+        Action.START_OVER: _send_update,
+        Action.SEND_FIRST_PACKET: _send_first_packet,
+        Action.SEND_NEXT_PACKET: _send_next_packet,
+        Action.REPEAT_PACKET: _repeat_packet,
+        Action.AWAIT_QUIET: _await_quiet,
+        Action.SEND_END: _send_end,
+        Action.REPEAT_END: _repeat_end,
+        Action.AWAIT_BURST_END: _await_burst_end,
+        Action.QUERY_VERSION: _query_version,
+    }
+
+
+def _describe(event: Event, row: _Received) -> str:
+    """One sentence on a message that is reported; device text is escaped."""
+    match row:
+        case Malformed(message, problem):
+            return f"message {message.command:04X} from {message.can_id:03X} ignored: {problem}"
+        case Unknown(message):
+            return f"unknown message {message.command:04X} from {message.can_id:03X} ignored"
+        case BootVersion(name, version):
+            return f"{event.value}: {printable(name)} {printable(version)}"
+        case _:
+            return f"{event.value}: {row}"

@@ -1,0 +1,1 @@
+"""The upgrade host, with the test in the place of the device."""

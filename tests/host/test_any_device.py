@@ -1,0 +1,101 @@
+"""Whatever a device says, and whenever: the host ends explicitly and does no harm (SE-01/03).
+
+Hypothesis plays the device. What must hold is watched on the wire: update commands answer something
+new, none follows end of transfer except to a device beyond its burst, every message is whole.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flasher import events
+from flasher.host.options import UpgradeOptions
+from flasher.host.outcome import DeviceLeft
+from flasher.protocol.frame import Frame
+from flasher.protocol.messages import (
+    Ack,
+    BootVersion,
+    Complete,
+    EndOfTransfer,
+    GeneralFeedback,
+    Nak,
+    RequestTransfer,
+    Row,
+    UpdateCommand,
+)
+from tests.host.bench import Bench
+
+TIMEOUT_S = 60.0
+
+rows = st.one_of(
+    st.builds(Ack, st.integers(0, 4)),
+    st.builds(Nak, st.integers(0, 4)),
+    st.sampled_from([BootVersion("BMS", "V1.2.3"), BootVersion("BMS", "V1.2.4")]),
+    st.just(BootVersion("BMS", "V1.2.3")),
+    st.just(RequestTransfer()),
+    st.just(Complete()),
+    st.just(GeneralFeedback()),
+)
+frames = st.builds(
+    Frame,
+    st.sampled_from([0x725, 0x720, 0x752, 0x000]),
+    st.binary(max_size=8),
+    st.booleans(),
+    st.booleans(),
+    st.booleans(),
+)
+pauses = st.sampled_from([0.0, 0.001, 0.02, 0.05, 0.1, 0.5, 1.0, 5.0, 10.0])
+script = st.lists(st.tuples(pauses, st.one_of(rows, rows, rows, frames)), max_size=40)
+
+
+@given(script)
+@settings(max_examples=300, deadline=None)
+def test_the_host_ends_explicitly_whatever_the_device_says(
+    steps: list[tuple[float, Row | Frame]],
+) -> None:
+    bench = Bench(300, options=UpgradeOptions(timeout_s=TIMEOUT_S, attempts=2))
+    said: list[tuple[float, Row]] = []
+    for pause_s, what in steps:
+        bench.wait(pause_s)
+        if isinstance(what, Frame):
+            bench.engine.receive(what, bench.now)
+        else:
+            said.append((bench.now, what))
+            bench.say(what)
+    bench.wait(TIMEOUT_S + 1.0)
+    outcome = bench.outcome
+    assert (outcome.error() is None) == outcome.ok
+    assert len(bench.seen(events.AttemptStarted)) <= 1
+    _watch_update_commands(bench, said)
+
+
+def _watch_update_commands(bench: Bench, said: list[tuple[float, Row]]) -> None:
+    commands = [at for at, row in bench.sent if isinstance(row, UpdateCommand)]
+    asking = [at for at, row in said if isinstance(row, BootVersion | RequestTransfer)]
+    assert len(commands) <= len(asking)
+    for earlier, later in pairwise(commands):
+        assert later - earlier >= 0.03
+    ends = [at for at, row in bench.sent if isinstance(row, EndOfTransfer)]
+    if ends and not bench.seen(events.AttemptStarted):
+        assert all(at < ends[0] for at in commands)
+    if not commands:
+        assert bench.outcome.device_left is DeviceLeft.UNTOUCHED
+
+
+@given(st.lists(rows, min_size=1, max_size=6))
+@settings(max_examples=60, deadline=None)
+def test_memory_and_time_are_bounded_when_a_device_repeats_itself_for_ever(
+    babble: list[Row],
+) -> None:
+    """SE-01: endless valid messages of no use."""
+    bench = Bench(300, options=UpgradeOptions(timeout_s=5.0))
+    turns = 0
+    while not bench.engine.done:
+        bench.say(babble[turns % len(babble)])
+        bench.wait(0.01)
+        turns += 1
+        assert turns < 600
+    assert bench.engine._answers.held_size == 0

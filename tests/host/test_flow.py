@@ -1,0 +1,379 @@
+"""The upgrade from reset to the final answer: what the host sends, and when (4.2, R2, R3, R12)."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from flasher import events
+from flasher.errors import ExitCode
+from flasher.events import Phase
+from flasher.host.options import UpgradeOptions, default_timeout_s
+from flasher.host.outcome import DeviceLeft
+from flasher.host.table import Ending, State
+from flasher.host.upgrade import Upgrade
+from flasher.image.plan import plan
+from flasher.protocol.frame import Frame
+from flasher.protocol.messages import (
+    Ack,
+    BootVersion,
+    EndOfTransfer,
+    GeneralFeedback,
+    Packet,
+    RequestTransfer,
+    Reset,
+    UpdateCommand,
+)
+from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Target
+from tests.host.bench import BOOT, Bench, answer_frames, image_of
+
+
+@pytest.mark.parametrize(
+    ("target", "boot_name", "text"),
+    [(WMC, "WMC", "WMC_UPD"), (BMS, "BMS", "BMS_UPD"), (OBC, "PBU", "OBC_UPD")],
+)
+def test_a_right_device_is_upgraded_with_every_message_once(
+    target: Target, boot_name: str, text: str
+) -> None:
+    bench = Bench(300, target=target)
+    bench.expect(Reset)
+    bench.say(GeneralFeedback())
+    bench.say(BootVersion(boot_name, "V1.2.3"))
+    assert bench.expect(UpdateCommand) == UpdateCommand(text, 300)
+    bench.say(RequestTransfer())
+    received = b""
+    for number in (1, 2, 3):
+        packet = bench.expect(Packet)
+        assert (packet.number, packet.total) == (number, 3)
+        received += packet.payload
+        bench.say(Ack(number))
+    assert received == bench.image.data + b"\xff" * 84
+    bench.expect(EndOfTransfer)
+    outcome = bench.complete()
+    assert outcome.ending is Ending.COMPLETED
+    assert outcome.ok
+    assert outcome.error() is None
+    assert outcome.device_left is DeviceLeft.NEW
+    assert outcome.boot_version == f"{boot_name} V1.2.3"
+    assert outcome.statistics.packets_acknowledged == 3
+    assert outcome.statistics.repetitions == 0
+    assert bench.unread == []
+
+
+def test_the_phases_and_packets_are_reported_in_order() -> None:
+    bench = Bench(200)
+    bench.to_end()
+    bench.complete()
+    phases = [event.phase for event in bench.events if isinstance(event, events.PhaseEntered)]
+    assert phases == [Phase.RESET, Phase.BOOT, Phase.UPDATE, Phase.TRANSFER, Phase.END]
+    assert bench.seen(events.PacketAcknowledged) == [
+        events.PacketAcknowledged(1, 2, 1),
+        events.PacketAcknowledged(2, 2, 1),
+    ]
+    assert bench.seen(events.BootVersionSeen) == [events.BootVersionSeen("BMS", "V1.2.3")]
+
+
+# -- reset (4.3) --------------------------------------------------------------------------------
+
+
+def test_reset_is_repeated_every_200_ms_and_given_up_after_one_second() -> None:
+    bench = Bench()
+    bench.wait(3.0)
+    resets = [at for at, row in bench.sent if isinstance(row, Reset)]
+    assert len(resets) == 5
+    gaps = [later - earlier for earlier, later in pairwise(resets)]
+    assert gaps == pytest.approx([0.2] * 4, abs=0.003)
+    assert bench.engine.state is State.AWAITING_BOOT
+
+
+def test_reset_stops_at_general_feedback() -> None:
+    bench = Bench()
+    bench.expect(Reset)
+    bench.say(GeneralFeedback())
+    bench.wait(1.5)
+    assert bench.unread == []
+
+
+def test_a_boot_version_without_general_feedback_is_answered() -> None:
+    """RS-06, and a device that sits in its bootloader already."""
+    bench = Bench()
+    bench.expect(Reset)
+    bench.say(BOOT)
+    assert bench.expect(UpdateCommand).size_bytes == 300
+
+
+def test_a_second_reset_is_not_queued_while_the_first_is_unsent() -> None:
+    """A sleeping device acknowledges nothing: copies must not pile up in the adapter."""
+    engine = Upgrade(plan(image_of(100), BMS, WELLING.bitrate_bps))
+    for tenth in range(20):
+        engine.tick(tenth / 10)
+    frames = 0
+    while engine.next_frame(2.0) is not None:
+        engine.frame_sent(2.0)
+        frames += 1
+    assert frames == 2
+
+
+def test_no_boot_version_ends_with_no_answer_and_an_untouched_device() -> None:
+    """RS-07: all versions lost."""
+    bench = Bench()
+    bench.wait(20.0)
+    outcome = bench.outcome
+    assert outcome.ending is Ending.NO_BOOT_VERSION
+    assert outcome.device_left is DeviceLeft.UNTOUCHED
+    error = outcome.error()
+    assert error is not None
+    assert error.exit_code == ExitCode.NO_ANSWER
+    assert "waiting for the boot version" in str(error)
+    assert bench.now - 100.0 < 21.0
+
+
+@pytest.mark.parametrize(("late_s", "answered"), [(-0.001, True), (0.001, False)])
+def test_the_boot_version_may_come_up_to_five_seconds_after_the_reset(
+    *, late_s: float, answered: bool
+) -> None:
+    """TM-01."""
+    bench = Bench()
+    bench.expect(Reset)
+    left_at = bench.sent[-1][0]
+    bench.say(GeneralFeedback())
+    bench.wait(left_at + 5.0 + late_s - bench.now)
+    if answered:
+        bench.say(BOOT)
+        bench.expect(UpdateCommand)
+    else:
+        assert bench.outcome.ending is Ending.NO_BOOT_VERSION
+
+
+# -- update command (R2) ------------------------------------------------------------------------
+
+
+def test_every_boot_version_of_a_burst_is_answered_until_request_transfer() -> None:
+    bench = Bench()
+    bench.to_boot()
+    for _ in range(4):
+        bench.say(BOOT)
+        bench.expect(UpdateCommand)
+        bench.wait(0.048)
+    bench.say(RequestTransfer())
+    assert bench.expect(Packet).number == 1
+
+
+def test_boot_versions_that_queued_up_are_one_version() -> None:
+    bench = Bench()
+    bench.to_boot()
+    bench.say(BOOT, BOOT, BOOT, BOOT)
+    bench.expect(UpdateCommand)
+    bench.wait(1.0)
+    assert bench.unread == []
+
+
+@pytest.mark.parametrize(("after_s", "commands"), [(0.029, 1), (0.031, 2)])
+def test_a_boot_version_within_30_ms_of_the_update_command_is_not_answered(
+    after_s: float, commands: int
+) -> None:
+    bench = Bench()
+    bench.to_request()
+    left_at = bench.sent[-1][0]
+    bench.wait(left_at + after_s - bench.now)
+    bench.say(BOOT)
+    bench.wait(1.0)
+    assert sum(isinstance(row, UpdateCommand) for _, row in bench.sent) == commands
+
+
+def test_the_update_command_is_never_repeated_into_silence() -> None:
+    """The device may be erasing: UP-07."""
+    bench = Bench()
+    bench.to_request()
+    bench.wait(30.0)
+    assert sum(isinstance(row, UpdateCommand) for _, row in bench.sent) == 1
+    outcome = bench.outcome
+    assert outcome.ending is Ending.NO_REQUEST
+    assert outcome.device_left is DeviceLeft.NO_APPLICATION
+    error = outcome.error()
+    assert error is not None
+    assert error.exit_code == ExitCode.NO_ANSWER
+
+
+@pytest.mark.parametrize(("late_s", "in_time"), [(-0.001, True), (0.001, False)])
+def test_request_transfer_may_come_up_to_ten_seconds_after_the_update_command(
+    *, late_s: float, in_time: bool
+) -> None:
+    """TM-01, UP-07."""
+    bench = Bench()
+    bench.to_request()
+    bench.wait(bench.sent[-1][0] + 10.0 + late_s - bench.now)
+    bench.say(RequestTransfer())
+    assert bench.engine.done is not in_time
+    if in_time:
+        assert bench.expect(Packet).number == 1
+
+
+def test_a_bootloader_that_announces_on_and_on_without_hearing_ends_in_bounded_time() -> None:
+    bench = Bench()
+    bench.to_boot()
+    for _ in range(400):
+        bench.say(BOOT)
+        bench.wait(0.05)
+        if bench.engine.done:
+            break
+    assert bench.outcome.ending is Ending.UNHEARING
+    assert bench.now - 100.0 < 12.0
+
+
+def test_an_update_command_not_yet_begun_is_dropped_at_request_transfer() -> None:
+    bench = Bench()
+    bench.to_request()
+    bench.wait(0.05)
+    for frame_row in (BOOT, RequestTransfer()):
+        _receive_without_sending(bench, frame_row)
+    bench.say()
+    assert bench.expect(Packet).number == 1
+
+
+def _receive_without_sending(bench: Bench, row: BootVersion | RequestTransfer) -> None:
+    for frame in answer_frames(row):
+        bench.engine.receive(frame, bench.now)
+
+
+# -- who answers (RS-08, RS-09) -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [("WMC", "V1.2.3"), ("BMS", "V1.2-3"), ("BMS", "\x1b[2J<b"), ("\x00\xff\x1b", "V1.2.3")],
+)
+def test_another_device_or_no_version_is_refused_before_anything_is_sent_to_it(
+    name: str, version: str
+) -> None:
+    bench = Bench()
+    bench.to_boot()
+    bench.say(BootVersion(name, version))
+    outcome = bench.outcome
+    assert outcome.ending is Ending.WRONG_DEVICE
+    assert outcome.device_left is DeviceLeft.UNTOUCHED
+    error = outcome.error()
+    assert error is not None
+    assert error.exit_code == ExitCode.WRONG_DEVICE
+    assert str(error).replace("\n", "").isprintable()
+    assert bench.unread == []
+
+
+def test_another_boot_name_is_taken_when_the_user_says_so() -> None:
+    bench = Bench(options=UpgradeOptions(allow_boot_name=True))
+    bench.to_boot()
+    bench.say(BootVersion("XYZ", "hello!"))
+    bench.expect(UpdateCommand)
+
+
+def test_another_version_within_the_burst_means_two_devices() -> None:
+    bench = Bench()
+    bench.to_request()
+    bench.wait(0.05)
+    bench.say(BootVersion("BMS", "V1.2.4"))
+    assert bench.outcome.ending is Ending.TWO_DEVICES
+
+
+# -- what is not for the host -------------------------------------------------------------------
+
+
+def test_frames_of_others_and_frames_that_are_no_payload_change_nothing() -> None:
+    """FR-09, CO-04, BU-04."""
+    bench = Bench()
+    bench.to_packet(1)
+    before = bench.engine.state
+    for frame in (
+        Frame(0x720, b"\x55\xaa\x0c\x04\xc2\x02\x01\x00"),
+        Frame(0x752, b"\x55\xaa\x0c\x04\xc2\x02\x01\x00"),
+        Frame(0x725, b""),
+        Frame(0x725, b"\x55\xaa\x0c\x04\xc2\x02\x01\x00", is_extended=True),
+        Frame(0x725, b"\x55\xaa\x0c\x04\xc2\x02\x01\x00", is_remote=True),
+        Frame(0x725, b"\x55\xaa\x0c\x04\xc2\x02\x01\x00", is_error=True),
+    ):
+        bench.engine.receive(frame, bench.now)
+    bench.wait(0.2)
+    assert bench.engine.state is before
+    assert bench.seen(events.BytesDamaged) == []
+
+
+def test_damaged_bytes_and_unknown_messages_are_reported_and_passed_over() -> None:
+    """FR-10, FR-04."""
+    bench = Bench()
+    bench.to_packet(1)
+    for data in (b"\x55\xaa\x0c\x04\xc2\x02\x01\x00", b"\x32\xbc\x87\xee\x00"):
+        bench.engine.receive(Frame(0x725, data), bench.now)
+    bench.say(Ack(1))
+    assert bench.expect(Packet).number == 2
+    assert len(bench.seen(events.BytesDamaged)) == 1
+
+
+# -- gaps and the overall deadline --------------------------------------------------------------
+
+
+def test_the_packet_gap_is_kept_before_every_packet() -> None:
+    bench = Bench(options=UpgradeOptions(packet_gap_s=0.02))
+    bench.to_request()
+    bench.say(RequestTransfer())
+    asked_at = bench.now
+    bench.expect(Packet)
+    packet_s = bench.sent[-1][0] - asked_at
+    assert packet_s > 0.02
+    bench.say(Ack(1))
+    answered_at = bench.now
+    bench.expect(Packet)
+    assert bench.sent[-1][0] - answered_at > 0.02
+
+
+def test_the_frame_gap_is_kept_within_a_packet() -> None:
+    bench = Bench(100, options=UpgradeOptions(frame_gap_s=0.005))
+    bench.to_request()
+    bench.say(RequestTransfer())
+    asked_at = bench.now
+    bench.expect(Packet)
+    assert bench.sent[-1][0] - asked_at > 17 * 0.005
+
+
+def test_a_device_that_is_always_just_in_time_is_ended_by_the_overall_deadline() -> None:
+    """TM-03."""
+    bench = Bench(128 * 1000)
+    bench.to_request()
+    bench.say(RequestTransfer())
+    number = 1
+    while not bench.engine.done:
+        if number == 1 or bench.unread:
+            number = bench.expect(Packet).number
+        bench.wait(0.49)
+        if not bench.engine.done:
+            bench.say(Ack(number))
+    outcome = bench.outcome
+    assert outcome.ending is Ending.OUT_OF_TIME
+    error = outcome.error()
+    assert error is not None
+    assert error.exit_code == ExitCode.TRANSFER
+    limit_s = default_timeout_s(plan(bench.image, BMS, 250_000), UpgradeOptions())
+    assert bench.now - 100.0 <= limit_s + 0.5
+
+
+@pytest.mark.parametrize(
+    ("reach", "code"),
+    [
+        ("to_boot", ExitCode.NO_ANSWER),
+        ("to_request", ExitCode.NO_ANSWER),
+        ("to_end", ExitCode.UNCONFIRMED),
+    ],
+)
+def test_the_deadline_is_reported_by_what_had_been_reached(reach: str, code: ExitCode) -> None:
+    bench = Bench(100, options=UpgradeOptions(timeout_s=2.0))
+    getattr(bench, reach)()
+    bench.wait(2.0)
+    error = bench.outcome.error()
+    assert error is not None
+    assert error.exit_code == code
+
+
+def test_the_default_deadline_grows_with_the_image() -> None:
+    small = default_timeout_s(plan(image_of(128), BMS, 250_000), UpgradeOptions())
+    large = default_timeout_s(plan(image_of(128 * 1000), BMS, 250_000), UpgradeOptions())
+    assert small < 120
+    assert large > small + 3 * 1000 * 0.1
