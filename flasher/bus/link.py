@@ -1,0 +1,97 @@
+"""The edge between an engine and a bus: five methods, and a clock to go with them.
+
+A link and its clock belong together: the deadlines that a link is given are times of that clock. A
+real adapter goes with `MonotonicClock`; a simulated bus makes the time itself.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Protocol
+
+from flasher.protocol.frame import Frame
+
+
+class Clock(Protocol):
+    """Seconds that only go forward."""
+
+    def now(self) -> float:
+        """The time."""
+        ...
+
+    def wait_until(self, moment: float) -> None:
+        """Return when `moment` has come; at once when it has passed."""
+        ...
+
+
+class Link(Protocol):
+    """Sends and receives single CAN frames. Methods raise BusError when the adapter fails."""
+
+    def send(self, frame: Frame) -> None:
+        """Hand a frame to the adapter; returns when it is accepted.
+
+        A full transmit queue is waited for, within the link's own limit; then
+        TransmitBlockedError.
+        """
+        ...
+
+    def receive(self, deadline: float) -> Frame | None:
+        """The next frame received; None when `deadline` passed first. A deadline in the past
+        takes only what is there already.
+        """
+        ...
+
+    def drain(self) -> int:
+        """Throw away what was received so far; returns how many frames."""
+        ...
+
+    def close(self) -> None:
+        """Release the adapter; harmless when repeated."""
+        ...
+
+
+class MonotonicClock:
+    """The computer's monotonic clock: jumps of the wall clock do not touch it."""
+
+    def now(self) -> float:
+        """Seconds since some moment in the past."""
+        return time.monotonic()
+
+    def wait_until(self, moment: float) -> None:
+        """Sleep until `moment`."""
+        remaining_s = moment - time.monotonic()
+        if remaining_s > 0:
+            time.sleep(remaining_s)
+
+
+class PacedClock:
+    """Real time, but `speed` times as fast: what makes a demonstration look like the real thing."""
+
+    def __init__(self, speed: float = 1.0) -> None:
+        self._speed = speed
+        self._origin = time.monotonic()
+
+    def now(self) -> float:
+        """Simulated seconds since the clock was made."""
+        return (time.monotonic() - self._origin) * self._speed
+
+    def wait_until(self, moment: float) -> None:
+        """Sleep until the simulated `moment`."""
+        remaining_s = (moment - self.now()) / self._speed
+        if remaining_s > 0:
+            time.sleep(remaining_s)
+
+
+class VirtualClock:
+    """Time that passes only when somebody waits for it."""
+
+    def __init__(self) -> None:
+        self._now = 0.0
+
+    def now(self) -> float:
+        """Simulated seconds."""
+        return self._now
+
+    def wait_until(self, moment: float) -> None:
+        """Make it that time."""
+        self._now = max(self._now, moment)

@@ -1,0 +1,70 @@
+"""Writes every frame in both directions to a file; python-can chooses the format by its suffix."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from types import TracebackType
+from typing import Self
+
+import can
+
+from flasher.errors import BusError, UsageError
+from flasher.protocol.frame import Frame
+
+
+class Recorder:
+    """A tap for the driver that records to a file (.asc, .blf, .log, .csv, ...).
+
+    Times in the file are wall-clock times, counted from the start by the driver's clock, so that a
+    jump of the wall clock leaves no gap. Use as a context manager: formats like .blf are complete
+    only when closed. Raises UsageError for a suffix that python-can does not know or a file that
+    cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self._path = os.fspath(path)
+        try:
+            self._writer = can.Logger(self._path)
+        except ValueError as error:
+            raise UsageError(
+                f"{self._path}: no trace format has this suffix.",
+                remedy="Use one of .asc .blf .csv .db .log .mf4 .trc .txt.",
+            ) from error
+        except OSError as error:
+            raise UsageError(f"{self._path} cannot be written: {error.strerror}.") from error
+        self._wall_offset_s: float | None = None
+
+    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
+        """Record one frame. Raises BusError when the file cannot take it (disk full)."""
+        if self._wall_offset_s is None:
+            self._wall_offset_s = time.time() - now
+        message = can.Message(
+            timestamp=now + self._wall_offset_s,
+            arbitration_id=frame.can_id,
+            data=frame.data,
+            is_extended_id=frame.is_extended,
+            is_remote_frame=frame.is_remote,
+            is_error_frame=frame.is_error,
+            is_rx=not sent,
+            channel=0,
+        )
+        try:
+            self._writer(message)
+        except OSError as error:
+            raise BusError(
+                f"The trace cannot be written: {error.strerror}.", where=self._path
+            ) from error
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        with contextlib.suppress(OSError):
+            self._writer.stop()

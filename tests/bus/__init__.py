@@ -1,0 +1,1 @@
+"""Links, the simulated bus, the driver loop, the python-can adapter."""

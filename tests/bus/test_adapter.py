@@ -1,0 +1,286 @@
+"""The python-can adapter: what back ends do to their users, and what `CanLink` makes of it."""
+
+from __future__ import annotations
+
+import errno
+import time
+import uuid
+from collections import deque
+from typing import Any
+
+import can
+import pytest
+
+from flasher.bus import adapter
+from flasher.bus.adapter import CanLink, open_adapter
+from flasher.errors import BusError, ExitCode, TransmitBlockedError, UsageError
+from flasher.protocol.frame import Frame
+
+FRAME = Frame(0x752, b"\x55\xaa\x16\x07")
+
+
+class FakeBus(can.BusABC):
+    """A back end whose answers are given; `sent` is what it took."""
+
+    def __init__(self) -> None:
+        self.sent: list[can.Message] = []
+        self.refusals: deque[Exception] = deque()
+        self.inbox: deque[can.Message | Exception | None] = deque()
+        self.channel_info = "fake channel"
+        self.send_options: list[float | None] = []
+        super().__init__(channel="fake")
+
+    def send(self, msg: can.Message, timeout: float | None = None) -> None:
+        self.send_options.append(timeout)
+        if self.refusals:
+            raise self.refusals.popleft()
+        self.sent.append(msg)
+        # As gs_usb does: pads what it was given.
+        msg.data.extend(bytes(8 - len(msg.data)))
+
+    def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
+        if not self.inbox:
+            return None, False
+        item = self.inbox.popleft()
+        if isinstance(item, Exception):
+            raise item
+        return item, False
+
+
+@pytest.fixture
+def bus() -> Any:
+    fake = FakeBus()
+    yield fake
+    fake.shutdown()
+
+
+def message(can_id: int = 0x725, data: bytes = b"\x01", **flags: Any) -> can.Message:
+    return can.Message(arbitration_id=can_id, data=data, **{"is_extended_id": False, **flags})
+
+
+# -- sending --------------------------------------------------------------------------------------
+
+
+def test_every_frame_is_a_fresh_message_since_back_ends_alter_them(bus: FakeBus) -> None:
+    link = CanLink(bus, "gs_usb")
+    link.send(FRAME)
+    link.send(FRAME)
+    assert bus.sent[0] is not bus.sent[1]
+    assert FRAME.data == b"\x55\xaa\x16\x07"
+    assert not bus.sent[0].is_extended_id
+
+
+FULL_QUEUES = [
+    ("socketcan", can.CanOperationError("Failed to transmit: No buffer space", errno.ENOBUFS)),
+    ("socketcan", can.CanOperationError("Transmit buffer full")),
+    ("kvaser", can.CanOperationError("Function canWrite failed - Transmit buffer overflow", -13)),
+    ("kvaser", can.CanOperationError("?", -13)),
+    ("vector", can.CanOperationError("xlCanTransmit failed", 11)),
+    ("pcan", can.CanOperationError("Failed to send: The transmit queue is full")),
+    ("pcan", can.CanOperationError("The transmit buffer in CAN controller is full")),
+    ("ixxat", can.CanOperationError("VCI_E_TXQUEUE_FULL")),
+    ("systec", can.CanOperationError("Transmit queue is full", 0x80)),
+]
+
+
+@pytest.mark.parametrize(("interface", "error"), FULL_QUEUES)
+def test_a_full_transmit_queue_is_waited_for_whatever_the_back_end_calls_it(
+    bus: FakeBus, interface: str, error: Exception
+) -> None:
+    bus.refusals.extend([error] * 3)
+    CanLink(bus, interface).send(FRAME)
+    assert len(bus.sent) == 1
+
+
+def test_frames_that_arrive_while_the_queue_is_full_are_kept_in_order(bus: FakeBus) -> None:
+    bus.refusals.extend([can.CanOperationError("full", errno.ENOBUFS)] * 2)
+    bus.inbox.extend([message(data=b"a"), message(data=b"b"), message(data=b"c")])
+    link = CanLink(bus, "socketcan")
+    link.send(FRAME)
+    received = [link.receive(0.0) for _ in range(3)]
+    assert [frame.data for frame in received if frame] == [b"a", b"b", b"c"]
+
+
+def test_a_queue_that_stays_full_ends_with_an_error_in_bounded_time(
+    bus: FakeBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(adapter, "SEND_LIMIT_S", 0.02)
+    bus.refusals.extend([can.CanOperationError("full", errno.ENOBUFS)] * 1_000_000)
+    with pytest.raises(TransmitBlockedError, match="took no frame") as caught:
+        CanLink(bus, "socketcan").send(FRAME)
+    assert caught.value.exit_code == ExitCode.BUS
+    assert "acknowledges" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        can.CanOperationError("Failed to transmit: Network is down", errno.ENETDOWN),
+        can.CanOperationError("Failed to transmit: No such device", errno.ENODEV),
+        OSError(errno.ENODEV, "unplugged"),
+        can.CanOperationError("bus off", 1),
+    ],
+)
+def test_any_other_transmit_error_is_the_adapters_failure(bus: FakeBus, error: Exception) -> None:
+    bus.refusals.append(error)
+    with pytest.raises(BusError, match="failed while sending") as caught:
+        CanLink(bus, "socketcan").send(FRAME)
+    assert not isinstance(caught.value, TransmitBlockedError)
+    assert "fake channel" in caught.value.where
+
+
+def test_only_a_serial_adapter_gets_a_send_timeout(bus: FakeBus) -> None:
+    CanLink(bus, "slcan").send(FRAME)
+    CanLink(bus, "socketcan").send(FRAME)
+    assert bus.send_options == [adapter.SEND_LIMIT_S, None]
+
+
+# -- receiving ------------------------------------------------------------------------------------
+
+
+def test_the_kinds_of_frames_are_told_apart(bus: FakeBus) -> None:
+    bus.inbox.extend(
+        [
+            message(0x725, b"\x01\x02"),
+            message(0x18DA00F1, b"\x01", is_extended_id=True),
+            message(0x725, b"", is_remote_frame=True),
+            message(0x725, b"\x01", is_error_frame=True),
+        ]
+    )
+    link = CanLink(bus, "fake")
+    assert [link.receive(0.0) for _ in range(4)] == [
+        Frame(0x725, b"\x01\x02"),
+        Frame(0x18DA00F1, b"\x01", is_extended=True),
+        Frame(0x725, b"", is_remote=True),
+        Frame(0x725, b"\x01", is_error=True),
+    ]
+
+
+def test_can_fd_frames_are_no_part_of_this_bus(bus: FakeBus) -> None:
+    bus.inbox.extend([message(0x725, bytes(12), is_fd=True), message(0x725, b"\x01")])
+    link = CanLink(bus, "fake")
+    assert link.receive(time.monotonic() + 1.0) == Frame(0x725, b"\x01")
+
+
+def test_filters_that_the_back_end_leaves_to_python_can_hold(bus: FakeBus) -> None:
+    bus.set_filters([{"can_id": 0x725, "can_mask": 0x7FF, "extended": False}])
+    bus.inbox.extend([message(0x123), message(0x725)])
+    assert CanLink(bus, "fake").receive(time.monotonic() + 1.0) == Frame(0x725, b"\x01")
+
+
+def test_a_receive_error_is_the_adapters_failure(bus: FakeBus) -> None:
+    bus.inbox.append(can.CanOperationError("Failed to receive: Network is down"))
+    with pytest.raises(BusError, match="failed while receiving"):
+        CanLink(bus, "socketcan").receive(0.0)
+
+
+def test_a_jump_of_the_wall_clock_does_not_lengthen_a_receive(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """TM-04: python-can's own recv() would wait for an hour here."""
+    wall = iter([1000.0] + [-2600.0] * 1000)
+    monkeypatch.setattr("can.bus.time", lambda: next(wall))
+    link = open_adapter(250_000, interface="virtual", channel=uuid.uuid4().hex)
+    began = time.monotonic()
+    assert link.receive(began + 0.01) is None
+    assert time.monotonic() - began < 1.0
+    link.close()
+
+
+def test_a_back_end_with_its_own_recv_is_used_as_it_is() -> None:
+    class Legacy(FakeBus):
+        def recv(self, timeout: float | None = None) -> can.Message | None:
+            return message(0x725, b"legacy")
+
+    legacy = Legacy()
+    assert CanLink(legacy, "fake").receive(0.0) == Frame(0x725, b"legacy")
+    legacy.shutdown()
+
+
+def test_drain_throws_away_what_waits_and_is_bounded(
+    bus: FakeBus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus.inbox.extend(message() for _ in range(5))
+    link = CanLink(bus, "fake")
+    assert link.drain() == 5
+    monkeypatch.setattr(adapter, "_DRAIN_FRAMES", 10)
+    bus.inbox.extend(message() for _ in range(50))
+    assert link.drain() == 10
+
+
+def test_closing_twice_or_after_unplugging_is_harmless(bus: FakeBus) -> None:
+    link = CanLink(bus, "fake")
+    bus.shutdown = lambda: (_ for _ in ()).throw(OSError("gone"))  # type: ignore[method-assign]
+    link.close()
+    del bus.shutdown
+    link.close()
+    link.close()
+
+
+# -- opening --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
+    """python-can finds no configuration file and no CAN_* variables."""
+    monkeypatch.setattr("can.util.load_file_config", lambda *_args: {})
+    monkeypatch.setattr("can.util.load_environment_config", lambda *_args: {})
+
+
+@pytest.mark.usefixtures("no_configuration")
+def test_the_bit_rate_is_the_dialects_unless_somebody_names_another(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[dict[str, Any]] = []
+
+    def open_bus(**config: Any) -> FakeBus:
+        seen.append(config)
+        return FakeBus()
+
+    monkeypatch.setattr("can.Bus", open_bus)
+    open_adapter(250_000, interface="virtual", channel="a").close()
+    open_adapter(250_000, interface="virtual", channel="a", bitrate=125_000).close()
+    monkeypatch.setattr("can.util.load_file_config", lambda *_args: {"bitrate": "500000"})
+    open_adapter(250_000, interface="virtual", channel="a").close()
+    assert [int(config["bitrate"]) for config in seen] == [250_000, 125_000, 500_000]
+    assert all(config["ignore_config"] for config in seen)
+
+
+@pytest.mark.usefixtures("no_configuration")
+def test_no_adapter_configured_names_the_fix() -> None:
+    with pytest.raises(BusError, match="No adapter is configured") as caught:
+        open_adapter(250_000)
+    assert "-i socketcan -c can0" in str(caught.value)
+    assert "--mock" in str(caught.value)
+
+
+@pytest.mark.usefixtures("no_configuration")
+def test_an_unknown_interface_is_wrong_usage_and_the_known_ones_are_named() -> None:
+    with pytest.raises(UsageError, match="zzz") as caught:
+        open_adapter(250_000, interface="zzz", channel="a")
+    assert "socketcan" in str(caught.value)
+    assert caught.value.exit_code == ExitCode.USAGE
+
+
+@pytest.mark.usefixtures("no_configuration")
+def test_a_configuration_that_makes_no_sense_is_wrong_usage() -> None:
+    with pytest.raises(UsageError, match="Port"):
+        open_adapter(250_000, interface="udp_multicast", channel="239.0.0.1", port="x")
+
+
+@pytest.mark.usefixtures("no_configuration")
+@pytest.mark.parametrize(
+    "error", [OSError(errno.ENODEV, "No such device"), ImportError("no uptime"), ValueError()]
+)
+def test_an_adapter_that_cannot_be_opened_names_interface_channel_and_fix(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def fail(**_config: Any) -> can.BusABC:
+        raise error
+
+    monkeypatch.setattr("can.Bus", fail)
+    for interface, fix in (("socketcan", "ip link set can7"), ("pcan", "driver")):
+        with pytest.raises(BusError, match="cannot be opened") as caught:
+            open_adapter(250_000, interface=interface, channel="can7")
+        assert "can7" in caught.value.where
+        assert fix in caught.value.remedy

@@ -1,0 +1,204 @@
+"""The one loop: what it owes to an engine, a link and a clock."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+
+import pytest
+
+from flasher.bus.link import VirtualClock
+from flasher.driver import MAX_WAIT_S, drive
+from flasher.errors import BusError
+from flasher.protocol.frame import Frame
+
+
+class FakeLink:
+    """Frames that arrive at given times, on a virtual clock; records what is sent."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.clock = clock
+        self.arrivals: deque[tuple[float, Frame]] = deque()
+        self.sent: list[tuple[float, Frame]] = []
+        self.drained = 0
+        self.send_takes_s = 0.0
+        self.fail_after_frames: int | None = None
+
+    def send(self, frame: Frame) -> None:
+        if self.fail_after_frames is not None and len(self.sent) >= self.fail_after_frames:
+            raise BusError("The adapter failed while sending: unplugged.")
+        self.clock.wait_until(self.clock.now() + self.send_takes_s)
+        self.sent.append((self.clock.now(), frame))
+
+    def receive(self, deadline: float) -> Frame | None:
+        if self.arrivals and self.arrivals[0][0] <= max(deadline, self.clock.now()):
+            at, frame = self.arrivals.popleft()
+            self.clock.wait_until(at)
+            return frame
+        if deadline > self.clock.now():
+            self.clock.wait_until(deadline)
+        return None
+
+    def drain(self) -> int:
+        self.drained += 1
+        return 0
+
+    def close(self) -> None:
+        pass
+
+
+class Recorder:
+    """An engine that records its calls and ends after a number of ticks."""
+
+    def __init__(self, *, ticks: int = 1, every_s: float = 1.0) -> None:
+        self.calls: list[tuple[str, float]] = []
+        self.outbox: deque[Frame] = deque()
+        self._ticks = ticks
+        self._every_s = every_s
+        self._next = every_s
+        self.cancelled_at: float | None = None
+        self.events: list[object] = []
+        self.on_tick: Callable[[float], None] | None = None
+
+    @property
+    def done(self) -> bool:
+        return self._ticks <= 0 or self.cancelled_at is not None
+
+    def receive(self, frame: Frame, now: float) -> None:
+        self.calls.append((f"receive {frame.can_id:03X}", now))
+
+    def tick(self, now: float) -> None:
+        self.calls.append(("tick", now))
+        self._ticks -= 1
+        self._next = now + self._every_s
+        if self.on_tick is not None:
+            self.on_tick(now)
+
+    def deadline(self) -> float | None:
+        return self._next
+
+    def next_frame(self, now: float) -> Frame | None:
+        return self.outbox[0] if self.outbox else None
+
+    def frame_sent(self, now: float) -> None:
+        self.calls.append((f"sent {self.outbox.popleft().can_id:03X}", now))
+
+    def cancel(self, now: float) -> None:
+        self.cancelled_at = now
+
+    def take_events(self) -> list[object]:
+        taken, self.events = self.events, []
+        return taken
+
+
+@pytest.fixture
+def clock() -> VirtualClock:
+    return VirtualClock()
+
+
+@pytest.fixture
+def link(clock: VirtualClock) -> FakeLink:
+    return FakeLink(clock)
+
+
+def test_the_link_is_drained_before_anything_else(clock: VirtualClock, link: FakeLink) -> None:
+    drive(Recorder(), link, clock)
+    assert link.drained == 1
+
+
+def test_the_engine_is_ticked_at_its_deadline(clock: VirtualClock, link: FakeLink) -> None:
+    engine = Recorder(ticks=3)
+    drive(engine, link, clock)
+    assert [at for _, at in engine.calls] == pytest.approx([1.0, 2.0, 3.0])
+
+
+def test_everything_that_waits_is_received_before_a_due_tick(
+    clock: VirtualClock, link: FakeLink
+) -> None:
+    """A stall of the computer must not become a timeout of the device."""
+    engine = Recorder()
+    for number in range(3):
+        link.arrivals.append((0.5, Frame(0x720 + number, b"x")))
+    clock.wait_until(5.0)
+    drive(engine, link, clock)
+    assert [what for what, _ in engine.calls] == [
+        "receive 720",
+        "receive 721",
+        "receive 722",
+        "tick",
+    ]
+
+
+def test_a_babbling_bus_does_not_stop_the_timers(clock: VirtualClock, link: FakeLink) -> None:
+    engine = Recorder()
+    link.arrivals.extend((0.0, Frame(0x001, b"x")) for _ in range(30_000))
+    clock.wait_until(5.0)
+    drive(engine, link, clock)
+    assert ("tick", 5.0) in engine.calls
+    assert len(link.arrivals) >= 19_000
+
+
+def test_frames_go_out_one_at_a_time_and_the_engine_is_told_when_each_was_accepted(
+    clock: VirtualClock, link: FakeLink
+) -> None:
+    engine = Recorder()
+    engine.outbox.extend([Frame(0x752, b"1"), Frame(0x753, b"2")])
+    link.send_takes_s = 0.1
+    drive(engine, link, clock)
+    assert [what for what, _ in engine.calls[:2]] == ["sent 752", "sent 753"]
+    assert [at for _, at in engine.calls[:2]] == pytest.approx([0.1, 0.2])
+
+
+def test_taps_see_every_frame_in_both_directions(clock: VirtualClock, link: FakeLink) -> None:
+    engine = Recorder()
+    engine.outbox.append(Frame(0x752, b"1"))
+    link.arrivals.append((0.2, Frame(0x725, b"2")))
+    seen: list[tuple[int, bool, float]] = []
+
+    def tap(frame: Frame, *, sent: bool, now: float) -> None:
+        seen.append((frame.can_id, sent, now))
+
+    drive(engine, link, clock, taps=[tap])
+    assert seen == [(0x752, True, 0.0), (0x725, False, 0.2)]
+
+
+def test_taps_see_frames_that_waited_for_a_due_tick(clock: VirtualClock, link: FakeLink) -> None:
+    engine = Recorder()
+    link.arrivals.append((0.2, Frame(0x725, b"2")))
+    clock.wait_until(3.0)
+    seen: list[tuple[int, bool, float]] = []
+
+    def tap(frame: Frame, *, sent: bool, now: float) -> None:
+        seen.append((frame.can_id, sent, now))
+
+    drive(engine, link, clock, taps=[tap])
+    assert seen == [(0x725, False, 3.0)]
+
+
+def test_events_are_handed_on_as_they_come(clock: VirtualClock, link: FakeLink) -> None:
+    engine = Recorder()
+    engine.on_tick = lambda now: engine.events.append(f"at {now:g}")
+    seen: list[object] = []
+    drive(engine, link, clock, on_event=seen.append)
+    assert seen == ["at 1"]
+
+
+def test_a_cancellation_is_seen_within_the_longest_wait(
+    clock: VirtualClock, link: FakeLink
+) -> None:
+    engine = Recorder(every_s=3600.0)
+    drive(engine, link, clock, cancelled=lambda: clock.now() >= 1.0)
+    assert engine.cancelled_at is not None
+    assert 1.0 <= engine.cancelled_at <= 1.0 + MAX_WAIT_S
+
+
+def test_a_failing_adapter_ends_the_loop_with_its_error(
+    clock: VirtualClock, link: FakeLink
+) -> None:
+    """BU-05."""
+    engine = Recorder()
+    engine.outbox.extend([Frame(0x752, b"1")] * 5)
+    link.fail_after_frames = 3
+    with pytest.raises(BusError, match="unplugged"):
+        drive(engine, link, clock)
+    assert len(link.sent) == 3
