@@ -1,0 +1,1 @@
+"""What flasher.device promises: a bootloader as the document describes it, on strict flash."""
