@@ -16,6 +16,8 @@ from flasher.protocol.frame import Frame
 
 MAX_WAIT_S: Final = 0.2
 """Longest blocking receive: the time after which a cancellation is seen at the latest."""
+_AT_ONCE: Final = float("-inf")
+"""A deadline in the past: only what is there already."""
 _CATCH_UP_FRAMES: Final = 10_000
 """Frames received before a due `tick` at the most: a babbling bus must not stop the timers."""
 
@@ -54,8 +56,8 @@ def drive(
             _catch_up(engine, link, clock, taps)
             engine.tick(clock.now())
         _send_all(engine, link, clock, taps)
-        if on_event is not None:
-            for event in engine.take_events():
+        for event in engine.take_events():
+            if on_event is not None:
                 on_event(event)
         if engine.done:
             return
@@ -63,16 +65,30 @@ def drive(
         latest = clock.now() + MAX_WAIT_S
         frame = link.receive(latest if wanted is None else min(wanted, latest))
         if frame is not None:
-            now = clock.now()
-            for tap in taps:
-                tap(frame, sent=False, now=now)
-            engine.receive(frame, now)
+            _receive_on(frame, engine, link, clock, taps)
+
+
+def _receive_on(
+    frame: Frame, engine: Engine, link: Link, clock: Clock, taps: Sequence[Tap]
+) -> None:
+    """Hand on a frame, and those that wait behind it until the engine has something to say."""
+    for _ in range(_CATCH_UP_FRAMES):
+        now = clock.now()
+        for tap in taps:
+            tap(frame, sent=False, now=now)
+        engine.receive(frame, now)
+        if engine.next_frame(now) is not None:
+            return
+        following = link.receive(_AT_ONCE)
+        if following is None:
+            return
+        frame = following
 
 
 def _catch_up(engine: Engine, link: Link, clock: Clock, taps: Sequence[Tap]) -> None:
-    """Receive what waits already."""
+    """Receive what waits already, whatever the engine has to say to it."""
     for _ in range(_CATCH_UP_FRAMES):
-        frame = link.receive(float("-inf"))
+        frame = link.receive(_AT_ONCE)
         if frame is None:
             return
         now = clock.now()

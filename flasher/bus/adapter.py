@@ -71,15 +71,16 @@ def open_adapter(default_bitrate_bps: int, **config: Any) -> CanLink:
                 interface, merged.get("channel"), merged.get("bitrate", default_bitrate_bps)
             ),
         ) from error
-    return CanLink(bus, interface)
+    return CanLink(bus, interface, str(merged.get("channel") or ""))
 
 
 class CanLink:
     """A python-can bus as a `Link` on the monotonic clock."""
 
-    def __init__(self, bus: can.BusABC, interface: str) -> None:
+    def __init__(self, bus: can.BusABC, interface: str, channel: str = "") -> None:
         self._bus = bus
         self._interface = interface
+        self._name = f"{interface} {channel}".strip()
         self._waiting: deque[Frame] = deque()
         # recv() measures its timeout by the wall clock, so that a jump of it can hang the call;
         # what it wraps does not. No filters are set that would need the wrapper, unless the back
@@ -95,8 +96,8 @@ class CanLink:
             self._send_options["timeout"] = SEND_LIMIT_S
 
     def __str__(self) -> str:
-        """The adapter as its back end describes it."""
-        return f"{self._interface}: {self._bus.channel_info}"
+        """The adapter as the user named it."""
+        return self._name
 
     def send(self, frame: Frame) -> None:
         """Hand a frame to the adapter; a full queue is waited for up to `SEND_LIMIT_S`."""
@@ -124,11 +125,12 @@ class CanLink:
         """The next frame, or None at `deadline` (monotonic clock)."""
         if self._waiting:
             return self._waiting.popleft()
-        while True:
-            remaining_s = max(0.0, deadline - time.monotonic())
+        remaining_s = deadline - time.monotonic()
+        frame = self._receive_once(max(remaining_s, 0.0))
+        # A filtered or foreign frame ends a wait early.
+        while frame is None and (remaining_s := deadline - time.monotonic()) > 0:
             frame = self._receive_once(remaining_s)
-            if frame is not None or time.monotonic() >= deadline:
-                return frame
+        return frame
 
     def drain(self) -> int:
         """Throw away what is waiting, bounded on a babbling bus."""

@@ -29,6 +29,10 @@ class DeviceLeft(Enum):
     """The state in which the device was left, as far as the host can know."""
 
     UNTOUCHED = "nothing was erased: the device runs, or starts again, what it ran before"
+    PERHAPS_ERASED = (
+        "it was told to erase its application and did not say whether it has: flash it again, or "
+        "see after a power cycle what it runs"
+    )
     NO_APPLICATION = (
         "its application is erased or half written: it stays in its bootloader until an image is "
         "flashed completely"

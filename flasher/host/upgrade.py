@@ -9,6 +9,7 @@ timer starts.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from math import inf
 from typing import ClassVar, Final
 
 from flasher import events
@@ -78,6 +79,8 @@ class Upgrade:
         self._ending: tuple[Ending, str] | None = None
         self._outcome: Outcome | None = None
 
+        self._erased = False
+        """Request transfer came, in any attempt: the old application is gone."""
         self._acknowledged = 0
         self._repetitions = 0
         self._naks = 0
@@ -139,14 +142,16 @@ class Upgrade:
             return 0.0
         if self.done:
             return None
-        times = (
-            self._deadline_at if self._ending is None else None,
+        earliest = inf if self._ending is not None else self._deadline_at
+        for time in (
             self._timer_at,
             self._tx.deadline(),
             self._answers.deadline(),
             self._broadcasts.deadline(),
-        )
-        return min((time for time in times if time is not None), default=None)
+        ):
+            if time is not None and time < earliest:
+                earliest = time
+        return None if earliest == inf else earliest
 
     def next_frame(self, now: float) -> Frame | None:
         """The next frame to send."""
@@ -285,6 +290,7 @@ class Upgrade:
     def _send_first_packet(self, now: float, event: Event, row: _Received) -> None:
         self._tx.drop_unstarted()
         self._at.request_at = now
+        self._erased = True
         self._at.next_packet(1)
         self._send_packet(now)
 
@@ -414,7 +420,9 @@ class Upgrade:
             return DeviceLeft.NO_APPLICATION
         if self._at.end_copies_left:
             return DeviceLeft.UNKNOWN
-        return DeviceLeft.NO_APPLICATION if self._at.update_left else DeviceLeft.UNTOUCHED
+        if self._erased:
+            return DeviceLeft.NO_APPLICATION
+        return DeviceLeft.PERHAPS_ERASED if self._at.update_left else DeviceLeft.UNTOUCHED
 
     _ACTIONS: ClassVar[Mapping[Action, Callable[[Upgrade, float, Event, _Received], None]]] = {
         Action.NOTHING: _nothing,

@@ -124,9 +124,9 @@ def test_a_queue_that_stays_full_ends_with_an_error_in_bounded_time(
 def test_any_other_transmit_error_is_the_adapters_failure(bus: FakeBus, error: Exception) -> None:
     bus.refusals.append(error)
     with pytest.raises(BusError, match="failed while sending") as caught:
-        CanLink(bus, "socketcan").send(FRAME)
+        CanLink(bus, "socketcan", "can3").send(FRAME)
     assert not isinstance(caught.value, TransmitBlockedError)
-    assert "fake channel" in caught.value.where
+    assert caught.value.where == "socketcan can3"
 
 
 def test_only_a_serial_adapter_gets_a_send_timeout(bus: FakeBus) -> None:

@@ -152,6 +152,10 @@ class Bench:
         self.say(RequestTransfer())
         return self.on_to_packet(number, first=1)
 
+    def to_transfer(self) -> None:
+        """Up to packet 1, which is not answered yet."""
+        self.to_packet(1)
+
     def on_to_packet(self, number: int, *, first: int) -> Packet:
         """From packet `first`, which is on its way, to `number`."""
         for current in range(first, number):

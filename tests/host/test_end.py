@@ -303,7 +303,8 @@ def test_complete_after_the_first_boot_version_still_completes() -> None:
     ("reach", "left"),
     [
         ("to_boot", DeviceLeft.UNTOUCHED),
-        ("to_request", DeviceLeft.NO_APPLICATION),
+        ("to_request", DeviceLeft.PERHAPS_ERASED),
+        ("to_transfer", DeviceLeft.NO_APPLICATION),
         ("to_end", DeviceLeft.UNKNOWN),
     ],
 )
@@ -342,7 +343,7 @@ def test_cancelling_in_the_middle_of_a_message_finishes_the_message() -> None:
 @pytest.mark.parametrize(
     ("stage", "kind", "left"),
     [
-        ("boot", UpdateCommand, DeviceLeft.NO_APPLICATION),
+        ("boot", UpdateCommand, DeviceLeft.PERHAPS_ERASED),
         ("last", EndOfTransfer, DeviceLeft.UNKNOWN),
     ],
 )

@@ -190,7 +190,7 @@ def test_the_update_command_is_never_repeated_into_silence() -> None:
     assert sum(isinstance(row, UpdateCommand) for _, row in bench.sent) == 1
     outcome = bench.outcome
     assert outcome.ending is Ending.NO_REQUEST
-    assert outcome.device_left is DeviceLeft.NO_APPLICATION
+    assert outcome.device_left is DeviceLeft.PERHAPS_ERASED
     error = outcome.error()
     assert error is not None
     assert error.exit_code == ExitCode.NO_ANSWER

@@ -1,0 +1,7 @@
+"""`python -m flasher`."""
+
+import sys
+
+from flasher.cli.main import main
+
+sys.exit(main())

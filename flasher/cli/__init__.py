@@ -1,0 +1,1 @@
+"""The command line: arguments, printing, progress bars, exit codes; nothing else prints."""

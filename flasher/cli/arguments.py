@@ -1,0 +1,147 @@
+"""Arguments that commands share: the image, the target, the bus, the mock."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import re
+from typing import Any, Final
+
+from flasher.api import as_target
+from flasher.errors import UsageError
+from flasher.image.image import Image
+from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, FORMATS, load
+from flasher.protocol.spec import DIALECTS, TARGET_ALIASES, TARGETS, WELLING, Target
+
+_NUMBER: Final = re.compile(r"(0[xX][0-9a-fA-F_]+|[0-9][0-9_]*)([kKmM]?)")
+_SUFFIXES: Final = {"": 1, "k": 1024, "m": 1024 * 1024}
+_BUS_KEYWORDS: Final = (
+    "interface",
+    "channel",
+    "bitrate",
+    "fd",
+    "data_bitrate",
+    "timing",
+    "can_filters",
+)
+
+
+def number(text: str) -> int:
+    """A whole number: decimal or 0x, with K or M for 1024 and 1024 * 1024."""
+    match = _NUMBER.fullmatch(text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number (decimal, 0x..., K or M suffix)")
+    return (
+        int(match[1], 0 if match[1].lower().startswith("0x") else 10) * _SUFFIXES[match[2].lower()]
+    )
+
+
+def address_range(text: str) -> tuple[int, int]:
+    """START:END, the end exclusive."""
+    start, colon, end = text.partition(":")
+    if not colon:
+        raise argparse.ArgumentTypeError(f"{text!r} is no range; write START:END")
+    return number(start), number(end)
+
+
+def seconds(text: str) -> float:
+    """A time in seconds, zero or more."""
+    with contextlib.suppress(ValueError):
+        value = float(text)
+        if 0 <= value < float("inf"):
+            return value
+    raise argparse.ArgumentTypeError(f"{text!r} is no time in seconds")
+
+
+def count(text: str) -> int:
+    """A whole number from 1 on."""
+    value = number(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError("must be 1 or more")
+    return value
+
+
+def target(text: str) -> Target:
+    """A target by its name or alias."""
+    try:
+        return as_target(text)
+    except UsageError as error:
+        raise argparse.ArgumentTypeError(error.what) from error
+
+
+def add_image(parser: argparse.ArgumentParser) -> None:
+    """The image file and what decides which of its bytes are sent."""
+    parser.add_argument("image", metavar="IMAGE", help="Intel HEX, S-record, ELF or raw binary")
+    group = parser.add_argument_group("image")
+    group.add_argument("--format", choices=FORMATS, help="read IMAGE as this, do not detect")
+    group.add_argument(
+        "--base", type=number, metavar="ADDRESS", help="address of a raw binary's first byte"
+    )
+    group.add_argument(
+        "--range",
+        dest="range_",
+        type=address_range,
+        metavar="START:END",
+        help="send only these addresses, END exclusive",
+    )
+    group.add_argument(
+        "--fill-gaps-up-to",
+        type=number,
+        default=DEFAULT_FILL_GAPS_UP_TO,
+        metavar="BYTES",
+        help="fill gaps between segments with FF up to this size; larger ones are refused "
+        "(default %(default)s)",
+    )
+    group.add_argument(
+        "--allow-outside-vector",
+        action="store_true",
+        help="send an image whose reset vector points outside of it",
+    )
+
+
+def load_image(options: argparse.Namespace) -> Image:
+    """The image that the options describe. Raises ImageError or UsageError."""
+    return load(
+        options.image,
+        format=options.format,
+        base=options.base,
+        range_=options.range_,
+        fill_gaps_up_to=options.fill_gaps_up_to,
+        allow_outside_vector=options.allow_outside_vector or getattr(options, "force", False),
+    )
+
+
+def add_target(parser: argparse.ArgumentParser, *, required: bool = True) -> None:
+    """Which device."""
+    names = "|".join((*TARGETS, *TARGET_ALIASES))
+    parser.add_argument(
+        "-t",
+        "--target",
+        type=target,
+        required=required,
+        metavar=names,
+        help="the device: mc is another name for wmc, pbu for obc",
+    )
+
+
+def add_dialect(parser: argparse.ArgumentParser) -> None:
+    """Which document."""
+    parser.add_argument(
+        "--dialect",
+        choices=tuple(DIALECTS),
+        default=WELLING.name,
+        help="which protocol document holds (default %(default)s)",
+    )
+
+
+def add_bus(parser: argparse.ArgumentParser) -> None:
+    """python-can's own bus arguments."""
+    from can.cli import add_bus_arguments  # noqa: PLC0415  loads python-can
+
+    add_bus_arguments(parser, filter_arg=True, group_title="bus (python-can)")
+
+
+def bus_config(options: argparse.Namespace) -> dict[str, Any]:
+    """The keywords for python-can that were given on the command line."""
+    config = {name: getattr(options, name) for name in _BUS_KEYWORDS if hasattr(options, name)}
+    return config | getattr(options, "bus_kwargs", {})

@@ -1,0 +1,91 @@
+"""How an upgrade goes, on stderr: a bar on a terminal, one line a phase elsewhere."""
+
+from __future__ import annotations
+
+import sys
+from types import TracebackType
+from typing import Any, Self
+
+from flasher import events
+from flasher.cli.output import Output
+from flasher.image.plan import Plan
+from flasher.protocol.spec import PACKET_DATA_SIZE
+
+
+class Progress:
+    """Takes the events of an upgrade and shows them."""
+
+    def __init__(self, plan: Plan, output: Output) -> None:
+        self._plan = plan
+        self._output = output
+        self._bar: Any = None
+        self._repetitions = 0
+        self._wants_bar = sys.stderr.isatty() and output.verbosity >= 0
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._close_bar()
+
+    def __call__(self, event: object) -> None:
+        """Show one event."""
+        output = self._output
+        match event:
+            case events.PacketAcknowledged(number, total, _):
+                self._move(number, total)
+            case events.PhaseEntered(phase, _):
+                if phase is not events.Phase.TRANSFER:
+                    self._close_bar()
+                output.progress(f"{phase.value} ...")
+            case events.BootVersionSeen(name, version):
+                output.progress(f"boot version: {name} {version}")
+            case events.AttemptStarted(attempt, reason):
+                self._close_bar()
+                output.progress(f"attempt {attempt}: {reason}")
+            case events.MessageRepeated(what, reason, tries):
+                self._repetitions += 1
+                output.progress(f"{what} again (try {tries}): {reason}", level=1)
+            case events.Reported(what):
+                output.progress(f"note: {what}", level=1)
+            case events.BytesDamaged(can_id, reason, data):
+                output.progress(
+                    f"bytes on 0x{can_id:03X} ignored: {reason}: {data[:24].hex(' ')}", level=2
+                )
+
+    def _move(self, number: int, total: int) -> None:
+        if not self._wants_bar:
+            return
+        if self._bar is None:
+            self._bar = self._open_bar()
+        size_bytes = self._plan.image.size_bytes
+        self._bar.update(min(number * PACKET_DATA_SIZE, size_bytes) - self._bar.n)
+        if self._repetitions:
+            self._bar.set_postfix_str(f"{self._repetitions} repeated", refresh=False)
+        if number == total:
+            self._close_bar()
+
+    def _open_bar(self) -> Any:
+        from tqdm import tqdm  # noqa: PLC0415  only where a bar is shown
+
+        bar = tqdm(
+            total=self._plan.image.size_bytes,
+            unit="B",
+            unit_scale=True,
+            desc=self._plan.target.node.name,
+            file=sys.stderr,
+            dynamic_ncols=True,
+        )
+        self._output.write_stderr = lambda text: bar.write(text, file=sys.stderr)
+        return bar
+
+    def _close_bar(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+            self._output.restore_stderr()

@@ -1,0 +1,49 @@
+"""How the tests run the command line."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flasher.cli.main import main
+
+SAMPLES = Path(__file__).parents[2] / "firmware_samples"
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a command printed and its exit code."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def document(self) -> dict[str, Any]:
+        """The one JSON document on stdout."""
+        loaded = json.loads(self.out)
+        assert isinstance(loaded, dict)
+        return loaded
+
+
+Flasher = Callable[..., Run]
+
+
+@pytest.fixture
+def flasher(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Flasher:
+    """Runs `flasher ...`; python-can finds no configuration of the machine."""
+    monkeypatch.setattr("can.util.load_file_config", lambda *_args: {})
+    monkeypatch.setattr("can.util.load_environment_config", lambda *_args: {})
+
+    def run(*arguments: str | Path) -> Run:
+        words: Sequence[str] = [str(argument) for argument in arguments]
+        code = main(words)
+        captured = capsys.readouterr()
+        return Run(code, captured.out, captured.err)
+
+    return run

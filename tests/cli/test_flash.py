@@ -1,0 +1,257 @@
+"""`flasher flash`: the main job, its words and its exit codes."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+
+import can
+import pytest
+
+from flasher.api import connect_mock
+from flasher.device.profile import DeviceProfile, set_option
+from flasher.errors import ExitCode
+from tests.cli.conftest import SAMPLES, Flasher
+
+BMS = SAMPLES / "bms.hex"
+
+
+@pytest.mark.parametrize(
+    ("sample", "target", "boot_version"),
+    [
+        ("bms.hex", "bms", "BMS"),
+        ("wmc.s19", "wmc", "WMC"),
+        ("wmc.hex", "mc", "WMC"),
+        ("obc.bin", "obc", "PBU"),
+        ("obc.elf", "PBU", "PBU"),
+    ],
+)
+def test_each_sample_is_flashed_to_the_mock(
+    flasher: Flasher, sample: str, target: str, boot_version: str
+) -> None:
+    run = flasher("flash", SAMPLES / sample, "-t", target, "--mock", "--mock-speed", "0")
+    assert run.code == ExitCode.OK
+    assert "transferred:" in run.out
+    assert f"boot version: {boot_version} V1.0.0" in run.out
+    assert "completed:    the device confirmed the complete image" in run.out
+    assert "running:      not asked" in run.out
+    assert "\r" not in run.err
+
+
+def test_the_paced_mock_takes_the_time_that_the_plan_says(flasher: Flasher) -> None:
+    speed = 20.0
+    began = time.monotonic()
+    run = flasher(
+        "flash", SAMPLES / "wmc.hex", "-t", "wmc", "--mock", "--mock-speed", speed, "--json"
+    )
+    took_s = (time.monotonic() - began) * speed
+    document = run.document
+    transfer_s = document["outcome"]["statistics"]["transfer_s"]
+    assert transfer_s >= document["plan"]["wire_s"] * 0.97
+    assert took_s >= transfer_s
+
+
+def test_json_is_one_document_with_the_exit_code_in_it(flasher: Flasher) -> None:
+    run = flasher("flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0", "--json")
+    document = run.document
+    assert run.code == document["exit_code"] == 0
+    assert document["ok"] is True
+    assert document["outcome"]["ending"] == "completed"
+    assert document["image"]["size_bytes"] == 78351
+    assert document["plan"]["packets"] == 613
+
+
+def test_json_of_a_failure_holds_the_error_and_its_code(flasher: Flasher) -> None:
+    run = flasher("flash", SAMPLES / "bad" / "no_end.hex", "-t", "bms", "--mock", "--json")
+    document = run.document
+    assert run.code == document["exit_code"] == ExitCode.IMAGE
+    assert document["ok"] is False
+    assert document["error"]["what"]
+    assert "error:" in run.err
+
+
+def test_a_dry_run_prints_the_plan_and_opens_no_adapter(flasher: Flasher) -> None:
+    run = flasher("flash", BMS, "-t", "bms", "--dry-run", "-i", "socketcan", "-c", "none0")
+    assert run.code == ExitCode.OK
+    assert "613 packets" in run.out
+    assert "nothing was sent" in run.out
+
+
+def test_a_quiet_flash_says_only_the_result(flasher: Flasher) -> None:
+    run = flasher("-q", "flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0")
+    assert run.err == ""
+    assert "completed:" in run.out
+
+
+@pytest.mark.parametrize("words", [("-v",), ("-vv",)])
+def test_verbosity_is_taken_before_and_behind_the_command(
+    flasher: Flasher, words: tuple[str, ...]
+) -> None:
+    before = flasher(*words, "flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0")
+    behind = flasher("flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0", *words)
+    assert before.code == behind.code == ExitCode.OK
+
+
+@pytest.mark.parametrize("suffix", [".asc", ".log", ".csv", ".blf"])
+def test_the_trace_holds_every_frame_in_both_directions(
+    flasher: Flasher, tmp_path: Path, suffix: str
+) -> None:
+    trace = tmp_path / f"upgrade{suffix}"
+    run = flasher(
+        "flash", SAMPLES / "obc.bin", "-t", "obc", "--mock", "--mock-speed", "0",
+        "--trace-file", trace, "--json",
+    )  # fmt: skip
+    assert run.code == ExitCode.OK
+    with can.LogReader(trace) as reader:
+        messages = list(reader)
+    ids = [message.arbitration_id for message in messages]
+    assert set(ids) == {0x753, 0x735}
+    # One more boot version than the plan has, at the most: the burst goes on while it is answered.
+    assert len(ids) >= run.document["plan"]["frames"]
+    times = [message.timestamp for message in messages]
+    assert times == sorted(times)
+
+
+def test_a_trace_of_an_unknown_kind_is_wrong_usage(flasher: Flasher, tmp_path: Path) -> None:
+    run = flasher("flash", BMS, "-t", "bms", "--mock", "--trace-file", tmp_path / "upgrade.xyz")
+    assert run.code == ExitCode.USAGE
+    assert ".asc" in run.err
+
+
+def test_a_trace_that_cannot_be_written_is_wrong_usage(flasher: Flasher, tmp_path: Path) -> None:
+    run = flasher(
+        "flash", BMS, "-t", "bms", "--mock", "--trace-file", tmp_path / "no" / "upgrade.asc"
+    )
+    assert run.code == ExitCode.USAGE
+    assert "cannot be written" in run.err
+
+
+# -- what goes wrong ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "sample", sorted(path.name for path in (SAMPLES / "bad").iterdir() if path.is_file())
+)
+def test_every_bad_sample_is_rejected_with_one_message(flasher: Flasher, sample: str) -> None:
+    run = flasher("flash", SAMPLES / "bad" / sample, "-t", "bms", "--mock")
+    assert run.code == ExitCode.IMAGE
+    assert run.err.count("error:") == 1
+    assert "Traceback" not in run.err
+    assert "what to do:" in run.err
+    assert run.out == ""
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("flash", "nowhere.hex", "-t", "bms", "--mock"),
+        ("flash", BMS, "-t", "cdl", "--mock"),
+        ("flash", BMS, "--mock"),
+        ("flash", BMS, "-t", "bms", "--mock", "--retries", "0"),
+        ("flash", BMS, "-t", "bms", "--mock", "--timeout", "-1"),
+        ("flash", BMS, "-t", "bms", "--mock", "--range", "5"),
+        ("flash", BMS, "-t", "bms", "--mock", "--base", "12x"),
+        ("flash", BMS, "-t", "bms", "--mock", "--no-such-option"),
+        ("flash", BMS, "-t", "bms", "--mock", "--dialect", "motinova"),
+        ("flash", BMS, "-t", "bms", "-i", "no_such_interface", "-c", "0"),
+        ("flash",),
+        ("no-such-command",),
+        (),
+    ],
+)
+def test_wrong_usage_is_exit_code_2(flasher: Flasher, words: tuple[str | Path, ...]) -> None:
+    run = flasher(*words)
+    assert run.code == ExitCode.USAGE
+    assert "Traceback" not in run.err
+
+
+def test_an_unknown_interface_names_the_known_ones(flasher: Flasher) -> None:
+    run = flasher("flash", BMS, "-t", "bms", "-i", "no_such_interface", "-c", "0")
+    assert "socketcan" in run.err
+
+
+def test_no_adapter_configured_is_exit_code_4_and_names_the_fix(flasher: Flasher) -> None:
+    run = flasher("flash", BMS, "-t", "bms")
+    assert run.code == ExitCode.BUS
+    assert "-i socketcan -c can0" in run.err
+
+
+def test_an_adapter_that_cannot_be_opened_is_exit_code_4_and_names_the_fix(
+    flasher: Flasher,
+) -> None:
+    run = flasher("flash", BMS, "-t", "bms", "-i", "socketcan", "-c", "nocan7")
+    assert run.code == ExitCode.BUS
+    assert "nocan7" in run.err
+    assert "what to do:" in run.err
+
+
+def test_a_silent_bus_is_exit_code_5_in_bounded_time(flasher: Flasher) -> None:
+    began = time.monotonic()
+    run = flasher(
+        "flash", BMS, "-t", "bms", "-i", "virtual", "-c", uuid.uuid4().hex, "--timeout", "1"
+    )
+    assert run.code == ExitCode.NO_ANSWER
+    assert time.monotonic() - began < 3.0
+    assert "State of the device: nothing was erased" in run.err
+
+
+def test_a_bug_is_exit_code_1_and_says_so(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_args: object, **_options: object) -> None:
+        raise ZeroDivisionError("injected")
+
+    monkeypatch.setattr("flasher.api.upgrade", broken)
+    run = flasher("flash", BMS, "-t", "bms", "--mock")
+    assert run.code == ExitCode.INTERNAL
+    assert "a bug in flasher" in run.err
+    assert "injected" in run.err
+
+
+@pytest.mark.parametrize(
+    ("option", "code"),
+    [
+        ("boot_version=V9.9.9", ExitCode.OK),
+        ("boot_version=hello!", ExitCode.WRONG_DEVICE),
+        ("image_checksum=crc32", ExitCode.REFUSED),
+    ],
+)
+def test_the_devices_choices_decide_the_exit_code(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch, option: str, code: ExitCode
+) -> None:
+    key, _, value = option.partition("=")
+    profile = set_option(DeviceProfile(), key, value)
+    monkeypatch.setattr(
+        "flasher.api.connect_mock",
+        lambda target, dialect, *, speed: connect_mock(
+            target, dialect, speed=speed, profile=profile
+        ),
+    )
+    run = flasher("flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0")
+    assert run.code == code
+
+
+# -- as a process ---------------------------------------------------------------------------------
+
+
+def test_help_is_quick_and_importing_flasher_loads_no_command_line_and_no_can() -> None:
+    code = (
+        "import sys, flasher; "
+        "bad = [m for m in sys.modules if m == 'can' or m.startswith(('can.', 'flasher.cli'))]; "
+        "sys.exit(repr(bad) if bad else 0)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=20)
+    began = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-m", "flasher", "--help"],
+        capture_output=True,
+        text=True,
+        timeout=20,
+        check=True,
+    )
+    assert "exit codes:" in done.stdout
+    # 0.15 s on an idle machine; the bound leaves room for a busy one.
+    assert time.monotonic() - began < 2.0

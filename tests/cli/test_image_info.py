@@ -1,0 +1,73 @@
+"""`flasher image-info`: what is in a file, in words and as JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flasher.cli.arguments import number
+from flasher.errors import ExitCode
+from tests.cli.conftest import SAMPLES, Flasher
+
+
+def test_the_sample_is_described_with_its_plan(flasher: Flasher) -> None:
+    run = flasher("image-info", SAMPLES / "wmc.s19", "-t", "wmc")
+    assert run.code == ExitCode.OK
+    assert "Motorola S-record" in run.out
+    assert "filled with FF" in run.out
+    assert "plausible for a Cortex-M" in run.out
+    assert "WMC (CAN ids 0x751, 0x715) at 250 kbit/s" in run.out
+    assert "on the wire" in run.out
+
+
+def test_json_names_segments_vectors_and_hash(flasher: Flasher) -> None:
+    document = flasher("image-info", SAMPLES / "wmc.hex", "--json").document
+    assert document["ok"] is True
+    assert len(document["image"]["segments"]) == 2
+    assert len(document["image"]["sha256"]) == 64
+    assert document["image"]["vector_table"]["plausible"] is True
+    assert document["plan"]["packets"] == 92
+
+
+def test_a_binary_says_that_its_address_is_unknown(flasher: Flasher) -> None:
+    run = flasher("image-info", SAMPLES / "obc.bin")
+    assert "address: unknown" in run.out
+    with_base = flasher("image-info", SAMPLES / "obc.bin", "--base", "0x8002000")
+    assert "0x08002000..0x08002F9F" in with_base.out
+
+
+def test_what_is_no_program_is_told_not_refused(flasher: Flasher, tmp_path: Path) -> None:
+    path = tmp_path / "data.bin"
+    path.write_bytes(bytes(range(1, 200)))
+    run = flasher("image-info", path)
+    assert run.code == ExitCode.OK
+    assert "not plausible for a Cortex-M" in run.out
+    path.write_bytes(b"abc")
+    assert "too short for a vector table" in flasher("image-info", path).out
+
+
+def test_an_outside_vector_is_refused_until_waived(flasher: Flasher) -> None:
+    bad = SAMPLES / "bad" / "outside_vector.hex"
+    assert flasher("image-info", bad).code == ExitCode.IMAGE
+    assert flasher("image-info", bad, "--allow-outside-vector").code == ExitCode.OK
+
+
+@pytest.mark.parametrize(("text", "value"), [("4K", 4096), ("0x10", 16), ("1M", 1048576), ("7", 7)])
+def test_numbers_take_hex_and_suffixes(text: str, value: int) -> None:
+    assert number(text) == value
+
+
+def test_the_gap_limit_is_the_users(flasher: Flasher) -> None:
+    wmc = SAMPLES / "wmc.hex"
+    assert flasher("image-info", wmc, "--fill-gaps-up-to", "1K").code == ExitCode.IMAGE
+    assert flasher("image-info", wmc, "--fill-gaps-up-to", "4K").code == ExitCode.OK
+
+
+def test_hostile_names_are_shown_harmlessly(flasher: Flasher, tmp_path: Path) -> None:
+    path = tmp_path / "a\x1b[2Jb.bin"
+    path.write_bytes(bytes(64))
+    run = flasher("image-info", path)
+    assert "\x1b" not in run.out + run.err
+    missing = flasher("image-info", tmp_path / "\x1b]0;x.bin")
+    assert "\x1b" not in missing.err
