@@ -12,11 +12,11 @@ from collections.abc import Callable, Mapping, Sequence
 from math import inf
 from typing import ClassVar, Final
 
-from flasher import events
 from flasher.events import Phase
 from flasher.host.classify import Classifier, Situation
+from flasher.host.journal import Journal, Received
 from flasher.host.options import UpgradeOptions, default_timeout_s
-from flasher.host.outcome import DeviceLeft, Outcome, Statistics
+from flasher.host.outcome import DeviceLeft, Outcome
 from flasher.host.table import TABLE, Action, Ending, Event, State
 from flasher.image.plan import Plan
 from flasher.protocol.engine import Transmitter
@@ -24,12 +24,9 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.messages import (
     BootVersion,
     EndOfTransfer,
-    Malformed,
-    Nak,
     ReadVersion,
     Reset,
     Row,
-    Unknown,
     UpdateCommand,
     decode,
 )
@@ -47,14 +44,8 @@ _PHASES: Final = {
     State.CONFIRMING: Phase.CONFIRM,
 }
 
-_TIMEOUTS: Final = frozenset(
-    {Event.PACKET_UNANSWERED, Event.PACKET_LOST, Event.END_UNANSWERED, Event.END_LOST}
-)
 
 _BEGINNINGS: Final = frozenset({Action.SEND_UPDATE, Action.START_OVER})
-
-_Received = Row | Malformed | Unknown | None
-"""The message behind an event; None for a timer or the user's word."""
 
 
 class Upgrade:
@@ -71,21 +62,13 @@ class Upgrade:
         self._tx = Transmitter(plan.bitrate_bps, self._options.frame_gap_s)
         self._at = Situation(self._tx)
         self._phase = Phase.RESET
-        self._events: list[object] = []
+        self._journal = Journal()
 
         self._began_at: float | None = None
         self._deadline_at = 0.0
         self._timer_at: float | None = None
         self._ending: tuple[Ending, str] | None = None
         self._outcome: Outcome | None = None
-
-        self._erased = False
-        """Request transfer came, in any attempt: the old application is gone."""
-        self._acknowledged = 0
-        self._repetitions = 0
-        self._naks = 0
-        self._timeouts = 0
-        self._transfer_s: float | None = None
 
     # -- the engine interface -------------------------------------------------------------------
 
@@ -133,7 +116,7 @@ class Upgrade:
         elif self._timer_at is not None and now >= self._timer_at:
             self._timer_at = None
             event = self._classifier.timer(self._at, now)
-            self._timeouts += event in _TIMEOUTS
+            self._journal.expired(event)
             self._dispatch(event, now)
 
     def deadline(self) -> float | None:
@@ -171,8 +154,7 @@ class Upgrade:
 
     def take_events(self) -> Sequence[object]:
         """What happened since the last call."""
-        taken, self._events = self._events, []
-        return taken
+        return self._journal.take()
 
     # -- the table ------------------------------------------------------------------------------
 
@@ -180,22 +162,20 @@ class Upgrade:
         if self._ending is not None:
             return
         if isinstance(found, Damage):
-            damaged = events.BytesDamaged(found.can_id, found.reason.value, found.data)
-            self._events.append(damaged)
+            self._journal.damaged(found)
             return
         row = decode(found)
-        self._naks += isinstance(row, Nak)
+        self._journal.received(row)
         self._dispatch(self._classifier.message(row, self._at, now), now, row)
 
-    def _dispatch(self, event: Event, now: float, row: _Received = None) -> None:
+    def _dispatch(self, event: Event, now: float, row: Received = None) -> None:
         action, state = TABLE[self._at.state][event]
         if action is Action.START_OVER:
             self._at = self._at.next_attempt()
-            self._events.append(events.AttemptStarted(self._at.attempt, event.value))
+            self._journal.attempt(self._at.attempt, event)
         if isinstance(row, BootVersion) and action in _BEGINNINGS and self._at.boot is None:
             self._at.boot = row
-            seen = events.BootVersionSeen(printable(row.name), printable(row.version))
-            self._events.append(seen)
+            self._journal.boot_seen(row)
         if state is not self._at.state:
             self._enter(state, now)
         if isinstance(action, Ending):
@@ -212,7 +192,7 @@ class Upgrade:
         phase = _PHASES.get(state, self._phase)
         if phase is not self._phase:
             self._phase = phase
-            self._events.append(events.PhaseEntered(phase, self._at.attempt))
+            self._journal.phase(phase, self._at.attempt)
 
     # -- timers that start when a message has left -----------------------------------------------
 
@@ -263,23 +243,23 @@ class Upgrade:
         if timeout_s is None:
             timeout_s = default_timeout_s(self._plan, self._options)
         self._deadline_at = now + timeout_s
-        self._events.append(events.PhaseEntered(self._phase, self._at.attempt))
+        self._journal.phase(self._phase, self._at.attempt)
         self._send(Reset())
 
-    def _nothing(self, now: float, event: Event, row: _Received) -> None:
+    def _nothing(self, now: float, event: Event, row: Received) -> None:
         """Ignored by the table."""
 
-    def _report(self, now: float, event: Event, row: _Received) -> None:
-        self._events.append(events.Reported(_describe(event, row)))
+    def _report(self, now: float, event: Event, row: Received) -> None:
+        self._journal.reported(event, row)
 
-    def _send_reset(self, now: float, event: Event, row: _Received) -> None:
+    def _send_reset(self, now: float, event: Event, row: Received) -> None:
         self._send(Reset())
 
-    def _await_boot(self, now: float, event: Event, row: _Received) -> None:
+    def _await_boot(self, now: float, event: Event, row: Received) -> None:
         self._tx.drop_unstarted()
         self._timer_at = max(now, self._tx.left_at) + self._timings.boot_version_timeout_s
 
-    def _send_update(self, now: float, event: Event, row: _Received) -> None:
+    def _send_update(self, now: float, event: Event, row: Received) -> None:
         self._tx.drop_unstarted()
         target = self._plan.target
         self._send(
@@ -287,29 +267,21 @@ class Upgrade:
             not_before=self._at.update_left_at + self._timings.update_spacing_s,
         )
 
-    def _send_first_packet(self, now: float, event: Event, row: _Received) -> None:
+    def _send_first_packet(self, now: float, event: Event, row: Received) -> None:
         self._tx.drop_unstarted()
         self._at.request_at = now
-        self._erased = True
+        self._journal.requested(now)
         self._at.next_packet(1)
         self._send_packet(now)
 
-    def _send_next_packet(self, now: float, event: Event, row: _Received) -> None:
-        self._packet_done()
+    def _send_next_packet(self, now: float, event: Event, row: Received) -> None:
+        self._journal.packet_done(self._at, self._plan.total_packets, now)
         self._at.next_packet(self._at.number + 1)
         self._send_packet(now)
 
-    def _repeat_packet(self, now: float, event: Event, row: _Received) -> None:
-        self._repetitions += 1
+    def _repeat_packet(self, now: float, event: Event, row: Received) -> None:
         self._send_packet(now)
-        what = f"packet {self._at.number}"
-        self._events.append(events.MessageRepeated(what, event.value, self._at.tries))
-
-    def _packet_done(self) -> None:
-        at = self._at
-        self._acknowledged = at.number
-        done = events.PacketAcknowledged(at.number, self._plan.total_packets, at.tries)
-        self._events.append(done)
+        self._journal.repeated(f"packet {self._at.number}", event, self._at.tries)
 
     def _send_packet(self, now: float) -> None:
         number = self._at.number
@@ -321,30 +293,27 @@ class Upgrade:
             not_before=self._after_packet_gap(now),
         )
 
-    def _await_quiet(self, now: float, event: Event, row: _Received) -> None:
+    def _await_quiet(self, now: float, event: Event, row: Received) -> None:
         # While a copy is still leaving, the time starts when it has (see _message_left).
         if self._tx.idle:
             self._timer_at = max(now, self._tx.left_at) + self._timings.quiet_after_repeat_s
 
-    def _send_end(self, now: float, event: Event, row: _Received) -> None:
-        self._packet_done()
-        self._transfer_s = now - self._at.request_at
+    def _send_end(self, now: float, event: Event, row: Received) -> None:
+        self._journal.packet_done(self._at, self._plan.total_packets, now)
         self._at.end_tries += 1
         self._send(EndOfTransfer(), not_before=self._after_packet_gap(now))
 
-    def _repeat_end(self, now: float, event: Event, row: _Received) -> None:
-        self._repetitions += 1
+    def _repeat_end(self, now: float, event: Event, row: Received) -> None:
         self._at.end_tries += 1
-        repeated = events.MessageRepeated("end of transfer", event.value, self._at.end_tries)
-        self._events.append(repeated)
+        self._journal.repeated("end of transfer", event, self._at.end_tries)
         self._send(EndOfTransfer())
 
-    def _await_burst_end(self, now: float, event: Event, row: _Received) -> None:
+    def _await_burst_end(self, now: float, event: Event, row: Received) -> None:
         self._tx.drop_unstarted()
         self._timer_at = now + BOOT_VERSION_BURST * self._timings.boot_version_spacing_s
         self._report(now, event, row)
 
-    def _query_version(self, now: float, event: Event, row: _Received) -> None:
+    def _query_version(self, now: float, event: Event, row: Received) -> None:
         self._send(ReadVersion())
 
     def _send(self, row: Row, *, not_before: float = 0.0) -> None:
@@ -391,19 +360,11 @@ class Upgrade:
             packet=at.number if self._phase is Phase.TRANSFER else None,
             boot_version=printable(f"{at.boot.name} {at.boot.version}") if at.boot else None,
             running_version=at.running_version,
-            statistics=Statistics(
-                attempts=at.attempt,
-                packets_acknowledged=self._acknowledged,
-                repetitions=self._repetitions,
-                naks=self._naks,
-                timeouts=self._timeouts,
-                duration_s=now - (self._began_at or 0.0),
-                transfer_s=self._transfer_s,
-            ),
+            statistics=self._journal.statistics(at.attempt, now - (self._began_at or 0.0)),
             detail=detail,
         )
 
-    def _detail(self, ending: Ending, row: _Received) -> str:
+    def _detail(self, ending: Ending, row: Received) -> str:
         """What was seen, where the ending alone does not say it."""
         if isinstance(row, BootVersion):
             return f"boot version {printable(row.name)!r} {printable(row.version)!r}"
@@ -420,11 +381,11 @@ class Upgrade:
             return DeviceLeft.NO_APPLICATION
         if self._at.end_copies_left:
             return DeviceLeft.UNKNOWN
-        if self._erased:
+        if self._journal.erased:
             return DeviceLeft.NO_APPLICATION
         return DeviceLeft.PERHAPS_ERASED if self._at.update_left else DeviceLeft.UNTOUCHED
 
-    _ACTIONS: ClassVar[Mapping[Action, Callable[[Upgrade, float, Event, _Received], None]]] = {
+    _ACTIONS: ClassVar[Mapping[Action, Callable[[Upgrade, float, Event, Received], None]]] = {
         Action.NOTHING: _nothing,
         Action.REPORT: _report,
         Action.SEND_RESET: _send_reset,
@@ -440,16 +401,3 @@ class Upgrade:
         Action.AWAIT_BURST_END: _await_burst_end,
         Action.QUERY_VERSION: _query_version,
     }
-
-
-def _describe(event: Event, row: _Received) -> str:
-    """One sentence on a message that is reported; device text is escaped."""
-    match row:
-        case Malformed(message, problem):
-            return f"message {message.command:04X} from {message.can_id:03X} ignored: {problem}"
-        case Unknown(message):
-            return f"unknown message {message.command:04X} from {message.can_id:03X} ignored"
-        case BootVersion(name, version):
-            return f"{event.value}: {printable(name)} {printable(version)}"
-        case _:
-            return f"{event.value}: {row}"
