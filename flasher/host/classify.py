@@ -190,7 +190,9 @@ class Classifier:
 
     def _boot_version(self, boot: BootVersion, at: Situation, now: float) -> Event:
         if at.state in _AFTER_END:
-            return self._boot_after_end(at, now)
+            # A device that announces itself before it can have heard of the end has restarted.
+            heard_of_end = at.end_copies_left or at.tx.begun
+            return self._boot_after_end(at, now) if heard_of_end else self._restarted(at)
         if at.state in _IN_TRANSFER:
             if now - at.request_at <= self._timings.leftover_boot_version_s:
                 return Event.BOOT_LEFTOVER

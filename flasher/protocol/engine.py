@@ -83,6 +83,11 @@ class Transmitter:
         """True when nothing waits to be sent."""
         return not self._queue
 
+    @property
+    def begun(self) -> bool:
+        """True while a message is half sent."""
+        return self._sent_frames > 0
+
     def queue(
         self,
         frames: Sequence[Frame],

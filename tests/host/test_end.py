@@ -29,7 +29,7 @@ from flasher.protocol.messages import (
 )
 from flasher.protocol.spec import BMS, OBC, WMC, Target
 from flasher.protocol.text import encode_text
-from tests.host.bench import BOOT, Bench, image_of
+from tests.host.bench import BOOT, Bench, answer_frames, image_of
 
 NEW = "V2r0r1_20260102"
 
@@ -237,6 +237,32 @@ def test_a_target_without_version_query_that_restarts_is_unconfirmed() -> None:
         bench.wait(0.05)
     bench.wait(1.0)
     assert bench.outcome.ending is Ending.UNCONFIRMED
+    assert sum(isinstance(row, UpdateCommand) for _, row in bench.sent) == 1
+
+
+def test_a_boot_version_before_the_end_has_left_is_a_restart() -> None:
+    bench = Bench(200, options=UpgradeOptions(packet_gap_s=0.2))
+    bench.to_packet(2)
+    bench.say(Ack(2))
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
+    assert bench.seen(events.AttemptStarted)
+
+
+def test_a_boot_version_while_the_end_is_leaving_is_not_answered() -> None:
+    bench = Bench(200)
+    bench.to_packet(2)
+
+    def announce(frames: int) -> None:
+        if frames == before + 2:
+            for frame in answer_frames(BOOT):
+                bench.engine.receive(frame, bench.now)
+
+    before = bench._frames
+    bench.on_frame = announce
+    bench.say(Ack(2))
+    bench.expect(EndOfTransfer)
+    bench.wait(1.0)
     assert sum(isinstance(row, UpdateCommand) for _, row in bench.sent) == 1
 
 
