@@ -17,7 +17,7 @@ from flasher.bus.simulated import SimulatedBus
 from flasher.device.model import Device
 from flasher.device.profile import DeviceProfile
 from flasher.driver import Tap, drive
-from flasher.errors import UsageError
+from flasher.errors import BusError, UsageError
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft, Outcome
 from flasher.host.table import Ending
@@ -108,17 +108,24 @@ def upgrade(
 ) -> Outcome:
     """Run one upgrade to its end, good or bad; `cancelled` is asked while it runs.
 
-    Raises BusError when the adapter fails; every other end is an `Outcome`.
+    Raises BusError when the adapter fails, saying how far the upgrade had come and in what state
+    the device is left; every other end is an `Outcome`.
     """
     engine = Upgrade(plan, options)
-    drive(
-        engine,
-        connection.link,
-        connection.clock,
-        taps=taps,
-        on_event=on_event,
-        cancelled=cancelled,
-    )
+    try:
+        drive(
+            engine,
+            connection.link,
+            connection.clock,
+            taps=taps,
+            on_event=on_event,
+            cancelled=cancelled,
+        )
+    except BusError as error:
+        # The adapter does not know what it was used for.
+        error.where = f"{engine.standing}; {error.where}"
+        error.remedy = f"{error.remedy} State of the device: {engine.device_left.value}.".lstrip()
+        raise
     return engine.outcome
 
 

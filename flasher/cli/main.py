@@ -6,7 +6,9 @@ Only the chosen command's module is imported, so that `flasher --help` is quick.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
+import io
 import os
 import sys
 import traceback
@@ -51,13 +53,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if argv is None else list(argv)
     name = next((word for word in arguments if word in COMMANDS), None)
     try:
-        parser = _build_parser(name)
-        options = parser.parse_args(arguments)
+        options = _parse(_build_parser(name), arguments)
     except SystemExit as ended:
         return int(ended.code or 0)
-    if options.command is None:
-        parser.print_help()
-        return ExitCode.USAGE
     output = Output(verbosity=options.verbose - options.quiet, json_wanted=options.json)
     try:
         return _run(options, output)
@@ -65,6 +63,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         # The reader of our output went away (`| head`): nothing is left to say to it.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return ExitCode.OK
+
+
+def _parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
+    """Parse; raises SystemExit for --help and for wrong usage.
+
+    python-can's argument actions print what they read (filters, timing): stdout is the result's,
+    so only what goes with the exit (the help) is let through.
+    """
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(said):
+            options = parser.parse_args(arguments)
+            if options.command is None:
+                parser.print_help()
+                parser.exit(ExitCode.USAGE)
+    except SystemExit:
+        sys.stdout.write(said.getvalue())
+        raise
+    return options
 
 
 def _run(options: argparse.Namespace, output: Output) -> int:

@@ -56,6 +56,12 @@ class Statistics:
     """From request transfer to the ACK of the last packet, in the last attempt that got there."""
 
 
+def standing(phase: Phase, packet: int | None, total_packets: int, attempt: int) -> str:
+    """Where an upgrade stands, in words."""
+    of_packets = f", packet {packet} of {total_packets}" if packet else ""
+    return f"{phase.value}{of_packets}" + (f", attempt {attempt}" if attempt > 1 else "")
+
+
 @dataclass(frozen=True)
 class Outcome:
     """The typed result of an upgrade."""
@@ -83,9 +89,7 @@ class Outcome:
     @property
     def where(self) -> str:
         """Phase, packet and attempt in words."""
-        packet = f", packet {self.packet} of {self.total_packets}" if self.packet else ""
-        attempt = self.statistics.attempts
-        return f"{self.phase.value}{packet}" + (f", attempt {attempt}" if attempt > 1 else "")
+        return standing(self.phase, self.packet, self.total_packets, self.statistics.attempts)
 
     def error(self) -> FlasherError | None:
         """The error that stands for this outcome; None when it is a good one."""

@@ -16,7 +16,7 @@ from flasher.events import Phase
 from flasher.host.classify import Classifier, Situation
 from flasher.host.journal import Journal, Received
 from flasher.host.options import UpgradeOptions, default_timeout_s
-from flasher.host.outcome import DeviceLeft, Outcome
+from flasher.host.outcome import DeviceLeft, Outcome, standing
 from flasher.host.table import TABLE, Action, Ending, Event, State
 from flasher.image.plan import Plan
 from flasher.protocol.engine import Transmitter
@@ -45,6 +45,12 @@ _PHASES: Final = {
 }
 
 
+_SETTLED: Final = {
+    Ending.COMPLETED: DeviceLeft.NEW,
+    Ending.CONFIRMED_BY_VERSION: DeviceLeft.NEW,
+    Ending.REFUSED: DeviceLeft.NO_APPLICATION,
+}
+"""Endings that by themselves say what the device has."""
 _BEGINNINGS: Final = frozenset({Action.SEND_UPDATE, Action.START_OVER})
 
 
@@ -88,6 +94,24 @@ class Upgrade:
     def state(self) -> State:
         """The row of the table that is in force."""
         return self._at.state
+
+    @property
+    def device_left(self) -> DeviceLeft:
+        """The state that the device would be left in if nothing more were sent."""
+        if self._at.end_copies_left:
+            return DeviceLeft.UNKNOWN
+        if self._journal.erased:
+            return DeviceLeft.NO_APPLICATION
+        return DeviceLeft.PERHAPS_ERASED if self._at.update_left else DeviceLeft.UNTOUCHED
+
+    @property
+    def standing(self) -> str:
+        """Phase, packet and attempt in words."""
+        return standing(self._phase, self._packet, self._plan.total_packets, self._at.attempt)
+
+    @property
+    def _packet(self) -> int | None:
+        return self._at.number if self._phase is Phase.TRANSFER else None
 
     def receive(self, frame: Frame, now: float) -> None:
         """A CAN frame arrived."""
@@ -354,10 +378,10 @@ class Upgrade:
         self._outcome = Outcome(
             ending=ending,
             phase=self._phase,
-            device_left=self._device_left(ending),
+            device_left=_SETTLED.get(ending, self.device_left),
             target=self._plan.target,
             total_packets=self._plan.total_packets,
-            packet=at.number if self._phase is Phase.TRANSFER else None,
+            packet=self._packet,
             boot_version=printable(f"{at.boot.name} {at.boot.version}") if at.boot else None,
             running_version=at.running_version,
             statistics=self._journal.statistics(at.attempt, now - (self._began_at or 0.0)),
@@ -373,17 +397,6 @@ class Upgrade:
         if ending is Ending.PACKET_FAILED and self._at.nak_next_seen:
             return "it answers NAK n+1 to a repeated n; --nak-next-is-ack takes that for an ACK"
         return ""
-
-    def _device_left(self, ending: Ending) -> DeviceLeft:
-        if ending in {Ending.COMPLETED, Ending.CONFIRMED_BY_VERSION}:
-            return DeviceLeft.NEW
-        if ending is Ending.REFUSED:
-            return DeviceLeft.NO_APPLICATION
-        if self._at.end_copies_left:
-            return DeviceLeft.UNKNOWN
-        if self._journal.erased:
-            return DeviceLeft.NO_APPLICATION
-        return DeviceLeft.PERHAPS_ERASED if self._at.update_left else DeviceLeft.UNTOUCHED
 
     _ACTIONS: ClassVar[Mapping[Action, Callable[[Upgrade, float, Event, Received], None]]] = {
         Action.NOTHING: _nothing,

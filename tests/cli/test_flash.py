@@ -12,8 +12,10 @@ import can
 import pytest
 
 from flasher.api import connect_mock
+from flasher.bus.simulated import SimulatedLink
 from flasher.device.profile import DeviceProfile, set_option
-from flasher.errors import ExitCode
+from flasher.errors import BusError, ExitCode
+from flasher.protocol.frame import Frame
 from tests.cli.conftest import SAMPLES, Flasher
 
 BMS = SAMPLES / "bms.hex"
@@ -196,6 +198,35 @@ def test_a_silent_bus_is_exit_code_5_in_bounded_time(flasher: Flasher) -> None:
     assert run.code == ExitCode.NO_ANSWER
     assert time.monotonic() - began < 3.0
     assert "State of the device: nothing was erased" in run.err
+
+
+def test_an_adapter_that_fails_in_the_middle_says_how_far_it_came_and_what_is_left(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """BU-05."""
+    sent = 0
+
+    def send(_link: SimulatedLink, _frame: Frame) -> None:
+        nonlocal sent
+        sent += 1
+        if sent > 200:
+            raise BusError("The adapter failed while sending: unplugged.", where="socketcan can0")
+        real_send(_link, _frame)
+
+    real_send = SimulatedLink.send
+    monkeypatch.setattr(SimulatedLink, "send", send)
+    run = flasher("flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0")
+    assert run.code == ExitCode.BUS
+    assert "transferring, packet 11 of 613; socketcan can0" in run.err
+    assert "State of the device: its application is erased" in run.err
+
+
+def test_filters_do_not_disturb_the_json_on_stdout(flasher: Flasher) -> None:
+    run = flasher(
+        "flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0", "--json",
+        "--filter", "725:7FF", "720:7FF",
+    )  # fmt: skip
+    assert run.document["ok"] is True
 
 
 def test_a_bug_is_exit_code_1_and_says_so(
