@@ -18,13 +18,13 @@ from flasher.device.classify import Situation, Transfer, classify, is_damaged_pa
 from flasher.device.machine import Machine
 from flasher.device.memory import FlashController, Operation
 from flasher.device.profile import DeviceProfile
-from flasher.device.store import ApplicationStore, checksum_fits, factory_image, find_version
+from flasher.device.store import ApplicationStore, checksum_fits, factory_image
 from flasher.device.table import TABLE, Action, Event, Row, State
 from flasher.errors import FlasherError
 from flasher.events import DeviceStateEntered, ImageStored, PacketStored
 from flasher.protocol import messages
 from flasher.protocol.spec import BOOT_VERSION_BURST, PACKET_COUNT_MAX, VERSION_FIELD_SIZE, Target
-from flasher.protocol.text import encode_text
+from flasher.protocol.text import encode_text, find_firmware_version
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.protocol.wire import Damage
 
@@ -264,7 +264,7 @@ class Device(Machine):
 
     def _start(self, now: float) -> str:
         self._due = None
-        self._firmware = find_version(self.store.image() or b"") or NO_VERSION
+        self._firmware = find_firmware_version(self.store.image() or b"") or NO_VERSION
         return f"version {self._firmware}"
 
     # -- actions: update command and transfer -----------------------------------------------------

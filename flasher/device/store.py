@@ -7,7 +7,6 @@ a whole application or none: what boots is never a mixture.
 
 from __future__ import annotations
 
-import re
 import zlib
 from struct import Struct
 from typing import Final
@@ -21,14 +20,7 @@ AREA_START: Final = 0x0800_8000
 _RECORD: Final = Struct("<II8s")
 _MAGIC: Final = b"WHOLEAPP"
 _CHECKSUM: Final = Struct("<I")
-_VERSION: Final = re.compile(rb"V\d+r\d+r\d+_\d{8}")
 _FACTORY_IMAGE_BYTES: Final = 500
-
-
-def find_version(image: bytes) -> str | None:
-    """The first text of the form Vxrxrx_YYYYMMDD in an image; None when there is none."""
-    found = _VERSION.search(image)
-    return found.group().decode("ascii") if found else None
 
 
 def checksum_fits(image: bytes) -> bool:

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, Self
 
+from flasher.protocol.text import find_firmware_version
+
 ADDRESS_SPACE: Final = 1 << 32
 """One past the highest address that a file can name."""
-
-_VERSION: Final = re.compile(
-    rb"V[0-9]r[0-9]r[0-9]_[0-9]{4}(?:0[1-9]|1[0-2])(?:0[1-9]|[12][0-9]|3[01])"
-)
-"""`Vxrxrx_YYYYMMDD`, the naming rule of firmware versions (3.1, version information)."""
 
 
 @dataclass(frozen=True)
@@ -62,7 +58,7 @@ class Image:
             source=source,
             segments=(Span(base or 0, len(data)),),
             filled_bytes=0,
-            version=find_version(data),
+            version=find_firmware_version(data),
         )
 
     @property
@@ -73,13 +69,3 @@ class Image:
     def sha256(self) -> str:
         """SHA-256 of `data`, in hex digits."""
         return hashlib.sha256(self.data).hexdigest()
-
-
-def find_version(data: bytes) -> str | None:
-    """The firmware version text inside `data`; None when there is none or more than one different.
-
-    It is looked for without regard to its surroundings: in a packed structure there is no
-    separator before or behind it.
-    """
-    found = set(_VERSION.findall(data))
-    return found.pop().decode("ascii") if len(found) == 1 else None

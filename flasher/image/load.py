@@ -14,9 +14,10 @@ from flasher.errors import ImageError, UsageError
 from flasher.image import elf, hexfile, srec
 from flasher.image.cortexm import check_starts_inside
 from flasher.image.detect import HEAD_SIZE, Format, detect
-from flasher.image.image import ADDRESS_SPACE, Image, find_version
+from flasher.image.image import ADDRESS_SPACE, Image
 from flasher.image.segments import SparseBytes, too_large
 from flasher.protocol.spec import IMAGE_MAX_SIZE
+from flasher.protocol.text import find_firmware_version
 
 DEFAULT_FILL_GAPS_UP_TO: Final = 4096
 """In bytes. Covers the room between a vector table and the code; a larger gap is another part."""
@@ -164,5 +165,5 @@ def _joined(sparse: SparseBytes, form: Format, fill_gaps_up_to: int) -> Image:
         source=sparse.source,
         segments=sparse.spans(),
         filled_bytes=len(data) - sparse.size_bytes,
-        version=find_version(data),
+        version=find_firmware_version(data),
     )

@@ -6,7 +6,16 @@ shown as it is, with everything that could disturb a terminal or a page escaped.
 
 from __future__ import annotations
 
+import re
+from typing import Final
+
 from flasher.protocol.spec import TEXT_END, TEXT_FILLER
+
+_FIRMWARE_VERSION: Final = re.compile(
+    rb"V[0-9]{1,2}r[0-9]{1,2}r[0-9]{1,2}_[0-9]{4}(?:0[1-9]|1[0-2])(?:0[1-9]|[12][0-9]|3[01])"
+)
+"""`Vxrxrx_YYYYMMDD`, the naming rule of firmware versions (5.1, version information); a number of
+two digits is found too."""
 
 
 def encode_text(text: str, size_bytes: int) -> bytes:
@@ -38,3 +47,14 @@ def printable(text: str) -> str:
         char if char.isascii() and char.isprintable() else char.encode("unicode_escape").decode()
         for char in text
     )
+
+
+def find_firmware_version(data: bytes) -> str | None:
+    """The firmware version `Vxrxrx_YYYYMMDD` inside an image; None when there is none, or more
+    than one different.
+
+    It is looked for without regard to its surroundings: in a packed structure there is no
+    separator before or behind it.
+    """
+    found = set(_FIRMWARE_VERSION.findall(data))
+    return found.pop().decode("ascii") if len(found) == 1 else None

@@ -14,9 +14,10 @@ import pytest
 
 from flasher.errors import ExitCode, ImageError, UsageError
 from flasher.image import load as load_module
-from flasher.image.image import Image, Span, find_version
+from flasher.image.image import Image, Span
 from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, load
 from flasher.protocol.spec import IMAGE_MAX_SIZE
+from flasher.protocol.text import find_firmware_version
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
 BAD = SAMPLES / "bad"
@@ -362,6 +363,7 @@ def test_an_image_of_bytes_at_hand_is_as_one_from_a_file(tmp_path: Path) -> None
         (b"BMSV1r2r3_20240131.HW", "V1r2r3_20240131"),
         (b"V1r2r3_20240131..V1r2r3_20240131", "V1r2r3_20240131"),
         (b"V1r2r3_20240131 V1r2r4_20240131", None),
+        (b"V1r12r3_20240131", "V1r12r3_20240131"),
         (b"V1r2r3_20241331", None),
         (b"V1r2r3_20240100", None),
         (b"V1.2.3_20240131", None),
@@ -370,7 +372,7 @@ def test_an_image_of_bytes_at_hand_is_as_one_from_a_file(tmp_path: Path) -> None
     ],
 )
 def test_a_version_is_found_when_there_is_just_one(data: bytes, version: str | None) -> None:
-    assert find_version(data) == version
+    assert find_firmware_version(data) == version
 
 
 # -- what it costs --------------------------------------------------------------------------------
