@@ -110,7 +110,7 @@ class Ending(Enum):
     RESTARTED = "the device restarted too often"
     BROKEN_PROTOCOL = "the device completed before it was told that the transfer had ended"
     OUT_OF_TIME = "the overall deadline passed"
-    CANCELLED = "cancelled"
+    CANCELLED = "cancelled by the user"
 
 
 class Transition(NamedTuple):

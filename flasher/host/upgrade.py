@@ -51,6 +51,7 @@ _SETTLED: Final = {
     Ending.REFUSED: DeviceLeft.NO_APPLICATION,
 }
 """Endings that by themselves say what the device has."""
+_ACKNOWLEDGED: Final = frozenset({Event.PACKET_DONE, Event.LAST_PACKET_DONE})
 _BEGINNINGS: Final = frozenset({Action.SEND_UPDATE, Action.START_OVER})
 
 
@@ -200,6 +201,8 @@ class Upgrade:
         if isinstance(row, BootVersion) and action in _BEGINNINGS and self._at.boot is None:
             self._at.boot = row
             self._journal.boot_seen(row)
+        if event in _ACKNOWLEDGED:
+            self._journal.packet_done(self._at, self._plan.total_packets, now)
         if state is not self._at.state:
             self._enter(state, now)
         if isinstance(action, Ending):
@@ -299,7 +302,6 @@ class Upgrade:
         self._send_packet(now)
 
     def _send_next_packet(self, now: float, event: Event, row: Received) -> None:
-        self._journal.packet_done(self._at, self._plan.total_packets, now)
         self._at.next_packet(self._at.number + 1)
         self._send_packet(now)
 
@@ -323,7 +325,6 @@ class Upgrade:
             self._timer_at = max(now, self._tx.left_at) + self._timings.quiet_after_repeat_s
 
     def _send_end(self, now: float, event: Event, row: Received) -> None:
-        self._journal.packet_done(self._at, self._plan.total_packets, now)
         self._at.end_tries += 1
         self._send(EndOfTransfer(), not_before=self._after_packet_gap(now))
 

@@ -71,6 +71,8 @@ def test_the_phases_and_packets_are_reported_in_order() -> None:
         events.PacketAcknowledged(1, 2, 1),
         events.PacketAcknowledged(2, 2, 1),
     ]
+    last = bench.events.index(events.PacketAcknowledged(2, 2, 1))
+    assert bench.events[last + 1] == events.PhaseEntered(Phase.END, 1)
     assert bench.seen(events.BootVersionSeen) == [events.BootVersionSeen("BMS", "V1.2.3")]
 
 
