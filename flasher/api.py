@@ -156,15 +156,24 @@ def flash(
     return outcome
 
 
-def make_plan(image: Image, target: str | Target, dialect: str | Dialect = "welling") -> Plan:
-    """What an upgrade would send. Raises UsageError for a dialect that has no upgrade."""
+def make_plan(
+    image: Image,
+    target: str | Target,
+    dialect: str | Dialect = "welling",
+    *,
+    bitrate_bps: int | None = None,
+) -> Plan:
+    """What an upgrade would send; at the dialect's bit rate unless another one is given.
+
+    Raises UsageError for a dialect that has no upgrade.
+    """
     chosen = as_dialect(dialect)
     if not chosen.has_upgrade:
         raise UsageError(
             f"The {chosen.name.upper()} dialect has no upgrade: its document cancelled it.",
             remedy="Use --dialect welling if the device speaks it.",
         )
-    return plan(image, as_target(target), chosen.bitrate_bps)
+    return plan(image, as_target(target), bitrate_bps or chosen.bitrate_bps)
 
 
 def as_target(target: str | Target) -> Target:

@@ -53,7 +53,7 @@ def drive(
             engine.cancel(now)
         wanted = engine.deadline()
         if wanted is not None and now >= wanted:
-            _catch_up(engine, link, clock, taps)
+            _receive_on(link.receive(_AT_ONCE), engine, link, clock, taps)
             engine.tick(clock.now())
         _send_all(engine, link, clock, taps)
         for event in engine.take_events():
@@ -64,37 +64,23 @@ def drive(
         wanted = engine.deadline()
         latest = clock.now() + MAX_WAIT_S
         frame = link.receive(latest if wanted is None else min(wanted, latest))
-        if frame is not None:
-            _receive_on(frame, engine, link, clock, taps)
+        _receive_on(frame, engine, link, clock, taps)
 
 
 def _receive_on(
-    frame: Frame, engine: Engine, link: Link, clock: Clock, taps: Sequence[Tap]
+    frame: Frame | None, engine: Engine, link: Link, clock: Clock, taps: Sequence[Tap]
 ) -> None:
-    """Hand on a frame, and those that wait behind it until the engine has something to say."""
+    """Hand on a frame and all that wait behind it: what is sent next must not look like the cause
+    of what had come before.
+    """
     for _ in range(_CATCH_UP_FRAMES):
-        now = clock.now()
-        for tap in taps:
-            tap(frame, sent=False, now=now)
-        engine.receive(frame, now)
-        if engine.next_frame(now) is not None:
-            return
-        following = link.receive(_AT_ONCE)
-        if following is None:
-            return
-        frame = following
-
-
-def _catch_up(engine: Engine, link: Link, clock: Clock, taps: Sequence[Tap]) -> None:
-    """Receive what waits already, whatever the engine has to say to it."""
-    for _ in range(_CATCH_UP_FRAMES):
-        frame = link.receive(_AT_ONCE)
         if frame is None:
             return
         now = clock.now()
         for tap in taps:
             tap(frame, sent=False, now=now)
         engine.receive(frame, now)
+        frame = link.receive(_AT_ONCE)
 
 
 def _send_all(engine: Engine, link: Link, clock: Clock, taps: Sequence[Tap]) -> None:

@@ -7,6 +7,7 @@ default (a wrong one disturbs a live bus), a full transmit queue is waited for (
 
 from __future__ import annotations
 
+import configparser
 import contextlib
 import errno
 import re
@@ -18,13 +19,13 @@ from typing import Any, Final
 import can
 import can.util
 
+from flasher.bus.link import SEND_LIMIT_S
 from flasher.errors import BusError, TransmitBlockedError, UsageError
 from flasher.protocol.frame import Frame
 
-SEND_LIMIT_S: Final = 2.0
-"""How long a full transmit queue is waited for. Eighteen frames take 10 ms on a free bus."""
 _FULL_QUEUE_PAUSE_S: Final = 0.0005
 """Between two tries on a full queue: about one frame on the wire. Frames are received meanwhile."""
+_CHANNELS: Final = {"socketcan": "can0", "pcan": "PCAN_USBBUS1", "slcan": "COM3"}
 _DRAIN_FRAMES: Final = 100_000
 _FAILURES: Final = (can.CanError, OSError)
 
@@ -52,7 +53,7 @@ def open_adapter(default_bitrate_bps: int, **config: Any) -> CanLink:
         merged = dict(can.util.load_config(config=dict(config)))
     except can.CanInterfaceNotImplementedError as error:
         raise _no_interface(error) from error
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, configparser.Error) as error:
         raise UsageError(
             f"The adapter's configuration makes no sense: {error}.",
             remedy="Check the bus arguments, python-can's configuration file and CAN_* variables.",
@@ -66,7 +67,7 @@ def open_adapter(default_bitrate_bps: int, **config: Any) -> CanLink:
         raise BusError(
             f"The adapter cannot be opened: {_words(error)}.",
             where=f"interface {interface}, channel {merged.get('channel')}",
-            cause=_opening_cause(interface),
+            cause=_opening_cause(interface, error),
             remedy=_opening_remedy(
                 interface, merged.get("channel"), merged.get("bitrate", default_bitrate_bps)
             ),
@@ -149,6 +150,8 @@ class CanLink:
         try:
             message, filtered = self._receive_raw(timeout_s)
         except _FAILURES as error:
+            if _is_foreign_datagram(error):
+                return None
             raise self._failure("receiving", error) from error
         if message is None or message.is_fd:
             return None
@@ -192,6 +195,11 @@ class CanLink:
         )
 
 
+def _is_foreign_datagram(error: Exception) -> bool:
+    """Something else than a CAN frame on udp_multicast's port, which anybody may send to."""
+    return "could not unpack" in str(error)
+
+
 def _words(error: Exception) -> str:
     """What the back end said, without a full stop, or the kind of error when it said nothing."""
     return str(error).strip().rstrip(".") or type(error).__name__
@@ -210,13 +218,19 @@ def _no_interface(error: Exception) -> UsageError | BusError:
     return UsageError(f"{_words(error)}.", remedy=f"python-can knows: {known}.")
 
 
-def _opening_cause(interface: str) -> str:
+def _opening_cause(interface: str, error: Exception) -> str:
+    if getattr(error, "errno", None) == errno.EAFNOSUPPORT:
+        return "this system's kernel has no CAN"
     if interface == "socketcan":
         return "the interface does not exist or is down"
+    if isinstance(error, NameError | ImportError | AttributeError):
+        return "the driver library of this interface is not installed"
     return "the adapter is not plugged in, in use by another program, or its driver is missing"
 
 
 def _opening_remedy(interface: str, channel: object, bitrate_bps: object) -> str:
+    if channel is None:
+        return f"Name the channel, for example `-i {interface} -c {_CHANNELS.get(interface, 0)}`."
     if interface == "socketcan":
         return (
             f"`ip -details link show {channel}` shows its state; "

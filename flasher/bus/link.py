@@ -7,9 +7,12 @@ real adapter goes with `MonotonicClock`; a simulated bus makes the time itself.
 from __future__ import annotations
 
 import time
-from typing import Protocol
+from typing import Final, Protocol
 
 from flasher.protocol.frame import Frame
+
+SEND_LIMIT_S: Final = 2.0
+"""How long a link waits for room in a full transmit queue. A packet takes 10 ms on a free bus."""
 
 
 class Clock(Protocol):

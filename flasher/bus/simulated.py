@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable
 
-from flasher.bus.link import Clock
+from flasher.bus.link import SEND_LIMIT_S, Clock
+from flasher.errors import TransmitBlockedError
 from flasher.protocol.bittime import frame_bits
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
@@ -141,10 +142,17 @@ class SimulatedLink:
         self._queue_frames = queue_frames
 
     def send(self, frame: Frame) -> None:
-        """Queue a frame; while the queue is full, time passes."""
+        """Queue a frame; while the queue is full, time passes, up to `SEND_LIMIT_S`."""
+        clock = self._bus.clock
+        give_up_at = clock.now() + SEND_LIMIT_S
         while len(self._node.outbox) >= self._queue_frames:
-            self._bus.advance(self._bus.clock.now() + 1.0)
-        self._node.outbox.append((self._bus.clock.now(), frame))
+            if clock.now() >= give_up_at:
+                raise TransmitBlockedError(
+                    f"The simulated bus took no frame for {SEND_LIMIT_S:g} s.",
+                    cause="other traffic takes the whole bus",
+                )
+            self._bus.advance(give_up_at)
+        self._node.outbox.append((clock.now(), frame))
 
     def receive(self, deadline: float) -> Frame | None:
         """Let time pass until a frame arrives or the deadline comes."""

@@ -13,6 +13,8 @@ from flasher.image.image import Image
 from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, FORMATS, load
 from flasher.protocol.spec import DIALECTS, TARGET_ALIASES, TARGETS, WELLING, Target
 
+SLOWEST: Final = 0.1
+"""Of the mock's speeds. Waits are cut by simulated time: Ctrl-C takes longer the slower it is."""
 _NUMBER: Final = re.compile(r"(0[xX][0-9a-fA-F_]+|[0-9][0-9_]*)([kKmM]?)")
 _SUFFIXES: Final = {"": 1, "k": 1024, "m": 1024 * 1024}
 _BUS_KEYWORDS: Final = (
@@ -51,6 +53,14 @@ def seconds(text: str) -> float:
         if 0 <= value < float("inf"):
             return value
     raise argparse.ArgumentTypeError(f"{text!r} is no time in seconds")
+
+
+def speed(text: str) -> float:
+    """Times as fast as a real bus: 0, or a number that is not so small that nothing moves."""
+    value = seconds(text)
+    if value and value < SLOWEST:
+        raise argparse.ArgumentTypeError(f"must be 0, or {SLOWEST} and more")
+    return value
 
 
 def count(text: str) -> int:

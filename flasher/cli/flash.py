@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from typing import Any
 
 from flasher import api
@@ -19,6 +20,7 @@ from flasher.cli.plan_text import (
 )
 from flasher.cli.progress import Progress
 from flasher.cli.stop import stop_on_signal
+from flasher.driver import Tap
 from flasher.errors import ExitCode
 from flasher.host.options import DEFAULT_ATTEMPTS, UpgradeOptions
 from flasher.host.outcome import Outcome
@@ -50,10 +52,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     mock.add_argument("--mock", action="store_true", help="upgrade a device model in this process")
     mock.add_argument(
         "--mock-speed",
-        type=arguments.seconds,
+        type=arguments.speed,
         default=1.0,
         metavar="X",
-        help="times as fast as a real bus; 0 takes no time (default %(default)s)",
+        help="times as fast as a real bus, from 0.1 on; 0 takes no time (default %(default)s)",
     )
     arguments.add_bus(parser)
 
@@ -116,7 +118,9 @@ def _add_upgrade(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, output: Output) -> int:
     """Run the command; returns the exit code."""
     image = arguments.load_image(options)
-    plan = api.make_plan(image, options.target, options.dialect)
+    plan = api.make_plan(
+        image, options.target, options.dialect, bitrate_bps=getattr(options, "bitrate", None)
+    )
     show = output.result if options.dry_run else output.progress
     lines = [*image_lines(image), *vector_lines(vector_table(image)), *plan_lines(plan)]
     for line in lines:
@@ -140,12 +144,8 @@ def run(options: argparse.Namespace, output: Output) -> int:
 
 def _upgrade(options: argparse.Namespace, plan: Plan, output: Output) -> Outcome:
     with ExitStack() as stack:
-        taps = []
-        if options.trace_file:
-            from flasher.trace.recorder import Recorder  # noqa: PLC0415  loads python-can
-
-            taps.append(stack.enter_context(Recorder(options.trace_file)))
         connection = stack.enter_context(_connection(options))
+        taps = stack.enter_context(_recording(options.trace_file, output))
         output.progress(f"on {connection.name}")
         progress = stack.enter_context(Progress(plan, output))
         cancelled = stack.enter_context(
@@ -159,6 +159,20 @@ def _upgrade(options: argparse.Namespace, plan: Plan, output: Output) -> Outcome
             on_event=progress,
             cancelled=cancelled,
         )
+
+
+@contextmanager
+def _recording(path: str | None, output: Output) -> Iterator[list[Tap]]:
+    """The tap that records to a file, if one is named."""
+    if path is None:
+        yield []
+        return
+    from flasher.trace.recorder import Recorder  # noqa: PLC0415  loads python-can
+
+    with Recorder(path) as recorder:
+        yield [recorder]
+    if recorder.failure is not None:
+        output.error_line(f"warning: the trace {path} is incomplete: {recorder.failure}")
 
 
 def _connection(options: argparse.Namespace) -> AbstractContextManager[api.Connection]:

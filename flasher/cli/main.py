@@ -9,15 +9,15 @@ import argparse
 import contextlib
 import importlib
 import io
-import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Final, NoReturn
 
-from flasher.cli.output import Output
-from flasher.errors import ExitCode, FlasherError
+from flasher.cli.lists import gather_lists
+from flasher.cli.output import Output, open_missing_streams
+from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, UsageError
 
 COMMANDS: Final = {
     "flash": ("flash", "upgrade a device"),
@@ -42,27 +42,28 @@ exit codes:
 
 
 class _Parser(argparse.ArgumentParser):
-    """argparse with the one exit code for wrong usage, and a hint instead of a wall of text."""
+    """argparse that reports wrong usage as all other errors are reported."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(ExitCode.USAGE, f"{self.prog}: {message}\nTry `{self.prog} --help`.\n")
+        raise UsageError(f"{self.prog}: {message}.", remedy=f"Try `{self.prog} --help`.")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code."""
-    arguments = sys.argv[1:] if argv is None else list(argv)
-    name = next((word for word in arguments if word in COMMANDS), None)
+    arguments = gather_lists(sys.argv[1:] if argv is None else argv)
+    open_missing_streams()
+    output = Output(json_wanted="--json" in arguments)
     try:
-        options = _parse(_build_parser(name), arguments)
+        return _guarded(lambda: _parse_and_run(arguments, output), output)
     except SystemExit as ended:
         return int(ended.code or 0)
-    output = Output(verbosity=options.verbose - options.quiet, json_wanted=options.json)
-    try:
-        return _run(options, output)
-    except BrokenPipeError:
-        # The reader of our output went away (`| head`): nothing is left to say to it.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return ExitCode.OK
+
+
+def _parse_and_run(arguments: Sequence[str], output: Output) -> int:
+    name = next((word for word in arguments if word in COMMANDS), None)
+    options = _parse(_build_parser(name), arguments)
+    output.verbosity = options.verbose - options.quiet
+    return int(options.run(options, output))
 
 
 def _parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argparse.Namespace:
@@ -79,22 +80,28 @@ def _parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argpars
                 parser.print_help()
                 parser.exit(ExitCode.USAGE)
     except SystemExit:
-        sys.stdout.write(said.getvalue())
+        if said.getvalue():
+            Output().result(said.getvalue().rstrip())
         raise
     return options
 
 
-def _run(options: argparse.Namespace, output: Output) -> int:
+def _guarded(run: Callable[[], int], output: Output) -> int:
+    """Run, and turn whatever is raised into a message and its exit code."""
     try:
-        return int(options.run(options, output))
+        return run()
     except FlasherError as error:
         output.failure(error)
         return error.exit_code
     except KeyboardInterrupt:
-        output.error_line("Interrupted at once: the device may be left in the middle of a message.")
+        output.failure(
+            InterruptedByUserError(
+                "Interrupted at once.",
+                remedy="If an upgrade was under way, it ended in the middle of a message and the "
+                "state of the device is not known: run the same command again.",
+            )
+        )
         return ExitCode.INTERRUPTED
-    except BrokenPipeError:
-        raise
     except Exception as error:  # noqa: BLE001  the last line of defence
         output.failure(
             FlasherError(
@@ -115,16 +122,13 @@ def _build_parser(chosen: str | None) -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--version", action="version", version=f"flasher {_version()}")
-    _add_verbosity(parser, default=0)
+    _add_output(parser, verbosity=0, json_wanted=False)
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     for name, (module_name, summary) in COMMANDS.items():
         command = commands.add_parser(
             name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter
         )
-        _add_verbosity(command, default=argparse.SUPPRESS)
-        command.add_argument(
-            "--json", action="store_true", help="print one JSON document (or JSON lines) on stdout"
-        )
+        _add_output(command, verbosity=argparse.SUPPRESS, json_wanted=argparse.SUPPRESS)
         if name == chosen:
             module = importlib.import_module(f"flasher.cli.{module_name}")
             module.add_arguments(command)
@@ -132,11 +136,18 @@ def _build_parser(chosen: str | None) -> argparse.ArgumentParser:
     return parser
 
 
-def _add_verbosity(parser: argparse.ArgumentParser, default: object) -> None:
+def _add_output(parser: argparse.ArgumentParser, *, verbosity: object, json_wanted: object) -> None:
+    """What may stand before the command and behind it."""
     parser.add_argument(
-        "-v", "--verbose", action="count", default=default, help="say more; twice for everything"
+        "-v", "--verbose", action="count", default=verbosity, help="say more; twice for everything"
     )
-    parser.add_argument("-q", "--quiet", action="count", default=default, help="say less")
+    parser.add_argument("-q", "--quiet", action="count", default=verbosity, help="say less")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        default=json_wanted,
+        help="print one JSON document (or JSON lines) on stdout",
+    )
 
 
 def _version() -> str:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from flasher.device.model import Device
 from flasher.device.profile import DeviceProfile, describe_options, set_option
 from flasher.driver import drive
 from flasher.errors import ExitCode, UsageError
+from flasher.protocol.text import printable
 
 _EXAMPLES = """\
 examples:
@@ -59,6 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, output: Output) -> int:
     """Run the command; returns the exit code."""
     dialect = api.as_dialect(options.dialect)
+    _check_folder(options.save_image)
     device = Device(
         options.target,
         bitrate_bps=dialect.bitrate_bps,
@@ -70,6 +74,11 @@ def run(options: argparse.Namespace, output: Output) -> int:
         api.connect(dialect, **arguments.bus_config(options)) as connection,
         stop_on_signal() as stopped,
     ):
+        if not dialect.has_upgrade:
+            output.progress(
+                f"note: the {dialect.name.upper()} document has no upgrade; behind its RESET "
+                "stands Welling's bootloader here"
+            )
         output.progress(f"{options.target.node.name} on {connection.name}; Ctrl-C ends it")
         drive(
             device,
@@ -78,6 +87,7 @@ def run(options: argparse.Namespace, output: Output) -> int:
             on_event=watcher,
             cancelled=lambda: stopped() or watcher.images == options.upgrades,
         )
+    output.document({"ok": True, "exit_code": int(ExitCode.OK), "images": watcher.images})
     return ExitCode.OK
 
 
@@ -119,21 +129,51 @@ class _Watcher:
 
     def _say(self, kind: str, text: str, event: Any) -> None:
         self._output.result(f"{kind + ':':<9}{text}")
-        self._output.document({"event": type(event).__name__, "text": text})
+        fields = {
+            name: value.hex() if isinstance(value, bytes) else value
+            for name, value in dataclasses.asdict(event).items()
+        }
+        self._output.document({"event": type(event).__name__, **fields, "text": text})
 
     def _save(self) -> None:
         image = self._device.stored_image
         if self._save_to and image is not None:
             _write_file(Path(self._save_to), image)
-            self._output.result(f"saved:   {self._save_to}")
+            self._output.result(f"saved:   {printable(self._save_to)}")
+
+
+def _check_folder(save_to: str | None) -> None:
+    """Raises UsageError where no file can come to be: better now than after an upgrade."""
+    if save_to is None:
+        return
+    path = Path(save_to)
+    if path.is_dir():
+        raise _not_written(path, "it is a folder")
+    if not path.parent.is_dir():
+        raise _not_written(path, "its folder does not exist")
 
 
 def _write_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all. Raises UsageError when it cannot be written."""
+    """Write a file whole or not at all, where a link leads to. Raises UsageError when it cannot be
+    written. What is no regular file (a pipe, a device) is written into, not replaced.
+    """
+    path = path.resolve()
     part = path.with_name(f".{path.name}.part")
     try:
-        part.write_bytes(data)
-        part.replace(path)
+        if path.exists() and not path.is_file():
+            path.write_bytes(data)
+        else:
+            part.write_bytes(data)
+            part.replace(path)
     except OSError as error:
-        part.unlink(missing_ok=True)
-        raise UsageError(f"{path} cannot be written: {error.strerror}.") from error
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
+        raise _not_written(path, error.strerror or type(error).__name__) from error
+
+
+def _not_written(path: Path, reason: str) -> UsageError:
+    return UsageError(
+        f"{printable(str(path))} cannot be written: {reason}.",
+        where="--save-image",
+        remedy="Name a file in a folder that exists and has room.",
+    )

@@ -1,17 +1,21 @@
 """Where everything that flasher says goes: results to stdout, the rest to stderr, or JSON.
 
-Device text reaches this place escaped (flasher.protocol.text); paths and images are escaped here.
+Device text and file names reach this place escaped (flasher.protocol.text). A reader that goes away
+(`| head`) or a terminal that does changes nothing about a running upgrade: what cannot be said is
+left out, and the exit code tells.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, TextIO
 
-from flasher.errors import FlasherError
+from flasher.errors import FlasherError, UsageError
 
 
 class Output:
@@ -35,12 +39,12 @@ class Output:
     def result(self, text: str) -> None:
         """A line of the result; silent when JSON is wanted."""
         if not self.json_wanted:
-            print(text, flush=True)
+            _print_stdout(text)
 
     def document(self, document: Mapping[str, Any]) -> None:
         """The one JSON document of a command, or one line of a stream of them."""
         if self.json_wanted:
-            print(json.dumps(document), flush=True)
+            _print_stdout(json.dumps(document))
 
     def progress(self, text: str, *, level: int = 0) -> None:
         """A line on how it goes."""
@@ -71,8 +75,45 @@ class Output:
         )
 
 
+def open_missing_streams() -> None:
+    """Give a process without stdout or stderr (a service, pythonw) somewhere to write to: print()
+    would else take one for the other.
+    """
+    if sys.stdout is None:
+        sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
+
+
 def _plain_stderr(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except OSError:
+        _give_up(sys.stderr)
+
+
+def _print_stdout(text: str) -> None:
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        _give_up(sys.stdout)
+    except OSError as error:
+        _give_up(sys.stdout)
+        raise UsageError(
+            f"Standard output cannot be written: {error.strerror}.",
+            cause="the disk that it is redirected to is full",
+            remedy="Redirect it elsewhere. What was done before this message stays done.",
+        ) from error
+
+
+def _give_up(stream: TextIO) -> None:
+    """Write to nowhere from now on: what waits in the buffer would fail again at the exit, and
+    take the exit code with it.
+    """
+    with contextlib.suppress(OSError):
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, stream.fileno())
+        os.close(nowhere)
 
 
 def counted(count: int, noun: str) -> str:

@@ -8,6 +8,7 @@ from flasher.cli.output import byte_count, counted, duration
 from flasher.image.cortexm import VectorTable
 from flasher.image.image import Image
 from flasher.image.plan import Plan
+from flasher.protocol.spec import DIALECTS
 from flasher.protocol.text import printable
 
 
@@ -43,9 +44,11 @@ def plan_lines(plan: Plan) -> list[str]:
     """What would be sent to whom, and how long it takes on the bus."""
     target = plan.target
     ids = f"CAN ids 0x{target.request_id:03X}, 0x{target.answer_id:03X}"
+    document_bps = {dialect.bitrate_bps for dialect in DIALECTS.values() if dialect.has_upgrade}
+    foreign = "" if plan.bitrate_bps in document_bps else " (not the document's bit rate)"
     sent = f"{counted(plan.total_packets, 'packet')}, {counted(plan.frames, 'frame')}"
     return [
-        f"  to:      {target.node.name} ({ids}) at {plan.bitrate_bps / 1000:g} kbit/s",
+        f"  to:      {target.node.name} ({ids}) at {plan.bitrate_bps / 1000:g} kbit/s{foreign}",
         f"  plan:    {sent}, {byte_count(plan.bytes_on_wire)} of frame data",
         f"  time:    {duration(plan.wire_s)} on the wire, erasing and the device's own time extra",
     ]

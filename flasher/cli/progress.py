@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from types import TracebackType
 from typing import Any, Self
@@ -34,7 +35,14 @@ class Progress:
         self._close_bar()
 
     def __call__(self, event: object) -> None:
-        """Show one event."""
+        """Show one event. A terminal that is gone does not end the upgrade."""
+        try:
+            self._show(event)
+        except OSError:
+            self._wants_bar = False
+            self._forget_bar()
+
+    def _show(self, event: object) -> None:
         output = self._output
         match event:
             case events.PacketAcknowledged(number, total, _):
@@ -86,6 +94,10 @@ class Progress:
 
     def _close_bar(self) -> None:
         if self._bar is not None:
-            self._bar.close()
-            self._bar = None
-            self._output.restore_stderr()
+            with contextlib.suppress(OSError):
+                self._bar.close()
+            self._forget_bar()
+
+    def _forget_bar(self) -> None:
+        self._bar = None
+        self._output.restore_stderr()

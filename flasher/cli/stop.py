@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: the first one asks for a clean end, a second Ctrl-C ends at once."""
+"""Ctrl-C and SIGTERM: the first one asks for a clean end, a second one ends at once."""
 
 from __future__ import annotations
 
@@ -10,20 +10,30 @@ from types import FrameType
 
 @contextmanager
 def stop_on_signal(on_first: Callable[[], None] | None = None) -> Iterator[Callable[[], bool]]:
-    """Gives a function that tells whether the user wants to stop; `on_first` may say so."""
-    asked = False
+    """Gives a function that tells whether the user wants to stop; the first time that it says so,
+    it calls `on_first`.
+    """
+    asked = told = False
 
     def handle(_number: int, _frame: FrameType | None) -> None:
         nonlocal asked
         if asked:
             raise KeyboardInterrupt
         asked = True
-        if on_first is not None:
-            on_first()
+
+    def stopped() -> bool:
+        # Not in the handler, which may have come in the middle of a print: printing there fails.
+        nonlocal told
+        if asked and not told:
+            told = True
+            if on_first is not None:
+                on_first()
+        return asked
 
     before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield lambda: asked
+        yield stopped
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
+            # None: it was not set from Python, which cannot set it again.
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -64,9 +64,9 @@ class Situation:
     end_tries: int = 0
     end_copies_left: int = 0
     end_naks: int = 0
-    burst_count: int = 0
-    """Boot versions since end of transfer, in one burst."""
-    burst_last_at: float = 0.0
+    announced_at: float | None = None
+    """When the first of the boot versions came that follow each other since end of transfer."""
+    announced_last_at: float = 0.0
     running_version: str | None = None
 
     @property
@@ -135,8 +135,7 @@ class Classifier:
             case State.AWAITING_REQUEST:
                 return Event.REQUEST_MISSING
             case State.TRANSFERRING:
-                exhausted = at.tries >= timings.packet_tries
-                return Event.PACKET_LOST if exhausted else Event.PACKET_UNANSWERED
+                return Event.PACKET_LOST if self._last_try(at) else Event.PACKET_UNANSWERED
             case State.SETTLING:
                 return self._settled(at)
             case State.ENDING:
@@ -174,8 +173,7 @@ class Classifier:
     def _settled(self, at: Situation) -> Event:
         """Every copy of the packet is answered, or will not be any more."""
         if not at.accepted:
-            exhausted = at.tries >= self._timings.packet_tries
-            return Event.PACKET_LOST if exhausted else Event.PACKET_REFUSED
+            return Event.PACKET_LOST if self._last_try(at) else Event.PACKET_REFUSED
         last = at.number == self._plan.total_packets
         return Event.LAST_PACKET_DONE if last else Event.PACKET_DONE
 
@@ -216,12 +214,15 @@ class Classifier:
         return Event.BOOT_VERSION
 
     def _boot_after_end(self, at: Situation, now: float) -> Event:
-        """A burst is the new application starting; beyond a burst, the device did not accept."""
-        if now - at.burst_last_at > self._burst_gap_s:
-            at.burst_count = 0
-        at.burst_count += 1
-        at.burst_last_at = now
-        return self._restarted(at) if at.burst_count > BOOT_VERSION_BURST else Event.BOOT_AFTER_END
+        """A burst is the new application starting; a device that announces on did not accept.
+
+        Judged by time, not by count: a doubled frame must not erase a good image.
+        """
+        if at.announced_at is None or now - at.announced_last_at > self._burst_gap_s:
+            at.announced_at = now
+        at.announced_last_at = now
+        goes_on = now - at.announced_at >= self._timings.announcing_on_s
+        return self._restarted(at) if goes_on else Event.BOOT_AFTER_END
 
     def _is_foreign(self, boot: BootVersion) -> bool:
         if self._options.allow_boot_name:
@@ -229,23 +230,27 @@ class Classifier:
         return boot.name != self._plan.target.boot_name or not boot.is_version
 
     def _restarted(self, at: Situation) -> Event:
-        exhausted = at.attempt >= self._options.attempts
-        return Event.RESTARTS_EXHAUSTED if exhausted else Event.BOOT_RESTARTED
+        return Event.RESTARTS_EXHAUSTED if self._last_attempt(at) else Event.BOOT_RESTARTED
+
+    def _last_attempt(self, at: Situation) -> bool:
+        return at.attempt >= self._options.attempts
+
+    def _last_try(self, at: Situation) -> bool:
+        return at.tries >= self._timings.packet_tries
 
     # -- the other messages -----------------------------------------------------------------------
 
     def _request(self, at: Situation) -> Event:
         if at.state is State.AWAITING_REQUEST:
-            return Event.REQUEST
+            # Before the update command has left it answers another one: a late copy.
+            return Event.UNEXPECTED if at.first_update_left_at is None else Event.REQUEST
         if at.state not in _IN_TRANSFER:
             return Event.UNEXPECTED
         if at.number > 1 or at.accepted:
-            exhausted = at.attempt >= self._options.attempts
-            return Event.RESTARTS_EXHAUSTED if exhausted else Event.REQUEST_LATE
+            return Event.RESTARTS_EXHAUSTED if self._last_attempt(at) else Event.REQUEST_LATE
         if not at.tx.idle:
             return Event.COPY_OUTSTANDING
-        exhausted = at.tries >= self._timings.packet_tries
-        return Event.PACKET_LOST if exhausted else Event.REQUEST_AGAIN
+        return Event.PACKET_LOST if self._last_try(at) else Event.REQUEST_AGAIN
 
     def _complete(self, at: Situation) -> Event:
         if at.state in _AFTER_END and at.end_copies_left:
@@ -262,8 +267,9 @@ class Classifier:
         return Event.VERSION_RIGHT if at.running_version == expected else Event.VERSION_OTHER
 
     def _end_timer(self, at: Situation) -> Event:
-        if not at.burst_count and at.end_tries < self._timings.end_tries:
+        announced = at.announced_at is not None
+        if not announced and at.end_tries < self._timings.end_tries:
             return Event.END_UNANSWERED
         if not self._plan.target.has_version_query:
             return Event.END_UNCONFIRMABLE
-        return Event.BURST_ENDED if at.burst_count else Event.END_LOST
+        return Event.BURST_ENDED if announced else Event.END_LOST

@@ -9,8 +9,6 @@ from flasher.image.plan import Plan
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 
 DEFAULT_ATTEMPTS: Final = 3
-_PACKET_ALLOWANCE_S: Final = 0.1
-"""Time for storing one packet in the default deadline: ten times what a flash row takes."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +31,13 @@ class UpgradeOptions:
 
 
 def default_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
-    """The overall deadline for a plan: every attempt with every wait at its limit, but packets
-    answered within `_PACKET_ALLOWANCE_S` of their time on the wire.
+    """The overall deadline for a plan: every attempt with every wait at its limit, so that it cuts
+    off no device that answers in time, only one that needs repetition after repetition.
     """
     timings = options.timings
     gaps_s = options.packet_gap_s * plan.total_packets + options.frame_gap_s * plan.frames
+    answers_s = timings.ack_timeout_s * plan.total_packets
     begin_s = timings.boot_version_timeout_s + timings.request_transfer_timeout_s
-    transfer_s = plan.wire_s + gaps_s + _PACKET_ALLOWANCE_S * plan.total_packets
+    transfer_s = plan.wire_s + gaps_s + answers_s
     end_s = timings.complete_timeout_s * timings.end_tries + timings.application_start_timeout_s
     return options.attempts * (begin_s + transfer_s) + end_s

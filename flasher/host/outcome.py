@@ -96,7 +96,9 @@ class Outcome:
         if self.ok:
             return None
         kind, cause, remedy = (
-            _late(self.phase) if self.ending is Ending.OUT_OF_TIME else _EXPLANATIONS[self.ending]
+            _late(self.phase, self.device_left)
+            if self.ending is Ending.OUT_OF_TIME
+            else _EXPLANATIONS[self.ending]
         )
         what = f"{self.target.node.name}: {self.ending.value}"
         if self.detail:
@@ -183,13 +185,16 @@ _EXPLANATIONS: Final = {
 }
 
 
-def _late(phase: Phase) -> _Explanation:
+def _late(phase: Phase, left: DeviceLeft) -> _Explanation:
     """The explanation of a passed deadline, by what had been reached."""
     remedy = f"Allow more time with --timeout, or find what is slow. {_AGAIN}"
     match phase:
         case Phase.RESET | Phase.BOOT | Phase.UPDATE:
             cause = "the device is not there, or not ready in the time allowed"
             return _Explanation(NoAnswerError, cause, remedy)
+        case Phase.END if left is not DeviceLeft.UNKNOWN:
+            cause = "no time was left to tell the device that the transfer had ended"
+            return _Explanation(TransferError, cause, remedy)
         case Phase.TRANSFER:
             cause = "the device answers late again and again, or the bus is congested"
             return _Explanation(TransferError, cause, remedy)

@@ -49,6 +49,7 @@ _SETTLED: Final = {
     Ending.COMPLETED: DeviceLeft.NEW,
     Ending.CONFIRMED_BY_VERSION: DeviceLeft.NEW,
     Ending.REFUSED: DeviceLeft.NO_APPLICATION,
+    Ending.RESTARTED: DeviceLeft.NO_APPLICATION,
 }
 """Endings that by themselves say what the device has."""
 _ACKNOWLEDGED: Final = frozenset({Event.PACKET_DONE, Event.LAST_PACKET_DONE})
@@ -257,7 +258,7 @@ class Upgrade:
                 return timings.ack_timeout_s
             case Command.PACKET, State.SETTLING:
                 return timings.quiet_after_repeat_s
-            case Command.END_OF_TRANSFER, State.ENDING if not self._at.burst_count:
+            case Command.END_OF_TRANSFER, State.ENDING if self._at.announced_at is None:
                 return timings.complete_timeout_s
             case _:
                 return None

@@ -40,6 +40,10 @@ class Timings:
     """An update command follows the one before not sooner than this (R2)."""
     leftover_boot_version_s: float = 0.06
     """A boot version up to this long after request transfer is a leftover of the burst (R11)."""
+    announcing_on_s: float = 1.0
+    """Announcements that still come this long after the first one since end of transfer are those
+    of a device that did not accept (R11): five times as long as a burst takes, so that a doubled
+    announcement, or a second pass through the bootloader, erases no good image."""
     quiet_after_repeat_s: float = 0.05
     """After a repetition the next message waits for this much silence (R10)."""
     application_start_timeout_s: float = 5.0

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
+from pathlib import Path
 from types import TracebackType
 from typing import Self
 
 import can
 
-from flasher.errors import BusError, UsageError
+from flasher.errors import UsageError
 from flasher.protocol.frame import Frame
 
 
@@ -20,11 +20,16 @@ class Recorder:
     Times in the file are wall-clock times, counted from the start by the driver's clock, so that a
     jump of the wall clock leaves no gap. Use as a context manager: formats like .blf are complete
     only when closed. Raises UsageError for a suffix that python-can does not know or a file that
-    cannot be written.
+    cannot be written. A disk that fills up later ends the recording and nothing else: `failure`
+    then says why.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self._path = os.fspath(path)
+        self.failure: str | None = None
+        """Why the recording ended early; None while it is complete."""
+        if not Path(self._path).absolute().parent.is_dir():
+            raise UsageError(f"{self._path} cannot be written: its folder does not exist.")
         try:
             self._writer = can.Logger(self._path)
         except ValueError as error:
@@ -32,12 +37,20 @@ class Recorder:
                 f"{self._path}: no trace format has this suffix.",
                 remedy="Use one of .asc .blf .csv .db .log .mf4 .trc .txt.",
             ) from error
+        except (ImportError, NotImplementedError) as error:
+            raise UsageError(
+                f"{self._path}: this trace format needs a package that is not installed.",
+                cause=str(error),
+                remedy="Install it, or use .asc, .blf or .log.",
+            ) from error
         except OSError as error:
             raise UsageError(f"{self._path} cannot be written: {error.strerror}.") from error
         self._wall_offset_s: float | None = None
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """Record one frame. Raises BusError when the file cannot take it (disk full)."""
+        """Record one frame."""
+        if self.failure is not None:
+            return
         if self._wall_offset_s is None:
             self._wall_offset_s = time.time() - now
         message = can.Message(
@@ -53,9 +66,7 @@ class Recorder:
         try:
             self._writer(message)
         except OSError as error:
-            raise BusError(
-                f"The trace cannot be written: {error.strerror}.", where=self._path
-            ) from error
+            self.failure = error.strerror or type(error).__name__
 
     def __enter__(self) -> Self:
         return self
@@ -66,5 +77,10 @@ class Recorder:
         error: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        with contextlib.suppress(OSError):
+        # ValueError: some formats touch their file once more when they are closed again.
+        try:
             self._writer.stop()
+        except OSError as problem:
+            self.failure = self.failure or problem.strerror or type(problem).__name__
+        except ValueError:
+            return

@@ -59,6 +59,7 @@ class Recorder:
         self.cancelled_at: float | None = None
         self.events: list[object] = []
         self.on_tick: Callable[[float], None] | None = None
+        self.on_receive: Callable[[], None] | None = None
 
     @property
     def done(self) -> bool:
@@ -66,6 +67,8 @@ class Recorder:
 
     def receive(self, frame: Frame, now: float) -> None:
         self.calls.append((f"receive {frame.can_id:03X}", now))
+        if self.on_receive is not None:
+            self.on_receive()
 
     def tick(self, now: float) -> None:
         self.calls.append(("tick", now))
@@ -126,6 +129,22 @@ def test_everything_that_waits_is_received_before_a_due_tick(
         "receive 721",
         "receive 722",
         "tick",
+    ]
+
+
+def test_what_waits_is_received_before_anything_is_sent(
+    clock: VirtualClock, link: FakeLink
+) -> None:
+    """EN-05: what had come before must not look like the answer to what is sent next."""
+    engine = Recorder(ticks=2)
+    link.arrivals.extend([(0.5, Frame(0x725, b"1")), (0.5, Frame(0x726, b"2"))])
+    engine.on_receive = lambda: engine.outbox.append(Frame(0x752, b"answer"))
+    drive(engine, link, clock)
+    assert [what for what, _ in engine.calls[:4]] == [
+        "receive 725",
+        "receive 726",
+        "sent 752",
+        "sent 752",
     ]
 
 

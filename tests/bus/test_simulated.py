@@ -7,8 +7,9 @@ from collections import deque
 
 import pytest
 
-from flasher.bus.link import MonotonicClock, PacedClock, VirtualClock
+from flasher.bus.link import SEND_LIMIT_S, MonotonicClock, PacedClock, VirtualClock
 from flasher.bus.simulated import SimulatedBus
+from flasher.errors import TransmitBlockedError
 from flasher.protocol.bittime import frame_bits
 from flasher.protocol.frame import Frame
 
@@ -51,6 +52,16 @@ class Talker:
     def take_events(self) -> list[object]:
         taken, self.reports = self.reports, []
         return taken
+
+
+class Babbler(Talker):
+    """Never lets anybody else speak."""
+
+    def next_frame(self, now: float) -> Frame | None:
+        return Frame(0x000, bytes(8))
+
+    def frame_sent(self, now: float) -> None:
+        pass
 
 
 def seconds(*frames: Frame) -> float:
@@ -127,6 +138,17 @@ def test_a_full_transmit_queue_makes_the_sender_wait_and_loses_nothing() -> None
     assert clock.now() == pytest.approx(seconds(*frames[:7]))
     link.receive(1.0)
     assert [frame for _, frame in listener.heard] == frames
+
+
+def test_a_bus_without_room_ends_the_wait_in_bounded_time() -> None:
+    clock = VirtualClock()
+    bus = SimulatedBus(BITRATE, clock)
+    bus.attach(Babbler())
+    link = bus.link(queue_frames=1)
+    link.send(Frame(0x752, b"x"))
+    with pytest.raises(TransmitBlockedError, match="took no frame"):
+        link.send(Frame(0x752, b"y"))
+    assert clock.now() < SEND_LIMIT_S + 0.1
 
 
 def test_a_device_is_ticked_when_it_wants_to_be() -> None:

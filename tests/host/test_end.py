@@ -46,6 +46,15 @@ def runs(version: str) -> VersionInformation:
     return VersionInformation(field, field, field, encode_text(version, 16))
 
 
+def announce_on(bench: Bench) -> None:
+    """Far beyond a burst: the device did not accept."""
+    for _ in range(25):
+        bench.say(BOOT)
+        bench.wait(0.05)
+        if bench.engine.done or isinstance(bench.sent[-1][1], UpdateCommand):
+            return
+
+
 def answer_version(bench: Bench, version: str) -> None:
     bench.say(runs(version), can_id=BMS.broadcast_id)
 
@@ -269,9 +278,7 @@ def test_a_boot_version_while_the_end_is_leaving_is_not_answered() -> None:
 def test_announcements_beyond_a_burst_are_a_device_that_did_not_accept() -> None:
     bench = versioned()
     bench.to_end()
-    for _ in range(5):
-        bench.say(BOOT)
-        bench.wait(0.05)
+    announce_on(bench)
     bench.expect(UpdateCommand)
     assert bench.seen(events.AttemptStarted)
     bench.say(RequestTransfer())
@@ -285,10 +292,35 @@ def test_announcements_beyond_a_burst_while_the_version_is_asked_start_over() ->
     bench = versioned()
     bench.to_end()
     bench.wait(31.0)
-    for _ in range(5):
-        bench.say(BOOT)
-        bench.wait(0.05)
+    announce_on(bench)
     assert isinstance(bench.unread[-1], UpdateCommand)
+
+
+@pytest.mark.parametrize("times", [(0.0, 0.05, 0.05, 0.1, 0.15), (0.0, 0.05, 0.1, 0.15, 0.2, 0.25)])
+def test_a_doubled_or_a_fifth_announcement_does_not_erase_a_good_image(
+    times: tuple[float, ...],
+) -> None:
+    bench = versioned()
+    bench.to_end()
+    began = bench.now
+    for at in times:
+        bench.wait(began + at - bench.now)
+        bench.say(BOOT)
+    bench.wait(0.5)
+    answer_version(bench, NEW)
+    assert bench.outcome.ending is Ending.CONFIRMED_BY_VERSION
+    assert sum(isinstance(row, UpdateCommand) for _, row in bench.sent) == 1
+
+
+def test_two_passes_through_the_bootloader_do_not_erase_a_good_image() -> None:
+    bench = versioned()
+    bench.to_end()
+    for _ in range(2):
+        for _ in range(4):
+            bench.say(BOOT)
+            bench.wait(0.05)
+        bench.wait(0.1)
+    assert sum(isinstance(row, UpdateCommand) for _, row in bench.sent) == 1
 
 
 def test_bursts_that_stop_in_between_are_not_counted_together() -> None:
@@ -305,11 +337,10 @@ def test_bursts_that_stop_in_between_are_not_counted_together() -> None:
 def test_a_device_that_never_accepts_ends_when_the_attempts_are_used_up() -> None:
     bench = versioned(options=UpgradeOptions(attempts=1))
     bench.to_end()
-    for _ in range(5):
-        bench.say(BOOT)
-        bench.wait(0.05)
+    announce_on(bench)
     outcome = bench.outcome
     assert outcome.ending is Ending.RESTARTED
+    assert outcome.device_left is DeviceLeft.NO_APPLICATION
     error = outcome.error()
     assert error is not None
     assert error.exit_code == ExitCode.TRANSFER

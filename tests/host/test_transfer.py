@@ -347,6 +347,21 @@ def test_request_transfer_in_the_middle_starts_over_and_is_reported() -> None:
     assert bench.expect(Packet).number == 1
 
 
+def test_a_doubled_late_request_is_not_taken_for_the_answer_to_the_update_command() -> None:
+    """The device may be erasing for long after the update command."""
+    bench = Bench()
+    bench.to_packet(3)
+    late = [*answer_frames(RequestTransfer()), *answer_frames(RequestTransfer())]
+    for frame in late:
+        bench.engine.receive(frame, bench.now)
+    bench.say()
+    bench.expect(UpdateCommand)
+    bench.wait(5.0)
+    assert bench.unread == []
+    bench.say(RequestTransfer())
+    assert bench.expect(Packet).number == 1
+
+
 def test_request_transfer_while_packet_1_settles_waits_for_quiet() -> None:
     bench = Bench()
     bench.to_packet(1)
