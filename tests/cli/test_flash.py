@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import subprocess
 import sys
 import time
@@ -115,6 +116,45 @@ def test_the_trace_holds_every_frame_in_both_directions(
     assert len(ids) >= run.document["plan"]["frames"]
     times = [message.timestamp for message in messages]
     assert times == sorted(times)
+
+
+def test_a_trace_that_fills_its_disk_does_not_stop_the_upgrade(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Full:
+        def __call__(self, _message: can.Message) -> None:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+        def stop(self) -> None:
+            pass
+
+    monkeypatch.setattr("flasher.trace.recorder.can.Logger", lambda _path: Full())
+    run = flasher(
+        "flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0",
+        "--trace-file", tmp_path / "upgrade.asc",
+    )  # fmt: skip
+    assert run.code == ExitCode.OK
+    assert "completed:" in run.out
+    assert "warning: the trace" in run.err
+    assert "No space left" in run.err
+
+
+def test_another_bit_rate_is_planned_with_and_pointed_out(flasher: Flasher) -> None:
+    run = flasher("flash", BMS, "-t", "bms", "--dry-run", "-b", "500000")
+    assert "at 500 kbit/s (not the document's bit rate)" in run.out
+
+
+@pytest.mark.parametrize("words", [("flash", "--json"), ("--json", "flash", "--nonsense")])
+def test_wrong_usage_is_a_json_document_too(flasher: Flasher, words: tuple[str, ...]) -> None:
+    run = flasher(*words)
+    assert run.code == run.document["exit_code"] == ExitCode.USAGE
+    assert run.document["error"]["kind"] == "UsageError"
+
+
+@pytest.mark.parametrize("speed", ["0.01", "-1", "nan"])
+def test_a_mock_so_slow_that_nothing_moves_is_refused(flasher: Flasher, speed: str) -> None:
+    run = flasher("flash", BMS, "-t", "bms", "--mock", "--mock-speed", speed)
+    assert run.code == ExitCode.USAGE
 
 
 def test_a_trace_of_an_unknown_kind_is_wrong_usage(flasher: Flasher, tmp_path: Path) -> None:

@@ -1,0 +1,189 @@
+"""The entry point: help, version, and output that nobody reads any more."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import runpy
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+from typing import TextIO
+
+import pytest
+
+from flasher.cli.main import COMMANDS, main
+from flasher.cli.output import counted, duration
+from flasher.errors import ExitCode
+from tests.cli.conftest import SAMPLES, Flasher
+from tests.end_to_end.processes import FLASHER, clean_environment, lines_until
+
+OBC_BIN = str(SAMPLES / "obc.bin")
+MOCK = ("flash", OBC_BIN, "-t", "obc", "--mock", "--mock-speed", "0")
+DEV_FULL = Path("/dev/full")
+posix_pipes = pytest.mark.skipif(
+    sys.platform == "win32", reason="a broken pipe is another error on Windows"
+)
+needs_dev_full = pytest.mark.skipif(not DEV_FULL.exists(), reason="there is no /dev/full")
+
+
+# -- help and version -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", [None, *COMMANDS])
+def test_help_is_on_stdout_with_examples(flasher: Flasher, command: str | None) -> None:
+    run = flasher(*([command] if command else []), "--help")
+    assert run.code == ExitCode.OK
+    assert "usage: flasher" in run.out
+    assert "examples:" in run.out
+    assert run.err == ""
+
+
+def test_the_commands_are_told_to_who_names_none(flasher: Flasher) -> None:
+    run = flasher()
+    assert run.code == ExitCode.USAGE
+    assert all(name in run.out for name in COMMANDS)
+
+
+def test_the_version_is_the_distributions(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert flasher("--version").out.startswith("flasher ")
+
+    def missing(_name: str) -> str:
+        raise PackageNotFoundError
+
+    monkeypatch.setattr("flasher.cli.main.version", missing)
+    assert flasher("--version").out == "flasher (not installed)\n"
+
+
+def test_python_m_flasher_is_the_same_and_exits_with_the_code(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["flasher", "image-info", OBC_BIN])
+    with pytest.raises(SystemExit) as caught:
+        runpy.run_module("flasher", run_name="__main__")
+    assert caught.value.code == ExitCode.OK
+    assert "4,000 bytes to send" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.0, "0.00 s"), (119.994, "119.99 s"), (3725.0, "62 min 05 s")]
+)
+def test_long_times_are_told_in_minutes(seconds: float, text: str) -> None:
+    assert duration(seconds) == text
+
+
+def test_one_is_singular() -> None:
+    assert counted(1, "packet") == "1 packet"
+    assert counted(1200, "packet") == "1,200 packets"
+
+
+# -- output that nobody reads ---------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def broken_pipe() -> Iterator[TextIO]:
+    """A stream whose reader has gone."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    stream = os.fdopen(writer, "w")
+    try:
+        yield stream
+    finally:
+        with contextlib.suppress(OSError):
+            stream.close()
+
+
+@contextlib.contextmanager
+def full_disk() -> Iterator[TextIO]:
+    """A stream to a disk without room."""
+    stream = DEV_FULL.open("w")
+    try:
+        yield stream
+    finally:
+        with contextlib.suppress(OSError):
+            stream.close()
+
+
+Stream = Callable[[], contextlib.AbstractContextManager[TextIO]]
+
+
+@posix_pipes
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        (("--help",), ExitCode.OK),
+        (("image-info", OBC_BIN), ExitCode.OK),
+        (MOCK, ExitCode.OK),
+        ((*MOCK, "--json"), ExitCode.OK),
+        (("flash", str(SAMPLES / "bad" / "no_end.hex"), "-t", "obc", "--json"), ExitCode.IMAGE),
+    ],
+)
+def test_a_reader_that_goes_away_does_not_change_the_exit_code(
+    monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], code: ExitCode
+) -> None:
+    with broken_pipe() as stream:
+        monkeypatch.setattr("sys.stdout", stream)
+        assert main(words) == code
+
+
+@pytest.mark.parametrize(
+    "stream",
+    [
+        pytest.param(broken_pipe, marks=posix_pipes),
+        pytest.param(full_disk, marks=needs_dev_full),
+    ],
+)
+def test_progress_that_cannot_be_written_does_not_end_an_upgrade(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, stream: Stream
+) -> None:
+    with stream() as opened:
+        monkeypatch.setattr("sys.stderr", opened)
+        assert main(MOCK) == ExitCode.OK
+    assert "completed:" in capsys.readouterr().out
+
+
+@needs_dev_full
+@pytest.mark.parametrize("words", [MOCK, (*MOCK, "--json")])
+def test_a_result_that_cannot_be_written_is_an_error_of_its_own(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    with full_disk() as opened:
+        monkeypatch.setattr("sys.stdout", opened)
+        assert main(words) == ExitCode.USAGE
+    said = capsys.readouterr().err
+    assert said.count("error:") == 1
+    assert "Standard output cannot be written: No space left" in said
+
+
+@posix_pipes
+def test_a_pipe_that_breaks_in_the_transfer_leaves_upgrade_and_exit_code_alone(
+    tmp_path: Path,
+) -> None:
+    with subprocess.Popen(
+        [*FLASHER, *MOCK[:-1], "10"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env=clean_environment(),
+    ) as process:
+        assert process.stderr is not None
+        assert process.stdout is not None
+        lines_until(process.stderr, "transferring ...")
+        process.stderr.close()
+        assert "completed:" in process.stdout.read()
+    assert process.returncode == ExitCode.OK
+
+
+def test_an_error_without_a_place_or_remedy_is_one_line(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stderr", stream := io.StringIO())
+    run = flasher("flash", OBC_BIN, "-t", "obc", "--mock", "--trace-file", "no-folder/a.asc")
+    assert run.code == ExitCode.USAGE
+    assert stream.getvalue().splitlines()[-1].startswith("error: no-folder/a.asc cannot be written")

@@ -1,0 +1,397 @@
+"""`flasher mock` in this process: a host in another thread talks to it over a virtual bus."""
+
+from __future__ import annotations
+
+import _thread
+import errno
+import json
+import threading
+import uuid
+from collections.abc import Callable, Iterator
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import can
+import pytest
+
+from flasher import api
+from flasher.cli import mock as mock_command
+from flasher.device.profile import describe_options
+from flasher.driver import drive
+from flasher.errors import ExitCode
+from flasher.host.outcome import Outcome
+from tests.cli.conftest import Flasher, Run
+
+IMAGE = bytes(range(256)) + b"and three bytes more than two packets"[:3]
+QUICK = (
+    "--set", "reset_delay_s=0.001", "--set", "erase_time_s=0", "--set", "program_time_s=0",
+    "--set", "start_delay_s=0",
+)  # fmt: skip
+
+
+class Host:
+    """What runs beside the mock; begins as soon as the mock listens."""
+
+    def __init__(self) -> None:
+        self.channel = uuid.uuid4().hex
+        self.failure: BaseException | None = None
+        self.outcomes: list[Outcome] = []
+        self.mock_runs = False
+        self._listens = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._does: Callable[[], object] = lambda: None
+
+    def do(self, does: Callable[[], object]) -> None:
+        """Do this in the thread."""
+        self._does = does
+        self._thread.start()
+
+    def mock_listens(self) -> None:
+        self.mock_runs = True
+        self._listens.set()
+
+    def join(self) -> None:
+        self._listens.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        self._listens.wait()
+        try:
+            self._does()
+        except BaseException as failure:  # noqa: BLE001  raised again in the test
+            self.failure = failure
+            if self.mock_runs:
+                self.interrupt()
+
+    # -- what it can do ---------------------------------------------------------------------------
+
+    def upgrade(self, image: bytes = IMAGE, target: str = "bms") -> Outcome:
+        """One upgrade from reset to the end."""
+        plan = api.make_plan(api.Image.from_bytes(image), target)
+        with api.connect(interface="virtual", channel=self.channel) as connection:
+            outcome = api.upgrade(plan, connection)
+        self.outcomes.append(outcome)
+        return outcome
+
+    def hear(self, question: bytes, can_id: int, wanted: bytes) -> bytes:
+        """Send the frames of a message, or listen only, until `wanted` was heard on `can_id`."""
+        heard = b""
+        with can.Bus(interface="virtual", channel=self.channel, ignore_config=True) as bus:
+            for start in range(0, len(question), 8):
+                data = question[start : start + 8]
+                bus.send(can.Message(arbitration_id=0x752, data=data, is_extended_id=False))
+            while wanted not in heard:
+                message = bus.recv(5.0)
+                assert message is not None, f"only heard {heard.hex(' ')}"
+                if message.arbitration_id == can_id:
+                    heard += bytes(message.data)
+        return heard
+
+    def interrupt(self) -> None:
+        """Ctrl-C for the mock, which runs in the main thread."""
+        _thread.interrupt_main()
+
+
+@pytest.fixture
+def host(monkeypatch: pytest.MonkeyPatch) -> Iterator[Host]:
+    beside = Host()
+
+    def drive_and_tell(*arguments: Any, **options: Any) -> None:
+        beside.mock_listens()
+        try:
+            drive(*arguments, **options)
+        finally:
+            beside.mock_runs = False
+
+    monkeypatch.setattr(mock_command, "drive", drive_and_tell)
+    # So that the mock sees sooner that it may end.
+    monkeypatch.setattr("flasher.driver.MAX_WAIT_S", 0.02)
+    yield beside
+    if beside._thread.ident is not None:
+        beside.join()
+    if beside.failure is not None:
+        raise beside.failure
+
+
+Serve = Callable[..., Run]
+
+
+@pytest.fixture
+def serve(flasher: Flasher, host: Host) -> Serve:
+    """Runs `flasher mock -t bms` on the host's channel until it ends."""
+
+    def run(*words: str | Path, target: str = "bms", options: tuple[str, ...] = ()) -> Run:
+        bus = ("-i", "virtual", "-c", host.channel)
+        return flasher(*options, "mock", "-t", target, *QUICK, *words, *bus)
+
+    return run
+
+
+# -- serving --------------------------------------------------------------------------------------
+
+
+def test_every_phase_of_an_upgrade_is_printed(serve: Serve, host: Host) -> None:
+    host.do(host.upgrade)
+    run = serve("--upgrades", "1")
+    assert run.code == ExitCode.OK
+    assert run.out.splitlines() == [
+        "state:   application: version V1r0r0_20220512",
+        "state:   restarting: reset",
+        "state:   announcing: whole application",
+        "state:   erasing: for 259 bytes in 3 packets",
+        "state:   transfer",
+        "packets: first of 3 stored",
+        "packets: all 3 stored",
+        "state:   checking: 259 bytes",
+        f"image:   259 bytes, sha256 {sha256(IMAGE).hexdigest()}",
+        "state:   starting: the new application",
+        "state:   application: version unknown",
+    ]
+    assert run.err == f"BMS on virtual {host.channel}; Ctrl-C ends it\n"
+    host.join()
+    assert host.outcomes[0].ending is api.Ending.COMPLETED
+
+
+@pytest.mark.parametrize("target", ["wmc", "bms", "obc"])
+def test_each_target_is_served(serve: Serve, host: Host, target: str) -> None:
+    host.do(lambda: host.upgrade(target=target))
+    run = serve("--upgrades", "1", target=target)
+    assert run.code == ExitCode.OK
+    host.join()
+    assert host.outcomes[0].ok
+
+
+def test_it_ends_after_n_upgrades(serve: Serve, host: Host, tmp_path: Path) -> None:
+    """EN-07: also to a smaller image."""
+    images = [IMAGE * 2, IMAGE, b"x"]
+
+    def upgrade_all() -> None:
+        for image in images:
+            host.upgrade(image)
+
+    host.do(upgrade_all)
+    run = serve("--upgrades", "3", "--save-image", tmp_path / "out.bin")
+    assert run.code == ExitCode.OK
+    assert run.out.count("image:") == 3
+    host.join()
+    assert [outcome.ending for outcome in host.outcomes] == [api.Ending.COMPLETED] * 3
+    assert (tmp_path / "out.bin").read_bytes() == b"x"
+
+
+def test_ctrl_c_ends_it_with_exit_code_0(serve: Serve, host: Host) -> None:
+    host.do(host.interrupt)
+    run = serve()
+    assert run.code == ExitCode.OK
+    assert "Ctrl-C ends it" in run.err
+
+
+def test_json_is_one_document_a_line_and_the_last_has_the_exit_code(
+    serve: Serve, host: Host, tmp_path: Path
+) -> None:
+    host.do(host.upgrade)
+    run = serve("--upgrades", "1", "--json", "--save-image", tmp_path / "out.bin")
+    *happened, last = [json.loads(line) for line in run.out.splitlines()]
+    assert last == {"ok": True, "exit_code": 0, "images": 1}
+    assert happened[0]["event"] == "DeviceStateEntered"
+    assert happened[0]["state"] == "application"
+    (stored,) = [document for document in happened if document["event"] == "ImageStored"]
+    assert stored["size_bytes"] == len(IMAGE)
+    assert stored["sha256"] == sha256(IMAGE).hexdigest()
+    assert all(document["text"] for document in happened)
+
+
+def test_quiet_says_what_happens_but_not_that_it_listens(serve: Serve, host: Host) -> None:
+    host.do(host.interrupt)
+    run = serve(options=("-q",))
+    assert run.err == ""
+    assert run.out.startswith("state:")
+
+
+def test_damage_and_refusals_are_told(serve: Serve, host: Host) -> None:
+    """A reset whose checksum is wrong, then an update command that has no place here."""
+
+    def disturb() -> None:
+        damaged = bytes.fromhex("55AA16074205 5245534554 00000000 F0")
+        with can.Bus(interface="virtual", channel=host.channel, ignore_config=True) as bus:
+            for start in range(0, len(damaged), 8):
+                data = damaged[start : start + 8]
+                bus.send(can.Message(arbitration_id=0x752, data=data, is_extended_id=False))
+        host.upgrade()
+
+    host.do(disturb)
+    run = serve("--upgrades", "1")
+    assert run.code == ExitCode.OK
+    (line,) = [line for line in run.out.splitlines() if line.startswith("damage:")]
+    assert line.startswith("damage:  0x752: ")
+    assert "55 aa 16 07" in line
+
+
+# -- --save-image ---------------------------------------------------------------------------------
+
+
+def test_the_saved_image_is_what_was_sent_byte_for_byte(
+    serve: Serve, host: Host, tmp_path: Path
+) -> None:
+    out = tmp_path / "out.bin"
+    out.write_bytes(b"an older and longer image" * 100)
+    host.do(host.upgrade)
+    run = serve("--upgrades", "1", "--save-image", out)
+    assert run.code == ExitCode.OK
+    assert f"saved:   {out}" in run.out
+    assert out.read_bytes() == IMAGE
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_a_folder_that_does_not_exist_is_refused_before_anything_is_served(
+    serve: Serve, tmp_path: Path
+) -> None:
+    run = serve("--save-image", tmp_path / "no" / "out.bin")
+    assert run.code == ExitCode.USAGE
+    assert "cannot be written: its folder does not exist" in run.err
+    assert "--save-image" in run.err
+    assert run.out == ""
+
+
+def test_a_folder_in_the_place_of_the_file_is_refused_too(serve: Serve, tmp_path: Path) -> None:
+    run = serve("--save-image", tmp_path)
+    assert run.code == ExitCode.USAGE
+    assert "it is a folder" in run.err
+
+
+@pytest.mark.parametrize("failing", ["write_bytes", "replace"])
+def test_a_disk_that_fills_up_leaves_the_old_file_and_no_half_one(
+    serve: Serve, host: Host, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
+) -> None:
+    real_write = Path.write_bytes
+
+    def fail(path: Path, data: Any) -> int:
+        if failing == "write_bytes":
+            real_write(path, data[:100])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    out = tmp_path / "out.bin"
+    out.write_bytes(b"old")
+    monkeypatch.setattr(Path, failing, fail)
+    host.do(host.upgrade)
+    run = serve("--upgrades", "1", "--save-image", out)
+    monkeypatch.undo()
+    assert run.code == ExitCode.USAGE
+    assert f"{out} cannot be written: No space left on device" in run.err
+    assert "Traceback" not in run.err
+    assert out.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_a_folder_that_vanishes_meanwhile_is_one_message(
+    serve: Serve, host: Host, tmp_path: Path
+) -> None:
+    folder = tmp_path / "results"
+    folder.mkdir()
+
+    def upgrade_without_folder() -> None:
+        folder.rmdir()
+        folder.write_text("now a file")
+        host.upgrade()
+
+    host.do(upgrade_without_folder)
+    run = serve("--upgrades", "1", "--save-image", folder / "out.bin")
+    assert run.code == ExitCode.USAGE
+    assert run.err.count("error:") == 1
+    assert "Traceback" not in run.err
+
+
+# -- the device -----------------------------------------------------------------------------------
+
+
+def test_without_an_application_it_announces_itself_until_it_is_upgraded(
+    serve: Serve, host: Host
+) -> None:
+    """R14."""
+
+    def hear_and_upgrade() -> None:
+        # Header, mode 0C, length 11, boot version: more of them than the one burst of four.
+        announcement = bytes.fromhex("55AA0C0BC109")
+        heard = host.hear(b"", 0x725, b"BMS")
+        while heard.count(announcement) < 6:
+            heard += host.hear(b"", 0x725, b"BMS")
+        host.upgrade()
+
+    host.do(hear_and_upgrade)
+    run = serve("--no-app", "--upgrades", "1")
+    assert run.code == ExitCode.OK
+    assert run.out.startswith("state:   announcing: no application\n")
+    assert "image:" in run.out
+
+
+def test_a_choice_changes_the_device(serve: Serve, host: Host) -> None:
+    host.do(host.upgrade)
+    run = serve("--set", "boot_version=V7.8.9", "--upgrades", "1")
+    assert run.code == ExitCode.OK
+    host.join()
+    assert host.outcomes[0].boot_version == "BMS V7.8.9"
+
+
+@pytest.mark.parametrize(
+    ("choice", "words"),
+    [
+        ("boot_verson=V1.0.0", ("boot_verson", "did you mean boot_version?")),
+        ("window_s=soon", ("window_s is a number, not 'soon'", "0.05")),
+        ("window_s=-1", ("window_s is a number from 0 on",)),
+        ("bad_packet=nak", ("bad_packet cannot be 'nak'", "nak_expected")),
+        ("page_size_bytes=100", ("page_size_bytes is a multiple of 128",)),
+        ("boot_version=V1", ("6 ASCII characters",)),
+        ("window_s", ("--set window_s: write KEY=VALUE",)),
+    ],
+)
+def test_a_choice_that_makes_no_sense_is_wrong_usage_and_says_what_would(
+    serve: Serve, choice: str, words: tuple[str, ...]
+) -> None:
+    run = serve("--set", choice)
+    assert run.code == ExitCode.USAGE
+    assert all(word in run.err for word in words), run.err
+    assert "Traceback" not in run.err
+
+
+def test_help_lists_every_choice_with_its_values(flasher: Flasher) -> None:
+    text = flasher("mock", "--help").out
+    for key, values, summary in describe_options():
+        assert f"  {key:<24} {values}\n      {summary}\n" in text + "\n"
+
+
+@pytest.mark.parametrize("words", [("--upgrades", "0"), ("-t", "hmi"), ("--no-such-option",)])
+def test_wrong_usage_is_exit_code_2(serve: Serve, words: tuple[str, ...]) -> None:
+    assert serve(*words).code == ExitCode.USAGE
+
+
+def test_no_adapter_is_exit_code_4(flasher: Flasher) -> None:
+    run = flasher("mock", "-t", "bms")
+    assert run.code == ExitCode.BUS
+    assert "-i socketcan -c can0" in run.err
+
+
+# -- the other dialect ----------------------------------------------------------------------------
+
+
+def test_in_the_motinova_dialect_the_application_answers_at_its_own_bit_rate(
+    serve: Serve, host: Host, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The document cancelled the upgrade but kept the reset: the model says what it adds."""
+    rates: list[int] = []
+    real_bus: Callable[..., can.BusABC] = can.Bus
+
+    def record(**config: Any) -> can.BusABC:
+        rates.append(int(config.get("bitrate", 0)))
+        return real_bus(**config)
+
+    def ask() -> None:
+        # Chapter 3: 752 R 3300, the version information; answered on 720 with 15 40.
+        host.hear(bytes.fromhex("55AA11023300FDA6627CF0"), 0x720, b"V1r0r0_20220512")
+        host.interrupt()
+
+    monkeypatch.setattr("can.Bus", record)
+    host.do(ask)
+    run = serve("--dialect", "motinova")
+    assert run.code == ExitCode.OK
+    assert rates[0] == 125_000
+    assert "the MOTINOVA document has no upgrade" in run.err

@@ -1,0 +1,69 @@
+"""Host and device model as two processes on one bus: UDP multicast that stays on this machine."""
+
+from __future__ import annotations
+
+import random
+import socket
+from contextlib import closing
+from pathlib import Path
+
+import can
+import pytest
+
+from tests.end_to_end.processes import MockProcess, transfer
+
+GROUP = "239.74.163.2"
+
+
+def free_port() -> int:
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as probe:
+        probe.bind(("", 0))
+        port = probe.getsockname()[1]
+    assert isinstance(port, int)
+    return port
+
+
+@pytest.fixture(scope="module")
+def bus() -> tuple[str, ...]:
+    """Bus arguments with a port of their own; `hop_limit=0` keeps the frames on this machine."""
+    port = free_port()
+    try:
+        probe = can.Bus(
+            interface="udp_multicast", channel=GROUP, port=port, hop_limit=0, ignore_config=True
+        )
+    except (can.CanError, OSError) as error:
+        pytest.skip(f"no multicast bus here: {error}")
+    with probe:
+        try:
+            probe.send(can.Message(arbitration_id=1, is_extended_id=False))
+            heard = probe.recv(1.0)
+        except (can.CanError, OSError) as error:
+            pytest.skip(f"multicast cannot be sent here: {error}")
+    if heard is None:
+        pytest.skip("multicast does not come back on this machine")
+    options = ("--bus-kwargs", "hop_limit=0", f"port={port}")
+    return ("-i", "udp_multicast", "-c", GROUP, *options)
+
+
+def test_images_of_every_edge_size_arrive_byte_for_byte_at_one_mock(
+    bus: tuple[str, ...], tmp_path: Path
+) -> None:
+    sizes = (128, 1, 129, 127)
+    data = random.Random(11)
+    serving = ("-t", "bms", "--save-image", "out.bin", "--upgrades", str(len(sizes)), *bus)
+    with MockProcess(*serving, folder=tmp_path) as mock:
+        for size_bytes in sizes:
+            done = transfer(mock, tmp_path, data.randbytes(size_bytes), *bus)
+            assert "completed:    the device confirmed" in done.stdout
+        assert mock.end() == 0
+
+
+def test_300_kib_arrive_byte_for_byte(bus: tuple[str, ...], tmp_path: Path) -> None:
+    """The mock's flash takes no time here: a packet would last 1 ms longer."""
+    fast = ("--set", "program_time_s=0", "--set", "erase_time_s=0")
+    image = random.Random(12).randbytes(300 * 1024)
+    serving = ("-t", "bms", "--save-image", "out.bin", "--upgrades", "1", *fast, *bus)
+    with MockProcess(*serving, folder=tmp_path) as mock:
+        done = transfer(mock, tmp_path, image, *bus)
+        assert "307,200 bytes in 2,400 packets" in done.stdout
+        assert mock.end() == 0
