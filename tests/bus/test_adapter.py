@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import errno
 import time
 import uuid
@@ -284,3 +285,45 @@ def test_an_adapter_that_cannot_be_opened_names_interface_channel_and_fix(
             open_adapter(250_000, interface=interface, channel="can7")
         assert "can7" in caught.value.where
         assert fix in caught.value.remedy
+
+
+def test_a_damaged_configuration_file_is_wrong_usage(monkeypatch: pytest.MonkeyPatch) -> None:
+    def damaged(**_options: Any) -> dict[str, Any]:
+        raise configparser.MissingSectionHeaderError("can.conf", 1, "interface = socketcan")
+
+    monkeypatch.setattr("can.util.load_config", damaged)
+    with pytest.raises(UsageError, match=r"can\.conf"):
+        open_adapter(250_000)
+
+
+@pytest.mark.usefixtures("no_configuration")
+@pytest.mark.parametrize(
+    ("error", "interface", "channel", "words"),
+    [
+        (TypeError("expected str, not None"), "socketcan", None, "-i socketcan -c can0"),
+        (OSError(errno.EAFNOSUPPORT, "not supported"), "socketcan", "can0", "no CAN"),
+        (NameError("name 'canOpenChannel' is not defined"), "kvaser", "0", "driver library"),
+    ],
+)
+def test_what_is_missing_for_an_adapter_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+    interface: str,
+    channel: str | None,
+    words: str,
+) -> None:
+    def fail(**_config: Any) -> can.BusABC:
+        raise error
+
+    monkeypatch.setattr("can.Bus", fail)
+    with pytest.raises(BusError, match="cannot be opened") as caught:
+        open_adapter(250_000, interface=interface, channel=channel)
+    assert words in str(caught.value)
+
+
+def test_a_foreign_datagram_on_the_multicast_port_is_passed_over(bus: FakeBus) -> None:
+    bus.inbox.extend(
+        [can.CanOperationError("could not unpack received message"), message(0x725, b"x")]
+    )
+    link = CanLink(bus, "udp_multicast")
+    assert link.receive(time.monotonic() + 1.0) == Frame(0x725, b"x")
