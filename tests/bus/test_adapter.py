@@ -14,6 +14,7 @@ import pytest
 
 from flasher.bus import adapter
 from flasher.bus.adapter import CanLink, open_adapter
+from flasher.bus.link import SEND_LIMIT_S
 from flasher.errors import BusError, ExitCode, TransmitBlockedError, UsageError
 from flasher.protocol.frame import Frame
 
@@ -105,7 +106,7 @@ def test_frames_that_arrive_while_the_queue_is_full_are_kept_in_order(bus: FakeB
 def test_a_queue_that_stays_full_ends_with_an_error_in_bounded_time(
     bus: FakeBus, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(adapter, "SEND_LIMIT_S", 0.02)
+    monkeypatch.setattr("flasher.bus.adapter.SEND_LIMIT_S", 0.02)
     bus.refusals.extend([can.CanOperationError("full", errno.ENOBUFS)] * 1_000_000)
     with pytest.raises(TransmitBlockedError, match="took no frame") as caught:
         CanLink(bus, "socketcan").send(FRAME)
@@ -133,7 +134,7 @@ def test_any_other_transmit_error_is_the_adapters_failure(bus: FakeBus, error: E
 def test_only_a_serial_adapter_gets_a_send_timeout(bus: FakeBus) -> None:
     CanLink(bus, "slcan").send(FRAME)
     CanLink(bus, "socketcan").send(FRAME)
-    assert bus.send_options == [adapter.SEND_LIMIT_S, None]
+    assert bus.send_options == [SEND_LIMIT_S, None]
 
 
 # -- receiving ------------------------------------------------------------------------------------
