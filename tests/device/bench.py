@@ -15,8 +15,10 @@ from flasher.protocol.wire import Message, Reassembler, encode, split
 
 START_S: Final = 1000.0
 """The clock does not begin at 0, as none does."""
-QUICK: Final = DeviceProfile(erase_time_s=0.0, program_time_s=0.0)
-"""Everything the document leaves open as by default, flash in no time."""
+QUICK: Final = DeviceProfile(
+    application_area_bytes=256 * 1024, erase_time_s=0.0, program_time_s=0.0
+)
+"""Everything the document leaves open as by default, flash in no time and soon made."""
 SMALL: Final = DeviceProfile(
     application_area_bytes=1024, page_size_bytes=256, erase_time_s=0.02, program_time_s=0.002
 )

@@ -8,6 +8,7 @@ from collections.abc import Callable
 import pytest
 
 from flasher.device.model import Device
+from flasher.device.profile import DeviceProfile
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft, Outcome
 from flasher.host.table import Ending
@@ -19,11 +20,13 @@ from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC
 from tests.end_to_end.world import Traffic, upgrade
 
 IMAGE = random.Random(3).randbytes(300)
+SMALL = DeviceProfile(application_area_bytes=16 * 1024)
+"""Hundreds of devices are made here; a large flash takes time to make."""
 VERSIONED = b"\x00\x50\x00\x20" + b"BMS\0V2r0r1_20260102\0" + random.Random(4).randbytes(200)
 
 
 def device_model(target: str = "bms") -> Device:
-    return Device(TARGETS[target], bitrate_bps=WELLING.bitrate_bps)
+    return Device(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=SMALL)
 
 
 def frames_of_an_upgrade() -> int:
