@@ -51,6 +51,14 @@ def test_a_time_is_a_finite_number_of_seconds(text: str) -> None:
         arguments.seconds(text)
 
 
+@pytest.mark.parametrize("text", ["0.01", "-1", "fast"])
+def test_a_speed_is_zero_or_fast_enough_to_be_stopped(text: str) -> None:
+    assert arguments.speed("0") == 0.0
+    assert arguments.speed("0.1") == 0.1
+    with pytest.raises(argparse.ArgumentTypeError):
+        arguments.speed(text)
+
+
 def test_a_count_begins_at_one() -> None:
     assert arguments.count("1") == 1
     with pytest.raises(argparse.ArgumentTypeError, match="1 or more"):

@@ -187,3 +187,24 @@ def test_an_error_without_a_place_or_remedy_is_one_line(
     run = flasher("flash", OBC_BIN, "-t", "obc", "--mock", "--trace-file", "no-folder/a.asc")
     assert run.code == ExitCode.USAGE
     assert stream.getvalue().splitlines()[-1].startswith("error: no-folder/a.asc cannot be written")
+
+
+def test_a_process_without_streams_works_and_exits_with_its_code(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Services and `pythonw` have neither stdout nor stderr."""
+    monkeypatch.setattr("sys.stdout", None)
+    monkeypatch.setattr("sys.stderr", None)
+    assert main(MOCK) == ExitCode.OK
+    assert main(["flash", str(SAMPLES / "bad" / "no_end.hex"), "-t", "obc"]) == ExitCode.IMAGE
+    for stream in (sys.stdout, sys.stderr):
+        assert stream is not None
+        stream.close()
+
+
+@pytest.mark.parametrize("words", [("--json", "flash"), ("flash", "--json", "--no-such-option")])
+def test_wrong_usage_is_a_json_document_too(flasher: Flasher, words: tuple[str, ...]) -> None:
+    run = flasher(*words)
+    assert run.code == run.document["exit_code"] == ExitCode.USAGE
+    assert run.document["error"]["kind"] == "UsageError"
+    assert "Try `flasher flash --help`" in run.err

@@ -5,6 +5,7 @@ from __future__ import annotations
 import _thread
 import errno
 import json
+import os
 import threading
 import uuid
 from collections.abc import Callable, Iterator
@@ -21,6 +22,7 @@ from flasher.device.profile import describe_options
 from flasher.driver import drive
 from flasher.errors import ExitCode
 from flasher.host.outcome import Outcome
+from flasher.protocol.wire import Message, encode
 from tests.cli.conftest import Flasher, Run
 
 IMAGE = bytes(range(256)) + b"and three bytes more than two packets"[:3]
@@ -209,14 +211,16 @@ def test_quiet_says_what_happens_but_not_that_it_listens(serve: Serve, host: Hos
 
 
 def test_damage_and_refusals_are_told(serve: Serve, host: Host) -> None:
-    """A reset whose checksum is wrong, then an update command that has no place here."""
+    """A reset whose checksum is wrong, then one whose text is."""
+    damaged = bytes.fromhex("55AA16074205 5245534554 00000000 F0")
+    wrong = encode(Message(0x752, 0x16, 0x4205, b"RESEX"))
 
     def disturb() -> None:
-        damaged = bytes.fromhex("55AA16074205 5245534554 00000000 F0")
         with can.Bus(interface="virtual", channel=host.channel, ignore_config=True) as bus:
-            for start in range(0, len(damaged), 8):
-                data = damaged[start : start + 8]
-                bus.send(can.Message(arbitration_id=0x752, data=data, is_extended_id=False))
+            for wire in (damaged, wrong):
+                for start in range(0, len(wire), 8):
+                    data = wire[start : start + 8]
+                    bus.send(can.Message(arbitration_id=0x752, data=data, is_extended_id=False))
         host.upgrade()
 
     host.do(disturb)
@@ -225,6 +229,8 @@ def test_damage_and_refusals_are_told(serve: Serve, host: Host) -> None:
     (line,) = [line for line in run.out.splitlines() if line.startswith("damage:")]
     assert line.startswith("damage:  0x752: ")
     assert "55 aa 16 07" in line
+    (line,) = [line for line in run.out.splitlines() if line.startswith("note:")]
+    assert line.startswith("note:    malformed message 4205")
 
 
 # -- --save-image ---------------------------------------------------------------------------------
@@ -299,6 +305,37 @@ def test_a_folder_that_vanishes_meanwhile_is_one_message(
     assert run.code == ExitCode.USAGE
     assert run.err.count("error:") == 1
     assert "Traceback" not in run.err
+
+
+def test_a_link_stays_a_link_and_the_file_behind_it_is_written(
+    serve: Serve, host: Host, tmp_path: Path
+) -> None:
+    real, link = tmp_path / "real.bin", tmp_path / "link.bin"
+    real.write_bytes(b"old")
+    try:
+        link.symlink_to(real)
+    except OSError as error:
+        pytest.skip(f"no links here: {error}")
+    host.do(host.upgrade)
+    assert serve("--upgrades", "1", "--save-image", link).code == ExitCode.OK
+    assert link.is_symlink()
+    assert real.read_bytes() == IMAGE
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes here")
+def test_a_named_pipe_is_written_into_and_not_replaced(
+    serve: Serve, host: Host, tmp_path: Path
+) -> None:
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        host.do(host.upgrade)
+        assert serve("--upgrades", "1", "--save-image", pipe).code == ExitCode.OK
+        assert os.read(reader, 4096) == IMAGE
+    finally:
+        os.close(reader)
+    assert pipe.is_fifo()
 
 
 # -- the device -----------------------------------------------------------------------------------
