@@ -80,8 +80,7 @@ def _parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argpars
                 parser.print_help()
                 parser.exit(ExitCode.USAGE)
     except SystemExit:
-        if said.getvalue():
-            Output().result(said.getvalue().rstrip())
+        Output().result(said.getvalue().rstrip())
         raise
     return options
 

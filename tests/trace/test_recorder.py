@@ -122,6 +122,9 @@ def test_a_suffix_without_a_format_names_those_that_have_one(tmp_path: Path) -> 
 def test_a_file_that_cannot_be_made_is_wrong_usage(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="cannot be written: its folder does not exist"):
         Recorder(tmp_path / "no" / "trace.asc")
+    (tmp_path / "folder.asc").mkdir()
+    with pytest.raises(UsageError, match=r"folder\.asc cannot be written"):
+        Recorder(tmp_path / "folder.asc")
 
 
 @pytest.mark.parametrize("error", [NotImplementedError, ImportError])
