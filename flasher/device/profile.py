@@ -59,8 +59,8 @@ class DeviceProfile:
     older_packet: Literal["ack", "nak", "silence"] = _option(
         "ack", "a packet stored before the last one (TX-03)"
     )
-    pause_in_transfer: Literal["waits", "announces"] = _option(
-        "waits", "a pause longer than transfer_timeout_s: waits on, or announces again (TX-12)"
+    pause_in_transfer: Literal["announces", "waits"] = _option(
+        "announces", "a pause longer than transfer_timeout_s: waits on, or announces again (TX-12)"
     )
     transfer_timeout_s: float = _option(5.0, "the pause that pause_in_transfer is about")
     reset_in_transfer: Literal["ignored", "restarts"] = _option(

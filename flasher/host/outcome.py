@@ -28,7 +28,7 @@ from flasher.protocol.spec import Target
 class DeviceLeft(Enum):
     """The state in which the device was left, as far as the host can know."""
 
-    UNTOUCHED = "nothing was erased: the device runs, or starts again, what it ran before"
+    UNTOUCHED = "this run erased nothing: the device is as it was before"
     PERHAPS_ERASED = (
         "it was told to erase its application and did not say whether it has: flash it again, or "
         "see after a power cycle what it runs"
@@ -181,7 +181,12 @@ _EXPLANATIONS: Final = {
         "the device runs another image than the one sent, or the image names its version wrongly",
         "Compare with flasher image-info, then flash the right image.",
     ),
-    Ending.CANCELLED: _Explanation(InterruptedByUserError, "", _AGAIN),
+    Ending.CANCELLED: _Explanation(
+        InterruptedByUserError,
+        "",
+        f"{_AGAIN} Give a bootloader that was receiving some seconds to time out first, or "
+        "power-cycle the device if it does not.",
+    ),
 }
 
 

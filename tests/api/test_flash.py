@@ -306,7 +306,9 @@ def test_the_adapter_is_closed_when_it_fails_itself(fake: FakeLink) -> None:
     with pytest.raises(BusError) as caught:
         flasher.flash(IMAGE, "bms", interface="fake")
     assert caught.value.where.endswith("fake 0")
-    assert caught.value.remedy.startswith("Plug it in. State of the device: nothing was erased")
+    assert caught.value.remedy.startswith(
+        "Plug it in. State of the device: this run erased nothing"
+    )
 
 
 @pytest.mark.usefixtures("fake")

@@ -374,7 +374,7 @@ def test_without_its_first_frame_nothing_tells_that_it_was_a_packet() -> None:
 
 def test_every_single_bit_flip_of_a_packet_is_rejected() -> None:
     """CR-01."""
-    bench = bench_in_transfer()
+    bench = bench_in_transfer(profile_with(pause_in_transfer="waits"))
     wire = bench.encoded(PACKETS[0])
     for bit in range(8 * len(wire)):
         flipped = bytearray(wire)
@@ -510,9 +510,9 @@ def test_bytes_after_the_end_of_the_image_are_ignored_whatever_they_are() -> Non
     assert bench.device.store.read(608)[600:] == b"\xff" * 8
 
 
-def test_a_long_pause_is_waited_out_by_default() -> None:
+def test_a_long_pause_may_be_waited_out() -> None:
     """TX-12."""
-    bench = bench_in_transfer(stored=2)
+    bench = bench_in_transfer(profile_with(pause_in_transfer="waits"), stored=2)
     bench.run(3600.0)
     assert bench.take() == []
     finish(bench, PACKETS[2:], IMAGE)
@@ -520,8 +520,7 @@ def test_a_long_pause_is_waited_out_by_default() -> None:
 
 def test_a_long_pause_may_end_the_transfer_and_the_device_is_reachable_again() -> None:
     """TX-12."""
-    profile = profile_with(pause_in_transfer="announces", transfer_timeout_s=2.0)
-    bench = bench_in_transfer(profile, stored=2)
+    bench = bench_in_transfer(profile_with(transfer_timeout_s=2.0), stored=2)
     bench.run(1.9)
     bench.transfer(PACKETS[2])
     bench.run(1.9)

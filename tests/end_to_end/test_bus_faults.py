@@ -7,8 +7,11 @@ from collections.abc import Callable
 
 import pytest
 
+from flasher.bus.link import VirtualClock
+from flasher.bus.simulated import SimulatedBus
 from flasher.device.model import Device
 from flasher.device.profile import DeviceProfile
+from flasher.driver import drive
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft, Outcome
 from flasher.host.table import Ending
@@ -237,6 +240,23 @@ def test_a_device_that_loses_power_is_reported_and_upgraded_when_it_comes_back()
     device.power_on(0.0)
     assert device.stored_image is None
     assert upgrade(device, image=IMAGE).ok
+    assert device.stored_image == IMAGE
+
+
+def test_an_upgrade_that_was_cancelled_in_the_middle_is_finished_by_the_same_command() -> None:
+    """PW-03: the device times out and announces itself again."""
+    device = device_model()
+    clock = VirtualClock()
+    bus = SimulatedBus(WELLING.bitrate_bps, clock)
+    bus.attach(device)
+    link = bus.link()
+    planned = plan(Image.from_bytes(IMAGE), BMS, WELLING.bitrate_bps)
+    first = Upgrade(planned)
+    drive(first, link, clock, cancelled=lambda: device.program_count >= 1)
+    assert first.outcome.ending is Ending.CANCELLED
+    again = Upgrade(planned)
+    drive(again, link, clock)
+    assert again.outcome.ok
     assert device.stored_image == IMAGE
 
 
