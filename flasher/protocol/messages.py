@@ -1,4 +1,4 @@
-"""Typed messages: the upgrade of appendix 3, and the version query that an upgrade relies on.
+"""Typed messages: the upgrade of appendix 3.
 
 Each class is one row of the document. `to_message` gives the wire form on a CAN id, `decode` the
 way back. Decoding is strict: mode, size and every constant byte must be the document's; what does
@@ -17,7 +17,6 @@ from flasher.protocol.spec import (
     PACKET_DATA_SIZE,
     PACKET_START,
     TARGETS,
-    VERSION_FIELD_SIZE,
     Command,
     Mode,
     data_size,
@@ -28,11 +27,9 @@ _UINT16: Final = Struct("<H")
 _UPDATE: Final = Struct("<7sI")
 _BOOT_VERSION: Final = Struct("3s6s")
 _PACKET: Final = Struct(f"<BHH{PACKET_DATA_SIZE}s")
-_VERSION: Final = Struct(f"{VERSION_FIELD_SIZE}s" * 4)
 assert _UPDATE.size == data_size(Command.UPDATE)
 assert _BOOT_VERSION.size == data_size(Command.BOOT_VERSION)
 assert _PACKET.size == data_size(Command.PACKET)
-assert _VERSION.size == data_size(Command.VERSION_INFORMATION)
 
 _BOOT_VERSION_TEXT: Final = re.compile(r"V[0-9]\.[0-9]\.[0-9]")
 
@@ -233,35 +230,6 @@ class Complete(_Constant):
     DATA = b"\x00\x00"
 
 
-@dataclass(frozen=True)
-class ReadVersion(_Constant):
-    """Tool to the BMS's application: version information, please."""
-
-    MODE = Mode.READ
-    COMMAND = Command.READ_VERSION
-    DATA = b""
-
-
-@dataclass(frozen=True)
-class VersionInformation(_Row):
-    """BMS to all: model, serial number, hardware and firmware version, 16 bytes of text each."""
-
-    MODE = Mode.REPORT
-    COMMAND = Command.VERSION_INFORMATION
-
-    model: bytes
-    serial_number: bytes
-    hardware: bytes
-    firmware: bytes
-
-    def data(self) -> bytes:
-        return _VERSION.pack(self.model, self.serial_number, self.hardware, self.firmware)
-
-    @classmethod
-    def from_data(cls, data: bytes) -> Self:
-        return cls(*_VERSION.unpack(data))
-
-
 Row = (
     Reset
     | GeneralFeedback
@@ -273,8 +241,6 @@ Row = (
     | Nak
     | EndOfTransfer
     | Complete
-    | ReadVersion
-    | VersionInformation
 )
 
 _ROWS: Final[dict[int, type[Row]]] = {
@@ -290,8 +256,6 @@ _ROWS: Final[dict[int, type[Row]]] = {
         Nak,
         EndOfTransfer,
         Complete,
-        ReadVersion,
-        VersionInformation,
     )
 }
 

@@ -79,9 +79,9 @@ def test_nothing_at_all_leaves_the_start_value() -> None:
     assert crc32(b"") == 0xFFFFFFFF
 
 
-@pytest.mark.parametrize("byte", range(256))
-def test_every_single_byte_agrees_with_the_appendix(byte: int) -> None:
-    assert crc32(bytes((byte,))) == _crc_of_the_appendix(bytes((byte,)))
+def test_every_single_byte_agrees_with_the_appendix() -> None:
+    for byte in range(256):
+        assert crc32(bytes((byte,))) == _crc_of_the_appendix(bytes((byte,))), byte
 
 
 def test_random_data_of_every_length_to_300_agree_with_the_appendix() -> None:

@@ -17,18 +17,16 @@ from flasher.protocol.messages import (
     Malformed,
     Nak,
     Packet,
-    ReadVersion,
     RequestTransfer,
     Reset,
     Row,
     Unknown,
     UpdateCommand,
-    VersionInformation,
     decode,
 )
 from flasher.protocol.wire import Message, encode
 
-from .cases import CASES, case
+from .cases import CASES
 
 _PAYLOAD: Final = bytes(range(128))
 
@@ -55,12 +53,6 @@ _ROWS: Final[list[tuple[Row, int, str]]] = [
     (Nak(256), 0x725, "0C C302 00 01"),
     (EndOfTransfer(), 0x752, "16 A401 04"),
     (Complete(), 0x725, "0C C502 00 00"),
-    (ReadVersion(), 0x752, "11 3300"),
-    (
-        VersionInformation(b"A" * 16, b"B" * 16, b"C" * 16, b"D" * 16),
-        0x720,
-        "0C 1540" + "41" * 16 + "42" * 16 + "43" * 16 + "44" * 16,
-    ),
 ]
 
 
@@ -201,16 +193,6 @@ def test_every_upgrade_message_of_the_vectors_has_a_row() -> None:
         row = decode(found.message)
         assert not isinstance(row, Malformed | Unknown), found.name
         assert encode(row.to_message(found.message.can_id)) == found.wire
-
-
-def test_the_version_information_of_the_vectors_has_its_four_fields() -> None:
-    found = decode(case("version: BM36, W2605001, V1r2r0_20220512, V1r2r3_20220512").message)
-    assert found == VersionInformation(
-        model=b"BM36.           ",
-        serial_number=b"W2605001.       ",
-        hardware=b"V1r2r0_20220512.",
-        firmware=b"V1r2r3_20220512.",
-    )
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)

@@ -41,10 +41,11 @@ def test_the_frames_of_the_table_are_decoded(vector: Case) -> None:
 
 
 @every_case
-@pytest.mark.parametrize("size_bytes", range(1, 9))
-def test_frames_of_any_one_size_are_decoded_alike(vector: Case, size_bytes: int) -> None:
-    reassembler = make_reassembler(vector.message.can_id)
-    assert feed_all(reassembler, pieces(vector.wire, size_bytes)) == [vector.message]
+def test_frames_of_any_one_size_are_decoded_alike(vector: Case) -> None:
+    for size_bytes in range(1, 9):
+        reassembler = make_reassembler(vector.message.can_id)
+        found = feed_all(reassembler, pieces(vector.wire, size_bytes))
+        assert found == [vector.message], size_bytes
 
 
 @every_case
@@ -71,10 +72,10 @@ def test_a_message_split_at_random_is_decoded_alike(vector: Case) -> None:
 
 
 @every_case
-@pytest.mark.parametrize("trailing", [b"\x00\x00", b"\xff" * 7, b"\xf0", b"\x55", b"\x55\xaa"])
-def test_bytes_after_a_message_do_not_touch_it(vector: Case, trailing: bytes) -> None:
-    reassembler = make_reassembler(vector.message.can_id)
-    assert feed_all(reassembler, [vector.wire + trailing]) == [vector.message]
+def test_bytes_after_a_message_do_not_touch_it(vector: Case) -> None:
+    for trailing in (b"\x00\x00", b"\xff" * 7, b"\xf0", b"\x55", b"\x55\xaa"):
+        reassembler = make_reassembler(vector.message.can_id)
+        assert feed_all(reassembler, [vector.wire + trailing]) == [vector.message], trailing
 
 
 @every_case
@@ -88,11 +89,11 @@ def test_the_last_frame_may_be_padded_to_eight_bytes(vector: Case) -> None:
 
 
 @every_case
-@pytest.mark.parametrize("size_bytes", range(1, 9))
-def test_two_messages_back_to_back_are_both_decoded(vector: Case, size_bytes: int) -> None:
-    reassembler = make_reassembler(vector.message.can_id)
-    twice = pieces(vector.wire * 2, size_bytes)
-    assert feed_all(reassembler, twice) == [vector.message] * 2
+def test_two_messages_back_to_back_are_both_decoded(vector: Case) -> None:
+    for size_bytes in range(1, 9):
+        reassembler = make_reassembler(vector.message.can_id)
+        found = feed_all(reassembler, pieces(vector.wire * 2, size_bytes))
+        assert found == [vector.message] * 2, size_bytes
 
 
 def test_all_messages_of_one_id_in_a_row_are_decoded_in_order() -> None:

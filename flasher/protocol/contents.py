@@ -1,0 +1,248 @@
+"""What the messages of chapter 3 carry, one class each (5.1, 5.2). Who sends them to whom under
+which command stands in `catalogue`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import Any, Final
+
+from flasher.protocol.fields import (
+    Address,
+    Bytes,
+    Content,
+    DateField,
+    Flags,
+    Number,
+    Numbers,
+    Text,
+    TextField,
+    constant,
+    field,
+    number,
+    reserved,
+)
+
+TEMPERATURE_OFFSET_C: Final = 40
+CELLS: Final = 16
+MEMORY_PIECE_SIZE: Final = 128
+"""Bytes that one memory read gives at the most (0x4308)."""
+
+
+def _temperature() -> Any:
+    return number(1, "°C", offset=TEMPERATURE_OFFSET_C)
+
+
+class Status(IntFlag):
+    """Status bits of the running information; 0 means asleep, the other bits are reserved."""
+
+    CHARGER_CONNECTED = 0x01
+
+
+class Fault(IntFlag):
+    """Faults: warnings in the upper half, protections and defects in the lower (5.1)."""
+
+    SECOND_LEVEL_DISCHARGE_OVER_CURRENT_PROTECTION = 1 << 0
+    CHARGE_OVER_CURRENT_PROTECTION = 1 << 1
+    SHORT_CIRCUIT_PROTECTION = 1 << 2
+    OVER_DISCHARGE_PROTECTION = 1 << 3
+    OVER_CHARGE_PROTECTION = 1 << 4
+    DISCHARGE_UNDER_TEMPERATURE_PROTECTION = 1 << 5
+    DISCHARGE_OVER_TEMPERATURE_PROTECTION = 1 << 6
+    CHARGE_UNDER_TEMPERATURE_PROTECTION = 1 << 7
+    CHARGE_OVER_TEMPERATURE_PROTECTION = 1 << 8
+    DISCHARGE_MOS_FAULT = 1 << 9
+    CHARGE_MOS_FAULT = 1 << 10
+    TEMPERATURE_SENSOR_FAULT = 1 << 11
+    FIRST_LEVEL_OVER_CURRENT_WARNING = 1 << 12
+    FIRST_LEVEL_OVER_CURRENT_PROTECTION = 1 << 13
+    AFE_FAULT = 1 << 14
+    MCU_FAULT = 1 << 15
+    CHARGE_OVER_VOLTAGE_WARNING = 1 << 16
+    DISCHARGE_UNDER_VOLTAGE_WARNING = 1 << 17
+    CHARGE_OVER_CURRENT_WARNING = 1 << 18
+    DISCHARGE_OVER_CURRENT_WARNING = 1 << 19
+    CHARGE_OVER_TEMPERATURE_WARNING = 1 << 20
+    CHARGE_UNDER_TEMPERATURE_WARNING = 1 << 21
+    DISCHARGE_OVER_TEMPERATURE_WARNING = 1 << 22
+    DISCHARGE_UNDER_TEMPERATURE_WARNING = 1 << 23
+    MOS_OVER_TEMPERATURE_WARNING = 1 << 24
+
+
+@dataclass(frozen=True)
+class Empty(Content):
+    """A query without data."""
+
+
+@dataclass(frozen=True)
+class Handshake(Content):
+    """A question: is the BMS there."""
+
+    text: bytes = constant(b"HANDSHAKE")
+
+
+@dataclass(frozen=True)
+class Ready(Content):
+    """Ready: for shutdown, or the answer to a handshake."""
+
+    text: bytes = constant(b"READY")
+
+
+@dataclass(frozen=True)
+class Shutdown(Content):
+    """The sender is about to switch off."""
+
+    text: bytes = constant(b"SHUTDOWN")
+
+
+@dataclass(frozen=True)
+class Reset(Content):
+    """Restart."""
+
+    text: bytes = constant(b"RESET")
+
+
+@dataclass(frozen=True)
+class GeneralFeedback(Content):
+    """A write was received."""
+
+    text: bytes = constant(b"ACK")
+
+
+@dataclass(frozen=True)
+class RunningInformation(Content):
+    """The battery now; current is negative while it discharges. Four bytes are reserved (R1)."""
+
+    voltage_mv: int = number(2, "mV")
+    mean_current_ma: int = number(2, "mA", signed=True)
+    """Discharge is negative."""
+    remaining_capacity_mah: int = number(2, "mAh")
+    full_capacity_mah: int = number(2, "mAh")
+    cell_temperature_c: int = _temperature()
+    state_of_charge_percent: int = number(1, "%")
+    status: Status = field(Flags(1, Status, none="asleep"))
+    state_of_health_percent: int = number(1, "%")
+    """0 from older devices, which do not know it (section 6)."""
+    reserved: bytes = reserved(4)
+
+
+@dataclass(frozen=True)
+class CellVoltages(Content):
+    """Voltages of up to 16 cells; absent cells are 0."""
+
+    cells_mv: tuple[int, ...] = field(Numbers(CELLS, Number(2, "mV")))
+
+
+@dataclass(frozen=True)
+class Faults(Content):
+    """Faults, sent every 200 ms while there are any."""
+
+    faults: Fault = field(Flags(4, Fault))
+
+
+@dataclass(frozen=True)
+class DesignInformation(Content):
+    """The battery as it was designed."""
+
+    design_capacity_mah: int = number(2, "mAh")
+    design_voltage_v: int = number(1, "V")
+    cell_model: Text = field(TextField(8))
+    reserved: bytes = reserved(5)
+
+
+@dataclass(frozen=True)
+class VersionInformation(Content):
+    """Who the battery is and what it runs."""
+
+    model: Text = field(TextField(16))
+    serial_number: Text = field(TextField(16))
+    hardware_version: Text = field(TextField(16))
+    firmware_version: Text = field(TextField(16))
+
+
+@dataclass(frozen=True)
+class PhysicalId(Content):
+    """Physical ID; a short one is filled up with 01 (R13)."""
+
+    physical_id: bytes = field(Bytes(12))
+
+
+@dataclass(frozen=True)
+class CheckCode(Content):
+    """Check code; what it is made of is not documented."""
+
+    check_code: bytes = field(Bytes(12))
+
+
+@dataclass(frozen=True)
+class History(Content):
+    """What the battery has lived through; both currents are without sign."""
+
+    highest_cell_temperature_c: int = _temperature()
+    lowest_cell_temperature_c: int = _temperature()
+    greatest_discharge_current_ma: int = number(2, "mA")
+    greatest_charge_current_ma: int = number(2, "mA")
+    cycles: int = number(2)
+    latest_charge_interval_h: int = number(2, "h")
+    longest_charge_interval_h: int = number(2, "h")
+    charge_over_current_count: int = number(2)
+    discharge_over_current_count: int = number(2)
+    over_charge_count: int = number(2)
+    over_discharge_count: int = number(2)
+    short_circuit_count: int = number(2)
+    charge_under_temperature_count: int = number(2)
+    charge_over_temperature_count: int = number(2)
+    discharge_under_temperature_count: int = number(2)
+    discharge_over_temperature_count: int = number(2)
+    running_time_min: int = number(4, "min")
+    state_of_health_percent: int = number(1, "%")
+    reserved: bytes = reserved(5)
+
+
+@dataclass(frozen=True)
+class ProductionInformation(Content):
+    """Who made the battery, where and when."""
+
+    manufacturer: Text = field(TextField(8))
+    place: Text = field(TextField(8))
+    date: Text = field(DateField())
+    reserved: bytes = reserved(8)
+
+
+@dataclass(frozen=True)
+class UserString(Content):
+    """A text for free use."""
+
+    text: Text = field(TextField(16))
+
+
+@dataclass(frozen=True)
+class Model(Content):
+    """The model of version information, to be written."""
+
+    model: Text = field(TextField(16))
+
+
+@dataclass(frozen=True)
+class SerialNumber(Content):
+    """The serial number of version information, to be written."""
+
+    serial_number: Text = field(TextField(16))
+
+
+@dataclass(frozen=True)
+class ReadMemory(Content):
+    """Which memory to read; `end` is exclusive (R5)."""
+
+    start: int = field(Address(4))
+    end: int = field(Address(4))
+
+
+@dataclass(frozen=True)
+class Memory(Content):
+    """What the memory holds; FF beyond the end."""
+
+    start: int = field(Address(4))
+    end: int = field(Address(4))
+    content: bytes = field(Bytes(MEMORY_PIECE_SIZE))

@@ -1,0 +1,320 @@
+"""Fields of a message's data, declared once: from the declaration come encoder and decoder, the
+label and unit that people see, and the documentation.
+
+A content is a frozen dataclass whose fields carry a codec each, in wire order. Decoding accepts any
+bytes of the right size, and encoding what was decoded gives the very same bytes: numbers out of
+range of their meaning, broken texts and reserved bytes are kept as they came.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntFlag
+from typing import Any, ClassVar, Final, Protocol, Self
+
+from flasher.protocol.text import decode_text, encode_text, printable
+
+_CODEC: Final = "codec"
+
+
+class Codec(Protocol):
+    """How one field stands in the data."""
+
+    @property
+    def size_bytes(self) -> int:
+        """Bytes of the field."""
+        ...
+
+    @property
+    def unit(self) -> str:
+        """Unit of the value; empty when it has none."""
+        ...
+
+    def encode(self, value: Any) -> bytes:
+        """The field's bytes; raises ValueError for a value that does not fit."""
+        ...
+
+    def decode(self, raw: bytes) -> Any:
+        """The value; never raises."""
+        ...
+
+    def show(self, value: Any) -> str:
+        """The value for people, without its unit, harmless on any screen."""
+        ...
+
+
+@dataclass(frozen=True)
+class Number:
+    """An integer, little-endian; the value is what is on the wire minus `offset`."""
+
+    size_bytes: int
+    unit: str = ""
+    offset: int = 0
+    signed: bool = False
+
+    def encode(self, value: int) -> bytes:
+        return _integer(value, value + self.offset, self.size_bytes, signed=self.signed)
+
+    def decode(self, raw: bytes) -> int:
+        return int.from_bytes(raw, "little", signed=self.signed) - self.offset
+
+    def show(self, value: int) -> str:
+        return str(value)
+
+
+@dataclass(frozen=True)
+class Address(Number):
+    """A place in memory, shown in hexadecimal."""
+
+    def show(self, value: int) -> str:
+        return f"0x{value:0{2 * self.size_bytes}X}"
+
+
+@dataclass(frozen=True)
+class Numbers:
+    """A row of integers of the same kind."""
+
+    count: int
+    each: Number
+
+    @property
+    def size_bytes(self) -> int:
+        return self.count * self.each.size_bytes
+
+    @property
+    def unit(self) -> str:
+        return self.each.unit
+
+    def encode(self, value: tuple[int, ...]) -> bytes:
+        if len(value) != self.count:
+            raise ValueError(f"{len(value)} numbers, not {self.count}")
+        return b"".join(map(self.each.encode, value))
+
+    def decode(self, raw: bytes) -> tuple[int, ...]:
+        size = self.each.size_bytes
+        return tuple(self.each.decode(raw[at : at + size]) for at in range(0, len(raw), size))
+
+    def show(self, value: tuple[int, ...]) -> str:
+        used = len(value)
+        while used and not value[used - 1]:
+            used -= 1
+        return " ".join(map(str, value[:used])) or "none"
+
+
+@dataclass(frozen=True)
+class Flags:
+    """A set of named bits, little-endian; unknown bits are kept."""
+
+    size_bytes: int
+    names: type[IntFlag]
+    none: str = "none"
+    unit: str = ""
+
+    def encode(self, value: int) -> bytes:
+        return _integer(int(value), int(value), self.size_bytes)
+
+    def decode(self, raw: bytes) -> IntFlag:
+        return self.names(int.from_bytes(raw, "little"))
+
+    def show(self, value: int) -> str:
+        return ", ".join(flag_names(self.names, value)) or self.none
+
+
+def flag_names(names: type[IntFlag], value: int) -> list[str]:
+    """The names of the bits that are set, in order; an unnamed bit as its number."""
+    named = {int(flag): (flag.name or "").lower().replace("_", " ") for flag in names}
+    bits = (1 << bit for bit in range(int(value).bit_length()) if value >> bit & 1)
+    return [named.get(bit, f"reserved bit {bit.bit_length() - 1}") for bit in bits]
+
+
+@dataclass(frozen=True)
+class Text:
+    """An ASCII field as it stands on the wire; `str()` is its text, escaped (R20)."""
+
+    raw: bytes
+
+    def __str__(self) -> str:
+        return decode_text(self.raw)
+
+
+@dataclass(frozen=True)
+class TextField:
+    """Text, terminator, spaces (5.1). Takes a str or a `Text`."""
+
+    size_bytes: int
+    unit: str = ""
+
+    def encode(self, value: Text | str) -> bytes:
+        if isinstance(value, str):
+            return encode_text(value, self.size_bytes)
+        return _sized(value.raw, self.size_bytes)
+
+    def decode(self, raw: bytes) -> Text:
+        return Text(raw)
+
+    def show(self, value: Text | str) -> str:
+        return printable(str(value))
+
+
+@dataclass(frozen=True)
+class DateField:
+    """Eight digits YYYYMMDD, without terminator. Takes a str of eight digits (whether the calendar
+    has the day is for the caller to ask) or a `Text`.
+    """
+
+    size_bytes: int = 8
+    unit: str = ""
+
+    def encode(self, value: Text | str) -> bytes:
+        if not isinstance(value, str):
+            return _sized(value.raw, self.size_bytes)
+        if len(value) != self.size_bytes or not (value.isascii() and value.isdigit()):
+            raise ValueError(f"{value!a} is not YYYYMMDD")
+        return value.encode("ascii")
+
+    def decode(self, raw: bytes) -> Text:
+        return Text(raw)
+
+    def show(self, value: Text | str) -> str:
+        # Not the text of `Text`: a dot in a date is no terminator.
+        text = printable(value if isinstance(value, str) else value.raw.decode("latin-1")).rstrip()
+        is_date = len(text) == self.size_bytes and text.isdigit()
+        return f"{text[:4]}-{text[4:6]}-{text[6:]}" if is_date else text
+
+
+@dataclass(frozen=True)
+class Bytes:
+    """Bytes without a meaning of their own, shown in hexadecimal."""
+
+    size_bytes: int
+    unit: str = ""
+
+    def encode(self, value: bytes) -> bytes:
+        return _sized(value, self.size_bytes)
+
+    def decode(self, raw: bytes) -> bytes:
+        return raw
+
+    def show(self, value: bytes) -> str:
+        return value.hex(" ")
+
+
+@dataclass(frozen=True)
+class Constant:
+    """Text that is always the same; another one is kept and shown."""
+
+    expected: bytes
+    unit: str = ""
+
+    @property
+    def size_bytes(self) -> int:
+        return len(self.expected)
+
+    def encode(self, value: bytes) -> bytes:
+        return _sized(value, self.size_bytes)
+
+    def decode(self, raw: bytes) -> bytes:
+        return raw
+
+    def show(self, value: bytes) -> str:
+        shown = printable(value.decode("latin-1"))
+        return shown if value == self.expected else f"{shown} (not {self.expected.decode()})"
+
+
+@dataclass(frozen=True)
+class Reserved(Bytes):
+    """Reserved bytes: zero when we send, kept when we receive."""
+
+
+def _integer(value: int, on_the_wire: int, size_bytes: int, *, signed: bool = False) -> bytes:
+    try:
+        return on_the_wire.to_bytes(size_bytes, "little", signed=signed)
+    except OverflowError as error:
+        raise ValueError(f"{value} does not fit {size_bytes} bytes") from error
+
+
+def _sized(raw: bytes, size_bytes: int) -> bytes:
+    if len(raw) != size_bytes:
+        raise ValueError(f"{len(raw)} bytes, not {size_bytes}")
+    return raw
+
+
+# -- declaring ------------------------------------------------------------------------------------
+
+
+def field(codec: Codec, **options: Any) -> Any:
+    """A dataclass field with its codec."""
+    return dataclasses.field(metadata={_CODEC: codec}, **options)
+
+
+def number(size_bytes: int, unit: str = "", *, offset: int = 0, signed: bool = False) -> Any:
+    """An integer field."""
+    return field(Number(size_bytes, unit, offset, signed))
+
+
+def constant(text: bytes) -> Any:
+    """A text that is always the same."""
+    return field(Constant(text), default=text)
+
+
+def reserved(size_bytes: int) -> Any:
+    """Reserved bytes, zero by default."""
+    return field(Reserved(size_bytes), default=bytes(size_bytes))
+
+
+@dataclass(frozen=True)
+class Content:
+    """The data of a message as typed values; subclasses declare their fields in wire order."""
+
+    SIZE_BYTES: ClassVar[int] = 0
+    LAYOUT: ClassVar[tuple[tuple[str, Codec], ...]] = ()
+    """Name and codec of every field, in wire order."""
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        declared = {name: value for name, value in vars(cls).items() if _is_field(value)}
+        cls.LAYOUT = tuple((name, value.metadata[_CODEC]) for name, value in declared.items())
+        cls.SIZE_BYTES = sum(codec.size_bytes for _, codec in cls.LAYOUT)
+
+    def data(self) -> bytes:
+        """The data field. Raises ValueError naming the field that does not fit."""
+        parts = []
+        for name, codec in self.LAYOUT:
+            try:
+                parts.append(codec.encode(getattr(self, name)))
+            except ValueError as error:
+                raise ValueError(f"{label(name, codec)}: {error}") from error
+        return b"".join(parts)
+
+    @classmethod
+    def from_data(cls, data: bytes) -> Self:
+        """The way back from any `SIZE_BYTES` bytes; raises ValueError for another size."""
+        if len(data) != cls.SIZE_BYTES:
+            raise ValueError(f"{len(data)} bytes of data, not {cls.SIZE_BYTES}")
+        values, at = [], 0
+        for _, codec in cls.LAYOUT:
+            values.append(codec.decode(data[at : at + codec.size_bytes]))
+            at += codec.size_bytes
+        return cls(*values)
+
+    def shown(self) -> Iterator[tuple[str, str, str]]:
+        """Label, value and unit of every field, for people; reserved bytes only if not zero."""
+        for name, codec in self.LAYOUT:
+            value = getattr(self, name)
+            if not isinstance(codec, Reserved) or any(value):
+                yield label(name, codec), codec.show(value), codec.unit
+
+
+def _is_field(value: object) -> bool:
+    return isinstance(value, dataclasses.Field) and _CODEC in value.metadata
+
+
+_UNIT_SUFFIXES: Final = {"mV": "_mv", "V": "_v", "mA": "_ma", "mAh": "_mah", "°C": "_c",
+                         "%": "_percent", "h": "_h", "min": "_min"}  # fmt: skip
+
+
+def label(name: str, codec: Codec) -> str:
+    """A field's name for people: without the unit that follows the value."""
+    return name.removesuffix(_UNIT_SUFFIXES.get(codec.unit, "")).replace("_", " ")

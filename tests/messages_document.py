@@ -1,0 +1,189 @@
+"""The document of the application's messages, drawn from the catalogue itself.
+
+    python -m tests.messages_document
+
+writes docs/messages.md anew; a test holds it against the catalogue.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Final
+
+from flasher.protocol.catalogue import ITEMS, Item, answer_of
+from flasher.protocol.fields import (
+    Address,
+    Codec,
+    Constant,
+    Content,
+    DateField,
+    Flags,
+    Number,
+    Numbers,
+    Reserved,
+    TextField,
+    flag_names,
+    label,
+)
+from flasher.protocol.spec import DIALECTS, Node
+
+MESSAGES: Final = Path(__file__).parents[1] / "docs" / "messages.md"
+
+_INTRODUCTION: Final = """\
+# Messages of the applications
+
+Every message of chapter 3 of both dialects, drawn from `flasher/protocol/catalogue.py` by
+`python -m tests.messages_document`; a test keeps it so. The messages of the upgrade (appendix 3)
+are in `flasher/protocol/messages.py`, how a message is framed in `flasher/protocol/wire.py`.
+
+A message is named by its CAN id and its command, as the protocol documents print them; the second
+byte of the command is the size of the data. Numbers have their low byte first. A text ends with `.`
+and is filled with spaces; a reader takes a full field without it too (R20).
+"""
+
+_SENDERS: Final = {
+    Node.BMS: "the battery (BMS)",
+    Node.WMC: "the motor controller (WMC)",
+    Node.OBC: "the on-board computer or push buttons (OBC)",
+    Node.HMI: "the display (HMI)",
+    Node.CDL: "the tool (CDL)",
+}
+
+
+def messages_document() -> str:
+    """docs/messages.md."""
+    lines = [_INTRODUCTION, *_dialects()]
+    for node, name in _SENDERS.items():
+        lines += [f"## Sent by {name}", "", *_rows(item for item in ITEMS if item.sender is node)]
+    lines += ["## What they carry", ""]
+    for content in dict.fromkeys(item.content for item in ITEMS if item.content.LAYOUT):
+        lines += _content(content)
+    return "\n".join(lines)
+
+
+def _dialects() -> Iterator[str]:
+    yield from _table("dialect", "document", "bit rate", "nodes", "messages below")
+    for dialect in DIALECTS.values():
+        nodes = ", ".join(node.name for node in dialect.nodes)
+        count = sum(dialect in item.dialects for item in ITEMS)
+        yield _cells(
+            dialect.name, dialect.version, f"{dialect.bitrate_bps // 1000} kbit/s", nodes, count
+        )
+    yield ""
+
+
+def _rows(items: Iterable[Item]) -> Iterator[str]:
+    yield from _table("message", "mode", "to", "what", "bytes", "carries", "answer", "dialect")
+    for item in items:
+        answer = answer_of(item)
+        yield _cells(
+            item.name,
+            item.mode.name.lower(),
+            item.receiver.name if item.receiver else "all",
+            item.title + " (manufacturer only)" * item.manufacturer_only,
+            item.content.SIZE_BYTES,
+            _link(item.content),
+            answer.name if answer else "",
+            _only(item),
+        )
+    yield ""
+
+
+def _only(item: Item) -> str:
+    if len(item.dialects) == len(DIALECTS):
+        return ""
+    return f"{' and '.join(dialect.name for dialect in item.dialects)} only"
+
+
+def _link(content: type[Content]) -> str:
+    if not content.LAYOUT:
+        return ""
+    title = _title(content)
+    return f"[{title}](#{title.lower().replace(' ', '-')})"
+
+
+def _title(content: type[Content]) -> str:
+    """The class name in words."""
+    return "".join(
+        f" {char.lower()}" if char.isupper() and at else char
+        for at, char in enumerate(content.__name__)
+    )
+
+
+def _content(content: type[Content]) -> Iterator[str]:
+    carriers = ", ".join(item.name for item in ITEMS if item.content is content)
+    yield from (f"### {_title(content)}", "", inspect.getdoc(content) or "", "")
+    yield from (f"{content.SIZE_BYTES} bytes, in {carriers}.", "")
+    yield from _table("first byte", "bytes", "field", "type", "unit", "on the wire")
+    at = 0
+    for name, codec in content.LAYOUT:
+        yield _cells(
+            at, codec.size_bytes, label(name, codec), _type(codec), codec.unit, _on_the_wire(codec)
+        )
+        at += codec.size_bytes
+    yield ""
+    for name, codec in content.LAYOUT:
+        if isinstance(codec, Flags):
+            yield from _bits(label(name, codec), codec)
+
+
+def _type(codec: Codec) -> str:
+    match codec:
+        case Number(size_bytes=size_bytes, signed=signed):
+            return f"{'int' if signed else 'uint'}{8 * size_bytes}"
+        case Numbers(count=count, each=each):
+            return f"{count} {_type(each)}"
+        case Flags(size_bytes=size_bytes):
+            return f"{8 * size_bytes} bits"
+        case TextField() | Constant():
+            return "text"
+        case DateField():
+            return "date"
+        case _:
+            return "bytes"
+
+
+def _on_the_wire(codec: Codec) -> str:
+    match codec:
+        case Address():
+            return "an address"
+        case Number(offset=offset) if offset:
+            return f"value + {offset}"
+        case Flags(none=none):
+            return f"no bit: {none}"
+        case Constant(expected=expected):
+            return f"`{expected.decode()}`, no terminator"
+        case TextField(size_bytes=size_bytes):
+            return f"up to {size_bytes - 1} characters"
+        case DateField():
+            return "YYYYMMDD"
+        case Reserved():
+            return "00"
+        case _:
+            return ""
+
+
+def _bits(name: str, codec: Flags) -> Iterator[str]:
+    yield from (f"Bits of {name}; the others are reserved:", "")
+    yield from _table("bit", "mask", "meaning")
+    for flag in codec.names:
+        (meaning,) = flag_names(codec.names, flag)
+        mask = f"{int(flag):0{2 * codec.size_bytes}X}"
+        yield _cells(int(flag).bit_length() - 1, mask, meaning)
+    yield ""
+
+
+def _table(*names: str) -> Iterator[str]:
+    yield _cells(*names)
+    yield "|" + "---|" * len(names)
+
+
+def _cells(*values: object) -> str:
+    return "| " + "".join(f"{value} | " if str(value) else "| " for value in values).rstrip()
+
+
+if __name__ == "__main__":
+    MESSAGES.parent.mkdir(exist_ok=True)
+    MESSAGES.write_text(messages_document(), encoding="utf-8")
