@@ -72,6 +72,41 @@ class AttemptStarted:
     reason: str
 
 
+# -- queries --------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class QueryAnswered:
+    """The device answered; `content` is the answer (a `flasher.protocol.fields.Content`)."""
+
+    title: str
+    content: object
+    tries: int
+
+
+@dataclass(frozen=True)
+class QueryUnanswered:
+    """The device did not answer within the time allowed."""
+
+    title: str
+    tries: int
+
+
+@dataclass(frozen=True)
+class VerificationStarted:
+    """The device has confirmed the image; now it is verified by `level` ("version", "memory")."""
+
+    level: str
+
+
+@dataclass(frozen=True)
+class MemoryRead:
+    """So many of `total_bytes` were read back and are right."""
+
+    read_bytes: int
+    total_bytes: int
+
+
 # -- both sides -----------------------------------------------------------------------------------
 
 
@@ -118,3 +153,27 @@ class DeviceReported:
     """The device model refused or ignored something; one sentence."""
 
     what: str
+
+
+@dataclass(frozen=True)
+class DeviceWritten:
+    """A write changed what the device model keeps: name of the item, old and new value, escaped."""
+
+    name: str
+    before: str
+    after: str
+
+
+@dataclass(frozen=True)
+class ShutdownAnnounced:
+    """The BMS model announces that it switches off, and why."""
+
+    why: str
+
+
+@dataclass(frozen=True)
+class ShutdownEnded:
+    """The BMS model switches off; names of the nodes that were ready for it, and of the others."""
+
+    ready: tuple[str, ...]
+    silent: tuple[str, ...]

@@ -78,8 +78,8 @@ def classify(row: object, situation: Situation) -> Event:
     match row:
         case messages.Reset():
             return _classify_reset(situation)
-        case messages.ReadVersion():
-            return Event.VERSION_QUERY if situation.target.has_version_query else Event.NO_CONCERN
+        case messages.Unknown():
+            return Event.QUERY
         case messages.UpdateCommand() if row.text == situation.target.update_text:
             return _classify_update(row, situation)
         case messages.Packet():

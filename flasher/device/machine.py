@@ -1,7 +1,8 @@
-"""The device's side of the engine interface: reception, sending, one timer. What to make of it is
-the model's business.
+"""The device's side of the engine interface: reception, sending, timers. What to make of it is the
+business of the model, and of the application that runs on it.
 
-One timer is enough, as in every state the device waits for one thing.
+One timer is enough for a bootloader, as in every state it waits for one thing; the application has
+its own.
 """
 
 from __future__ import annotations
@@ -10,12 +11,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Final
 
-from flasher.errors import UsageError
+from flasher.device.application import Application
+from flasher.device.timer import due_again
 from flasher.events import BytesDamaged, DeviceReported
-from flasher.protocol import messages
 from flasher.protocol.engine import Transmitter
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import Target
 from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Damage, Message, Reassembler, encode, split
 
@@ -24,24 +24,32 @@ _UNUSED_WIRE_S: Final = 0.0
 
 
 class Machine(ABC):
-    """An engine (`flasher.protocol.engine`) that answers on `target`'s ids; base of `Device`.
-
-    Raises UsageError for timings that would make it announce without a pause.
+    """An engine (`flasher.protocol.engine`) that hears the ids of its application and its own
+    `own_ids`; base of `Device` and `Unit`.
     """
 
-    def __init__(self, target: Target, *, bitrate_bps: int, timings: Timings) -> None:
-        if timings.boot_version_spacing_s <= 0:
-            raise UsageError("the time between two announcements is greater than 0")
-        self.target = target
+    def __init__(
+        self,
+        application: Application,
+        own_ids: frozenset[int] = frozenset(),
+        *,
+        bitrate_bps: int,
+        timings: Timings,
+    ) -> None:
+        self.application = application
         self.timings = timings
         self._bitrate_bps = bitrate_bps
-        self._request_id = target.request_id
-        self._reassembler = Reassembler(target.request_id, timings.inter_frame_timeout_s)
+        self._reassemblers = {
+            can_id: Reassembler(can_id, timings.inter_frame_timeout_s)
+            for can_id in sorted(own_ids | application.hears)
+        }
         self._transmitter = Transmitter(bitrate_bps)
         self._events: list[object] = []
         self._due: float | None = None
         self._is_deaf = False
         self._is_cancelled = False
+        self._runs_application = False
+        application.attach(self)
 
     # -- the engine interface ---------------------------------------------------------------------
 
@@ -51,28 +59,38 @@ class Machine(ABC):
         return self._is_cancelled and self._transmitter.idle
 
     def receive(self, frame: Frame, now: float) -> None:
-        """A CAN frame arrived. Only payload on this device's own id is looked at."""
-        if frame.can_id != self._request_id or not frame.is_payload:
-            return
+        """A CAN frame arrived. Only payload on the ids that concern this device is looked at."""
         if self._is_cancelled or self._is_deaf:
             return
-        for found in self._reassembler.feed(frame.data, now):
+        if self._runs_application:
+            self.application.heard(now)
+        reassembler = self._reassemblers.get(frame.can_id)
+        if reassembler is None or not frame.is_payload:
+            return
+        for found in reassembler.feed(frame.data, now):
             self._take(found, now)
 
     def tick(self, now: float) -> None:
         """Let everything happen that is due by `now`."""
         if self._is_cancelled:
             return
-        for found in self._reassembler.tick(now):
-            self._take(found, now)
+        for reassembler in self._reassemblers.values():
+            for found in reassembler.tick(now):
+                self._take(found, now)
         self._run_timer(now)
+        if self._runs_application:
+            self.application.tick(now)
 
     def deadline(self) -> float | None:
         """When it next wants `tick` or has a frame to send; None while it waits for the bus."""
         wanted = self._transmitter.deadline()
         if self._is_cancelled:
             return wanted
-        for other in (self._due, self._reassembler.deadline()):
+        others = [reassembler.deadline() for reassembler in self._reassemblers.values()]
+        others.append(self._due)
+        if self._runs_application:
+            others.append(self.application.deadline())
+        for other in others:
             if other is not None and (wanted is None or other < wanted):
                 wanted = other
         return wanted
@@ -96,12 +114,50 @@ class Machine(ABC):
         events, self._events = self._events, []
         return events
 
+    # -- for the application ----------------------------------------------------------------------
+
+    @property
+    def is_idle(self) -> bool:
+        """True when nothing waits to be sent."""
+        return self._transmitter.idle
+
+    def send(self, message: Message) -> None:
+        """Send a message after those before it."""
+        frames = split(message.can_id, encode(message))
+        self._transmitter.queue(frames, wire_s=_UNUSED_WIRE_S)
+
+    def emit(self, event: object) -> None:
+        """Tell those who watch."""
+        self._events.append(event)
+
+    def switch_off(self, now: float) -> None:
+        """The application cuts the power."""
+        self.power_cut(now)
+
+    def hold_key(self, now: float) -> None:
+        """Somebody held the key for as long as it takes to switch off; the application knows
+        whether that is its business.
+        """
+        if self._runs_application:
+            self.application.hold_key(now)
+
     # -- for the model ----------------------------------------------------------------------------
 
+    @property
     @abstractmethod
-    def _take_row(
-        self, row: messages.Row | messages.Malformed | messages.Unknown, now: float
-    ) -> None:
+    def has_power(self) -> bool:
+        """False after a power cut."""
+
+    @abstractmethod
+    def power_cut(self, now: float) -> None:
+        """The power goes, and with it everything but the flash and what is kept on purpose."""
+
+    @abstractmethod
+    def power_on(self, now: float) -> None:
+        """The power comes back."""
+
+    @abstractmethod
+    def _take_message(self, message: Message, now: float) -> None:
         """An intact message arrived."""
 
     @abstractmethod
@@ -118,22 +174,19 @@ class Machine(ABC):
             self._expire(now)
 
     def _rearm(self, delay_s: float, now: float) -> None:
-        """Count from when the timer was due, so that lateness does not add up, unless too late."""
-        due = now if self._due is None else self._due + delay_s
-        self._due = due if due > now else now + delay_s
-
-    def _send(self, row: messages.Row, can_id: int | None = None) -> None:
-        """Send a message after those before it, to the tool unless another id is given."""
-        own_id = self.target.answer_id if can_id is None else can_id
-        frames = split(own_id, encode(row.to_message(own_id)))
-        self._transmitter.queue(frames, wire_s=_UNUSED_WIRE_S)
+        self._due = due_again(self._due, delay_s, now)
 
     def _report(self, what: str) -> None:
-        self._events.append(DeviceReported(what))
+        self.emit(DeviceReported(what))
+
+    def _forget_received(self) -> None:
+        """Forget every message of which the end is still to come."""
+        for reassembler in self._reassemblers.values():
+            reassembler.reset()
 
     def _lose_memory(self) -> None:
         """Forget everything received, and everything to be sent at once, even half a message."""
-        self._reassembler.reset()
+        self._forget_received()
         self._transmitter = Transmitter(self._bitrate_bps)
         self._due = None
 
@@ -143,11 +196,47 @@ class Machine(ABC):
             return
         due_before = self._due
         if isinstance(found, Damage):
-            self._events.append(BytesDamaged(found.can_id, found.reason.value, found.data))
+            self.emit(BytesDamaged(found.can_id, found.reason.value, found.data))
             self._take_damage(found, now)
         else:
-            self._take_row(messages.decode(found), now)
+            self._take_message(found, now)
         # What this message began is over at once with times of 0. A timer that ran before waits for
         # `tick`: messages that were held up somewhere are taken first.
         if self._due != due_before:
             self._run_timer(now)
+
+
+class Unit(Machine):
+    """A node without a bootloader: its application runs while there is power."""
+
+    def __init__(self, application: Application, *, bitrate_bps: int, timings: Timings) -> None:
+        super().__init__(application, bitrate_bps=bitrate_bps, timings=timings)
+        self.power_on(float("-inf"))
+
+    @property
+    def has_power(self) -> bool:
+        """False after a power cut."""
+        return self._runs_application
+
+    def power_cut(self, now: float) -> None:
+        """The power goes."""
+        self._runs_application = False
+        self._is_deaf = True
+        self.application.stop()
+        self._lose_memory()
+
+    def power_on(self, now: float) -> None:
+        """The power comes back."""
+        if not self._runs_application:
+            self._runs_application = True
+            self._is_deaf = False
+            self.application.start("", now)
+
+    def _take_message(self, message: Message, now: float) -> None:
+        self.application.take(message, now)
+
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        pass
+
+    def _expire(self, now: float) -> None:
+        self._due = None

@@ -1,4 +1,5 @@
-"""The device: application and bootloader on a flash of their own, written from the document alone.
+"""The device: a bootloader on a flash of its own, and the application that it starts, written from
+the document alone.
 
 What happens becomes an event (`classify`, `_elapsed`), the table says what follows, and the methods
 at the end do it. An action may change everything but the state, and returns a few words for those
@@ -14,19 +15,22 @@ import hashlib
 from collections.abc import Callable, Mapping
 from typing import ClassVar, Final
 
+from flasher.device.application import Application
+from flasher.device.bms import BmsApplication
 from flasher.device.classify import Situation, Transfer, classify, is_damaged_packet, named_number
 from flasher.device.machine import Machine
 from flasher.device.memory import FlashController, Operation
+from flasher.device.memory_map import memory_map
 from flasher.device.profile import DeviceProfile
 from flasher.device.store import ApplicationStore, checksum_fits, factory_image
 from flasher.device.table import TABLE, Action, Event, Row, State
-from flasher.errors import FlasherError
+from flasher.errors import FlasherError, UsageError
 from flasher.events import DeviceStateEntered, ImageStored, PacketStored
 from flasher.protocol import messages
-from flasher.protocol.spec import BOOT_VERSION_BURST, PACKET_COUNT_MAX, VERSION_FIELD_SIZE, Target
-from flasher.protocol.text import encode_text, find_firmware_version
+from flasher.protocol.spec import BOOT_VERSION_BURST, DIALECTS, PACKET_COUNT_MAX, Node, Target
+from flasher.protocol.text import find_firmware_version
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
-from flasher.protocol.wire import Damage
+from flasher.protocol.wire import Damage, Message
 
 NO_VERSION: Final = "unknown"
 """Firmware text of an application in whose image no version was found."""
@@ -45,8 +49,9 @@ class Device(Machine):
     """One upgradable device, an engine (`flasher.protocol.engine`).
 
     At construction it has been on for a while: its application runs, or, when there is none, its
-    bootloader announces itself from the first time it is given. Raises UsageError for timings that
-    would make it announce without a pause.
+    bootloader announces itself from the first time it is given. A BMS has an application that
+    answers, others a silent one unless another is given. Raises UsageError for timings that would
+    make it announce without a pause.
     """
 
     table: ClassVar[Mapping[State, Row]] = TABLE
@@ -59,10 +64,19 @@ class Device(Machine):
         profile: DeviceProfile = _DEFAULT_PROFILE,
         timings: Timings = DEFAULT_TIMINGS,
         has_application: bool = True,
+        application: Application | None = None,
     ) -> None:
-        super().__init__(target, bitrate_bps=bitrate_bps, timings=timings)
+        if timings.boot_version_spacing_s <= 0:
+            raise UsageError("the time between two announcements is greater than 0")
+        self.target = target
         self.profile = profile
         self.store = ApplicationStore(profile)
+        super().__init__(
+            application or _own_application(target, profile, self.store),
+            frozenset((target.request_id,)),
+            bitrate_bps=bitrate_bps,
+            timings=timings,
+        )
         self.state = State.APPLICATION if has_application else State.ANNOUNCING
         self._controller = FlashController(
             self.store.flash,
@@ -72,11 +86,12 @@ class Device(Machine):
         self._transfer = Transfer(0)
         self._announced = 0
         self._has_whole_application = has_application
-        self._firmware = NO_VERSION
+        self._runs_application = has_application
         # What the message in hand brought, for the action that follows it.
         self._offered_bytes = 0
         self._number: int | None = None
         self._payload = b""
+        self._message: Message | None = None
         self._actions = self._make_actions()
         if has_application:
             self.store.load(factory_image(profile))
@@ -105,6 +120,11 @@ class Device(Machine):
 
     # -- power ------------------------------------------------------------------------------------
 
+    @property
+    def has_power(self) -> bool:
+        """False after a power cut."""
+        return self.state is not State.OFF
+
     def power_cut(self, now: float) -> None:
         """The power goes: all is lost but the flash, and an operation under way stays torn."""
         self._handle(Event.POWER_CUT, now)
@@ -115,6 +135,14 @@ class Device(Machine):
         self._run_timer(now)
 
     # -- from the world to events -----------------------------------------------------------------
+
+    def _take_message(self, message: Message, now: float) -> None:
+        self._message = message
+        # On other ids there is nothing for a bootloader, whatever the command.
+        if message.can_id == self.target.request_id:
+            self._take_row(messages.decode(message), now)
+        else:
+            self._handle(Event.QUERY, now)
 
     def _take_row(
         self, row: messages.Row | messages.Malformed | messages.Unknown, now: float
@@ -129,7 +157,8 @@ class Device(Machine):
         self._handle(self._classify(row), now)
 
     def _take_damage(self, damage: Damage, now: float) -> None:
-        if is_damaged_packet(damage) and self.state is State.TRANSFER:
+        is_own = damage.can_id == self.target.request_id
+        if is_own and is_damaged_packet(damage) and self.state is State.TRANSFER:
             self._number = named_number(damage.data)
             self._handle(Event.PACKET_BAD, now)
 
@@ -169,6 +198,9 @@ class Device(Machine):
         before = self.state
         action, self.state = self.table[before][event]
         self._is_deaf = self.state in _DEAF
+        self._runs_application = self.state is State.APPLICATION
+        if before is State.APPLICATION and not self._runs_application:
+            self.application.stop()
         detail = self._actions[action](now)
         if self.state is not before and not {self.state, before} <= _PER_PACKET:
             self._events.append(DeviceStateEntered(self.state.value, detail))
@@ -180,7 +212,7 @@ class Device(Machine):
             Action.CONFIRM_RESET: self._confirm_reset,
             Action.RESTART: self._restart,
             Action.SEND_FEEDBACK: self._send_feedback,
-            Action.SEND_VERSION: self._send_version,
+            Action.ANSWER: self._answer,
             Action.BOOT: self._boot,
             Action.ANNOUNCE: self._announce,
             Action.START: self._start,
@@ -200,6 +232,10 @@ class Device(Machine):
             Action.SWITCH_OFF: self._switch_off,
         }
 
+    def _send(self, row: messages.Row) -> None:
+        """Send one of the upgrade's messages to the tool."""
+        self.send(row.to_message(self.target.answer_id))
+
     # -- actions: application, reset, announcements -----------------------------------------------
 
     def _nothing(self, now: float) -> str:
@@ -217,11 +253,9 @@ class Device(Machine):
             self._send(messages.GeneralFeedback())
         return ""
 
-    def _send_version(self, now: float) -> str:
-        profile = self.profile
-        texts = (profile.model, profile.serial_number, profile.hardware_version, self._firmware)
-        information = messages.VersionInformation(*map(_version_field, texts))
-        self._send(information, self.target.broadcast_id)
+    def _answer(self, now: float) -> str:
+        if self._message is not None:
+            self.application.take(self._message, now)
         return ""
 
     def _confirm_reset(self, now: float) -> str:
@@ -237,7 +271,7 @@ class Device(Machine):
 
     def _await_restart(self, now: float) -> None:
         self._controller.abort(now)
-        self._reassembler.reset()
+        self._forget_received()
         self._due = now + self.profile.reset_delay_s
 
     def _boot(self, now: float) -> str:
@@ -264,8 +298,9 @@ class Device(Machine):
 
     def _start(self, now: float) -> str:
         self._due = None
-        self._firmware = find_firmware_version(self.store.image() or b"") or NO_VERSION
-        return f"version {self._firmware}"
+        firmware = find_firmware_version(self.store.image() or b"") or NO_VERSION
+        self.application.start(firmware, now)
+        return f"version {firmware}"
 
     # -- actions: update command and transfer -----------------------------------------------------
 
@@ -375,8 +410,9 @@ class Device(Machine):
         return ""
 
 
-def _version_field(text: str) -> bytes:
-    """A text as a field; one that fills the field has no terminator, a longer one is cut (R20)."""
-    if len(text) < VERSION_FIELD_SIZE:
-        return encode_text(text, VERSION_FIELD_SIZE)
-    return text.encode("ascii")[:VERSION_FIELD_SIZE]
+def _own_application(
+    target: Target, profile: DeviceProfile, store: ApplicationStore
+) -> Application:
+    if target.node is Node.BMS:
+        return BmsApplication(profile, memory_map(store.flash))
+    return Application(target.node, DIALECTS[profile.dialect])

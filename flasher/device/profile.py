@@ -1,4 +1,4 @@
-"""What a bootloader may choose where the document leaves it open: one frozen dataclass.
+"""What a device may choose where the document leaves it open: one frozen dataclass.
 
 The cases of the conformance suite marked P name these choices. An option's allowed values are its
 type, its help stands beside it, and both the command line and the tests read them from here.
@@ -11,13 +11,20 @@ import difflib
 import math
 import types
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from flasher.errors import UsageError
-from flasher.protocol.spec import IMAGE_MAX_SIZE, PACKET_DATA_SIZE, VERSION_FIELD_SIZE
+from flasher.protocol.spec import (
+    IMAGE_MAX_SIZE,
+    PACKET_DATA_SIZE,
+    VERSION_FIELD_SIZE,
+    WELLING,
+)
 from flasher.protocol.text import encode_text
 
 _HELP = "help"
+_NO_QUERIES = "none"
 _SUFFIXES = {"K": 1024, "M": 1024 * 1024}
 
 
@@ -88,6 +95,23 @@ class DeviceProfile:
     serial_number: str = _option("W2605001", "serial number text of the version information")
     hardware_version: str = _option("V1r2r0_20220512", "hardware text of the version information")
     factory_version: str = _option("V1r0r0_20220512", "version of the first application")
+    dialect: Literal["welling", "motinova"] = _option(
+        WELLING.name, "document that its application speaks by"
+    )
+    older_battery: Literal["no", "yes"] = _option(
+        "no", "yes: no state of health, no answer to 732 5300 and 742 5200 (section 6)"
+    )
+    silent_queries: str = _option(
+        "none", "commands not answered, as 3800,732:5000: of all ids, or of one; parted by commas"
+    )
+    battery_use: Literal["riding", "resting"] = _option(
+        "riding", "rides and charges in turn, or rests"
+    )
+    battery_seed: int = _option(1, "decides how the cells differ")
+    faults: int = _option(0, "faults that are set from the start, as the 32 bits of 720 1204")
+    idle_shutdown: Literal["off", "on"] = _option(
+        "off", "switches off when the bus was idle for 30 min at a small current (5.1)"
+    )
 
     # Memory.
     application_area_bytes: int = _option(
@@ -109,6 +133,16 @@ class DeviceProfile:
         area = min(self.application_area_bytes, IMAGE_MAX_SIZE)
         return area if limit is None else min(limit, area)
 
+    def is_silent_to(self, can_id: int, command: int) -> bool:
+        """True for a query or write that `silent_queries` names."""
+        return (None, command) in self._silent or (can_id, command) in self._silent
+
+    @cached_property
+    def _silent(self) -> frozenset[tuple[int | None, int]]:
+        if self.silent_queries in {"", _NO_QUERIES}:
+            return frozenset()
+        return frozenset(map(_parse_query, self.silent_queries.split(",")))
+
     def __post_init__(self) -> None:
         hints = get_type_hints(type(self))
         for field in dataclasses.fields(self):
@@ -123,6 +157,9 @@ class DeviceProfile:
             raise UsageError(f"boot_version is 6 ASCII characters, not {self.boot_version!a}")
         if not self.transfer_timeout_s:
             raise UsageError("transfer_timeout_s is greater than 0")
+        if self.faults >> 32:
+            raise UsageError(f"faults are 32 bits, not 0x{self.faults:X}")
+        _ = self._silent
 
     def _check_sizes(self) -> None:
         unit, page = self.program_unit_bytes, self.page_size_bytes
@@ -194,6 +231,17 @@ def _parse(key: str, hint: object, text: str) -> object:
             f"{key} is a number, not {text!a}",
             where="--set",
             remedy="write a number such as 0.05" if hint is float else "write 2048, 0x800 or 2K",
+        ) from None
+
+
+def _parse_query(text: str) -> tuple[int | None, int]:
+    """`COMMAND` or `ID:COMMAND`, both in hexadecimal, as (id or None, command)."""
+    can_id, _, command = text.strip().rpartition(":")
+    try:
+        return (int(can_id, 16) if can_id else None), int(command, 16)
+    except ValueError:
+        raise UsageError(
+            f"silent_queries: {text!a} is no command", remedy="write 3800 or 732:5000"
         ) from None
 
 

@@ -33,7 +33,7 @@ class Event(Enum):
     # Messages.
     RESET = "reset"
     RESET_IGNORED = "reset that the bootloader ignores"
-    VERSION_QUERY = "version query"
+    QUERY = "query or write of the application"
     UPGRADE_IN_APPLICATION = "upgrade message for the running application"
     UPDATE = "update command"
     UPDATE_AGAIN = "update command repeated"
@@ -85,7 +85,7 @@ class Action(Enum):
     CONFIRM_RESET = "send general feedback, restart"
     RESTART = "restart"
     SEND_FEEDBACK = "send general feedback"
-    SEND_VERSION = "send version information"
+    ANSWER = "answer it"
     BOOT = "look for a whole application"
     ANNOUNCE = "send boot version"
     START = "start the application"
@@ -150,7 +150,7 @@ TABLE: Final[Mapping[State, Row]] = {
         State.APPLICATION,
         {
             Event.RESET: (Action.CONFIRM_RESET, State.RESTARTING),
-            Event.VERSION_QUERY: (Action.SEND_VERSION, State.APPLICATION),
+            Event.QUERY: (Action.ANSWER, State.APPLICATION),
             Event.UPGRADE_IN_APPLICATION: (Action.SEND_FEEDBACK, State.APPLICATION),
         },
     ),

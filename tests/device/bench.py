@@ -28,6 +28,16 @@ _BLOCKED_STEP_S: Final = 0.01
 _EventT = TypeVar("_EventT")
 
 
+class VersionQuery:
+    """The tool asks the application for its version."""
+
+    def to_message(self, can_id: int) -> Message:
+        return Message(can_id, 0x11, 0x3300, b"")
+
+
+READ_VERSION: Final = VersionQuery()
+
+
 class Sent(NamedTuple):
     """A whole message that the device has sent."""
 
@@ -141,11 +151,11 @@ class Bench:
     def put_hex(self, text: str) -> None:
         self.put_wire(bytes.fromhex(text))
 
-    def send(self, *rows: messages.Row) -> None:
+    def send(self, *rows: messages.Row | VersionQuery) -> None:
         for row in rows:
             self.put_wire(self.encoded(row))
 
-    def encoded(self, row: messages.Row) -> bytes:
+    def encoded(self, row: messages.Row | VersionQuery) -> bytes:
         return encode(row.to_message(self.target.request_id))
 
     # -- from the device --------------------------------------------------------------------------

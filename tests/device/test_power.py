@@ -13,7 +13,7 @@ from flasher.events import DeviceStateEntered
 from flasher.protocol import messages
 from flasher.protocol.frame import Frame
 from flasher.protocol.wire import split
-from tests.device.bench import SMALL, Bench, image_of, packets_of
+from tests.device.bench import READ_VERSION, SMALL, Bench, image_of, packets_of
 
 OLD = image_of(700, "V1r5r0_20250101", seed=3)
 NEW = image_of(600)
@@ -200,7 +200,7 @@ def test_without_power_nothing_is_heard_and_nothing_is_said() -> None:
     bench = Bench(SMALL)
     bench.device.power_cut(bench.now)
     bench.device.power_cut(bench.now)
-    bench.send(messages.Reset(), messages.ReadVersion())
+    bench.send(messages.Reset(), READ_VERSION)
     bench.run(10.0)
     assert bench.take() == []
     assert bench.device.state is State.OFF

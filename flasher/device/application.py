@@ -1,0 +1,93 @@
+"""What runs on a device once its bootloader has started it (R19), and what it may ask of the
+machine that it runs on.
+
+The base says nothing and understands nothing: the documents tell nothing of what WMC and OBC would
+answer. `bms` answers, `talkers` ask.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from flasher.protocol.catalogue import ITEMS
+from flasher.protocol.spec import Dialect, Node
+from flasher.protocol.wire import Message
+
+
+class Port(Protocol):
+    """The machine, as its application sees it."""
+
+    @property
+    def is_idle(self) -> bool:
+        """True when everything that was to be sent has been accepted by the bus. What repeats is
+        sent only then, so that a bus that takes nothing does not pile it up.
+        """
+        ...
+
+    def send(self, message: Message) -> None:
+        """Send a message after those before it."""
+        ...
+
+    def emit(self, event: object) -> None:
+        """Tell those who watch."""
+        ...
+
+    def switch_off(self, now: float) -> None:
+        """Cut the machine's own power."""
+        ...
+
+
+class Application:
+    """An application that is silent; base of those that are not."""
+
+    def __init__(self, node: Node, dialect: Dialect) -> None:
+        self.node = node
+        self.dialect = dialect
+        self._port: Port | None = None
+
+    @property
+    def hears(self) -> frozenset[int]:
+        """CAN ids of the messages that it takes."""
+        return frozenset()
+
+    @property
+    def port(self) -> Port:
+        """The machine that it runs on."""
+        if self._port is None:
+            raise LookupError("an application runs on a machine")
+        return self._port
+
+    def attach(self, port: Port) -> None:
+        """Put it on the machine that it runs on."""
+        self._port = port
+
+    def start(self, firmware: str, now: float) -> None:
+        """It starts, with the version text that its image holds."""
+
+    def stop(self) -> None:
+        """A restart, or the power is gone: all is lost but what is kept on purpose."""
+
+    def heard(self, now: float) -> None:
+        """There was a frame on the bus, whosesoever."""
+
+    def take(self, message: Message, now: float) -> None:
+        """An intact message arrived on one of the ids that it hears."""
+
+    def hold_key(self, now: float) -> None:
+        """The key was held for as long as it takes to switch off."""
+
+    def deadline(self) -> float | None:
+        """When it next wants `tick`."""
+        return None
+
+    def tick(self, now: float) -> None:
+        """The time that it asked for has come."""
+
+
+def ids_heard_by(node: Node, dialect: Dialect) -> frozenset[int]:
+    """CAN ids of all messages of the documents that others send to `node`, or to all."""
+    return frozenset(
+        item.can_id
+        for item in ITEMS
+        if dialect in item.dialects and item.sender is not node and item.receiver in {None, node}
+    )
