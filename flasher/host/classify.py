@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from flasher.host.options import UpgradeOptions
+from flasher.host.options import UpgradeOptions, firmware_version
 from flasher.host.table import Event, State
 from flasher.image.plan import Plan
 from flasher.protocol.engine import Transmitter
+from flasher.protocol.fields import Content
 from flasher.protocol.messages import (
     Ack,
     BootVersion,
@@ -23,10 +24,8 @@ from flasher.protocol.messages import (
     RequestTransfer,
     Row,
     Unknown,
-    VersionInformation,
 )
 from flasher.protocol.spec import BOOT_VERSION_BURST
-from flasher.protocol.text import decode_text
 from flasher.protocol.timing import Timings
 
 _NEVER = float("-inf")
@@ -100,7 +99,7 @@ class Classifier:
         self._burst_gap_s = BOOT_VERSION_BURST * self._timings.boot_version_spacing_s
         """Announcements further apart than a whole burst takes are not of one burst."""
 
-    def message(self, row: Row | Malformed | Unknown, at: Situation, now: float) -> Event:
+    def message(self, row: Row | Malformed | Unknown | Content, at: Situation, now: float) -> Event:
         """The event that a received message is."""
         match row:
             case Ack() | Nak():
@@ -117,7 +116,7 @@ class Classifier:
                 return self._complete(at)
             case GeneralFeedback():
                 return Event.FEEDBACK
-            case VersionInformation():
+            case Content():
                 return self._version(row, at)
             case _:
                 return Event.UNEXPECTED
@@ -257,10 +256,10 @@ class Classifier:
             return Event.COMPLETE
         return Event.COMPLETE_EARLY if at.state in _IN_TRANSFER | _AFTER_END else Event.UNEXPECTED
 
-    def _version(self, version: VersionInformation, at: Situation) -> Event:
+    def _version(self, answer: Content, at: Situation) -> Event:
         if at.state is not State.CONFIRMING:
             return Event.UNEXPECTED
-        at.running_version = decode_text(version.firmware)
+        at.running_version = firmware_version(answer)
         expected = self._plan.image.version
         if expected is None:
             return Event.VERSION_UNJUDGED
@@ -270,6 +269,6 @@ class Classifier:
         announced = at.announced_at is not None
         if not announced and at.end_tries < self._timings.end_tries:
             return Event.END_UNANSWERED
-        if not self._plan.target.has_version_query:
+        if self._options.version_request_for(self._plan.target) is None:
             return Event.END_UNCONFIRMABLE
         return Event.BURST_ENDED if announced else Event.END_LOST

@@ -9,11 +9,12 @@ from flasher.events import Phase
 from flasher.host.classify import Situation
 from flasher.host.outcome import Statistics
 from flasher.host.table import Event
+from flasher.protocol.fields import Content
 from flasher.protocol.messages import BootVersion, Malformed, Nak, Row, Unknown
 from flasher.protocol.text import printable
 from flasher.protocol.wire import Damage
 
-Received = Row | Malformed | Unknown | None
+Received = Row | Malformed | Unknown | Content | None
 """The message behind an event; None for a timer or the user's word."""
 
 _TIMEOUTS = frozenset(

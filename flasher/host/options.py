@@ -5,7 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from flasher.host.query import Request
 from flasher.image.plan import Plan
+from flasher.protocol.catalogue import BY_KEY
+from flasher.protocol.fields import Content
+from flasher.protocol.spec import Command, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 
 DEFAULT_ATTEMPTS: Final = 3
@@ -26,8 +30,26 @@ class UpgradeOptions:
     """Silence between an answer and the next packet, for slow receivers."""
     nak_next_is_ack: bool = False
     """Take NAK n+1 for ACK n when n was sent more than once (R10)."""
+    reset_command: int = Command.RESET
+    reset_data: bytes = b"RESET"
+    """What makes the application restart into the bootloader; a product may have its own (R3)."""
+    version_request: Request | None = None
+    """How to ask the new application for its version; None is the document's way, where the target
+    has one."""
     allow_boot_name: bool = False
     """Upgrade a device whose bootloader gives another name, or no version, than the target's."""
+
+    def version_request_for(self, target: Target) -> Request | None:
+        """How to ask this target for its version; None where nobody knows."""
+        if self.version_request is not None:
+            return self.version_request
+        item = BY_KEY.get((target.request_id, Command.READ_VERSION))
+        return None if item is None else Request(item)
+
+
+def firmware_version(answer: Content) -> str:
+    """The firmware version that an answer to a version request names, safe to show."""
+    return str(getattr(answer, "firmware_version", ""))
 
 
 def default_timeout_s(plan: Plan, options: UpgradeOptions) -> float:

@@ -19,21 +19,25 @@ from flasher.host.options import UpgradeOptions, default_timeout_s
 from flasher.host.outcome import DeviceLeft, Outcome, standing
 from flasher.host.table import TABLE, Action, Ending, Event, State
 from flasher.image.plan import Plan
+from flasher.protocol import catalogue
 from flasher.protocol.engine import Transmitter
+from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import (
     BootVersion,
     EndOfTransfer,
-    ReadVersion,
-    Reset,
+    Malformed,
     Row,
+    Unknown,
     UpdateCommand,
     decode,
 )
-from flasher.protocol.spec import BOOT_VERSION_BURST, Command
+from flasher.protocol.spec import BOOT_VERSION_BURST, Command, Mode
 from flasher.protocol.text import printable
 from flasher.protocol.wire import Damage, Message, Reassembler, encode, split
 
+NOBODY: Final = -1
+"""A CAN id that no frame has."""
 _PHASES: Final = {
     State.RESETTING: Phase.RESET,
     State.AWAITING_BOOT: Phase.BOOT,
@@ -66,7 +70,11 @@ class Upgrade:
         self._classifier = Classifier(plan, self._options)
         inter_frame_s = self._timings.inter_frame_timeout_s
         self._answers = Reassembler(plan.target.answer_id, inter_frame_s)
-        self._broadcasts = Reassembler(plan.target.broadcast_id, inter_frame_s)
+        self._version_request = self._options.version_request_for(plan.target)
+        request = self._version_request
+        self._version_answer = None if request is None else request.answer_item
+        version_id = self._version_answer.can_id if self._version_answer else NOBODY
+        self._broadcasts = Reassembler(version_id, inter_frame_s)
         self._tx = Transmitter(plan.bitrate_bps, self._options.frame_gap_s)
         self._at = Situation(self._tx)
         self._phase = Phase.RESET
@@ -190,9 +198,15 @@ class Upgrade:
         if isinstance(found, Damage):
             self._journal.damaged(found)
             return
-        row = decode(found)
+        row = self._decode(found)
         self._journal.received(row)
         self._dispatch(self._classifier.message(row, self._at, now), now, row)
+
+    def _decode(self, message: Message) -> Row | Malformed | Unknown | Content:
+        answer = self._version_answer
+        if answer is not None and message[:3] == (answer.can_id, answer.mode, answer.command):
+            return answer.content.from_data(message.data)
+        return decode(message)
 
     def _dispatch(self, event: Event, now: float, row: Received = None) -> None:
         action, state = TABLE[self._at.state][event]
@@ -272,7 +286,7 @@ class Upgrade:
             timeout_s = default_timeout_s(self._plan, self._options)
         self._deadline_at = now + timeout_s
         self._journal.phase(self._phase, self._at.attempt)
-        self._send(Reset())
+        self._send_reset(now, Event.RESET_DUE, None)
 
     def _nothing(self, now: float, event: Event, row: Received) -> None:
         """Ignored by the table."""
@@ -281,7 +295,9 @@ class Upgrade:
         self._journal.reported(event, row)
 
     def _send_reset(self, now: float, event: Event, row: Received) -> None:
-        self._send(Reset())
+        options, request_id = self._options, self._plan.target.request_id
+        reset = Message(request_id, Mode.WRITE, options.reset_command, options.reset_data)
+        self._queue(split(request_id, encode(reset)), Command.RESET)
 
     def _await_boot(self, now: float, event: Event, row: Received) -> None:
         self._tx.drop_unstarted()
@@ -340,7 +356,11 @@ class Upgrade:
         self._report(now, event, row)
 
     def _query_version(self, now: float, event: Event, row: Received) -> None:
-        self._send(ReadVersion())
+        request = self._version_request
+        if request is None:
+            raise RuntimeError("the table asks for a version that nobody can be asked for")
+        query = catalogue.encode(request.item, request.content)
+        self._queue(split(query.can_id, encode(query)), Command.READ_VERSION)
 
     def _send(self, row: Row, *, not_before: float = 0.0) -> None:
         request_id = self._plan.target.request_id

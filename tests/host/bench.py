@@ -36,7 +36,8 @@ from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.protocol.wire import Message, Reassembler, encode, split
 
 BOOT = BootVersion("BMS", "V1.2.3")
-SentRow = TypeVar("SentRow", bound=Row)
+SentRow = TypeVar("SentRow", bound=Row | Message)
+"""What the host sends: rows of the upgrade, and queries of chapter 3 as they are on the wire."""
 
 
 def image_of(size_bytes: int, seed: int = 1) -> Image:
@@ -65,7 +66,7 @@ class Bench:
         self.now = 100.0
         self.engine = Upgrade(plan(self.image, target, WELLING.bitrate_bps), options)
         self.events: list[object] = []
-        self.sent: list[tuple[float, Row]] = []
+        self.sent: list[tuple[float, Row | Message]] = []
         """Every message that has left the host, with the time at which its last frame had."""
         self.on_frame: Callable[[int], None] | None = None
         """Called with the number of frames sent so far, before the engine is told of each."""
@@ -102,7 +103,7 @@ class Bench:
         return row
 
     @property
-    def unread(self) -> list[Row]:
+    def unread(self) -> list[Row | Message]:
         """What the host has sent and no `expect` has taken."""
         return [row for _, row in self.sent[self._read :]]
 
@@ -120,17 +121,17 @@ class Bench:
             for found in self._wire.feed(frame.data, self.now):
                 assert isinstance(found, Message), found
                 row = decode(found)
-                assert not isinstance(row, Malformed | Unknown), row
-                self.sent.append((self.now, row))
+                assert not isinstance(row, Malformed), row
+                self.sent.append((self.now, found if isinstance(row, Unknown) else row))
         self.events += self.engine.take_events()
 
     # -- the device ------------------------------------------------------------------------------
 
-    def say(self, *rows: Row, can_id: int | None = None) -> None:
+    def say(self, *rows: Row | Message) -> None:
         """The device sends messages now, in no time."""
         for row in rows:
-            answer_id = self.target.answer_id if can_id is None else can_id
-            for frame in split(answer_id, encode(row.to_message(answer_id))):
+            message = row if isinstance(row, Message) else row.to_message(self.target.answer_id)
+            for frame in split(message.can_id, encode(message)):
                 self.engine.receive(frame, self.now)
         self.events += self.engine.take_events()
         self._flush()

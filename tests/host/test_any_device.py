@@ -52,7 +52,7 @@ script = st.lists(st.tuples(pauses, st.one_of(rows, rows, rows, frames)), max_si
 
 
 @given(script)
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=200, deadline=None, derandomize=True)
 def test_the_host_ends_explicitly_whatever_the_device_says(
     steps: list[tuple[float, Row | Frame]],
 ) -> None:
@@ -86,7 +86,7 @@ def _watch_update_commands(bench: Bench, said: list[tuple[float, Row]]) -> None:
 
 
 @given(st.lists(rows, min_size=1, max_size=6))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None, derandomize=True)
 def test_memory_and_time_are_bounded_when_a_device_repeats_itself_for_ever(
     babble: list[Row],
 ) -> None:

@@ -20,18 +20,19 @@ from flasher.protocol.messages import (
     GeneralFeedback,
     Nak,
     Packet,
-    ReadVersion,
     RequestTransfer,
     Reset,
     Row,
     UpdateCommand,
-    VersionInformation,
 )
 from flasher.protocol.spec import BMS, OBC, WMC, Target
 from flasher.protocol.text import encode_text
+from flasher.protocol.wire import Message
 from tests.host.bench import BOOT, Bench, answer_frames, image_of
 
 NEW = "V2r0r1_20260102"
+READ_VERSION = (0x11, 0x3300, b"")
+"""Mode, command and data of the version query."""
 
 
 def versioned(**changes: object) -> Bench:
@@ -40,10 +41,10 @@ def versioned(**changes: object) -> Bench:
     return Bench(image=image, **changes)  # type: ignore[arg-type]
 
 
-def runs(version: str) -> VersionInformation:
+def runs(version: str) -> Message:
     """The application's answer to the version query."""
-    field = encode_text("BM36", 16)
-    return VersionInformation(field, field, field, encode_text(version, 16))
+    data = encode_text("BM36", 16) * 3 + encode_text(version, 16)
+    return Message(BMS.broadcast_id, 0x0C, 0x1540, data)
 
 
 def announce_on(bench: Bench) -> None:
@@ -56,7 +57,7 @@ def announce_on(bench: Bench) -> None:
 
 
 def answer_version(bench: Bench, version: str) -> None:
-    bench.say(runs(version), can_id=BMS.broadcast_id)
+    bench.say(runs(version))
 
 
 # -- NAK at the end (R6, EN-06) -----------------------------------------------------------------
@@ -146,7 +147,7 @@ def test_a_lost_final_answer_is_replaced_by_the_version_answer() -> None:
     bench.to_end()
     bench.expect(EndOfTransfer)
     bench.expect(EndOfTransfer)
-    bench.expect(ReadVersion)
+    assert bench.expect(Message)[1:] == READ_VERSION
     answer_version(bench, NEW)
     outcome = bench.outcome
     assert outcome.ending is Ending.CONFIRMED_BY_VERSION
@@ -182,7 +183,7 @@ def test_the_version_is_asked_every_200_ms_and_given_up_after_five_seconds() -> 
     bench = versioned()
     bench.to_end()
     bench.wait(60.0)
-    asked = [at for at, row in bench.sent if isinstance(row, ReadVersion)]
+    asked = [at for at, row in bench.sent if isinstance(row, Message) and row[1:] == READ_VERSION]
     assert 24 <= len(asked) <= 26
     assert bench.outcome.ending is Ending.UNCONFIRMED
 
@@ -221,7 +222,7 @@ def test_no_boot_version_is_answered_after_the_end_and_the_version_answer_decide
     for _ in range(4):
         bench.say(BOOT)
         bench.wait(0.05)
-    bench.expect(ReadVersion)
+    assert bench.expect(Message)[1:] == READ_VERSION
     answer_version(bench, NEW)
     assert bench.outcome.ending is Ending.CONFIRMED_BY_VERSION
     assert sum(isinstance(row, UpdateCommand) for _, row in bench.sent) == 1

@@ -1,0 +1,190 @@
+"""What the tool may read from and write to a device, by name; all of it from the catalogue.
+
+The name is the catalogue's title with dashes ("serial-number"). What can be written but has no
+query of its own is read as a field of the answer that holds it: the serial number and the model
+stand in the version information.
+"""
+
+from __future__ import annotations
+
+import datetime
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any, Final, TypeVar
+
+from flasher.errors import UsageError
+from flasher.protocol import catalogue
+from flasher.protocol.catalogue import Item
+from flasher.protocol.contents import Empty
+from flasher.protocol.fields import (
+    Bytes,
+    Codec,
+    Content,
+    DateField,
+    Number,
+    Reserved,
+    TextField,
+    label,
+)
+from flasher.protocol.spec import Dialect, Mode, Node, Target
+
+_DATE: Final = re.compile(r"([0-9]{4})-?([0-9]{2})-?([0-9]{2})")
+
+
+@dataclass(frozen=True)
+class Readable:
+    """Something that can be read: the query, and one field of its answer or (empty) all of it."""
+
+    name: str
+    item: Item
+    field: str = ""
+
+    @property
+    def content(self) -> type[Content]:
+        """What the answer carries."""
+        answer = catalogue.answer_of(self.item)
+        if answer is None:
+            raise ValueError(f"{self.item.name} has no answer")
+        return answer.content
+
+
+@dataclass(frozen=True)
+class Writable:
+    """Something that can be written, and how it is read back (None: it cannot be)."""
+
+    name: str
+    item: Item
+    read_back: Readable | None
+
+    @property
+    def fields(self) -> tuple[tuple[str, Codec], ...]:
+        """Name and codec of what is given when it is written."""
+        return meaningful_fields(self.item.content)
+
+
+def meaningful_fields(content: type[Content]) -> tuple[tuple[str, Codec], ...]:
+    """The fields of a content without the reserved ones."""
+    return tuple((name, codec) for name, codec in content.LAYOUT if not isinstance(codec, Reserved))
+
+
+def readable(target: Target, dialect: Dialect) -> dict[str, Readable]:
+    """What the documents let the tool read from the target, by name; memory is apart."""
+    queries = {
+        name: Readable(name, item)
+        for name, item in _named(target, dialect, Mode.READ)
+        if item.content is Empty
+    }
+    single = {}
+    for name, item in _named(target, dialect, Mode.WRITE):
+        found = None if name in queries else _holder(item, queries)
+        if found is not None:
+            single[name] = found
+    return queries | single
+
+
+def writable(target: Target, dialect: Dialect) -> dict[str, Writable]:
+    """What the documents let the tool write to the target, by name."""
+    reads = readable(target, dialect)
+    return {
+        name: Writable(name, item, reads.get(name))
+        for name, item in _named(target, dialect, Mode.WRITE)
+    }
+
+
+def _named(target: Target, dialect: Dialect, mode: Mode) -> list[tuple[str, Item]]:
+    verb = f"{mode.name.lower()} "
+    return [
+        (item.title.removeprefix(verb).replace(" ", "-"), item)
+        for item in catalogue.ITEMS
+        if (item.sender, item.receiver, item.mode) == (Node.CDL, target.node, mode)
+        and item.title.startswith(verb)
+        and dialect in item.dialects
+    ]
+
+
+def _holder(item: Item, queries: Mapping[str, Readable]) -> Readable | None:
+    """The query whose answer has the one field that `item` writes."""
+    (field, codec), *more = meaningful_fields(item.content)
+    for query in queries.values():
+        if not more and (field, codec) in query.content.LAYOUT:
+            return Readable(field.replace("_", "-"), query.item, field)
+    return None
+
+
+Found = TypeVar("Found", Readable, Writable)
+
+
+def find(name: str, among: Mapping[str, Found], target: Target, verb: str) -> Found:
+    """The item with this name. Raises UsageError, with the closest name, when there is none."""
+    wanted = name.lower().replace("_", "-").replace(" ", "-")
+    if wanted in among:
+        return among[wanted]
+    if not among:
+        raise UsageError(
+            f"The documents give the tool nothing to {verb} in the {target.node.name}.",
+            remedy="Use -t bms; `flasher scan` shows what the other devices send by themselves.",
+        )
+    close = get_close_matches(wanted, among, n=1)
+    hint = f"Did you mean {close[0]}? " if close else ""
+    raise UsageError(
+        f"There is nothing called {name!a} to {verb} in the {target.node.name}.",
+        remedy=f"{hint}There are: {', '.join(among)}.",
+    )
+
+
+# -- values from a person -------------------------------------------------------------------------
+
+
+def make_content(writable: Writable, values: Sequence[object]) -> Content:
+    """The content to write from one value a field: text, a date (YYYYMMDD), bytes in hexadecimal.
+
+    Raises UsageError when a value is missing, too many, or does not fit its field.
+    """
+    fields = writable.fields
+    names = " ".join(label(name, codec).upper().replace(" ", "_") for name, codec in fields)
+    if len(values) != len(fields):
+        given = "no value was" if not values else f"{len(values)} were"
+        raise UsageError(
+            f"{writable.name} takes {len(fields)} value{'s' * (len(fields) > 1)}; {given} given.",
+            remedy=f"Write: flasher write {writable.name} {names}",
+        )
+    by_name = {
+        name: _value(label(name, codec), codec, value)
+        for (name, codec), value in zip(fields, values, strict=True)
+    }
+    content = writable.item.content
+    try:
+        return content.from_data(content(**by_name).data())
+    except ValueError as error:
+        raise UsageError(f"{writable.name}: {error}.") from error
+
+
+def _value(name: str, codec: Codec, value: object) -> Any:
+    if not isinstance(value, str) or isinstance(codec, TextField):
+        return value
+    if isinstance(codec, DateField):
+        return check_date(value)
+    try:
+        if isinstance(codec, Bytes):
+            return bytes.fromhex(value.removeprefix("0x").replace(":", " "))
+        if isinstance(codec, Number):
+            return int(value, 0)
+    except ValueError as error:
+        size = f"{codec.size_bytes} bytes in hexadecimal"
+        wanted = size if isinstance(codec, Bytes) else "a number"
+        raise UsageError(f"{name}: {value!a} is not {wanted}.") from error
+    return value
+
+
+def check_date(text: str) -> str:
+    """A date as the field has it, YYYYMMDD. Raises UsageError when no calendar has it."""
+    match = _DATE.fullmatch(text)
+    if match is None:
+        raise UsageError(f"date: {text!a} is not a date YYYYMMDD.")
+    try:
+        datetime.date(*map(int, match.groups()))
+    except ValueError as error:
+        raise UsageError(f"date: {text!a} is not in the calendar: {error}.") from error
+    return "".join(match.groups())

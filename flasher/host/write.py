@@ -1,0 +1,129 @@
+"""Writing an item: what is to be written, and how it ended.
+
+A write counts when general feedback confirms it and the item reads back as it was written, as far
+as the document gives a query for it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from flasher.errors import FlasherError, UsageError, VerificationError
+from flasher.host.items import Writable, find, make_content, meaningful_fields, writable
+from flasher.protocol.fields import Content, label
+from flasher.protocol.spec import BMS, WELLING, Dialect, Target
+
+
+@dataclass(frozen=True)
+class FieldChange:
+    """One field of a write: name and unit, and its value before, as wanted and as read back, each
+    safe to show; None where it is not known.
+    """
+
+    name: str
+    unit: str
+    old: str | None
+    new: str
+    read_back: str | None
+
+    @property
+    def differs(self) -> bool:
+        """True when something else was read back than was written."""
+        return self.read_back is not None and self.read_back != self.new
+
+
+@dataclass(frozen=True)
+class WritePlan:
+    """What is to be written to whom; made without a bus."""
+
+    target: Target
+    dialect: Dialect
+    writable: Writable
+    content: Content
+
+
+@dataclass(frozen=True)
+class Written:
+    """How a write ended. Contents are None where nothing was answered."""
+
+    plan: WritePlan
+    old: Content | None
+    is_confirmed: bool
+    read_back: Content | None
+
+    @property
+    def changes(self) -> tuple[FieldChange, ...]:
+        """Old value, new value and what was read back, for each field."""
+        return field_changes(self.plan, self.old, self.read_back)
+
+    @property
+    def differences(self) -> tuple[FieldChange, ...]:
+        """The fields that read back differently."""
+        return tuple(change for change in self.changes if change.differs)
+
+    def error(self) -> FlasherError | None:
+        """The error that stands for it; None when it was confirmed and reads back right."""
+        name, node = self.plan.writable.name, self.plan.target.node.name
+        different = self.differences
+        could_read = self.plan.writable.read_back is not None
+        if different:
+            first = different[0]
+            confirmed = "confirmed" if self.is_confirmed else "did not confirm"
+            return VerificationError(
+                f"The {node} {confirmed} the new {name}, but reads back {first.name}"
+                f" {first.read_back!r} instead of {first.new!r}.",
+                cause="the device refuses the value, or it is not writable in this state",
+                remedy="Read it again after a power cycle; the old value may be in force.",
+            )
+        if self.is_confirmed and (self.read_back is not None or not could_read):
+            return None
+        missing = "read it back" if self.is_confirmed else "confirm it"
+        known = "; it does read back as written" if self.read_back is not None else ""
+        return VerificationError(
+            f"The {node} was sent the new {name} but did not {missing}{known}.",
+            cause="the device went away, or it does not take this write",
+            remedy=f"Look with: flasher read {name} -t {self.plan.target.name}",
+        )
+
+
+def plan_write(
+    name: str,
+    values: Sequence[object],
+    target: Target = BMS,
+    *,
+    dialect: Dialect = WELLING,
+    manufacturer: bool = False,
+) -> WritePlan:
+    """What `write` would send: one value a field, or one finished content.
+
+    Raises UsageError for an unknown name, values that do not fit, and items that the document
+    reserves for the manufacturer when `manufacturer` is not given.
+    """
+    chosen = find(name, writable(target, dialect), target, "write")
+    if chosen.item.manufacturer_only and not manufacturer:
+        raise UsageError(
+            f"The document reserves writing the {chosen.name} for the manufacturer.",
+            remedy="Add --manufacturer if that is you; the device may lose its warranty data.",
+        )
+    if len(values) == 1 and isinstance(values[0], chosen.item.content):
+        content: Content = values[0]
+    else:
+        content = make_content(chosen, values)
+    return WritePlan(target, dialect, chosen, content)
+
+
+def field_changes(
+    plan: WritePlan, old: Content | None, read_back: Content | None = None
+) -> tuple[FieldChange, ...]:
+    """The fields of a write beside what the device held and holds."""
+    return tuple(
+        FieldChange(
+            name=label(name, codec),
+            unit=codec.unit,
+            old=None if old is None else codec.show(getattr(old, name)),
+            new=codec.show(getattr(plan.content, name)),
+            read_back=None if read_back is None else codec.show(getattr(read_back, name)),
+        )
+        for name, codec in meaningful_fields(type(plan.content))
+    )

@@ -1,0 +1,279 @@
+"""Upgrade, wait for the new application, verification: one machine, one result."""
+
+from __future__ import annotations
+
+import random
+from dataclasses import replace
+
+import pytest
+
+from flasher import events
+from flasher.bus.link import VirtualClock
+from flasher.bus.simulated import Disturbance, SimulatedBus
+from flasher.device.model import Device
+from flasher.driver import drive
+from flasher.errors import ExitCode
+from flasher.host.options import UpgradeOptions
+from flasher.host.session import Result, Session
+from flasher.host.verify import (
+    Level,
+    MemoryCheck,
+    Verdict,
+    VersionCheck,
+    possible_levels,
+)
+from flasher.image.image import Image
+from flasher.image.plan import Plan, plan
+from flasher.protocol import catalogue
+from flasher.protocol.contents import Memory, ReadMemory, VersionInformation
+from flasher.protocol.fields import Content, Text
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC
+from flasher.protocol.text import encode_text
+from flasher.protocol.wire import Message, Reassembler, encode, split
+
+NEW = "V2r0r1_20260102"
+BASE = 0x0800_8000
+BYTES = b"\x00\x50\x00\x20BMS\0" + NEW.encode() + b"\0" + random.Random(4).randbytes(300)
+IMAGE = Image.from_bytes(BYTES, base=BASE)
+
+
+def planned(image: Image = IMAGE) -> Plan:
+    return plan(image, BMS, WELLING.bitrate_bps)
+
+
+def run(
+    level: Level,
+    image: Image = IMAGE,
+    target: str = "bms",
+    disturbance: Disturbance | None = None,
+) -> tuple[Result, list[object]]:
+    """A session with the device model."""
+    clock = VirtualClock()
+    bus = SimulatedBus(WELLING.bitrate_bps, clock, disturbance)
+    bus.attach(Device(TARGETS[target], bitrate_bps=WELLING.bitrate_bps))
+    session = Session(plan(image, TARGETS[target], WELLING.bitrate_bps), level=level)
+    seen: list[object] = []
+    drive(session, bus.link(), clock, on_event=seen.append)
+    return session.result, seen
+
+
+def test_the_new_version_is_asked_for_and_right() -> None:
+    result, seen = run(Level.VERSION)
+    assert result.ok
+    assert result.verification.verdict is Verdict.VERSION_RIGHT
+    assert result.running_version == NEW
+    assert result.error() is None
+    assert events.VerificationStarted("version") in seen
+
+
+def test_without_verification_nothing_is_asked_and_nothing_is_claimed() -> None:
+    result, seen = run(Level.NONE)
+    assert result.ok
+    assert result.verification.verdict is Verdict.NOT_ASKED
+    assert result.running_version is None
+    assert not [event for event in seen if isinstance(event, events.VerificationStarted)]
+
+
+def test_another_version_than_the_image_names_is_exit_code_10() -> None:
+    result, _ = run(Level.VERSION, replace(IMAGE, version="V9r9r9_20990101"))
+    assert result.outcome.ok
+    assert not result.ok
+    error = result.error()
+    assert error is not None
+    assert error.exit_code == ExitCode.VERIFICATION
+    assert f"{NEW} instead of V9r9r9_20990101" in str(error)
+    assert "completed, but" in str(error)
+
+
+def test_an_image_without_a_version_is_not_compared_and_that_is_said() -> None:
+    result, _ = run(Level.VERSION, Image.from_bytes(bytes(200)))
+    assert result.ok
+    assert result.verification.verdict is Verdict.VERSION_UNJUDGED
+
+
+def test_a_failed_upgrade_is_not_verified() -> None:
+    result, seen = run(Level.VERSION, disturbance=lambda _frame, _now: [])
+    assert not result.ok
+    assert result.verification.verdict is Verdict.NOT_ASKED
+    error = result.error()
+    assert error is not None
+    assert error.exit_code == ExitCode.NO_ANSWER
+    assert not [event for event in seen if isinstance(event, events.VerificationStarted)]
+
+
+def test_an_application_that_does_not_answer_is_exit_code_10_in_bounded_time() -> None:
+    result, _ = run(
+        Level.VERSION, disturbance=lambda frame, _now: [] if frame.can_id == 0x720 else [frame]
+    )
+    assert result.outcome.ok
+    assert result.verification.verdict is Verdict.NO_ANSWER
+    error = result.error()
+    assert error is not None
+    assert error.exit_code == ExitCode.VERIFICATION
+
+
+def test_the_version_answer_that_replaced_a_lost_final_answer_is_not_asked_for_again() -> None:
+    complete = bytes.fromhex("55AA0C04C5020000")
+    result, seen = run(
+        Level.VERSION,
+        disturbance=lambda frame, _now: [] if frame.data == complete else [frame],
+    )
+    assert result.ok
+    assert result.verification.verdict is Verdict.VERSION_RIGHT
+    assert events.VerificationStarted("version") not in seen
+
+
+def test_only_the_bms_has_queries_to_verify_with() -> None:
+    assert possible_levels(BMS) == (Level.NONE, Level.VERSION, Level.MEMORY)
+    assert possible_levels(WMC) == possible_levels(OBC) == (Level.NONE,)
+
+
+def test_the_result_cannot_be_read_before_there_is_one() -> None:
+    with pytest.raises(RuntimeError, match="not ended"):
+        _ = Session(planned()).result
+
+
+# -- the checks, with the test in the place of the application -------------------------------------
+
+
+class Application:
+    """Lets time pass for a check and answers what it asks."""
+
+    def __init__(self, check: VersionCheck | MemoryCheck) -> None:
+        self.check = check
+        self.now = 50.0
+        self.asked: list[Content] = []
+        self._wire = Reassembler(BMS.request_id, 1.0)
+
+    def next_question(self) -> Content | None:
+        """What is asked next; None when the check is done."""
+        while not self.check.done:
+            wanted = self.check.deadline()
+            assert wanted is not None
+            self.now = max(self.now, wanted)
+            self.check.tick(self.now)
+            while (frame := self.check.next_frame(self.now)) is not None:
+                self.check.frame_sent(self.now)
+                for found in self._wire.feed(frame.data, self.now):
+                    assert isinstance(found, Message)
+                    decoded = catalogue.decode(found)
+                    assert decoded is not None
+                    self.asked.append(decoded.content)
+                    return decoded.content
+        return None
+
+    def answer(self, key: tuple[int, int], content: Content) -> None:
+        self.now += 0.005
+        message = catalogue.encode(catalogue.BY_KEY[key], content)
+        for frame in split(message.can_id, encode(message)):
+            self.check.receive(frame, self.now)
+
+
+VERSION = (0x720, 0x1540)
+MEMORY = (0x725, 0x5688)
+
+
+def memory(question: Content, data: bytes = BYTES) -> Memory:
+    assert isinstance(question, ReadMemory)
+    piece = data[question.start - BASE : question.end - BASE]
+    return Memory(question.start, question.end, piece.ljust(128, b"\xff"))
+
+
+def read_all(application: Application, data: bytes = BYTES) -> None:
+    while (question := application.next_question()) is not None:
+        application.answer(MEMORY, memory(question, data))
+
+
+def test_the_memory_is_read_piece_by_piece_and_compared() -> None:
+    check = MemoryCheck(planned(), UpgradeOptions(), NEW)
+    application = Application(check)
+    read_all(application)
+    assert check.verification is not None
+    assert check.verification.verdict is Verdict.MEMORY_RIGHT
+    assert check.verification.running_version == NEW
+    ends = [question.end for question in application.asked if isinstance(question, ReadMemory)]
+    assert ends == [BASE + 128, BASE + 256, BASE + len(BYTES)]
+    progress = check.take_events()
+    assert progress[-1] == events.MemoryRead(len(BYTES), len(BYTES))
+
+
+def test_the_first_difference_is_named() -> None:
+    other = bytearray(BYTES)
+    other[200] ^= 0xFF
+    other[250] ^= 0xFF
+    check = MemoryCheck(planned(), UpgradeOptions(), NEW)
+    read_all(Application(check), bytes(other))
+    assert check.verification is not None
+    assert check.verification.verdict is Verdict.MEMORY_OTHER
+    where = f"0x{BASE + 200:08X}: {other[200]:02X} instead of {BYTES[200]:02X}"
+    assert where in check.verification.detail
+    error = check.verification.error(BMS)
+    assert error is not None
+    assert error.exit_code == ExitCode.VERIFICATION
+
+
+def test_an_answer_for_another_address_is_not_taken() -> None:
+    check = MemoryCheck(planned(), UpgradeOptions(), NEW)
+    application = Application(check)
+    question = application.next_question()
+    assert isinstance(question, ReadMemory)
+    application.answer(MEMORY, Memory(question.start + 1, question.end, bytes(128)))
+    assert not check.done
+    application.answer(MEMORY, memory(question))
+    read_all(application)
+    verification = check.verification
+    assert verification is not None
+    assert verification.ok
+
+
+def test_memory_that_is_not_given_ends_in_bounded_time() -> None:
+    check = MemoryCheck(planned(), UpgradeOptions(), NEW)
+    application = Application(check)
+    while application.next_question() is not None:
+        pass
+    assert check.verification is not None
+    assert check.verification.verdict is Verdict.NO_ANSWER
+    assert f"0x{BASE:08X}" in check.verification.detail
+    assert application.now < 50.0 + 2.0
+
+
+def test_an_image_without_a_base_cannot_be_read_back() -> None:
+    with pytest.raises(ValueError, match="base"):
+        MemoryCheck(planned(Image.from_bytes(BYTES)), UpgradeOptions(), None)
+
+
+def test_an_application_that_starts_slowly_is_waited_for() -> None:
+    check = VersionCheck(planned(), UpgradeOptions())
+    application = Application(check)
+    while application.now < 53.0:
+        assert application.next_question() is not None
+    texts = [Text(encode_text(text, 16)) for text in ("BM36", "W1", "V1r0r0_20200101", NEW)]
+    application.answer(VERSION, VersionInformation(*texts))
+    application.next_question()
+    assert check.verification is not None
+    assert check.verification.verdict is Verdict.VERSION_RIGHT
+
+
+@pytest.mark.parametrize("asked", [True, False])
+def test_cancelling_a_check_says_that_the_upgrade_was_complete(*, asked: bool) -> None:
+    check = VersionCheck(planned(), UpgradeOptions())
+    application = Application(check)
+    if asked:
+        application.next_question()
+    check.cancel(application.now)
+    assert check.verification is not None
+    error = check.verification.error(BMS)
+    assert error is not None
+    assert error.exit_code == ExitCode.INTERRUPTED
+    assert "completed, but" in str(error)
+    assert check.deadline() is None
+
+
+def test_frames_before_the_beginning_and_after_the_end_are_nothing_to_a_check() -> None:
+    check = VersionCheck(planned(), UpgradeOptions())
+    check.receive(Frame(0x720, b"\x55\xaa"), 0.0)
+    assert check.next_frame(0.0) is None
+    check.cancel(0.0)
+    check.tick(1.0)
+    assert check.done

@@ -1,0 +1,1 @@
+"""The blocking functions for service programs."""

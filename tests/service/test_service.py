@@ -1,0 +1,275 @@
+"""Reading, writing, memory, info and scan on an open connection."""
+
+from __future__ import annotations
+
+import pytest
+
+from flasher import service
+from flasher.errors import (
+    InterruptedByUserError,
+    NoAnswerError,
+    UsageError,
+    VerificationError,
+)
+from flasher.host.write import plan_write
+from flasher.protocol import contents
+from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC, Dialect, Node, Target
+from tests.service.battery import ANSWERS, Battery, wire_to
+
+BOTH = pytest.mark.parametrize("dialect", [WELLING, MOTINOVA], ids=lambda d: d.name)
+SILENT = frozenset(ANSWERS)
+
+
+@BOTH
+def test_an_item_is_read_by_its_name(dialect: Dialect) -> None:
+    answer = service.read(wire_to(Battery()), "running-information", dialect=dialect)
+    assert isinstance(answer, contents.RunningInformation)
+    assert (answer.voltage_mv, answer.mean_current_ma) == (36_000, -1000)
+    assert (answer.cell_temperature_c, answer.status) == (25, contents.Status.CHARGER_CONNECTED)
+
+
+def test_a_sleeping_device_that_misses_the_first_messages_is_read_all_the_same() -> None:
+    battery = Battery(deaf_messages=3)
+    answer = service.read(wire_to(battery), "version-information")
+    assert isinstance(answer, contents.VersionInformation)
+    assert str(answer.model) == "BM36"
+    assert battery.received == [(0x3300, b"")]
+
+
+def test_a_silent_device_is_no_answer_with_what_was_asked() -> None:
+    wire = wire_to(Battery(silent=SILENT))
+    with pytest.raises(NoAnswerError) as caught:
+        service.read(wire, "history")
+    assert "752 3800, sent 5 times" in caught.value.where
+    assert 1.0 <= wire.clock.now() < 1.1
+
+
+def test_an_answer_in_another_form_is_named_as_the_cause() -> None:
+    battery = Battery()
+    battery.answers[0x3300] = (0x720, 0x1530, bytes(0x30))
+    with pytest.raises(NoAnswerError) as caught:
+        service.read(wire_to(battery), "version-information")
+    assert "1530 with 48 bytes, not 1540" in caught.value.cause
+
+
+def test_an_unknown_name_is_refused_with_the_closest_one() -> None:
+    with pytest.raises(UsageError, match="serial-nmber") as caught:
+        service.read(wire_to(), "serial-nmber")
+    assert "Did you mean serial-number?" in caught.value.remedy
+
+
+@pytest.mark.parametrize("target", [WMC, OBC], ids=lambda t: t.name)
+def test_devices_without_queries_are_not_asked(target: Target) -> None:
+    with pytest.raises(UsageError, match="nothing to read"):
+        service.read(wire_to(), "version-information", target)
+
+
+def test_cancelled_reading_is_an_interruption() -> None:
+    with pytest.raises(InterruptedByUserError):
+        service.read(wire_to(Battery(silent=SILENT)), "history", cancelled=lambda: True)
+
+
+# -- writing ---------------------------------------------------------------------------------------
+
+SERIAL = b"W9999999.       "
+
+
+@BOTH
+def test_a_write_is_confirmed_and_read_back(dialect: Dialect) -> None:
+    battery = Battery()
+    written = service.write(
+        wire_to(battery), "serial-number", "W9999999", dialect=dialect, manufacturer=True
+    )
+    assert battery.received == [(0x3300, b""), (0x4110, SERIAL), (0x3300, b"")]
+    (change,) = written.changes
+    assert (change.old, change.new, change.read_back) == ("W2605001", "W9999999", "W9999999")
+
+
+def test_production_data_go_out_as_the_document_has_them() -> None:
+    battery = Battery()
+    values = ("ACME", "SUZHOU", "20260517")
+    service.write(wire_to(battery), "production-information", *values, manufacturer=True)
+    assert battery.received[1] == (0x3F20, b"ACME.   SUZHOU. 20260517" + bytes(8))
+
+
+def test_a_finished_content_may_be_given() -> None:
+    battery = Battery()
+    service.write(wire_to(battery), "check-code", contents.CheckCode(b"\x5a" * 12))
+    assert battery.received[1] == (0x320C, b"\x5a" * 12)
+
+
+def test_what_the_document_reserves_for_the_manufacturer_needs_his_word() -> None:
+    battery = Battery()
+    with pytest.raises(UsageError, match="manufacturer"):
+        service.write(wire_to(battery), "model", "BM48")
+    assert battery.received == []
+
+
+def test_nothing_is_written_to_a_device_that_does_not_answer() -> None:
+    battery = Battery(silent=SILENT)
+    with pytest.raises(NoAnswerError) as caught:
+        service.write(wire_to(battery), "user-string-1", "RACK 7")
+    assert "Nothing was written" in caught.value.remedy
+    assert 0x3A10 not in [command for command, _ in battery.received]
+
+
+def test_an_unconfirmed_write_fails_even_if_it_reads_back() -> None:
+    battery = Battery()
+    battery.silent = frozenset({0x3A10})
+    plan = plan_write("user-string-1", [""])
+    old = service.old_content(wire_to(battery), plan)
+    written = service.carry_out(wire_to(battery), plan, old)
+    assert not written.is_confirmed
+    error = written.error()
+    assert isinstance(error, VerificationError)
+    assert "did not confirm it; it does read back as written" in error.what
+
+
+def test_a_write_that_reads_back_differently_fails_and_names_both_values() -> None:
+    with pytest.raises(VerificationError) as caught:
+        service.write(wire_to(Battery(loses_writes=True)), "user-string-2", "RACK 7")
+    assert caught.value.what.endswith("reads back text '' instead of 'RACK 7'.")
+
+
+def test_a_write_is_seen_through_once_it_has_begun() -> None:
+    battery = Battery()
+    plan = plan_write("user-string-1", ["RACK 7"])
+    written = service.carry_out(wire_to(battery), plan, None, cancelled=lambda: True)
+    assert written.error() is None
+    assert written.is_confirmed
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "says"),
+    [
+        ("production-information", ("ACME", "SUZHOU", "20260230"), "not in the calendar"),
+        ("production-information", ("ACME", "SUZHOU", "2026W101"), "not a date"),
+        ("production-information", ("ACME", "SUZHOU"), "takes 3 values; 2 were given"),
+        ("production-information", ("LONGNAME", "X", "20260517"), "longer than 7"),
+        ("serial-number", ("W26.5001",), "ends a field"),
+        ("serial-number", ("W" * 16,), "longer than 15"),
+        ("serial-number", ("\x1b[2J",), "not printable ASCII"),
+        ("serial-number", (), "takes 1 value; no value was given"),
+        ("check-code", ("0011",), "2 bytes, not 12"),
+        ("check-code", ("xyz",), "12 bytes in hexadecimal"),
+        ("reset", (), "nothing called 'reset'"),
+    ],
+)
+def test_values_that_do_not_fit_are_refused_before_anything_is_sent(
+    name: str, values: tuple[str, ...], says: str
+) -> None:
+    battery = Battery()
+    with pytest.raises(UsageError, match=says):
+        service.write(wire_to(battery), name, *values, manufacturer=True)
+    assert battery.received == []
+
+
+# -- memory ----------------------------------------------------------------------------------------
+
+
+def test_memory_is_read_in_pieces_of_128_bytes() -> None:
+    battery = Battery()
+    data = service.read_memory(wire_to(battery), 0x1010, 0x1010 + 300)
+    assert data == battery.memory[0x10 : 0x10 + 300]
+    assert [asked.hex(" ") for _, asked in battery.received] == [
+        "10 10 00 00 90 10 00 00",
+        "90 10 00 00 10 11 00 00",
+        "10 11 00 00 3c 11 00 00",
+    ]
+
+
+def test_memory_that_is_not_answered_names_the_address() -> None:
+    with pytest.raises(NoAnswerError) as caught:
+        service.read_memory(wire_to(Battery()), 0x1380, 0x1480)
+    assert caught.value.where == "memory at 0x00001400"
+
+
+def test_repeated_answers_do_not_shift_the_pieces() -> None:
+    battery = Battery(copies=2, deaf_messages=1)
+    assert service.read_memory(wire_to(battery), 0x1000, 0x1400) == battery.memory
+
+
+@pytest.mark.parametrize(("start", "end"), [(8, 8), (9, 8), (0, 0x1_0000_0000)])
+def test_an_impossible_range_is_refused(start: int, end: int) -> None:
+    with pytest.raises(UsageError, match="no range of memory"):
+        service.read_memory(wire_to(), start, end)
+
+
+# -- info and scan ---------------------------------------------------------------------------------
+
+FAULTS = (0x720, 0x1204, bytes.fromhex("0400 0100"))
+
+
+@BOTH
+def test_info_asks_everything_that_the_tool_may_ask(dialect: Dialect) -> None:
+    found = service.info(wire_to(Battery()), dialect=dialect)
+    assert found.is_there
+    assert [reading.item.command for reading in found.readings] == list(ANSWERS)
+    assert all(reading.answer is not None for reading in found.readings)
+    assert found.survey.faults is None
+
+
+def test_info_hears_faults() -> None:
+    found = service.info(wire_to(Battery(repeats=(FAULTS,))))
+    assert found.survey.faults is not None
+    assert found.survey.faults.faults == (
+        contents.Fault.SHORT_CIRCUIT_PROTECTION | contents.Fault.CHARGE_OVER_VOLTAGE_WARNING
+    )
+
+
+def test_info_of_a_device_that_answers_half_is_bounded_and_says_what_is_missing() -> None:
+    silent = frozenset(list(ANSWERS)[::2])
+    wire = wire_to(Battery(silent=silent, delay_s=0.3))
+    found = service.info(wire)
+    missing = {reading.item.command for reading in found.readings if reading.answer is None}
+    assert missing == silent
+    assert wire.clock.now() < 0.5 + 11 * 1.1
+
+
+def test_info_gives_an_absent_device_up_soon() -> None:
+    wire = wire_to()
+    found = service.info(wire)
+    assert not found.is_there
+    assert [reading.was_asked for reading in found.readings] == [True] * 3 + [False] * 8
+    assert wire.clock.now() < 4.0
+
+
+def test_info_of_a_device_without_queries_listens_only() -> None:
+    chatty = Battery(repeats=((0x710, 0x1305, b"READY"),))
+    found = service.info(wire_to(chatty), WMC)
+    assert found.is_there
+    assert found.readings == ()
+    assert chatty.received == []
+    assert found.survey.heard[Node.WMC].messages["710 1305 ready for shutdown"] >= 2
+
+
+def test_scan_finds_who_talks_and_who_answers() -> None:
+    wire = wire_to(Battery(), Battery(silent=SILENT, repeats=((0x730, 0x1405, b"READY"),)))
+    survey = service.scan(wire)
+    assert set(survey.heard) == {Node.BMS, Node.OBC}
+    assert survey.guess_dialect()[0] is None
+
+
+@pytest.mark.parametrize(
+    ("report", "dialect"),
+    [
+        ((0x740, 0x1305, b"READY"), MOTINOVA),
+        ((0x710, 0x1808, b"SHUTDOWN"), WELLING),
+        ((0x725, 0xC109, b"BMSV1.2.3"), WELLING),
+    ],
+    ids=["HMI", "WMC shutdown", "boot version"],
+)
+def test_traffic_of_one_dialect_only_tells_it(
+    report: tuple[int, int, bytes], dialect: Dialect
+) -> None:
+    survey = service.scan(wire_to(Battery(silent=SILENT, repeats=(report,))))
+    assert survey.guess_dialect()[0] is dialect
+
+
+def test_a_bootloader_that_announces_itself_is_named() -> None:
+    survey = service.scan(wire_to(Battery(repeats=((0x725, 0xC109, b"BMSV1.2.3"),))))
+    assert survey.heard[Node.BMS].boot_version == "BMS V1.2.3"
+
+
+def test_the_default_target_is_the_bms() -> None:
+    assert service.info(wire_to(Battery())).target is BMS
