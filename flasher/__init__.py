@@ -2,7 +2,8 @@
 
 The whole job:
 
-    outcome = flasher.flash("firmware.hex", "bms", interface="socketcan", channel="can0")
+    result = flasher.flash("firmware.hex", "bms", interface="socketcan", channel="can0")
+    print(result.running_version)
 
 The same without hardware, with something to look at while it runs:
 
@@ -16,8 +17,14 @@ What would be sent, and how long it takes on the bus:
 In two steps, to look at a failure instead of catching it:
 
     with flasher.connect(interface="pcan", channel="PCAN_USBBUS1") as connection:
-        outcome = flasher.upgrade(plan, connection)
-    print(outcome.ending, outcome.device_left, outcome.error())
+        result = flasher.upgrade(plan, connection)
+    print(result.outcome.ending, result.outcome.device_left, result.error())
+
+What the battery says of itself, as dataclasses with units in their names:
+
+    with flasher.connect(interface="socketcan", channel="can0") as connection:
+        print(flasher.query(connection, "running-information").voltage_mv)
+        flasher.write(connection, "user-string-1", "checked 2026-01")
 
 Every failure is a `FlasherError` with its exit code, its likely cause and what to do; what happens
 meanwhile comes as the dataclasses of `flasher.events`.
@@ -29,15 +36,20 @@ from flasher.api import (
     DeviceLeft,
     Ending,
     Image,
+    Level,
     Outcome,
     Plan,
+    Result,
     UpgradeOptions,
     connect,
     connect_mock,
     flash,
     load,
     make_plan,
+    query,
+    read,
     upgrade,
+    write,
 )
 from flasher.errors import ExitCode, FlasherError
 
@@ -47,15 +59,20 @@ __all__ = [
     "connect_mock",
     "load",
     "make_plan",
+    "query",
+    "read",
     "upgrade",
+    "write",
     "Connection",
     "DeviceLeft",
     "Ending",
     "ExitCode",
     "FlasherError",
     "Image",
+    "Level",
     "Outcome",
     "Plan",
+    "Result",
     "UpgradeOptions",
     "events",
 ]

@@ -12,19 +12,24 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
+from flasher import service
 from flasher.bus.link import Clock, Link, MonotonicClock, PacedClock, VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile
+from flasher.device.profile import DeviceProfile, set_option
+from flasher.device.system import System
 from flasher.driver import Tap, drive
 from flasher.errors import BusError, UsageError
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft, Outcome
+from flasher.host.session import Result, Session
 from flasher.host.table import Ending
-from flasher.host.upgrade import Upgrade
+from flasher.host.verify import Level, possible_levels
+from flasher.host.write import Written
 from flasher.image.image import Image
 from flasher.image.load import load
 from flasher.image.plan import Plan, plan
+from flasher.protocol.fields import Content
 from flasher.protocol.spec import DIALECTS, TARGETS, Dialect, Target, find_target
 
 __all__ = [
@@ -33,16 +38,24 @@ __all__ = [
     "connect_mock",
     "load",
     "make_plan",
+    "query",
+    "read",
     "upgrade",
+    "write",
+    "check_level",
+    "default_level",
     "as_dialect",
+    "as_level",
     "as_target",
     "Connection",
     "DeviceLeft",
     "Ending",
     "EventHandler",
     "Image",
+    "Level",
     "Outcome",
     "Plan",
+    "Result",
     "UpgradeOptions",
 ]
 
@@ -81,19 +94,24 @@ def connect_mock(
     dialect: str | Dialect = "welling",
     *,
     speed: float = 1.0,
+    system: bool = False,
     profile: DeviceProfile | None = None,
     on_event: EventHandler | None = None,
 ) -> Iterator[Connection]:
-    """A bus in this process with a device model on it.
+    """A bus in this process with a device model on it, or, as `system`, with a whole bicycle.
 
     It takes the time that a real bus takes, divided by `speed`; 0 means no time at all. `on_event`
     gets what the device model reports.
     """
-    bitrate_bps = as_dialect(dialect).bitrate_bps
+    chosen, node = as_dialect(dialect), as_target(target)
+    bitrate_bps = chosen.bitrate_bps
+    own = set_option(profile or DeviceProfile(), "dialect", chosen.name)
     clock: Clock = PacedClock(speed) if speed else VirtualClock()
     bus = SimulatedBus(bitrate_bps, clock)
-    device = Device(as_target(target), bitrate_bps=bitrate_bps, profile=profile or DeviceProfile())
-    bus.attach(device, on_event)
+    if system:
+        bus.attach(System(chosen, node, profile=own), on_event)
+    else:
+        bus.attach(Device(node, bitrate_bps=bitrate_bps, profile=own), on_event)
     yield Connection(bus.link(), clock, "the built-in mock")
 
 
@@ -102,16 +120,20 @@ def upgrade(
     connection: Connection,
     *,
     options: UpgradeOptions | None = None,
+    verify: Level | None = None,
     taps: Sequence[Tap] = (),
     on_event: EventHandler | None = None,
     cancelled: Callable[[], bool] | None = None,
-) -> Outcome:
-    """Run one upgrade to its end, good or bad; `cancelled` is asked while it runs.
+) -> Result:
+    """Run one upgrade to its end, good or bad, and verify a good one.
 
-    Raises BusError when the adapter fails, saying how far the upgrade had come and in what state
-    the device is left; every other end is an `Outcome`.
+    `verify` None stands for `default_level`. `cancelled` is asked while it runs. Raises UsageError
+    when the target or the image cannot be verified so, BusError when the adapter fails, saying how
+    far the upgrade had come and in what state the device is left; every other end is a `Result`.
     """
-    engine = Upgrade(plan, options)
+    level = default_level(plan.target, options) if verify is None else verify
+    check_level(plan, level, options)
+    engine = Session(plan, options, level)
     try:
         drive(
             engine,
@@ -126,7 +148,30 @@ def upgrade(
         error.where = f"{engine.standing}; {error.where}"
         error.remedy = f"{error.remedy} State of the device: {engine.device_left.value}.".lstrip()
         raise
-    return engine.outcome
+    return engine.result
+
+
+def default_level(target: Target, options: UpgradeOptions | None = None) -> Level:
+    """How far an upgrade of a target is verified unless somebody says otherwise: by its version
+    where there is a query for it.
+    """
+    return Level.VERSION if Level.VERSION in possible_levels(target, options) else Level.NONE
+
+
+def check_level(plan: Plan, level: Level, options: UpgradeOptions | None = None) -> None:
+    """Raise UsageError when an upgrade cannot be verified so."""
+    if level not in possible_levels(plan.target, options):
+        raise UsageError(
+            f"A {plan.target.node.name} cannot be verified by {level.value}.",
+            cause="the document gives no query for it, and no profile names one",
+            remedy="Leave --verify out, or use --verify none.",
+        )
+    if level is Level.MEMORY and plan.image.base is None:
+        raise UsageError(
+            "The memory cannot be read back without addresses.",
+            cause=f"{plan.image.source} is a raw binary",
+            remedy="Say with --base where its first byte lies.",
+        )
 
 
 def flash(
@@ -136,24 +181,85 @@ def flash(
     dialect: str | Dialect = "welling",
     mock: bool = False,
     options: UpgradeOptions | None = None,
+    verify: Level | str | None = None,
     on_event: EventHandler | None = None,
     **bus: Any,
-) -> Outcome:
-    """Upgrade a device with an image file (or a loaded `Image`).
+) -> Result:
+    """Upgrade a device with an image file (or a loaded `Image`), and verify it.
 
     `bus` are python-can's keywords, as for `connect`; with `mock` the built-in device model is
-    upgraded instead. Returns the outcome of a good upgrade; every other one is raised as the
-    FlasherError that stands for it (see flasher.errors).
+    upgraded instead. `verify` is "none", "version" or "memory"; None chooses (`default_level`).
+    Returns the result of a good session; every other one is raised as the FlasherError that stands
+    for it (see flasher.errors).
     """
     loaded = image if isinstance(image, Image) else load(image)
     planned = make_plan(loaded, target, dialect)
+    level = None if verify is None else as_level(verify)
     opened = connect_mock(target, dialect) if mock else connect(dialect, **bus)
     with opened as connection:
-        outcome = upgrade(planned, connection, options=options, on_event=on_event)
-    error = outcome.error()
+        result = upgrade(planned, connection, options=options, verify=level, on_event=on_event)
+    error = result.error()
     if error is not None:
         raise error
-    return outcome
+    return result
+
+
+def as_level(level: Level | str) -> Level:
+    """A level of verification by its name. Raises UsageError."""
+    try:
+        return Level(level)
+    except ValueError:
+        names = ", ".join(each.value for each in Level)
+        raise UsageError(f"There is no verification {level!r}; there are {names}.") from None
+
+
+def query(
+    connection: Connection,
+    name: str,
+    target: str | Target = "bms",
+    *,
+    dialect: str | Dialect = "welling",
+) -> Content:
+    """What a device answers to the question `name` ("version-information", "running-information",
+    "serial-number", ...), as the typed content of `flasher.protocol.contents`.
+
+    Raises NoAnswerError when it does not answer, UsageError for a name that is none.
+    """
+    return service.read(connection, name, as_target(target), dialect=as_dialect(dialect))
+
+
+def read(
+    connection: Connection, start: int, end: int, *, dialect: str | Dialect = "welling"
+) -> bytes:
+    """The battery's memory from `start` up to `end`, which is not read any more (R5).
+
+    Raises NoAnswerError when some of it is not answered.
+    """
+    return service.read_memory(connection, start, end, dialect=as_dialect(dialect))
+
+
+def write(
+    connection: Connection,
+    name: str,
+    *values: object,
+    target: str | Target = "bms",
+    dialect: str | Dialect = "welling",
+    manufacturer: bool = False,
+) -> Written:
+    """Write an item and read it back where it can be read; old and new value are in the result.
+
+    `manufacturer` allows what the document leaves to the manufacturer. Raises UsageError for a
+    value that does not fit, NoAnswerError when the write is not confirmed, VerificationError when
+    it reads back differently.
+    """
+    return service.write(
+        connection,
+        name,
+        *values,
+        target=as_target(target),
+        dialect=as_dialect(dialect),
+        manufacturer=manufacturer,
+    )
 
 
 def make_plan(
@@ -162,16 +268,18 @@ def make_plan(
     dialect: str | Dialect = "welling",
     *,
     bitrate_bps: int | None = None,
+    has_upgrade: bool | None = None,
 ) -> Plan:
     """What an upgrade would send; at the dialect's bit rate unless another one is given.
 
-    Raises UsageError for a dialect that has no upgrade.
+    Raises UsageError for a dialect that has no upgrade, unless `has_upgrade` says that a product
+    has it all the same.
     """
     chosen = as_dialect(dialect)
-    if not chosen.has_upgrade:
+    if not (chosen.has_upgrade if has_upgrade is None else has_upgrade):
         raise UsageError(
             f"The {chosen.name.upper()} dialect has no upgrade: its document cancelled it.",
-            remedy="Use --dialect welling if the device speaks it.",
+            remedy="Use --dialect welling if the device speaks it; a profile can enable it.",
         )
     return plan(image, as_target(target), bitrate_bps or chosen.bitrate_bps)
 

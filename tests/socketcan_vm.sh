@@ -25,7 +25,7 @@ for side in vx0 vx1; do
     tc qdisc replace dev "$side" root netem rate 250kbit limit 10
 done
 code=0
-"$PYTHON" -m pytest -m socketcan -p no:cacheprovider --color=no -rsP --durations=0 \
+"$PYTHON" -m pytest -n 0 -m socketcan -p no:cacheprovider --color=no -rsP --durations=0 \
     tests/end_to_end/test_socketcan.py || code=$?
 tc -s qdisc show dev vx0
 exit "$code"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import re
+from collections.abc import Sequence
 from typing import Any, Final
 
-from flasher.api import as_target
+from flasher.api import Connection, as_target, connect, connect_mock
 from flasher.errors import UsageError
 from flasher.image.image import Image
 from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, FORMATS, load
@@ -155,3 +156,42 @@ def bus_config(options: argparse.Namespace) -> dict[str, Any]:
     """The keywords for python-can that were given on the command line."""
     config = {name: getattr(options, name) for name in _BUS_KEYWORDS if hasattr(options, name)}
     return config | getattr(options, "bus_kwargs", {})
+
+
+def add_mock(parser: argparse.ArgumentParser) -> None:
+    """The device model in this process, in place of an adapter."""
+    mock = parser.add_argument_group("without hardware")
+    mock.add_argument("--mock", action="store_true", help="use a device model in this process")
+    mock.add_argument(
+        "--mock-speed",
+        type=seconds,
+        default=1.0,
+        metavar="X",
+        help="times as fast as a real bus; 0 takes no time (default %(default)s)",
+    )
+
+
+def open_connection(
+    options: argparse.Namespace, target: Target
+) -> contextlib.AbstractContextManager[Connection]:
+    """The bus that the options name: an adapter, or a whole bicycle with the model of `target`."""
+    if options.mock:
+        return connect_mock(target, options.dialect, speed=options.mock_speed, system=True)
+    return connect(options.dialect, **bus_config(options))
+
+
+def take_values_anywhere(parser: argparse.ArgumentParser, dest: str) -> None:
+    """Let the values of a command stand behind options too (`write model -t bms X`): argparse
+    itself takes only those that stand together, and calls the others unrecognized.
+    """
+    parse_known = parser.parse_known_args
+
+    def parse(
+        words: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        options, rest = parse_known(words, namespace)
+        values = [word for word in rest if not word.startswith("-")]
+        setattr(options, dest, [*getattr(options, dest), *values])
+        return options, [word for word in rest if word.startswith("-")]
+
+    setattr(parser, "parse_known_args", parse)  # noqa: B010  mypy forbids the plain assignment

@@ -18,14 +18,19 @@ from flasher.cli.plan_text import (
     plan_lines,
     vector_lines,
 )
+from flasher.cli.profile import add_option as add_profile
+from flasher.cli.profile import profile_of
 from flasher.cli.progress import Progress
 from flasher.cli.stop import stop_on_signal
 from flasher.driver import Tap
 from flasher.errors import ExitCode
 from flasher.host.options import DEFAULT_ATTEMPTS, UpgradeOptions
 from flasher.host.outcome import Outcome
+from flasher.host.session import Result
+from flasher.host.verify import Level, Verdict, possible_levels
 from flasher.image.cortexm import vector_table
 from flasher.image.plan import Plan
+from flasher.profile.model import Profile
 from flasher.protocol.timing import DEFAULT_TIMINGS
 
 _EPILOG = """\
@@ -36,8 +41,11 @@ examples:
   flasher flash firmware.hex -t obc --dry-run           show the plan, open no adapter
 
 "Transferred" (every packet acknowledged), "completed" (the device said so) and "running version X"
-(the new application answered) are three claims. Exit code 0 stands for "completed".
+(the new application answered) are three claims; the last lines say which of them were made good.
 """
+
+
+_NO_QUERY = ": the document gives this target no query for it"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,6 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_image(parser)
     arguments.add_target(parser)
     arguments.add_dialect(parser)
+    add_profile(parser)
     _add_upgrade(parser)
     mock = parser.add_argument_group("without hardware")
     mock.add_argument("--mock", action="store_true", help="upgrade a device model in this process")
@@ -64,18 +73,23 @@ def _add_upgrade(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("upgrade")
     group.add_argument("-n", "--dry-run", action="store_true", help="show the plan and stop")
     group.add_argument(
+        "--verify",
+        choices=[level.value for level in Level],
+        help="after the upgrade: ask the new application for its version, or read the whole image "
+        "back as well (default: version where the target has a query for it, else none)",
+    )
+    group.add_argument(
         "--retries",
         type=arguments.count,
-        default=DEFAULT_TIMINGS.packet_tries,
         metavar="N",
-        help="send a packet up to N times (default %(default)s)",
+        help=f"send a packet up to N times (default {DEFAULT_TIMINGS.packet_tries})",
     )
     group.add_argument(
         "--attempts",
         type=arguments.count,
-        default=DEFAULT_ATTEMPTS,
         metavar="N",
-        help="begin the transfer up to N times, if the device restarts (default %(default)s)",
+        help="begin the transfer up to N times, if the device restarts "
+        f"(default {DEFAULT_ATTEMPTS})",
     )
     group.add_argument(
         "--timeout",
@@ -86,14 +100,12 @@ def _add_upgrade(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--frame-gap",
         type=arguments.seconds,
-        default=0.0,
         metavar="S",
         help="seconds of silence between frames, for slow receivers",
     )
     group.add_argument(
         "--packet-gap",
         type=arguments.seconds,
-        default=0.0,
         metavar="S",
         help="seconds of silence before each packet, for slow receivers",
     )
@@ -117,9 +129,15 @@ def _add_upgrade(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, output: Output) -> int:
     """Run the command; returns the exit code."""
+    profile = profile_of(options)
     image = arguments.load_image(options)
+    profile.check_fits(image)
     plan = api.make_plan(
-        image, options.target, options.dialect, bitrate_bps=getattr(options, "bitrate", None)
+        image,
+        options.target,
+        options.dialect,
+        bitrate_bps=getattr(options, "bitrate", None),
+        has_upgrade=profile.has_upgrade,
     )
     show = output.result if options.dry_run else output.progress
     lines = [*image_lines(image), *vector_lines(vector_table(image)), *plan_lines(plan)]
@@ -129,20 +147,34 @@ def run(options: argparse.Namespace, output: Output) -> int:
         output.result("dry run: nothing was sent")
         output.document(_document(plan, ok=True, exit_code=ExitCode.OK, dry_run=True))
         return ExitCode.OK
-    outcome = _upgrade(options, plan, output)
-    error = outcome.error()
+    chosen = _upgrade_options(options, profile)
+    level = _level(options, plan, chosen)
+    result = _upgrade(options, plan, chosen, level, output)
+    error = result.error()
     if error is not None:
-        more = {"outcome": _outcome_document(outcome), "plan": plan_document(plan)}
-        output.failure(error, **more)
+        if result.outcome.ok:
+            for line in _summary(result, plan):
+                output.progress(line)
+        output.failure(error, **_result_document(result), plan=plan_document(plan))
         return error.exit_code
-    for line in _summary(outcome, plan):
+    for line in _summary(result, plan):
         output.result(line)
-    document = _document(plan, ok=True, exit_code=ExitCode.OK, outcome=_outcome_document(outcome))
+    document = _document(plan, ok=True, exit_code=ExitCode.OK, **_result_document(result))
     output.document(document)
     return ExitCode.OK
 
 
-def _upgrade(options: argparse.Namespace, plan: Plan, output: Output) -> Outcome:
+def _level(options: argparse.Namespace, plan: Plan, chosen: UpgradeOptions) -> Level:
+    if options.verify is None:
+        return api.default_level(plan.target, chosen)
+    level = Level(options.verify)
+    api.check_level(plan, level, chosen)
+    return level
+
+
+def _upgrade(
+    options: argparse.Namespace, plan: Plan, chosen: UpgradeOptions, level: Level, output: Output
+) -> Result:
     with ExitStack() as stack:
         connection = stack.enter_context(_connection(options))
         taps = stack.enter_context(_recording(options.trace_file, output))
@@ -154,7 +186,8 @@ def _upgrade(options: argparse.Namespace, plan: Plan, output: Output) -> Outcome
         return api.upgrade(
             plan,
             connection,
-            options=_upgrade_options(options),
+            options=chosen,
+            verify=level,
             taps=taps,
             on_event=progress,
             cancelled=cancelled,
@@ -181,20 +214,23 @@ def _connection(options: argparse.Namespace) -> AbstractContextManager[api.Conne
     return api.connect(options.dialect, **arguments.bus_config(options))
 
 
-def _upgrade_options(options: argparse.Namespace) -> UpgradeOptions:
-    return UpgradeOptions(
-        timings=dataclasses.replace(DEFAULT_TIMINGS, packet_tries=options.retries),
+def _upgrade_options(options: argparse.Namespace, profile: Profile) -> UpgradeOptions:
+    """The profile's choices, and the command line's where it makes any."""
+    return profile.upgrade_options(
+        packet_tries=options.retries,
         attempts=options.attempts,
         timeout_s=options.timeout,
         frame_gap_s=options.frame_gap,
         packet_gap_s=options.packet_gap,
-        nak_next_is_ack=options.nak_next_is_ack,
-        allow_boot_name=options.allow_boot_name or options.force,
+        nak_next_is_ack=options.nak_next_is_ack or None,
+        allow_boot_name=(options.allow_boot_name or options.force) or None,
+        version_request=profile.version_query and profile.version_query.request(options.target),
     )
 
 
-def _summary(outcome: Outcome, plan: Plan) -> list[str]:
+def _summary(result: Result, plan: Plan) -> list[str]:
     """The final lines of a good upgrade: three claims, kept apart."""
+    outcome = result.outcome
     figures = outcome.statistics
     transfer_s = figures.transfer_s or 0.0
     sent = f"{byte_count(plan.image.size_bytes)} in {counted(plan.total_packets, 'packet')}"
@@ -205,8 +241,17 @@ def _summary(outcome: Outcome, plan: Plan) -> list[str]:
         f"              {faults}, {whole}",
         f"boot version: {outcome.boot_version}",
         f"completed:    {outcome.ending.value}",
-        f"running:      {outcome.running_version or 'not asked'}",
+        f"running:      {_running(result)}",
     ]
+
+
+def _running(result: Result) -> str:
+    """What is known of the application that runs now, and how."""
+    verification = result.verification
+    if verification.verdict is Verdict.NOT_ASKED:
+        reason = "" if possible_levels(result.outcome.target) != (Level.NONE,) else _NO_QUERY
+        return result.running_version or f"not asked{reason}"
+    return f"{result.running_version or 'unknown'} ({verification.verdict.value})"
 
 
 def _rate(plan: Plan, transfer_s: float) -> str:
@@ -218,6 +263,19 @@ def _rate(plan: Plan, transfer_s: float) -> str:
     # A bus in memory or on a network has no bit rate to keep to.
     closeness = f"{share:.0%} of a {line}" if share <= 1.02 else f"faster than a {line}"
     return f" ({plan.image.size_bytes / transfer_s / 1000:.1f} kB/s, {closeness})"
+
+
+def _result_document(result: Result) -> dict[str, Any]:
+    verification = result.verification
+    return {
+        "outcome": _outcome_document(result.outcome),
+        "verification": {
+            "level": verification.level.value,
+            "verdict": verification.verdict.name.lower(),
+            "running_version": result.running_version,
+            "detail": verification.detail,
+        },
+    }
 
 
 def _outcome_document(outcome: Outcome) -> dict[str, Any]:

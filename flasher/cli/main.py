@@ -22,7 +22,13 @@ from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, Usage
 COMMANDS: Final = {
     "flash": ("flash", "upgrade a device"),
     "image-info": ("image_info", "what is in a file, what would be sent, how long it takes"),
+    "info": ("info", "identity, versions, state, faults and history of a device"),
+    "scan": ("scan", "who is on the bus, and which dialect is spoken"),
+    "read": ("read", "read an item of a device by its name, or its memory"),
+    "write": ("write", "write an item of a device by its name, and read it back"),
     "mock": ("mock", "run the device model on a bus until interrupted"),
+    "monitor": ("monitor", "show decoded traffic, live or of a recorded trace"),
+    "profile": ("profile", "what a target profile sets, and where each value comes from"),
 }
 """Name of each command, its module in this package, and its one-line help."""
 

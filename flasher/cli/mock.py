@@ -1,29 +1,38 @@
-"""`flasher mock`: the device model on any python-can bus, until interrupted."""
+"""`flasher mock`: the device model, or a whole bicycle, on any python-can bus until interrupted."""
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from flasher import api, events
 from flasher.cli import arguments
+from flasher.cli.files import check_writable, write_whole
 from flasher.cli.output import Output, byte_count
 from flasher.cli.stop import stop_on_signal
 from flasher.device.model import Device
 from flasher.device.profile import DeviceProfile, describe_options, set_option
+from flasher.device.system import System
 from flasher.driver import drive
 from flasher.errors import ExitCode, UsageError
+from flasher.protocol.engine import Engine
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
+from flasher.protocol.timing import DEFAULT_TIMINGS
 
-_EXAMPLES = """\
+_SAVE_IMAGE: Final = "--save-image"
+_QUIET_S: Final = 2.5 * DEFAULT_TIMINGS.command_repeat_s
+"""A tool that is quiet for this long has verified what it sent."""
+_EXAMPLES: Final = """\
 examples:
   flasher mock -t bms -i socketcan -c vcan0
   flasher mock -t mc -i udp_multicast -c 239.74.163.2 --bus-kwargs hop_limit=0 port=43210
   flasher mock -t bms -i socketcan -c vcan0 --no-app --save-image received.bin
   flasher mock -t bms -i socketcan -c vcan0 --set repeated_packet=nak_next
+  flasher mock -t bms --system -i socketcan -c vcan0
 
 Ends with exit code 0 when interrupted.
 
@@ -33,14 +42,17 @@ choices for --set, the first value is the default:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.description = "Serve as a device: its application and its bootloader."
+    parser.description = (
+        "Serve as a device: its application and its bootloader. With --system, as all devices of a "
+        "bicycle, which talk to each other."
+    )
     rows = [f"  {key:<24} {values}\n      {summary}" for key, values, summary in describe_options()]
     parser.epilog = _EXAMPLES + "\n".join(rows)
     arguments.add_target(parser)
     arguments.add_dialect(parser)
     group = parser.add_argument_group("device model")
     group.add_argument(
-        "--save-image", metavar="FILE", help="write each image that was received completely"
+        _SAVE_IMAGE, metavar="FILE", help="write each image that was received completely"
     )
     group.add_argument(
         "--no-app", action="store_true", help="start without a valid application (R14)"
@@ -54,7 +66,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="set a choice of the device; may be repeated, see below",
     )
     group.add_argument(
-        "--upgrades", type=arguments.count, metavar="N", help="end after N complete upgrades"
+        "--system",
+        action="store_true",
+        help="serve as a whole bicycle; what is printed is about the target",
+    )
+    group.add_argument(
+        "--upgrades",
+        type=arguments.count,
+        metavar="N",
+        help="end after N complete upgrades, when the tool asks no more",
     )
     arguments.add_bus(parser)
 
@@ -62,14 +82,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, output: Output) -> int:
     """Run the command; returns the exit code."""
     dialect = api.as_dialect(options.dialect)
-    _check_folder(options.save_image)
-    device = Device(
-        options.target,
-        bitrate_bps=dialect.bitrate_bps,
-        profile=_profile(options.choices),
-        has_application=not options.no_app,
-    )
+    if options.save_image is not None:
+        check_writable(Path(options.save_image), _SAVE_IMAGE)
+    profile = set_option(_profile(options.choices), "dialect", dialect.name)
+    engine: Engine
+    if options.system:
+        engine = system = System(
+            dialect, options.target, profile=profile, has_application=not options.no_app
+        )
+        device = system.device
+    else:
+        engine = device = Device(
+            options.target,
+            bitrate_bps=dialect.bitrate_bps,
+            profile=profile,
+            has_application=not options.no_app,
+        )
     watcher = _Watcher(device, options.save_image, output)
+    tool = _Tool(options.target)
     with (
         api.connect(dialect, **arguments.bus_config(options)) as connection,
         stop_on_signal() as stopped,
@@ -79,13 +109,18 @@ def run(options: argparse.Namespace, output: Output) -> int:
                 f"note: the {dialect.name.upper()} document has no upgrade; behind its RESET "
                 "stands Welling's bootloader here"
             )
-        output.progress(f"{options.target.node.name} on {connection.name}; Ctrl-C ends it")
+        served = "a whole bicycle" if options.system else options.target.node.name
+        output.progress(f"{served} on {connection.name}; Ctrl-C ends it")
         drive(
-            device,
+            engine,
             connection.link,
             connection.clock,
+            taps=[tool],
             on_event=watcher,
-            cancelled=lambda: stopped() or watcher.images == options.upgrades,
+            cancelled=lambda: (
+                stopped()
+                or (watcher.images == options.upgrades and tool.is_quiet(connection.clock.now()))
+            ),
         )
     output.document({"ok": True, "exit_code": int(ExitCode.OK), "images": watcher.images})
     return ExitCode.OK
@@ -99,6 +134,22 @@ def _profile(choices: list[str]) -> DeviceProfile:
             raise UsageError(f"--set {choice}: write KEY=VALUE.")
         profile = set_option(profile, key, value)
     return profile
+
+
+class _Tool:
+    """Tap: tells when the tool has nothing more to say to the target."""
+
+    def __init__(self, target: Target) -> None:
+        self._request_id = target.request_id
+        self._last_at = 0.0
+
+    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
+        if frame.can_id == self._request_id:
+            self._last_at = now
+
+    def is_quiet(self, now: float) -> bool:
+        """True when even the repetition of a query would have come."""
+        return now - self._last_at >= _QUIET_S
 
 
 class _Watcher:
@@ -122,6 +173,15 @@ class _Watcher:
                 self._save()
                 self.images += 1
                 self._say("image", f"{byte_count(size_bytes)}, sha256 {sha256}", event)
+            case events.DeviceWritten(name, before, after):
+                self._say(
+                    "written", f"{name}: {after or 'empty'} (before: {before or 'empty'})", event
+                )
+            case events.ShutdownAnnounced(why):
+                self._say("power", f"shutdown announced: {why}", event)
+            case events.ShutdownEnded(ready, silent):
+                others = f"; no answer from {', '.join(silent)}" if silent else ""
+                self._say("power", f"off; ready: {', '.join(ready) or 'nobody'}{others}", event)
             case events.DeviceReported(what):
                 self._say("note", what, event)
             case events.BytesDamaged(can_id, reason, data):
@@ -138,42 +198,5 @@ class _Watcher:
     def _save(self) -> None:
         image = self._device.stored_image
         if self._save_to and image is not None:
-            _write_file(Path(self._save_to), image)
+            write_whole(Path(self._save_to), image, _SAVE_IMAGE)
             self._output.result(f"saved:   {printable(self._save_to)}")
-
-
-def _check_folder(save_to: str | None) -> None:
-    """Raises UsageError where no file can come to be: better now than after an upgrade."""
-    if save_to is None:
-        return
-    path = Path(save_to)
-    if path.is_dir():
-        raise _not_written(path, "it is a folder")
-    if not path.parent.is_dir():
-        raise _not_written(path, "its folder does not exist")
-
-
-def _write_file(path: Path, data: bytes) -> None:
-    """Write a file whole or not at all, where a link leads to. Raises UsageError when it cannot be
-    written. What is no regular file (a pipe, a device) is written into, not replaced.
-    """
-    path = path.resolve()
-    part = path.with_name(f".{path.name}.part")
-    try:
-        if path.exists() and not path.is_file():
-            path.write_bytes(data)
-        else:
-            part.write_bytes(data)
-            part.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            part.unlink(missing_ok=True)
-        raise _not_written(path, error.strerror or type(error).__name__) from error
-
-
-def _not_written(path: Path, reason: str) -> UsageError:
-    return UsageError(
-        f"{printable(str(path))} cannot be written: {reason}.",
-        where="--save-image",
-        remedy="Name a file in a folder that exists and has room.",
-    )

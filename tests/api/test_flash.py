@@ -24,6 +24,7 @@ from flasher.device.model import Device
 from flasher.device.profile import DeviceProfile
 from flasher.errors import BusError, ExitCode, FlasherError, UsageError
 from flasher.host.options import UpgradeOptions
+from flasher.protocol import contents
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC
 from flasher.protocol.timing import Timings
@@ -54,7 +55,7 @@ def at_once(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 def test_the_whole_job_is_one_call(tmp_path: Path, target: Any) -> None:
     path = tmp_path / "firmware.bin"
     path.write_bytes(DATA)
-    outcome = flasher.flash(path, target, mock=True)
+    outcome = flasher.flash(path, target, mock=True).outcome
     assert outcome.ok
     assert outcome.ending is flasher.Ending.COMPLETED
     assert outcome.device_left is flasher.DeviceLeft.NEW
@@ -90,7 +91,7 @@ def test_events_arrive_in_order_while_it_runs() -> None:
 
 def test_the_mock_takes_the_time_of_a_real_bus_unless_told_otherwise() -> None:
     began = time.monotonic()
-    outcome = flasher.flash(IMAGE, "bms", mock=True)
+    outcome = flasher.flash(IMAGE, "bms", mock=True).outcome
     assert time.monotonic() - began >= outcome.statistics.duration_s * 0.99
     assert outcome.statistics.transfer_s is not None
     assert outcome.statistics.transfer_s >= 3 * 0.009
@@ -119,7 +120,7 @@ def test_taps_see_the_traffic_of_an_upgrade() -> None:
 
     with flasher.connect_mock("bms", speed=0) as connection:
         flasher.upgrade(flasher.make_plan(IMAGE, "bms"), connection, taps=[tap])
-    assert ids == {(0x752, True), (0x725, False)}
+    assert ids == {(0x752, True), (0x725, False), (0x720, False)}
     assert times == sorted(times)
 
 
@@ -198,7 +199,7 @@ def lose_complete(frame: Frame, _now: float) -> list[Frame]:
 
 def test_a_final_answer_that_never_comes_is_unconfirmed_not_done() -> None:
     connection, device = simulated(lose_complete, repeated_end="silence", start_delay_s=1000.0)
-    outcome = flasher.upgrade(flasher.make_plan(IMAGE, "bms"), connection)
+    outcome = flasher.upgrade(flasher.make_plan(IMAGE, "bms"), connection).outcome
     error = outcome.error()
     assert isinstance(error, errors.UnconfirmedError)
     assert error.exit_code == ExitCode.UNCONFIRMED
@@ -219,7 +220,7 @@ def test_the_version_decides_when_the_final_answer_is_lost(
     connection, device = simulated(lose_complete, repeated_end="silence")
     image = flasher.Image.from_bytes(b"V2r0r0_20260101\x00" + DATA)
     plan = flasher.make_plan(dataclasses.replace(image, version=claimed), "bms")
-    outcome = flasher.upgrade(plan, connection)
+    outcome = flasher.upgrade(plan, connection).outcome
     error = outcome.error()
     assert outcome.ending is ending
     assert outcome.running_version == "V2r0r0_20260101"
@@ -244,7 +245,7 @@ def test_a_cancelled_upgrade_is_an_outcome_that_says_what_is_left() -> None:
         connection,
         on_event=note,
         cancelled=lambda: bool(acknowledged),
-    )
+    ).outcome
     error = outcome.error()
     assert outcome.ending is flasher.Ending.CANCELLED
     assert isinstance(error, errors.InterruptedByUserError)
@@ -348,9 +349,9 @@ def test_a_babbling_bus_keeps_an_upgrade_neither_from_its_deadline_nor_from_bein
     connection = api.Connection(link, MonotonicClock(), "babbling")
     plan = flasher.make_plan(IMAGE, "bms")
     began = time.monotonic()
-    outcome = flasher.upgrade(plan, connection, options=UpgradeOptions(timeout_s=0.1))
+    outcome = flasher.upgrade(plan, connection, options=UpgradeOptions(timeout_s=0.1)).outcome
     assert outcome.ending is flasher.Ending.OUT_OF_TIME
-    outcome = flasher.upgrade(plan, connection, cancelled=lambda: True)
+    outcome = flasher.upgrade(plan, connection, cancelled=lambda: True).outcome
     assert outcome.ending is flasher.Ending.CANCELLED
     assert time.monotonic() - began < 2.0
     assert link.received > 10_000
@@ -424,7 +425,7 @@ def test_the_examples_of_the_tour_run(
     examples = [
         textwrap.dedent(block) for block in re.findall(r"(?:^    .+\n)+", tour, re.MULTILINE)
     ]
-    assert len(examples) == 4
+    assert len(examples) == 5
     opened: list[dict[str, Any]] = []
 
     def connect(_dialect: object = None, **bus: Any) -> AbstractContextManager[api.Connection]:
@@ -445,8 +446,32 @@ def test_the_examples_of_the_tour_run(
     assert "PacketAcknowledged(number=92, total=92, tries=1)" in said
     assert re.search(r"^92 [\d.]+$", said, re.MULTILINE)
     assert "Ending.COMPLETED DeviceLeft.NEW None" in said
-    assert [bus["interface"] for bus in opened] == ["socketcan", "pcan"]
+    assert [bus["interface"] for bus in opened] == ["socketcan", "pcan", "socketcan"]
 
 
 def test_everything_that_the_tour_exports_is_there() -> None:
     assert [name for name in flasher.__all__ if not hasattr(flasher, name)] == []
+
+
+# -- the battery's own data -----------------------------------------------------------------------
+
+
+def test_a_program_reads_and_writes_what_the_battery_says_of_itself() -> None:
+    with flasher.connect_mock("bms", speed=0) as connection:
+        running = flasher.query(connection, "running-information")
+        assert isinstance(running, contents.RunningInformation)
+        assert 30_000 < running.voltage_mv < 45_000
+        written = flasher.write(connection, "user-string-1", "checked")
+        assert written.error() is None
+        text = flasher.query(connection, "user-string-1")
+        assert isinstance(text, contents.UserString)
+        assert str(text.text) == "checked"
+        assert len(flasher.read(connection, 0x0800_8000, 0x0800_8010)) == 16
+
+
+def test_what_only_the_manufacturer_writes_needs_a_word() -> None:
+    with (
+        flasher.connect_mock("bms", speed=0) as connection,
+        pytest.raises(errors.UsageError, match="manufacturer"),
+    ):
+        flasher.write(connection, "serial-number", "W2605002")

@@ -20,6 +20,8 @@ from flasher.protocol.frame import Frame
 from tests.cli.conftest import SAMPLES, Flasher
 
 BMS = SAMPLES / "bms.hex"
+OBC = SAMPLES / "obc.bin"
+"""The small one, where the device does not matter."""
 
 
 @pytest.mark.parametrize(
@@ -40,7 +42,8 @@ def test_each_sample_is_flashed_to_the_mock(
     assert "transferred:" in run.out
     assert f"boot version: {boot_version} V1.0.0" in run.out
     assert "completed:    the device confirmed the complete image" in run.out
-    assert "running:      not asked" in run.out
+    running = "V1r0r4_20220512 (the application runs and names" if target == "bms" else "not asked"
+    assert f"running:      {running}" in run.out
     assert "\r" not in run.err
 
 
@@ -84,7 +87,7 @@ def test_a_dry_run_prints_the_plan_and_opens_no_adapter(flasher: Flasher) -> Non
 
 
 def test_a_quiet_flash_says_only_the_result(flasher: Flasher) -> None:
-    run = flasher("-q", "flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0")
+    run = flasher("-q", "flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0")
     assert run.err == ""
     assert "completed:" in run.out
 
@@ -93,8 +96,8 @@ def test_a_quiet_flash_says_only_the_result(flasher: Flasher) -> None:
 def test_verbosity_is_taken_before_and_behind_the_command(
     flasher: Flasher, words: tuple[str, ...]
 ) -> None:
-    before = flasher(*words, "flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0")
-    behind = flasher("flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0", *words)
+    before = flasher(*words, "flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0")
+    behind = flasher("flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0", *words)
     assert before.code == behind.code == ExitCode.OK
 
 
@@ -130,7 +133,7 @@ def test_a_trace_that_fills_its_disk_does_not_stop_the_upgrade(
 
     monkeypatch.setattr("flasher.trace.recorder.can.Logger", lambda _path: Full())
     run = flasher(
-        "flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0",
+        "flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0",
         "--trace-file", tmp_path / "upgrade.asc",
     )  # fmt: skip
     assert run.code == ExitCode.OK
@@ -153,19 +156,19 @@ def test_wrong_usage_is_a_json_document_too(flasher: Flasher, words: tuple[str, 
 
 @pytest.mark.parametrize("speed", ["0.01", "-1", "nan"])
 def test_a_mock_so_slow_that_nothing_moves_is_refused(flasher: Flasher, speed: str) -> None:
-    run = flasher("flash", BMS, "-t", "bms", "--mock", "--mock-speed", speed)
+    run = flasher("flash", OBC, "-t", "obc", "--mock", "--mock-speed", speed)
     assert run.code == ExitCode.USAGE
 
 
 def test_a_trace_of_an_unknown_kind_is_wrong_usage(flasher: Flasher, tmp_path: Path) -> None:
-    run = flasher("flash", BMS, "-t", "bms", "--mock", "--trace-file", tmp_path / "upgrade.xyz")
+    run = flasher("flash", OBC, "-t", "obc", "--mock", "--trace-file", tmp_path / "upgrade.xyz")
     assert run.code == ExitCode.USAGE
     assert ".asc" in run.err
 
 
 def test_a_trace_that_cannot_be_written_is_wrong_usage(flasher: Flasher, tmp_path: Path) -> None:
     run = flasher(
-        "flash", BMS, "-t", "bms", "--mock", "--trace-file", tmp_path / "no" / "upgrade.asc"
+        "flash", OBC, "-t", "obc", "--mock", "--trace-file", tmp_path / "no" / "upgrade.asc"
     )
     assert run.code == ExitCode.USAGE
     assert "cannot be written" in run.err
@@ -192,12 +195,12 @@ def test_every_bad_sample_is_rejected_with_one_message(flasher: Flasher, sample:
         ("flash", "nowhere.hex", "-t", "bms", "--mock"),
         ("flash", BMS, "-t", "cdl", "--mock"),
         ("flash", BMS, "--mock"),
-        ("flash", BMS, "-t", "bms", "--mock", "--retries", "0"),
-        ("flash", BMS, "-t", "bms", "--mock", "--timeout", "-1"),
-        ("flash", BMS, "-t", "bms", "--mock", "--range", "5"),
-        ("flash", BMS, "-t", "bms", "--mock", "--base", "12x"),
-        ("flash", BMS, "-t", "bms", "--mock", "--no-such-option"),
-        ("flash", BMS, "-t", "bms", "--mock", "--dialect", "motinova"),
+        ("flash", OBC, "-t", "obc", "--mock", "--retries", "0"),
+        ("flash", OBC, "-t", "obc", "--mock", "--timeout", "-1"),
+        ("flash", OBC, "-t", "obc", "--mock", "--range", "5"),
+        ("flash", OBC, "-t", "obc", "--mock", "--base", "12x"),
+        ("flash", OBC, "-t", "obc", "--mock", "--no-such-option"),
+        ("flash", OBC, "-t", "obc", "--mock", "--dialect", "motinova"),
         ("flash", BMS, "-t", "bms", "-i", "no_such_interface", "-c", "0"),
         ("flash",),
         ("no-such-command",),
@@ -263,7 +266,7 @@ def test_an_adapter_that_fails_in_the_middle_says_how_far_it_came_and_what_is_le
 
 def test_filters_do_not_disturb_the_json_on_stdout(flasher: Flasher) -> None:
     run = flasher(
-        "flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0", "--json",
+        "flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0", "--json",
         "--filter", "725:7FF", "720:7FF",
     )  # fmt: skip
     assert run.document["ok"] is True
@@ -276,7 +279,7 @@ def test_a_bug_is_exit_code_1_and_says_so(
         raise ZeroDivisionError("injected")
 
     monkeypatch.setattr("flasher.api.upgrade", broken)
-    run = flasher("flash", BMS, "-t", "bms", "--mock")
+    run = flasher("flash", OBC, "-t", "obc", "--mock")
     assert run.code == ExitCode.INTERNAL
     assert "a bug in flasher" in run.err
     assert "injected" in run.err
@@ -301,7 +304,7 @@ def test_the_devices_choices_decide_the_exit_code(
             target, dialect, speed=speed, profile=profile
         ),
     )
-    run = flasher("flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0")
+    run = flasher("flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0")
     assert run.code == code
 
 

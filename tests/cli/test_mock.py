@@ -72,9 +72,15 @@ class Host:
         """One upgrade from reset to the end."""
         plan = api.make_plan(api.Image.from_bytes(image), target)
         with api.connect(interface="virtual", channel=self.channel) as connection:
-            outcome = api.upgrade(plan, connection)
+            outcome = api.upgrade(plan, connection).outcome
         self.outcomes.append(outcome)
         return outcome
+
+    def upgrade_unverified(self) -> None:
+        """One upgrade after which nothing is asked: for a mock that ends before it could answer."""
+        plan = api.make_plan(api.Image.from_bytes(IMAGE), "bms")
+        with api.connect(interface="virtual", channel=self.channel) as connection:
+            api.upgrade(plan, connection, verify=api.Level.NONE)
 
     def hear(self, question: bytes, can_id: int, wanted: bytes) -> bytes:
         """Send the frames of a message, or listen only, until `wanted` was heard on `can_id`."""
@@ -109,6 +115,7 @@ def host(monkeypatch: pytest.MonkeyPatch) -> Iterator[Host]:
     monkeypatch.setattr(mock_command, "drive", drive_and_tell)
     # So that the mock sees sooner that it may end.
     monkeypatch.setattr("flasher.driver.MAX_WAIT_S", 0.02)
+    monkeypatch.setattr("flasher.cli.mock._QUIET_S", 0.3)
     yield beside
     if beside._thread.ident is not None:
         beside.join()
@@ -162,6 +169,21 @@ def test_each_target_is_served(serve: Serve, host: Host, target: str) -> None:
     assert run.code == ExitCode.OK
     host.join()
     assert host.outcomes[0].ok
+
+
+def test_the_last_upgrade_can_be_verified_before_it_ends(serve: Serve, host: Host) -> None:
+    results: list[api.Result] = []
+
+    def upgrade() -> None:
+        plan = api.make_plan(api.Image.from_bytes(b"V2r0r0_20260101".ljust(200, b"-")), "bms")
+        with api.connect(interface="virtual", channel=host.channel) as connection:
+            results.append(api.upgrade(plan, connection, verify=api.Level.VERSION))
+
+    host.do(upgrade)
+    assert serve("--upgrades", "1", "--set", "after_complete=restarts").code == ExitCode.OK
+    host.join()
+    assert results[0].ok
+    assert results[0].running_version == "V2r0r0_20260101"
 
 
 def test_it_ends_after_n_upgrades(serve: Serve, host: Host, tmp_path: Path) -> None:
@@ -279,7 +301,7 @@ def test_a_disk_that_fills_up_leaves_the_old_file_and_no_half_one(
     out = tmp_path / "out.bin"
     out.write_bytes(b"old")
     monkeypatch.setattr(Path, failing, fail)
-    host.do(host.upgrade)
+    host.do(host.upgrade_unverified)
     run = serve("--upgrades", "1", "--save-image", out)
     monkeypatch.undo()
     assert run.code == ExitCode.USAGE
@@ -298,7 +320,7 @@ def test_a_folder_that_vanishes_meanwhile_is_one_message(
     def upgrade_without_folder() -> None:
         folder.rmdir()
         folder.write_text("now a file")
-        host.upgrade()
+        host.upgrade_unverified()
 
     host.do(upgrade_without_folder)
     run = serve("--upgrades", "1", "--save-image", folder / "out.bin")

@@ -1,1 +1,1 @@
-"""Recording of bus traffic."""
+"""Traces and watching."""

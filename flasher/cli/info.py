@@ -1,0 +1,127 @@
+"""`flasher info`: identity, versions, state, faults, production and history of a device."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from flasher import api, service
+from flasher.cli import arguments
+from flasher.cli.content_text import content_document, content_lines, row_line
+from flasher.cli.output import Output
+from flasher.cli.stop import stop_on_signal
+from flasher.cli.survey_text import heard_document, heard_lines
+from flasher.errors import ExitCode, NoAnswerError
+from flasher.service import DeviceInfo, Reading
+
+_EPILOG = """\
+examples:
+  flasher info -t bms --mock
+  flasher info -t bms -i socketcan -c can0
+  flasher info -t wmc -i socketcan -c can0       it cannot be asked: shows what it sends
+
+What the device does not answer is shown as such: an older one does not know every question.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.description = "Show what a device tells about itself."
+    parser.epilog = _EPILOG
+    arguments.add_target(parser)
+    arguments.add_dialect(parser)
+    arguments.add_mock(parser)
+    arguments.add_bus(parser)
+
+
+def run(options: argparse.Namespace, output: Output) -> int:
+    """Run the command; returns the exit code."""
+    dialect = api.as_dialect(options.dialect)
+    with (
+        arguments.open_connection(options, options.target) as connection,
+        stop_on_signal() as stopped,
+    ):
+        output.progress(f"asking the {options.target.node.name} on {connection.name} ...")
+        found = service.info(connection, options.target, dialect=dialect, cancelled=stopped)
+    if not found.is_there:
+        error = _silent(found)
+        output.failure(error, **_document(found))
+        return error.exit_code
+    for line in _lines(found):
+        output.result(line)
+    output.document({"ok": True, "exit_code": int(ExitCode.OK), **_document(found)})
+    return ExitCode.OK
+
+
+def _silent(found: DeviceInfo) -> NoAnswerError:
+    node = found.target.node.name
+    if found.readings:
+        return NoAnswerError(
+            f"The {node} answered nothing and sent nothing.",
+            cause="it is off, asleep or not connected, or the bit rate or dialect is another",
+            remedy="Wake it with its key; see who is on the bus with flasher scan.",
+        )
+    return NoAnswerError(
+        f"The {node} sent nothing in {service.INFO_LISTEN_ONLY_S:g} s, and the documents give no"
+        " question to ask it.",
+        cause="it is off, or it has nothing to say: it speaks by itself only now and then",
+        remedy="Try again while it is switched on; flasher scan shows who else is there.",
+    )
+
+
+def _lines(found: DeviceInfo) -> list[str]:
+    node = found.target.node.name
+    lines = [f"{node}, {found.dialect.name} dialect"]
+    if not found.readings:
+        lines.append("The documents give no question to ask it; this is what it sent by itself:")
+        return lines + heard_lines(found.survey.heard[found.target.node], contents=True)
+    for reading in found.readings:
+        if reading.answer is not None:
+            lines += ["", _title(reading), *content_lines(reading.answer)]
+    faults = found.survey.faults
+    lines += ["", "faults", *(content_lines(faults) if faults else [_no_faults()])]
+    missing = [reading for reading in found.readings if reading.answer is None]
+    if missing:
+        lines += ["", "not answered"]
+        lines += [row_line(_title(reading), _why(reading)) for reading in missing]
+    heard = found.survey.heard[found.target.node]
+    if heard.boot_version:
+        lines += ["", f"its bootloader announced itself meanwhile: {heard.boot_version}"]
+    if heard.damaged:
+        lines += ["", f"bytes from it that made no message: {heard.damaged} times"]
+    return lines
+
+
+def _title(reading: Reading) -> str:
+    return reading.name.replace("-", " ")
+
+
+def _no_faults() -> str:
+    return row_line("faults", "none reported")
+
+
+def _why(reading: Reading) -> str:
+    if not reading.was_asked:
+        return "not asked: the device is silent"
+    if reading.misfit:
+        return f"came in another form: {reading.misfit}"
+    return "no answer"
+
+
+def _document(found: DeviceInfo) -> dict[str, Any]:
+    faults = found.survey.faults
+    heard = found.survey.heard.get(found.target.node)
+    return {
+        "target": found.target.name,
+        "dialect": found.dialect.name,
+        "can_be_asked": bool(found.readings),
+        "items": {
+            reading.name: content_document(reading.answer) if reading.answer else None
+            for reading in found.readings
+        },
+        "unanswered": {
+            reading.name: _why(reading) for reading in found.readings if reading.answer is None
+        },
+        "faults": content_document(faults)["faults"] if faults else [],
+        "heard": heard_document(heard) if heard else None,
+    }

@@ -1,0 +1,109 @@
+"""`flasher scan`: who is on the bus."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from flasher import api, service
+from flasher.cli import arguments
+from flasher.cli.output import Output, counted
+from flasher.cli.stop import stop_on_signal
+from flasher.cli.survey_text import heard_document, heard_lines
+from flasher.errors import ExitCode, NoAnswerError
+from flasher.host.survey import Survey
+from flasher.protocol.spec import BMS, DIALECTS, Dialect
+
+_EPILOG = """\
+examples:
+  flasher scan -i socketcan -c can0
+  flasher scan --dialect motinova -i pcan -c PCAN_USBBUS1      listens at 125 kbit/s
+
+Listens for a second, then asks the BMS, the only device that the documents let us ask. Who is not
+listed may still be there: most devices speak only now and then.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.description = "Find out who is on the bus, and which dialect is spoken."
+    parser.epilog = _EPILOG
+    arguments.add_target(parser, required=False)
+    arguments.add_dialect(parser)
+    arguments.add_mock(parser)
+    arguments.add_bus(parser)
+
+
+def run(options: argparse.Namespace, output: Output) -> int:
+    """Run the command; returns the exit code."""
+    dialect = api.as_dialect(options.dialect)
+    bitrate_bps = getattr(options, "bitrate", None) or dialect.bitrate_bps
+    with (
+        arguments.open_connection(options, options.target or BMS) as connection,
+        stop_on_signal() as stopped,
+    ):
+        output.progress(f"listening for {service.SCAN_LISTEN_S:g} s on {connection.name} ...")
+        survey = service.scan(connection, dialect=dialect, cancelled=stopped)
+    guessed, why = judge_dialect(survey, bitrate_bps)
+    bus = _bus_document(survey, bitrate_bps, guessed, why)
+    if not survey.heard:
+        error = _silent(survey, bitrate_bps)
+        output.failure(error, **bus)
+        return error.exit_code
+    for line in _lines(survey, bitrate_bps, dialect, guessed, why):
+        output.result(line)
+    output.document({"ok": True, "exit_code": int(ExitCode.OK), **bus})
+    return ExitCode.OK
+
+
+def judge_dialect(survey: Survey, bitrate_bps: int) -> tuple[Dialect | None, str]:
+    """The dialect that is spoken and why, from the traffic or else the bit rate in use."""
+    guessed, why = survey.guess_dialect()
+    if guessed is not None:
+        return guessed, why
+    if any(heard.messages for heard in survey.heard.values()):
+        for dialect in DIALECTS.values():
+            if dialect.bitrate_bps == bitrate_bps:
+                return dialect, f"by the bit rate alone, which is an assumption; {why}"
+    return None, why
+
+
+def _silent(survey: Survey, bitrate_bps: int) -> NoAnswerError:
+    foreign = ""
+    if survey.foreign_frames:
+        foreign = f"; {counted(survey.foreign_frames, 'frame')} under ids of other protocols came"
+    return NoAnswerError(
+        f"Nobody of the drive system was heard at {bitrate_bps / 1000:g} kbit/s{foreign}.",
+        cause="everything is off or asleep, the wiring is open, or the bit rate is another",
+        remedy="Switch the system on; try --dialect motinova (125 kbit/s) or welling (250).",
+    )
+
+
+def _lines(
+    survey: Survey, bitrate_bps: int, asked: Dialect, guessed: Dialect | None, why: str
+) -> list[str]:
+    lines = [
+        f"bit rate: {bitrate_bps / 1000:g} kbit/s assumed from the options, frames do not tell it",
+        f"dialect:  {guessed.name if guessed else 'unknown'} ({why})",
+    ]
+    if guessed is not None and guessed is not asked:
+        lines.append(f"          it was asked as {asked.name}: use --dialect {guessed.name}")
+    for node, heard in sorted(survey.heard.items(), key=lambda pair: pair[0].value):
+        note = " (a tool like this one)" if node.name == "CDL" else ""
+        lines += ["", f"{node.name}{note}", *heard_lines(heard)]
+    if survey.foreign_frames:
+        lines += ["", f"frames under ids of other protocols: {survey.foreign_frames}"]
+    return lines
+
+
+def _bus_document(
+    survey: Survey, bitrate_bps: int, guessed: Dialect | None, why: str
+) -> dict[str, Any]:
+    return {
+        "bitrate_bps": bitrate_bps,
+        "bitrate_is_assumed": True,
+        "dialect": guessed.name if guessed else None,
+        "dialect_because": why,
+        "nodes": {node.name.lower(): heard_document(h) for node, h in survey.heard.items()},
+        "foreign_frames": survey.foreign_frames,
+    }

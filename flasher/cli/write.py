@@ -1,0 +1,137 @@
+"""`flasher write`: write an item of a device by its name, and read it back."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from typing import Any
+
+from flasher import api, service
+from flasher.cli import arguments
+from flasher.cli.output import Output
+from flasher.cli.stop import stop_on_signal
+from flasher.errors import ExitCode, UsageError
+from flasher.host.items import writable
+from flasher.host.write import FieldChange, WritePlan, Written, field_changes, plan_write
+from flasher.protocol.fields import Content, label
+from flasher.protocol.spec import BMS, Dialect, Target
+
+_EPILOG = """\
+examples:
+  flasher write --list
+  flasher write user-string-1 -t bms "rack 7" -i socketcan -c can0
+  flasher write serial-number -t bms W2605001 --manufacturer --yes -i socketcan -c can0
+  flasher write production-information -t bms ACME SUZHOU 20260517 --manufacturer --mock
+  flasher write check-code -t bms 00112233445566778899AABB --mock
+
+Shows the old and the new value and asks before it writes; without a terminal --yes is needed. Exit
+code 10 when the write is not confirmed or reads back differently, 5 when the device is silent.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Arguments of the command."""
+    parser.description = "Write an item of a device by its name, and read it back."
+    parser.epilog = _EPILOG
+    parser.add_argument("item", nargs="?", metavar="ITEM", help="what to write; see --list")
+    parser.add_argument("values", nargs="*", metavar="VALUE", help="one for each of its fields")
+    arguments.take_values_anywhere(parser, "values")
+    arguments.add_target(parser, required=False)
+    arguments.add_dialect(parser)
+    group = parser.add_argument_group("write")
+    group.add_argument("--list", action="store_true", help="list the items and stop")
+    group.add_argument("-y", "--yes", action="store_true", help="do not ask")
+    group.add_argument(
+        "--manufacturer",
+        action="store_true",
+        help="write what the document reserves for the manufacturer",
+    )
+    arguments.add_mock(parser)
+    arguments.add_bus(parser)
+
+
+def run(options: argparse.Namespace, output: Output) -> int:
+    """Run the command; returns the exit code."""
+    target = options.target or BMS
+    dialect = api.as_dialect(options.dialect)
+    if options.list:
+        return _list(target, dialect, output)
+    if options.item is None:
+        raise UsageError("Nothing to write was named.", remedy="See flasher write --list.")
+    plan = plan_write(
+        options.item, options.values, target, dialect=dialect, manufacturer=options.manufacturer
+    )
+    if not options.yes and not _is_terminal():
+        raise UsageError(
+            f"Writing {plan.writable.name} needs a confirmation, and there is no terminal to ask.",
+            remedy="Add --yes.",
+        )
+    with arguments.open_connection(options, target) as connection:
+        with stop_on_signal() as stopped:
+            old = service.old_content(connection, plan, cancelled=stopped)
+        _show(plan, old, output)
+        if not options.yes and not _agrees(plan):
+            output.progress("nothing was written")
+            output.document({"ok": False, "exit_code": int(ExitCode.INTERRUPTED), "written": False})
+            return ExitCode.INTERRUPTED
+        with stop_on_signal(lambda: output.error_line("the write ends first ...")):
+            written = service.carry_out(connection, plan, old)
+    return _conclude(written, output)
+
+
+def _show(plan: WritePlan, old: Content | None, output: Output) -> None:
+    output.result(f"{plan.target.node.name} {plan.writable.name}")
+    for change in field_changes(plan, old):
+        before = "unknown" if change.old is None else repr(change.old)
+        output.result(f"  {change.name:<16} old {before}  new {change.new!r}")
+
+
+def _conclude(written: Written, output: Output) -> int:
+    error = written.error()
+    if error is not None:
+        output.failure(error, **_document(written))
+        return error.exit_code
+    read_back = "read back right" if written.read_back else "there is no query to read it back"
+    output.result(f"written: confirmed by the device, {read_back}")
+    output.document({"ok": True, "exit_code": int(ExitCode.OK), **_document(written)})
+    return ExitCode.OK
+
+
+def _document(written: Written) -> dict[str, Any]:
+    return {
+        "target": written.plan.target.name,
+        "item": written.plan.writable.name,
+        "confirmed": written.is_confirmed,
+        "fields": {change.name.replace(" ", "_"): _change(change) for change in written.changes},
+    }
+
+
+def _change(change: FieldChange) -> dict[str, str | None]:
+    return {"old": change.old, "new": change.new, "read_back": change.read_back}
+
+
+def _is_terminal() -> bool:
+    return sys.stdin.isatty() and sys.stderr.isatty()
+
+
+def _agrees(plan: WritePlan) -> bool:
+    sys.stderr.write(f"Write {plan.writable.name} to the {plan.target.node.name}? [y/N] ")
+    sys.stderr.flush()
+    return sys.stdin.readline().strip().lower() in {"y", "yes"}
+
+
+def _list(target: Target, dialect: Dialect, output: Output) -> int:
+    items = writable(target, dialect)
+    for name, entry in items.items():
+        values = " ".join(label(n, codec).upper().replace(" ", "_") for n, codec in entry.fields)
+        only = "  (manufacturer only)" if entry.item.manufacturer_only else ""
+        output.result(f"{name:<24} {values}{only}")
+    if not items:
+        output.result(f"The documents give the tool nothing to write to the {target.node.name}.")
+    document = {
+        name: {"fields": [n for n, _ in entry.fields],
+               "manufacturer_only": entry.item.manufacturer_only}
+        for name, entry in items.items()
+    }  # fmt: skip
+    output.document({"ok": True, "exit_code": int(ExitCode.OK), "items": document})
+    return ExitCode.OK

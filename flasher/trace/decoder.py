@@ -1,0 +1,251 @@
+"""From CAN frames to what they say: every message of both documents, and everything else by name.
+
+`Decoder` takes the whole bus, whoever sends: one byte stream for each CAN id. What comes out is
+`Seen`, one a message, a damage or a frame that is not ours, with its fields both typed and as text
+that is harmless on any screen. Pure: the time is an argument.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum, IntFlag
+from typing import Any, Final, NamedTuple
+
+from flasher.protocol import catalogue, messages
+from flasher.protocol.contents import Faults
+from flasher.protocol.fields import Content, Reserved, Text, flag_names, label
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import TARGETS, Mode, Node, can_id
+from flasher.protocol.text import printable
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.protocol.wire import Damage, Message, Reassembler
+
+
+class Kind(Enum):
+    """What was seen."""
+
+    MESSAGE = "message"
+    UNKNOWN = "unknown message"
+    """Intact, but no row of the documents."""
+    MALFORMED = "malformed message"
+    """A row of the documents, but not with the mode or the data that it has there."""
+    DAMAGED = "damaged bytes"
+    FOREIGN = "foreign frame"
+    """A frame that no node of the documents sends."""
+    ERROR_FRAME = "error frame"
+
+
+class Field(NamedTuple):
+    """One value inside a message: `name` carries its unit, `value` goes into JSON as it is."""
+
+    name: str
+    value: Any
+    label: str
+    text: str
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One thing seen on the bus at `at` seconds. `sender` and `receiver` are names of nodes,
+    "all" for a broadcast, and empty where the id is of no node.
+    """
+
+    at: float
+    kind: Kind
+    can_id: int
+    title: str
+    sender: str = ""
+    receiver: str = ""
+    command: int | None = None
+    fields: tuple[Field, ...] = ()
+    is_alarm: bool = False
+    """An intact message that tells of trouble: a NAK, or faults that are set."""
+
+    @property
+    def is_trouble(self) -> bool:
+        """True for all that does not belong on a healthy bus."""
+        return self.is_alarm or self.kind not in (Kind.MESSAGE, Kind.FOREIGN)
+
+
+BROADCAST: Final = "all"
+_HEALTH: Final = "state_of_health_percent"
+_ROUTES: Final = {
+    can_id(sender, receiver): (sender.name, BROADCAST if receiver is None else receiver.name)
+    for sender in Node
+    for receiver in (None, *Node)
+    if sender is not receiver
+}
+"""Sender and receiver of every CAN id of the documents."""
+_TO_DEVICE: Final = frozenset(target.request_id for target in TARGETS.values())
+_TO_TOOL: Final = frozenset(target.answer_id for target in TARGETS.values())
+
+_TITLES: Final[dict[type[messages.Row], str]] = {
+    messages.Reset: "reset",
+    messages.GeneralFeedback: "general feedback",
+    messages.BootVersion: "boot version",
+    messages.UpdateCommand: "update command",
+    messages.RequestTransfer: "request transfer",
+    messages.Packet: "packet",
+    messages.Ack: "ACK",
+    messages.Nak: "NAK",
+    messages.EndOfTransfer: "end of transfer",
+    messages.Complete: "complete",
+}
+
+
+def message_titles() -> tuple[str, ...]:
+    """The titles of all messages that can be told apart, each once."""
+    titles = [item.title for item in catalogue.ITEMS] + list(_TITLES.values())
+    return tuple(dict.fromkeys(titles))
+
+
+class Decoder:
+    """Tells what the frames of a bus say. Give it every frame, and `tick` at `deadline`."""
+
+    def __init__(
+        self, inter_frame_timeout_s: float = DEFAULT_TIMINGS.inter_frame_timeout_s
+    ) -> None:
+        self._streams = {key: Reassembler(key, inter_frame_timeout_s) for key in _ROUTES}
+
+    def feed(self, frame: Frame, now: float) -> Iterator[Seen]:
+        """What the frame completed, in order: usually nothing, sometimes more than one."""
+        if frame.is_error:
+            yield Seen(now, Kind.ERROR_FRAME, frame.can_id, Kind.ERROR_FRAME.value)
+            return
+        stream = self._streams.get(frame.can_id)
+        if stream is None or not frame.is_payload:
+            yield _foreign(frame, now)
+            return
+        for found in stream.feed(frame.data, now):
+            yield _describe(found, now)
+
+    def deadline(self) -> float | None:
+        """When `tick` has something to drop; None while nothing is held."""
+        deadlines = (stream.deadline() for stream in self._streams.values())
+        return min((at for at in deadlines if at is not None), default=None)
+
+    def tick(self, now: float) -> Iterator[Seen]:
+        """What was cut short: the rest of a message that did not come in time (R12)."""
+        for stream in self._streams.values():
+            for found in stream.tick(now):
+                yield _describe(found, now)
+
+
+def _describe(found: Message | Damage, now: float) -> Seen:
+    sender, receiver = _ROUTES[found.can_id]
+    if isinstance(found, Damage):
+        fields = (_plain("reason", found.reason.value), _raw("bytes", found.data))
+        title = Kind.DAMAGED.value
+        return Seen(now, Kind.DAMAGED, found.can_id, title, sender, receiver, fields=fields)
+    kind, title, shown, alarm = _judge(found)
+    return Seen(now, kind, found.can_id, title, sender, receiver, found.command, shown, alarm)
+
+
+def _judge(message: Message) -> tuple[Kind, str, tuple[Field, ...], bool]:
+    """Kind, title, fields, and whether it tells of trouble."""
+    decoded = catalogue.decode(message)
+    if decoded is not None:
+        content = decoded.content
+        alarm = isinstance(content, Faults) and bool(content.faults)
+        return Kind.MESSAGE, decoded.item.title, content_fields(content), alarm
+    known = catalogue.BY_KEY.get((message.can_id, message.command))
+    if known is not None:
+        problem = f"mode is {message.mode:02X}, not {known.mode:02X}"
+        return Kind.MALFORMED, known.title, _undecoded(message, problem), False
+    if message.can_id in _TO_DEVICE | _TO_TOOL:
+        row = messages.decode(message)
+        if isinstance(row, messages.Malformed):
+            return Kind.MALFORMED, Kind.MALFORMED.value, _undecoded(message, row.problem), False
+        if not isinstance(row, messages.Unknown) and _goes_this_way(row, message.can_id):
+            alarm = isinstance(row, messages.Nak)
+            return Kind.MESSAGE, _TITLES[type(row)], _row_fields(row), alarm
+    return Kind.UNKNOWN, Kind.UNKNOWN.value, _undecoded(message), False
+
+
+def _goes_this_way(row: messages.Row, of_id: int) -> bool:
+    """Devices report, the tool reads and writes (2.2.1)."""
+    return of_id in (_TO_TOOL if row.MODE == Mode.REPORT else _TO_DEVICE)
+
+
+# -- fields ---------------------------------------------------------------------------------------
+
+
+def content_fields(content: Content) -> tuple[Field, ...]:
+    """The fields of a message of chapter 3; reserved bytes only if they are not zero. State of
+    health 0 is an older device's, which does not know it (section 6): None.
+    """
+    fields = []
+    for name, codec in content.LAYOUT:
+        value = getattr(content, name)
+        if not isinstance(codec, Reserved) or any(value):
+            shown = Field(name, _plain_value(value), label(name, codec), codec.show(value))
+            if name == _HEALTH and value == 0:
+                fields.append(shown._replace(value=None, text="not given"))
+            else:
+                fields.append(shown._replace(unit=codec.unit))
+    return tuple(fields)
+
+
+def _row_fields(row: messages.Row) -> tuple[Field, ...]:
+    """The fields of a message of the upgrade."""
+    return tuple(_row_field(field.name, getattr(row, field.name)) for field in _declared(row))
+
+
+def _declared(row: messages.Row) -> tuple[dataclasses.Field[Any], ...]:
+    return dataclasses.fields(row)
+
+
+def _row_field(name: str, value: int | str | bytes) -> Field:
+    if isinstance(value, bytes):
+        return _raw(name, value)
+    if name == "size_bytes":
+        return Field(name, value, "size", str(value), "B")
+    return _plain(name, value)
+
+
+def _undecoded(message: Message, problem: str = "") -> tuple[Field, ...]:
+    """What can be said of a message that is no row of the documents."""
+    fields = (
+        Field("command", f"{message.command:04X}", "command", f"{message.command:04X}"),
+        Field("mode", message.mode, "mode", f"{message.mode:02X}"),
+        _raw("data", message.data),
+    )
+    return (_plain("problem", problem), *fields) if problem else fields
+
+
+def _foreign(frame: Frame, now: float) -> Seen:
+    fields = [_raw("data", frame.data)]
+    if frame.is_extended:
+        fields.insert(0, _plain("identifier", "29 bits"))
+    if frame.is_remote:
+        fields.insert(0, _plain("frame", "remote request"))
+    sender, receiver = ("", "") if frame.is_extended else _ROUTES.get(frame.can_id, ("", ""))
+    title = Kind.FOREIGN.value
+    return Seen(now, Kind.FOREIGN, frame.can_id, title, sender, receiver, fields=tuple(fields))
+
+
+def _plain(name: str, value: int | str) -> Field:
+    value = printable(value) if isinstance(value, str) else value
+    return Field(name, value, name.replace("_", " "), str(value))
+
+
+def _raw(name: str, data: bytes) -> Field:
+    return Field(name, data.hex(), name.replace("_", " "), data.hex(" ") or "none")
+
+
+def _plain_value(value: object) -> Any:
+    """A value as JSON holds it: numbers, texts, lists of them; bytes in hexadecimal."""
+    match value:
+        case IntFlag():
+            return flag_names(type(value), value)
+        case Text():
+            return str(value)
+        case bytes():
+            return value.hex()
+        case tuple():
+            return list(value)
+        case _:
+            return value

@@ -1,0 +1,265 @@
+"""Watching a bus without taking part: an engine that sends nothing, and what has been seen so far.
+
+`Watcher` is driven like every other engine, so a live bus, the mock and a test are watched by the
+same code; `replay` does it with the frames of a file. `Board` remembers the latest message of each
+kind, which of its fields changed, and how often it comes.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from flasher.protocol.frame import Frame
+from flasher.trace.decoder import Decoder, Kind, Seen
+
+RATE_WINDOW_S: Final = 5.0
+"""Rates are counted over this time."""
+CHANGE_SHOWN_S: Final = 1.0
+"""A changed field stays marked for this time, or until it is seen unchanged later."""
+_RATE_SAMPLES: Final = 10_000
+"""Times held for one rate at the most: more than a bus carries in the window."""
+_AFTER_LAST_S: Final = 1.0
+"""A message whose rest does not come for so long after the last frame is cut short."""
+_AT_ONCE: Final = float("-inf")
+
+
+@dataclass(frozen=True)
+class FrameSeen:
+    """A frame as it came, before what it says."""
+
+    at: float
+    frame: Frame
+
+
+@dataclass(frozen=True)
+class Pulse:
+    """A moment to refresh a screen."""
+
+    at: float
+
+
+@dataclass(frozen=True)
+class Filter:
+    """What to show; an empty part lets everything through.
+
+    `nodes` match senders and receivers, `words` titles (any of them, as a part of the title,
+    in either case).
+    """
+
+    nodes: frozenset[str] = frozenset()
+    words: tuple[str, ...] = ()
+    trouble_only: bool = False
+
+    def accepts(self, seen: Seen) -> bool:
+        """True when it is to be shown."""
+        if self.nodes and not self.nodes & {seen.sender, seen.receiver}:
+            return False
+        title = seen.title.lower()
+        if self.words and not any(word.lower() in title for word in self.words):
+            return False
+        return seen.is_trouble or not self.trouble_only
+
+
+EVERYTHING: Final = Filter()
+
+
+class Watcher:
+    """The engine. Its events are `Seen`, `FrameSeen` with `raw`, `Pulse` with `pulse_s`.
+
+    It is done after `count` things that the filter accepts, or after `duration_s` seconds from its
+    first `tick`; without them it goes on until it is cancelled.
+    """
+
+    def __init__(
+        self,
+        shown: Filter = EVERYTHING,
+        *,
+        raw: bool = False,
+        count: int | None = None,
+        duration_s: float | None = None,
+        pulse_s: float | None = None,
+    ) -> None:
+        self._decoder = Decoder()
+        self._filter = shown
+        self._raw = raw
+        self._left = count
+        self._duration_s = duration_s
+        self._pulse_s = pulse_s
+        self._begun = False
+        self._ends_at: float | None = None
+        self._pulse_at: float | None = None
+        self._cancelled = False
+        self._events: list[object] = []
+        self.frames = 0
+        """Frames received."""
+
+    @property
+    def done(self) -> bool:
+        """True when there is nothing left to watch for."""
+        return self._cancelled or self._left == 0
+
+    def receive(self, frame: Frame, now: float) -> None:
+        """A CAN frame arrived."""
+        if self.done or (self._ends_at is not None and now > self._ends_at):
+            return
+        self.frames += 1
+        if self._raw:
+            self._events.append(FrameSeen(now, frame))
+        self._take(self._decoder.feed(frame, now))
+
+    def tick(self, now: float) -> None:
+        """The time that `deadline` asked for has come."""
+        if not self._begun:
+            self._begun = True
+            self._ends_at = None if self._duration_s is None else now + self._duration_s
+            self._pulse_at = None if self._pulse_s is None else now
+        self._take(self._decoder.tick(now))
+        if self._pulse_at is not None and self._pulse_s is not None and now >= self._pulse_at:
+            self._events.append(Pulse(now))
+            self._pulse_at = now + self._pulse_s
+        if self._ends_at is not None and now >= self._ends_at:
+            self._cancelled = True
+
+    def deadline(self) -> float | None:
+        """When it next wants `tick`; at once before the beginning."""
+        if self.done:
+            return None
+        if not self._begun:
+            return _AT_ONCE
+        times = (self._decoder.deadline(), self._ends_at, self._pulse_at)
+        return min((at for at in times if at is not None), default=None)
+
+    def next_frame(self, now: float) -> Frame | None:
+        """Nothing, ever: watching does not disturb."""
+        return None
+
+    def frame_sent(self, now: float) -> None:
+        """Never called."""
+
+    def cancel(self, now: float) -> None:
+        """End."""
+        self._cancelled = True
+
+    def take_events(self) -> Sequence[object]:
+        """What was seen since the last call."""
+        taken, self._events = self._events, []
+        return taken
+
+    def _take(self, found: Iterable[Seen]) -> None:
+        for seen in found:
+            if self._left != 0 and self._filter.accepts(seen):
+                self._events.append(seen)
+                if self._left is not None:
+                    self._left -= 1
+
+
+def replay(
+    watcher: Watcher,
+    frames: Iterable[tuple[float, Frame]],
+    on_event: Callable[[object], None],
+    cancelled: Callable[[], bool] = lambda: False,
+) -> None:
+    """Show recorded frames to a watcher as if they came now, without waiting.
+
+    A time that lies before the one of the frame before it counts as the same.
+    """
+    now = _AT_ONCE
+    for at, frame in frames:
+        now = max(now, at)
+        _pass_time(watcher, now)
+        if not watcher.done:
+            watcher.receive(frame, now)
+        for event in watcher.take_events():
+            on_event(event)
+        if watcher.done or cancelled():
+            return
+    _pass_time(watcher, now + _AFTER_LAST_S)
+    for event in watcher.take_events():
+        on_event(event)
+
+
+def _pass_time(watcher: Watcher, until: float) -> None:
+    """Let the watcher do what is due before `until`."""
+    while (due := watcher.deadline()) is not None and due < until:
+        watcher.tick(until if due == _AT_ONCE else due)
+
+
+# -- what has been seen so far --------------------------------------------------------------------
+
+
+@dataclass
+class Line:
+    """The latest message of one kind, and its history."""
+
+    seen: Seen
+    count: int = 0
+    first_at: float = 0.0
+    changed_at: dict[str, float] = field(default_factory=dict)
+    """When each field last had another value than before."""
+    times: deque[float] = field(default_factory=lambda: deque(maxlen=_RATE_SAMPLES))
+
+    def changed(self, now: float) -> set[str]:
+        """Names of the fields that changed a moment ago."""
+        return {name for name, at in self.changed_at.items() if now - at <= CHANGE_SHOWN_S}
+
+    def rate_hz(self, now: float) -> float | None:
+        """Messages a second, counted over the last seconds; None before there are two."""
+        while self.times and now - self.times[0] > RATE_WINDOW_S:
+            self.times.popleft()
+        if self.count < 2:
+            return None
+        watched_s = min(RATE_WINDOW_S, now - self.first_at)
+        return len(self.times) / watched_s if watched_s > 0 else None
+
+
+Key = tuple[int, str, int]
+
+
+class Board:
+    """The latest of everything, in the order of CAN ids and commands.
+
+    What is not a message of the documents has one line for each kind and id, whatever it holds, and
+    foreign frames have one line in all: a babbling bus does not fill the memory.
+    """
+
+    def __init__(self) -> None:
+        self._lines: dict[Key, Line] = {}
+
+    def __len__(self) -> int:
+        return len(self._lines)
+
+    def add(self, seen: Seen) -> frozenset[str]:
+        """Take note; returns the names of the fields that differ from the last time."""
+        key = _key(seen)
+        line = self._lines.get(key)
+        if line is None:
+            line = self._lines[key] = Line(seen, first_at=seen.at)
+            changed = frozenset[str]()
+        else:
+            before = {shown.name: shown.value for shown in line.seen.fields}
+            changed = frozenset(
+                shown.name
+                for shown in seen.fields
+                if shown.name not in before or before[shown.name] != shown.value
+            )
+        line.seen = seen
+        line.count += 1
+        line.times.append(seen.at)
+        line.changed_at.update(dict.fromkeys(changed, seen.at))
+        return changed
+
+    def lines(self) -> Iterator[Line]:
+        """Every line, in order."""
+        for key in sorted(self._lines):
+            yield self._lines[key]
+
+
+def _key(seen: Seen) -> Key:
+    if seen.kind is Kind.MESSAGE and seen.command is not None:
+        return seen.can_id, "", seen.command
+    if seen.kind in (Kind.FOREIGN, Kind.ERROR_FRAME):
+        return 1 << 32, seen.kind.value, 0  # behind everything else
+    return seen.can_id, seen.kind.value, 0
