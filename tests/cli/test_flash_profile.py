@@ -1,0 +1,86 @@
+"""`flasher flash --profile`: what a product does its own way decides what is sent and accepted."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flasher.errors import ExitCode
+from tests.cli.conftest import SAMPLES, Flasher, Run
+
+BMS = SAMPLES / "bms.hex"
+
+
+@pytest.fixture
+def flash(flasher: Flasher, tmp_path: Path) -> Flasher:
+    """Runs `flasher flash` on the instant mock with a profile of the given text."""
+
+    def run(profile: str, *words: str | Path) -> Run:
+        path = tmp_path / "profile.toml"
+        path.write_text(profile, encoding="utf-8")
+        return flasher("flash", *words, "--profile", path, "--mock", "--mock-speed", "0")
+
+    return run
+
+
+def test_an_image_outside_of_the_application_area_is_rejected(flash: Flasher) -> None:
+    area = "[bms.application_area]\nstart = 0x08010000\nsize_bytes = 0x20000\n"
+    run = flash(area, BMS, "-t", "bms")
+    assert run.code == ExitCode.IMAGE
+    assert "outside of the device's application area" in run.err
+    assert "0x08010000..0x0802FFFF" in run.err
+
+
+@pytest.mark.parametrize(
+    "limit",
+    [
+        "[bms]\nimage_limit_bytes = 78350\n",
+        "[bms.application_area]\nstart = 0x08008000\nsize_bytes = 0x10000\n",
+    ],
+)
+def test_an_image_that_is_too_large_for_the_device_is_rejected_even_by_force(
+    flash: Flasher, limit: str
+) -> None:
+    run = flash(limit, BMS, "-t", "bms", "--force")
+    assert run.code == ExitCode.IMAGE
+    assert "more than the device takes" in run.err
+
+
+def test_an_image_that_fits_is_flashed(flash: Flasher) -> None:
+    area = "[bms.application_area]\nstart = 0x08008000\nsize_bytes = 0x20000\n"
+    assert flash(area, BMS, "-t", "bms").code == ExitCode.OK
+
+
+def test_a_profile_enables_the_upgrade_in_the_dialect_that_cancelled_it(flash: Flasher) -> None:
+    obc = SAMPLES / "obc.bin"
+    words = (obc, "-t", "obc", "--dialect", "motinova")
+    assert flash("", *words).code == ExitCode.USAGE
+    enabled = flash("[obc]\nhas_upgrade = true\n", *words)
+    assert enabled.code == ExitCode.OK
+    assert "at 125 kbit/s" in enabled.err
+
+
+def test_a_reset_command_of_the_products_own_is_what_is_sent(flash: Flasher) -> None:
+    """The device model does not know it: it stays in its application."""
+    run = flash(
+        '[obc]\nreset_command = 0x4F04\nreset_data = "BOOT"\n[obc.timings]\n'
+        "boot_version_timeout_s = 0.5\n",
+        SAMPLES / "obc.bin", "-t", "obc",
+    )  # fmt: skip
+    assert run.code == ExitCode.NO_ANSWER
+
+
+def test_the_command_line_goes_before_the_profile(flash: Flasher) -> None:
+    slow = "[obc]\npacket_gap_s = 0.1\n"
+    obc = SAMPLES / "obc.bin"
+    by_profile = flash(slow, obc, "-t", "obc", "--json").document
+    by_option = flash(slow, obc, "-t", "obc", "--packet-gap", "0", "--json").document
+    times = [run["outcome"]["statistics"]["transfer_s"] for run in (by_profile, by_option)]
+    assert times[0] > times[1] + 3.0
+
+
+def test_a_misspelt_key_is_wrong_usage_with_a_suggestion(flash: Flasher) -> None:
+    run = flash("[bms]\natempts = 2\n", BMS, "-t", "bms")
+    assert run.code == ExitCode.USAGE
+    assert "attempts" in run.err
