@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import BinaryIO, Final
 
-from bincopy import BinFile
-
 from flasher.image.records import Run, Runs, Scanner, shown
 from flasher.image.segments import SparseBytes
 
@@ -34,6 +32,8 @@ def read(file: BinaryIO, source: str, into: SparseBytes) -> None:
 
 
 def _read_run(run: Run) -> tuple[int, bytes]:
+    from bincopy import BinFile  # noqa: PLC0415  a fifth of the time that flasher takes to load
+
     reader = BinFile()
     reader.add_srec("\n".join(run.lines))
     return reader.minimum_address, bytes(reader.as_binary())
