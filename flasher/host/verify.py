@@ -15,18 +15,15 @@ from flasher import events
 from flasher.errors import FlasherError, InterruptedByUserError, VerificationError
 from flasher.host.options import UpgradeOptions, firmware_version
 from flasher.host.query import Query, Request
+from flasher.host.read import READ_MEMORY, memory_requests, piece_of
 from flasher.image.plan import Plan
-from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.contents import (
     MEMORY_PIECE_SIZE,
     Memory,
-    ReadMemory,
 )
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import Target
-
-READ_MEMORY: Final = 0x4308
 
 
 class Level(Enum):
@@ -96,7 +93,7 @@ def possible_levels(target: Target, options: UpgradeOptions | None = None) -> tu
     levels = [Level.NONE]
     if (options or UpgradeOptions()).version_request_for(target) is not None:
         levels.append(Level.VERSION)
-    if (target.request_id, READ_MEMORY) in BY_KEY:
+    if READ_MEMORY.receiver is target.node:
         levels.append(Level.MEMORY)
     return tuple(levels)
 
@@ -244,15 +241,8 @@ class MemoryCheck(Check):
         self._running_version = running_version
 
     def _first(self) -> Request:
-        start = self._base + self._offset
-        end = min(start + MEMORY_PIECE_SIZE, self._base + self._plan.image.size_bytes)
-        return Request(
-            BY_KEY[self._plan.target.request_id, READ_MEMORY],
-            ReadMemory(start, end),
-            accepts=lambda content: (
-                isinstance(content, Memory) and (content.start, content.end) == (start, end)
-            ),
-        )
+        end = self._base + self._plan.image.size_bytes
+        return next(memory_requests(self._base + self._offset, end))
 
     def _judge(self, answer: Content | None, now: float) -> Request | None:
         data = self._plan.image.data
@@ -261,11 +251,9 @@ class MemoryCheck(Check):
             self._conclude(Verdict.NO_ANSWER, self._running_version, f"to a memory read {where}")
             return None
         expected = data[self._offset : self._offset + MEMORY_PIECE_SIZE]
-        got = answer.content[: len(expected)]
+        got = piece_of(answer)
         if got != expected:
-            at = next(
-                i for i, pair in enumerate(zip(got, expected, strict=True)) if len(set(pair)) > 1
-            )
+            at = next(index for index, byte in enumerate(expected) if got[index] != byte)
             address = self._base + self._offset + at
             detail = f"first at 0x{address:08X}: {got[at]:02X} instead of {expected[at]:02X}"
             self._conclude(Verdict.MEMORY_OTHER, self._running_version, detail)

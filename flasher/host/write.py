@@ -104,7 +104,7 @@ def plan_write(
     if chosen.item.manufacturer_only and not manufacturer:
         raise UsageError(
             f"The document reserves writing the {chosen.name} for the manufacturer.",
-            remedy="Add --manufacturer if that is you; the device may lose its warranty data.",
+            remedy="Add --manufacturer if that is you.",
         )
     if len(values) == 1 and isinstance(values[0], chosen.item.content):
         content: Content = values[0]

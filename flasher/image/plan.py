@@ -72,11 +72,6 @@ class Plan:
         """All CAN frames, the tool's and the device's."""
         return self.host_frames + self.device_frames
 
-    @property
-    def payload_bytes(self) -> int:
-        """Bytes of the image itself, without filler: what the update command says (R9)."""
-        return self.image.size_bytes
-
     def packet_frames(self, number: int) -> list[Frame]:
         """The CAN frames of packet `number`, from 1; raises IndexError for any other."""
         return split(self.target.request_id, self._packet_wire(number))

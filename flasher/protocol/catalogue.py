@@ -16,6 +16,7 @@ from flasher.protocol.spec import (
     DIALECTS,
     MOTINOVA,
     WELLING,
+    Command,
     Dialect,
     Mode,
     Node,
@@ -62,7 +63,9 @@ _OLD: Final = (WELLING,)
 _HMI: Final = (MOTINOVA,)
 _R, _W, _P = Mode.READ, Mode.WRITE, Mode.REPORT
 _WMC, _BMS, _OBC, _HMI_NODE, _CDL = Node.WMC, Node.BMS, Node.OBC, Node.HMI, Node.CDL
-_FEEDBACK: Final = 0x5503
+_FEEDBACK: Final = Command.GENERAL_FEEDBACK
+_VERSION: Final = Command.VERSION_INFORMATION
+_ASK_VERSION: Final = Command.READ_VERSION
 
 ITEMS: Final = (
     # 5.1, sent by the BMS.
@@ -71,7 +74,7 @@ ITEMS: Final = (
     Item(_BMS, None, _P, 0x1204, contents.Faults, "faults"),
     Item(_BMS, None, _P, 0x1308, contents.Shutdown, "shutdown announced"),
     Item(_BMS, None, _P, 0x1410, contents.DesignInformation, "design information"),
-    Item(_BMS, None, _P, 0x1540, contents.VersionInformation, "version information"),
+    Item(_BMS, None, _P, _VERSION, contents.VersionInformation, "version information"),
     Item(_BMS, None, _P, 0x160C, contents.PhysicalId, "physical id"),
     Item(_BMS, None, _P, 0x170C, contents.CheckCode, "check code"),
     Item(_BMS, _WMC, _P, 0x3005, contents.Ready, "handshake answered"),
@@ -91,17 +94,17 @@ ITEMS: Final = (
     Item(_WMC, _BMS, _R, 0x3300, contents.Empty, "read design information", 0x1410),
     Item(_OBC, None, _P, 0x1405, contents.Ready, "ready for shutdown"),
     Item(_OBC, _BMS, _R, 0x5000, contents.Empty, "read running information", 0x1010),
-    Item(_OBC, _BMS, _R, 0x5100, contents.Empty, "read version information", 0x1540),
+    Item(_OBC, _BMS, _R, 0x5100, contents.Empty, "read version information", _VERSION),
     Item(_OBC, _BMS, _R, 0x5200, contents.Empty, "read design information", 0x1410),
     Item(_OBC, _BMS, _R, 0x5300, contents.Empty, "read cell voltages", 0x1120),
     Item(_HMI_NODE, None, _P, 0x1305, contents.Ready, "ready for shutdown", dialects=_HMI),
-    Item(_HMI_NODE, _BMS, _R, 0x5000, contents.Empty, "read version information", 0x1540, _HMI),
+    Item(_HMI_NODE, _BMS, _R, 0x5000, contents.Empty, "read version information", _VERSION, _HMI),
     Item(_HMI_NODE, _BMS, _R, 0x5100, contents.Empty, "read design information", 0x1410, _HMI),
     Item(_HMI_NODE, _BMS, _R, 0x5200, contents.Empty, "read cell voltages", 0x1120, _HMI),
     Item(_CDL, _BMS, _R, 0x3000, contents.Empty, "read physical id", 0x160C),
     Item(_CDL, _BMS, _R, 0x3100, contents.Empty, "read check code", 0x170C),
     Item(_CDL, _BMS, _W, 0x320C, contents.CheckCode, "write check code", _FEEDBACK),
-    Item(_CDL, _BMS, _R, 0x3300, contents.Empty, "read version information", 0x1540),
+    Item(_CDL, _BMS, _R, _ASK_VERSION, contents.Empty, "read version information", _VERSION),
     Item(_CDL, _BMS, _R, 0x3400, contents.Empty, "read running information", 0x1010),
     Item(_CDL, _BMS, _R, 0x3500, contents.Empty, "read cell voltages", 0x1120),
     Item(_CDL, _BMS, _R, 0x3600, contents.Empty, "read design information", 0x1410),
@@ -125,7 +128,7 @@ ITEMS: Final = (
         _CDL, _BMS, _W, 0x4110, contents.SerialNumber, "write serial number",
         _FEEDBACK, manufacturer_only=True,
     ),
-    Item(_CDL, _BMS, _W, 0x4205, contents.Reset, "reset", _FEEDBACK),
+    Item(_CDL, _BMS, _W, Command.RESET, contents.Reset, "reset", _FEEDBACK),
     Item(_CDL, _BMS, _R, 0x4308, contents.ReadMemory, "read memory", 0x5688),
 )  # fmt: skip
 

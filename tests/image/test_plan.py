@@ -38,7 +38,7 @@ def received(frames: list[Frame]) -> Packet:
 
 def test_the_document_s_own_example_comes_to_613_packets() -> None:
     result = plan(load(SAMPLES / "bms.bin"), BMS, BITRATE_BPS)
-    assert result.payload_bytes == 78_351
+    assert result.image.size_bytes == 78_351
     assert result.total_packets == 613
     # reset 2 frames, update command 3, end of transfer 2, each packet 18
     assert result.host_frames == 2 + 3 + 2 + 613 * 18
