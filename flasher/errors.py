@@ -7,6 +7,8 @@ exits: that is the command line's business.
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Callable, Iterable
 from enum import IntEnum
 from typing import ClassVar
 
@@ -25,7 +27,18 @@ class ExitCode(IntEnum):
     REFUSED = 8
     UNCONFIRMED = 9
     VERIFICATION = 10
+    NOTHING_TO_DO = 11
     INTERRUPTED = 130
+
+
+def did_you_mean(
+    word: str, known: Iterable[str], spelled: Callable[[str], str] = lambda known: known
+) -> str:
+    """The known word that was probably meant, `spelled` as people write it, as a sentence with a
+    blank behind it; "" when none is close.
+    """
+    close = difflib.get_close_matches(word, list(known), n=1)
+    return f"Did you mean {spelled(close[0])}? " if close else ""
 
 
 class FlasherError(Exception):
@@ -42,6 +55,8 @@ class FlasherError(Exception):
         self.where = where
         self.cause = cause
         self.remedy = remedy
+        self.needs_rescue = False
+        """True when a device was left that has no application, or perhaps none."""
 
     def __str__(self) -> str:
         """The whole message, one part a line, as a person reads it."""
@@ -84,7 +99,9 @@ class NoAnswerError(FlasherError):
 
 
 class WrongDeviceError(FlasherError):
-    """Another device answers than the one that was asked for."""
+    """Another device answers than the one that was asked for, or the image is not meant for it, or
+    it is not in a state to be upgraded.
+    """
 
     exit_code = ExitCode.WRONG_DEVICE
 

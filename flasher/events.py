@@ -15,6 +15,7 @@ from enum import Enum
 class Phase(Enum):
     """Where an upgrade stands, in the words of the protocol."""
 
+    IDENTIFY = "asking the device who it is"
     RESET = "resetting the application"
     BOOT = "waiting for the boot version"
     UPDATE = "waiting for request transfer"
@@ -37,6 +38,45 @@ class BootVersionSeen:
 
     name: str
     version: str
+
+
+@dataclass(frozen=True)
+class PowerCycleAwaited:
+    """The device has to be switched off and on now; its announcement is waited for so long."""
+
+    limit_s: float
+
+
+@dataclass(frozen=True)
+class CheckMade:
+    """Something was checked before the first write: `check` names it, `verdict` is "passed",
+    "unknown" (nothing to check against), "warned", "waived", "refused" or "skipped", `text` is one
+    sentence.
+    """
+
+    check: str
+    verdict: str
+    text: str
+
+
+@dataclass(frozen=True)
+class ShutdownHeard:
+    """The battery announces that it switches off (0x1308)."""
+
+    sender: str
+
+
+@dataclass(frozen=True)
+class AdapterLost:
+    """The adapter failed; for `wait_s` it is tried to be opened again."""
+
+    reason: str
+    wait_s: float
+
+
+@dataclass(frozen=True)
+class AdapterBack:
+    """The adapter works again; the attempt that follows is reported as every other."""
 
 
 @dataclass(frozen=True)

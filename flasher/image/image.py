@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, Self
 
+from flasher.image.marks import named_targets
+from flasher.protocol.spec import Target
 from flasher.protocol.text import find_firmware_version
 
 ADDRESS_SPACE: Final = 1 << 32
@@ -69,3 +71,8 @@ class Image:
     def sha256(self) -> str:
         """SHA-256 of `data`, in hex digits."""
         return hashlib.sha256(self.data).hexdigest()
+
+    @cached_property
+    def named_targets(self) -> frozenset[Target]:
+        """The targets that `data` names by itself; empty when it names none."""
+        return named_targets(self.data)

@@ -17,7 +17,7 @@ from flasher.image.detect import HEAD_SIZE, Format, detect
 from flasher.image.image import ADDRESS_SPACE, Image
 from flasher.image.segments import SparseBytes, too_large
 from flasher.protocol.spec import IMAGE_MAX_SIZE
-from flasher.protocol.text import find_firmware_version
+from flasher.protocol.text import find_firmware_version, printable
 
 DEFAULT_FILL_GAPS_UP_TO: Final = 4096
 """In bytes. Covers the room between a vector table and the code; a larger gap is another part."""
@@ -48,7 +48,7 @@ def load(
     options make no sense.
     """
     _check_options(format, base, range_, fill_gaps_up_to)
-    source = os.fspath(path)
+    source = printable(os.fspath(path))
     with _opened(path, source) as (file, size_bytes):
         form = Format(format) if format else _detect(file, source)
         sparse = SparseBytes(source, range_)
@@ -102,7 +102,7 @@ def _opened(path: str | os.PathLike[str], source: str) -> Iterator[tuple[BinaryI
             )
         opened = Path(path).open("rb")  # noqa: SIM115  closed below, where reading may fail too
     except (FileNotFoundError, NotADirectoryError, ValueError) as error:
-        raise UsageError(f"there is no file {source!r}", remedy="correct the name") from error
+        raise UsageError(f"there is no file '{source}'", remedy="correct the name") from error
     except OSError as error:
         raise _unreadable(source, error) from error
     try:

@@ -71,6 +71,7 @@ class Transmitter:
         self._queue: deque[_Outgoing] = deque()
         self._sent_frames = 0
         self._not_before = 0.0
+        self._quiet_until = float("-inf")
         self._message_began_at = 0.0
         self.left_at = float("-inf")
         """When the last frame of the last message has left: accepted by the adapter plus its time
@@ -103,6 +104,7 @@ class Transmitter:
         """
         if wire_s is None:
             wire_s = message_bits(frames) / self._bitrate_bps
+        not_before = max(not_before, self._quiet_until)
         if not self._queue:
             self._not_before = not_before
         self._queue.append(_Outgoing(frames, wire_s, not_before, tag))
@@ -113,6 +115,14 @@ class Transmitter:
         self._queue.clear()
         if started is not None:
             self._queue.append(started)
+
+    def abandon(self, quiet_until: float) -> None:
+        """Forget everything, a message that is half sent included; what is queued from now on waits
+        until `quiet_until`, so that the receiver drops the half (R12).
+        """
+        self._queue.clear()
+        self._sent_frames = 0
+        self._quiet_until = quiet_until
 
     def deadline(self) -> float | None:
         """When `next_frame` has something to give; None when nothing waits."""

@@ -7,7 +7,6 @@ not fit comes back as `Malformed`, what is not in the table as `Unknown`, both a
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from struct import Struct
 from typing import ClassVar, Final, Self
@@ -21,6 +20,7 @@ from flasher.protocol.spec import (
     Mode,
     data_size,
 )
+from flasher.protocol.text import boot_version_number
 from flasher.protocol.wire import Message
 
 _UINT16: Final = Struct("<H")
@@ -30,8 +30,6 @@ _PACKET: Final = Struct(f"<BHH{PACKET_DATA_SIZE}s")
 assert _UPDATE.size == data_size(Command.UPDATE)
 assert _BOOT_VERSION.size == data_size(Command.BOOT_VERSION)
 assert _PACKET.size == data_size(Command.PACKET)
-
-_BOOT_VERSION_TEXT: Final = re.compile(r"V[0-9]\.[0-9]\.[0-9]")
 
 
 @dataclass(frozen=True)
@@ -131,7 +129,7 @@ class BootVersion(_Row):
     @property
     def is_version(self) -> bool:
         """True when the version text has the document's form Vx.x.x."""
-        return _BOOT_VERSION_TEXT.fullmatch(self.version) is not None
+        return boot_version_number(self.version) is not None
 
     def data(self) -> bytes:
         return _BOOT_VERSION.pack(self.name.encode("latin-1"), self.version.encode("latin-1"))

@@ -191,9 +191,7 @@ class Reassembler:
         if wire[-1:] != TAIL:
             self._damage(DamageReason.BAD_TAIL, size, found)
             return
-        body = wire[len(HEADER) : -CRC_SIZE - len(TAIL)]
-        crc = crc32(HEADER + self.can_id.to_bytes(2, "big") + body)
-        if crc != int.from_bytes(wire[-CRC_SIZE - len(TAIL) : -len(TAIL)], "big"):
+        if not self._crc_fits(wire):
             self._damage(DamageReason.BAD_CRC, size, found)
             return
         self._flush_junk(found)
@@ -201,6 +199,11 @@ class Reassembler:
         command = int.from_bytes(wire[PREFIX_SIZE:_HEAD_SIZE], "big")
         data = wire[_HEAD_SIZE : -CRC_SIZE - len(TAIL)]
         found.append(Message(self.can_id, wire[len(HEADER)], command, data))
+
+    def _crc_fits(self, wire: bytes) -> bool:
+        body = wire[len(HEADER) : -CRC_SIZE - len(TAIL)]
+        crc = crc32(HEADER + self.can_id.to_bytes(2, "big") + body)
+        return crc == int.from_bytes(wire[-CRC_SIZE - len(TAIL) : -len(TAIL)], "big")
 
     def _damage(self, reason: DamageReason, size: int, found: list[Message | Damage]) -> None:
         """Report the candidate of `size` bytes at the front and give up its header only, so that

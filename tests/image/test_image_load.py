@@ -410,6 +410,35 @@ def measure(path: Path) -> tuple[str, float, float]:
     return "".join(said), seconds, megabytes
 
 
+@pytest.mark.parametrize(
+    ("content", "options"),
+    [
+        (b"", {}),
+        (b":x", {}),
+        (b"S1x", {}),
+        (b"\x7fELFx", {}),
+        (b"PK\x03\x04", {}),
+        (b"some\ntext\n", {}),
+        (b"\x00\x01", {"range_": (0, 1)}),
+        (b"\x00\x01", {"base": 0x1_0000_0000 - 1}),
+        (None, {}),
+    ],
+)
+def test_a_file_name_cannot_disturb_a_terminal(
+    tmp_path: Path, content: bytes | None, options: dict[str, Any]
+) -> None:
+    path = tmp_path / "a\x1b[31m\nname.hex"
+    if options:
+        path = path.with_suffix(".bin")
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises((ImageError, UsageError)) as caught:
+        load(path, **options)
+    said = str(caught.value)
+    assert "\x1b" not in said
+    assert "a\\x1b[31m\\nname" in said
+
+
 def test_a_file_that_spans_gigabytes_is_refused_quickly_and_in_little_memory() -> None:
     assert (BAD / "gigabytes.hex").stat().st_size == 132
     said, seconds, megabytes = measure(BAD / "gigabytes.hex")

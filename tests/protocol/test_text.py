@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import datetime
+
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flasher.protocol.text import decode_text, encode_text, printable
+from flasher.protocol.messages import BootVersion
+from flasher.protocol.text import (
+    FirmwareVersion,
+    boot_version_number,
+    decode_text,
+    encode_text,
+    find_firmware_version,
+    firmware_version_spans,
+    printable,
+)
 
 
 @pytest.mark.parametrize(
@@ -101,3 +112,94 @@ def test_any_bytes_are_shown_in_printable_ascii(field: bytes) -> None:
 def test_a_text_that_keeps_the_rule_comes_back(text: str) -> None:
     kept = text.replace(".", "").rstrip()
     assert decode_text(encode_text(kept, 16)) == kept
+
+
+# -- versions -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("older", "newer"),
+    [
+        ("V1r0r4_20220512", "V1r0r5_20220512"),
+        ("V1r0r9_20220512", "V1r1r0_20220512"),
+        ("V1r9r9_20220512", "V2r0r0_20220512"),
+        ("V1r0r9_20220512", "V1r0r10_20220512"),  # as numbers, not as texts
+        ("V9r0r0_20220512", "V10r0r0_20220512"),
+        ("V1r0r4_20220512", "V1r0r4_20220513"),
+        ("V1r0r4_20221231", "V1r0r4_20230101"),
+        ("V1r0r4_20231231", "V1r0r5_20220101"),  # numbers go before the date
+    ],
+)
+def test_firmware_versions_are_ordered_by_numbers_then_date(older: str, newer: str) -> None:
+    first, second = FirmwareVersion.parse(older), FirmwareVersion.parse(newer)
+    assert first is not None
+    assert second is not None
+    assert first < second
+
+
+def test_a_firmware_version_in_its_parts() -> None:
+    assert FirmwareVersion.parse("V1r2r34_20220512") == FirmwareVersion(1, 2, 34, "20220512")
+    assert FirmwareVersion.parse("V01r2r3_20220512") == FirmwareVersion.parse("V1r2r3_20220512")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "V1.0.0",
+        "V1r0r4",
+        "V1r0r4_2022",
+        "V1r0r4_20221301",
+        "V1r0r4_20220532",
+        "v1r0r4_20220512",
+        "V1r0r4_20220512 ",
+        "V1r0r4_20220512\n",
+        " V1r0r4_20220512",
+        "V123r0r4_20220512",
+        "V\u0661r0r4_20220512",
+        "\ud800",
+    ],
+)
+def test_a_text_that_breaks_the_naming_rule_is_no_firmware_version(text: str) -> None:
+    assert FirmwareVersion.parse(text) is None
+
+
+_NUMBERS = st.integers(min_value=0, max_value=99)
+
+
+@settings(max_examples=100, deadline=None, derandomize=True)
+@given(numbers=st.tuples(_NUMBERS, _NUMBERS, _NUMBERS), date=st.dates())
+def test_what_is_found_in_an_image_can_be_parsed(
+    numbers: tuple[int, int, int], date: datetime.date
+) -> None:
+    day = f"{date.year:04}{date.month:02}{date.day:02}"
+    text = "V{}r{}r{}_".format(*numbers) + day
+    data = b"\0" + text.encode() + b"\0"
+    assert find_firmware_version(data) == text
+    assert list(firmware_version_spans(data)) == [(1, 1 + len(text))]
+    assert FirmwareVersion.parse(text) == FirmwareVersion(*numbers, day)
+
+
+def test_the_same_version_twice_is_one_and_two_are_none() -> None:
+    one, other = b"V1r0r4_20220512", b"V1r0r5_20220512"
+    assert find_firmware_version(one + b"\0" + one) == one.decode()
+    assert find_firmware_version(one + b"\0" + other) is None
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [
+        ("V1.0.0", (1, 0, 0)),
+        ("V0.9.8", (0, 9, 8)),
+        ("V1.0", None),
+        ("V1.0.10", None),
+        ("1.0.0", None),
+        ("v1.0.0", None),
+        ("V1.0.0\n", None),
+        ("V\u0661.0.0", None),
+        ("", None),
+    ],
+)
+def test_a_boot_version_as_numbers(text: str, number: tuple[int, int, int] | None) -> None:
+    assert boot_version_number(text) == number
+    assert BootVersion("BMS", text).is_version is (number is not None)
