@@ -7,25 +7,32 @@ default (a wrong one disturbs a live bus), a full transmit queue is waited for (
 
 from __future__ import annotations
 
-import configparser
 import contextlib
 import errno
 import re
 import time
 from collections import deque
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NoReturn
 
 import can
-import can.util
 
+from flasher.bus.health import (
+    LAYOUTS,
+    ControllerState,
+    HealthKeeper,
+    Layout,
+    LinkHealth,
+    bus_off_error,
+)
+from flasher.bus.inspect_interface import Interface, read_interface
 from flasher.bus.link import SEND_LIMIT_S
-from flasher.errors import BusError, TransmitBlockedError, UsageError
+from flasher.bus.opening import bus_config, open_bus, words_of
+from flasher.errors import BusError, TransmitBlockedError
 from flasher.protocol.frame import Frame
 
 _FULL_QUEUE_PAUSE_S: Final = 0.0005
 """Between two tries on a full queue: about one frame on the wire. Frames are received meanwhile."""
-_CHANNELS: Final = {"socketcan": "can0", "pcan": "PCAN_USBBUS1", "slcan": "COM3"}
 _DRAIN_FRAMES: Final = 100_000
 _FAILURES: Final = (can.CanError, OSError)
 
@@ -41,75 +48,83 @@ _QUEUE_FULL_TEXT: Final = re.compile(
     re.IGNORECASE,
 )
 """What the others say in words (PCAN, IXXAT, and SocketCAN's own "Transmit buffer full")."""
+_BUS_OFF_TEXT: Final = re.compile(r"bus[ _-]?off", re.IGNORECASE)
+_PCAN_BUS_OFF: Final = 0x00010
+_PCAN_PASSIVE: Final = 0x40000
+_PCAN_WARNING: Final = 0x00004 | 0x00008
 
 
-def open_adapter(default_bitrate_bps: int, **config: Any) -> CanLink:
+def open_adapter(default_bitrate_bps: int, *, listen_only: bool = False, **config: Any) -> CanLink:
     """Open the adapter that `config` (python-can's keywords), its files and variables describe.
 
-    `default_bitrate_bps` holds where none of them names a bit rate. Raises UsageError for an
-    interface that python-can does not know, BusError when the adapter cannot be opened.
+    `default_bitrate_bps` holds where none of them names a bit rate. `listen_only` keeps the adapter
+    from acknowledging, where its back end can be told (`opening.can_listen_only`). Raises
+    UsageError for an interface that python-can does not know, BusError when the adapter cannot be
+    opened.
     """
-    try:
-        merged = dict(can.util.load_config(config=dict(config)))
-    except can.CanInterfaceNotImplementedError as error:
-        raise _no_interface(error) from error
-    except (ValueError, TypeError, configparser.Error) as error:
-        raise UsageError(
-            f"The adapter's configuration makes no sense: {error}.",
-            remedy="Check the bus arguments, python-can's configuration file and CAN_* variables.",
-        ) from error
-    if "timing" not in merged:
-        merged.setdefault("bitrate", default_bitrate_bps)
+    merged = bus_config(default_bitrate_bps, config, listen_only=listen_only)
     interface = str(merged["interface"])
-    try:
-        bus = can.Bus(**merged, ignore_config=True)
-    except Exception as error:
-        raise BusError(
-            f"The adapter cannot be opened: {_words(error)}.",
-            where=f"interface {interface}, channel {merged.get('channel')}",
-            cause=_opening_cause(interface, error),
-            remedy=_opening_remedy(
-                interface, merged.get("channel"), merged.get("bitrate", default_bitrate_bps)
-            ),
-        ) from error
-    return CanLink(bus, interface, str(merged.get("channel") or ""))
+    channel = str(merged.get("channel") or "")
+    return CanLink(open_bus(merged), interface, channel, lambda: open_bus(merged))
 
 
 class CanLink:
     """A python-can bus as a `Link` on the monotonic clock."""
 
-    def __init__(self, bus: can.BusABC, interface: str, channel: str = "") -> None:
-        self._bus = bus
+    def __init__(
+        self,
+        bus: can.BusABC,
+        interface: str,
+        channel: str = "",
+        open_again: Callable[[], can.BusABC] | None = None,
+    ) -> None:
         self._interface = interface
+        self._channel = channel
         self._name = f"{interface} {channel}".strip()
+        self._open_again = open_again
         self._waiting: deque[Frame] = deque()
-        # recv() measures its timeout by the wall clock, so that a jump of it can hang the call;
-        # what it wraps does not. No filters are set that would need the wrapper, unless the back
-        # end was given some and leaves them to it.
-        self._receive_raw = (
-            bus._recv_internal  # noqa: SLF001
-            if type(bus).recv is can.BusABC.recv
-            else lambda timeout: (bus.recv(timeout), True)
-        )
+        self._health = HealthKeeper(LAYOUTS.get(interface, Layout.UNKNOWN))
         self._send_options: dict[str, float] = {}
         if interface == "slcan":
             # The serial port would block for ever; elsewhere the option costs time or is ignored.
             self._send_options["timeout"] = SEND_LIMIT_S
+        self._use(bus)
+
+    def _use(self, bus: can.BusABC | None) -> None:
+        """Send to and receive from this bus; None while there is none."""
+        self._bus = bus
+        self._send_raw: Callable[..., None] = _no_bus if bus is None else bus.send
+        # recv() measures its timeout by the wall clock, so that a jump of it can hang the call;
+        # what it wraps does not. No filters are set that would need the wrapper, unless the back
+        # end was given some and leaves them to it.
+        self._receive_raw: Callable[[float], tuple[can.Message | None, bool]]
+        if bus is None:
+            self._receive_raw = _no_bus
+        elif type(bus).recv is can.BusABC.recv:
+            self._receive_raw = bus._recv_internal  # noqa: SLF001
+        else:
+            self._receive_raw = lambda timeout: (bus.recv(timeout), True)
 
     def __str__(self) -> str:
         """The adapter as the user named it."""
         return self._name
 
     def send(self, frame: Frame) -> None:
-        """Hand a frame to the adapter; a full queue is waited for up to `SEND_LIMIT_S`."""
+        """Hand a frame to the adapter; a full queue is waited for up to `SEND_LIMIT_S`.
+
+        A controller that is known to be bus-off is an error at once: its driver may take frames
+        all the same, and lose them.
+        """
         give_up_at: float | None = None
+        if self._health.state is ControllerState.BUS_OFF:
+            raise bus_off_error(str(self), "The adapter failed while sending: it is bus-off.")
         while True:
             # A back end may alter a message: never the same object twice.
             message = can.Message(
                 arbitration_id=frame.can_id, data=frame.data, is_extended_id=False
             )
             try:
-                self._bus.send(message, **self._send_options)
+                self._send_raw(message, **self._send_options)
             except _FAILURES as error:
                 if not self._is_queue_full(error):
                     raise self._failure("sending", error) from error
@@ -117,9 +132,11 @@ class CanLink:
                 if give_up_at is None:
                     give_up_at = now + SEND_LIMIT_S
                 elif now >= give_up_at:
+                    self._health.is_blocked = True
                     raise self._blocked(error) from error
                 self._pause()
             else:
+                self._health.sent += 1
                 return
 
     def receive(self, deadline: float) -> Frame | None:
@@ -143,8 +160,30 @@ class CanLink:
 
     def close(self) -> None:
         """Shut the adapter down; a failure to do so is of no interest any more."""
-        with contextlib.suppress(*_FAILURES):
-            self._bus.shutdown()
+        if self._bus is not None:
+            with contextlib.suppress(*_FAILURES):
+                self._bus.shutdown()
+
+    def reopen(self) -> None:
+        """Close the adapter and open it again as it was. Raises BusError while it is not back.
+
+        Frames that were waiting are gone, and the health begins anew.
+        """
+        if self._open_again is None:
+            raise BusError("This adapter cannot be opened again.", where=str(self))
+        self.close()
+        self._use(None)
+        self._waiting.clear()
+        self._use(self._open_again())
+        self._health.reset()
+
+    def health(self) -> LinkHealth:
+        """What is known of the adapter and its bus. Sends nothing; takes up to 2 s on SocketCAN."""
+        if self._interface == "socketcan":
+            seen = read_interface(self._channel)
+            if isinstance(seen, Interface):
+                return self._health.health(seen.state, seen.tx_errors, seen.rx_errors)
+        return self._health.health(_asked_state(self._bus, self._interface))
 
     def _receive_once(self, timeout_s: float) -> Frame | None:
         try:
@@ -155,15 +194,19 @@ class CanLink:
             raise self._failure("receiving", error) from error
         if message is None or message.is_fd:
             return None
-        if not filtered and not self._bus._matches_filters(message):  # noqa: SLF001  as recv() does
-            return None
-        return Frame(
+        frame = Frame(
             message.arbitration_id,
             bytes(message.data),
             message.is_extended_id,
             message.is_remote_frame,
             message.is_error_frame,
         )
+        # What filters hide was received all the same; what an adapter reports passes them.
+        self._health.hear(frame)
+        if filtered or frame.is_error or self._bus is None:
+            return frame
+        is_wanted = self._bus._matches_filters(message)  # noqa: SLF001  as recv() does
+        return frame if is_wanted else None
 
     def _pause(self) -> None:
         """Wait for room in the transmit queue, and lose nothing that arrives meanwhile."""
@@ -178,8 +221,12 @@ class CanLink:
         return _QUEUE_FULL_TEXT.search(str(error)) is not None
 
     def _failure(self, doing: str, error: Exception) -> BusError:
+        what = f"The adapter failed while {doing}: {words_of(error)}."
+        if _BUS_OFF_TEXT.search(str(error)):
+            self._health.state = ControllerState.BUS_OFF
+            return bus_off_error(str(self), what)
         return BusError(
-            f"The adapter failed while {doing}: {_words(error)}.",
+            what,
             where=str(self),
             cause="it was unplugged, its interface went down, or the bus is off",
             remedy="Check the adapter and the wiring, then run the same command again.",
@@ -187,7 +234,7 @@ class CanLink:
 
     def _blocked(self, error: Exception) -> TransmitBlockedError:
         return TransmitBlockedError(
-            f"The adapter took no frame for {SEND_LIMIT_S:g} s: {_words(error)}.",
+            f"The adapter took no frame for {SEND_LIMIT_S:g} s: {words_of(error)}.",
             where=str(self),
             cause="nobody on the bus acknowledges (device off, wrong bit rate, wiring, "
             "termination), or other traffic takes the whole bus",
@@ -200,43 +247,28 @@ def _is_foreign_datagram(error: Exception) -> bool:
     return "could not unpack" in str(error)
 
 
-def _words(error: Exception) -> str:
-    """What the back end said, without a full stop, or the kind of error when it said nothing."""
-    return str(error).strip().rstrip(".") or type(error).__name__
+def _no_bus(*_arguments: object, **_options: object) -> NoReturn:
+    """What sending and receiving come to while an adapter is gone."""
+    raise can.CanOperationError("it is not open")
 
 
-def _no_interface(error: Exception) -> UsageError | BusError:
-    known = ", ".join(sorted(can.VALID_INTERFACES))
-    if '"None"' in str(error):
-        return BusError(
-            "No adapter is configured.",
-            cause="neither -i/--interface, nor a python-can configuration file, nor the variable "
-            "CAN_INTERFACE names one",
-            remedy="Name it, for example `-i socketcan -c can0` or `-i pcan -c PCAN_USBBUS1`; "
-            f"--mock needs none. Interfaces: {known}.",
-        )
-    return UsageError(f"{_words(error)}.", remedy=f"python-can knows: {known}.")
+def _asked_state(bus: can.BusABC | None, interface: str) -> ControllerState:
+    """What a back end says when asked. python-can's own `state` is a constant, and PCAN's is the
+    mode that was set; only ERROR is told by those that override it.
+    """
+    try:
+        if interface == "pcan":
+            return _pcan_state(int(bus.status()))  # type: ignore[union-attr]
+        if bus is not None and bus.state is can.BusState.ERROR:
+            return ControllerState.BUS_OFF
+    except Exception:  # noqa: BLE001  a vendor's library; the question is no reason to fail
+        return ControllerState.UNKNOWN
+    return ControllerState.UNKNOWN
 
 
-def _opening_cause(interface: str, error: Exception) -> str:
-    if getattr(error, "errno", None) == errno.EAFNOSUPPORT:
-        return "this system's kernel has no CAN"
-    if interface == "socketcan":
-        return "the interface does not exist or is down"
-    if isinstance(error, NameError | ImportError | AttributeError):
-        return "the driver library of this interface is not installed"
-    return "the adapter is not plugged in, in use by another program, or its driver is missing"
-
-
-def _opening_remedy(interface: str, channel: object, bitrate_bps: object) -> str:
-    if channel is None:
-        return f"Name the channel, for example `-i {interface} -c {_CHANNELS.get(interface, 0)}`."
-    if interface == "socketcan":
-        return (
-            f"`ip -details link show {channel}` shows its state; "
-            f"`ip link set {channel} up type can bitrate {bitrate_bps}` (as root) starts it."
-        )
-    return (
-        "Plug it in, close other programs that use it, install its driver and python-can's extra "
-        f"for it (`pip install 'python-can[{interface}]'` where there is one)."
-    )
+def _pcan_state(status: int) -> ControllerState:
+    if status & _PCAN_BUS_OFF:
+        return ControllerState.BUS_OFF
+    if status & _PCAN_PASSIVE:
+        return ControllerState.PASSIVE
+    return ControllerState.UNKNOWN if status & ~_PCAN_WARNING else ControllerState.ACTIVE

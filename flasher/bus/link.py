@@ -1,4 +1,4 @@
-"""The edge between an engine and a bus: five methods, and a clock to go with them.
+"""The edge between an engine and a bus: seven methods, and a clock to go with them.
 
 A link and its clock belong together: the deadlines that a link is given are times of that clock. A
 real adapter goes with `MonotonicClock`; a simulated bus makes the time itself.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from typing import Final, Protocol
 
+from flasher.bus.health import LinkHealth
 from flasher.protocol.frame import Frame
 
 SEND_LIMIT_S: Final = 2.0
@@ -50,6 +51,17 @@ class Link(Protocol):
 
     def close(self) -> None:
         """Release the adapter; harmless when repeated."""
+        ...
+
+    def reopen(self) -> None:
+        """Close the adapter and open it again as it was, for one that was lost and may be back.
+
+        Raises BusError while it is not; may be called again, not more often than every 100 ms.
+        """
+        ...
+
+    def health(self) -> LinkHealth:
+        """What is known of the adapter and its bus. Sends nothing, never raises."""
         ...
 
 

@@ -14,6 +14,8 @@ import pytest
 
 from flasher.bus import adapter
 from flasher.bus.adapter import CanLink, open_adapter
+from flasher.bus.health import ControllerState
+from flasher.bus.inspect_interface import Interface, Unseen
 from flasher.bus.link import SEND_LIMIT_S
 from flasher.errors import BusError, ExitCode, TransmitBlockedError, UsageError
 from flasher.protocol.frame import Frame
@@ -129,6 +131,7 @@ def test_any_other_transmit_error_is_the_adapters_failure(bus: FakeBus, error: E
         CanLink(bus, "socketcan", "can3").send(FRAME)
     assert not isinstance(caught.value, TransmitBlockedError)
     assert caught.value.where == "socketcan can3"
+    assert ("it is bus-off" in caught.value.cause) == ("bus off" in str(error))
 
 
 def test_only_a_serial_adapter_gets_a_send_timeout(bus: FakeBus) -> None:
@@ -328,3 +331,224 @@ def test_a_foreign_datagram_on_the_multicast_port_is_passed_over(bus: FakeBus) -
     )
     link = CanLink(bus, "udp_multicast")
     assert link.receive(time.monotonic() + 1.0) == Frame(0x725, b"x")
+
+
+# -- opening again --------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("no_configuration")
+def test_a_lost_adapter_is_opened_again_with_the_same_configuration(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen: list[dict[str, Any]] = []
+    opened: list[FakeBus] = []
+
+    def open_bus(**config: Any) -> FakeBus:
+        seen.append(config)
+        if len(seen) in (2, 3):
+            raise OSError(errno.ENODEV, "No such device")
+        opened.append(FakeBus())
+        return opened[-1]
+
+    monkeypatch.setattr("can.Bus", open_bus)
+    link = open_adapter(250_000, interface="pcan", channel="PCAN_USBBUS1")
+    opened[0].inbox.append(message())
+    link.send(FRAME)
+    for _ in range(2):
+        with pytest.raises(BusError, match="cannot be opened"):
+            link.reopen()
+        with pytest.raises(BusError, match="not open"):
+            link.send(FRAME)
+        with pytest.raises(BusError, match="not open"):
+            link.receive(0.0)
+    link.reopen()
+    link.send(FRAME)
+    assert len(opened[1].sent) == 1
+    assert link.health().frames_sent == 1
+    assert seen[0] == seen[3]
+    link.close()
+
+
+def test_a_link_that_was_handed_a_bus_cannot_be_opened_again(bus: FakeBus) -> None:
+    with pytest.raises(BusError, match="cannot be opened again"):
+        CanLink(bus, "fake").reopen()
+
+
+@pytest.mark.usefixtures("no_configuration")
+@pytest.mark.parametrize(
+    ("seen", "words"),
+    [
+        (
+            Interface("can0", is_can=True, is_up=False),
+            "ip link set can0 up type can bitrate 250000",
+        ),
+        (
+            Interface("can0", is_can=True, is_up=True, has_carrier=False),
+            "ip link set can0 type can restart",
+        ),
+    ],
+)
+def test_an_interface_that_opens_but_carries_nothing_is_not_taken_for_open(
+    monkeypatch: pytest.MonkeyPatch, seen: Interface, words: str
+) -> None:
+    fake = FakeBus()
+    monkeypatch.setattr("can.Bus", lambda **_config: fake)
+    monkeypatch.setattr("flasher.bus.opening.look_up", lambda _name: seen)
+    with pytest.raises(BusError) as caught:
+        open_adapter(250_000, interface="socketcan", channel="can0")
+    assert words in caught.value.remedy
+    assert fake._is_shutdown
+
+
+@pytest.mark.usefixtures("no_configuration")
+@pytest.mark.parametrize(
+    ("interface", "option"),
+    [
+        ("slcan", {"listen_only": True}),
+        ("pcan", {"state": can.BusState.PASSIVE}),
+        ("kvaser", {"driver_mode": False}),
+        ("virtual", {}),
+    ],
+)
+def test_listening_only_is_asked_for_in_the_back_ends_own_words(
+    monkeypatch: pytest.MonkeyPatch, interface: str, option: dict[str, Any]
+) -> None:
+    seen: list[dict[str, Any]] = []
+
+    def open_bus(**config: Any) -> FakeBus:
+        seen.append(config)
+        return FakeBus()
+
+    monkeypatch.setattr("can.Bus", open_bus)
+    for listen_only in (False, True):
+        open_adapter(250_000, listen_only=listen_only, interface=interface, channel="a").close()
+    assert {key: seen[1][key] for key in seen[1] if key not in seen[0]} == option
+
+
+@pytest.mark.usefixtures("no_configuration")
+@pytest.mark.parametrize(
+    ("error", "cause", "remedy"),
+    [
+        (PermissionError(errno.EACCES, "denied"), "may not use", "dialout"),
+        (OSError(errno.EBUSY, "busy"), "another program", "close other programs"),
+        (can.CanInterfaceNotImplementedError("no serial"), "Python package", "python-can[serial]"),
+    ],
+)
+def test_why_it_cannot_be_opened_is_found_behind_the_back_ends_own_error(
+    monkeypatch: pytest.MonkeyPatch, error: Exception, cause: str, remedy: str
+) -> None:
+    def fail(**_config: Any) -> can.BusABC:
+        raise can.CanInitializationError("could not create the serial device") from error
+
+    def fail_plainly(**_config: Any) -> can.BusABC:
+        raise error
+
+    wrapped = isinstance(error, OSError)
+    monkeypatch.setattr("can.Bus", fail if wrapped else fail_plainly)
+    with pytest.raises(BusError) as caught:
+        open_adapter(250_000, interface="slcan", channel="/dev/ttyACM0")
+    assert cause in caught.value.cause
+    assert remedy in caught.value.remedy
+
+
+# -- health ---------------------------------------------------------------------------------------
+
+
+def error_message(can_id: int, data: str) -> can.Message:
+    return message(can_id, bytes.fromhex(data), is_error_frame=True)
+
+
+NO_ACK = error_message(0x204, "00 20 00 00 00 00 80 00")
+BUS_OFF = error_message(0x040, "00 00 00 00 00 00 00 00")
+
+
+def test_frames_that_nobody_acknowledges_are_noticed(bus: FakeBus) -> None:
+    bus.inbox.append(NO_ACK)
+    link = CanLink(bus, "gs_usb", "0")
+    link.send(FRAME)
+    frame = link.receive(0.0)
+    assert frame == Frame(0x204, bytes(NO_ACK.data), is_error=True)
+    health = link.health()
+    assert (health.state, health.tx_errors) == (ControllerState.PASSIVE, 128)
+    assert health.not_acknowledged
+
+
+def test_once_bus_off_is_reported_nothing_more_is_sent_into_the_void(bus: FakeBus) -> None:
+    bus.inbox.append(BUS_OFF)
+    link = CanLink(bus, "gs_usb", "0")
+    link.receive(0.0)
+    with pytest.raises(BusError) as caught:
+        link.send(FRAME)
+    assert "bus-off" in caught.value.cause
+    assert bus.sent == []
+
+
+def test_error_frames_pass_filters_and_filtered_frames_count_as_received(bus: FakeBus) -> None:
+    bus.set_filters([{"can_id": 0x725, "can_mask": 0x7FF, "extended": False}])
+    bus.inbox.extend([message(0x123), NO_ACK])
+    link = CanLink(bus, "gs_usb")
+    link.send(FRAME)
+    frame = link.receive(time.monotonic() + 1.0)
+    assert frame is not None
+    assert frame.is_error
+    assert not link.health().not_acknowledged
+
+
+def test_on_socketcan_the_kernel_is_asked(bus: FakeBus, monkeypatch: pytest.MonkeyPatch) -> None:
+    answers: list[Interface | Unseen] = [
+        Interface("can0", is_can=True, is_up=True, state_name="BUS-OFF", tx_errors=9, rx_errors=1),
+        Unseen.MISSING,
+    ]
+    monkeypatch.setattr("flasher.bus.adapter.read_interface", lambda _name: answers.pop(0))
+    link = CanLink(bus, "socketcan", "can0")
+    assert link.health().state is ControllerState.BUS_OFF
+    assert link.health().state is ControllerState.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    ("status", "state"),
+    [
+        (0x00000, ControllerState.ACTIVE),
+        (0x00008, ControllerState.ACTIVE),
+        (0x40000, ControllerState.PASSIVE),
+        (0x00010, ControllerState.BUS_OFF),
+        (0x00400, ControllerState.UNKNOWN),
+    ],
+)
+def test_pcan_is_asked_for_its_status_since_its_state_is_the_mode_that_was_set(
+    bus: FakeBus, status: int, state: ControllerState
+) -> None:
+    bus.status = lambda: status  # type: ignore[attr-defined]
+    assert CanLink(bus, "pcan").health().state is state
+
+
+def test_what_python_can_makes_up_for_a_state_is_not_believed(bus: FakeBus) -> None:
+    assert bus.state is can.BusState.ACTIVE
+    assert CanLink(bus, "kvaser").health().state is ControllerState.UNKNOWN
+
+
+def test_a_back_end_that_knows_of_an_error_is_believed() -> None:
+    class Ixxat(FakeBus):
+        state = can.BusState.ERROR
+
+    ixxat = Ixxat()
+    assert CanLink(ixxat, "ixxat").health().state is ControllerState.BUS_OFF
+    ixxat.shutdown()
+
+
+def test_health_never_raises(bus: FakeBus) -> None:
+    def fail() -> int:
+        raise OSError("unplugged")
+
+    bus.status = fail  # type: ignore[attr-defined]
+    assert CanLink(bus, "pcan").health().state is ControllerState.UNKNOWN
+
+
+def test_a_full_queue_is_remembered(bus: FakeBus, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flasher.bus.adapter.SEND_LIMIT_S", 0.01)
+    link = CanLink(bus, "slcan")
+    link.send(FRAME)
+    bus.refusals.extend([can.CanOperationError("Transmit queue full")] * 100_000)
+    with pytest.raises(TransmitBlockedError):
+        link.send(FRAME)
+    assert link.health().not_acknowledged

@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
+from flasher.bus.health import HealthKeeper, LinkHealth
 from flasher.bus.link import VirtualClock
 from flasher.driver import MAX_WAIT_S, drive
 from flasher.errors import BusError
@@ -45,6 +46,12 @@ class FakeLink:
 
     def close(self) -> None:
         pass
+
+    def reopen(self) -> None:
+        pass
+
+    def health(self) -> LinkHealth:
+        return HealthKeeper().health()
 
 
 class Recorder:

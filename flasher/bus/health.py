@@ -1,0 +1,299 @@
+"""What an adapter tells about its bus: error frames decoded, and the health of a link.
+
+An error frame is no frame of the wire: the driver makes it up to report trouble. Drivers lay it out
+in two ways that are documented (Linux's error.h, PCAN-Basic); of any other it is only known that
+something went wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final
+
+from flasher.errors import BusError
+from flasher.protocol.frame import Frame
+
+
+class TroubleKind(Enum):
+    """What an error frame reports, the worst first."""
+
+    BUS_OFF = "bus-off"
+    RESTARTED = "restarted"
+    NOT_ACKNOWLEDGED = "not acknowledged"
+    PASSIVE = "error-passive"
+    WARNING = "error-warning"
+    OTHER = "bus error"
+
+
+@dataclass(frozen=True)
+class BusTrouble:
+    """One error frame in words. Counters are those of the controller, None when not told."""
+
+    kinds: frozenset[TroubleKind]
+    words: str
+    tx_errors: int | None = None
+    rx_errors: int | None = None
+    is_active_again: bool = False
+    """True when the controller reports that it takes part normally again."""
+
+    @property
+    def kind(self) -> TroubleKind:
+        """The worst of what it reports."""
+        return next(kind for kind in TroubleKind if kind in self.kinds)
+
+
+class Layout(Enum):
+    """How a back end lays out its error frames."""
+
+    SOCKETCAN = "socketcan"
+    PCAN = "pcan"
+    UNKNOWN = "unknown"
+
+
+LAYOUTS: Final[Mapping[str, Layout]] = {
+    "socketcan": Layout.SOCKETCAN,
+    "gs_usb": Layout.SOCKETCAN,  # the firmware speaks Linux's layout
+    "socketcand": Layout.SOCKETCAN,  # the class in the id, no data
+    "pcan": Layout.PCAN,
+}
+"""By python-can's name of the interface; every other one has none that is documented."""
+
+# -- Linux, include/uapi/linux/can/error.h --------------------------------------------------------
+
+_TX_TIMEOUT: Final = 0x001
+_LOST_ARBITRATION: Final = 0x002
+_CONTROLLER: Final = 0x004
+_PROTOCOL: Final = 0x008
+_TRANSCEIVER: Final = 0x010
+_NO_ACK: Final = 0x020
+_BUS_OFF: Final = 0x040
+_BUS_ERROR: Final = 0x080
+_RESTARTED: Final = 0x100
+_COUNTERS: Final = 0x200
+_WARNING_BITS: Final = 0x04 | 0x08
+_PASSIVE_BITS: Final = 0x10 | 0x20
+_ACTIVE_BIT: Final = 0x40
+_ACK_SLOT: Final = 0x19
+"""Place of an error in the frame: the acknowledge slot. Both layouts use the SJA1000's numbers."""
+_CLASSES: Final = (
+    (_TX_TIMEOUT, TroubleKind.OTHER, "the driver's transmission timed out"),
+    (_LOST_ARBITRATION, TroubleKind.OTHER, "arbitration lost"),
+    (_TRANSCEIVER, TroubleKind.OTHER, "trouble of the transceiver (wiring)"),
+    (_NO_ACK, TroubleKind.NOT_ACKNOWLEDGED, "nobody acknowledged"),
+    (_BUS_OFF, TroubleKind.BUS_OFF, "bus-off"),
+    (_BUS_ERROR, TroubleKind.OTHER, "bus error"),
+    (_RESTARTED, TroubleKind.RESTARTED, "the controller was restarted"),
+)
+_CONTROLLER_STATES: Final = (
+    (0x01, TroubleKind.OTHER, "receive buffer overflow"),
+    (0x02, TroubleKind.OTHER, "transmit buffer overflow"),
+    (0x04, TroubleKind.WARNING, "error-warning by receiving"),
+    (0x08, TroubleKind.WARNING, "error-warning by sending"),
+    (0x10, TroubleKind.PASSIVE, "error-passive by receiving"),
+    (0x20, TroubleKind.PASSIVE, "error-passive by sending"),
+)
+_VIOLATIONS: Final = (
+    (0x01, "bit error"),
+    (0x02, "form error"),
+    (0x04, "stuff error"),
+    (0x08, "no dominant bit possible"),
+    (0x10, "no recessive bit possible"),
+    (0x20, "overload"),
+)
+_ERROR_FRAME_SIZE: Final = 8
+WARNING_LIMIT: Final = 96
+"""Error counter from which a controller warns."""
+PASSIVE_LIMIT: Final = 128
+"""Error counter from which a controller is error-passive."""
+
+
+def decode_error_frame(frame: Frame, layout: Layout = Layout.SOCKETCAN) -> BusTrouble:
+    """What an error frame reports. Never raises, whatever its data."""
+    if layout is Layout.SOCKETCAN:
+        return _decode_socketcan(frame.can_id, frame.data.ljust(_ERROR_FRAME_SIZE, b"\0"))
+    if layout is Layout.PCAN:
+        return _decode_pcan(frame.can_id, frame.data.ljust(_ERROR_FRAME_SIZE, b"\0"))
+    return BusTrouble(frozenset({TroubleKind.OTHER}), "an error frame that says no more")
+
+
+def _decode_socketcan(classes: int, data: bytes) -> BusTrouble:
+    found = [(kind, words) for bit, kind, words in _CLASSES if classes & bit]
+    if classes & _CONTROLLER:
+        found += [(kind, words) for bit, kind, words in _CONTROLLER_STATES if data[1] & bit]
+    if classes & _PROTOCOL:
+        found += [(TroubleKind.OTHER, words) for bit, words in _VIOLATIONS if data[2] & bit]
+        if data[3] == _ACK_SLOT:
+            found.append((TroubleKind.NOT_ACKNOWLEDGED, "nobody acknowledged"))
+    is_active_again = bool(classes & _CONTROLLER and data[1] & _ACTIVE_BIT)
+    if is_active_again:
+        found.append((TroubleKind.OTHER, "error-active again"))
+    # Older kernels fill the counters without the class bit that announces them.
+    counted = classes & _COUNTERS or (classes & _CONTROLLER and any(data[6:8]))
+    tx_errors, rx_errors = (data[6], data[7]) if counted else (None, None)
+    return _trouble(found, tx_errors, rx_errors, is_active_again=is_active_again)
+
+
+def _decode_pcan(kind_of_error: int, data: bytes) -> BusTrouble:
+    """PCAN-Basic: the id names the kind of error, the data direction, place and both counters."""
+    is_received, place, rx_errors, tx_errors = data[:4]
+    names = {0: "", 1: "bit error", 2: "form error", 4: "stuff error"}
+    words = names.get(kind_of_error, "bus error")
+    found = [(TroubleKind.OTHER, words)] if words else []
+    if kind_of_error and place == _ACK_SLOT and not is_received:
+        found.append((TroubleKind.NOT_ACKNOWLEDGED, "nobody acknowledged"))
+    if max(rx_errors, tx_errors) >= PASSIVE_LIMIT:
+        by = "sending" if tx_errors >= rx_errors else "receiving"
+        found.append((TroubleKind.PASSIVE, f"error-passive by {by}"))
+    elif max(rx_errors, tx_errors) >= WARNING_LIMIT:
+        found.append((TroubleKind.WARNING, "error-warning"))
+    return _trouble(
+        found,
+        tx_errors,
+        rx_errors,
+        is_active_again=not kind_of_error and max(rx_errors, tx_errors) < WARNING_LIMIT,
+    )
+
+
+def _trouble(
+    found: list[tuple[TroubleKind, str]],
+    tx_errors: int | None,
+    rx_errors: int | None,
+    *,
+    is_active_again: bool,
+) -> BusTrouble:
+    kinds = frozenset(kind for kind, _ in found) or frozenset({TroubleKind.OTHER})
+    words = ", ".join(dict.fromkeys(words for _, words in found)) or "error counters"
+    if tx_errors is not None:
+        words += f" (error counters: tx {tx_errors}, rx {rx_errors})"
+    return BusTrouble(kinds, words, tx_errors, rx_errors, is_active_again)
+
+
+# -- the health of a link ---------------------------------------------------------------------
+
+
+class ControllerState(Enum):
+    """How far a CAN controller takes part in the traffic."""
+
+    ACTIVE = "error-active"
+    PASSIVE = "error-passive"
+    BUS_OFF = "bus-off"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class LinkHealth:
+    """What is known of a link since it was opened. Counters are None where nobody tells them."""
+
+    state: ControllerState
+    tx_errors: int | None
+    rx_errors: int | None
+    frames_sent: int
+    """Frames that the adapter accepted: no proof that they left."""
+    frames_received: int
+    """Frames of the wire, without error frames."""
+    error_frames: int
+    is_blocked: bool
+    """True when the adapter refused a frame for as long as a link waits."""
+    last_trouble: BusTrouble | None
+    not_acknowledged: bool
+    """True when frames were sent, nothing at all was ever received, and error frames, the state or
+    the full queue say that nobody acknowledges."""
+
+    def error(self, where: str = "") -> BusError | None:
+        """The adapter's or the bus's failure that this health shows; None when it shows none."""
+        if self.state is ControllerState.BUS_OFF:
+            return bus_off_error(where)
+        if self.not_acknowledged:
+            return BusError(
+                f"Nobody on the bus acknowledges: {self.frames_sent} frames were given to the "
+                "adapter, and nothing at all was received.",
+                where=where,
+                cause="the device is off or not connected, the bit rate is another, CAN-H and "
+                f"CAN-L are swapped or open, or termination is missing{self._evidence}",
+                remedy="Check power, wiring and bit rate; flasher doctor looks at the adapter.",
+            )
+        return None
+
+    @property
+    def _evidence(self) -> str:
+        if self.last_trouble is not None:
+            return f"; the adapter reports: {self.last_trouble.words}"
+        return "; the transmit queue stays full" if self.is_blocked else ""
+
+
+def bus_off_error(where: str, what: str = "The adapter has left the bus.") -> BusError:
+    """The error for a controller that went bus-off."""
+    return BusError(
+        what,
+        where=where,
+        cause="it is bus-off: too many of its frames met errors (another bit rate on the bus, a "
+        "short circuit, CAN-H and CAN-L swapped)",
+        remedy="Check bit rate and wiring, then start the adapter again; flasher doctor names "
+        "the command.",
+    )
+
+
+class HealthKeeper:
+    """Counts for one link and remembers the troubles that it was told of."""
+
+    def __init__(self, layout: Layout = Layout.UNKNOWN) -> None:
+        self._layout = layout
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the adapter was opened anew."""
+        self.sent = 0
+        self.received = 0
+        self.error_frames = 0
+        self.is_blocked = False
+        self.state = ControllerState.UNKNOWN
+        self._last: BusTrouble | None = None
+        self._tx_errors: int | None = None
+        self._rx_errors: int | None = None
+        self._was_unacknowledged = False
+
+    def hear(self, frame: Frame) -> None:
+        """A frame arrived, of the wire or an error frame."""
+        if not frame.is_error:
+            self.received += 1
+            return
+        self.error_frames += 1
+        trouble = self._last = decode_error_frame(frame, self._layout)
+        if trouble.tx_errors is not None:
+            self._tx_errors, self._rx_errors = trouble.tx_errors, trouble.rx_errors
+        if TroubleKind.NOT_ACKNOWLEDGED in trouble.kinds:
+            self._was_unacknowledged = True
+        if TroubleKind.BUS_OFF in trouble.kinds:
+            self.state = ControllerState.BUS_OFF
+        elif TroubleKind.PASSIVE in trouble.kinds:
+            self.state = ControllerState.PASSIVE
+        elif trouble.is_active_again or TroubleKind.RESTARTED in trouble.kinds:
+            self.state = ControllerState.ACTIVE
+
+    def health(
+        self,
+        state: ControllerState = ControllerState.UNKNOWN,
+        tx_errors: int | None = None,
+        rx_errors: int | None = None,
+    ) -> LinkHealth:
+        """The health now; what the adapter itself was asked for counts more than error frames."""
+        if state is ControllerState.UNKNOWN:
+            state = self.state
+        if tx_errors is None:
+            tx_errors, rx_errors = self._tx_errors, self._rx_errors
+        # Without acknowledgement a controller stops at error-passive, by sending: it never goes
+        # bus-off. On another bit rate the receive counter may be the higher one: silence counts.
+        says_so = self._was_unacknowledged or self.is_blocked or state is ControllerState.PASSIVE
+        return LinkHealth(
+            state=state,
+            tx_errors=tx_errors,
+            rx_errors=rx_errors,
+            frames_sent=self.sent,
+            frames_received=self.received,
+            error_frames=self.error_frames,
+            is_blocked=self.is_blocked,
+            last_trouble=self._last,
+            not_acknowledged=bool(self.sent) and not self.received and says_so,
+        )

@@ -1,0 +1,197 @@
+"""Opening a python-can bus: its configuration, and in plain words why it cannot be opened."""
+
+from __future__ import annotations
+
+import configparser
+import contextlib
+import errno
+from collections.abc import Mapping
+from typing import Any, Final
+
+import can
+import can.util
+
+from flasher.bus.health import bus_off_error
+from flasher.bus.inspect_interface import Unseen, look_up
+from flasher.errors import BusError, UsageError
+from flasher.protocol.text import printable
+
+_CHANNELS: Final = {"socketcan": "can0", "pcan": "PCAN_USBBUS1", "slcan": "COM3"}
+_EXTRAS: Final[Mapping[str, tuple[str, str]]] = {
+    "canalystii": ("canalystii", "canalystii"),
+    "cantact": ("cantact", "cantact"),
+    "gs_usb": ("gs-usb", "gs_usb"),
+    "neovi": ("neovi", "ics"),
+    "nixnet": ("nixnet", "nixnet"),
+    "robotell": ("serial", "serial"),
+    "seeedstudio": ("seeedstudio", "serial"),
+    "serial": ("serial", "serial"),
+    "slcan": ("serial", "serial"),
+    "udp_multicast": ("multicast", "msgpack"),
+}
+"""python-can's extra that an interface needs, and the module that it brings."""
+_LISTEN_ONLY: Final[Mapping[str, Mapping[str, object]]] = {
+    "cantact": {"monitor": True},
+    "kvaser": {"driver_mode": False},
+    "nixnet": {"listen_only": True},
+    "pcan": {"state": can.BusState.PASSIVE},
+    "seeedstudio": {"operation_mode": "silent"},
+    "slcan": {"listen_only": True},
+    "systec": {"state": can.BusState.PASSIVE},
+    "vector": {"listen_only": True},
+}
+"""What makes a back end listen without acknowledging. SocketCAN is set up so by root; of the others
+python-can offers nothing."""
+_PERMISSION: Final = frozenset({errno.EACCES, errno.EPERM})
+
+
+def needed_extra(interface: str) -> tuple[str, str] | None:
+    """python-can's extra for an interface and the module that it brings; None where none is."""
+    return _EXTRAS.get(interface)
+
+
+def can_listen_only(interface: str) -> bool:
+    """True when a back end is told by an argument to listen without acknowledging."""
+    return interface in _LISTEN_ONLY
+
+
+def bus_config(
+    default_bitrate_bps: int, given: Mapping[str, Any], *, listen_only: bool = False
+) -> dict[str, Any]:
+    """All keywords for `can.Bus`, from what was given, variables and files.
+
+    `listen_only` adds what keeps the adapter silent, where its back end can be told. Raises
+    UsageError for a configuration that makes no sense, BusError when there is none.
+    """
+    try:
+        merged: dict[str, Any] = dict(can.util.load_config(config=dict(given)))
+    except can.CanInterfaceNotImplementedError as error:
+        raise _no_interface(error) from error
+    except (ValueError, TypeError, configparser.Error) as error:
+        raise UsageError(
+            f"The adapter's configuration makes no sense: {printable(words_of(error))}.",
+            remedy="Check the bus arguments, python-can's configuration file and CAN_* variables.",
+        ) from error
+    if "timing" not in merged:
+        merged.setdefault("bitrate", default_bitrate_bps)
+    if listen_only:
+        merged.update(_LISTEN_ONLY.get(str(merged["interface"]), {}))
+    return merged
+
+
+def open_bus(config: Mapping[str, Any]) -> can.BusABC:
+    """Open what `bus_config` gave. Raises BusError with cause and remedy."""
+    interface, channel = str(config["interface"]), config.get("channel")
+    try:
+        bus = can.Bus(**config, ignore_config=True)
+    except Exception as error:
+        raise BusError(
+            f"The adapter cannot be opened: {words_of(error)}.",
+            where=f"interface {interface}, channel {channel}",
+            cause=_opening_cause(interface, error),
+            remedy=_opening_remedy(interface, channel, config.get("bitrate"), error),
+        ) from error
+    if interface == "socketcan":
+        failure = _unusable(str(channel), config.get("bitrate"))
+        if failure is not None:
+            with contextlib.suppress(can.CanError, OSError):
+                bus.shutdown()
+            raise failure
+    return bus
+
+
+def words_of(error: Exception) -> str:
+    """What the back end said, without a full stop, or the kind of error when it said nothing."""
+    return str(error).strip().rstrip(".!") or type(error).__name__
+
+
+def start_command(channel: object, bitrate_bps: object) -> str:
+    """How root starts a SocketCAN interface; virtual ones, told by their name, take no options."""
+    if str(channel).startswith(("vcan", "vxcan")):
+        return f"ip link set {channel} up"
+    return f"ip link set {channel} up type can bitrate {bitrate_bps} restart-ms 100"
+
+
+def _unusable(channel: str, bitrate_bps: object) -> BusError | None:
+    """A SocketCAN interface opens while it is down or bus-off, and then carries nothing."""
+    seen = look_up(channel)
+    if isinstance(seen, Unseen) or not seen.is_can:
+        return None
+    where = f"interface socketcan, channel {channel}"
+    if not seen.is_up:
+        return BusError(
+            f"The adapter cannot be opened: the interface {channel} is down.",
+            where=where,
+            cause="nobody has started it since it was plugged in",
+            remedy=f"`{start_command(channel, bitrate_bps)}` (as root) starts it.",
+        )
+    if seen.has_carrier is False:
+        error = bus_off_error(where, f"The adapter cannot be used: {channel} has no carrier.")
+        error.cause += ", or the other end of a vxcan pair is down"
+        error.remedy = (
+            f"Check bit rate and wiring; `ip link set {channel} type can restart` (as root) "
+            "starts the controller again."
+        )
+        return error
+    return None
+
+
+def _no_interface(error: Exception) -> UsageError | BusError:
+    known = ", ".join(sorted(can.VALID_INTERFACES))
+    if '"None"' in str(error):
+        return BusError(
+            "No adapter is configured.",
+            cause="neither -i/--interface, nor a python-can configuration file, nor the variable "
+            "CAN_INTERFACE names one",
+            remedy="Name it, for example `-i socketcan -c can0` or `-i pcan -c PCAN_USBBUS1`; "
+            f"--mock needs none. flasher doctor lists what is plugged in. Interfaces: {known}.",
+        )
+    return UsageError(f"{words_of(error)}.", remedy=f"python-can knows: {known}.")
+
+
+def _code(error: BaseException) -> int | None:
+    """The operating system's code, which back ends wrap once or twice."""
+    found: BaseException | None = error
+    while found is not None:
+        code = getattr(found, "errno", None) or getattr(found, "error_code", None)
+        if isinstance(code, int):
+            return code
+        found = found.__cause__ or found.__context__
+    return None
+
+
+def _opening_cause(interface: str, error: Exception) -> str:
+    code = _code(error)
+    if code == errno.EAFNOSUPPORT:
+        return "this system's kernel has no CAN"
+    if code in _PERMISSION:
+        return "this user may not use the adapter"
+    if code == errno.EBUSY:
+        return "another program uses the adapter"
+    if interface == "socketcan":
+        return "the interface does not exist or is down"
+    if isinstance(error, can.CanInterfaceNotImplementedError | ImportError) and needed_extra(
+        interface
+    ):
+        return "the Python package for this interface is not installed"
+    if isinstance(error, NameError | ImportError | AttributeError):
+        return "the driver library of this interface is not installed"
+    return "the adapter is not plugged in, in use by another program, or its driver is missing"
+
+
+def _opening_remedy(interface: str, channel: object, bitrate_bps: object, error: Exception) -> str:
+    if channel is None:
+        return f"Name the channel, for example `-i {interface} -c {_CHANNELS.get(interface, 0)}`."
+    if _code(error) in _PERMISSION:
+        return (
+            "On Linux, add the user to the group of the device (`sudo usermod -aG dialout $USER`, "
+            "then log in again) or install the adapter's udev rule."
+        )
+    if interface == "socketcan":
+        return (
+            f"`ip -details link show {channel}` shows its state; "
+            f"`{start_command(channel, bitrate_bps)}` (as root) starts it."
+        )
+    extra = needed_extra(interface)
+    package = f" (`pip install 'python-can[{extra[0]}]'`)" if extra else ""
+    return f"Plug it in, close other programs that use it, install its driver{package}."

@@ -1,0 +1,101 @@
+"""What can happen to the host's adapter on a simulated bus, and what it reports of it.
+
+It is pulled out, it goes bus-off, or it is alone, with nobody to acknowledge. The error frames are
+those of Linux's SocketCAN drivers. Pure: time is an argument.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from flasher.bus.health import PASSIVE_LIMIT, WARNING_LIMIT
+from flasher.protocol.frame import Frame
+
+_ERRORS_PER_TRY: Final = 8
+"""A frame without acknowledgement raises the transmit counter by this."""
+_ERROR_BITS: Final = 20
+"""Error flag, delimiter and the pause after it, about."""
+
+
+def _error_frame(classes: int, controller: int = 0, tx_errors: int = 0) -> Frame:
+    """As Linux lays it out: class bits in the id, controller state and counters in the data."""
+    return Frame(classes, bytes((0, controller, 0, 0, 0, 0, tx_errors, 0)), is_error=True)
+
+
+BUS_OFF: Final = _error_frame(0x040)
+RESTARTED: Final = _error_frame(0x100)
+TX_WARNING: Final = _error_frame(0x204, 0x08, WARNING_LIMIT)
+TX_PASSIVE: Final = _error_frame(0x204, 0x20, PASSIVE_LIMIT)
+ACTIVE_AGAIN: Final = _error_frame(0x204, 0x40)
+
+
+class AdapterFaults:
+    """The adapter's troubles; without any it is plugged in and takes part."""
+
+    def __init__(self) -> None:
+        self.is_plugged = True
+        self.is_off = False
+        self.is_alone = False
+        """True while nobody acknowledges."""
+        self.times_unplugged = 0
+        """A link opened before the last time is lost until it is opened again."""
+        self._back_at: float | None = None
+        self._reports: list[tuple[float, Frame]] = []
+        self._has_reported = False
+
+    @property
+    def takes_part(self) -> bool:
+        """True when its frames leave and others' frames arrive."""
+        return self.is_plugged and not self.is_off and not self.is_alone
+
+    def unplug(self, back_at: float | None) -> None:
+        """Pull it out; it is back at a time, or when it is plugged in."""
+        self.is_plugged = False
+        self.times_unplugged += 1
+        self._back_at = back_at
+        self._reports.clear()
+
+    def go_off(self, now: float, back_at: float | None) -> None:
+        """Bus-off, until a time or until it is plugged in anew."""
+        self.is_off = True
+        self._back_at = back_at
+        self._reports = [(now, BUS_OFF)]
+
+    def come_back(self, now: float) -> None:
+        """Plugged in, and its controller started anew."""
+        if self.is_off and self.is_plugged:
+            self._reports.append((now, RESTARTED))
+        self.is_plugged, self.is_off = True, False
+        self._back_at = None
+
+    def be_alone(self, now: float, *, alone: bool) -> None:
+        """Cut it off from everybody else, or bring it together with them again."""
+        if not alone and self._has_reported:
+            self._reports = [(now, ACTIVE_AGAIN)]
+        self.is_alone, self._has_reported = alone, False
+
+    def try_in_vain(self, now: float, frame_s: float, bit_s: float) -> None:
+        """It sends a frame over and over: the error counter rises to error-passive and stays."""
+        if not self.is_alone or self._has_reported:
+            return
+        self._has_reported = True
+        try_s = frame_s + _ERROR_BITS * bit_s
+        for report, limit in ((TX_WARNING, WARNING_LIMIT), (TX_PASSIVE, PASSIVE_LIMIT)):
+            self._reports.append((now + limit // _ERRORS_PER_TRY * try_s, report))
+
+    def deadline(self) -> float | None:
+        """When something is to happen next."""
+        times = [at for at, _ in self._reports]
+        if self._back_at is not None:
+            times.append(self._back_at)
+        return min(times, default=None)
+
+    def tick(self, now: float) -> list[Frame]:
+        """Come back when it is time; the error frames that the adapter reports now."""
+        if self._back_at is not None and self._back_at <= now:
+            self.come_back(now)
+        if not self._reports:
+            return []
+        due = [frame for at, frame in self._reports if at <= now]
+        self._reports = [(at, frame) for at, frame in self._reports if at > now]
+        return due
