@@ -52,7 +52,7 @@ class Application:
 
     @property
     def port(self) -> Port:
-        """The machine that it runs on."""
+        """The machine that it runs on. Raises LookupError before it was attached to one."""
         if self._port is None:
             raise LookupError("an application runs on a machine")
         return self._port

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from typing import Final
+from typing import ClassVar, Final
 
 from flasher.device.application import Application
 from flasher.device.timer import due_again
@@ -21,12 +21,18 @@ from flasher.protocol.wire import Damage, Message, Reassembler, encode, split
 
 _UNUSED_WIRE_S: Final = 0.0
 """Nothing here counts from when a message has left the wire, so its time there is not computed."""
+BUS_OFF_S: Final = 0.02
+"""How long a CAN controller stays off the bus unless told otherwise: longer than the 128 times 11
+bits that the standard asks for, as software has to notice first."""
 
 
 class Machine(ABC):
     """An engine (`flasher.protocol.engine`) that hears the ids of its application and its own
     `own_ids`; base of `Device` and `Unit`.
     """
+
+    reassembler_type: ClassVar[type[Reassembler]] = Reassembler
+    """What makes messages of the frames on each id."""
 
     def __init__(
         self,
@@ -40,7 +46,7 @@ class Machine(ABC):
         self.timings = timings
         self._bitrate_bps = bitrate_bps
         self._reassemblers = {
-            can_id: Reassembler(can_id, timings.inter_frame_timeout_s)
+            can_id: self.reassembler_type(can_id, timings.inter_frame_timeout_s)
             for can_id in sorted(own_ids | application.hears)
         }
         self._transmitter = Transmitter(bitrate_bps)
@@ -49,6 +55,7 @@ class Machine(ABC):
         self._is_deaf = False
         self._is_cancelled = False
         self._runs_application = False
+        self._off_bus_until: float | None = None
         application.attach(self)
 
     # -- the engine interface ---------------------------------------------------------------------
@@ -60,7 +67,8 @@ class Machine(ABC):
 
     def receive(self, frame: Frame, now: float) -> None:
         """A CAN frame arrived. Only payload on the ids that concern this device is looked at."""
-        if self._is_cancelled or self._is_deaf:
+        self._rejoin_bus(now)
+        if self._is_cancelled or self._is_deaf or self._off_bus_until is not None:
             return
         if self._runs_application:
             self.application.heard(now)
@@ -74,6 +82,7 @@ class Machine(ABC):
         """Let everything happen that is due by `now`."""
         if self._is_cancelled:
             return
+        self._rejoin_bus(now)
         for reassembler in self._reassemblers.values():
             for found in reassembler.tick(now):
                 self._take(found, now)
@@ -87,7 +96,7 @@ class Machine(ABC):
         if self._is_cancelled:
             return wanted
         others = [reassembler.deadline() for reassembler in self._reassemblers.values()]
-        others.append(self._due)
+        others += (self._due, self._off_bus_until)
         if self._runs_application:
             others.append(self.application.deadline())
         for other in others:
@@ -122,7 +131,9 @@ class Machine(ABC):
         return self._transmitter.idle
 
     def send(self, message: Message) -> None:
-        """Send a message after those before it."""
+        """Send a message after those before it. Off the bus, it is lost."""
+        if self._off_bus_until is not None:
+            return
         frames = split(message.can_id, encode(message))
         self._transmitter.queue(frames, wire_s=_UNUSED_WIRE_S)
 
@@ -140,6 +151,26 @@ class Machine(ABC):
         """
         if self._runs_application:
             self.application.hold_key(now)
+
+    # -- the bus's faults -------------------------------------------------------------------------
+
+    def bus_off(self, now: float, off_s: float = BUS_OFF_S) -> None:
+        """The CAN controller leaves the bus and is back after `off_s` seconds.
+
+        What was to be sent is lost, the rest of a message half sent too, and so is everything that
+        is said meanwhile, by others or by the device.
+        """
+        self._transmitter = Transmitter(self._bitrate_bps)
+        self._off_bus_until = now + off_s
+
+    @property
+    def is_off_bus(self) -> bool:
+        """True from `bus_off` until it is back."""
+        return self._off_bus_until is not None
+
+    def _rejoin_bus(self, now: float) -> None:
+        if self._off_bus_until is not None and now >= self._off_bus_until:
+            self._off_bus_until = None
 
     # -- for the model ----------------------------------------------------------------------------
 
@@ -188,6 +219,7 @@ class Machine(ABC):
         """Forget everything received, and everything to be sent at once, even half a message."""
         self._forget_received()
         self._transmitter = Transmitter(self._bitrate_bps)
+        self._off_bus_until = None
         self._due = None
 
     def _take(self, found: Message | Damage, now: float) -> None:

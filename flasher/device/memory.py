@@ -167,9 +167,13 @@ class FlashController:
     @property
     def ends_at(self) -> float | None:
         """When the operation under way is over; None while there is none."""
+        return self.reached_at(1.0)
+
+    def reached_at(self, share: float) -> float | None:
+        """When `share` (0 to 1) of the operation under way is done; None while there is none."""
         if self._under_way is None:
             return None
-        return self._began_at + self._duration_s(self._under_way)
+        return self._began_at + share * self._duration_s(self._under_way)
 
     def run(self, operations: Iterable[Operation], now: float) -> None:
         """Begin `operations`, after the one under way; those that still waited are forgotten."""

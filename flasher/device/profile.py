@@ -105,7 +105,7 @@ class DeviceProfile:
         "none", "commands not answered, as 3800,732:5000: of all ids, or of one; parted by commas"
     )
     battery_use: Literal["riding", "resting"] = _option(
-        "riding", "rides and charges in turn, or rests"
+        "resting", "rides and charges in turn, or rests: a vehicle in use is not upgraded"
     )
     battery_seed: int = _option(1, "decides how the cells differ")
     faults: int = _option(0, "faults that are set from the start, as the 32 bits of 720 1204")

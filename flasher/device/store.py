@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import zlib
 from struct import Struct
-from typing import Final
+from typing import ClassVar, Final
 
 from flasher.device.memory import ERASED, Flash, Operation
 from flasher.device.profile import DeviceProfile
@@ -42,11 +42,13 @@ def factory_image(profile: DeviceProfile) -> bytes:
 class ApplicationStore:
     """The application area and its record, on a flash of their own size."""
 
+    flash_type: ClassVar[type[Flash]] = Flash
+
     def __init__(self, profile: DeviceProfile) -> None:
         self._area_bytes = profile.application_area_bytes
         self._erases_all = profile.erased_pages == "all"
         self._record_address = AREA_START + self._area_bytes
-        self.flash = Flash(
+        self.flash = self.flash_type(
             AREA_START,
             self._area_bytes + profile.page_size_bytes,
             page_size_bytes=profile.page_size_bytes,
@@ -59,7 +61,10 @@ class ApplicationStore:
         if magic != _MAGIC or not 0 < size_bytes <= self._area_bytes:
             return None
         image = self.flash.read(AREA_START, size_bytes)
-        return image if zlib.crc32(image) == crc else None
+        return image if self._is_intact(image, crc) else None
+
+    def _is_intact(self, image: bytes, crc: int) -> bool:
+        return zlib.crc32(image) == crc
 
     def read(self, size_bytes: int) -> bytes:
         """The first bytes of the area, whole or not."""
