@@ -30,28 +30,35 @@ Every failure is a `FlasherError` with its exit code, its likely cause and what 
 meanwhile comes as the dataclasses of `flasher.events`.
 """
 
-from flasher import events
-from flasher.api import (
-    Connection,
-    DeviceLeft,
-    Ending,
-    Image,
-    Level,
-    Outcome,
-    Plan,
-    Result,
-    UpgradeOptions,
-    connect,
-    connect_mock,
-    flash,
-    load,
-    make_plan,
-    query,
-    read,
-    upgrade,
-    write,
-)
-from flasher.errors import ExitCode, FlasherError
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from flasher import events
+    from flasher.api import (
+        Connection,
+        DeviceLeft,
+        Ending,
+        Identity,
+        Image,
+        Level,
+        Outcome,
+        Plan,
+        Result,
+        UpgradeOptions,
+        connect,
+        connect_mock,
+        flash,
+        load,
+        make_plan,
+        query,
+        read,
+        upgrade,
+        write,
+    )
+    from flasher.errors import ExitCode, FlasherError
 
 __all__ = [
     "flash",
@@ -68,6 +75,7 @@ __all__ = [
     "Ending",
     "ExitCode",
     "FlasherError",
+    "Identity",
     "Image",
     "Level",
     "Outcome",
@@ -76,3 +84,16 @@ __all__ = [
     "UpgradeOptions",
     "events",
 ]
+
+_ELSEWHERE = {"ExitCode": "errors", "FlasherError": "errors"}
+
+
+def __getattr__(name: str) -> Any:
+    """Load what is asked for when it is asked for: pytest imports this package in every project
+    that has flasher installed, for its plugin, and must not wait for the rest.
+    """
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name == "events":
+        return importlib.import_module("flasher.events")
+    return getattr(importlib.import_module(f"flasher.{_ELSEWHERE.get(name, 'api')}"), name)

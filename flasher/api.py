@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from flasher import service
@@ -18,17 +18,21 @@ from flasher.bus.simulated import SimulatedBus
 from flasher.device.model import Device
 from flasher.device.profile import DeviceProfile, set_option
 from flasher.device.system import System
-from flasher.driver import Tap, drive
-from flasher.errors import BusError, UsageError
+from flasher.driver import Tap
+from flasher.errors import UsageError
+from flasher.flashing import run_session
+from flasher.host.identity import Check, Finding, Identity, judge_image
 from flasher.host.options import UpgradeOptions
-from flasher.host.outcome import DeviceLeft, Outcome
+from flasher.host.outcome import DeviceLeft, Outcome, before_the_start
 from flasher.host.session import Result, Session
 from flasher.host.table import Ending
 from flasher.host.verify import Level, possible_levels
 from flasher.host.write import Written
 from flasher.image.image import Image
 from flasher.image.load import load
+from flasher.image.manifest import Release, find_release
 from flasher.image.plan import Plan, plan
+from flasher.log import log_event
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import DIALECTS, TARGETS, Dialect, Target, find_target
 
@@ -47,14 +51,18 @@ __all__ = [
     "as_dialect",
     "as_level",
     "as_target",
+    "find_release",
+    "Check",
     "Connection",
     "DeviceLeft",
     "Ending",
     "EventHandler",
+    "Identity",
     "Image",
     "Level",
     "Outcome",
     "Plan",
+    "Release",
     "Result",
     "UpgradeOptions",
 ]
@@ -95,10 +103,13 @@ def connect_mock(
     *,
     speed: float = 1.0,
     system: bool = False,
+    has_application: bool = True,
     profile: DeviceProfile | None = None,
     on_event: EventHandler | None = None,
 ) -> Iterator[Connection]:
     """A bus in this process with a device model on it, or, as `system`, with a whole bicycle.
+
+    Without an application the device sits in its bootloader, as one does whose upgrade failed.
 
     It takes the time that a real bus takes, divided by `speed`; 0 means no time at all. `on_event`
     gets what the device model reports.
@@ -109,9 +120,10 @@ def connect_mock(
     clock: Clock = PacedClock(speed) if speed else VirtualClock()
     bus = SimulatedBus(bitrate_bps, clock)
     if system:
-        bus.attach(System(chosen, node, profile=own), on_event)
+        bus.attach(System(chosen, node, profile=own, has_application=has_application), on_event)
     else:
-        bus.attach(Device(node, bitrate_bps=bitrate_bps, profile=own), on_event)
+        device = Device(node, bitrate_bps=bitrate_bps, profile=own, has_application=has_application)
+        bus.attach(device, on_event)
     yield Connection(bus.link(), clock, "the built-in mock")
 
 
@@ -121,34 +133,40 @@ def upgrade(
     *,
     options: UpgradeOptions | None = None,
     verify: Level | None = None,
+    identity: Identity | None = None,
     taps: Sequence[Tap] = (),
     on_event: EventHandler | None = None,
     cancelled: Callable[[], bool] | None = None,
 ) -> Result:
     """Run one upgrade to its end, good or bad, and verify a good one.
 
-    `verify` None stands for `default_level`. `cancelled` is asked while it runs. Raises UsageError
-    when the target or the image cannot be verified so, BusError when the adapter fails, saying how
-    far the upgrade had come and in what state the device is left; every other end is a `Result`.
+    `verify` None stands for `default_level`. `identity` says what the image may be flashed to; the
+    device is asked who it is and held against it before anything is written. `cancelled` is asked
+    while it runs. Raises UsageError when the target or the image cannot be verified so, BusError
+    when the adapter fails, saying how far the upgrade had come and in what state the device is
+    left; every other end is a `Result`.
     """
-    level = default_level(plan.target, options) if verify is None else verify
-    check_level(plan, level, options)
-    engine = Session(plan, options, level)
-    try:
-        drive(
-            engine,
-            connection.link,
-            connection.clock,
-            taps=taps,
-            on_event=on_event,
-            cancelled=cancelled,
-        )
-    except BusError as error:
-        # The adapter does not know what it was used for.
-        error.where = f"{engine.standing}; {error.where}"
-        error.remedy = f"{error.remedy} State of the device: {engine.device_left.value}.".lstrip()
-        raise
-    return engine.result
+    chosen = options or UpgradeOptions()
+    level = default_level(plan.target, chosen) if verify is None else verify
+    check_level(plan, level, chosen)
+    return run_session(
+        Session(plan, chosen, level, identity or Identity()),
+        connection.link,
+        connection.clock,
+        adapter_return_s=chosen.adapter_return_s,
+        taps=taps,
+        on_event=_logged(on_event),
+        cancelled=cancelled,
+    )
+
+
+def _logged(on_event: EventHandler | None) -> EventHandler:
+    def tell(event: object) -> None:
+        log_event(event)
+        if on_event is not None:
+            on_event(event)
+
+    return tell
 
 
 def default_level(target: Target, options: UpgradeOptions | None = None) -> Level:
@@ -182,6 +200,7 @@ def flash(
     mock: bool = False,
     options: UpgradeOptions | None = None,
     verify: Level | str | None = None,
+    identity: Identity | None = None,
     on_event: EventHandler | None = None,
     **bus: Any,
 ) -> Result:
@@ -189,19 +208,64 @@ def flash(
 
     `bus` are python-can's keywords, as for `connect`; with `mock` the built-in device model is
     upgraded instead. `verify` is "none", "version" or "memory"; None chooses (`default_level`).
-    Returns the result of a good session; every other one is raised as the FlasherError that stands
-    for it (see flasher.errors).
+    `identity` None takes the manifest beside the file, if there is one, and waives no check.
+    Returns the result of a good session, or of one that found nothing to do; every other one is
+    raised as the FlasherError that stands for it (see flasher.errors).
     """
     loaded = image if isinstance(image, Image) else load(image)
-    planned = make_plan(loaded, target, dialect)
+    if identity is None:
+        identity = Identity(None if isinstance(image, Image) else find_release(image))
+    planned = make_plan(release_checked(loaded, identity.release), target, dialect)
+    check_image(planned, identity)
     level = None if verify is None else as_level(verify)
     opened = connect_mock(target, dialect) if mock else connect(dialect, **bus)
     with opened as connection:
-        result = upgrade(planned, connection, options=options, verify=level, on_event=on_event)
+        result = upgrade(
+            planned,
+            connection,
+            options=release_options(options, identity.release),
+            verify=level,
+            identity=identity,
+            on_event=on_event,
+        )
     error = result.error()
     if error is not None:
         raise error
     return result
+
+
+def release_checked(image: Image, release: Release | None) -> Image:
+    """The image, with the version that its manifest gives where it names none itself.
+
+    Raises ImageError when its bytes are not those of the manifest.
+    """
+    if release is None:
+        return image
+    release.check_bytes(image)
+    return image if image.version else replace(image, version=release.firmware_version)
+
+
+def release_options(options: UpgradeOptions | None, release: Release | None) -> UpgradeOptions:
+    """The options, with what the manifest asks of the bootloader where they do not say it."""
+    chosen = options or UpgradeOptions()
+    if release is None or chosen.minimum_boot_version is not None:
+        return chosen
+    return replace(chosen, minimum_boot_version=release.minimum_boot_version)
+
+
+def check_image(plan: Plan, identity: Identity) -> list[Finding]:
+    """What an image and its manifest say of the target by themselves, without a device.
+
+    Raises WrongDeviceError when they speak against it.
+    """
+    findings = list(judge_image(plan.image, plan.target, identity))
+    for found in findings:
+        if found.ending is not None:
+            refused = before_the_start(plan, found.ending, found.detail, duration_s=0.0).error()
+            if refused is not None:
+                refused.where = "before anything was sent"
+                raise refused
+    return findings
 
 
 def as_level(level: Level | str) -> Level:

@@ -2,17 +2,15 @@
 
 Here stand the readings that tell one ACK from another: R2 (boot versions before the transfer), R6
 (NAK after the end), R10 (copies, stale answers), R11 (restart or leftover), R16 (request transfer
-again). `Situation` is what they rest on; noting an answer in it is part of classifying it.
+again). What they rest on is the `Situation`; noting an answer in it is part of classifying it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 from flasher.host.options import UpgradeOptions, firmware_version
+from flasher.host.situation import Situation
 from flasher.host.table import Event, State
 from flasher.image.plan import Plan
-from flasher.protocol.engine import Transmitter
 from flasher.protocol.fields import Content
 from flasher.protocol.messages import (
     Ack,
@@ -26,67 +24,11 @@ from flasher.protocol.messages import (
     Unknown,
 )
 from flasher.protocol.spec import BOOT_VERSION_BURST
+from flasher.protocol.text import boot_version_number
 from flasher.protocol.timing import Timings
 
-_NEVER = float("-inf")
 _IN_TRANSFER = frozenset({State.TRANSFERRING, State.SETTLING})
 _AFTER_END = frozenset({State.ENDING, State.CONFIRMING})
-
-
-@dataclass
-class Situation:
-    """Where one attempt stands; all times in seconds on the engine's clock."""
-
-    tx: Transmitter
-    state: State = State.RESETTING
-    state_since: float = 0.0
-    attempt: int = 1
-
-    boot: BootVersion | None = None
-    """The first boot version of the attempt."""
-    update_left_at: float = _NEVER
-    """When the last update command left, of this or an earlier attempt."""
-    first_update_left_at: float | None = None
-    request_at: float = 0.0
-
-    number: int = 0
-    """The packet in work, 1-based."""
-    tries: int = 0
-    """How often it was begun to be sent."""
-    copies_unanswered: int = 0
-    """Copies of it that have left and were not answered."""
-    accepted: bool = False
-    """One of its copies was acknowledged."""
-    nak_next_seen: bool = False
-    """A repeated packet n was answered with NAK n+1, and that was not taken for an ACK (R10)."""
-
-    end_tries: int = 0
-    end_copies_left: int = 0
-    end_naks: int = 0
-    announced_at: float | None = None
-    """When the first of the boot versions came that follow each other since end of transfer."""
-    announced_last_at: float = 0.0
-    running_version: str | None = None
-
-    @property
-    def update_left(self) -> bool:
-        """True when an update command was sent: the device may have erased its application."""
-        return self.update_left_at > _NEVER
-
-    def next_attempt(self) -> Situation:
-        """The situation when the device starts over."""
-        return Situation(
-            tx=self.tx,
-            state=self.state,
-            state_since=self.state_since,
-            attempt=self.attempt + 1,
-            update_left_at=self.update_left_at,
-        )
-
-    def next_packet(self, number: int) -> None:
-        """Begin the work on another packet."""
-        self.number, self.tries = number, 0
-        self.copies_unanswered, self.accepted = 0, False
 
 
 class Classifier:
@@ -98,6 +40,8 @@ class Classifier:
         self._timings: Timings = options.timings
         self._burst_gap_s = BOOT_VERSION_BURST * self._timings.boot_version_spacing_s
         """Announcements further apart than a whole burst takes are not of one burst."""
+        minimum = options.minimum_boot_version
+        self._minimum_boot = None if minimum is None else boot_version_number(minimum)
 
     def message(self, row: Row | Malformed | Unknown | Content, at: Situation, now: float) -> Event:
         """The event that a received message is."""
@@ -130,11 +74,11 @@ class Classifier:
                 given_up = in_state_s >= timings.command_timeout_s
                 return Event.RESET_UNANSWERED if given_up else Event.RESET_DUE
             case State.AWAITING_BOOT:
-                return Event.BOOT_MISSING
+                return self._no_boot(at)
             case State.AWAITING_REQUEST:
                 return Event.REQUEST_MISSING
             case State.TRANSFERRING:
-                return Event.PACKET_LOST if self._last_try(at) else Event.PACKET_UNANSWERED
+                return self._packet_lost(at) if self._last_try(at) else Event.PACKET_UNANSWERED
             case State.SETTLING:
                 return self._settled(at)
             case State.ENDING:
@@ -172,9 +116,12 @@ class Classifier:
     def _settled(self, at: Situation) -> Event:
         """Every copy of the packet is answered, or will not be any more."""
         if not at.accepted:
-            return Event.PACKET_LOST if self._last_try(at) else Event.PACKET_REFUSED
+            return self._packet_lost(at) if self._last_try(at) else Event.PACKET_REFUSED
         last = at.number == self._plan.total_packets
         return Event.LAST_PACKET_DONE if last else Event.PACKET_DONE
+
+    def _packet_lost(self, at: Situation) -> Event:
+        return Event.PACKET_LOST if self._last_attempt(at) else Event.PACKET_GIVEN_UP
 
     def _end_answer(self, answer: Ack | Nak, at: Situation) -> Event:
         """After end of transfer; the number of a NAK does not matter (R6)."""
@@ -198,7 +145,15 @@ class Classifier:
             return Event.BOOT_WRONG
         if at.state is State.AWAITING_REQUEST:
             return self._boot_again(boot, at, now)
-        return Event.BOOT_VERSION
+        return Event.BOOT_TOO_OLD if self._is_too_old(boot) else Event.BOOT_VERSION
+
+    def _no_boot(self, at: Situation) -> Event:
+        """No boot version came. A device that was told to update is not left alone at once."""
+        if at.update_left and not self._last_attempt(at):
+            return Event.BOOT_GIVEN_UP
+        if at.failed_packet is not None:
+            return Event.BOOT_LOST
+        return Event.POWER_UP_MISSING if self._options.at_power_up else Event.BOOT_MISSING
 
     def _boot_again(self, boot: BootVersion, at: Situation, now: float) -> Event:
         """After an update command was sent, before request transfer (R2)."""
@@ -228,6 +183,10 @@ class Classifier:
             return False
         return boot.name != self._plan.target.boot_name or not boot.is_version
 
+    def _is_too_old(self, boot: BootVersion) -> bool:
+        wanted, got = self._minimum_boot, boot_version_number(boot.version)
+        return wanted is not None and (got is None or got < wanted)
+
     def _restarted(self, at: Situation) -> Event:
         return Event.RESTARTS_EXHAUSTED if self._last_attempt(at) else Event.BOOT_RESTARTED
 
@@ -249,7 +208,7 @@ class Classifier:
             return Event.RESTARTS_EXHAUSTED if self._last_attempt(at) else Event.REQUEST_LATE
         if not at.tx.idle:
             return Event.COPY_OUTSTANDING
-        return Event.PACKET_LOST if self._last_try(at) else Event.REQUEST_AGAIN
+        return self._packet_lost(at) if self._last_try(at) else Event.REQUEST_AGAIN
 
     def _complete(self, at: Situation) -> Event:
         if at.state in _AFTER_END and at.end_copies_left:

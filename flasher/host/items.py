@@ -11,10 +11,9 @@ import datetime
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any, Final, TypeVar
 
-from flasher.errors import UsageError
+from flasher.errors import UsageError, did_you_mean
 from flasher.protocol import catalogue
 from flasher.protocol.catalogue import Item
 from flasher.protocol.contents import Empty
@@ -43,7 +42,7 @@ class Readable:
 
     @property
     def content(self) -> type[Content]:
-        """What the answer carries."""
+        """What the answer carries. Raises ValueError for an item that is not asked for."""
         answer = catalogue.answer_of(self.item)
         if answer is None:
             raise ValueError(f"{self.item.name} has no answer")
@@ -126,8 +125,7 @@ def find(name: str, among: Mapping[str, Found], target: Target, verb: str) -> Fo
             f"The documents give the tool nothing to {verb} in the {target.node.name}.",
             remedy="Use -t bms; `flasher scan` shows what the other devices send by themselves.",
         )
-    close = get_close_matches(wanted, among, n=1)
-    hint = f"Did you mean {close[0]}? " if close else ""
+    hint = did_you_mean(wanted, among)
     raise UsageError(
         f"There is nothing called {name!a} to {verb} in the {target.node.name}.",
         remedy=f"{hint}There are: {', '.join(among)}.",

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 from flasher import events
 from flasher.events import Phase
-from flasher.host.classify import Situation
 from flasher.host.outcome import Statistics
+from flasher.host.situation import Situation
 from flasher.host.table import Event
 from flasher.protocol.fields import Content
 from flasher.protocol.messages import BootVersion, Malformed, Nak, Row, Unknown
@@ -37,10 +37,7 @@ class Journal:
         self._repetitions = 0
         self._naks = 0
         self._timeouts = 0
-        self._request_at = 0.0
         self._transfer_s: float | None = None
-        self.erased = False
-        """Request transfer came, in any attempt: the old application is gone."""
 
     def take(self) -> Sequence[object]:
         """The events since the last call."""
@@ -65,6 +62,10 @@ class Journal:
         """A phase was entered."""
         self._events.append(events.PhaseEntered(phase, attempt))
 
+    def power_cycle(self, limit_s: float) -> None:
+        """Somebody has to switch the device off and on."""
+        self._events.append(events.PowerCycleAwaited(limit_s))
+
     def attempt(self, attempt: int, reason: Event) -> None:
         """The transfer starts over."""
         self._events.append(events.AttemptStarted(attempt, reason.value))
@@ -82,22 +83,20 @@ class Journal:
         told = events.BytesDamaged(damage.can_id, damage.reason.value, damage.data)
         self._events.append(told)
 
-    def boot_seen(self, boot: BootVersion) -> None:
-        """The first boot version of the attempt came."""
-        told = events.BootVersionSeen(printable(boot.name), printable(boot.version))
-        self._events.append(told)
-
-    def requested(self, now: float) -> None:
-        """The device asks for packet 1."""
-        self.erased = True
-        self._request_at = now
+    def boot_seen(self, boot: BootVersion, minimum: str | None) -> None:
+        """The first boot version of the attempt came, and is not below the `minimum`."""
+        version = printable(boot.version)
+        self._events.append(events.BootVersionSeen(printable(boot.name), version))
+        if minimum is not None:
+            text = f"the bootloader {version} is not older than {minimum}, as the manifest asks"
+            self._events.append(events.CheckMade("boot-version", "passed", text))
 
     def packet_done(self, at: Situation, total: int, now: float) -> None:
         """The packet in work is acknowledged; the last one ends the transfer."""
         self._acknowledged = at.number
         self._events.append(events.PacketAcknowledged(at.number, total, at.tries))
         if at.number == total:
-            self._transfer_s = now - self._request_at
+            self._transfer_s = now - at.request_at
 
     def repeated(self, what: str, reason: Event, tries: int) -> None:
         """A message is sent again."""

@@ -13,6 +13,10 @@ from flasher.protocol.spec import Command, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 
 DEFAULT_ATTEMPTS: Final = 3
+DEFAULT_POWER_UP_TIMEOUT_S: Final = 60.0
+"""Long enough to walk to the bicycle and unplug its battery."""
+DEFAULT_ADAPTER_RETURN_S: Final = 0.8
+"""A bus-off recovers and an interface comes up again within this; a pulled plug ends within 1 s."""
 
 
 @dataclass(frozen=True)
@@ -21,7 +25,8 @@ class UpgradeOptions:
 
     timings: Timings = DEFAULT_TIMINGS
     attempts: int = DEFAULT_ATTEMPTS
-    """How often the transfer may begin, restarts of the device included."""
+    """How often the upgrade may begin: after a restart of the device, an adapter that was lost and
+    came back, or a packet whose tries are exhausted."""
     timeout_s: float | None = None
     """Overall deadline; None computes one from the plan."""
     frame_gap_s: float = 0.0
@@ -38,6 +43,19 @@ class UpgradeOptions:
     has one."""
     allow_boot_name: bool = False
     """Upgrade a device whose bootloader gives another name, or no version, than the target's."""
+    minimum_boot_version: str | None = None
+    """Oldest bootloader, as `Vx.x.x`, that may be given the image; None is any."""
+    at_power_up: bool = False
+    """Send no reset: wait for the announcement of a device that is switched on."""
+    power_up_timeout_s: float = DEFAULT_POWER_UP_TIMEOUT_S
+    """How long such an announcement is waited for."""
+    adapter_return_s: float = DEFAULT_ADAPTER_RETURN_S
+    """How long a lost adapter is tried to be opened again."""
+
+    @property
+    def boot_timeout_s(self) -> float:
+        """How long a boot version is waited for."""
+        return self.power_up_timeout_s if self.at_power_up else self.timings.boot_version_timeout_s
 
     def version_request_for(self, target: Target) -> Request | None:
         """How to ask this target for its version; None where nobody knows."""
@@ -52,6 +70,11 @@ def firmware_version(answer: Content) -> str:
     return str(getattr(answer, "firmware_version", ""))
 
 
+def overall_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
+    """The overall deadline: the one that was chosen, else the default of the plan."""
+    return default_timeout_s(plan, options) if options.timeout_s is None else options.timeout_s
+
+
 def default_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
     """The overall deadline for a plan: every attempt with every wait at its limit, so that it cuts
     off no device that answers in time, only one that needs repetition after repetition.
@@ -59,7 +82,9 @@ def default_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
     timings = options.timings
     gaps_s = options.packet_gap_s * plan.total_packets + options.frame_gap_s * plan.frames
     answers_s = timings.ack_timeout_s * plan.total_packets
-    begin_s = timings.boot_version_timeout_s + timings.request_transfer_timeout_s
+    begin_s = timings.command_timeout_s + options.boot_timeout_s
+    begin_s += timings.request_transfer_timeout_s
     transfer_s = plan.wire_s + gaps_s + answers_s
     end_s = timings.complete_timeout_s * timings.end_tries + timings.application_start_timeout_s
-    return options.attempts * (begin_s + transfer_s) + end_s
+    away_s = (options.attempts - 1) * options.adapter_return_s
+    return options.attempts * (begin_s + transfer_s) + away_s + end_s

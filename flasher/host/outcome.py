@@ -11,6 +11,7 @@ from enum import Enum
 from typing import Final, NamedTuple, assert_never
 
 from flasher.errors import (
+    BusError,
     FlasherError,
     InterruptedByUserError,
     NoAnswerError,
@@ -22,6 +23,7 @@ from flasher.errors import (
 )
 from flasher.events import Phase
 from flasher.host.table import Ending
+from flasher.image.plan import Plan
 from flasher.protocol.spec import Target
 
 
@@ -39,6 +41,11 @@ class DeviceLeft(Enum):
     )
     UNKNOWN = "it has every byte of the image; whether it runs it is not known"
     NEW = "it has the new image"
+
+    @property
+    def needs_rescue(self) -> bool:
+        """True when it has no application, or perhaps none."""
+        return self not in (DeviceLeft.UNTOUCHED, DeviceLeft.NEW)
 
 
 @dataclass(frozen=True)
@@ -91,9 +98,16 @@ class Outcome:
         """Phase, packet and attempt in words."""
         return standing(self.phase, self.packet, self.total_packets, self.statistics.attempts)
 
+    @property
+    def nothing_to_do(self) -> bool:
+        """True when the device was left alone on request, as it runs the version already."""
+        return self.ending is Ending.UP_TO_DATE
+
     def error(self) -> FlasherError | None:
-        """The error that stands for this outcome; None when it is a good one."""
-        if self.ok:
+        """The error that stands for this outcome; None when it is a good one, or when there was
+        nothing to do.
+        """
+        if self.ok or self.nothing_to_do:
             return None
         kind, cause, remedy = (
             _late(self.phase, self.device_left)
@@ -104,12 +118,30 @@ class Outcome:
         if self.detail:
             what += f" ({self.detail})"
         names = {"node": self.target.node.name, "boot_name": self.target.boot_name}
-        return kind(
+        error = kind(
             f"{what}.",
             where=self.where,
             cause=cause.format(**names),
             remedy=f"{remedy.format(**names)} State of the device: {self.device_left.value}.",
         )
+        error.needs_rescue = self.device_left.needs_rescue
+        return error
+
+
+def before_the_start(plan: Plan, ending: Ending, detail: str, *, duration_s: float) -> Outcome:
+    """The outcome of a session that ends before its upgrade has begun."""
+    return Outcome(
+        ending=ending,
+        phase=Phase.IDENTIFY,
+        device_left=DeviceLeft.UNTOUCHED,
+        target=plan.target,
+        total_packets=plan.total_packets,
+        packet=None,
+        boot_version=None,
+        running_version=None,
+        statistics=Statistics(duration_s=duration_s),
+        detail=detail,
+    )
 
 
 class _Explanation(NamedTuple):
@@ -127,8 +159,15 @@ _EXPLANATIONS: Final = {
         NoAnswerError,
         "the device has no power, sleeps, is not on this bus, the bit rate differs, or its "
         "bootloader announces itself only at power-up",
-        "Check supply, wiring, termination and bit rate. Else switch the device off, start the "
-        "same command and switch it on at once: its announcement at power-up is answered.",
+        "Check supply, wiring, termination and bit rate (flasher doctor). A device that announces "
+        "itself at power-up only is reached by flasher rescue and a power cycle.",
+    ),
+    Ending.NO_ANNOUNCEMENT: _Explanation(
+        NoAnswerError,
+        "nobody switched it off and on, it has no power, it is not on this bus, or the bit rate "
+        "differs",
+        f"{_AGAIN} Take the device's supply away for some seconds when you are asked to (a battery "
+        "wakes by its key or charger); --wait allows more time.",
     ),
     Ending.NO_REQUEST: _Explanation(
         NoAnswerError,
@@ -145,6 +184,26 @@ _EXPLANATIONS: Final = {
         "the connected device is no {node}, whose bootloader calls itself {boot_name} Vx.x.x",
         "Check -t/--target and what is connected; --allow-boot-name takes the device as it is.",
     ),
+    Ending.BOOT_TOO_OLD: _Explanation(
+        WrongDeviceError,
+        "the image's manifest asks for a newer bootloader",
+        "Look for an image for this bootloader; --allow-boot-version takes the device as it is.",
+    ),
+    Ending.NOT_FOR_DEVICE: _Explanation(
+        WrongDeviceError,
+        "another file was meant, another device is connected, or the manifest is not up to date",
+        "Compare the image (flasher image-info) with the device (flasher info).",
+    ),
+    Ending.IN_USE: _Explanation(
+        WrongDeviceError,
+        "somebody rides it, or a load draws current",
+        "Let it stand still and switch its loads off; --allow-in-use upgrades it all the same.",
+    ),
+    Ending.SECOND_TOOL: _Explanation(
+        BusError,
+        "another program or dongle speaks as the CAN dongle (CDL) on this bus",
+        f"End the other tool and disconnect it. {_AGAIN}",
+    ),
     Ending.TWO_DEVICES: _Explanation(
         WrongDeviceError,
         "two devices of the same kind are on the bus",
@@ -154,12 +213,14 @@ _EXPLANATIONS: Final = {
         TransferError,
         "the device lost power or contact, the line is disturbed, or the device cannot store this "
         "packet",
-        f"Check supply and wiring. {_AGAIN}",
+        f"Check supply and wiring. {_AGAIN} A device that stays silent needs flasher rescue and a "
+        "power cycle.",
     ),
     Ending.RESTARTED: _Explanation(
         TransferError,
-        "its supply drops, its watchdog bites, or it does not accept what it is sent",
-        f"Check the supply. {_AGAIN}",
+        "its supply drops, its watchdog bites, it does not accept what it is sent, or two devices "
+        "of the same kind answer",
+        f"Check the supply, and that there is one {{node}} only. {_AGAIN}",
     ),
     Ending.BROKEN_PROTOCOL: _Explanation(
         TransferError,
@@ -194,7 +255,7 @@ def _late(phase: Phase, left: DeviceLeft) -> _Explanation:
     """The explanation of a passed deadline, by what had been reached."""
     remedy = f"Allow more time with --timeout, or find what is slow. {_AGAIN}"
     match phase:
-        case Phase.RESET | Phase.BOOT | Phase.UPDATE:
+        case Phase.IDENTIFY | Phase.RESET | Phase.BOOT | Phase.UPDATE:
             cause = "the device is not there, or not ready in the time allowed"
             return _Explanation(NoAnswerError, cause, remedy)
         case Phase.END if left is not DeviceLeft.UNKNOWN:

@@ -34,6 +34,7 @@ class Event(Enum):
     BOOT_VERSION = "boot version"
     BOOT_TOO_SOON = "boot version too soon after the update command"
     BOOT_WRONG = "boot version of another device"
+    BOOT_TOO_OLD = "boot version older than the image needs"
     BOOT_CHANGED = "another boot version in one burst"
     BOOT_UNHEARING = "boot version although told to update for long"
     BOOT_LEFTOVER = "leftover boot version"
@@ -47,7 +48,8 @@ class Event(Enum):
     LAST_PACKET_DONE = "last packet acknowledged"
     PACKET_REFUSED = "packet refused"
     PACKET_UNANSWERED = "packet not answered"
-    PACKET_LOST = "packet refused or not answered, no try left"
+    PACKET_GIVEN_UP = "packet refused or not answered, no try left, an attempt left"
+    PACKET_LOST = "packet refused or not answered, no try and no attempt left"
     COPY_OUTSTANDING = "answered, another copy is not"
     ANSWER_STALE = "stale ACK or NAK"
     ANSWER_UNEXPECTED = "ACK or NAK for another packet"
@@ -67,7 +69,12 @@ class Event(Enum):
     QUERY_DUE = "version not answered yet"
     QUERY_UNANSWERED = "version not answered"
     BOOT_MISSING = "no boot version in time"
+    POWER_UP_MISSING = "no boot version in time, waited for at power-up"
+    BOOT_GIVEN_UP = "no boot version of a device that was told to update, an attempt left"
+    BOOT_LOST = "no boot version after a lost packet, no attempt left"
     REQUEST_MISSING = "no request transfer in time"
+    LINK_BACK = "the adapter was lost and is back"
+    SECOND_TOOL = "somebody else speaks as the tool"
     UNEXPECTED = "message that has no place here"
     OUT_OF_TIME = "overall deadline"
     CANCEL = "cancelled by the user"
@@ -83,6 +90,7 @@ class Action(Enum):
     AWAIT_BOOT = "wait for the boot version"
     SEND_UPDATE = "send update command"
     START_OVER = "start over: send update command"
+    BEGIN_AGAIN = "begin again: send reset"
     SEND_FIRST_PACKET = "send packet 1"
     SEND_NEXT_PACKET = "send the next packet"
     REPEAT_PACKET = "send the packet again"
@@ -102,15 +110,25 @@ class Ending(Enum):
     OTHER_VERSION = "another version answers than the one that was sent"
     REFUSED = "the device refused the image at the end"
     NO_BOOT_VERSION = "no boot version came"
+    NO_ANNOUNCEMENT = "it did not announce itself"
     NO_REQUEST = "no request transfer came"
     UNHEARING = "the bootloader announces itself but does not take the update command"
     WRONG_DEVICE = "another device answers"
+    BOOT_TOO_OLD = "its bootloader is older than the image needs"
     TWO_DEVICES = "two devices answer on the same id"
+    NOT_FOR_DEVICE = "the image is not meant for this device"
+    IN_USE = "the vehicle is in use"
+    UP_TO_DATE = "the device already runs this version"
+    SECOND_TOOL = "a second tool speaks on the bus"
     PACKET_FAILED = "a packet was not acknowledged"
     RESTARTED = "the device restarted too often"
     BROKEN_PROTOCOL = "the device completed before it was told that the transfer had ended"
     OUT_OF_TIME = "the overall deadline passed"
     CANCELLED = "cancelled by the user"
+
+
+BEFORE_THE_START: Final = frozenset({Ending.NOT_FOR_DEVICE, Ending.IN_USE, Ending.UP_TO_DATE})
+"""Endings of a session whose upgrade is never begun: the table does not hold them."""
 
 
 class Transition(NamedTuple):
@@ -132,7 +150,8 @@ def _row(
 ) -> _Row:
     """A complete row: the moves, what is ignored or reported where it stands, the rest impossible.
 
-    Every state but the last two ends on the deadline and on the user's word.
+    Every state but the last two ends on the deadline, on the user's word and on a second tool, and
+    begins again when a lost adapter is back.
     """
     row = {event: Transition(Action.IMPOSSIBLE, state) for event in Event}
     row.update({event: Transition(Action.NOTHING, state) for event in ignored})
@@ -140,6 +159,8 @@ def _row(
     row[Event.UNEXPECTED] = Transition(Action.REPORT, state)
     row[Event.OUT_OF_TIME] = Transition(Ending.OUT_OF_TIME, State.STOPPING)
     row[Event.CANCEL] = Transition(Ending.CANCELLED, State.STOPPING)
+    row[Event.SECOND_TOOL] = Transition(Ending.SECOND_TOOL, State.STOPPING)
+    row[Event.LINK_BACK] = Transition(Action.BEGIN_AGAIN, State.RESETTING)
     row.update({event: Transition(*move) for event, move in moves.items()})
     return row
 
@@ -147,6 +168,7 @@ def _row(
 _BEFORE_UPDATE: Final[dict[Event, tuple[Action | Ending, State]]] = {
     Event.BOOT_VERSION: (Action.SEND_UPDATE, State.AWAITING_REQUEST),
     Event.BOOT_WRONG: (Ending.WRONG_DEVICE, State.STOPPING),
+    Event.BOOT_TOO_OLD: (Ending.BOOT_TOO_OLD, State.STOPPING),
 }
 
 TABLE: Final[Mapping[State, _Row]] = {
@@ -162,7 +184,13 @@ TABLE: Final[Mapping[State, _Row]] = {
     ),
     State.AWAITING_BOOT: _row(
         State.AWAITING_BOOT,
-        _BEFORE_UPDATE | {Event.BOOT_MISSING: (Ending.NO_BOOT_VERSION, State.STOPPING)},
+        _BEFORE_UPDATE
+        | {
+            Event.BOOT_MISSING: (Ending.NO_BOOT_VERSION, State.STOPPING),
+            Event.POWER_UP_MISSING: (Ending.NO_ANNOUNCEMENT, State.STOPPING),
+            Event.BOOT_GIVEN_UP: (Action.BEGIN_AGAIN, State.RESETTING),
+            Event.BOOT_LOST: (Ending.PACKET_FAILED, State.STOPPING),
+        },
         ignored=(Event.FEEDBACK,),
     ),
     State.AWAITING_REQUEST: _row(
@@ -185,6 +213,7 @@ TABLE: Final[Mapping[State, _Row]] = {
             Event.LAST_PACKET_DONE: (Action.SEND_END, State.ENDING),
             Event.PACKET_REFUSED: (Action.REPEAT_PACKET, State.TRANSFERRING),
             Event.PACKET_UNANSWERED: (Action.REPEAT_PACKET, State.TRANSFERRING),
+            Event.PACKET_GIVEN_UP: (Action.BEGIN_AGAIN, State.RESETTING),
             Event.PACKET_LOST: (Ending.PACKET_FAILED, State.STOPPING),
             Event.COPY_OUTSTANDING: (Action.AWAIT_QUIET, State.SETTLING),
             Event.REQUEST_AGAIN: (Action.REPEAT_PACKET, State.TRANSFERRING),
@@ -205,6 +234,7 @@ TABLE: Final[Mapping[State, _Row]] = {
             Event.PACKET_DONE: (Action.SEND_NEXT_PACKET, State.TRANSFERRING),
             Event.LAST_PACKET_DONE: (Action.SEND_END, State.ENDING),
             Event.PACKET_REFUSED: (Action.REPEAT_PACKET, State.TRANSFERRING),
+            Event.PACKET_GIVEN_UP: (Action.BEGIN_AGAIN, State.RESETTING),
             Event.PACKET_LOST: (Ending.PACKET_FAILED, State.STOPPING),
             Event.COPY_OUTSTANDING: (Action.AWAIT_QUIET, State.SETTLING),
             Event.REQUEST_AGAIN: (Action.AWAIT_QUIET, State.SETTLING),
@@ -231,6 +261,8 @@ TABLE: Final[Mapping[State, _Row]] = {
             Event.END_UNCONFIRMABLE: (Ending.UNCONFIRMED, State.STOPPING),
             Event.BOOT_AFTER_END: (Action.AWAIT_BURST_END, State.ENDING),
             Event.BURST_ENDED: (Action.QUERY_VERSION, State.CONFIRMING),
+            # Every packet is acknowledged: whatever was lost, only the end is missing.
+            Event.LINK_BACK: (Action.REPEAT_END, State.ENDING),
             Event.BOOT_RESTARTED: (Action.START_OVER, State.AWAITING_REQUEST),
             Event.RESTARTS_EXHAUSTED: (Ending.RESTARTED, State.STOPPING),
         },
@@ -246,6 +278,7 @@ TABLE: Final[Mapping[State, _Row]] = {
             Event.VERSION_OTHER: (Ending.OTHER_VERSION, State.STOPPING),
             Event.VERSION_UNJUDGED: (Ending.UNCONFIRMED, State.STOPPING),
             Event.QUERY_DUE: (Action.QUERY_VERSION, State.CONFIRMING),
+            Event.LINK_BACK: (Action.QUERY_VERSION, State.CONFIRMING),
             Event.QUERY_UNANSWERED: (Ending.UNCONFIRMED, State.STOPPING),
             Event.BOOT_AFTER_END: (Action.NOTHING, State.CONFIRMING),
             Event.BOOT_RESTARTED: (Action.START_OVER, State.AWAITING_REQUEST),

@@ -12,8 +12,9 @@ from enum import Enum
 from typing import Final
 
 from flasher import events
-from flasher.errors import FlasherError, InterruptedByUserError, VerificationError
+from flasher.errors import BusError, FlasherError, InterruptedByUserError, VerificationError
 from flasher.host.options import UpgradeOptions, firmware_version
+from flasher.host.outcome import DeviceLeft
 from flasher.host.query import Query, Request
 from flasher.host.read import READ_MEMORY, memory_requests, piece_of
 from flasher.image.plan import Plan
@@ -44,9 +45,11 @@ class Verdict(Enum):
     VERSION_OTHER = "the application runs another version than the image names"
     NO_ANSWER = "the application does not answer"
     MEMORY_OTHER = "the memory differs from the image"
+    SECOND_TOOL = "a second tool speaks on the bus"
     INTERRUPTED = "interrupted by the user"
 
 
+_IT_HAS: Final = f"State of the device: {DeviceLeft.NEW.value}."
 GOOD: Final = frozenset(
     {Verdict.NOT_ASKED, Verdict.VERSION_RIGHT, Verdict.VERSION_UNJUDGED, Verdict.MEMORY_RIGHT}
 )
@@ -73,7 +76,18 @@ class Verification:
         what = f"{target.node.name}: completed, but {self.verdict.value}"
         what += f" ({self.detail})." if self.detail else "."
         if self.verdict is Verdict.INTERRUPTED:
-            return InterruptedByUserError(what, remedy="Ask for the version with flasher info.")
+            return InterruptedByUserError(
+                what,
+                where=f"verification by {self.level.value}",
+                remedy=f"See with flasher info what it runs. {_IT_HAS}",
+            )
+        if self.verdict is Verdict.SECOND_TOOL:
+            return BusError(
+                what,
+                where=f"verification by {self.level.value}",
+                cause="another program or dongle speaks as the CAN dongle (CDL) on this bus",
+                remedy=f"End the other tool, then look at the device with flasher info. {_IT_HAS}",
+            )
         return VerificationError(
             what,
             where=f"verification by {self.level.value}",

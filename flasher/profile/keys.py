@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 from dataclasses import dataclass
 from typing import Any, Final
 
-from flasher.errors import UsageError
+from flasher.errors import UsageError, did_you_mean
 from flasher.protocol.spec import COMMAND_SIZE, IMAGE_MAX_SIZE, LENGTH_MAX, TARGETS
 from flasher.protocol.timing import Timings
 
@@ -65,8 +64,12 @@ GROUPS: Final = ("timings", "application_area", "version_query")
 """Keys that stand in tables of their own."""
 KEYS: Final[dict[str, Key]] = {
     "has_upgrade": Key(bool, "upgrade even where the document has cancelled it"),
-    "attempts": Key(int, "how often the transfer may begin", 1, _TRIES_LIMIT),
+    "attempts": Key(int, "how often the upgrade may begin", 1, _TRIES_LIMIT),
     "timeout_s": Key(float, "overall deadline", 0, 24 * _TIME_LIMIT_S, above=True),
+    "power_up_timeout_s": Key(float, "wait for a power cycle", 0, 24 * _TIME_LIMIT_S, above=True),
+    "adapter_return_s": Key(float, "wait for a lost adapter", 0, _TIME_LIMIT_S),
+    "low_charge_percent": Key(int, "warn below this state of charge", 0, 100),
+    "in_use_ma": Key(int, "a discharge beyond this is a vehicle in use", 0, 0x7FFF),
     "frame_gap_s": Key(float, "silence between the frames of a message", 0, 1.0),
     "packet_gap_s": Key(float, "silence before each packet", 0, 60.0),
     "nak_next_is_ack": Key(bool, "NAK n+1 after a repeated packet n is ACK n (R10)"),
@@ -130,8 +133,7 @@ def explain_unknown(key: str, file: str, prefix: str) -> UsageError:
     where = f"{prefix}{group}".rstrip(".")
     place = f"in [{where}]" if where else "for every device"
     places = {known.rpartition(".")[2]: known for known in KEYS} | {name: name for name in GROUPS}
-    close = difflib.get_close_matches(name, places, n=1)
-    suggestion = f"Did you mean {_spelled(places[close[0]], prefix)}? " if close else ""
+    suggestion = did_you_mean(name, places, lambda known: _spelled(places[known], prefix))
     siblings = [known for known in KEYS if known.rpartition(".")[0] == group]
     listed = ", ".join(known.rpartition(".")[2] for known in siblings)
     tables = "" if group else f"; tables: {', '.join(GROUPS)}"

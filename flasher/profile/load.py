@@ -170,7 +170,7 @@ def _build(target: Target, dialect: Dialect, given: Mapping[str, Any], path: str
         target,
         dialect,
         has_upgrade=dialect.has_upgrade,
-        version_query=_documented_query(target),
+        version_query=documented_query(target),
     )
     parts = {name: _group(name, getattr(defaults, name), given, file) for name in GROUPS}
     plain = {name: value for name, value in given.items() if "." not in name}
@@ -201,7 +201,7 @@ def _group(name: str, default: Any, given: Mapping[str, Any], file: str) -> Any:
     return kind(**values)
 
 
-def _documented_query(target: Target) -> VersionQuery | None:
+def documented_query(target: Target) -> VersionQuery | None:
     """Version information as chapter 3 has it, for the BMS only."""
     if not target.has_version_query:
         return None

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, fields, make_dataclass, replace
 from typing import Any
 
 from flasher.errors import ImageError
+from flasher.host.identity import Identity
 from flasher.host.options import UpgradeOptions
 from flasher.host.query import Request
 from flasher.image.image import Image
@@ -99,6 +100,12 @@ class Profile:
     attempts: int = UpgradeOptions.attempts
     timeout_s: float | None = None
     """Overall deadline; None computes one from the plan."""
+    power_up_timeout_s: float = UpgradeOptions.power_up_timeout_s
+    adapter_return_s: float = UpgradeOptions.adapter_return_s
+    low_charge_percent: int = Identity.low_charge_percent
+    """Below this state of charge there is a warning before an upgrade."""
+    in_use_ma: int = Identity.in_use_ma
+    """A discharge beyond this means that the vehicle is in use."""
     frame_gap_s: float = UpgradeOptions.frame_gap_s
     packet_gap_s: float = UpgradeOptions.packet_gap_s
     nak_next_is_ack: bool = UpgradeOptions.nak_next_is_ack
@@ -150,6 +157,14 @@ class Profile:
         base: Timings = options["timings"]
         options["timings"] = replace(base, **timings)
         return UpgradeOptions(**options)
+
+    def identity(self, **overrides: Any) -> Identity:
+        """What is checked before an upgrade, with the limits of this product. `overrides` are the
+        other fields of `Identity`.
+        """
+        return Identity(
+            low_charge_percent=self.low_charge_percent, in_use_ma=self.in_use_ma, **overrides
+        )
 
     def values(self) -> Iterator[tuple[str, object]]:
         """Every value with its name; those of a table have the table's name before a point. A table

@@ -18,6 +18,7 @@ import pytest
 
 import flasher
 from flasher import api, errors, events
+from flasher.bus.health import HealthKeeper, LinkHealth
 from flasher.bus.link import MonotonicClock, VirtualClock
 from flasher.bus.simulated import Disturbance, SimulatedBus
 from flasher.device.model import Device
@@ -77,6 +78,7 @@ def test_events_arrive_in_order_while_it_runs() -> None:
     seen: list[object] = []
     flasher.flash(IMAGE, "bms", mock=True, on_event=seen.append)
     assert [event.phase for event in seen if isinstance(event, events.PhaseEntered)] == [
+        events.Phase.IDENTIFY,
         events.Phase.RESET,
         events.Phase.BOOT,
         events.Phase.UPDATE,
@@ -158,7 +160,6 @@ BAD_ENDINGS: list[tuple[str, dict[str, Any], UpgradeOptions, type[FlasherError],
 @pytest.mark.parametrize(("ending", "choices", "options", "kind", "code"), BAD_ENDINGS)
 def test_each_bad_ending_is_raised_as_its_own_error_with_its_exit_code(
     at_once: dict[str, Any],
-    monkeypatch: pytest.MonkeyPatch,
     ending: str,
     choices: dict[str, Any],
     options: UpgradeOptions,
@@ -166,10 +167,7 @@ def test_each_bad_ending_is_raised_as_its_own_error_with_its_exit_code(
     code: ExitCode,
 ) -> None:
     choices = dict(choices)
-    if not choices.pop("has_application", True):
-        monkeypatch.setattr(
-            api, "Device", lambda *given, **named: Device(*given, **named, has_application=False)
-        )
+    at_once["has_application"] = choices.pop("has_application", True)
     at_once["profile"] = DeviceProfile(**choices)
     with pytest.raises(FlasherError) as caught:
         flasher.flash(IMAGE, "bms", mock=True, options=options)
@@ -276,6 +274,12 @@ class FakeLink:
 
     def drain(self) -> int:
         return 0
+
+    def reopen(self) -> None:
+        raise BusError("the adapter is not back")
+
+    def health(self) -> LinkHealth:
+        return HealthKeeper().health()
 
     def close(self) -> None:
         self.closed += 1
@@ -427,24 +431,24 @@ def test_the_examples_of_the_tour_run(
     ]
     assert len(examples) == 5
     opened: list[dict[str, Any]] = []
+    real: Connect = api.connect_mock
 
     def connect(_dialect: object = None, **bus: Any) -> AbstractContextManager[api.Connection]:
         opened.append(bus)
-        return flasher.connect_mock("bms", speed=0)
+        return real("bms", speed=0)
 
     monkeypatch.setattr(api, "connect", connect)
     monkeypatch.setattr(flasher, "connect", connect)
     monkeypatch.chdir(tmp_path)
-    sample = Path(__file__).parents[2] / "firmware_samples" / "wmc.hex"
+    sample = Path(__file__).parents[2] / "firmware_samples" / "bms.hex"
     Path("firmware.hex").write_bytes(sample.read_bytes())
-    real: Connect = api.connect_mock
     monkeypatch.setattr(api, "connect_mock", lambda *given: real(*given, speed=0.0))
     names: dict[str, Any] = {"flasher": flasher}
     for example in examples:
         exec(example, names)  # noqa: S102  our own documentation
     said = capsys.readouterr().out
-    assert "PacketAcknowledged(number=92, total=92, tries=1)" in said
-    assert re.search(r"^92 [\d.]+$", said, re.MULTILINE)
+    assert "PacketAcknowledged(number=613, total=613, tries=1)" in said
+    assert re.search(r"^613 [\d.]+$", said, re.MULTILINE)
     assert "Ending.COMPLETED DeviceLeft.NEW None" in said
     assert [bus["interface"] for bus in opened] == ["socketcan", "pcan", "socketcan"]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flasher.host.outcome import _EXPLANATIONS
-from flasher.host.table import TABLE, Action, Ending, Event, State
+from flasher.host.table import BEFORE_THE_START, TABLE, Action, Ending, Event, State
 from flasher.host.upgrade import Upgrade
 
 RUNNING = [state for state in State if state not in {State.STOPPING, State.DONE}]
@@ -26,9 +26,11 @@ def test_every_action_has_its_method_and_is_used() -> None:
 
 def test_every_ending_is_reached_and_explained() -> None:
     used = {move.action for row in TABLE.values() for move in row.values()}
-    assert set(Ending) <= used
+    assert set(Ending) - BEFORE_THE_START <= used
+    assert not BEFORE_THE_START & used
     good = {Ending.COMPLETED, Ending.CONFIRMED_BY_VERSION}
-    assert set(_EXPLANATIONS) == set(Ending) - good - {Ending.OUT_OF_TIME}
+    unexplained = {Ending.OUT_OF_TIME, Ending.UP_TO_DATE}
+    assert set(_EXPLANATIONS) == set(Ending) - good - unexplained
 
 
 def test_every_state_is_reached_from_the_first() -> None:

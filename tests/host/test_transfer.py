@@ -26,6 +26,8 @@ from flasher.protocol.messages import (
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from tests.host.bench import BOOT, Bench, answer_frames
 
+ONE_ATTEMPT = UpgradeOptions(attempts=1)
+
 # -- NAK and silence (R12, TX-09) ----------------------------------------------------------------
 
 
@@ -53,7 +55,7 @@ def test_a_packet_may_be_refused_as_often_as_there_are_tries_but_one(naks: int) 
 
 
 def test_the_last_try_refused_ends_the_upgrade_naming_the_packet() -> None:
-    bench = Bench(300)
+    bench = Bench(300, options=ONE_ATTEMPT)
     bench.to_packet(2)
     for _ in range(4):
         bench.say(Nak(2))
@@ -82,7 +84,7 @@ def test_the_answer_may_come_up_to_500_ms_after_the_packet_has_left(
 
 
 def test_a_silent_device_gets_every_try_and_then_the_upgrade_ends() -> None:
-    bench = Bench()
+    bench = Bench(options=ONE_ATTEMPT)
     bench.to_packet(2)
     bench.wait(10.0)
     copies = [row for _, row in bench.sent if isinstance(row, Packet) and row.number == 2]
@@ -241,7 +243,7 @@ def test_nak_n_plus_1_for_a_packet_sent_once_is_never_an_ack() -> None:
 
 
 def test_the_failure_names_the_option_when_the_device_answers_nak_n_plus_1() -> None:
-    bench = Bench(100)
+    bench = Bench(100, options=ONE_ATTEMPT)
     bench.to_packet(1)
     while not bench.engine.done:
         bench.wait(0.5)
@@ -326,7 +328,7 @@ def test_request_transfer_doubled_at_once_does_no_harm() -> None:
 
 
 def test_request_transfer_again_and_again_is_bounded() -> None:
-    bench = Bench()
+    bench = Bench(options=ONE_ATTEMPT)
     bench.to_packet(1)
     for _ in range(20):
         bench.wait(0.06)

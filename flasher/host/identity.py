@@ -1,0 +1,237 @@
+"""Whether this image belongs into this device, judged before the first write to it.
+
+Two halves: what the image and its manifest say by themselves (`judge_image`), and what the running
+application answers (`judge_device`). The bootloader's own name and version are judged by the
+upgrade when they are announced. Each check is waived by its own option; where there is nothing to
+check against, the finding says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, NamedTuple
+
+from flasher.events import CheckMade
+from flasher.host.options import firmware_version
+from flasher.host.table import Ending
+from flasher.image.image import Image
+from flasher.image.release import Release, target_problem
+from flasher.protocol.contents import RunningInformation
+from flasher.protocol.fields import Content
+from flasher.protocol.spec import Target
+from flasher.protocol.text import FirmwareVersion, printable
+
+DEFAULT_LOW_CHARGE_PERCENT: Final = 20
+DEFAULT_IN_USE_MA: Final = 1000
+"""More than lights and displays take, less than the motor."""
+
+
+class Check(Enum):
+    """What is checked; the value names it, and the option that waives it."""
+
+    TARGET = "other-target"
+    HARDWARE = "hardware"
+    DOWNGRADE = "downgrade"
+    PREVIOUS = "previous-version"
+    SAME_VERSION = "same-version"
+    IN_USE = "in-use"
+    CHARGE = "low-charge"
+
+    @property
+    def option(self) -> str:
+        """The option that waives it."""
+        return f"--allow-{self.value}"
+
+
+WAIVABLE: Final = (
+    Check.TARGET,
+    Check.HARDWARE,
+    Check.DOWNGRADE,
+    Check.PREVIOUS,
+    Check.IN_USE,
+)
+"""Checks that refuse; the others report."""
+_ENDINGS: Final[Mapping[Check, Ending]] = {
+    Check.IN_USE: Ending.IN_USE,
+    Check.SAME_VERSION: Ending.UP_TO_DATE,
+}
+"""How a refused check ends the session, where it is not that the image does not belong there."""
+
+
+class Verdict(Enum):
+    """What a check found; the value is its name in events."""
+
+    PASSED = "passed"
+    UNKNOWN = "unknown"
+    """There is nothing to check against."""
+    WARNED = "warned"
+    WAIVED = "waived"
+    REFUSED = "refused"
+    SKIPPED = "skipped"
+    """Left alone on request."""
+
+
+class Finding(NamedTuple):
+    """One check and what it found, in one sentence."""
+
+    check: Check
+    verdict: Verdict
+    text: str
+
+    @property
+    def event(self) -> CheckMade:
+        """It, as it is reported."""
+        return CheckMade(self.check.value, self.verdict.value, self.text)
+
+    @property
+    def ending(self) -> Ending | None:
+        """How it ends the session; None when it does not."""
+        if self.verdict not in (Verdict.REFUSED, Verdict.SKIPPED):
+            return None
+        return _ENDINGS.get(self.check, Ending.NOT_FOR_DEVICE)
+
+    @property
+    def detail(self) -> str:
+        """What is wrong, and the option that waives it."""
+        waiver = f"; {self.check.option} waives this" if self.check in WAIVABLE else ""
+        return f"{self.text}{waiver}"
+
+
+@dataclass(frozen=True)
+class Identity:
+    """What is known and wanted about image and device before an upgrade."""
+
+    release: Release | None = None
+    """The image's manifest; None where there is none."""
+    waived: frozenset[Check] = frozenset()
+    skip_same_version: bool = False
+    low_charge_percent: int = DEFAULT_LOW_CHARGE_PERCENT
+    """Below this state of charge there is a warning."""
+    in_use_ma: int = DEFAULT_IN_USE_MA
+    """A discharge beyond this means that the vehicle is in use."""
+
+    def refusal(self, check: Check, text: str) -> Finding:
+        """A finding against the upgrade, or that it is waived."""
+        return Finding(check, Verdict.WAIVED if check in self.waived else Verdict.REFUSED, text)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the running application told; None where it did not answer or was not asked."""
+
+    version: Content | None = None
+    running: RunningInformation | None = None
+
+    @property
+    def hardware_version(self) -> str | None:
+        """Escaped."""
+        hardware = getattr(self.version, "hardware_version", None)
+        return None if hardware is None else str(hardware)
+
+    @property
+    def firmware_version(self) -> str | None:
+        """Escaped."""
+        return None if self.version is None else firmware_version(self.version)
+
+
+def new_version(image: Image, release: Release | None) -> str | None:
+    """The version that the image is: its own word, else the manifest's."""
+    return image.version or (release.firmware_version if release else None)
+
+
+# -- the image by itself ----------------------------------------------------------------------
+
+
+def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Finding]:
+    """What the image and its manifest say of the target."""
+    problem = target_problem(image, identity.release, target)
+    wanted = target.node.name
+    if problem is not None:
+        yield identity.refusal(Check.TARGET, problem)
+    elif identity.release is not None or image.named_targets:
+        source = "the manifest" if identity.release is not None else "a name inside the image"
+        yield Finding(Check.TARGET, Verdict.PASSED, f"by {source} the image is for the {wanted}")
+    else:
+        text = "no manifest, and the image names no device: nobody can tell whether it is for the "
+        yield Finding(Check.TARGET, Verdict.UNKNOWN, text + wanted)
+
+
+# -- the device -------------------------------------------------------------------------------
+
+
+def judge_device(image: Image, target: Target, identity: Identity, seen: Seen) -> Iterator[Finding]:
+    """What the running application says of the image. `seen` is empty where it did not answer."""
+    if seen.version is None:
+        text = f"the {target.node.name}'s application does not tell its versions: neither hardware"
+        yield Finding(Check.HARDWARE, Verdict.UNKNOWN, text + " nor downgrade can be checked")
+    else:
+        yield _hardware(identity, seen.hardware_version)
+        yield from _versions(image, identity, seen.firmware_version or "")
+    if seen.running is not None:
+        yield from _state(identity, seen.running)
+
+
+def _hardware(identity: Identity, hardware: str | None) -> Finding:
+    release = identity.release
+    if release is None or not release.hardware_versions:
+        text = "no manifest says which hardware the image fits"
+        return Finding(Check.HARDWARE, Verdict.UNKNOWN, text)
+    fits = ", ".join(printable(each) for each in release.hardware_versions)
+    if hardware is None:
+        text = f"the device does not tell its hardware; the manifest lists {fits}"
+        return Finding(Check.HARDWARE, Verdict.UNKNOWN, text)
+    if release.fits_hardware(hardware):
+        return Finding(Check.HARDWARE, Verdict.PASSED, f"the manifest lists hardware {hardware}")
+    text = f"the device's hardware {hardware} is not in the manifest, which lists {fits}"
+    return identity.refusal(Check.HARDWARE, text)
+
+
+def _versions(image: Image, identity: Identity, running: str) -> Iterator[Finding]:
+    """The running version against the new one, and against the manifest's rule."""
+    release = identity.release
+    if release is not None:
+        yield from _previous(release, identity, running)
+    new = new_version(image, release)
+    if new is None:
+        text = f"the image names no version to compare with the running {running}"
+        yield Finding(Check.DOWNGRADE, Verdict.UNKNOWN, text)
+        return
+    if new == running:
+        skipped = Verdict.SKIPPED if identity.skip_same_version else Verdict.WARNED
+        yield Finding(Check.SAME_VERSION, skipped, f"the device already runs {running}")
+        return
+    before, after = FirmwareVersion.parse(running), FirmwareVersion.parse(new)
+    if before is None or after is None:
+        text = f"{running} and {new} cannot be compared: not both follow the naming rule"
+        yield Finding(Check.DOWNGRADE, Verdict.UNKNOWN, text)
+    elif after < before:
+        yield identity.refusal(Check.DOWNGRADE, f"{new} is older than {running}, which runs now")
+    else:
+        text = f"{new} is newer than {running}, which runs now"
+        yield Finding(Check.DOWNGRADE, Verdict.PASSED, text)
+
+
+def _previous(release: Release, identity: Identity, running: str) -> Iterator[Finding]:
+    """The manifest's rule on the version that is replaced, where it has one."""
+    if release.previous_from is None and not release.previous_except:
+        return
+    if release.fits_previous(running):
+        text = f"the manifest lets {running} be replaced"
+        yield Finding(Check.PREVIOUS, Verdict.PASSED, text)
+    else:
+        excluded = running in release.previous_except or release.previous_from is None
+        rule = "excludes it" if excluded else f"replaces {release.previous_from} and newer"
+        text = f"the device runs {running}: the manifest {rule}"
+        yield identity.refusal(Check.PREVIOUS, text)
+
+
+def _state(identity: Identity, running: RunningInformation) -> Iterator[Finding]:
+    """Charge and current; a discharging current is negative (5.1)."""
+    if running.mean_current_ma < -identity.in_use_ma:
+        text = f"the battery gives {-running.mean_current_ma} mA, more than {identity.in_use_ma} mA"
+        yield identity.refusal(Check.IN_USE, text)
+    if running.state_of_charge_percent < identity.low_charge_percent:
+        text = f"the battery is at {running.state_of_charge_percent} %: charge it first, if it can "
+        yield Finding(Check.CHARGE, Verdict.WARNED, text + "wait")

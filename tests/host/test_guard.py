@@ -1,0 +1,134 @@
+"""Who speaks with the tool's id: an echo of what was sent, or somebody else."""
+
+from __future__ import annotations
+
+import pytest
+
+from flasher import events
+from flasher.host.guard import DOUBLE_LIMIT_S, Guard
+from flasher.protocol.echoes import ECHO_LIMIT_S
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import BMS, OBC, Target
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.protocol.wire import Message, encode, split
+
+OWN = [Frame(0x752, bytes([number] * 8)) for number in range(18)]
+OTHER = Frame(0x752, b"\x55\xaa\x16\x07")
+
+
+def guard(target: Target = BMS) -> Guard:
+    return Guard(target, DEFAULT_TIMINGS)
+
+
+def sent(frames: list[Frame]) -> Guard:
+    """A guard that knows of these frames, sent at 0.5 ms intervals from 1.0 on."""
+    made = guard()
+    for number, frame in enumerate(frames):
+        made.sent(frame, 1.0 + number * 0.0005)
+    return made
+
+
+@pytest.mark.parametrize("delay_s", [0.0005, 0.1, ECHO_LIMIT_S - 0.001])
+def test_echoes_of_what_was_sent_are_nobody_also_when_they_are_late(delay_s: float) -> None:
+    made = sent(OWN)
+    for number, frame in enumerate(OWN):
+        assert made.see(frame, 1.0 + number * 0.0005 + delay_s) is None
+
+
+@pytest.mark.parametrize("step", [2, 3, 7])
+def test_echoes_of_which_some_are_missing_are_nobody(step: int) -> None:
+    made = sent(OWN)
+    assert all(made.see(frame, 1.01) is None for frame in OWN[::step])
+
+
+def test_echoes_that_come_twice_are_nobody() -> None:
+    made = sent(OWN)
+    for frame in OWN:
+        assert made.see(frame, 1.02) is None
+        assert made.see(frame, 1.02) is None
+
+
+def test_the_same_frame_sent_again_has_its_own_echo() -> None:
+    made = guard()
+    for time in (1.0, 1.2, 1.4):
+        made.sent(OWN[0], time)
+        assert made.see(OWN[0], time + 0.001) is None
+
+
+def test_a_frame_that_was_not_sent_is_somebody_else_and_is_told_in_hex() -> None:
+    seen = sent(OWN).see(OTHER, 1.01)
+    assert seen is not None
+    assert "55 aa 16 07" in seen
+    assert "0x752" in seen
+
+
+def test_nothing_sent_at_all_and_somebody_speaks() -> None:
+    assert guard().see(OWN[0], 1.0) is not None
+
+
+@pytest.mark.parametrize("late_s", [ECHO_LIMIT_S + 0.01, 60.0])
+def test_what_was_sent_long_ago_is_no_echo_any_more(late_s: float) -> None:
+    made = guard()
+    made.sent(OWN[0], 1.0)
+    assert made.see(OWN[0], 1.0 + late_s) is not None
+
+
+def test_a_second_copy_counts_as_an_echo_for_a_moment_only() -> None:
+    made = guard()
+    made.sent(OWN[0], 1.0)
+    assert made.see(OWN[0], 1.001) is None
+    assert made.see(OWN[0], 1.001 + DOUBLE_LIMIT_S / 2) is None
+    assert made.see(OWN[0], 1.002 + DOUBLE_LIMIT_S) is not None
+
+
+def test_an_adapter_without_echoes_hides_no_second_tool() -> None:
+    """Packets of another image: the frames that begin a packet differ in their number or bytes."""
+    made = sent(OWN)
+    other = [Frame(0x752, bytes([99, number] * 4)) for number in range(18)]
+    assert made.see(other[0], 1.01) is not None
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        Frame(0x752, b"", is_remote=True),
+        Frame(0x752, b"\x01", is_extended=True),
+        Frame(0x752, b"\x01", is_error=True),
+        Frame(0x752, b""),
+        Frame(0x751, b"\x01"),
+        Frame(0x753, b"\x01"),
+        Frame(0x725, b"\x01"),
+        Frame(0x750, b"\xff\x00"),
+    ],
+)
+def test_other_kinds_of_frame_and_other_ids_are_no_second_tool(frame: Frame) -> None:
+    assert guard().see(frame, 1.0) is None
+
+
+def frames_of(can_id: int, mode: int, command: int, data: bytes) -> list[Frame]:
+    return split(can_id, encode(Message(can_id, mode, command, data)))
+
+
+@pytest.mark.parametrize("target", [BMS, OBC])
+def test_the_batterys_shutdown_is_noticed_whatever_the_target_and_told_once(
+    target: Target,
+) -> None:
+    made = guard(target)
+    for repetition in range(4):
+        for frame in frames_of(0x720, 0x0C, 0x1308, b"SHUTDOWN"):
+            assert made.see(frame, 1.0 + repetition * 0.2) is None
+    assert made.shutdown_heard
+    assert made.take_events() == [events.ShutdownHeard("BMS")]
+    assert made.take_events() == []
+
+
+def test_other_words_of_the_battery_are_no_shutdown() -> None:
+    made = guard()
+    for can_id, mode, command, data in (
+        (0x720, 0x0C, 0x1204, b"\0\0\1\0"),
+        (0x720, 0x11, 0x1308, b"SHUTDOWN"),
+        (0x721, 0x0C, 0x1308, b"SHUTDOWN"),
+    ):
+        for frame in frames_of(can_id, mode, command, data):
+            made.see(frame, 1.0)
+    assert not made.shutdown_heard

@@ -1,0 +1,398 @@
+"""A whole session, and what may befall it in each of its stages."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from flasher import events
+from flasher.bus.health import LinkHealth
+from flasher.bus.simulated import SimulatedLink
+from flasher.device.model import Device
+from flasher.errors import BusError, ExitCode
+from flasher.events import Phase
+from flasher.host.options import UpgradeOptions, default_timeout_s
+from flasher.host.outcome import DeviceLeft
+from flasher.host.table import Ending
+from flasher.host.verify import Level, Verdict
+from flasher.protocol import catalogue
+from flasher.protocol.contents import VersionInformation
+from flasher.protocol.fields import Text
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import WELLING
+from flasher.protocol.text import encode_text
+from flasher.protocol.timing import Timings
+from flasher.protocol.wire import encode, split
+from tests.end_to_end.stage import IMAGE, NEW, SMALL, Speaker, Stage
+
+OTHER_TOOL = Frame(0x752, bytes.fromhex("55AA110239005A5A"))
+UPDATE = bytes.fromhex("55AA160DA10B")
+COMPLETE = bytes.fromhex("55AA0C04C5020000")
+READ_VERSION = bytes.fromhex("55AA11023300")
+TWIN = replace(SMALL, serial_number="W2605077")
+NEVER = 1e9
+VERIFICATION = "verification"
+BEFORE_ERASE = (Phase.IDENTIFY, Phase.RESET, Phase.BOOT)
+
+
+def once(stage: Stage, phase: Phase | str, happens: Callable[[], None]) -> None:
+    """Let something happen when a phase, or the verification, is entered for the first time."""
+    left = [happens]
+
+    def on_phase() -> None:
+        if stage.seen(events.PhaseEntered)[-1].phase is phase and left:
+            left.pop()()
+
+    if phase == VERIFICATION:
+        stage.at_event[events.VerificationStarted] = left.pop()
+    else:
+        stage.at_event[events.PhaseEntered] = on_phase
+
+
+def lose_complete_and_what_the_new_application_says(frame: Frame, now: float) -> list[Frame]:
+    return [] if frame.data == COMPLETE or (now > 5.0 and frame.can_id == 0x720) else [frame]
+
+
+# -- a second tool --------------------------------------------------------------------------------
+
+
+class Witness:
+    """A tap: what the host handed to its adapter after it had heard the other tool."""
+
+    def __init__(self) -> None:
+        self.has_heard = False
+        self.sent_after: list[Frame] = []
+
+    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
+        if sent and self.has_heard:
+            self.sent_after.append(frame)
+        self.has_heard = self.has_heard or (not sent and frame == OTHER_TOOL)
+
+
+@pytest.mark.parametrize("phase", [*Phase, VERIFICATION])
+def test_a_second_tool_ends_the_session_in_every_stage_and_not_one_frame_more_is_sent(
+    phase: Phase | str,
+) -> None:
+    stage, witness = Stage(), Witness()
+    if phase is Phase.CONFIRM:
+        stage.disturb = lose_complete_and_what_the_new_application_says
+
+    def speak() -> None:
+        now = stage.clock.now()
+        stage.bus.attach(Speaker(OTHER_TOOL, every_s=60.0, begins_at=now + 0.0011))
+
+    once(stage, phase, speak)
+    result = stage.flash(taps=[witness])
+    assert witness.has_heard
+    assert witness.sent_after == []
+    assert result.exit_code == ExitCode.BUS
+    error = result.error()
+    assert error is not None
+    assert "55 aa 11 02 39" in str(error)
+    assert "End the other tool" in error.remedy
+    if phase in BEFORE_ERASE:
+        assert result.outcome.device_left is DeviceLeft.UNTOUCHED
+    if phase == VERIFICATION:
+        assert "completed, but a second tool speaks" in error.what
+        assert DeviceLeft.NEW.value in error.remedy
+
+
+def test_a_second_tool_cuts_a_message_short_that_was_finished_for_a_clean_end() -> None:
+    """Ctrl-C lets the message go to its end; somebody else's voice does not."""
+    stage, witness = Stage(), Witness()
+    asked: list[bool] = []
+
+    def stop() -> None:
+        asked.append(True)
+        stage.bus.attach(Speaker(OTHER_TOOL, every_s=60.0, begins_at=stage.clock.now()))
+
+    stage.at_packet[2] = stop
+    stage.cancelled = lambda: bool(asked)
+    result = stage.flash(options=UpgradeOptions(frame_gap_s=0.002), taps=[witness])
+    assert result.exit_code in (ExitCode.INTERRUPTED, ExitCode.BUS)
+    assert witness.sent_after == []
+
+
+# -- echoes ---------------------------------------------------------------------------------------
+
+
+class Echoing:
+    """An adapter that receives its own messages: `copies` of the frame with a number, late."""
+
+    def __init__(
+        self, link: SimulatedLink, stage: Stage, copies: Callable[[int], int], delay_s: float
+    ) -> None:
+        self._link, self._clock = link, stage.clock
+        self._copies, self._delay_s = copies, delay_s
+        self._echoes: deque[tuple[float, Frame]] = deque()
+        self._count = 0
+
+    def send(self, frame: Frame) -> None:
+        self._link.send(frame)
+        self._count += 1
+        at = self._clock.now() + self._delay_s
+        self._echoes.extend([(at, frame)] * self._copies(self._count))
+
+    def receive(self, deadline: float) -> Frame | None:
+        until = min(deadline, self._echoes[0][0]) if self._echoes else deadline
+        frame = self._link.receive(until)
+        if frame is None and self._echoes and self._echoes[0][0] <= self._clock.now():
+            return self._echoes.popleft()[1]
+        return frame
+
+    def drain(self) -> int:
+        return self._link.drain()
+
+    def close(self) -> None:
+        self._link.close()
+
+    def reopen(self) -> None:
+        self._link.reopen()
+
+    def health(self) -> LinkHealth:
+        return self._link.health()
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.002, 0.3])
+@pytest.mark.parametrize(
+    "copies",
+    [lambda _n: 1, lambda n: int(n % 3 > 0), lambda _n: 2, lambda n: n % 3],
+    ids=["every one", "some missing", "twice", "none to two"],
+)
+def test_echoes_of_own_frames_are_no_second_tool(
+    copies: Callable[[int], int], delay_s: float
+) -> None:
+    stage = Stage()
+    stage.wrap = lambda link: Echoing(link, stage, copies, delay_s)
+    result = stage.flash()
+    assert result.exit_code == ExitCode.OK
+    assert stage.has == IMAGE.data
+    assert not stage.seen(events.MessageRepeated)
+
+
+def test_a_second_tool_is_heard_among_echoes() -> None:
+    stage, witness = Stage(), Witness()
+    stage.wrap = lambda link: Echoing(link, stage, lambda _number: 1, 0.001)
+    stage.at_packet[2] = lambda: stage.bus.attach(
+        Speaker(OTHER_TOOL, every_s=60.0, begins_at=stage.clock.now())
+    )
+    assert stage.flash(taps=[witness]).exit_code == ExitCode.BUS
+    assert witness.sent_after == []
+
+
+# -- two devices ----------------------------------------------------------------------------------
+
+
+def with_another(stage: Stage, **differs: str) -> Device:
+    profile = replace(SMALL, **differs)  # type: ignore[arg-type]
+    other = Device(stage.target, bitrate_bps=WELLING.bitrate_bps, profile=profile)
+    stage.bus.attach(other)
+    return other
+
+
+@pytest.mark.parametrize(
+    "differs", [{"serial_number": "W2605002"}, {"factory_version": "V1r0r1_20230512"}], ids=str
+)
+def test_two_devices_that_tell_different_versions_are_refused_before_the_reset(
+    differs: dict[str, str],
+) -> None:
+    stage = Stage()
+    other = with_another(stage, **differs)
+    result = stage.flash()
+    assert result.exit_code == ExitCode.WRONG_DEVICE
+    assert result.outcome.ending is Ending.TWO_DEVICES
+    assert result.outcome.device_left is DeviceLeft.UNTOUCHED
+    assert not any(b"RESET" in frame.data for frame in stage.heard)
+    assert stage.device.erase_count == other.erase_count == 0
+
+
+class LateTwin(Speaker):
+    """Another battery, which answers the version query a while after the first one."""
+
+    def __init__(self, delay_s: float) -> None:
+        self._delay_s = delay_s
+        answer = catalogue.BY_KEY[(0x720, 0x1540)]
+        texts = (TWIN.model, TWIN.serial_number, TWIN.hardware_version, TWIN.factory_version)
+        fields = (Text(encode_text(text, 16)) for text in texts)
+        frames = split(0x720, encode(catalogue.encode(answer, VersionInformation(*fields))))
+        super().__init__(*frames, every_s=0.0006, begins_at=NEVER)
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if frame.data.startswith(READ_VERSION):
+            self._next = now + self._delay_s
+
+    def frame_sent(self, now: float) -> None:
+        super().frame_sent(now)
+        if self._sent % len(self._frames) == 0:
+            self._next = NEVER
+
+
+@pytest.mark.parametrize("delay_s", [0.015, 0.04, 0.08])
+def test_a_second_device_that_answers_later_is_noticed_before_the_reset_too(
+    delay_s: float,
+) -> None:
+    stage = Stage()
+    stage.bus.attach(LateTwin(delay_s))
+    result = stage.flash()
+    assert result.outcome.ending is Ending.TWO_DEVICES
+    assert not any(b"RESET" in frame.data for frame in stage.heard)
+    assert stage.device.erase_count == 0
+
+
+def test_two_bootloaders_that_announce_different_versions_are_refused() -> None:
+    stage = Stage("wmc")
+    with_another(stage, boot_version="V9.9.9")
+    result = stage.flash()
+    assert result.exit_code == ExitCode.WRONG_DEVICE
+    assert result.outcome.ending is Ending.TWO_DEVICES
+    assert result.outcome.device_left is DeviceLeft.PERHAPS_ERASED
+    stage.wait(10.0)
+    # The first one was answered before the second one spoke; nothing followed.
+    assert sum(frame.data.startswith(UPDATE) for frame in stage.heard) == 1
+
+
+# -- a device that announces itself ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.013, 0.1, 0.35, 0.9])
+def test_an_announcement_while_the_device_is_asked_is_answered_inside_of_its_window(
+    after_s: float,
+) -> None:
+    """It is switched on meanwhile, and listens for as long as its burst lasts only."""
+    stage = Stage(profile=replace(SMALL, window_s=0.0, without_application="listens"))
+    stage.cut_power()
+
+    def later() -> None:
+        at = stage.clock.now() + after_s
+        stage.bus.attach(Switch(stage, at))
+
+    once(stage, Phase.IDENTIFY, later)
+    result = stage.flash()
+    assert result.exit_code == ExitCode.OK
+    assert stage.has == IMAGE.data
+    assert not any(b"RESET" in frame.data for frame in stage.heard) or after_s > 0.8
+
+
+class Switch(Speaker):
+    """Switches the device on at a time; sends nothing."""
+
+    def __init__(self, stage: Stage, at: float) -> None:
+        super().__init__(Frame(0x7FF, b""), every_s=1e9, begins_at=at)
+        self._stage = stage
+
+    def tick(self, now: float) -> None:
+        super().tick(now)
+        self._is_due = False
+        self._stage.give_power()
+
+
+# -- attempts and the deadline ---------------------------------------------------------------------
+
+HURRIED = Timings(ack_timeout_s=0.05, packet_tries=2)
+
+
+def deaf_to(number: int, times: int) -> Callable[[Frame, float], list[Frame]]:
+    """The ACK of a packet is lost so often."""
+    ack, left = bytes.fromhex("55AA0C04C202") + bytes([number]), [times]
+
+    def disturb(frame: Frame, _now: float) -> list[Frame]:
+        if frame.data[:7] == ack and left[0]:
+            left[0] -= 1
+            return []
+        return [frame]
+
+    return disturb
+
+
+def test_a_packet_whose_tries_are_exhausted_begins_another_attempt_and_each_is_reported() -> None:
+    stage = Stage()
+    stage.disturb = deaf_to(2, times=4)
+    result = stage.flash(options=UpgradeOptions(timings=HURRIED))
+    assert result.exit_code == ExitCode.OK
+    assert stage.has == IMAGE.data
+    started = stage.seen(events.AttemptStarted)
+    assert [each.attempt for each in started] == [2, 3]
+    assert all("no try left" in each.reason for each in started)
+    phases = [(each.phase, each.attempt) for each in stage.seen(events.PhaseEntered)]
+    assert [(Phase.RESET, n) for n in (1, 2, 3)] == [p for p in phases if p[0] is Phase.RESET]
+    assert result.outcome.statistics.attempts == 3
+
+
+@pytest.mark.parametrize("attempts", [1, 2, 4])
+def test_attempts_are_bounded(attempts: int) -> None:
+    stage = Stage()
+    stage.disturb = deaf_to(2, times=1000)
+    result = stage.flash(options=UpgradeOptions(timings=HURRIED, attempts=attempts))
+    assert result.exit_code == ExitCode.TRANSFER
+    assert result.outcome.ending is Ending.PACKET_FAILED
+    assert result.outcome.packet == 2
+    assert len(stage.seen(events.AttemptStarted)) == attempts - 1
+    resets = sum(frame.data[6:8] == b"RE" for frame in stage.heard)
+    assert resets >= attempts
+    assert (attempts == 1) is (resets == 1)
+
+
+@pytest.mark.parametrize("timeout_s", [0.3, 1.2, 3.0])
+@pytest.mark.parametrize("cut", [None, 1, 3])
+def test_the_deadline_bounds_every_stage_together(timeout_s: float, cut: int | None) -> None:
+    """Silent from the beginning, or from a packet on."""
+    stage = Stage()
+    if cut is None:
+        stage.cut_power()
+    else:
+        stage.at_packet[cut] = stage.cut_power
+    result = stage.flash(options=UpgradeOptions(timeout_s=timeout_s, attempts=9))
+    assert not result.ok
+    assert stage.clock.now() <= timeout_s + 0.05
+
+
+@pytest.mark.parametrize("level", [Level.VERSION, Level.NONE])
+def test_the_deadline_bounds_the_verification_too(level: Level) -> None:
+    stage = Stage()
+    stage.at_event[events.VerificationStarted] = stage.cut_power
+    result = stage.flash(options=UpgradeOptions(timeout_s=2.0), verify=level)
+    assert result.outcome.ok
+    assert stage.clock.now() <= 2.0 + 0.05
+    if level is Level.VERSION:
+        assert result.verification.verdict is Verdict.NO_ANSWER
+        assert result.exit_code == ExitCode.VERIFICATION
+        assert "overall deadline" in result.verification.detail
+
+
+def test_a_device_that_is_always_just_in_time_is_upgraded_or_ends_with_the_deadline() -> None:
+    """TM-03: each packet is acknowledged at its last try, as late as is allowed."""
+    stage = Stage(profile=replace(SMALL, program_time_s=0.49))
+    acks: dict[bytes, int] = {}
+
+    def disturb(frame: Frame, _now: float) -> list[Frame]:
+        if frame.data[:6] != bytes.fromhex("55AA0C04C202"):
+            return [frame]
+        acks[frame.data] = acks.get(frame.data, 0) + 1
+        return [frame] if acks[frame.data] % 5 == 0 else []
+
+    stage.disturb = disturb
+    options = UpgradeOptions()
+    result = stage.flash(options=options)
+    assert result.ok or result.outcome.ending is Ending.OUT_OF_TIME
+    assert result.ok == (stage.has == IMAGE.data)
+    assert stage.clock.now() <= default_timeout_s(stage.plan(), options) + 0.5
+
+
+def test_nobody_who_acknowledges_is_told_from_a_device_that_is_silent() -> None:
+    alone, silent = Stage(), Stage()
+    alone.bus.nobody_acknowledges = True
+    silent.cut_power()
+    silent.bus.attach(Speaker(Frame(0x100, b"\1"), every_s=0.1))
+    with pytest.raises(BusError, match="Nobody on the bus acknowledges"):
+        alone.flash()
+    assert silent.flash().exit_code == ExitCode.NO_ANSWER
+
+
+def test_a_session_that_went_well_says_what_runs() -> None:
+    stage = Stage()
+    result = stage.flash()
+    assert (result.exit_code, result.running_version) == (ExitCode.OK, NEW)
+    assert [each.phase for each in stage.seen(events.PhaseEntered)] == [*Phase][:-1]
