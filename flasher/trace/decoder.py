@@ -96,6 +96,11 @@ _TITLES: Final[dict[type[messages.Row], str]] = {
 }
 
 
+def route(of_id: int) -> tuple[str, str] | None:
+    """Names of sender and receiver of an 11-bit id; None for an id of no node."""
+    return _ROUTES.get(of_id)
+
+
 def message_titles() -> tuple[str, ...]:
     """The titles of all messages that can be told apart, each once."""
     titles = [item.title for item in catalogue.ITEMS] + list(_TITLES.values())
@@ -109,6 +114,8 @@ class Decoder:
         self, inter_frame_timeout_s: float = DEFAULT_TIMINGS.inter_frame_timeout_s
     ) -> None:
         self._streams = {key: Reassembler(key, inter_frame_timeout_s) for key in _ROUTES}
+        self._holding: dict[int, Reassembler] = {}
+        """The streams that hold the beginning of something: seldom more than two or three."""
 
     def feed(self, frame: Frame, now: float) -> Iterator[Seen]:
         """What the frame completed, in order: usually nothing, sometimes more than one."""
@@ -121,17 +128,23 @@ class Decoder:
             return
         for found in stream.feed(frame.data, now):
             yield _describe(found, now)
+        if stream.held_size:
+            self._holding[frame.can_id] = stream
+        else:
+            self._holding.pop(frame.can_id, None)
 
     def deadline(self) -> float | None:
         """When `tick` has something to drop; None while nothing is held."""
-        deadlines = (stream.deadline() for stream in self._streams.values())
+        deadlines = (stream.deadline() for stream in self._holding.values())
         return min((at for at in deadlines if at is not None), default=None)
 
     def tick(self, now: float) -> Iterator[Seen]:
         """What was cut short: the rest of a message that did not come in time (R12)."""
-        for stream in self._streams.values():
+        for key, stream in list(self._holding.items()):
             for found in stream.tick(now):
                 yield _describe(found, now)
+            if not stream.held_size:
+                del self._holding[key]
 
 
 def _describe(found: Message | Damage, now: float) -> Seen:

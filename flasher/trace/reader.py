@@ -49,7 +49,8 @@ def _frame(message: can.Message) -> Frame:
     return Frame(
         message.arbitration_id,
         bytes(message.data),
-        message.is_extended_id,
+        # An error frame has no id of its own; some formats give it the longer form.
+        message.is_extended_id and not message.is_error_frame,
         message.is_remote_frame,
         message.is_error_frame,
     )

@@ -12,6 +12,21 @@ import can
 
 from flasher.errors import UsageError
 from flasher.protocol.frame import Frame
+from flasher.protocol.text import printable
+
+
+def message_of(frame: Frame, *, sent: bool, at_s: float) -> can.Message:
+    """A frame as python-can's writers take it, at wall time `at_s`."""
+    return can.Message(
+        timestamp=at_s,
+        arbitration_id=frame.can_id,
+        data=frame.data,
+        is_extended_id=frame.is_extended,
+        is_remote_frame=frame.is_remote,
+        is_error_frame=frame.is_error,
+        is_rx=not sent,
+        channel=0,
+    )
 
 
 class Recorder:
@@ -28,23 +43,24 @@ class Recorder:
         self._path = os.fspath(path)
         self.failure: str | None = None
         """Why the recording ended early; None while it is complete."""
+        shown = printable(self._path) or "''"
         if not Path(self._path).absolute().parent.is_dir():
-            raise UsageError(f"{self._path} cannot be written: its folder does not exist.")
+            raise UsageError(f"{shown} cannot be written: its folder does not exist.")
         try:
             self._writer = can.Logger(self._path)
         except ValueError as error:
             raise UsageError(
-                f"{self._path}: no trace format has this suffix.",
+                f"{shown}: no trace format has this suffix.",
                 remedy="Use one of .asc .blf .csv .db .log .mf4 .trc .txt.",
             ) from error
         except (ImportError, NotImplementedError) as error:
             raise UsageError(
-                f"{self._path}: this trace format needs a package that is not installed.",
+                f"{shown}: this trace format needs a package that is not installed.",
                 cause=str(error),
                 remedy="Install it, or use .asc, .blf or .log.",
             ) from error
         except OSError as error:
-            raise UsageError(f"{self._path} cannot be written: {error.strerror}.") from error
+            raise UsageError(f"{shown} cannot be written: {error.strerror}.") from error
         self._wall_offset_s: float | None = None
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
@@ -53,16 +69,7 @@ class Recorder:
             return
         if self._wall_offset_s is None:
             self._wall_offset_s = time.time() - now
-        message = can.Message(
-            timestamp=now + self._wall_offset_s,
-            arbitration_id=frame.can_id,
-            data=frame.data,
-            is_extended_id=frame.is_extended,
-            is_remote_frame=frame.is_remote,
-            is_error_frame=frame.is_error,
-            is_rx=not sent,
-            channel=0,
-        )
+        message = message_of(frame, sent=sent, at_s=now + self._wall_offset_s)
         try:
             self._writer(message)
         except OSError as error:

@@ -192,3 +192,13 @@ def test_a_real_full_disk_is_noticed_while_recording(tmp_path: Path, suffix: str
         for number in range(10_000):
             recorder(SENT, sent=True, now=number * 0.001)
     assert recorder.failure is not None
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [("no\x1b[2J/x.log", "no\\x1b[2J/x.log"), ("x\x1b.y", "x\\x1b.y"), ("", "''")],
+)
+def test_a_name_that_cannot_be_written_is_shown_harmlessly(name: str, shown: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        Recorder(name)
+    assert caught.value.what.startswith(shown)

@@ -1,0 +1,143 @@
+"""Bundles: what a failed command leaves behind for whoever has to find out why.
+
+A folder of three files: `trace.log`, the last frames; `transcript.txt`, what they say; and
+`report.json`, the circumstances. It appears whole, under its final name, or not at all.
+
+The trace is in candump form: unlike the .asc of python-can it keeps wall times to the microsecond
+without a date in the computer's language, and it keeps directions, remote and error frames too.
+"""
+
+from __future__ import annotations
+
+import json
+import platform
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from itertools import count
+from pathlib import Path
+from typing import Any, Final
+
+import can
+
+from flasher.protocol.text import printable
+from flasher.trace.decoder import Seen
+from flasher.trace.pieces import Pieces, bits_of
+from flasher.trace.recorder import message_of
+from flasher.trace.ring import Entry, FlightRecorder
+from flasher.trace.steps import step_of
+
+TRACE: Final = "trace.log"
+TRANSCRIPT: Final = "transcript.txt"
+REPORT: Final = "report.json"
+FORMAT: Final = 1
+"""Version of report.json: counts up when a key changes its meaning."""
+_PACKAGES: Final = {"flasher": "welling-flasher", "python_can": "python-can"}
+
+
+def write_bundle(
+    folder: Path,
+    recorder: FlightRecorder,
+    facts: Mapping[str, Any],
+    *,
+    wall_clock: Callable[[], float] = time.time,
+) -> Path:
+    """Write a bundle into `folder`, which is made if it is not there; returns the bundle's path.
+
+    It is named after `facts["target"]` and the time, and never overwrites anything. `facts` go into
+    report.json as they are; what JSON does not know becomes text. Raises OSError.
+    """
+    now = wall_clock()
+    folder.mkdir(parents=True, exist_ok=True)
+    stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(now))
+    path, part = _names(folder, f"flasher-{facts.get('target') or 'bus'}-{stamp}")
+    try:
+        _write_trace(part / TRACE, recorder)
+        with (part / TRANSCRIPT).open("w", encoding="utf-8") as file:
+            file.writelines(f"{line}\n" for line in transcript(recorder))
+        report = {**_circumstances(recorder, now), **facts}
+        text = json.dumps(report, indent=2, default=lambda value: printable(str(value)))
+        (part / REPORT).write_text(f"{text}\n", encoding="utf-8")
+        part.rename(path)
+    except BaseException:
+        shutil.rmtree(part, ignore_errors=True)
+        raise
+    return path
+
+
+def _names(folder: Path, base: str) -> tuple[Path, Path]:
+    """A name that is free, and the folder beside it to write into, which is made."""
+    for number in count(1):
+        name = base if number == 1 else f"{base}-{number}"
+        part = folder / f".{name}.part"
+        if (folder / name).exists():
+            continue
+        try:
+            part.mkdir()
+        except FileExistsError:
+            continue
+        return folder / name, part
+    raise AssertionError  # pragma: no cover  count never ends
+
+
+def _write_trace(path: Path, recorder: FlightRecorder) -> None:
+    offset_s = recorder.wall_offset_s or 0.0
+    writer = can.CanutilsLogWriter(path)
+    try:
+        for entry in recorder:
+            at_s = entry.at_s + offset_s
+            writer.on_message_received(message_of(entry.frame, sent=entry.sent, at_s=at_s))
+    finally:
+        writer.stop()
+
+
+def transcript(recorder: FlightRecorder) -> Iterator[str]:
+    """Every message of the ring, one line each: seconds since the oldest frame, direction, id,
+    sender and receiver, what it says.
+    """
+    pieces = Pieces()
+    first_at: float | None = None
+    last_at = 0.0
+    own: dict[int, str] = {}
+    for at_s, frame, sent in recorder:
+        first_at = at_s if first_at is None else first_at
+        last_at = at_s - first_at
+        own[frame.can_id] = "out" if sent else "in"
+        for piece in pieces.feed(frame, last_at, bits_of(frame)):
+            yield _line(piece.seen, own.get(piece.seen.can_id, "in"))
+    for piece in pieces.finish(last_at):
+        yield _line(piece.seen, own.get(piece.seen.can_id, "in"))
+
+
+def _line(seen: Seen, direction: str) -> str:
+    step = step_of(seen, seen.at)
+    route = f"{step.sender} > {step.receiver}" if step.sender else ""
+    said = ("! " if step.is_trouble else "") + step.title + (f": {step.text}" if step.text else "")
+    return f"{step.at_s:10.6f}  {direction:<3}  {seen.can_id:03X}  {route:<9}  {said}"
+
+
+def _circumstances(recorder: FlightRecorder, now: float) -> dict[str, Any]:
+    last: Entry | None = recorder.last
+    offset_s = recorder.wall_offset_s or 0.0
+    return {
+        "bundle": FORMAT,
+        "written_at": now,
+        "versions": {
+            **{name: _version(package) for name, package in _PACKAGES.items()},
+            "python": platform.python_version(),
+            "os": platform.platform(),
+        },
+        "frames_seen": recorder.frames,
+        "frames_kept": len(recorder),
+        "last_frame": None
+        if last is None
+        else {"monotonic_s": last.at_s, "wall_s": last.at_s + offset_s},
+    }
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,306 @@
+"""From the frames of a trace to its story.
+
+The frames are read once and not kept. It goes by CAN ids alone, since most formats do not say who
+sent a frame; it reads messages and asks no host engine, which could be wrong together with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import (
+    BMS,
+    BOOT_VERSION_BURST,
+    MOTINOVA,
+    TARGETS,
+    WELLING,
+    Command,
+    Node,
+    Target,
+    can_id,
+)
+from flasher.protocol.text import printable
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.trace.busload import MAX_TALKERS, BusCounter
+from flasher.trace.decoder import Kind
+from flasher.trace.dialogue import Dialogue
+from flasher.trace.explanations import EXPLANATIONS
+from flasher.trace.pieces import Piece, Pieces, bits_of
+from flasher.trace.steps import MAX_STEPS, StepList, step_of
+from flasher.trace.story import (
+    Cause,
+    Recorded,
+    Story,
+    UpgradeStory,
+    Verdict,
+)
+from flasher.trace.verdict import judge, remarks
+
+MAX_PACKETS: Final = 200_000
+"""Packets that a story holds one by one, over all upgrades."""
+EVERYTHING_LIMIT: Final = 200_000
+"""Lines of a list when every message is wanted."""
+_WALL_TIME_FROM: Final = 1e8
+"""Stamps from here on (1973) are wall time, smaller ones count from some start."""
+_BEGINNERS: Final = (Command.RESET, Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER)
+"""Messages of the tool that make an upgrade."""
+_BURST_S: Final = 1.0
+"""An announcement so short before an update command is a part of the upgrade."""
+_SHUTDOWN: Final = 0x1308
+_BY_REQUEST: Final = {target.request_id: target for target in TARGETS.values()}
+_BY_ANSWER: Final = {target.answer_id: target for target in TARGETS.values()}
+_HMI_IDS: Final = frozenset(
+    can_id(sender, receiver)
+    for sender in Node
+    for receiver in (None, *Node)
+    if sender is not receiver and Node.HMI in (sender, receiver)
+)
+
+
+def explain(
+    frames: Iterable[tuple[float, Frame]],
+    *,
+    source: str,
+    suffix: str = "",
+    bitrate_bps: int | None = None,
+    until: float | None = None,
+    everything: bool = False,
+    recorded: Recorded | None = None,
+) -> Story:
+    """The story of a trace: `frames` with their times in seconds, in the order of the file.
+
+    `suffix` names the format. `bitrate_bps` None finds the dialect's own rate. `until` is the time,
+    on the same clock, up to which the bus was listened to, where that is known. `everything` keeps
+    every message as a line of its own. Raises what `frames` raises.
+    """
+    reading = _Reading(bitrate_bps, everything=everything)
+    now = float("-inf")
+    for at, frame in frames:
+        now = max(now, at)
+        reading.frame(frame, now)
+    return reading.story(source, suffix, until, recorded)
+
+
+class _Reading:
+    """What has been read so far."""
+
+    def __init__(self, bitrate_bps: int | None, *, everything: bool) -> None:
+        self._given_bps = bitrate_bps
+        self._bitrate_bps = bitrate_bps or WELLING.bitrate_bps
+        self._everything = everything
+        self._bus = BusCounter()
+        self._pieces = Pieces()
+        self._open: dict[Target, Dialogue] = {}
+        self._upgrades: list[tuple[float, UpgradeStory]] = []
+        self._packets_left = MAX_PACKETS
+        self._outside = self._new_steps()
+        self._announced: dict[Target, list[Piece]] = {}
+        """The latest announcements that no tool has answered yet."""
+        self._announcements = 0
+        self._has_hmi = False
+        self._has_nodes = False
+        self._start: float | None = None
+
+    def frame(self, frame: Frame, now: float) -> None:
+        """Take one frame."""
+        if self._start is None:
+            self._start = now
+        now -= self._start
+        bits = bits_of(frame)
+        self._bus.frame(frame, now, bits)
+        if frame.is_error:
+            for dialogue in self._open.values():
+                dialogue.error_frame(now)
+            if not self._open:
+                self._outside.error_frame(now)
+            return
+        for piece in self._pieces.feed(frame, now, bits):
+            self._piece(piece)
+        target = None if frame.is_extended else _BY_REQUEST.get(frame.can_id)
+        if target in self._open and frame.is_payload:
+            self._open[target].interleaving.frame(frame, now)
+
+    def _piece(self, piece: Piece) -> None:
+        seen = piece.seen
+        if seen.kind is Kind.FOREIGN:
+            return
+        self._has_nodes |= seen.kind is not Kind.DAMAGED
+        self._has_hmi |= seen.can_id in _HMI_IDS
+        self._bus.seen(seen)
+        if seen.can_id in _BY_REQUEST:
+            self._tool(_BY_REQUEST[seen.can_id], piece)
+        elif seen.can_id in _BY_ANSWER:
+            self._device(_BY_ANSWER[seen.can_id], piece)
+        else:
+            self._other(piece)
+
+    # -- who it is for ---------------------------------------------------------------------------
+
+    def _tool(self, target: Target, piece: Piece) -> None:
+        dialogue = self._open.get(target)
+        if dialogue is not None and dialogue.begins_another(piece.seen):
+            self._close(target, piece.begin_s)
+            dialogue = None
+        if dialogue is None:
+            if piece.seen.kind is not Kind.MESSAGE or piece.seen.command not in _BEGINNERS:
+                self._outside.add(step_of(piece.seen, piece.end_s))
+                return
+            dialogue = self._begin(target, piece)
+        dialogue.tool(piece)
+
+    def _begin(self, target: Target, piece: Piece) -> Dialogue:
+        """An upgrade, with the announcements that led to it."""
+        heard = [
+            said
+            for said in self._announced.pop(target, [])
+            if piece.begin_s - said.end_s <= _BURST_S
+        ]
+        dialogue = self._open[target] = Dialogue(
+            target,
+            heard[0].begin_s if heard else piece.begin_s,
+            self._bitrate_bps,
+            steps=self._new_steps(),
+            max_packets=self._packets_left,
+        )
+        for said in heard:
+            dialogue.device(said)
+        return dialogue
+
+    def _device(self, target: Target, piece: Piece) -> None:
+        dialogue = self._open.get(target)
+        if dialogue is not None:
+            dialogue.device(piece)
+            return
+        if piece.seen.command == Command.BOOT_VERSION and piece.seen.kind is Kind.MESSAGE:
+            self._announcements += 1
+            self._announced[target] = [
+                *self._announced.get(target, [])[1 - BOOT_VERSION_BURST :],
+                piece,
+            ]
+        self._outside.add(step_of(piece.seen, piece.end_s))
+
+    def _other(self, piece: Piece) -> None:
+        """A message between other nodes, or to all of them."""
+        seen = piece.seen
+        if seen.kind is Kind.MESSAGE and seen.can_id == BMS.broadcast_id:
+            battery = self._open.get(BMS)
+            if seen.command == Command.VERSION_INFORMATION and battery is not None:
+                battery.version(piece)
+                return
+            if seen.command == _SHUTDOWN:
+                for dialogue in self._open.values():
+                    dialogue.shutdown(piece)
+        tells = seen.is_trouble or Node.CDL.name in (seen.sender, seen.receiver)
+        if tells or self._everything or seen.command == _SHUTDOWN:
+            self._outside.add(step_of(seen, piece.end_s))
+
+    def _new_steps(self) -> StepList:
+        limit = EVERYTHING_LIMIT if self._everything else MAX_STEPS
+        return StepList(fold=not self._everything, limit=limit)
+
+    # -- the story ---------------------------------------------------------------------------------
+
+    def _close(self, target: Target, until_s: float) -> None:
+        dialogue = self._open.pop(target)
+        dialogue.finish()
+        self._packets_left = max(0, self._packets_left - len(dialogue.packets))
+        is_alone = self._bus.is_alone and not dialogue.is_answered
+        verdict = judge(dialogue, until_s, is_alone=is_alone)
+        story = UpgradeStory(
+            target=target.node.name,
+            begin_s=dialogue.begin_s,
+            end_s=dialogue.last_at_s,
+            image_size_bytes=dialogue.image_size_bytes,
+            total_packets=dialogue.total,
+            boot_version=next(reversed(dialogue.boot_versions), None),
+            running_version=dialogue.running_version,
+            attempts=dialogue.attempt,
+            phases=tuple(dialogue.spans),
+            packets=tuple(record.story() for record in dialogue.packets),
+            steps=dialogue.steps.lines(),
+            steps_left_out=dialogue.steps.left_out,
+            link=dialogue.link.report(),
+            remarks=remarks(dialogue, verdict.cause),
+            verdict=verdict,
+        )
+        self._upgrades.append((dialogue.begin_s, story))
+
+    def story(
+        self, source: str, suffix: str, until: float | None, recorded: Recorded | None
+    ) -> Story:
+        """All of it; nothing may be fed afterwards. `until` is when the trace ended, in seconds on
+        its clock; None where its last frame tells.
+        """
+        start = self._start or 0.0
+        until_s = max(self._bus.last_at, 0.0 if until is None else until - start)
+        for piece in self._pieces.finish(self._bus.last_at):
+            # A device that was still speaking when the recording ended has damaged nothing.
+            was_speaking = until_s - piece.end_s < DEFAULT_TIMINGS.inter_frame_timeout_s
+            if piece.seen.can_id in _BY_REQUEST or not was_speaking:
+                self._piece(piece)
+        for target in tuple(self._open):
+            self._close(target, until_s)
+        upgrades = tuple(story for _, story in sorted(self._upgrades, key=lambda one: one[0]))
+        bitrate_bps = self._rate(bool(upgrades))
+        bus = self._bus.figures(bitrate_bps)
+        talkers = self._bus.talkers(_ids_of(upgrades))
+        return Story(
+            source=printable(source),
+            format=printable(suffix),
+            started_at=start if start >= _WALL_TIME_FROM else None,
+            duration_s=bus.duration_s,
+            bitrate_bps=bitrate_bps,
+            frames=bus.frames,
+            bus=bus,
+            upgrades=upgrades,
+            talkers=tuple(talkers[:MAX_TALKERS]),
+            verdict=_chief(upgrades) or self._without_upgrade(),
+            steps=self._outside.lines(),
+            steps_left_out=self._outside.left_out,
+            talkers_left_out=max(0, len(talkers) - MAX_TALKERS),
+            recorded=recorded,
+        )
+
+    def _rate(self, has_upgrade: bool) -> int:  # noqa: FBT001  a fact, not an option
+        """The rate that was given; else the dialect's: only one of them has displays, and only the
+        other one has upgrades.
+        """
+        if self._given_bps is None and self._has_hmi and not has_upgrade:
+            return MOTINOVA.bitrate_bps
+        return self._bitrate_bps
+
+    def _without_upgrade(self) -> Verdict:
+        bus = self._bus
+        if self._announcements:
+            cause = Cause.QUERIES_ONLY
+            text = f"A bootloader announced itself {self._announcements} time(s), and no tool began"
+            text += " an upgrade."
+        elif self._has_nodes:
+            cause = Cause.QUERIES_ONLY
+            text = "Nobody began an upgrade; there are messages of the drive system."
+        elif bus.frames:
+            cause = Cause.FOREIGN_ONLY
+            text = f"None of the {bus.frames:,} frames holds a message of the drive system."
+        else:
+            cause = Cause.EMPTY
+            text = "There is no frame in it."
+        if bus.error_frames:
+            text += f" Error frames: {bus.error_frames:,}."
+        likely, remedy = EXPLANATIONS[cause]
+        return Verdict(cause, None, None, 0, text, likely, remedy)
+
+
+def _ids_of(upgrades: tuple[UpgradeStory, ...]) -> frozenset[int]:
+    """The ids of the dialogues that are told in full."""
+    targets = [TARGETS[upgrade.target.lower()] for upgrade in upgrades]
+    return frozenset(used for each in targets for used in (each.request_id, each.answer_id))
+
+
+def _chief(upgrades: tuple[UpgradeStory, ...]) -> Verdict | None:
+    """The verdict that matters most: of the last upgrade of each target, the first bad one."""
+    last = {upgrade.target: upgrade.verdict for upgrade in upgrades}
+    verdicts = list(last.values())
+    bad = [verdict for verdict in verdicts if not verdict.cause.is_good]
+    return next(iter(bad or verdicts), None)

@@ -1,0 +1,149 @@
+"""Where a story comes from: a trace file, or a bundle's folder with the trace and report in it."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+from flasher.errors import UsageError
+from flasher.protocol.frame import Frame
+from flasher.protocol.text import printable
+from flasher.trace.bundle import REPORT, TRACE
+from flasher.trace.explain import explain
+from flasher.trace.explanations import EXPLANATIONS
+from flasher.trace.reader import read_trace
+from flasher.trace.story import Cause, Recorded, Story, Verdict
+
+_MAX_REPORT_SIZE: Final = 16 * 1024 * 1024
+"""More is none of ours, and is cut: which makes it no JSON."""
+
+
+def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool = False) -> Story:
+    """The story of a trace of any format that python-can reads, or of a bundle's folder.
+
+    Raises UsageError for what is neither.
+    """
+    damage: list[str] = []
+    if not path.is_dir():
+        story = explain(
+            _until_damage(path, damage),
+            source=str(path),
+            suffix=_suffix(path),
+            bitrate_bps=bitrate_bps,
+            everything=everything,
+        )
+        return replace(story, damage=" ".join(damage))
+    trace = path / TRACE
+    if not trace.is_file():
+        raise UsageError(
+            f"{printable(str(path))} is a folder, but no bundle: there is no {TRACE} in it.",
+            remedy="Name a trace file, or the folder that a failed command has left.",
+        )
+    report = _report(path / REPORT)
+    story = explain(
+        _until_damage(trace, damage),
+        source=str(path),
+        suffix=_suffix(trace),
+        bitrate_bps=bitrate_bps or _number(report.get("bitrate_bps")),
+        until=report.get("written_at") if isinstance(report.get("written_at"), float) else None,
+        everything=everything,
+        recorded=_recorded(report) if report else None,
+    )
+    return replace(_as_the_tool_ended(story), damage=" ".join(damage))
+
+
+def _as_the_tool_ended(story: Story) -> Story:
+    """A bundle is written when the tool has ended: where its trace breaks off, it was the tool that
+    stopped, and not the recording.
+    """
+    recorded = story.recorded
+    if recorded is None or recorded.exit_code is None:
+        return story
+
+    def judged(verdict: Verdict) -> Verdict:
+        if verdict.cause is not Cause.RECORDING_ENDS:
+            return verdict
+        said = recorded.error.partition(" | ")[0]
+        return replace(
+            verdict,
+            cause=Cause.TOOL_ENDED,
+            text=f"{verdict.text} Here the tool ended: {said}".rstrip(": "),
+            likely=EXPLANATIONS[Cause.TOOL_ENDED].likely,
+            remedy=EXPLANATIONS[Cause.TOOL_ENDED].remedy,
+        )
+
+    upgrades = [*story.upgrades]
+    if upgrades:
+        upgrades[-1] = replace(upgrades[-1], verdict=judged(upgrades[-1].verdict))
+    return replace(story, upgrades=tuple(upgrades), verdict=judged(story.verdict))
+
+
+def _until_damage(path: Path, damage: list[str]) -> Iterator[tuple[float, Frame]]:
+    """The frames of a trace up to where it cannot be read on, which is noted in `damage`: a
+    recorder that was killed leaves half a line behind. Raises UsageError when not one can be read.
+    """
+    count = 0
+    try:
+        for timed in read_trace(path):
+            yield timed
+            count += 1
+    except UsageError as error:
+        if not count:
+            raise
+        damage.append(f"{error.where or error.what}: {error.cause}")
+
+
+def _suffix(path: Path) -> str:
+    return "".join(path.suffixes[-2:] if path.suffix == ".gz" else path.suffixes[-1:])[1:].lower()
+
+
+def _report(path: Path) -> dict[str, Any]:
+    """The report of a bundle; empty when there is none."""
+    try:
+        if not path.exists():
+            return {}
+        with path.open("rb") as file:
+            loaded = json.loads(file.read(_MAX_REPORT_SIZE))
+    except (OSError, ValueError, RecursionError) as error:
+        raise _no_report(path, f"{type(error).__name__}: {error!s:.100}") from error
+    if not isinstance(loaded, dict):
+        raise _no_report(path, "it holds no JSON object")
+    return loaded
+
+
+def _no_report(path: Path, cause: str) -> UsageError:
+    return UsageError(
+        f"{printable(str(path))} is no report of a bundle.",
+        cause=printable(cause),
+        remedy=f"Explain the {TRACE} in the same folder instead.",
+    )
+
+
+def _number(value: object) -> int | None:
+    return value if isinstance(value, int) and 0 < value <= 10_000_000 else None
+
+
+def _recorded(report: dict[str, Any]) -> Recorded:
+    words = report.get("command_line")
+    error = report.get("error")
+    error = error if isinstance(error, dict) else {}
+    exit_code = error.get("exit_code")
+    said = [
+        f"{title}{error[key]}"
+        for key, title in (
+            ("what", ""),
+            ("where", "where: "),
+            ("cause", "likely cause: "),
+            ("remedy", "what to do: "),
+        )
+        if error.get(key)
+    ]
+    return Recorded(
+        command=printable(shlex.join(map(str, words))) if isinstance(words, list) else "",
+        exit_code=exit_code if isinstance(exit_code, int) else None,
+        error=printable(" | ".join(said)),
+    )

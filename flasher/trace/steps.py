@@ -1,0 +1,134 @@
+"""The list of steps of a story: good packets folded, error frames counted, never endless."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+from flasher.trace.decoder import Field, Kind, Seen
+from flasher.trace.story import Line, PacketRun, Step, StepKind
+
+MAX_STEPS: Final = 1000
+"""Lines that one list keeps: the first half of them and the last half."""
+_VALUE_WIDTH: Final = 64
+"""Longer values are cut."""
+_ERRORS: Final = "error frames"
+
+
+class StepList:
+    """Collects lines; `fold` packets that were sent once and acknowledged into runs."""
+
+    def __init__(self, *, fold: bool = True, limit: int = MAX_STEPS) -> None:
+        self._fold = fold
+        self._head: list[Line] = []
+        self._half = max(1, limit // 2)
+        self._tail: deque[Line] = deque(maxlen=self._half)
+        self._taken = 0
+        self._pending: tuple[int, float, Step] | None = None
+        """A packet that waits for its ACK: number, begin, and its line if that does not come."""
+        self._run: PacketRun | None = None
+        self._errors = 0
+        self._errors_at = (0.0, 0.0)
+
+    @property
+    def left_out(self) -> int:
+        """Lines that were not kept."""
+        return self._taken - len(self._head) - len(self._tail)
+
+    def add(self, step: Step) -> None:
+        """One more line."""
+        self._flush()
+        self._keep(step)
+
+    def packet(self, number: int, begin_s: float, step: Step) -> None:
+        """A packet; it becomes a line of its own unless its ACK is the next thing."""
+        if not self._fold:
+            self.add(step)
+            return
+        self._flush_errors()
+        if self._pending is not None:
+            self._flush()
+        self._pending = (number, begin_s, step)
+
+    def ack(self, number: int, step: Step) -> None:
+        """An ACK; with the packet before it a part of a run."""
+        if self._pending is None or self._pending[0] != number:
+            self.add(step)
+            return
+        begin_s = self._pending[1]
+        self._pending = None
+        if self._run is not None and self._run.last == number - 1:
+            self._run = PacketRun(self._run.first, number, self._run.begin_s, step.at_s)
+        else:
+            self._flush_run()
+            self._run = PacketRun(number, number, begin_s, step.at_s)
+
+    def error_frame(self, at_s: float) -> None:
+        """An error frame; many in a row are one line."""
+        if not self._errors:
+            self._flush()
+            self._errors_at = (at_s, at_s)
+        self._errors += 1
+        self._errors_at = (self._errors_at[0], at_s)
+
+    def lines(self) -> tuple[Line, ...]:
+        """All that were kept."""
+        self._flush()
+        return (*self._head, *self._tail)
+
+    def _keep(self, line: Line) -> None:
+        self._taken += 1
+        if len(self._head) < self._half:
+            self._head.append(line)
+        else:
+            self._tail.append(line)
+
+    def _flush(self) -> None:
+        self._flush_errors()
+        self._flush_run()
+        if self._pending is not None:
+            step = self._pending[2]
+            self._pending = None
+            self._keep(step)
+
+    def _flush_run(self) -> None:
+        if self._run is not None:
+            self._keep(self._run)
+            self._run = None
+
+    def _flush_errors(self) -> None:
+        if self._errors:
+            begin_s, end_s = self._errors_at
+            text = f"{self._errors:,}"
+            if self._errors > 1:
+                text += f" within {end_s - begin_s:.3f} s"
+            self._errors = 0
+            self._keep(Step(begin_s, StepKind.ERROR_FRAMES, "", "", _ERRORS, text, is_trouble=True))
+
+
+def step_of(seen: Seen, at_s: float) -> Step:
+    """A thing seen as a line."""
+    kind = StepKind.DAMAGED if seen.kind is Kind.DAMAGED else StepKind.MESSAGE
+    said = ", ".join(_field_text(shown) for shown in seen.fields if _says_something(shown))
+    return Step(
+        at_s,
+        kind,
+        seen.sender,
+        seen.receiver,
+        seen.title,
+        said,
+        is_trouble=seen.is_trouble,
+        can_id=seen.can_id,
+    )
+
+
+def _says_something(shown: Field) -> bool:
+    """False for image bytes, and for a constant text that repeats the title."""
+    return shown.name not in ("payload", "text")
+
+
+def _field_text(shown: Field) -> str:
+    text = shown.text
+    if len(text) > _VALUE_WIDTH:
+        text = f"{text[:_VALUE_WIDTH].rstrip()} ..."
+    return f"{shown.label} {text} {shown.unit}".rstrip()

@@ -1,0 +1,274 @@
+"""What the facts of an upgrade mean: how it ended, where, most likely why, what to do.
+
+The order of the questions is the order of strength: what spoils everything (a second tool, a dead
+bus, two devices) is asked before what it would look like in the phase where it happened.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final, NamedTuple
+
+from flasher.protocol.text import BOOT_VERSION_FORM
+from flasher.trace.explanations import EXPLANATIONS, NOTHING
+from flasher.trace.facts import Facts
+from flasher.trace.story import Cause, Phase, Verdict
+
+_SILENT_S: Final = 1.0
+"""A tool that says nothing for so long, while it is its turn, has stopped."""
+_ACK_WAIT_S: Final = 0.4
+"""A packet without an answer for so long is unanswered, even if it was sent only once."""
+_RESETS: Final = 3
+"""So many unanswered resets are not the beginning of a trace that was cut off."""
+_ERRORS: Final = 3
+"""So many error frames since the last progress are the reason, not a chance."""
+_EXTRA_ACKS: Final = 3
+_DEAD_AGAIN: Final = frozenset({Cause.NO_BOOT_VERSION, Cause.NO_REQUEST, Cause.UPDATE_NOT_TAKEN})
+
+
+class _Found(NamedTuple):
+    cause: Cause
+    text: str
+
+
+def judge(upgrade: Facts, until_s: float, *, is_alone: bool) -> Verdict:
+    """The verdict. The trace is known to go on until `until_s`; `is_alone` when nobody but the tool
+    was ever heard.
+    """
+    found = _completed(upgrade) or _spoiled(upgrade, is_alone=is_alone)
+    if found is None:
+        silent_s = until_s - upgrade.last_at_s
+        match upgrade.phase:
+            case Phase.UPDATE:
+                found = _in_update(upgrade)
+            case Phase.TRANSFER:
+                found = _in_transfer(upgrade, silent_s)
+            case Phase.END | Phase.CONFIRM:
+                found = _at_end(upgrade)
+            case _:
+                found = _before_update(upgrade, until_s)
+    if upgrade.earlier is not None and found.cause in _DEAD_AGAIN:
+        # The device did not come back: what happened before says more than that.
+        return replace(upgrade.earlier, text=f"{upgrade.earlier.text} Then: {found.text}")
+    packet = upgrade.current if upgrade.phase is Phase.TRANSFER else None
+    likely, remedy = EXPLANATIONS.get(found.cause, NOTHING)
+    names = {"node": upgrade.target.node.name, "boot_name": upgrade.target.boot_name}
+    return Verdict(
+        cause=found.cause,
+        phase=upgrade.phase,
+        packet=None if packet is None else packet.number,
+        attempt=upgrade.attempt,
+        text=found.text,
+        likely=likely.format(**names),
+        remedy=remedy.format(**names),
+    )
+
+
+def _completed(upgrade: Facts) -> _Found | None:
+    node, running = upgrade.target.node.name, upgrade.running_version
+    if upgrade.completed_at_s is None:
+        return None
+    if running is None:
+        text = f"The {node} has every packet and said complete; no version answer is in the trace."
+        return _Found(Cause.COMPLETED, text)
+    if _is_other(upgrade):
+        return _other_version(upgrade)
+    return _Found(
+        Cause.COMPLETED,
+        f"The {node} has every packet, said complete, and is running version {running}.",
+    )
+
+
+def _is_other(upgrade: Facts) -> bool:
+    """True when the one version inside the image is not the one that answers."""
+    known = upgrade.image_versions
+    return len(known) == 1 and upgrade.running_version not in known
+
+
+def _other_version(upgrade: Facts) -> _Found:
+    (sent,) = upgrade.image_versions
+    said = "said complete" if upgrade.completed_at_s is not None else "did not say complete"
+    return _Found(
+        Cause.OTHER_VERSION,
+        f"The {upgrade.target.node.name} {said}; it answers version {upgrade.running_version}, "
+        f"the packets hold version {sent}.",
+    )
+
+
+# -- what spoils everything -----------------------------------------------------------------------
+
+
+def _spoiled(upgrade: Facts, *, is_alone: bool) -> _Found | None:
+    node = upgrade.target.node.name
+    if upgrade.intrusions:
+        said = "; ".join(upgrade.intrusions[:3])
+        text = f"On the tool's own CAN id there came what this upgrade does not explain: {said}."
+        return _Found(Cause.SECOND_TOOL, text)
+    if upgrade.interleaving.found and upgrade.damage_from_tool:
+        begun = "began inside another one"
+        text = f"On the tool's own CAN id a message {begun}, {upgrade.interleaving.found} time(s)."
+        return _Found(Cause.SECOND_TOOL, text)
+    if is_alone and upgrade.errors:
+        text = f"Only the tool's frames and {upgrade.errors:,} error frame(s) are on this bus."
+        return _Found(Cause.NOBODY_ACKNOWLEDGES, text)
+    if upgrade.boot_changes or upgrade.extra_acks >= _EXTRA_ACKS:
+        return _Found(Cause.TWO_DEVICES, _two_devices(upgrade))
+    names = upgrade.boot_names
+    is_other = names and (upgrade.target.boot_name not in names or upgrade.is_boot_odd)
+    if is_other and upgrade.phase is not Phase.TRANSFER and not upgrade.ends:
+        own = f"{upgrade.target.boot_name} {BOOT_VERSION_FORM}"
+        text = f"The bootloader announces {', '.join(upgrade.boot_versions)}; a {node} says {own}."
+        return _Found(Cause.WRONG_DEVICE, text)
+    if upgrade.early_complete and not upgrade.ends:
+        text = f"The {node} said complete before the tool had sent the end of the transfer."
+        return _Found(Cause.COMPLETE_TOO_EARLY, text)
+    if upgrade.shutdown_at_s is not None:
+        after_s = upgrade.shutdown_at_s - upgrade.begin_s
+        text = f"The battery announced SHUTDOWN {after_s:.2f} s after the begin of the upgrade, "
+        text += "which was not completed."
+        return _Found(Cause.SHUTDOWN, text)
+    if upgrade.errors_now >= _ERRORS:
+        text = f"{upgrade.errors_now:,} error frames came since the last thing that went well."
+        return _Found(Cause.BUS_TROUBLE, text)
+    return None
+
+
+def _two_devices(upgrade: Facts) -> str:
+    node = upgrade.target.node.name
+    if upgrade.boot_changes:
+        heard = ", ".join(f"{text} ({count})" for text, count in upgrade.boot_versions.items())
+        return f"On the id of the {node} bootloaders announce different versions: {heard}."
+    return f"{upgrade.extra_acks} packets that were sent once had two ACKs."
+
+
+# -- phase by phase -------------------------------------------------------------------------------
+
+
+def _before_update(upgrade: Facts, until_s: float) -> _Found:
+    node = upgrade.target.node.name
+    if upgrade.is_announced:
+        said = ", ".join(upgrade.boot_versions)
+        text = f"The bootloader announced {said}, and the tool sent no update command."
+        return _stopped(text, until_s - upgrade.tool_at_s)
+    if upgrade.feedbacks:
+        text = f"The application of the {node} confirmed the reset, and no boot version followed."
+        return _Found(Cause.NO_BOOT_VERSION, text + _short(until_s - upgrade.last_at_s))
+    text = f"The reset was sent {_times(upgrade.resets)}, and the {node} did not answer."
+    if upgrade.resets >= _RESETS or until_s - upgrade.begin_s >= _SILENT_S:
+        return _Found(Cause.NO_BOOT_VERSION, text)
+    return _Found(Cause.RECORDING_ENDS, text)
+
+
+def _in_update(upgrade: Facts) -> _Found:
+    node = upgrade.target.node.name
+    sent = f"The update command was sent {_times(upgrade.updates)}"
+    if upgrade.feedbacks_after_update:
+        text = f"{sent}; the application of the {node} answers it, not the bootloader."
+        return _Found(Cause.UPDATE_NOT_TAKEN, text)
+    if upgrade.boots_after_update:
+        text = f"{sent}; the bootloader of the {node} goes on announcing itself."
+        return _Found(Cause.UPDATE_NOT_TAKEN, text)
+    return _Found(Cause.NO_REQUEST, f"{sent}, and the {node} did not request the transfer.")
+
+
+def _in_transfer(upgrade: Facts, silent_s: float) -> _Found:
+    node, packet = upgrade.target.node.name, upgrade.current
+    if upgrade.is_restarted:
+        at = "" if packet is None else f" at packet {packet.number} of {upgrade.total}"
+        text = f"The {node} restarted{at}, {_times(upgrade.restarts)} in all."
+        return _Found(Cause.DEVICE_RESTARTED, text)
+    if upgrade.is_cut_short:
+        after = "" if packet is None else f" after packet {packet.number} of {upgrade.total}"
+        return _stopped(f"The tool's last message{after} was never finished.", silent_s)
+    if packet is None:
+        return _stopped(f"The {node} requested the transfer, and no packet came.", silent_s)
+    which = f"Packet {packet.number} of {upgrade.total}"
+    if packet.answered_at_s is not None:
+        return _stopped(f"{which} was acknowledged, and nothing followed.", silent_s)
+    sent = f"{which} was sent {_times(packet.tries)}"
+    if upgrade.damage_now * 2 >= packet.tries:
+        pieces = f"{_pieces(upgrade.damage_now)} among tool and device"
+        return _Found(Cause.PACKET_DAMAGED, f"{sent} whole and never acknowledged; {pieces}.")
+    if packet.naks * 2 >= packet.tries and packet.naks > 1:
+        return _Found(Cause.PACKET_REFUSED, f"{sent} and refused {_times(packet.naks)} (NAK).")
+    if packet.naks and packet.tries == 1:
+        return _stopped(f"{which} was refused once, and was not sent again.", silent_s)
+    if packet.tries > 1 or silent_s >= _ACK_WAIT_S:
+        answers = "the application answers" if upgrade.feedbacks_after_update else "no ACK came"
+        return _Found(Cause.PACKET_UNANSWERED, f"{sent}, and {answers}.")
+    return _Found(Cause.RECORDING_ENDS, f"{sent}, its answer is not in the trace any more.")
+
+
+def _at_end(upgrade: Facts) -> _Found:
+    node = upgrade.target.node.name
+    if upgrade.running_version is not None:
+        if _is_other(upgrade):
+            return _other_version(upgrade)
+        if upgrade.image_versions:
+            text = f"The {node} did not say complete; the new application answers its version, "
+            return _Found(Cause.CONFIRMED_BY_VERSION, f"{text}{upgrade.running_version}.")
+    if upgrade.end_naks:
+        text = f"The {node} has every packet and answered the end of the transfer with NAK, "
+        return _Found(Cause.REFUSED, f"{text}{_times(upgrade.end_naks)}.")
+    text = f"Every packet is acknowledged, the end was sent {_times(upgrade.ends)}, "
+    text += "and neither complete nor NAK came."
+    if upgrade.boots_after_end:
+        text += f" The bootloader announced itself {_times(upgrade.boots_after_end)} after it."
+    if upgrade.running_version is not None:
+        text += f" An application answers, version {upgrade.running_version}; the packets name "
+        text += "none to compare it with."
+    return _Found(Cause.UNCONFIRMED, text)
+
+
+def _stopped(text: str, silent_s: float) -> _Found:
+    """It was the tool's turn: it stopped, or the recording did."""
+    if silent_s >= _SILENT_S:
+        return _Found(Cause.TOOL_STOPPED, f"{text} The trace goes on for {silent_s:.2f} s.")
+    return _Found(Cause.RECORDING_ENDS, text)
+
+
+def _pieces(count: int) -> str:
+    return f"{count} damaged piece{'' if count == 1 else 's'}"
+
+
+def _short(silent_s: float) -> str:
+    """The proviso of a trace that ends before the wait is over."""
+    if silent_s >= _SILENT_S:
+        return f" The trace goes on for {silent_s:.2f} s."
+    return " The trace ends here: either the tool gave up, or the recording was stopped."
+
+
+def _times(count: int) -> str:
+    return {1: "once", 2: "twice"}.get(count, f"{count} times")
+
+
+# -- what else was remarkable ---------------------------------------------------------------------
+
+
+def remarks(upgrade: Facts, cause: Cause) -> tuple[str, ...]:
+    """What is worth saying beside the verdict; what the verdict says is left out."""
+    found = []
+    names = upgrade.boot_names
+    if upgrade.restarts and cause is not Cause.DEVICE_RESTARTED:
+        found.append(f"the device restarted in the transfer {_times(upgrade.restarts)}")
+    if upgrade.early_complete and cause is not Cause.COMPLETE_TOO_EARLY:
+        found.append("the device said complete before the end of the transfer was sent")
+    if upgrade.boot_changes and cause is not Cause.TWO_DEVICES:
+        found.append(f"different boot versions: {', '.join(upgrade.boot_versions)}")
+    if upgrade.extra_acks and cause is not Cause.TWO_DEVICES:
+        found.append(f"packets with an ACK too many: {upgrade.extra_acks}")
+    if names and upgrade.target.boot_name not in names and cause is not Cause.WRONG_DEVICE:
+        found.append(f"boot name is {', '.join(sorted(names))}, not {upgrade.target.boot_name}")
+    if upgrade.shutdown_at_s is not None and cause is not Cause.SHUTDOWN:
+        found.append("the battery announced SHUTDOWN in the meantime")
+    if upgrade.intrusions and cause is not Cause.SECOND_TOOL:
+        found.append(f"not explained by this upgrade: {'; '.join(upgrade.intrusions)}")
+    if upgrade.errors and cause not in {Cause.BUS_TROUBLE, Cause.NOBODY_ACKNOWLEDGES}:
+        found.append(f"{upgrade.errors:,} error frame(s) in the meantime")
+    if upgrade.damage_from_tool:
+        found.append(f"{_pieces(upgrade.damage_from_tool)} on the tool's id")
+    if upgrade.damage_from_device:
+        found.append(f"{_pieces(upgrade.damage_from_device)} on the device's id")
+    if upgrade.end_naks and cause is not Cause.REFUSED:
+        found.append(f"the end of the transfer was refused {_times(upgrade.end_naks)}")
+    return tuple(found)

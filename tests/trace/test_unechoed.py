@@ -1,0 +1,39 @@
+"""Echoes of an adapter: in a trace, a frame that was sent stands once."""
+
+from __future__ import annotations
+
+from flasher.protocol.echoes import ECHO_LIMIT_S
+from flasher.protocol.frame import Frame
+from flasher.trace.ring import FlightRecorder
+from flasher.trace.unechoed import Unechoed
+
+OWN = Frame(0x752, b"\x01")
+ANSWER = Frame(0x725, b"\x02")
+
+
+def recorded(*frames: tuple[float, bool, Frame]) -> list[tuple[float, bool, Frame]]:
+    flight = FlightRecorder()
+    tap = Unechoed(lambda: [flight])
+    for now, sent, frame in frames:
+        tap(frame, sent=sent, now=now)
+    return [(entry.at_s, entry.sent, entry.frame) for entry in flight]
+
+
+def test_an_echo_is_left_out_and_everything_else_stays() -> None:
+    sent, answer = (1.0, True, OWN), (1.2, False, ANSWER)
+    assert recorded(sent, (1.1, False, OWN), answer) == [sent, answer]
+
+
+def test_each_sent_frame_has_one_echo_a_further_copy_is_somebody_elses() -> None:
+    sent, copy = (1.0, True, OWN), (1.2, False, OWN)
+    assert recorded(sent, (1.1, False, OWN), copy) == [sent, copy]
+    twice = [sent, (1.05, True, OWN)]
+    assert recorded(*twice, (1.1, False, OWN), (1.2, False, OWN)) == twice
+
+
+def test_what_was_never_sent_or_comes_too_late_is_no_echo() -> None:
+    early, late = (0.5, False, OWN), (1.0 + ECHO_LIMIT_S + 0.01, False, OWN)
+    assert recorded(early) == [early]
+    assert recorded((1.0, True, OWN), late) == [(1.0, True, OWN), late]
+    other = (1.1, False, Frame(0x752, b"\x03"))
+    assert recorded((1.0, True, OWN), other) == [(1.0, True, OWN), other]
