@@ -1,0 +1,1 @@
+"""Pages for people: self-contained HTML with charts, made from what other packages found out."""

@@ -1,0 +1,92 @@
+"""The one way from data to an HTML page: templates, escaping, and what every page has.
+
+A page is one file: its style is inside, it holds no script and asks for nothing from anywhere (its
+Content-Security-Policy forbids both). Every value goes through two gates: HTML escaping, and
+`visible`, which shows what could reorder, hide or pile up text. Text that a device sent can
+therefore be put anywhere in a template.
+"""
+
+from __future__ import annotations
+
+import unicodedata
+from enum import Enum
+from typing import Any, Final
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from flasher.report import scale
+
+TEXT_LIMIT: Final = 400
+"""Characters of one text on a page; what is longer ends in an ellipsis."""
+_UNSAFE_CATEGORIES: Final = ("C", "M", "Zl", "Zp")
+"""Unicode: control, format (text direction), surrogates, unassigned; combining marks; separators
+of lines and paragraphs."""
+_ELLIPSIS: Final = "\N{HORIZONTAL ELLIPSIS}"
+
+
+class Status(Enum):
+    """How good a thing is. The value is its class in the style sheet; a page always adds a word."""
+
+    GOOD = "good"
+    WARNING = "warning"
+    BAD = "bad"
+    NEUTRAL = "neutral"
+
+
+def visible(text: str) -> str:
+    """`text` with characters escaped that have no shape of their own; newline and tab are kept."""
+    return "".join(
+        char.encode("unicode_escape").decode()
+        if unicodedata.category(char).startswith(_UNSAFE_CATEGORIES) and char not in "\n\t"
+        else char
+        for char in text
+    )
+
+
+def shortened(text: str, limit: int = TEXT_LIMIT) -> str:
+    """`text`, cut to `limit` characters with an ellipsis."""
+    return text if len(text) <= limit else text[: limit - 1].rstrip() + _ELLIPSIS
+
+
+def counted(number: int) -> str:
+    """A whole number with commas: 65,535."""
+    return f"{number:,}"
+
+
+def percent(share: float) -> str:
+    """A share of 1 in percent: 87 %, 0.4 %, 0 %."""
+    value = share * 100
+    return f"{value:.1f} %" if 0.05 <= value < 9.95 else f"{value:.0f} %"
+
+
+def render_page(template: str, **context: Any) -> str:
+    """The page that `template` (a file in `templates/`) makes of `context`.
+
+    Raises jinja2.UndefinedError for a name that the template needs and `context` does not have.
+    """
+    return _ENVIRONMENT.get_template(template).render(**context)
+
+
+def _finalize(value: object) -> object:
+    """Last gate for every value that a template prints; markup of our own passes."""
+    return visible(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("flasher.report"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        finalize=_finalize,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["duration"] = scale.duration_text
+    environment.filters["counted"] = counted
+    environment.filters["percent"] = percent
+    environment.filters["shortened"] = shortened
+    environment.globals["Status"] = Status
+    return environment
+
+
+_ENVIRONMENT: Final = _environment()

@@ -1,0 +1,241 @@
+"""The latency chart as numbers: where every dot and tick lies. `templates/charts.html` draws it.
+
+Pure layout. A chart is made for a width in CSS pixels, so that its text has its full size both
+on a phone and on a desk (`WIDTHS`). Long series are drawn as stretches, so that a chart has a
+bounded size however long the series is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Final, NamedTuple
+
+from flasher.report.scale import (
+    Axis,
+    Tick,
+    duration_text,
+    middle,
+    slices,
+    whole_ticks,
+)
+
+WIDTHS: Final = {"wide": 880, "narrow": 340}
+"""Width of a drawing for each class of the style sheet; a page holds both and shows one."""
+_DOTS_PER_WIDTH: Final = 0.5
+"""More samples than this a pixel are drawn as stretches with minimum, median and maximum."""
+_STRETCH_WIDTH: Final = 6
+LEFT: Final = 58
+RIGHT: Final = 14
+TOP: Final = 12
+_LATENCY_HEIGHT: Final = 200
+_LANE_HEIGHT: Final = 18
+_LANE_GAP: Final = 6
+_Y_INTERVALS: Final = 7
+AXIS_HEIGHT: Final = 40
+
+
+class Frame(NamedTuple):
+    """The drawing and the area inside its axes, in CSS pixels."""
+
+    width: float
+    height: float
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+
+@dataclass(frozen=True)
+class Sample:
+    """One packet: its number, the time of its answer in seconds (None: no answer), how often it was
+    sent again, and how many NAKs came for it.
+    """
+
+    number: int
+    seconds: float | None
+    repeated: int = 0
+    naks: int = 0
+
+
+class MarkKind(Enum):
+    """What a mark under the plot stands for; the value is its word."""
+
+    REPEATED = "repeated"
+    NAK = "NAK"
+    UNANSWERED = "no answer"
+
+    @property
+    def short(self) -> str:
+        """A word that fits left of the plot."""
+        return {"repeated": "again", "NAK": "NAK", "no answer": "silent"}[self.value]
+
+
+class Mark(NamedTuple):
+    """Something that happened to a packet, or to some of a stretch."""
+
+    x: float
+    kind: MarkKind
+    tip: str
+
+
+class Lane(NamedTuple):
+    """A row of marks of one kind."""
+
+    kind: MarkKind
+    y: float
+    marks: tuple[Mark, ...]
+
+
+class Dot(NamedTuple):
+    """One answer."""
+
+    x: float
+    y: float
+    tip: str
+
+
+class Stretch(NamedTuple):
+    """The answers of some packets in a row: from the fastest to the slowest, and the median."""
+
+    x: float
+    top: float
+    height: float
+    middle: float
+    width: float
+    tip: str
+
+
+@dataclass(frozen=True)
+class LatencyChart:
+    """Answer time over packet number."""
+
+    frame: Frame
+    x_ticks: tuple[Tick, ...]
+    y_axis: Axis
+    dots: tuple[Dot, ...]
+    stretches: tuple[Stretch, ...]
+    lanes: tuple[Lane, ...]
+    per_stretch: int
+    """Packets in one stretch, at the most; 1 where each packet has its dot."""
+    description: str
+
+
+def latency_chart(samples: Sequence[Sample], width: float) -> LatencyChart:
+    """The chart of these packets, in order, `width` CSS pixels wide. Raises ValueError for none."""
+    if not samples:
+        raise ValueError("no packets")
+    plot_width = width - LEFT - RIGHT
+    kinds = [kind for kind in MarkKind if any(_count(sample, kind) for sample in samples)]
+    bottom = TOP + _LATENCY_HEIGHT
+    lanes_top = bottom + _LANE_GAP
+    height = lanes_top + _LANE_HEIGHT * len(kinds) + AXIS_HEIGHT
+    frame = Frame(width, height, LEFT, TOP, width - RIGHT, bottom)
+    known = [sample.seconds for sample in samples if sample.seconds is not None]
+    y_axis = Axis.over(known, bottom, TOP, from_zero=True, intervals=_Y_INTERVALS)
+    groups = slices(len(samples), len(samples))
+    folded = len(samples) > plot_width * _DOTS_PER_WIDTH
+    if folded:
+        groups = slices(len(samples), int(plot_width // _STRETCH_WIDTH))
+    place = _places(len(samples), frame)
+    parts = [(place((begin + end - 1) / 2), samples[begin:end]) for begin, end in groups]
+    return LatencyChart(
+        frame=frame,
+        x_ticks=tuple(_number_ticks(samples, frame)),
+        y_axis=y_axis,
+        dots=() if folded else tuple(_dots(parts, y_axis)),
+        stretches=tuple(_stretches(parts, y_axis)) if folded else (),
+        lanes=tuple(
+            Lane(kind, lanes_top + _LANE_HEIGHT * (row + 0.5), tuple(_marks(parts, kind)))
+            for row, kind in enumerate(kinds)
+        ),
+        per_stretch=max(end - begin for begin, end in groups),
+        description=_describe(samples, known),
+    )
+
+
+def _places(count: int, frame: Frame) -> Callable[[float], float]:
+    """Where the sample with an index lies."""
+    begin, end = frame.left + 4, frame.right - 4
+    if count == 1:
+        return lambda _: (begin + end) / 2
+    return lambda index: round(begin + index * (end - begin) / (count - 1), 1)
+
+
+def _number_ticks(samples: Sequence[Sample], frame: Frame) -> Iterable[Tick]:
+    """Ticks at round packet numbers; where numbers are missing, at round counts of packets."""
+    begin, end, intervals = frame.left + 4, frame.right - 4, intervals_for(frame.width)
+    first, last = samples[0].number, samples[-1].number
+    if last - first == len(samples) - 1:
+        yield from whole_ticks(first, last, begin, end, intervals)
+        return
+    for tick in whole_ticks(0, len(samples) - 1, begin, end, intervals):
+        yield Tick(samples[int(tick.value)].number, tick.at)
+
+
+def intervals_for(width: float) -> int:
+    """Ticks that an axis of this width has room for, less one."""
+    return max(2, int(width // 90))
+
+
+def _count(sample: Sample, kind: MarkKind) -> int:
+    match kind:
+        case MarkKind.REPEATED:
+            return sample.repeated
+        case MarkKind.NAK:
+            return sample.naks
+        case MarkKind.UNANSWERED:
+            return int(sample.seconds is None)
+
+
+_Parts = Sequence[tuple[float, Sequence[Sample]]]
+
+
+def _name(part: Sequence[Sample]) -> str:
+    if len(part) == 1:
+        return f"packet {part[0].number}"
+    return f"packets {part[0].number} to {part[-1].number}"
+
+
+def _dots(parts: _Parts, axis: Axis) -> Iterable[Dot]:
+    for x, part in parts:
+        seconds = part[0].seconds
+        if seconds is not None:
+            y = round(axis.at(seconds), 1)
+            yield Dot(x, y, f"{_name(part)}: {duration_text(seconds)}")
+
+
+def _stretches(parts: _Parts, axis: Axis) -> Iterable[Stretch]:
+    for x, part in parts:
+        known = sorted(sample.seconds for sample in part if sample.seconds is not None)
+        if known:
+            low, mid, high = known[0], middle(known), known[-1]
+            top = round(axis.at(high) - 1, 1)
+            tip = (
+                f"{_name(part)}: {duration_text(low)} to {duration_text(high)}, "
+                f"median {duration_text(mid)}"
+            )
+            tall = round(axis.at(low) + 1 - top, 1)
+            yield Stretch(x, top, tall, round(axis.at(mid), 1), _STRETCH_WIDTH - 2, tip)
+
+
+def _marks(parts: _Parts, kind: MarkKind) -> Iterable[Mark]:
+    for x, part in parts:
+        count = sum(_count(sample, kind) for sample in part)
+        if count:
+            times = "" if count == 1 else f", {count} times"
+            yield Mark(x, kind, f"{_name(part)}: {kind.value}{times}")
+
+
+def _describe(samples: Sequence[Sample], known: Sequence[float]) -> str:
+    said = f"{len(samples):,} packets, {len(known):,} with an answer"
+    if known:
+        said += (
+            f": {duration_text(min(known))} to {duration_text(max(known))}, "
+            f"median {duration_text(middle(sorted(known)))}"
+        )
+    for kind in (MarkKind.REPEATED, MarkKind.NAK):
+        count = sum(_count(sample, kind) for sample in samples)
+        said += f"; {count:,} {'repetitions' if kind is MarkKind.REPEATED else 'NAKs'}"
+    return said + "."

@@ -1,0 +1,295 @@
+"""The page of `flasher explain --html`: the story of a trace, drawn.
+
+`render` arranges; the templates print. What could grow with the trace (steps, packets with trouble,
+talkers, upgrades) is cut at a number that a person can still read, and the page says so.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Final, NamedTuple
+
+from flasher.protocol.spec import Node
+from flasher.report import chart, sequence, spread
+from flasher.report.base import Status, render_page
+from flasher.report.scale import duration_text
+from flasher.trace.figures import Distribution
+from flasher.trace.story import (
+    Cause,
+    Line,
+    PacketRun,
+    PacketStory,
+    Step,
+    StepKind,
+    Story,
+    UpgradeStory,
+)
+
+UPGRADES_SHOWN: Final = 8
+"""Upgrades of one trace that are drawn; the others have a line in a table."""
+ATTEMPTS_DRAWN: Final = 3
+"""The last attempts that have a latency chart; with more than one upgrade only the last one."""
+PACKETS_SHOWN: Final = 200
+"""Packets with trouble that have a line, over all upgrades."""
+TALKERS_SHOWN: Final = 100
+REMARKS_SHOWN: Final = 40
+_LIFELINES: Final = 4
+_HISTOGRAM_LEAST: Final = 20
+_ITEMS_LEAST: Final = 60
+_OTHERS: Final = "others"
+_BROADCAST: Final = "all"
+_TOOL: Final = Node.CDL.name
+_UNKNOWN: Final = frozenset({Cause.UNCONFIRMED, Cause.RECORDING_ENDS})
+_WORDS: Final = {
+    Status.GOOD: "went well",
+    Status.WARNING: "outcome not known",
+    Status.BAD: "went wrong",
+    Status.NEUTRAL: "no upgrade",
+}
+
+Drawings = dict[str, chart.LatencyChart]
+"""One drawing for each width."""
+
+
+class PhaseRow(NamedTuple):
+    """A phase, and where it lies as shares of the upgrade."""
+
+    name: str
+    attempt: int
+    begin_s: float
+    length_s: float
+    begin_share: float
+    length_share: float
+
+
+class SpreadRow(NamedTuple):
+    """A distribution of the link report, with its drawings: None when there is nothing to draw."""
+
+    name: str
+    distribution: Distribution | None
+    drawings: dict[str, spread.Spread] | None
+
+
+class LatencyView(NamedTuple):
+    """The latency chart of one attempt."""
+
+    attempt: int
+    drawings: Drawings
+
+
+class _Room(NamedTuple):
+    """What one upgrade may take of the page."""
+
+    items: int
+    attempts: int
+    packets: int
+
+    @classmethod
+    def for_upgrades(cls, count: int) -> _Room:
+        """The share of each of so many upgrades."""
+        if count <= 1:
+            return cls(sequence.ITEMS_SHOWN, ATTEMPTS_DRAWN, PACKETS_SHOWN)
+        items = max(_ITEMS_LEAST, sequence.ITEMS_SHOWN // count)
+        return cls(items, 1, PACKETS_SHOWN // count)
+
+
+@dataclass(frozen=True)
+class UpgradeView:
+    """One upgrade as the page shows it."""
+
+    story: UpgradeStory
+    status: Status
+    word: str
+    phases: tuple[PhaseRow, ...]
+    sequence: dict[str, list[sequence.Part]]
+    latencies: tuple[LatencyView, ...]
+    spreads: tuple[SpreadRow, ...]
+    histogram: dict[str, spread.Histogram] | None
+    """Of the answers to packets that were sent once; None when there are only a few."""
+    troubled: tuple[PacketStory, ...]
+    troubled_count: int
+    remarks: tuple[str, ...]
+
+
+def render(story: Story) -> str:
+    """The whole page as HTML text."""
+    shown = story.upgrades[:UPGRADES_SHOWN]
+    room = _Room.for_upgrades(len(shown))
+    status = status_of(story.verdict.cause)
+    return render_page(
+        "explain.html",
+        story=story,
+        status=status,
+        word=_WORDS[status],
+        started=_wall_text(story.started_at),
+        upgrades=[_view(upgrade, room) for upgrade in shown],
+        more_upgrades=[
+            (upgrade, status_of(upgrade.verdict.cause))
+            for upgrade in story.upgrades[UPGRADES_SHOWN:]
+        ],
+        outside=_drawn(story.steps, "", room.items),
+        talkers=story.talkers[:TALKERS_SHOWN],
+        talkers_left_out=story.talkers_left_out + max(0, len(story.talkers) - TALKERS_SHOWN),
+    )
+
+
+def status_of(cause: Cause) -> Status:
+    """How good the end of an upgrade is."""
+    if cause.is_good:
+        return Status.GOOD
+    if not cause.is_upgrade:
+        return Status.NEUTRAL
+    return Status.WARNING if cause in _UNKNOWN else Status.BAD
+
+
+def _wall_text(seconds: float | None) -> str:
+    """Wall time in words; empty for none, or for one that no calendar holds."""
+    if seconds is None:
+        return ""
+    try:
+        return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%d %H:%M:%S} UTC"
+    except (OverflowError, ValueError, OSError):
+        return ""
+
+
+def _view(upgrade: UpgradeStory, room: _Room) -> UpgradeView:
+    status = status_of(upgrade.verdict.cause)
+    troubled = [packet for packet in upgrade.packets if _is_troubled(packet)]
+    more = len(upgrade.remarks) - REMARKS_SHOWN
+    remarks = upgrade.remarks[:REMARKS_SHOWN]
+    return UpgradeView(
+        story=upgrade,
+        status=status,
+        word=_WORDS[status],
+        phases=tuple(_phases(upgrade)),
+        sequence=_drawn(upgrade.steps, upgrade.target, room.items),
+        latencies=tuple(_latencies(upgrade.packets, room.attempts)),
+        spreads=tuple(_spreads(upgrade)),
+        histogram=_histogram(upgrade.packets),
+        troubled=tuple(troubled[: room.packets]),
+        troubled_count=len(troubled),
+        remarks=(*remarks, f"{more:,} more remarks") if more > 0 else remarks,
+    )
+
+
+def _is_troubled(packet: PacketStory) -> bool:
+    return packet.tries > 1 or packet.naks > 0 or packet.answered_at_s is None
+
+
+# -- the parts of an upgrade ----------------------------------------------------------------------
+
+
+def _phases(upgrade: UpgradeStory) -> Iterable[PhaseRow]:
+    whole_s = max((span.end_s for span in upgrade.phases), default=0.0) - upgrade.begin_s
+    for span in upgrade.phases:
+        length_s = span.end_s - span.begin_s
+        begin, length = span.begin_s - upgrade.begin_s, length_s
+        if whole_s > 0:
+            begin, length = begin / whole_s, length / whole_s
+        yield PhaseRow(
+            span.phase.value, span.attempt, span.begin_s, length_s, _share(begin), _share(length)
+        )
+
+
+def _share(value: float) -> float:
+    return min(1.0, max(0.0, value))
+
+
+def _latencies(packets: Sequence[PacketStory], most: int) -> Iterable[LatencyView]:
+    """A chart for each of the last attempts that sent packets."""
+    by_attempt: dict[int, list[chart.Sample]] = {}
+    for packet in packets:
+        sample = chart.Sample(packet.number, packet.answer_s, packet.tries - 1, packet.naks)
+        by_attempt.setdefault(packet.attempt, []).append(sample)
+    for attempt, samples in list(by_attempt.items())[-most:]:
+        drawings = {name: chart.latency_chart(samples, at) for name, at in chart.WIDTHS.items()}
+        yield LatencyView(attempt, drawings)
+
+
+def _histogram(packets: Iterable[PacketStory]) -> dict[str, spread.Histogram] | None:
+    values = [one.answer_s for one in packets if one.tries == 1 and one.answer_s is not None]
+    if len(values) < _HISTOGRAM_LEAST:
+        return None
+    return {name: spread.histogram(values, width) for name, width in chart.WIDTHS.items()}
+
+
+def _spreads(upgrade: UpgradeStory) -> Iterable[SpreadRow]:
+    if upgrade.link is None:
+        return
+    for name, found in (
+        ("the device's answer to a packet", upgrade.link.device_answer),
+        ("the tool's next packet after an ACK", upgrade.link.host_turnaround),
+    ):
+        drawings = (
+            None
+            if found is None or found.maximum_s <= 0
+            else {width: spread.spread(found, at) for width, at in chart.WIDTHS.items()}
+        )
+        yield SpreadRow(name, found, drawings)
+
+
+# -- steps as a sequence diagram ------------------------------------------------------------------
+
+
+def _drawn(lines: Sequence[Line], target: str, most: int) -> dict[str, list[sequence.Part]]:
+    """The diagram of these steps for each width."""
+    participants = _participants(lines, target)
+    items = sequence.thinned([_item(line, participants) for line in lines], most)
+    return {
+        name: sequence.diagram(items, participants, width) for name, width in chart.WIDTHS.items()
+    }
+
+
+def _participants(lines: Sequence[Line], target: str) -> list[str]:
+    """The tool, the target, then whoever is named most; the rest are the others."""
+    named = Counter(
+        name
+        for line in lines
+        if isinstance(line, Step)
+        for name in (line.sender, line.receiver)
+        if name and name not in (_BROADCAST, _TOOL, target)
+    )
+    tool = any(isinstance(line, Step) and _TOOL in (line.sender, line.receiver) for line in lines)
+    first = [_TOOL, target] if target else [_TOOL] * (tool or not named)
+    room = _LIFELINES - len(first)
+    others = [name for name, _ in named.most_common(room)]
+    if len(named) > room:
+        others[-1:] = [_OTHERS]
+    return [*first, *others]
+
+
+def _item(line: Line, participants: Sequence[str]) -> sequence.Item:
+    if isinstance(line, PacketRun):
+        some = f"packet {line.first}" if line.count == 1 else f"packets {line.first} to {line.last}"
+        return sequence.Item(
+            sequence.ItemKind.BLOCK,
+            line.begin_s,
+            f"{some} acknowledged",
+            f"in {duration_text(line.end_s - line.begin_s)}",
+            end_s=line.end_s,
+        )
+    if not line.sender or line.kind not in (StepKind.MESSAGE, StepKind.DAMAGED):
+        return sequence.Item(
+            sequence.ItemKind.BLOCK,
+            line.at_s,
+            line.title,
+            line.text,
+            is_trouble=line.is_trouble,
+            end_s=None if line.kind is StepKind.GAP else line.at_s,
+        )
+    return sequence.Item(
+        sequence.ItemKind.ARROW,
+        line.at_s,
+        line.title,
+        line.text,
+        _place(line.sender, participants),
+        line.receiver if line.receiver == _BROADCAST else _place(line.receiver, participants),
+        line.is_trouble,
+    )
+
+
+def _place(name: str, participants: Sequence[str]) -> str:
+    return name if name in participants else _OTHERS

@@ -1,0 +1,199 @@
+"""Axes: where the ticks of a chart go, what they are called, and where a value lies.
+
+Small pure functions; lengths on paper are in the units of the drawing, values in whatever the
+caller measures.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+LOG_RANGE: Final = 30.0
+"""A range of values wider than this factor is drawn on a logarithmic scale."""
+_STEPS: Final = (1, 2, 5, 10)
+"""Steps that people count in, times a power of ten."""
+_ROUNDING: Final = 1e-9
+_UNITS: Final = (("s", 1.0), ("ms", 1e-3), ("\N{MICRO SIGN}s", 1e-6))
+_LEAST: Final = 1e-12
+"""Less than this is 0: no clock measures it."""
+_SAME: Final = 1e-6
+"""Values that differ by less than this share are one value: no tick could tell them apart."""
+
+
+class Tick(NamedTuple):
+    """A mark of an axis: its value, and where it lies on paper."""
+
+    value: float
+    at: float
+
+
+def nice_step(span: float, intervals: int) -> float:
+    """The smallest step of 1, 2 or 5 times a power of ten that parts `span` into at most
+    `intervals`. Raises ValueError unless both are positive.
+    """
+    if span <= 0 or intervals <= 0:
+        raise ValueError("span and intervals must be positive")
+    raw = span / intervals
+    magnitude = 10.0 ** math.floor(math.log10(raw))
+    for step in _STEPS:
+        if step * magnitude >= raw * (1 - _ROUNDING):
+            return step * magnitude
+    return _STEPS[-1] * magnitude * 10  # only by rounding
+
+
+def linear_ticks(low: float, high: float, intervals: int = 5) -> list[float]:
+    """Round values from at or below `low` to at or above `high`; two at the least."""
+    if high - low <= max(_SAME * max(abs(low), abs(high)), _LEAST):
+        high = low + (abs(low) if abs(low) > _LEAST else 1.0)
+    step = nice_step(high - low, intervals)
+    first = math.floor(low / step + _ROUNDING)
+    last = math.ceil(high / step - _ROUNDING)
+    return [_clean(number * step) for number in range(first, last + 1)]
+
+
+def log_ticks(low: float, high: float, intervals: int = 9) -> list[float]:
+    """1, 2, 5 times the powers of ten that enclose `low` to `high`; where that makes more than
+    `intervals`, only the powers, and of many of these each second, third, ... one.
+
+    Raises ValueError unless 0 < low <= high.
+    """
+    if not 0 < low <= high:
+        raise ValueError("a logarithmic scale needs 0 < low <= high")
+    first = math.floor(math.log10(low) + _ROUNDING)
+    last = max(first + 1, math.ceil(math.log10(high) - _ROUNDING))
+    fine = [_clean(step * 10.0**power) for power in range(first, last) for step in (1, 2, 5)]
+    fine.append(_clean(10.0**last))
+    begin = max(tick for tick in fine[:-1] if tick <= low * (1 + _ROUNDING))
+    end = min(tick for tick in fine if tick >= high * (1 - _ROUNDING) and tick > begin)
+    kept = [tick for tick in fine if begin <= tick <= end]
+    if len(kept) - 1 <= intervals:
+        return kept
+    stride = -(-(last - first) // max(1, intervals))
+    return [_clean(10.0**power) for power in range(first, last + stride, stride)]
+
+
+def wants_log(values: Iterable[float]) -> bool:
+    """True when all values are above 0 and lie so far apart that a linear axis would hide the
+    small ones.
+    """
+    kept = list(values)
+    return bool(kept) and min(kept) > _LEAST and max(kept) / min(kept) > LOG_RANGE
+
+
+@dataclass(frozen=True)
+class Axis:
+    """Puts values on a line from `begin` to `end` on paper; `end` may lie before `begin`."""
+
+    low: float
+    high: float
+    begin: float
+    end: float
+    is_log: bool
+    ticks: tuple[Tick, ...]
+
+    @classmethod
+    def over(
+        cls,
+        values: Iterable[float],
+        begin: float,
+        end: float,
+        *,
+        from_zero: bool = False,
+        intervals: int = 5,
+        may_be_log: bool = True,
+    ) -> Axis:
+        """An axis that holds `values`, logarithmic where the range needs it. `from_zero` begins a
+        linear one at 0. Without values it goes from 0 to 1.
+        """
+        kept = list(values) or [0.0, 1.0]
+        is_log = may_be_log and wants_log(kept)
+        low, high = min(kept), max(kept)
+        if is_log:
+            places = log_ticks(low, high, intervals)
+        else:
+            places = linear_ticks(min(low, 0.0) if from_zero else low, high, intervals)
+        bare = cls(places[0], places[-1], begin, end, is_log, ())
+        ticks = tuple(Tick(value, round(bare.at(value), 1)) for value in places)
+        return cls(bare.low, bare.high, begin, end, is_log, ticks)
+
+    def at(self, value: float) -> float:
+        """Where `value` lies on paper; outside of the axis, at its nearer end."""
+        value = min(max(value, self.low), self.high)
+        if self.is_log:
+            share = math.log(value / self.low) / math.log(self.high / self.low)
+        else:
+            share = (value - self.low) / (self.high - self.low)
+        return self.begin + share * (self.end - self.begin)
+
+    def duration_label(self, seconds: float) -> str:
+        """A tick of a time axis in words: on a linear axis all with one unit, and as many decimals
+        as tell neighbours apart.
+        """
+        if self.is_log or len(self.ticks) < 2 or self.high < 0:
+            return duration_text(seconds)
+        if seconds == 0:
+            return "0"
+        unit, size = next(((name, size) for name, size in _UNITS if self.high >= size), _UNITS[-1])
+        step = (self.ticks[1].value - self.ticks[0].value) / size
+        decimals = max(0, -math.floor(math.log10(step) + _ROUNDING))
+        return f"{seconds / size:.{decimals}f} {unit}"
+
+
+def whole_ticks(first: int, last: int, begin: float, end: float, intervals: int = 6) -> list[Tick]:
+    """Ticks at whole numbers inside `first` to `last`, such as packet numbers; `first` always."""
+    if last <= first:
+        return [Tick(first, (begin + end) / 2)]
+    step = max(1, round(nice_step(last - first, intervals)))
+    numbers = [first, *range((first // step + 1) * step, last + 1, step)]
+    if len(numbers) > 2 and numbers[1] - first < step / 2:
+        del numbers[1]
+    scale = (end - begin) / (last - first)
+    return [Tick(number, round(begin + (number - first) * scale, 1)) for number in numbers]
+
+
+def slices(count: int, most: int) -> list[tuple[int, int]]:
+    """`count` things in order as at most `most` stretches of nearly one length: begin and end
+    (exclusive) of each.
+    """
+    parts = min(count, most)
+    return [(count * part // parts, count * (part + 1) // parts) for part in range(parts)]
+
+
+def middle(ordered: Sequence[float]) -> float:
+    """The median of values in ascending order. Raises ValueError for none."""
+    if not ordered:
+        raise ValueError("no values")
+    half = len(ordered) // 2
+    return ordered[half] if len(ordered) % 2 else (ordered[half - 1] + ordered[half]) / 2
+
+
+def duration_text(seconds: float | None) -> str:
+    """A time with three figures and the unit that suits it: 870 µs, 3.12 ms, 41.3 s, 2 min 05 s."""
+    if seconds is None:
+        return "\N{EN DASH}"
+    size = abs(seconds)
+    if size >= 120:
+        minutes, rest = divmod(round(size), 60)
+        return f"{'-' if seconds < 0 else ''}{minutes} min {rest:02} s"
+    if size == 0:
+        return "0 s"
+    if size >= 0.9995:
+        return f"{_three(seconds)} s"
+    if size >= 0.0009995:
+        return f"{_three(seconds * 1e3)} ms"
+    return f"{_three(seconds * 1e6)} \N{MICRO SIGN}s"
+
+
+def _three(value: float) -> str:
+    """`value` with three figures, and no more zeros than that."""
+    digits = max(0, 2 - math.floor(math.log10(abs(value))))
+    text = f"{value:.{digits}f}"
+    return text.rstrip("0").rstrip(".") if "." in text else text
+
+
+def _clean(value: float) -> float:
+    """Without the dust of binary fractions."""
+    return float(f"{value:.12g}")
