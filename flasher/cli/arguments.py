@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from flasher.api import Connection, as_target, connect, connect_mock
+from flasher.device.profile import DeviceProfile
 from flasher.errors import UsageError
 from flasher.image.image import Image
 from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, FORMATS, load
@@ -176,7 +177,10 @@ def open_connection(
 ) -> contextlib.AbstractContextManager[Connection]:
     """The bus that the options name: an adapter, or a whole bicycle with the model of `target`."""
     if options.mock:
-        return connect_mock(target, options.dialect, speed=options.mock_speed, system=True)
+        riding = DeviceProfile(battery_use="riding")  # so that there is something to see
+        return connect_mock(
+            target, options.dialect, speed=options.mock_speed, system=True, profile=riding
+        )
     return connect(options.dialect, **bus_config(options))
 
 

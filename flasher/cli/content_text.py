@@ -5,8 +5,9 @@ looks like is told by `flasher.trace.decoder`, the same for a query's answer and
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Final
+from typing import Final
 
+from flasher.cli.documents import FieldValue
 from flasher.host.items import meaningful_fields
 from flasher.protocol.fields import Content
 from flasher.trace.decoder import content_fields
@@ -30,7 +31,7 @@ def content_lines(content: Content) -> list[str]:
     return [row_line(label, value) for label, value in content_rows(content)]
 
 
-def content_document(content: Content) -> dict[str, Any]:
+def content_document(content: Content) -> dict[str, FieldValue]:
     """A content as JSON: field names with their units, texts escaped, bytes in hexadecimal, flags
     by name; null for a state of health that an older device does not know. Reserved bytes are
     left out, so that the keys do not depend on the answer.

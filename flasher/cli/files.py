@@ -3,20 +3,55 @@
 from __future__ import annotations
 
 import contextlib
+import os
+from collections.abc import Iterable
 from pathlib import Path
 
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 
 
-def check_writable(path: Path, option: str) -> None:
+def check_writable(path: Path, option: str, *, is_appended_to: bool = False) -> None:
     """Raises UsageError where no file can come to be: better before the work than after it.
-    `option` is the one that named the file.
+    `option` is the one that named the file. A file is replaced, for which its folder has to be
+    writable, unless it `is_appended_to`.
     """
     if path.is_dir():
         raise _not_written(path, option, "it is a folder")
     if not path.parent.is_dir():
         raise _not_written(path, option, "its folder does not exist")
+    if not is_appended_to and not _can_be_replaced(path):
+        raise _not_written(path, option, "its folder may not be written into")
+
+
+def _can_be_replaced(path: Path) -> bool:
+    """False for a folder in which this user can make no file; what is no regular file stays."""
+    try:
+        path = path.resolve(strict=False)
+        is_special = path.exists() and not path.is_file()
+    except (OSError, RuntimeError):
+        return True  # writing it will tell why not
+    return is_special or os.access(path.parent, os.W_OK)
+
+
+def check_not_read(path: str | Path, option: str, others: Iterable[object]) -> None:
+    """Raises UsageError when the file that is going to be written is one of the `others`: values of
+    the command line, which may name what the command reads.
+    """
+    for other in others:
+        if isinstance(other, str | Path) and _is_same(Path(path), Path(other)):
+            raise UsageError(
+                f"{printable(str(path))} is a file of the command itself.",
+                where=option,
+                remedy="Name another file: this one would be written over.",
+            )
+
+
+def _is_same(path: Path, other: Path) -> bool:
+    """By what they lead to, where they exist; ValueError: a text that can be no file's name."""
+    with contextlib.suppress(OSError, ValueError):
+        return path.samefile(other)
+    return path.absolute() == other.absolute()
 
 
 def write_whole(path: Path, data: bytes, option: str) -> None:
@@ -42,7 +77,7 @@ def _replace(path: Path, data: bytes) -> None:
     try:
         part.write_bytes(data)
         part.replace(path)
-    except OSError:
+    except BaseException:  # an interrupt too leaves nothing half written
         with contextlib.suppress(OSError):
             part.unlink(missing_ok=True)
         raise

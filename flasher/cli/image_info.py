@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from typing import Final, TypedDict
 
 from flasher import api
 from flasher.cli import arguments
+from flasher.cli.documents import ImageDocument, PlanDocument
+from flasher.cli.manifest_text import ManifestBesideDocument, beside_line, manifest_beside
 from flasher.cli.output import Output
 from flasher.cli.plan_text import (
     image_document,
@@ -26,9 +29,24 @@ examples:
 """
 
 
+class ImageInfoDocument(TypedDict):
+    """What is in a file, what lies beside it, and what an upgrade would send."""
+
+    image: ImageDocument
+    manifest: ManifestBesideDocument
+    plan: PlanDocument
+    """For the BMS where no target was named: others differ by the ids alone."""
+
+
+DOCUMENTS: Final = (ImageInfoDocument,)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.description = "Show what is in an image file and what an upgrade would send."
+    parser.description = (
+        "Show what is in an image file and what an upgrade would send. Opens no adapter. A file "
+        "that no device should get is refused as flasher flash refuses it."
+    )
     parser.epilog = _EPILOG
     arguments.add_image(parser)
     arguments.add_target(parser, required=False)
@@ -41,14 +59,15 @@ def run(options: argparse.Namespace, output: Output) -> int:
     table = vector_table(image)
     # The time differs by stuff bits only between targets: any one serves for the figure.
     plan = api.make_plan(image, options.target or BMS, options.dialect)
-    for line in (*image_lines(image), *vector_lines(table), *plan_lines(plan)):
+    beside = manifest_beside(options.image, image, options.target)
+    for line in (*image_lines(image), *vector_lines(table)):
+        output.result(line)
+    output.result(beside_line(beside))
+    for line in plan_lines(plan):
         output.result(line)
     output.document(
-        {
-            "ok": True,
-            "exit_code": int(ExitCode.OK),
-            "image": image_document(image, table),
-            "plan": plan_document(plan),
-        }
+        ImageInfoDocument(
+            image=image_document(image, table), manifest=beside, plan=plan_document(plan)
+        )
     )
     return ExitCode.OK

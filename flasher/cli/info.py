@@ -3,34 +3,60 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import Final, TypedDict
 
 from flasher import api, service
 from flasher.cli import arguments
 from flasher.cli.content_text import content_document, content_lines, row_line
+from flasher.cli.documents import FieldValue, HeardDocument
 from flasher.cli.output import Output
+from flasher.cli.recording import add_recording, recorded_connection
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.survey_text import heard_document, heard_lines
 from flasher.errors import ExitCode, NoAnswerError
 from flasher.service import DeviceInfo, Reading
 
+_DESCRIPTION = """\
+Ask one device everything that the documents let a tool ask (identity, versions, state, history),
+and show the answers with what it sends by itself. Nothing is written, and nothing is reset.
+"""
 _EPILOG = """\
 examples:
   flasher info -t bms --mock
   flasher info -t bms -i socketcan -c can0
+  flasher info -t bms -i socketcan -c can0 --json > record.json
   flasher info -t wmc -i socketcan -c can0       it cannot be asked: shows what it sends
 
 What the device does not answer is shown as such: an older one does not know every question.
 """
 
 
+class InfoDocument(TypedDict):
+    """What a device tells about itself."""
+
+    target: str
+    dialect: str
+    can_be_asked: bool
+    """False where the documents give no question to ask it."""
+    items: dict[str, dict[str, FieldValue] | None]
+    """Each item with its fields; null for one that was not answered."""
+    unanswered: dict[str, str]
+    """Why, for each of those."""
+    faults: FieldValue
+    heard: HeardDocument | None
+
+
+DOCUMENTS: Final = (InfoDocument,)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.description = "Show what a device tells about itself."
+    parser.description = _DESCRIPTION
     parser.epilog = _EPILOG
     arguments.add_target(parser)
     arguments.add_dialect(parser)
     arguments.add_mock(parser)
+    add_recording(parser)
     arguments.add_bus(parser)
 
 
@@ -38,18 +64,26 @@ def run(options: argparse.Namespace, output: Output) -> int:
     """Run the command; returns the exit code."""
     dialect = api.as_dialect(options.dialect)
     with (
-        arguments.open_connection(options, options.target) as connection,
+        recorded_connection(options, output, options.target) as (connection, record),
         stop_on_signal() as stopped,
     ):
         output.progress(f"asking the {options.target.node.name} on {connection.name} ...")
-        found = service.info(connection, options.target, dialect=dialect, cancelled=stopped)
+        found = service.info(
+            connection,
+            options.target,
+            dialect=dialect,
+            taps=record.taps,
+            cancelled=stopped,
+        )
+        if not found.is_there:
+            record.failed(_silent(found))
     if not found.is_there:
         error = _silent(found)
         output.failure(error, **_document(found))
         return error.exit_code
     for line in _lines(found):
         output.result(line)
-    output.document({"ok": True, "exit_code": int(ExitCode.OK), **_document(found)})
+    output.document(_document(found))
     return ExitCode.OK
 
 
@@ -108,7 +142,7 @@ def _why(reading: Reading) -> str:
     return "no answer"
 
 
-def _document(found: DeviceInfo) -> dict[str, Any]:
+def _document(found: DeviceInfo) -> InfoDocument:
     faults = found.survey.faults
     heard = found.survey.heard.get(found.target.node)
     return {

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
+from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final, TypedDict
 
 from flasher import api, events
 from flasher.cli import arguments
+from flasher.cli.documents import to_json
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.output import Output, byte_count
 from flasher.cli.stop import stop_on_signal
 from flasher.device.model import Device
 from flasher.device.profile import DeviceProfile, describe_options, set_option
 from flasher.device.system import System
+from flasher.device.variants import VARIANTS, find, make
 from flasher.driver import drive
 from flasher.errors import ExitCode, UsageError
+from flasher.log import BY_DEVICE, log_event
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import Target
+from flasher.protocol.spec import Dialect, Target
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
 
@@ -33,11 +36,44 @@ examples:
   flasher mock -t bms -i socketcan -c vcan0 --no-app --save-image received.bin
   flasher mock -t bms -i socketcan -c vcan0 --set repeated_packet=nak_next
   flasher mock -t bms --system -i socketcan -c vcan0
+  flasher mock --list-variants
+  flasher mock -t bms -i socketcan -c vcan0 --variant accepts-early-end
 
 Ends with exit code 0 when interrupted.
 
 choices for --set, the first value is the default:
 """
+SHOWN: Final = BY_DEVICE | {events.BytesDamaged}
+"""The events that are printed: the log on stderr leaves them out."""
+
+
+class MockDocument(TypedDict):
+    """What the device model received."""
+
+    images: int
+    """Complete upgrades."""
+
+
+class VariantDocument(TypedDict):
+    """A deliberately wrong device model."""
+
+    name: str
+    clause: str
+    """The case that it fails."""
+    also: list[str]
+    """Other cases that it may fail."""
+    summary: str
+    upgrade_works: bool
+    """False when not even an undisturbed upgrade to an ordinary image ends well."""
+
+
+class VariantsDocument(TypedDict):
+    """What --variant takes."""
+
+    variants: list[VariantDocument]
+
+
+DOCUMENTS: Final = (MockDocument, VariantsDocument)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -48,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     rows = [f"  {key:<24} {values}\n      {summary}" for key, values, summary in describe_options()]
     parser.epilog = _EXAMPLES + "\n".join(rows)
-    arguments.add_target(parser)
+    arguments.add_target(parser, required=False)
     arguments.add_dialect(parser)
     group = parser.add_argument_group("device model")
     group.add_argument(
@@ -71,6 +107,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="serve as a whole bicycle; what is printed is about the target",
     )
     group.add_argument(
+        "--variant",
+        metavar="NAME",
+        help="serve as a device that is wrong in one thing, see --list-variants",
+    )
+    group.add_argument(
+        "--list-variants",
+        action="store_true",
+        help="list what --variant takes, with the clause that each violates, and end",
+    )
+    group.add_argument(
         "--upgrades",
         type=arguments.count,
         metavar="N",
@@ -81,24 +127,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, output: Output) -> int:
     """Run the command; returns the exit code."""
+    if options.list_variants:
+        _list_variants(output)
+        return ExitCode.OK
+    if options.target is None:
+        raise UsageError(
+            "flasher mock: -t/--target is required.", remedy="Write -t wmc, bms or obc."
+        )
     dialect = api.as_dialect(options.dialect)
     if options.save_image is not None:
         check_writable(Path(options.save_image), _SAVE_IMAGE)
     profile = set_option(_profile(options.choices), "dialect", dialect.name)
-    engine: Engine
-    if options.system:
-        engine = system = System(
-            dialect, options.target, profile=profile, has_application=not options.no_app
-        )
-        device = system.device
-    else:
-        engine = device = Device(
-            options.target,
-            bitrate_bps=dialect.bitrate_bps,
-            profile=profile,
-            has_application=not options.no_app,
-        )
+    engine, device = _served(options, dialect, profile)
     watcher = _Watcher(device, options.save_image, output)
+    output.shown_events = SHOWN
     tool = _Tool(options.target)
     with (
         api.connect(dialect, **arguments.bus_config(options)) as connection,
@@ -110,6 +152,9 @@ def run(options: argparse.Namespace, output: Output) -> int:
                 "stands Welling's bootloader here"
             )
         served = "a whole bicycle" if options.system else options.target.node.name
+        if options.variant is not None:
+            variant = find(options.variant)
+            served = f"{served} that is wrong ({variant.clause}: {variant.summary})"
         output.progress(f"{served} on {connection.name}; Ctrl-C ends it")
         drive(
             engine,
@@ -122,8 +167,48 @@ def run(options: argparse.Namespace, output: Output) -> int:
                 or (watcher.images == options.upgrades and tool.is_quiet(connection.clock.now()))
             ),
         )
-    output.document({"ok": True, "exit_code": int(ExitCode.OK), "images": watcher.images})
+    output.document(MockDocument(images=watcher.images))
     return ExitCode.OK
+
+
+def _served(
+    options: argparse.Namespace, dialect: Dialect, profile: DeviceProfile
+) -> tuple[Engine, Device]:
+    """What is put on the bus, and the device of it that is watched."""
+    has_application = not options.no_app
+    if options.system:
+        if options.variant is not None:
+            raise UsageError(
+                "--variant and --system do not go together.",
+                remedy="Leave one out: a variant is served alone.",
+            )
+        system = System(dialect, options.target, profile=profile, has_application=has_application)
+        return system, system.device
+    build = Device if options.variant is None else partial(make, options.variant)
+    device = build(
+        options.target,
+        bitrate_bps=dialect.bitrate_bps,
+        profile=profile,
+        has_application=has_application,
+    )
+    return device, device
+
+
+def _list_variants(output: Output) -> None:
+    width = max(map(len, VARIANTS))
+    for variant in VARIANTS.values():
+        output.result(f"{variant.name:<{width}}  {variant.clause}  {variant.summary}")
+    documents = [
+        VariantDocument(
+            name=variant.name,
+            clause=variant.clause,
+            also=list(variant.also),
+            summary=variant.summary,
+            upgrade_works=variant.upgrade_works,
+        )
+        for variant in VARIANTS.values()
+    ]
+    output.document(VariantsDocument(variants=documents))
 
 
 def _profile(choices: list[str]) -> DeviceProfile:
@@ -162,6 +247,7 @@ class _Watcher:
         self.images = 0
 
     def __call__(self, event: object) -> None:
+        log_event(event)
         match event:
             case events.DeviceStateEntered(state, detail):
                 self._say("state", f"{state}{f': {detail}' if detail else ''}", event)
@@ -187,13 +273,9 @@ class _Watcher:
             case events.BytesDamaged(can_id, reason, data):
                 self._say("damage", f"0x{can_id:03X}: {reason}: {data[:16].hex(' ')} ...", event)
 
-    def _say(self, kind: str, text: str, event: Any) -> None:
+    def _say(self, kind: str, text: str, event: object) -> None:
         self._output.result(f"{kind + ':':<9}{text}")
-        fields = {
-            name: value.hex() if isinstance(value, bytes) else value
-            for name, value in dataclasses.asdict(event).items()
-        }
-        self._output.document({"event": type(event).__name__, **fields, "text": text})
+        self._output.line({**to_json(event), "text": text})
 
     def _save(self) -> None:
         image = self._device.stored_image

@@ -6,10 +6,10 @@ import argparse
 import os
 import sys
 from contextlib import ExitStack
-from typing import Final
+from typing import Final, TypedDict
 
 from flasher.cli import arguments
-from flasher.cli.monitor_views import Lines, Table, View
+from flasher.cli.monitor_views import FrameLine, Lines, SeenLine, Table, View
 from flasher.cli.output import Output, counted
 from flasher.cli.stop import stop_on_signal
 from flasher.driver import drive
@@ -34,9 +34,25 @@ message; `*` marks what changed since the same message before. Ctrl-C ends it wi
 """
 
 
+class MonitorDocument(TypedDict):
+    """How much was seen."""
+
+    frames: int
+    messages: int
+    """Shown, after the filters."""
+    troubles: int
+
+
+DOCUMENTS: Final = (MonitorDocument,)
+LINES: Final = (SeenLine, FrameLine)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.description = "Show decoded traffic: of a bus, or of a recorded trace."
+    parser.description = (
+        "Show decoded traffic, of a bus or of a recorded trace. Nothing is sent; the adapter still "
+        "acknowledges frames, as every node does."
+    )
     parser.epilog = _EPILOG
     parser.add_argument(
         "trace", metavar="TRACE", nargs="?", help="a recorded trace (.asc .blf .log ...), no bus"
@@ -133,13 +149,7 @@ def run(options: argparse.Namespace, output: Output) -> int:
         f"{view.troubles:,} with trouble"
     )
     output.document(
-        {
-            "ok": True,
-            "exit_code": int(ExitCode.OK),
-            "frames": watcher.frames,
-            "messages": view.messages,
-            "troubles": view.troubles,
-        }
+        MonitorDocument(frames=watcher.frames, messages=view.messages, troubles=view.troubles)
     )
     return ExitCode.OK
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Final, Self
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Self, TypedDict
 
+from flasher.cli.documents import FieldValue
 from flasher.cli.output import Output, counted
 from flasher.protocol.frame import Frame
-from flasher.trace.decoder import Field, Seen
+from flasher.trace.decoder import Field, Kind, Seen
 from flasher.trace.watcher import Board, FrameSeen, Pulse
 
 if TYPE_CHECKING:  # rich is loaded only where a table is shown
@@ -15,6 +16,42 @@ if TYPE_CHECKING:  # rich is loaded only where a table is shown
 
 _VALUE_WIDTH: Final = 64
 """Longer values are cut in lines, unless -v is given."""
+
+
+_Route = TypedDict("_Route", {"from": str, "to": str})
+
+
+class SeenLine(_Route):
+    """A message, a damage or a foreign frame, decoded. `from` and `to` are nodes, "all", or empty
+    for an id of no node.
+    """
+
+    event: Literal["Seen"]
+    at_s: float
+    """Since the first of them."""
+    kind: Annotated[str, Kind]
+    can_id: int
+    command: int | None
+    message: str
+    """Its title in the documents."""
+    trouble: bool
+    fields: dict[str, FieldValue]
+    changed: list[str]
+    """Fields that differ from the same message before."""
+
+
+class FrameLine(TypedDict):
+    """A CAN frame as it came (--raw)."""
+
+    event: Literal["Frame"]
+    at_s: float
+    kind: Literal["frame"]
+    can_id: int
+    data: str
+    """In hexadecimal."""
+    extended: bool
+    remote: bool
+    error: bool
 
 
 def route(seen: Seen) -> str:
@@ -80,21 +117,21 @@ class Lines(View):
 
     def show(self, seen: Seen, at_s: float, changed: frozenset[str]) -> None:
         self.output.result(_line(seen, at_s, changed, cut=self.output.verbosity < 1))
-        self.output.document(_document(seen, at_s, changed))
+        self.output.line(_document(seen, at_s, changed))
 
     def show_frame(self, frame: Frame, at_s: float) -> None:
         self.output.result(f"{at_s:10.3f}  {frame.can_id:03X}  {_frame_text(frame)}")
-        self.output.document(
-            {
-                "at_s": round(at_s, 6),
-                "kind": "frame",
-                "can_id": frame.can_id,
-                "data": frame.data.hex(),
-                "extended": frame.is_extended,
-                "remote": frame.is_remote,
-                "error": frame.is_error,
-            }
-        )
+        line: FrameLine = {
+            "event": "Frame",
+            "at_s": round(at_s, 6),
+            "kind": "frame",
+            "can_id": frame.can_id,
+            "data": frame.data.hex(),
+            "extended": frame.is_extended,
+            "remote": frame.is_remote,
+            "error": frame.is_error,
+        }
+        self.output.line(line)
 
 
 class Table(View):
@@ -160,8 +197,9 @@ def _field_text(shown: Field, is_changed: bool, *, cut: bool) -> str:  # noqa: F
     return f"{'*' if is_changed else ''}{shown.label} {text} {shown.unit}".rstrip()
 
 
-def _document(seen: Seen, at_s: float, changed: frozenset[str]) -> dict[str, Any]:
+def _document(seen: Seen, at_s: float, changed: frozenset[str]) -> SeenLine:
     return {
+        "event": "Seen",
         "at_s": round(at_s, 6),
         "kind": seen.kind.name.lower(),
         "can_id": seen.can_id,

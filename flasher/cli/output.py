@@ -1,4 +1,5 @@
-"""Where everything that flasher says goes: results to stdout, the rest to stderr, or JSON.
+"""Where everything that flasher says goes: results to stdout, the rest to stderr, or JSON; and all
+of it into the log, for `--log-file` (flasher.cli.logs).
 
 Device text and file names reach this place escaped (flasher.protocol.text). A reader that goes away
 (`| head`) or a terminal that does changes nothing about a running upgrade: what cannot be said is
@@ -9,13 +10,19 @@ from __future__ import annotations
 
 import contextlib
 import json
+import logging
 import os
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, Final, TextIO
 
-from flasher.errors import FlasherError, UsageError
+from flasher.cli.documents import SCHEMA_VERSION, ErrorDocument, to_json
+from flasher.errors import ExitCode, FlasherError, UsageError
+
+_LOG: Final = logging.getLogger("flasher.cli")
+_SAID: Final = {"said": True}
+"""Marks log records of what was printed, so that -v does not print it twice."""
 
 
 class Output:
@@ -24,6 +31,12 @@ class Output:
     def __init__(self, *, verbosity: int = 0, json_wanted: bool = False) -> None:
         self.verbosity = verbosity
         self.json_wanted = json_wanted
+        self.events_wanted = False
+        """True when each event is to be a JSON line."""
+        self.command: str | None = None
+        """Name of the command that runs; None before it is known."""
+        self.shown_events: frozenset[type] = frozenset()
+        """Events that the command prints itself while it runs: -v does not log them once more."""
         self.write_stderr: Callable[[str], None] = _plain_stderr
         """Replaced while a progress bar is on the screen."""
 
@@ -39,46 +52,70 @@ class Output:
     def result(self, text: str) -> None:
         """A line of the result; silent when JSON is wanted."""
         if not self.json_wanted:
+            _LOG.info("%s", text, extra=_SAID)
             _print_stdout(text)
 
-    def document(self, document: Mapping[str, Any]) -> None:
-        """The one JSON document of a command, or one line of a stream of them."""
+    def document(
+        self, document: Mapping[str, object], *, exit_code: ExitCode = ExitCode.OK
+    ) -> None:
+        """The one JSON document of a command, the last line of its output. `ok` and `exit_code` are
+        added, unless the document has them.
+        """
+        self.line(
+            {
+                "command": self.command,
+                "ok": exit_code == ExitCode.OK,
+                "exit_code": int(exit_code),
+                **document,
+            }
+        )
+
+    def line(self, line: Mapping[str, object]) -> None:
+        """A line of JSON that a command prints before its document; silent when no JSON is wanted.
+        It has the key `event`.
+        """
         if self.json_wanted:
-            _print_stdout(json.dumps(document))
+            text = json.dumps({"schema": SCHEMA_VERSION, **line})
+            _LOG.debug("%s", text, extra=_SAID)
+            _print_stdout(text)
+
+    def event(self, event: object) -> None:
+        """An event of flasher.events, as a line of JSON when --events asks for it."""
+        if self.events_wanted:
+            self.line(to_json(event))
 
     def progress(self, text: str, *, level: int = 0) -> None:
         """A line on how it goes."""
+        _LOG.log(logging.INFO if level < 2 else logging.DEBUG, "%s", text, extra=_SAID)
         if self.verbosity >= level:
             self.write_stderr(text)
 
     def error_line(self, text: str) -> None:
         """A line that is never silenced."""
+        _LOG.error("%s", text, extra=_SAID)
         self.write_stderr(text)
 
     def failure(self, error: FlasherError, **more: Any) -> None:
         """An error as a person reads it, and as the JSON document of the command."""
+        _LOG.error("error: %s", error, extra=_SAID)
         head = "\x1b[1;31merror:\x1b[0m" if self.colour else "error:"
-        self.error_line(f"{head} {error}")
-        self.document(
-            {
-                "ok": False,
-                "exit_code": int(error.exit_code),
-                "error": {
-                    "kind": type(error).__name__,
-                    "what": error.what,
-                    "where": error.where,
-                    "cause": error.cause,
-                    "remedy": error.remedy,
-                },
-                **more,
-            }
+        self.write_stderr(f"{head} {error}")
+        said = ErrorDocument(
+            kind=type(error).__name__,
+            what=error.what,
+            where=error.where,
+            cause=error.cause,
+            remedy=error.remedy,
         )
+        self.document({**more, "error": said}, exit_code=error.exit_code)
 
 
 def open_missing_streams() -> None:
-    """Give a process without stdout or stderr (a service, pythonw) somewhere to write to: print()
-    would else take one for the other.
+    """Give a process without stdin, stdout or stderr (a service, pythonw) somewhere to write to and
+    nothing to read: print() would else take one for the other.
     """
+    if sys.stdin is None:
+        sys.stdin = Path(os.devnull).open(encoding="utf-8")  # noqa: SIM115
     if sys.stdout is None:
         sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
     if sys.stderr is None:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
+from flasher.cli.documents import ImageDocument, PlanDocument
 from flasher.cli.output import byte_count, counted, duration
 from flasher.image.cortexm import VectorTable
 from flasher.image.image import Image
 from flasher.image.plan import Plan
+from flasher.image.release import names_of
 from flasher.protocol.spec import DIALECTS
 from flasher.protocol.text import printable
 
@@ -24,6 +24,7 @@ def image_lines(image: Image) -> list[str]:
         lines += [f"  segment: {segment}" for segment in image.segments]
         lines.append(f"  gaps:    {byte_count(image.filled_bytes)} filled with FF")
     lines.append(f"  version: {image.version or 'none found inside'}")
+    lines.append(f"  names:   {names_of(image.named_targets) or 'no target found inside'}")
     lines.append(f"  sha256:  {image.sha256}")
     return lines
 
@@ -54,7 +55,7 @@ def plan_lines(plan: Plan) -> list[str]:
     ]
 
 
-def image_document(image: Image, table: VectorTable | None) -> dict[str, Any]:
+def image_document(image: Image, table: VectorTable | None) -> ImageDocument:
     """The image as JSON."""
     return {
         "source": image.source,
@@ -64,6 +65,7 @@ def image_document(image: Image, table: VectorTable | None) -> dict[str, Any]:
         "segments": [{"start": s.start, "size_bytes": s.size_bytes} for s in image.segments],
         "filled_bytes": image.filled_bytes,
         "version": image.version,
+        "named_targets": sorted(target.name for target in image.named_targets),
         "sha256": image.sha256,
         "vector_table": None
         if table is None
@@ -77,7 +79,7 @@ def image_document(image: Image, table: VectorTable | None) -> dict[str, Any]:
     }
 
 
-def plan_document(plan: Plan) -> dict[str, Any]:
+def plan_document(plan: Plan) -> PlanDocument:
     """The plan as JSON."""
     return {
         "target": plan.target.name,

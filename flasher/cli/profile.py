@@ -5,7 +5,7 @@ right. Also the --profile option, for the commands that take one.
 from __future__ import annotations
 
 import argparse
-from typing import Any, Final
+from typing import Final, TypedDict
 
 from flasher import api
 from flasher.cli import arguments
@@ -39,6 +39,36 @@ _HEXADECIMAL: Final = frozenset(
     {"command", "answer_command", "answer_id", "reset_command", "start"}
 )
 
+ProfileValue = str | bool | int | float | list[int] | None
+"""Bytes are a list of their values, as in the file."""
+
+
+class SourcedValue(TypedDict):
+    """A value of a profile and where it comes from."""
+
+    value: ProfileValue
+    source: str
+    """"default", "document", or the path of a file."""
+
+
+class ProfileDocument(TypedDict):
+    """Every value that holds for a target; those of a table have its name before a point."""
+
+    target: str
+    dialect: str
+    values: dict[str, SourcedValue]
+
+
+class CheckedProfileDocument(TypedDict):
+    """A profile that is right."""
+
+    file: str
+    targets: list[str]
+    """The targets that it has values of their own for."""
+
+
+DOCUMENTS: Final = (ProfileDocument, CheckedProfileDocument)
+
 
 def add_option(parser: argparse.ArgumentParser) -> None:
     """The option --profile."""
@@ -56,7 +86,10 @@ def profile_of(options: argparse.Namespace) -> Profile:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.description = "Show or check what a target profile sets."
+    parser.description = (
+        "Show what holds for a target and where each value comes from, or check a file. Opens no "
+        "adapter."
+    )
     parser.epilog = _EPILOG
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     show = actions.add_parser("show", help="every value with its source")
@@ -65,27 +98,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_option(show)
     check = actions.add_parser("check", help="is a file right")
     check.add_argument("file", metavar="FILE", help="the file to check")
-    for action in (show, check):
-        action.add_argument(
-            "--json", action="store_true", default=argparse.SUPPRESS, help="print a JSON document"
-        )
 
 
 def run(options: argparse.Namespace, output: Output) -> int:
     """Run the command; returns the exit code."""
-    document = _show(options, output) if options.action == "show" else _check(options, output)
-    output.document({"ok": True, "exit_code": int(ExitCode.OK), **document})
+    if options.action == "show":
+        output.document(_show(options, output))
+    else:
+        output.document(_check(options, output))
     return ExitCode.OK
 
 
-def _check(options: argparse.Namespace, output: Output) -> dict[str, Any]:
+def _check(options: argparse.Namespace, output: Output) -> CheckedProfileDocument:
     names = [target.name for target in check_profile(options.file)]
     own = f"with values of their own for {', '.join(names)}" if names else "for every device alike"
     output.result(f"{printable(options.file)}: right, {own}")
     return {"file": options.file, "targets": names}
 
 
-def _show(options: argparse.Namespace, output: Output) -> dict[str, Any]:
+def _show(options: argparse.Namespace, output: Output) -> ProfileDocument:
     profile = profile_of(options)
     rows = [(name, _shown(name, value)) for name, value in profile.values()]
     widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
@@ -121,5 +152,11 @@ def _shown(name: str, value: object) -> str:
             return str(value)
 
 
-def _plain(value: object) -> object:
-    return list(value) if isinstance(value, bytes) else value
+def _plain(value: object) -> ProfileValue:
+    match value:
+        case bytes():
+            return list(value)
+        case None | bool() | int() | float() | str():
+            return value
+        case _:
+            raise TypeError(f"a profile has no value like {value!r}")

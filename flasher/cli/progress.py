@@ -5,12 +5,30 @@ from __future__ import annotations
 import contextlib
 import sys
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from flasher import events
 from flasher.cli.output import Output
 from flasher.image.plan import Plan
 from flasher.protocol.spec import PACKET_DATA_SIZE
+
+SHOWN: Final = frozenset(
+    {
+        events.PacketAcknowledged,
+        events.PhaseEntered,
+        events.BootVersionSeen,
+        events.AttemptStarted,
+        events.MessageRepeated,
+        events.Reported,
+        events.CheckMade,
+        events.PowerCycleAwaited,
+        events.ShutdownHeard,
+        events.AdapterLost,
+        events.AdapterBack,
+        events.BytesDamaged,
+    }
+)
+"""The events that have lines or a bar of their own here: the log on stderr leaves them out."""
 
 
 class Progress:
@@ -24,6 +42,7 @@ class Progress:
         self._wants_bar = sys.stderr.isatty() and output.verbosity >= 0
 
     def __enter__(self) -> Self:
+        self._output.shown_events = SHOWN
         return self
 
     def __exit__(
@@ -33,6 +52,7 @@ class Progress:
         traceback: TracebackType | None,
     ) -> None:
         self._close_bar()
+        self._output.shown_events = frozenset()
 
     def __call__(self, event: object) -> None:
         """Show one event. A terminal that is gone does not end the upgrade."""
@@ -51,20 +71,26 @@ class Progress:
                 if phase is not events.Phase.TRANSFER:
                     self._close_bar()
                 output.progress(f"{phase.value} ...")
-            case events.BootVersionSeen(name, version):
-                output.progress(f"boot version: {name} {version}")
             case events.AttemptStarted(attempt, reason):
                 self._close_bar()
                 output.progress(f"attempt {attempt}: {reason}")
+            case events.PowerCycleAwaited(limit_s):
+                self._prompt(limit_s)
             case events.MessageRepeated(what, reason, tries):
                 self._repetitions += 1
                 output.progress(f"{what} again (try {tries}): {reason}", level=1)
-            case events.Reported(what):
-                output.progress(f"note: {what}", level=1)
-            case events.BytesDamaged(can_id, reason, data):
-                output.progress(
-                    f"bytes on 0x{can_id:03X} ignored: {reason}: {data[:24].hex(' ')}", level=2
-                )
+            case _ if warning := _warning(event):
+                self._close_bar()
+                output.error_line(f"warning: {warning}")
+            case _ if note := _note(event):
+                text, level = note
+                output.progress(text, level=level)
+
+    def _prompt(self, limit_s: float) -> None:
+        """What the user has to do now, so that it is seen."""
+        text = f"power-cycle the device now (waiting {limit_s:g} s)"
+        bold = f"\x1b[1;33m{text}\x1b[0m" if self._output.colour else text
+        self._output.error_line(f">>> {bold}")
 
     def _move(self, number: int, total: int) -> None:
         if not self._wants_bar:
@@ -101,3 +127,33 @@ class Progress:
     def _forget_bar(self) -> None:
         self._bar = None
         self._output.restore_stderr()
+
+
+def _warning(event: object) -> str:
+    """What nobody should miss, in words; empty for any other event."""
+    match event:
+        case events.ShutdownHeard(sender):
+            return f"the {sender} announces SHUTDOWN: it switches off"
+        case events.AdapterLost(reason, wait_s):
+            return f"{reason} Waiting {wait_s:g} s for the adapter ..."
+        case events.CheckMade(_, "warned" | "waived", text):
+            return text
+        case _:
+            return ""
+
+
+def _note(event: object) -> tuple[str, int] | None:
+    """A line and the level of verbosity that shows it; None for an event without a line."""
+    match event:
+        case events.BootVersionSeen(name, version):
+            return f"boot version: {name} {version}", 0
+        case events.CheckMade(_, verdict, text):
+            return f"check: {verdict}: {text}", 0
+        case events.AdapterBack():
+            return "the adapter is back", 0
+        case events.Reported(what):
+            return f"note: {what}", 1
+        case events.BytesDamaged(can_id, reason, data):
+            return f"bytes on 0x{can_id:03X} ignored: {reason}: {data[:24].hex(' ')}", 2
+        case _:
+            return None

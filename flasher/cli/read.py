@@ -6,13 +6,15 @@ import argparse
 import io
 import sys
 from pathlib import Path
-from typing import Any, Final, Self
+from typing import Any, Final, Literal, NotRequired, Self, TypedDict
 
 from flasher import api, service
 from flasher.cli import arguments
 from flasher.cli.content_text import content_document, content_lines, row_line
-from flasher.cli.files import write_whole
+from flasher.cli.documents import FieldValue
+from flasher.cli.files import check_writable, write_whole
 from flasher.cli.output import Output, byte_count
+from flasher.cli.recording import add_recording, recorded_connection
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode, NoAnswerError, UsageError
 from flasher.events import QueryAnswered
@@ -21,11 +23,16 @@ from flasher.host.read import check_range, piece_of
 from flasher.protocol.contents import Memory
 from flasher.protocol.fields import label
 from flasher.protocol.spec import BMS, Dialect, Target
+from flasher.protocol.text import printable
 
 MEMORY: Final = "memory"
 _OUTPUT: Final = "--output"
 _HEX_SUFFIXES: Final = frozenset({".hex", ".ihex", ".ihx"})
 _DUMP_WIDTH: Final = 16
+_DESCRIPTION = """\
+Read an item of a device by its name, or its memory. --list names the items. Nothing is written. The
+documents let a tool read from the BMS only.
+"""
 _EPILOG = """\
 examples:
   flasher read --list
@@ -38,9 +45,37 @@ else raw binary) or --format. FILE is written whole or not at all.
 """
 
 
+class ItemDocument(TypedDict):
+    """An item that was read."""
+
+    target: str
+    item: str
+    fields: dict[str, FieldValue]
+
+
+class MemoryDocument(TypedDict):
+    """Memory that was read, `end` exclusive: `data` in hexadecimal, or the file it is in."""
+
+    target: str
+    start: int
+    end: int
+    data: NotRequired[str]
+    file: NotRequired[str]
+    format: NotRequired[Literal["hex", "bin"]]
+
+
+class ReadableDocument(TypedDict):
+    """The items that can be read, with the names of their fields."""
+
+    items: dict[str, list[str]]
+
+
+DOCUMENTS: Final = (ItemDocument, MemoryDocument, ReadableDocument)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.description = "Read an item of a device by its name, or its memory."
+    parser.description = _DESCRIPTION
     parser.epilog = _EPILOG
     parser.add_argument("item", nargs="?", metavar="ITEM", help="what to read; see --list")
     parser.add_argument("values", nargs="*", metavar="START END", help="for memory: which")
@@ -52,6 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("-o", _OUTPUT, metavar="FILE", help="write memory to this file")
     group.add_argument("--format", choices=("hex", "bin"), help="format of FILE")
     arguments.add_mock(parser)
+    add_recording(parser)
     arguments.add_bus(parser)
 
 
@@ -75,10 +111,17 @@ def _read_item(
 ) -> int:
     entry = find(options.item, readable(target, dialect), target, "read")
     with (
-        arguments.open_connection(options, target) as connection,
+        recorded_connection(options, output, target) as (connection, record),
         stop_on_signal() as stopped,
     ):
-        answer = service.read(connection, entry.name, target, dialect=dialect, cancelled=stopped)
+        answer = service.read(
+            connection,
+            entry.name,
+            target,
+            dialect=dialect,
+            taps=record.taps,
+            cancelled=stopped,
+        )
     document = content_document(answer)
     if entry.field:
         codec = dict(answer.LAYOUT)[entry.field]
@@ -87,15 +130,7 @@ def _read_item(
     else:
         for line in content_lines(answer):
             output.result(line)
-    output.document(
-        {
-            "ok": True,
-            "exit_code": int(ExitCode.OK),
-            "target": target.name,
-            "item": entry.name,
-            "fields": document,
-        }
-    )
+    output.document(ItemDocument(target=target.name, item=entry.name, fields=document))
     return ExitCode.OK
 
 
@@ -111,31 +146,40 @@ def _read_memory(
     path = Path(options.output) if options.output else None
     if path is None and options.format:
         raise UsageError("--format needs --output FILE.")
+    if path is not None:
+        check_writable(path, _OUTPUT)
     with (
-        arguments.open_connection(options, target) as connection,
+        recorded_connection(options, output, target) as (connection, record),
         stop_on_signal() as stopped,
         _MemoryProgress(end - start, output) as progress,
     ):
         try:
             data = service.read_memory(
-                connection, start, end, dialect=dialect, on_event=progress, cancelled=stopped
+                connection,
+                start,
+                end,
+                dialect=dialect,
+                taps=record.taps,
+                on_event=progress,
+                cancelled=stopped,
             )
         except NoAnswerError as error:
             error.remedy = f"{error.remedy} No file was written."
             raise
-    document: dict[str, Any] = {"target": target.name, "start": start, "end": end}
+    document: MemoryDocument = {"target": target.name, "start": start, "end": end}
     if path is not None:
         is_hex = options.format == "hex" or (
             options.format is None and path.suffix.lower() in _HEX_SUFFIXES
         )
         write_whole(path, _intel_hex(start, data) if is_hex else data, _OUTPUT)
-        output.result(f"{byte_count(len(data))} from 0x{start:08X} in {path}")
-        document |= {"file": str(path), "format": "hex" if is_hex else "bin"}
+        output.result(f"{byte_count(len(data))} from 0x{start:08X} in {printable(str(path))}")
+        document["file"] = str(path)
+        document["format"] = "hex" if is_hex else "bin"
     else:
         for at in range(0, len(data), _DUMP_WIDTH):
             output.result(_dump_line(start + at, data[at : at + _DUMP_WIDTH]))
         document["data"] = data.hex()
-    output.document({"ok": True, "exit_code": int(ExitCode.OK), **document})
+    output.document(document)
     return ExitCode.OK
 
 
@@ -170,6 +214,7 @@ class _MemoryProgress:
 
     def __init__(self, size_bytes: int, output: Output) -> None:
         self._size_bytes = size_bytes
+        self._output = output
         self._wants_bar = sys.stderr.isatty() and output.verbosity >= 0
         self._bar: Any = None
 
@@ -193,6 +238,7 @@ class _MemoryProgress:
 
     def __call__(self, event: object) -> None:
         """Take an event of the reading."""
+        self._output.event(event)
         if (
             self._bar is not None
             and isinstance(event, QueryAnswered)
@@ -216,5 +262,5 @@ def _list(target: Target, dialect: Dialect, output: Output) -> int:
         output.result(f"{MEMORY:<24} START END [-o FILE]")
     else:
         output.result(f"The documents give the tool nothing to read from the {target.node.name}.")
-    output.document({"ok": True, "exit_code": int(ExitCode.OK), "items": document})
+    output.document(ReadableDocument(items=document))
     return ExitCode.OK

@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import Final, Literal, TypedDict
 
 from flasher import api, service
 from flasher.cli import arguments
+from flasher.cli.documents import HeardDocument
 from flasher.cli.output import Output, counted
+from flasher.cli.recording import add_recording, recorded_connection
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.survey_text import heard_document, heard_lines
 from flasher.errors import ExitCode, NoAnswerError
 from flasher.host.survey import Survey
 from flasher.protocol.spec import BMS, DIALECTS, Dialect
 
+_DESCRIPTION = """\
+Find out who is on the bus, and which dialect is spoken. Sends one round of queries to the battery,
+and nothing else: no bit rate is tried, since a wrong one disturbs a live bus.
+"""
 _EPILOG = """\
 examples:
+  flasher scan --mock
   flasher scan -i socketcan -c can0
   flasher scan --dialect motinova -i pcan -c PCAN_USBBUS1      listens at 125 kbit/s
 
@@ -24,13 +31,30 @@ listed may still be there: most devices speak only now and then.
 """
 
 
+class ScanDocument(TypedDict):
+    """Who is on the bus."""
+
+    bitrate_bps: int
+    bitrate_is_assumed: Literal[True]
+    """Frames do not tell it: it is the one of the options."""
+    dialect: str | None
+    dialect_because: str
+    nodes: dict[str, HeardDocument]
+    foreign_frames: int
+    """Under ids of no node of the documents."""
+
+
+DOCUMENTS: Final = (ScanDocument,)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.description = "Find out who is on the bus, and which dialect is spoken."
+    parser.description = _DESCRIPTION
     parser.epilog = _EPILOG
     arguments.add_target(parser, required=False)
     arguments.add_dialect(parser)
     arguments.add_mock(parser)
+    add_recording(parser)
     arguments.add_bus(parser)
 
 
@@ -39,11 +63,13 @@ def run(options: argparse.Namespace, output: Output) -> int:
     dialect = api.as_dialect(options.dialect)
     bitrate_bps = getattr(options, "bitrate", None) or dialect.bitrate_bps
     with (
-        arguments.open_connection(options, options.target or BMS) as connection,
+        recorded_connection(options, output, options.target or BMS) as (connection, record),
         stop_on_signal() as stopped,
     ):
         output.progress(f"listening for {service.SCAN_LISTEN_S:g} s on {connection.name} ...")
-        survey = service.scan(connection, dialect=dialect, cancelled=stopped)
+        survey = service.scan(connection, dialect=dialect, taps=record.taps, cancelled=stopped)
+        if not survey.heard:
+            record.failed(_silent(survey, bitrate_bps))
     guessed, why = judge_dialect(survey, bitrate_bps)
     bus = _bus_document(survey, bitrate_bps, guessed, why)
     if not survey.heard:
@@ -52,7 +78,7 @@ def run(options: argparse.Namespace, output: Output) -> int:
         return error.exit_code
     for line in _lines(survey, bitrate_bps, dialect, guessed, why):
         output.result(line)
-    output.document({"ok": True, "exit_code": int(ExitCode.OK), **bus})
+    output.document(bus)
     return ExitCode.OK
 
 
@@ -98,7 +124,7 @@ def _lines(
 
 def _bus_document(
     survey: Survey, bitrate_bps: int, guessed: Dialect | None, why: str
-) -> dict[str, Any]:
+) -> ScanDocument:
     return {
         "bitrate_bps": bitrate_bps,
         "bitrate_is_assumed": True,

@@ -9,17 +9,25 @@ from types import FrameType
 
 
 @contextmanager
-def stop_on_signal(on_first: Callable[[], None] | None = None) -> Iterator[Callable[[], bool]]:
+def stop_on_signal(
+    on_first: Callable[[], None] | None = None, on_second: Callable[[], None] | None = None
+) -> Iterator[Callable[[], bool]]:
     """Gives a function that tells whether the user wants to stop; the first time that it says so,
-    it calls `on_first`.
+    it calls `on_first`. With `on_second` the second signal calls it, in the handler, and only a
+    third one ends at once.
     """
     asked = told = False
+    second = on_second
 
     def handle(_number: int, _frame: FrameType | None) -> None:
-        nonlocal asked
-        if asked:
+        nonlocal asked, second
+        if not asked:
+            asked = True
+        elif second is not None:
+            call, second = second, None
+            call()
+        else:
             raise KeyboardInterrupt
-        asked = True
 
     def stopped() -> bool:
         # Not in the handler, which may have come in the middle of a print: printing there fails.

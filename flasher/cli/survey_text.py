@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Final
+from typing import Final
 
 from flasher.cli.content_text import content_document, content_rows, row_line
+from flasher.cli.documents import HeardDocument
 from flasher.cli.output import counted
 from flasher.host.survey import Heard
 
@@ -29,7 +30,7 @@ def heard_lines(heard: Heard, *, contents: bool = False) -> list[str]:
     return lines or [f"  {counted(heard.frames, 'frame')} that made no message"]
 
 
-def heard_document(heard: Heard) -> dict[str, Any]:
+def heard_document(heard: Heard) -> HeardDocument:
     """The same as JSON."""
     return {
         "frames": heard.frames,

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import sys
-from typing import Any
+from typing import Final, Literal, TypedDict
 
 from flasher import api, service
 from flasher.cli import arguments
 from flasher.cli.output import Output
+from flasher.cli.recording import add_recording, recorded_connection
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode, UsageError
 from flasher.host.items import writable
@@ -16,6 +17,10 @@ from flasher.host.write import FieldChange, WritePlan, Written, field_changes, p
 from flasher.protocol.fields import Content, label
 from flasher.protocol.spec import BMS, Dialect, Target
 
+_DESCRIPTION = """\
+Write an item of a device by its name, and read it back. --list names the items. Firmware is not
+written by this command: see flasher flash.
+"""
 _EPILOG = """\
 examples:
   flasher write --list
@@ -29,9 +34,49 @@ code 10 when the write is not confirmed or reads back differently, 5 when the de
 """
 
 
+class ChangeDocument(TypedDict):
+    """A field of a write; null where a value is not known."""
+
+    old: str | None
+    new: str
+    read_back: str | None
+
+
+class WrittenDocument(TypedDict):
+    """How a write ended."""
+
+    target: str
+    item: str
+    confirmed: bool
+    """True when the device acknowledged the write."""
+    fields: dict[str, ChangeDocument]
+
+
+class NotWrittenDocument(TypedDict):
+    """The write was not agreed to."""
+
+    written: Literal[False]
+
+
+class WritableItem(TypedDict):
+    """What an item is made of."""
+
+    fields: list[str]
+    manufacturer_only: bool
+
+
+class WritableDocument(TypedDict):
+    """The items that can be written."""
+
+    items: dict[str, WritableItem]
+
+
+DOCUMENTS: Final = (WrittenDocument, NotWrittenDocument, WritableDocument)
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
-    parser.description = "Write an item of a device by its name, and read it back."
+    parser.description = _DESCRIPTION
     parser.epilog = _EPILOG
     parser.add_argument("item", nargs="?", metavar="ITEM", help="what to write; see --list")
     parser.add_argument("values", nargs="*", metavar="VALUE", help="one for each of its fields")
@@ -47,6 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write what the document reserves for the manufacturer",
     )
     arguments.add_mock(parser)
+    add_recording(parser)
     arguments.add_bus(parser)
 
 
@@ -66,16 +112,18 @@ def run(options: argparse.Namespace, output: Output) -> int:
             f"Writing {plan.writable.name} needs a confirmation, and there is no terminal to ask.",
             remedy="Add --yes.",
         )
-    with arguments.open_connection(options, target) as connection:
+    with recorded_connection(options, output, target) as (connection, record):
         with stop_on_signal() as stopped:
-            old = service.old_content(connection, plan, cancelled=stopped)
+            old = service.old_content(connection, plan, taps=record.taps, cancelled=stopped)
         _show(plan, old, output)
         if not options.yes and not _agrees(plan):
             output.progress("nothing was written")
-            output.document({"ok": False, "exit_code": int(ExitCode.INTERRUPTED), "written": False})
+            output.document({"written": False}, exit_code=ExitCode.INTERRUPTED)
             return ExitCode.INTERRUPTED
         with stop_on_signal(lambda: output.error_line("the write ends first ...")):
-            written = service.carry_out(connection, plan, old)
+            written = service.carry_out(connection, plan, old, taps=record.taps)
+        if (error := written.error()) is not None:
+            record.failed(error)
     return _conclude(written, output)
 
 
@@ -93,11 +141,11 @@ def _conclude(written: Written, output: Output) -> int:
         return error.exit_code
     read_back = "read back right" if written.read_back else "there is no query to read it back"
     output.result(f"written: confirmed by the device, {read_back}")
-    output.document({"ok": True, "exit_code": int(ExitCode.OK), **_document(written)})
+    output.document(_document(written))
     return ExitCode.OK
 
 
-def _document(written: Written) -> dict[str, Any]:
+def _document(written: Written) -> WrittenDocument:
     return {
         "target": written.plan.target.name,
         "item": written.plan.writable.name,
@@ -106,7 +154,7 @@ def _document(written: Written) -> dict[str, Any]:
     }
 
 
-def _change(change: FieldChange) -> dict[str, str | None]:
+def _change(change: FieldChange) -> ChangeDocument:
     return {"old": change.old, "new": change.new, "read_back": change.read_back}
 
 
@@ -129,9 +177,11 @@ def _list(target: Target, dialect: Dialect, output: Output) -> int:
     if not items:
         output.result(f"The documents give the tool nothing to write to the {target.node.name}.")
     document = {
-        name: {"fields": [n for n, _ in entry.fields],
-               "manufacturer_only": entry.item.manufacturer_only}
+        name: WritableItem(
+            fields=[field for field, _ in entry.fields],
+            manufacturer_only=entry.item.manufacturer_only,
+        )
         for name, entry in items.items()
-    }  # fmt: skip
-    output.document({"ok": True, "exit_code": int(ExitCode.OK), "items": document})
+    }
+    output.document(WritableDocument(items=document))
     return ExitCode.OK

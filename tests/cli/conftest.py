@@ -34,6 +34,16 @@ class Run:
 Flasher = Callable[..., Run]
 
 
+@pytest.fixture(autouse=True)
+def bundle_folder(
+    tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """Where failures leave their bundles: not in the folder that the tests are run in."""
+    folder = tmp_path_factory.mktemp("bundles")
+    monkeypatch.setenv("FLASHER_BUNDLE_DIR", str(folder))
+    return folder
+
+
 @pytest.fixture
 def flasher(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Flasher:
     """Runs `flasher ...`; python-can finds no configuration of the machine."""

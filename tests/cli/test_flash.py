@@ -258,7 +258,7 @@ def test_an_adapter_that_fails_in_the_middle_says_how_far_it_came_and_what_is_le
 
     real_send = SimulatedLink.send
     monkeypatch.setattr(SimulatedLink, "send", send)
-    run = flasher("flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0")
+    run = flasher("flash", BMS, "-t", "bms", "--mock", "--mock-speed", "0", "--attempts", "1")
     assert run.code == ExitCode.BUS
     assert "transferring, packet 11 of 613; socketcan can0" in run.err
     assert "State of the device: its application is erased" in run.err
@@ -300,8 +300,8 @@ def test_the_devices_choices_decide_the_exit_code(
     profile = set_option(DeviceProfile(), key, value)
     monkeypatch.setattr(
         "flasher.api.connect_mock",
-        lambda target, dialect, *, speed: connect_mock(
-            target, dialect, speed=speed, profile=profile
+        lambda target, dialect, *, speed, has_application: connect_mock(
+            target, dialect, speed=speed, has_application=has_application, profile=profile
         ),
     )
     run = flasher("flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0")

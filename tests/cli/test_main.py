@@ -202,6 +202,16 @@ def test_a_process_without_streams_works_and_exits_with_its_code(
         stream.close()
 
 
+def test_a_process_without_stdin_cannot_be_asked(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stdin", None)
+    run = flasher("write", "user-string-1", "rack", "--mock", "--mock-speed", "0")
+    assert run.code == ExitCode.USAGE
+    assert "there is no terminal to ask" in run.err
+    sys.stdin.close()
+
+
 @pytest.mark.parametrize("words", [("--json", "flash"), ("flash", "--json", "--no-such-option")])
 def test_wrong_usage_is_a_json_document_too(flasher: Flasher, words: tuple[str, ...]) -> None:
     run = flasher(*words)

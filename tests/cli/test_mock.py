@@ -19,6 +19,7 @@ import pytest
 from flasher import api
 from flasher.cli import mock as mock_command
 from flasher.device.profile import describe_options
+from flasher.device.variants import VARIANTS
 from flasher.driver import drive
 from flasher.errors import ExitCode
 from flasher.host.outcome import Outcome
@@ -216,7 +217,7 @@ def test_json_is_one_document_a_line_and_the_last_has_the_exit_code(
     host.do(host.upgrade)
     run = serve("--upgrades", "1", "--json", "--save-image", tmp_path / "out.bin")
     *happened, last = [json.loads(line) for line in run.out.splitlines()]
-    assert last == {"ok": True, "exit_code": 0, "images": 1}
+    assert (last["ok"], last["exit_code"], last["images"]) == (True, 0, 1)
     assert happened[0]["event"] == "DeviceStateEntered"
     assert happened[0]["state"] == "application"
     (stored,) = [document for document in happened if document["event"] == "ImageStored"]
@@ -427,6 +428,88 @@ def test_no_adapter_is_exit_code_4(flasher: Flasher) -> None:
     run = flasher("mock", "-t", "bms")
     assert run.code == ExitCode.BUS
     assert "-i socketcan -c can0" in run.err
+
+
+# -- wrong devices --------------------------------------------------------------------------------
+
+
+def test_a_variant_is_served_and_said(serve: Serve, host: Host) -> None:
+    """RS-01 once: the tool hears the announcements, but never the general feedback."""
+    host.do(host.upgrade)
+    run = serve("--upgrades", "1", "--variant", "no-feedback")
+    assert run.code == ExitCode.OK
+    assert run.err == (
+        "BMS that is wrong (RS-01: restarts at a reset without general feedback) "
+        f"on virtual {host.channel}; Ctrl-C ends it\n"
+    )
+    host.join()
+    assert host.outcomes[0].ok
+
+
+def test_a_variant_does_what_it_is_said_to_do_wrong(serve: Serve, host: Host) -> None:
+    """RS-04: a reset with another text is confirmed."""
+    wrong = encode(Message(0x752, 0x16, 0x4205, b"RESEX"))
+
+    def reset() -> None:
+        host.hear(wrong, 0x725, b"ACK")
+        host.interrupt()
+
+    host.do(reset)
+    run = serve("--variant", "resets-at-any-text")
+    assert run.code == ExitCode.OK
+    assert "state:   restarting: reset" in run.out
+
+
+def test_a_variant_takes_the_choices_of_set_and_keeps_its_own(serve: Serve, host: Host) -> None:
+    """EN-04: an image without a checksum, refused by a right device of that choice, is taken."""
+    host.do(host.upgrade)
+    run = serve("--upgrades", "1", "--variant", "ignores-image-checksum", "--no-app")
+    assert run.code == ExitCode.OK
+    assert "state:   announcing: no application" in run.out
+
+
+def test_variants_are_listed_with_their_clauses_without_target_or_adapter(flasher: Flasher) -> None:
+    run = flasher("mock", "--list-variants")
+    assert run.code == ExitCode.OK
+    lines = run.out.splitlines()
+    assert len(lines) == len(VARIANTS)
+    assert all(len(line) <= 120 for line in lines)
+    assert lines[10] == "no-crc-check                  CR-01  takes a message with any CRC"
+
+
+def test_the_list_of_variants_is_a_json_document(flasher: Flasher) -> None:
+    document = flasher("mock", "--list-variants", "--json").document
+    assert document["ok"]
+    assert [row["name"] for row in document["variants"]] == list(VARIANTS)
+    assert {
+        "name": "no-crc-check",
+        "clause": "CR-01",
+        "also": list(VARIANTS["no-crc-check"].also),
+        "summary": "takes a message with any CRC",
+        "upgrade_works": True,
+    } in document["variants"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--variant", "no-crc"), "no variant 'no-crc' of the device model"),
+        (("--variant", "no-crc"), "Did you mean no-crc-check?"),
+        (("--variant", "no-feedback", "--system"), "--variant and --system do not go together"),
+    ],
+)
+def test_a_variant_that_cannot_be_served_is_wrong_usage(
+    serve: Serve, words: tuple[str, ...], said: str
+) -> None:
+    run = serve(*words)
+    assert run.code == ExitCode.USAGE
+    assert said in run.err
+
+
+def test_without_a_target_it_is_wrong_usage(flasher: Flasher) -> None:
+    run = flasher("mock", "-i", "virtual", "-c", "x")
+    assert run.code == ExitCode.USAGE
+    assert "-t/--target is required" in run.err
 
 
 # -- the other dialect ----------------------------------------------------------------------------

@@ -136,15 +136,6 @@ def test_memory_that_ends_in_silence_leaves_no_file(
     assert battery.received[0] == (0x4308, bytes.fromhex("00130000 80130000"))
 
 
-def test_a_file_that_cannot_be_written_is_a_usage_error(
-    flasher: Flasher, battery: Battery, tmp_path: Path
-) -> None:
-    run = flasher("read", "memory", "0x1000", "0x1010", "-o", tmp_path / "no" / "m.bin", *MOCK)
-    assert run.code == ExitCode.USAGE
-    assert "cannot be written" in run.err
-    assert battery.received
-
-
 @pytest.mark.parametrize(
     "words",
     [
@@ -259,4 +250,16 @@ def test_a_silent_device_is_exit_5_and_nothing_is_written(
 def test_an_unknown_option_is_still_refused(flasher: Flasher, battery: Battery) -> None:
     run = flasher("write", "model", "-t", "bms", "--no-such-option", "X", *MOCK)
     assert run.code == ExitCode.USAGE
+    assert battery.received == []
+
+
+def test_a_file_that_cannot_be_written_is_said_before_the_memory_is_read(
+    flasher: Flasher, battery: Battery, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ("read", "memory", "0x8008000", "0x8008080", "-t", "bms", *MOCK, "-o")
+    assert flasher(*words, tmp_path / "no" / "x.bin").code == ExitCode.USAGE
+    monkeypatch.setattr("os.access", lambda path, _mode: Path(path) != tmp_path)
+    run = flasher(*words, tmp_path / "x.bin")
+    assert run.code == ExitCode.USAGE
+    assert "its folder may not be written into" in run.err
     assert battery.received == []

@@ -162,5 +162,5 @@ def test_a_second_ctrl_c_ends_at_once(tmp_path: Path) -> None:
     assert process.returncode == ExitCode.INTERRUPTED
     assert took_s < 2.0
     assert "Interrupted at once" in said
-    assert "run the same command again" in said
+    assert "Run the same command again" in said
     assert "Traceback" not in said

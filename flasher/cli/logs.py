@@ -1,0 +1,168 @@
+"""Where log records go while a command runs: to stderr for -v and -vv, and into --log-file.
+
+What the command prints itself is in the log file too, but not on stderr a second time. A log that
+cannot be written any more (the disk is full) never disturbs the command; it is told at the end.
+"""
+
+from __future__ import annotations
+
+import datetime
+import logging
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+from typing import Final, Self
+
+from flasher.cli.files import check_not_read, check_writable
+from flasher.cli.output import Output
+from flasher.errors import UsageError
+from flasher.log import ROOT
+from flasher.protocol.text import printable
+
+OPTION: Final = "--log-file"
+_PYTHON_CAN: Final = "can"
+_FORGOTTEN_BUS: Final = "was not properly shut down"
+"""What python-can says of a bus that it could not open: the failure itself was told."""
+_NOWHERE: Final = logging.NullHandler()
+_NOTHING: Final = logging.CRITICAL + 1
+_ON_STDERR: Final = {
+    -1: (_NOTHING, logging.ERROR),
+    0: (_NOTHING, logging.WARNING),
+    1: (logging.INFO, logging.WARNING),
+    2: (logging.DEBUG, logging.INFO),
+}
+"""Levels of flasher's and of python-can's records on stderr, for each verbosity."""
+_FILE_CAN_LEVEL: Final = logging.INFO
+"""Of python-can in the log file: at DEBUG it has records for each frame, which take time."""
+
+
+class Logs:
+    """The handlers of one command. They are removed at the end, and levels put back."""
+
+    def __init__(self, output: Output) -> None:
+        self._output = output
+        self._file: _File | None = None
+        self._restore: list[tuple[logging.Logger, int, logging.Handler]] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        # A bus that could not be opened complains when it is forgotten: not on a bare stderr.
+        logging.getLogger(_PYTHON_CAN).addHandler(_NOWHERE)
+        while self._restore:
+            logger, level, handler = self._restore.pop()
+            logger.removeHandler(handler)
+            logger.setLevel(level)
+        if self._file is not None:
+            self._file.close()
+            if self._file.failure:
+                self._output.write_stderr(f"warning: {self._file.failure}")
+
+    def open(self, verbosity: int, log_file: str | None, others: Iterable[object] = ()) -> None:
+        """Begin. Raises UsageError when the log file cannot be written, or is one of the `others`:
+        the texts of the command line, which may name an image.
+        """
+        flasher_level, can_level = _ON_STDERR[max(-1, min(verbosity, 2))]
+        screen = _Screen(self._output)
+        self._attach(ROOT, _at(flasher_level, screen))
+        self._attach(_PYTHON_CAN, _at(can_level, _Screen(self._output)))
+        if log_file is not None:
+            check_not_read(log_file, OPTION, others)
+            self._file = _File(Path(log_file))
+            self._attach(ROOT, _at(logging.DEBUG, self._file))
+            self._attach(_PYTHON_CAN, _at(_FILE_CAN_LEVEL, _Forward(self._file)))
+
+    def _attach(self, name: str, handler: logging.Handler) -> None:
+        logger = logging.getLogger(name)
+        self._restore.append((logger, logger.level, handler))
+        logger.addHandler(handler)
+        levels = [each.level for each in logger.handlers if each.level]
+        logger.setLevel(min(levels))
+
+
+def _at(level: int, handler: logging.Handler) -> logging.Handler:
+    handler.setLevel(level)
+    return handler
+
+
+class _Screen(logging.Handler):
+    """Terse lines on stderr, above a progress bar where there is one."""
+
+    def __init__(self, output: Output) -> None:
+        super().__init__()
+        self._output = output
+
+    def emit(self, record: logging.LogRecord) -> None:
+        event = getattr(record, "event", None)
+        if getattr(record, "said", False) or type(event) in self._output.shown_events:
+            return
+        if _FORGOTTEN_BUS in str(record.msg):
+            return
+        try:
+            name = record.name.removeprefix(f"{ROOT}.")
+            text = " | ".join(_lines(record))
+            self._output.write_stderr(f"{record.levelname.lower()}: {name}: {text}")
+        except Exception:  # noqa: BLE001, S110  a record of a foreign library never ends the command
+            pass
+
+
+class _File(logging.FileHandler):
+    """Every record with its time, appended. `failure` says why it is incomplete, if it is."""
+
+    def __init__(self, path: Path) -> None:
+        check_writable(path, OPTION, is_appended_to=True)
+        try:
+            super().__init__(path, encoding="utf-8", errors="backslashreplace")
+        except OSError as error:
+            raise UsageError(
+                f"{printable(str(path))} cannot be written: {error.strerror}.",
+                where=OPTION,
+                remedy="Name a file in a folder that exists and has room.",
+            ) from error
+        self._shown = printable(str(path))
+        self.failure = ""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Time with its offset, level, logger, text; lines that follow are indented."""
+        at = datetime.datetime.fromtimestamp(record.created, datetime.UTC).astimezone()
+        head = f"{at.isoformat(timespec='milliseconds')} {record.levelname:<7} {record.name}: "
+        return head + "\n    ".join(_lines(record))
+
+    def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802  logging's own name
+        """A record that cannot be written is left out."""
+        self._fail()
+
+    def close(self) -> None:
+        try:
+            super().close()
+        except OSError:
+            self._fail()
+
+    def _fail(self) -> None:
+        self.failure = f"the log {self._shown} is incomplete: it could not be written any more"
+
+
+class _Forward(logging.Handler):
+    """Records of another logger into the same file, from a level of their own."""
+
+    def __init__(self, file: _File) -> None:
+        super().__init__()
+        self._file = file
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._file.handle(record)
+
+
+def _lines(record: logging.LogRecord) -> list[str]:
+    """The text of a record. What the command has printed was escaped where it came from."""
+    text = record.getMessage()
+    if record.exc_info:
+        text += "\n" + logging.Formatter().formatException(record.exc_info)
+    lines = text.splitlines() or [""]
+    return lines if getattr(record, "said", False) else [printable(line) for line in lines]

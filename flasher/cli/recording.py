@@ -1,0 +1,206 @@
+"""What every command on a bus keeps of its frames: a trace if one is wanted, a bundle if it fails.
+
+    with recording(options, output, target=target) as record:
+        with connect(...) as connection:
+            record.opened(connection)
+            service.info(connection, target, taps=record.taps)
+
+An error that leaves the `with` block, or is handed to `failed`, makes a bundle. Nothing that goes
+wrong here changes what the command says or its exit code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import sys
+import traceback
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+from flasher.api import Connection, as_dialect
+from flasher.cli.arguments import bus_config, open_connection
+from flasher.cli.files import check_not_read
+from flasher.cli.output import Output
+from flasher.driver import Tap
+from flasher.errors import ExitCode, FlasherError
+from flasher.protocol.spec import Target
+from flasher.protocol.text import printable
+from flasher.trace.figures import LinkReport
+from flasher.trace.link import LinkMeter
+from flasher.trace.ring import FlightRecorder
+from flasher.trace.unechoed import Unechoed
+
+BUNDLE_FOLDER: Final = "FLASHER_BUNDLE_DIR"
+"""The environment variable that names the folder for bundles."""
+_WITH_BUNDLE: Final = frozenset(
+    {
+        ExitCode.INTERNAL,
+        ExitCode.BUS,
+        ExitCode.NO_ANSWER,
+        ExitCode.WRONG_DEVICE,
+        ExitCode.TRANSFER,
+        ExitCode.REFUSED,
+        ExitCode.UNCONFIRMED,
+        ExitCode.VERIFICATION,
+    }
+)
+"""Failures on the bus or of flasher itself; wrong usage and the user's own Ctrl-C explain
+themselves."""
+
+
+def add_recording(parser: argparse.ArgumentParser) -> None:
+    """The options of a command that talks on a bus."""
+    group = parser.add_argument_group("recording")
+    group.add_argument(
+        "--trace-file", metavar="FILE", help="record all frames; format by suffix (.asc .blf ...)"
+    )
+    group.add_argument(
+        "--bundle-dir",
+        metavar="DIR",
+        type=Path,
+        help="where a failure leaves its bundle: last frames, transcript, report "
+        f"(default: ${BUNDLE_FOLDER}, else the current folder)",
+    )
+    group.add_argument("--no-bundle", action="store_true", help="leave none")
+
+
+class Recording:
+    """The frames and facts of one command."""
+
+    def __init__(self, target: Target | None, bitrate_bps: int) -> None:
+        self.flight = FlightRecorder()
+        self.facts: dict[str, Any] = {}
+        """What goes into the bundle's report; anything that JSON knows."""
+        self._meter = None if target is None else LinkMeter(target, bitrate_bps)
+        self.recorders: list[Tap] = [self.flight]
+        if self._meter is not None:
+            self.recorders.append(self._meter)
+        self.taps: tuple[Tap, ...] = (Unechoed(lambda: self.recorders),)
+        """For the driver."""
+        self.failure: BaseException | None = None
+
+    def opened(self, connection: Connection) -> None:
+        """The bus is open."""
+        self.facts["connection"] = connection.name
+
+    def failed(self, error: BaseException) -> None:
+        """The command reports this error itself, and does not raise it."""
+        self.failure = error
+
+    def link_report(self) -> LinkReport | None:
+        """How the transfer used the bus so far; None before the first packet."""
+        return None if self._meter is None else self._meter.report()
+
+
+@contextmanager
+def recording(
+    options: argparse.Namespace, output: Output, *, target: Target | None = None
+) -> Iterator[Recording]:
+    """Record what goes over the bus while the block runs. `options` are those of `add_recording`
+    and of the bus. Raises UsageError for a trace file that cannot be written.
+    """
+    facts = _circumstances(options, target)
+    record = Recording(target, facts["bitrate_bps"])
+    record.facts |= facts
+    try:
+        with ExitStack() as stack:
+            stack.enter_context(_trace_file(options, record, output))
+            yield record
+    except Exception as error:
+        record.failed(error)
+        raise
+    finally:
+        if record.failure is not None and not options.no_bundle:
+            _leave_bundle(options, output, record, record.failure)
+
+
+@contextmanager
+def recorded_connection(
+    options: argparse.Namespace, output: Output, target: Target
+) -> Iterator[tuple[Connection, Recording]]:
+    """The bus that the options name, with a recording of it: for commands that ask one thing."""
+    with (
+        recording(options, output, target=target) as record,
+        open_connection(options, target) as connection,
+    ):
+        record.opened(connection)
+        yield connection, record
+
+
+@contextmanager
+def _trace_file(options: argparse.Namespace, record: Recording, output: Output) -> Iterator[None]:
+    """Records to a file, if one is named."""
+    path: str | None = options.trace_file
+    if path is None:
+        yield
+        return
+    check_not_read(path, "--trace-file", _other_texts(options, "trace_file"))
+    from flasher.trace.recorder import Recorder  # noqa: PLC0415  loads python-can
+
+    with Recorder(path) as recorder:
+        record.recorders.append(recorder)
+        yield
+    if recorder.failure is not None:
+        reason = printable(f"{path} is incomplete: {recorder.failure}")
+        output.error_line(f"warning: the trace {reason}")
+
+
+def _other_texts(options: argparse.Namespace, but: str) -> list[object]:
+    """What else stands on the command line, and may name a file."""
+    return [value for name, value in vars(options).items() if name != but]
+
+
+def _leave_bundle(
+    options: argparse.Namespace, output: Output, record: Recording, error: BaseException
+) -> None:
+    if isinstance(error, FlasherError) and error.exit_code not in _WITH_BUNDLE:
+        return
+    from flasher.trace.bundle import write_bundle  # noqa: PLC0415  loads python-can
+
+    folder = options.bundle_dir or Path(os.environ.get(BUNDLE_FOLDER) or ".")
+    link = record.link_report()
+    facts = {**record.facts, "error": _error(error), "link": link and dataclasses.asdict(link)}
+    try:
+        path = write_bundle(folder, record.flight, facts)
+    except Exception as problem:  # noqa: BLE001  the command's own failure is what matters
+        reason = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
+        output.error_line(printable(f"warning: no bundle in {folder}: {reason}"))
+    else:
+        output.error_line(f"bundle: {printable(str(path))}")
+
+
+def _circumstances(options: argparse.Namespace, target: Target | None) -> dict[str, Any]:
+    words = getattr(options, "command_line", None) or sys.argv[1:]
+    return {
+        "command_line": ["flasher", *map(printable, words)],
+        "target": None if target is None else target.name,
+        "dialect": options.dialect,
+        "bus": {} if options.mock else bus_config(options),
+        "bitrate_bps": getattr(options, "bitrate", None) or as_dialect(options.dialect).bitrate_bps,
+    }
+
+
+def _error(error: BaseException) -> dict[str, Any]:
+    if isinstance(error, FlasherError):
+        return {
+            "kind": type(error).__name__,
+            "exit_code": int(error.exit_code),
+            "what": error.what,
+            "where": error.where,
+            "cause": error.cause,
+            "remedy": error.remedy,
+        }
+    lines = traceback.format_exception(error)
+    return {
+        "kind": type(error).__name__,
+        "exit_code": int(ExitCode.INTERNAL),
+        "what": printable(str(error)),
+        "where": "",
+        "cause": "a bug in flasher",
+        "remedy": "",
+        "traceback": [printable(line) for part in lines for line in part.splitlines()],
+    }

@@ -1,0 +1,147 @@
+"""`flasher explain`: what it prints, its page and its JSON."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flasher.errors import ExitCode
+from flasher.protocol.frame import Frame
+from tests.trace.tape import Tape
+
+from .conftest import SAMPLES, Flasher
+
+
+def failed(folder: Path) -> Path:
+    tape = Tape().to_packet(7)
+    for _ in range(5):
+        tape.packet(7).nak(7)
+    return tape.save(folder / "failed.log")
+
+
+def test_the_verdict_comes_first_then_the_story(flasher: Flasher, tmp_path: Path) -> None:
+    run = flasher("explain", failed(tmp_path))
+    assert run.code == 0
+    lines = run.out.splitlines()
+    assert lines[1] == ("verdict: a packet was refused again and again (transferring, packet 7)")
+    assert lines[2] == "  Packet 7 of 10 was sent 5 times and refused 5 times (NAK)."
+    assert lines[3].startswith("  likely cause: ")
+    assert lines[4].startswith("  what to do: ")
+    for words in (
+        "  boot version:  BMS V1.2.3",
+        "packets 1 to 6, acknowledged in",
+        "! NAK: number 7",
+        "6 of 7 acknowledged, 4 repeated, 5 NAKs",
+        "(min / median / p95 / p99 / max)",
+        "bus load: ",
+    ):
+        assert words in run.out
+
+
+def test_a_foreign_trace_says_that_there_is_no_upgrade(flasher: Flasher, tmp_path: Path) -> None:
+    tape = Tape()
+    for number in range(30):
+        tape.frame(Frame(0x180 + number % 3, bytes([number])))
+    run = flasher("explain", tape.save(tmp_path / "foreign.asc"))
+    assert run.code == 0
+    assert "verdict: no upgrade, only traffic of other kinds" in run.out
+    assert "180       foreign     10 frames" in run.out
+
+
+def test_packets_and_all_show_more(flasher: Flasher, tmp_path: Path) -> None:
+    trace = failed(tmp_path)
+    run = flasher("explain", trace, "--packets", "--all")
+    assert run.out.count("packet: number") == 11
+    assert "attempt  packet" in run.out
+    assert sum(line.endswith("none") for line in run.out.splitlines()) == 1
+
+
+def test_json_gives_the_same_as_data(flasher: Flasher, tmp_path: Path) -> None:
+    document = flasher("explain", failed(tmp_path), "--json").document
+    assert (document["ok"], document["exit_code"]) == (True, 0)
+    verdict = document["story"]["verdict"]
+    assert (verdict["cause"], verdict["phase"], verdict["packet"]) == (
+        "packet_refused", "transfer", 7,
+    )  # fmt: skip
+    packets = document["story"]["upgrades"][0]["packets"]
+    assert [packet["tries"] for packet in packets] == [1] * 6 + [5]
+
+
+def test_the_page_is_written_beside_the_text(flasher: Flasher, tmp_path: Path) -> None:
+    pytest.importorskip("jinja2")
+    page = tmp_path / "story.html"
+    run = flasher("explain", failed(tmp_path), "--html", page)
+    assert run.code == 0
+    assert "verdict:" in run.out
+    assert "a packet was refused again and again" in page.read_text(encoding="utf-8")
+
+
+def test_a_page_that_cannot_be_written_is_said_before_the_work(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    run = flasher("explain", failed(tmp_path), "--html", tmp_path / "none" / "story.html")
+    assert run.code == 2
+    assert "--html" in run.err
+    assert run.out == ""
+
+
+@pytest.mark.parametrize("name", ["missing.log", "trace.xyz", "."])
+def test_what_is_no_trace_is_wrong_usage(name: str, flasher: Flasher, tmp_path: Path) -> None:
+    (tmp_path / "trace.xyz").write_bytes(b"x")
+    run = flasher("explain", tmp_path / name)
+    assert run.code == 2
+    assert "Traceback" not in run.err
+
+
+def test_hostile_texts_do_not_reach_the_terminal(flasher: Flasher, tmp_path: Path) -> None:
+    trace = Tape().reset().feedback().boot(b"\x1b[2J\r\n").save(tmp_path / "hostile.asc")
+    run = flasher("explain", trace)
+    assert r"\x1b[2J\r\n" in run.out
+    assert "\x1b" not in run.out
+
+
+def test_the_bit_rate_can_be_given(flasher: Flasher, tmp_path: Path) -> None:
+    run = flasher("explain", failed(tmp_path), "--bitrate", "500000")
+    assert "500 kbit/s" in run.out
+
+
+def test_a_page_never_replaces_the_trace_that_it_is_made_from(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    trace = failed(tmp_path)
+    before = trace.read_bytes()
+    other_name = tmp_path / "same.log"
+    other_name.symlink_to(trace)
+    for page in (trace, other_name):
+        run = flasher("explain", trace, "--html", page)
+        assert run.code == ExitCode.USAGE
+        assert "is a file of the command itself" in run.err
+    assert trace.read_bytes() == before
+
+
+def test_an_empty_trace_has_no_figures_of_a_bus(flasher: Flasher, tmp_path: Path) -> None:
+    empty = tmp_path / "empty.log"
+    empty.write_text("")
+    assert flasher("explain", empty).out.endswith("bus load: none, there is no frame\n")
+
+
+def test_where_the_trace_of_a_bundle_breaks_off_the_tool_gave_up_and_not_the_recording(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    run = flasher(
+        "flash", SAMPLES / "obc.bin", "-t", "obc", "--mock", "--mock-speed", "0", "--timeout",
+        "0.3", "--bundle-dir", tmp_path,
+    )  # fmt: skip
+    assert run.code == ExitCode.TRANSFER
+    (bundle,) = tmp_path.iterdir()
+    page = tmp_path / "story.html"
+    told = flasher("explain", bundle, "--html", page).out
+    assert "verdict: the tool gave up in the middle (transferring, packet " in told
+    assert "Here the tool ended: OBC: the overall deadline passed." in told
+    assert "the recording was stopped" not in told
+    assert "what to do: Allow more time with --timeout" in page.read_text()
+    for name in ("trace.log", "report.json"):
+        refused = flasher("explain", bundle, "--html", bundle / name)
+        assert refused.code == ExitCode.USAGE
+    assert flasher("explain", bundle).out == told

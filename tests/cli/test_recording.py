@@ -1,0 +1,229 @@
+"""What commands leave of their frames: a trace file, and a bundle when they fail."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flasher import service
+from flasher.cli.output import Output
+from flasher.cli.recording import add_recording, recording
+from flasher.errors import (
+    BusError,
+    ExitCode,
+    FlasherError,
+    ImageError,
+    InterruptedByUserError,
+    NoAnswerError,
+    UsageError,
+)
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import BMS
+from tests.trace.tape import Tape
+
+from .conftest import SAMPLES, Flasher
+
+MOCK = ("--mock", "--mock-speed", "0")
+
+
+def options(*words: str | Path) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    add_recording(parser)
+    chosen = parser.parse_args([str(word) for word in words])
+    chosen.dialect, chosen.mock, chosen.command_line = "welling", False, ["flash", "a b", "\x1b"]
+    return chosen
+
+
+def bundles(folder: Path) -> list[Path]:
+    return sorted(folder.iterdir()) if folder.exists() else []
+
+
+def report_of(bundle: Path) -> dict[str, Any]:
+    loaded = json.loads((bundle / "report.json").read_text())
+    assert isinstance(loaded, dict)
+    return loaded
+
+
+def run_into(error: BaseException, *words: str | Path) -> None:
+    def command() -> None:
+        with recording(options(*words), Output(), target=BMS) as record:
+            for at, frame in Tape().to_packet(3).packet(3):
+                for tap in record.taps:
+                    tap(frame, sent=frame.can_id == 0x752, now=at)
+            raise error
+
+    with pytest.raises(type(error)) as raised:
+        command()
+    assert raised.value is error
+
+
+def test_a_failure_on_the_bus_leaves_a_bundle_and_says_where(
+    bundle_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run_into(NoAnswerError("Nobody.", where="packet 3", cause="no power", remedy="Switch on."))
+    (bundle,) = bundles(bundle_folder)
+    assert capsys.readouterr().err == f"bundle: {bundle}\n"
+    report = report_of(bundle)
+    assert report["error"] == {
+        "kind": "NoAnswerError", "exit_code": 5, "what": "Nobody.", "where": "packet 3",
+        "cause": "no power", "remedy": "Switch on.",
+    }  # fmt: skip
+    assert report["command_line"] == ["flasher", "flash", "a b", r"\x1b"]
+    assert (report["target"], report["bitrate_bps"]) == ("bms", 250_000)
+    assert report["link"]["packets"] == 3
+    assert "packet: number 3" in (bundle / "transcript.txt").read_text()
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        UsageError("x"),
+        ImageError("x"),
+        InterruptedByUserError("x"),
+        KeyboardInterrupt(),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_what_explains_itself_leaves_none(error: BaseException, bundle_folder: Path) -> None:
+    run_into(error)
+    assert bundles(bundle_folder) == []
+
+
+def test_a_bug_leaves_a_bundle_with_its_traceback(bundle_folder: Path) -> None:
+    run_into(ZeroDivisionError("oops"))
+    error = report_of(bundles(bundle_folder)[0])["error"]
+    assert (error["exit_code"], error["what"]) == (1, "oops")
+    assert any("raise error" in line for line in error["traceback"])
+
+
+def test_a_failure_that_is_returned_can_be_handed_in(bundle_folder: Path) -> None:
+    with recording(options(), Output()) as record:
+        record.facts["outcome"] = {"ending": "refused"}
+        record.failed(FlasherError("x"))
+    (bundle,) = bundles(bundle_folder)
+    assert bundle.name.startswith("flasher-bus-")
+    assert report_of(bundle)["outcome"] == {"ending": "refused"}
+
+
+def test_success_leaves_none(bundle_folder: Path) -> None:
+    with recording(options(), Output(), target=BMS) as record:
+        assert record.link_report() is None
+    assert bundles(bundle_folder) == []
+
+
+def test_no_bundle_leaves_none(bundle_folder: Path) -> None:
+    run_into(BusError("x"), "--no-bundle")
+    assert bundles(bundle_folder) == []
+
+
+def test_the_option_goes_before_the_environment(tmp_path: Path, bundle_folder: Path) -> None:
+    run_into(BusError("x"), "--bundle-dir", tmp_path / "here")
+    assert len(bundles(tmp_path / "here")) == 1
+    assert bundles(bundle_folder) == []
+
+
+def test_a_folder_that_cannot_be_written_is_one_warning_and_the_error_stays(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_bytes(b"")
+    run_into(BusError("x"), "--bundle-dir", tmp_path / "file")
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert lines[0].startswith(f"warning: no bundle in {tmp_path / 'file'}: ")
+
+
+def test_a_trace_file_holds_both_directions(tmp_path: Path) -> None:
+    path = tmp_path / "trace.log"
+    with recording(options("--trace-file", path), Output()) as record:
+        for tap in record.taps:
+            tap(Frame(0x752, b"\x01"), sent=True, now=1.0)
+            tap(Frame(0x725, b"\x02"), sent=False, now=2.0)
+    lines = path.read_text().splitlines()
+    assert [line.split(maxsplit=2)[2] for line in lines] == ["752#01 T", "725#02 R"]
+
+
+def test_the_echoes_of_an_adapter_are_in_neither_trace_nor_bundle_nor_figures(
+    tmp_path: Path, bundle_folder: Path
+) -> None:
+    """An interface such as udp_multicast hears its own frames: they are no repetitions."""
+    path, tape = tmp_path / "trace.log", Tape().to_packet(7)
+    with recording(options("--trace-file", path), Output(), target=BMS) as record:
+        for now, frame in tape.frames:
+            is_own = frame.can_id == BMS.request_id
+            for tap in record.taps:
+                tap(frame, sent=is_own, now=now)
+                if is_own:
+                    tap(frame, sent=False, now=now + 0.0001)
+        link = record.link_report()
+        record.failed(NoAnswerError("x"))
+    assert link is not None
+    assert link.repetitions == 0
+    assert link.device_answer is not None
+    (bundle,) = bundles(bundle_folder)
+    assert len(path.read_text().splitlines()) == len(tape.frames)
+    assert len((bundle / "trace.log").read_text().splitlines()) == len(tape.frames)
+
+
+def test_a_trace_file_that_cannot_be_written_is_wrong_usage(bundle_folder: Path) -> None:
+    with pytest.raises(UsageError), recording(options("--trace-file", "/nowhere/x"), Output()):
+        pytest.fail("it began all the same")
+    assert bundles(bundle_folder) == []
+
+
+@pytest.mark.parametrize("name", ["image.log", "folder/../image.log", "link.log"])
+def test_a_trace_never_replaces_the_image(flasher: Flasher, tmp_path: Path, name: str) -> None:
+    """The suffix does not matter to an image: its content tells what it is."""
+    image = tmp_path / "image.log"
+    image.write_bytes((SAMPLES / "obc.bin").read_bytes())
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "link.log").symlink_to(image)
+    run = flasher(
+        "flash", image, "-t", "obc", "--mock", "--mock-speed", "0", "--trace-file", tmp_path / name
+    )
+    assert run.code == ExitCode.USAGE
+    assert "is a file of the command itself" in run.err
+    assert image.read_bytes() == (SAMPLES / "obc.bin").read_bytes()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("info", "-t", "bms"),
+        ("read", "version-information"),
+        ("read", "memory", "0x8004000", "0x8004080"),
+        ("write", "user-string-1", "rack", "--yes"),
+        ("scan",),
+    ],
+    ids=" ".join,
+)
+def test_commands_record_what_they_ask(
+    words: tuple[str, ...], flasher: Flasher, tmp_path: Path, bundle_folder: Path
+) -> None:
+    trace = tmp_path / "trace.asc"
+    assert flasher(*words, *MOCK, "--trace-file", trace).code == 0
+    assert bundles(bundle_folder) == []
+    assert "752" in trace.read_text() or words == ("scan",)
+    told = flasher("explain", trace)
+    assert "verdict: no upgrade, but drive-system traffic" in told.out
+
+
+def test_a_silent_device_leaves_a_bundle_that_is_explained(
+    flasher: Flasher, bundle_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def silent(*_: object, **__: object) -> None:
+        raise NoAnswerError("The BMS did not answer.", remedy="Wake it.")
+
+    monkeypatch.setattr(service, "read", silent)
+    run = flasher("read", "version-information", *MOCK)
+    assert run.code == 5
+    (bundle,) = bundles(bundle_folder)
+    assert f"bundle: {bundle}" in run.err
+    told = flasher("explain", bundle)
+    assert told.code == 0
+    assert "reported then: exit code 5" in told.out
+    assert "flasher read version-information --mock" in told.out
+    assert "The BMS did not answer." in told.out

@@ -1,0 +1,225 @@
+"""`flasher rescue`, and the command that every failed upgrade names for it."""
+
+from __future__ import annotations
+
+import shlex
+import signal
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from flasher import events
+from flasher.cli.repair import repair_command
+from flasher.errors import ExitCode
+from flasher.events import Phase
+from tests.cli.conftest import SAMPLES, Flasher
+from tests.end_to_end.stage import IMAGE, Stage
+
+
+def repair_named_in(said: str) -> list[str]:
+    """The words of the command behind "To repair it:", as a shell parts them."""
+    line = next(line for line in said.splitlines() if "To repair it: " in line)
+    words = shlex.split(line.partition("To repair it: ")[2])
+    assert words[:1] == ["flasher"]
+    return words[1:]
+
+
+@pytest.fixture
+def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
+    made = Stage()
+    monkeypatch.setattr("flasher.api.connect", made.connect)
+    return made
+
+
+def test_the_mock_of_rescue_has_no_application_and_is_rescued(flasher: Flasher) -> None:
+    image = SAMPLES / "obc.bin"
+    run = flasher("rescue", image, "-t", "obc", "--mock", "--mock-speed", "0")
+    assert run.code == ExitCode.OK
+    assert ">>> power-cycle the device now (waiting 60 s)" in run.err
+    assert "completed:    the device confirmed the complete image" in run.out
+
+
+def test_no_wait_is_no_wait_and_not_the_default(flasher: Flasher, stage: Stage) -> None:
+    stage.cut_power()
+    run = flasher("rescue", SAMPLES / "obc.bin", "-t", "obc", "-i", "virtual", "--wait", "0")
+    assert ">>> power-cycle the device now (waiting 0 s)" in run.err
+    assert run.code == ExitCode.NO_ANSWER
+
+
+def test_rescue_is_one_json_document_too(flasher: Flasher) -> None:
+    image = SAMPLES / "obc.bin"
+    run = flasher("rescue", image, "-t", "obc", "--mock", "--mock-speed", "0", "--json")
+    assert run.document["command"] == "rescue"
+    assert run.document["outcome"]["ending"] == "completed"
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        (),
+        ("--timeout", "30", "--skip-same-version"),
+        ("--timeo=30", "--skip", "--retries", "2", "--verify", "none"),
+        ("--bus-kwargs", "a=1", "b=two"),
+    ],
+    ids=" ".join,
+)
+def test_the_command_that_is_named_repairs_as_it_stands(
+    flasher: Flasher,
+    stage: Stage,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    options: Sequence[str],
+) -> None:
+    """Typed from another folder's shell, with a name that needs quoting."""
+    monkeypatch.chdir(tmp_path)
+    image = tmp_path / "it's new; v2.bin"
+    image.write_bytes(IMAGE.data)
+    stage.at_packet[3] = stage.cut_power
+    failed = flasher("-q", "flash", image, "-t", "bms", "-i", "virtual", *options)
+    assert failed.code == ExitCode.TRANSFER
+    assert stage.has is None
+    stage.give_power()
+    repaired = flasher(*repair_named_in(failed.err))
+    assert repaired.code == ExitCode.OK, repaired.err
+    assert stage.has == IMAGE.data
+
+
+@pytest.mark.parametrize(
+    ("typed", "repair"),
+    [
+        ("flash a.hex -t bms", "rescue a.hex -t bms"),
+        ("-v flash a.hex -t bms --json", "-v rescue a.hex -t bms --json"),
+        ("rescue a.hex -t bms --wait 300", "rescue a.hex -t bms --wait 300"),
+        ("flash -t bms --timeout 5 a.hex", "rescue -t bms a.hex"),
+        ("flash -t bms --timeout=5 a.hex", "rescue -t bms a.hex"),
+        ("flash -t bms --timing f_clock=8 a.hex", "rescue -t bms --timing f_clock=8 a.hex"),
+        ("flash --skip-same a.hex -t bms", "rescue a.hex -t bms"),
+        ("--log-file flash flash a.hex -t bms", "--log-file flash rescue a.hex -t bms"),
+        ("--log flash flash a.hex -t bms", "--log flash rescue a.hex -t bms"),
+        ("flash -t bms -- --timeout", "rescue -t bms -- --timeout"),
+        ("flash flash -t bms", "rescue flash -t bms"),
+        ("flash 'a b.hex' -t bms -c '$x'", "rescue 'a b.hex' -t bms -c '$x'"),
+    ],
+)
+def test_the_repair_is_what_was_typed_without_what_does_not_fit(typed: str, repair: str) -> None:
+    words = shlex.split(typed)
+    command = "rescue" if "rescue" in words else "flash"
+    assert repair_command(words, command) == f"flasher {repair}"
+
+
+# -- Ctrl-C ---------------------------------------------------------------------------------------
+
+STAGES = [
+    (Phase.IDENTIFY, "this run erased nothing", False),
+    (Phase.RESET, "this run erased nothing", False),
+    (Phase.BOOT, "this run erased nothing", False),
+    (Phase.UPDATE, "it was told to erase its application", True),
+    (Phase.TRANSFER, "its application is erased or half written", True),
+    (Phase.END, "it has every byte of the image", True),
+]
+
+
+@pytest.mark.parametrize(("phase", "state", "needs_repair"), STAGES)
+@pytest.mark.parametrize("times", [1, 2])
+def test_ctrl_c_in_every_phase_says_what_the_device_has_and_how_to_repair_it(
+    flasher: Flasher,
+    stage: Stage,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    phase: Phase,
+    state: str,
+    *,
+    needs_repair: bool,
+    times: int,
+) -> None:
+    """With the first frame of the phase; the second Ctrl-C cuts off what is being sent."""
+    pressed: list[Phase] = []
+
+    def show(_progress: object, event: object) -> None:
+        if isinstance(event, events.PhaseEntered) and event.phase is phase and not pressed:
+            pressed.append(phase)
+            stage.at_next_frame = press
+
+    def press() -> None:
+        for _ in range(times):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("flasher.cli.progress.Progress.__call__", show)
+    image = tmp_path / "image.bin"
+    image.write_bytes(IMAGE.data)
+    run = flasher("flash", image, "-t", "bms", "-i", "virtual", "--json")
+    assert pressed
+    assert run.code == ExitCode.INTERRUPTED, run.err
+    error = run.document["error"]
+    if phase is not Phase.RESET:
+        assert phase.value in error["where"]
+    if times == 1:
+        assert f"State of the device: {state}" in error["remedy"]
+        assert ("To repair it: " in error["remedy"]) is needs_repair
+    else:
+        assert "State of the device: " in error["remedy"]
+        assert "Interrupted at once" in error["what"]
+    if "To repair it: " in error["remedy"]:
+        stage.wait(10.0)
+        assert flasher("flash", image, "-t", "bms", "-i", "virtual").code == ExitCode.OK
+        assert stage.has == IMAGE.data
+
+
+def test_ctrl_c_while_power_is_awaited_leaves_the_device_as_it_was(
+    flasher: Flasher, stage: Stage, tmp_path: Path
+) -> None:
+    image = tmp_path / "image.bin"
+    image.write_bytes(IMAGE.data)
+    ticks = iter(range(100))
+
+    def press(_moment: float) -> None:
+        if next(ticks) == 3:
+            signal.raise_signal(signal.SIGINT)
+
+    stage.clock.on_wait = press
+    run = flasher("rescue", image, "-t", "bms", "-i", "virtual", "--json")
+    assert run.code == ExitCode.INTERRUPTED
+    assert "this run erased nothing" in run.document["error"]["remedy"]
+    assert stage.clock.now() < 5.0
+    assert stage.heard == []
+
+
+@pytest.mark.usefixtures("stage")
+def test_ctrl_c_in_the_verification_says_that_the_image_is_there(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def show(_progress: object, event: object) -> None:
+        if isinstance(event, events.VerificationStarted):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("flasher.cli.progress.Progress.__call__", show)
+    image = tmp_path / "image.bin"
+    image.write_bytes(IMAGE.data)
+    run = flasher("flash", image, "-t", "bms", "-i", "virtual", "--json")
+    assert run.code == ExitCode.INTERRUPTED
+    error = run.document["error"]
+    assert "completed, but interrupted by the user" in error["what"]
+    assert error["where"] == "verification by version"
+    assert "State of the device: it has the new image." in error["remedy"]
+    assert "rescue" not in error["remedy"]
+
+
+def test_ctrl_c_while_the_adapter_is_awaited_is_heard_at_once(
+    flasher: Flasher, stage: Stage, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def show(_progress: object, event: object) -> None:
+        if isinstance(event, events.AdapterLost):
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr("flasher.cli.progress.Progress.__call__", show)
+    stage.at_packet[2] = stage.bus.unplug
+    image = tmp_path / "image.bin"
+    image.write_bytes(IMAGE.data)
+    run = flasher("flash", image, "-t", "bms", "-i", "virtual", "--adapter-wait", "500", "--json")
+    assert run.code == ExitCode.INTERRUPTED
+    assert stage.clock.now() < 2.0
+    error = run.document["error"]
+    assert "packet 2 of 4" in error["where"]
+    assert "no such device" in error["cause"]
+    assert "To repair it: " in error["remedy"]

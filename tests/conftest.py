@@ -1,0 +1,15 @@
+"""What holds for every test: failures leave their bundles where nobody has to clear them away."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from flasher.cli.recording import BUNDLE_FOLDER
+
+
+@pytest.fixture(autouse=True, scope="session")
+def bundles_elsewhere(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """For processes that a test starts too."""
+    os.environ[BUNDLE_FOLDER] = str(tmp_path_factory.mktemp("bundles"))
