@@ -1,0 +1,62 @@
+"""The host's process is killed in the middle, and the same command is given again."""
+
+from __future__ import annotations
+
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment, run_flasher
+from tests.end_to_end.test_processes import GROUP, bus, free_port
+
+__all__ = ["GROUP", "bus", "free_port"]  # `bus` is a fixture
+
+PACKETS = 40
+IMAGE = random.Random(40).randbytes(PACKETS * 128 - 5)
+SLOW = ("--packet-gap", "0.02")
+"""So that the kill hits while packets go."""
+PAUSE_S = "transfer_timeout_s=0.3"
+"""The device does not wait long for a host that is gone."""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a kill that nobody can catch")
+def test_a_host_that_is_killed_at_any_packet_is_repaired_by_the_same_command(
+    bus: tuple[str, ...],
+    tmp_path: Path,
+) -> None:
+    """One device lives through all of it; each time it is left without an application."""
+    (tmp_path / "image.bin").write_bytes(IMAGE)
+    serving = ("-t", "bms", "--set", PAUSE_S, "--save-image", "out.bin", "-v", *bus)
+    flash = ("flash", "-t", "bms", *bus, "image.bin")
+    with MockProcess(*serving, folder=tmp_path) as mock:
+        for number in (1, PACKETS // 2, PACKETS - 1):
+            kill_at(number, (*flash, *SLOW), tmp_path)
+            (tmp_path / "out.bin").unlink(missing_ok=True)
+            done = run_flasher(*flash, folder=tmp_path)
+            assert done.returncode == 0, done.stderr
+            assert "application does not tell its versions" in done.stderr  # it has none
+            mock.wait_for("image:")
+            assert (tmp_path / "out.bin").read_bytes() == IMAGE
+
+
+def kill_at(number: int, words: tuple[str, ...], folder: Path) -> None:
+    """Start a flash and kill it as soon as it says that a packet is acknowledged."""
+    events = ("--json", "--events")
+    with subprocess.Popen(
+        [*FLASHER, *words, *events],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        cwd=folder,
+        env=clean_environment(),
+    ) as process:
+        assert process.stdout is not None
+        try:
+            wanted = f'"number": {number}, "total": {PACKETS}'
+            assert any(wanted in line for line in process.stdout)
+        finally:
+            process.kill()
+    assert process.returncode < 0
