@@ -2,7 +2,7 @@
 
     python -m tests.diagram
 
-writes them anew, into README.md and docs/states.md; a test holds both against the tables.
+writes them anew, into docs/upgrade.md and docs/states.md; a test holds both against the tables.
 """
 
 from __future__ import annotations
@@ -18,14 +18,15 @@ from flasher.host import table as host
 from flasher.host.table import Ending
 
 _ROOT: Final = Path(__file__).parents[1]
-README: Final = _ROOT / "README.md"
+UPGRADE: Final = _ROOT / "docs" / "upgrade.md"
 STATES: Final = _ROOT / "docs" / "states.md"
 _MARKED: Final = re.compile(
     r"(<!-- state diagram -->\n).*?(<!-- end of state diagram -->)", re.DOTALL
 )
 
 _QUIET: Final = {"NOTHING", "REPORT", "IMPOSSIBLE"}
-_EVERYWHERE: Final = {"CANCEL", "OUT_OF_TIME", "POWER_CUT", "UNEXPECTED"}
+_EVERYWHERE: Final = {"CANCEL", "OUT_OF_TIME", "POWER_CUT", "SECOND_TOOL", "UNEXPECTED"}
+_NOT_IN_THE_OVERVIEW: Final = {"LINK_BACK"}
 _GOOD: Final = {Ending.COMPLETED, Ending.CONFIRMED_BY_VERSION}
 
 _INTRODUCTION: Final = """\
@@ -33,8 +34,8 @@ _INTRODUCTION: Final = """\
 
 Drawn from the tables in the code by `python -m tests.diagram`; a test keeps them so. Each arrow is
 *event / action*. Left out are events that are ignored or only reported, and those that are possible
-in every state: for the host the overall deadline and the user's cancellation (both end the
-upgrade), for the device a power cut.
+in every state: for the host the overall deadline, the user's cancellation and a second tool (all
+end the upgrade), for the device a power cut.
 """
 
 _Table = Mapping[Any, Mapping[Any, Any]]
@@ -48,7 +49,9 @@ def diagram(table: _Table, first: Enum, *, overview: bool = False) -> str:
     for state, row in table.items():
         for event, move in row.items():
             is_bad = isinstance(move.action, Ending) and move.action not in _GOOD
-            if event.name in _EVERYWHERE or move.action.name in _QUIET or (overview and is_bad):
+            if event.name in _EVERYWHERE or move.action.name in _QUIET:
+                continue
+            if overview and (is_bad or event.name in _NOT_IN_THE_OVERVIEW):
                 continue
             label = event.value if overview else f"{event.value} / {_action(move.action)}"
             arrow = f"{state.name.lower()} --> {move.state.name.lower()}"
@@ -75,8 +78,8 @@ def states_document() -> str:
     )
 
 
-def readme_document(text: str) -> str:
-    """README.md with its diagram drawn anew."""
+def upgrade_document(text: str) -> str:
+    """docs/upgrade.md with its diagram drawn anew."""
     overview = diagram(host.TABLE, host.State.RESETTING, overview=True)
     return _MARKED.sub(lambda match: f"{match[1]}{overview}{match[2]}", text)
 
@@ -84,4 +87,4 @@ def readme_document(text: str) -> str:
 if __name__ == "__main__":
     STATES.parent.mkdir(exist_ok=True)
     STATES.write_text(states_document(), encoding="utf-8")
-    README.write_text(readme_document(README.read_text(encoding="utf-8")), encoding="utf-8")
+    UPGRADE.write_text(upgrade_document(UPGRADE.read_text(encoding="utf-8")), encoding="utf-8")

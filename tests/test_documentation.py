@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 from flasher.cli.main import COMMANDS
 from flasher.errors import ExitCode
 from tests import diagram
 
-README = diagram.README.read_text(encoding="utf-8")
+README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
 
 
 def test_the_state_diagrams_are_those_of_the_tables() -> None:
     drawn = "draw them anew: python -m tests.diagram"
     assert diagram.STATES.read_text(encoding="utf-8") == diagram.states_document(), drawn
-    assert "stateDiagram-v2" in README
-    assert diagram.readme_document(README) == README, drawn
+    upgrade = diagram.UPGRADE.read_text(encoding="utf-8")
+    assert "stateDiagram-v2" in upgrade
+    assert diagram.upgrade_document(upgrade) == upgrade, drawn
 
 
 def test_the_readme_lists_every_exit_code() -> None:
@@ -33,3 +35,23 @@ def test_the_readme_opens_with_two_commands() -> None:
     assert "flash firmware_samples/" in blocks[0]
     assert "--mock" in blocks[0]
     assert "pytest" in blocks[1]
+
+
+def test_every_link_of_the_documentation_leads_somewhere() -> None:
+    root = Path(__file__).parents[1]
+    for page in (root / "README.md", *(root / "docs").glob("*.md")):
+        text = page.read_text(encoding="utf-8")
+        for link in re.findall(r"\]\(([^)\s]+)\)", text):
+            name, _, anchor = link.partition("#")
+            if "://" in name:
+                continue
+            target = (page.parent / name) if name else page
+            assert target.exists(), f"{page.name}: {link}"
+            if anchor and target.suffix == ".md":
+                titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
+                assert anchor in {_anchor(title) for title in titles}, f"{page.name}: {link}"
+
+
+def _anchor(title: str) -> str:
+    """As GitHub makes it of a heading."""
+    return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
