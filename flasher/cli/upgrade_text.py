@@ -85,12 +85,12 @@ def summary_lines(result: Result, plan: Plan) -> list[str]:
 
 
 def link_lines(report: LinkReport) -> list[str]:
-    """How the line and both ends did; times in milliseconds."""
+    """How long each end took, as min / median / p95 / p99 / max."""
     return [
-        f"{title:<13} {_figures(figures)}"
-        for title, figures in (
-            ("device:", report.device_answer),
-            ("host:", report.host_turnaround),
+        f"{end:<13} {_figures(figures)} ms {doing}"
+        for end, figures, doing in (
+            ("device took:", report.device_answer, "to answer a packet"),
+            ("host took:", report.host_turnaround, "to send the next (min/median/p95/p99/max)"),
         )
         if figures is not None
     ]
@@ -98,8 +98,7 @@ def link_lines(report: LinkReport) -> list[str]:
 
 def _figures(of: Distribution) -> str:
     times = (of.minimum_s, of.median_s, of.p95_s, of.p99_s, of.maximum_s)
-    shown = " / ".join(f"{each * 1000:.2f}" for each in times)
-    return f"{shown} ms (min / median / p95 / p99 / max)"
+    return " / ".join(f"{each * 1000:.2f}" for each in times)
 
 
 def _running(result: Result) -> str:
