@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import platform
 import re
 import time
 from collections import deque
@@ -34,6 +35,10 @@ from flasher.protocol.frame import Frame
 _FULL_QUEUE_PAUSE_S: Final = 0.0005
 """Between two tries on a full queue: about one frame on the wire. Frames are received meanwhile."""
 _DRAIN_FRAMES: Final = 100_000
+_KERNEL_STAMPS: Final = frozenset({"socketcan", "udp_multicast"})
+"""Back ends whose messages bear the time at which Linux had them, by the wall clock."""
+_STAMP_AGE_MAX_S: Final = 1.0
+"""A frame that seems to have waited for longer: rather the wall clock was set meanwhile."""
 _FAILURES: Final = (can.CanError, OSError)
 
 _QUEUE_FULL_CODES: Final[Mapping[str, frozenset[int]]] = {
@@ -82,7 +87,11 @@ class CanLink:
         self._channel = channel
         self._name = f"{interface} {channel}".strip()
         self._open_again = open_again
-        self._waiting: deque[Frame] = deque()
+        self._waiting: deque[tuple[Frame, float | None]] = deque()
+        is_stamped = interface in _KERNEL_STAMPS and platform.system() == "Linux"
+        self.stamp_source = "kernel" if is_stamped else ""
+        self.received_at: float | None = None
+        """Of the frame that `receive` returned last (`StampingLink`)."""
         self._health = HealthKeeper(LAYOUTS.get(interface, Layout.UNKNOWN))
         self._send_options: dict[str, float] = {}
         if interface == "slcan":
@@ -142,7 +151,8 @@ class CanLink:
     def receive(self, deadline: float) -> Frame | None:
         """The next frame, or None at `deadline` (monotonic clock)."""
         if self._waiting:
-            return self._waiting.popleft()
+            waited, self.received_at = self._waiting.popleft()
+            return waited
         remaining_s = deadline - time.monotonic()
         frame = self._receive_once(max(remaining_s, 0.0))
         # A filtered or foreign frame ends a wait early.
@@ -194,6 +204,7 @@ class CanLink:
             raise self._failure("receiving", error) from error
         if message is None or message.is_fd:
             return None
+        self.received_at = self._moment_of(message)
         frame = Frame(
             message.arbitration_id,
             bytes(message.data),
@@ -212,7 +223,14 @@ class CanLink:
         """Wait for room in the transmit queue, and lose nothing that arrives meanwhile."""
         frame = self._receive_once(_FULL_QUEUE_PAUSE_S)
         if frame is not None:
-            self._waiting.append(frame)
+            self._waiting.append((frame, self.received_at))
+
+    def _moment_of(self, message: can.Message) -> float | None:
+        """The kernel's stamp on the monotonic clock, by how long ago it was."""
+        if not self.stamp_source:
+            return None
+        age_s = time.time() - message.timestamp
+        return time.monotonic() - age_s if 0.0 <= age_s <= _STAMP_AGE_MAX_S else None
 
     def _is_queue_full(self, error: Exception) -> bool:
         code = getattr(error, "error_code", None)

@@ -7,7 +7,7 @@ real adapter goes with `MonotonicClock`; a simulated bus makes the time itself.
 from __future__ import annotations
 
 import time
-from typing import Final, Protocol
+from typing import Final, Protocol, runtime_checkable
 
 from flasher.bus.health import LinkHealth
 from flasher.protocol.frame import Frame
@@ -62,6 +62,23 @@ class Link(Protocol):
 
     def health(self) -> LinkHealth:
         """What is known of the adapter and its bus. Sends nothing, never raises."""
+        ...
+
+
+@runtime_checkable
+class StampingLink(Link, Protocol):
+    """A link that may know better than its reader when a frame arrived."""
+
+    @property
+    def stamp_source(self) -> str:
+        """Who stamps the frames ("kernel"); empty where nobody does."""
+        ...
+
+    @property
+    def received_at(self) -> float | None:
+        """When the frame that `receive` returned last was there, in seconds on the link's clock;
+        None without a stamp that can be trusted.
+        """
         ...
 
 
