@@ -28,6 +28,7 @@ class ExitCode(IntEnum):
     UNCONFIRMED = 9
     VERIFICATION = 10
     NOTHING_TO_DO = 11
+    PARTIAL = 12
     INTERRUPTED = 130
 
 

@@ -38,6 +38,7 @@ COMMANDS: Final = {
     "monitor": ("monitor", "show decoded traffic, live or of a recorded trace"),
     "explain": ("explain", "the story of a recorded trace or a bundle, with a verdict"),
     "doctor": ("doctor", "look at adapters, bus and traffic, and say what fixes what is wrong"),
+    "conformance": ("conformance", "test a bootloader against the protocol, case by case"),
     "manifest": ("manifest", "create or check the release manifest of an image"),
     "profile": ("profile", "what a target profile sets, and where each value comes from"),
 }
@@ -57,7 +58,7 @@ examples:
 
 """
 _LOG: Final = logging.getLogger("flasher.cli")
-_CHANGING: Final = frozenset({"flash", "rescue", "write"})
+_CHANGING: Final = frozenset({"flash", "rescue", "write", "conformance"})
 """Commands that change a device."""
 _FOR_THE_FILE: Final = {"said": True}
 """What who types it sees anyway."""

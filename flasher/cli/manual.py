@@ -31,7 +31,7 @@ PURPOSES: Final[Mapping[str, tuple[str, ...]]] = {
     "upgrade a device": ("flash", "rescue", "image-info", "manifest"),
     "look at devices and the bus": ("info", "scan", "read", "write", "monitor"),
     "when something goes wrong": ("doctor", "explain"),
-    "without hardware, and for bootloaders": ("mock",),
+    "without hardware, and for bootloaders": ("mock", "conformance"),
     "what a product does its own way": ("profile",),
 }
 """The commands by what they are for; one that is in none of them comes at the end."""
@@ -49,6 +49,7 @@ _MEANINGS: Final[Mapping[ExitCode, str]] = {
     ExitCode.UNCONFIRMED: "unconfirmed",
     ExitCode.VERIFICATION: "verification failed",
     ExitCode.NOTHING_TO_DO: "nothing to do",
+    ExitCode.PARTIAL: "some failed",
     ExitCode.INTERRUPTED: "interrupted",
 }
 
@@ -65,6 +66,7 @@ _EXIT_CODES: Final[Mapping[str, tuple[ExitCode, ...]]] = {
     "mock": (ExitCode.BUS,),
     "doctor": (ExitCode.BUS, _STOPS),
     "explain": (_STOPS,),
+    "conformance": (ExitCode.IMAGE, *_ASKS, ExitCode.PARTIAL, _STOPS),
     "profile": (),
 }
 """What a command can end with besides done, wrong usage and a bug; another command: anything."""

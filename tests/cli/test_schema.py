@@ -108,6 +108,9 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("explain", Path("upgrade.log")),
         ("explain", Path("nothing.log")),
         ("mock", "-t", "bms", "-i", "virtual", "-c", "schema"),
+        ("conformance", "-t", "bms", "--mock", "--case", "RS-01", "EN-04"),
+        ("conformance", "--list"),
+        ("conformance", "profile"),
 )  # fmt: skip
 
 

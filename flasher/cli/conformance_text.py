@@ -1,0 +1,213 @@
+"""What `flasher conformance` prints: the summary of a run, the difference of two, the list."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+from flasher.cli.output import counted, duration
+from flasher.conformance.diff import Change, Difference, Run, Slowdown
+from flasher.conformance.listing import Listed
+from flasher.conformance.model import CaseResult, Outcome, Status
+from flasher.conformance.report import FINAL_IMAGE_OK, CaseText, Report
+from flasher.conformance.summary import (
+    by_case,
+    counts,
+    distribution,
+    end_of_run,
+    finding,
+    group_title,
+    headline,
+    times,
+)
+from flasher.protocol.text import printable
+
+_TEXT_LIMIT: Final = 160
+_NOTES_SHOWN: Final = 12
+_TOLD: Final = (Status.FAIL, Status.ERROR, Status.INCONCLUSIVE, Status.DEVIATION)
+"""Verdicts whose cases have a line each; unsupported ones share one for each reason."""
+_MS: Final = 1000
+
+Replays = Mapping[tuple[str, int], str]
+
+
+# -- a run ----------------------------------------------------------------------------------------
+
+
+def report_lines(report: Report, replays: Replays, *, verbose: bool = False) -> Iterator[str]:
+    """The summary of a run: groups, what went wrong with how to see it again, times, the verdict.
+
+    `verbose` tells every case and every failed check.
+    """
+    yield _shown(
+        f"{report.subject}, target {report.target}, profile: {report.profile_source}, "
+        f"seed {report.seed}"
+    )
+    yield ""
+    yield from _groups(report)
+    cases = by_case(report)
+    if verbose:
+        yield ""
+        yield from (
+            _shown(f"{result.status.value:<12}  {text.id}  {text.title}")
+            for text, results in cases
+            for result in results
+        )
+    for status in _TOLD:
+        lines = [
+            line
+            for text, results in cases
+            for result in results
+            if result.status is status
+            for line in _told(text, result, replays, verbose=verbose)
+        ]
+        if lines:
+            yield ""
+            yield from lines
+    yield from _not_judged(report)
+    yield from _times(report, verbose=verbose)
+    yield ""
+    for line in end_of_run(report):
+        yield _shown(f"note: {line}")
+    if report.final_image:
+        verified = report.final_image == FINAL_IMAGE_OK
+        said = "flashed and verified" if verified else report.final_image
+        yield _shown(f"good image at the end: {said}")
+    verdict = "passed" if report.ok else "NOT PASSED"
+    yield f"{verdict}: {headline(report)}; {duration(report.duration_s)} on the bus"
+
+
+def _groups(report: Report) -> Iterator[str]:
+    groups: dict[str, list[CaseResult]] = {}
+    for text, results in by_case(report):
+        groups.setdefault(text.group, []).extend(results)
+    width = max((len(group_title(group)) for group in groups), default=0)
+    for group, results in groups.items():
+        said = ", ".join(f"{count} {status.value}" for status, count in counts(results).items())
+        yield f"{group}  {group_title(group):<{width}}  {said}"
+
+
+def _told(text: CaseText, result: CaseResult, replays: Replays, *, verbose: bool) -> Iterator[str]:
+    """One line: which case, what was expected, what was got, and how to run it again."""
+    repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
+    check = result.first_failure
+    said = finding(check) if check is not None else result.note
+    if result.status is Status.DEVIATION:
+        said = f"{said} (profile: {text.deviation})"
+    head = f"{result.status.value.upper()} {text.id}{repeat} {text.title} [{text.clause}]"
+    replay = replays.get((result.case_id, result.repeat), "")
+    yield _shown(f"{head}: {_short(said)}") + (f" | replay: {replay}" if replay else "")
+    failed = [one for one in result.checks if one.outcome is Outcome.FAIL]
+    if verbose:
+        for one in failed[1:]:
+            yield _shown(f"    also: {_short(finding(one))}")
+    elif len(failed) > 1:
+        yield f"    and {counted(len(failed) - 1, 'more failed check')}"
+
+
+def _not_judged(report: Report) -> Iterator[str]:
+    """Cases without a verdict, together with those that have the same reason."""
+    reasons: dict[tuple[Status, str], list[str]] = {}
+    for result in report.results:
+        if result.status in (Status.UNSUPPORTED, Status.NOT_RUN):
+            reasons.setdefault((result.status, _why(result)), []).append(result.case_id)
+    if reasons:
+        yield ""
+    for (status, why), case_ids in reasons.items():
+        named = list(dict.fromkeys(case_ids))
+        shown = " ".join(named[:_NOTES_SHOWN])
+        more = f" and {len(named) - _NOTES_SHOWN} more" if len(named) > _NOTES_SHOWN else ""
+        yield _shown(f"{status.value}: {shown}{more}: {_short(why)}")
+
+
+def _why(result: CaseResult) -> str:
+    if result.note:
+        return result.note
+    whys = [check.got for check in result.checks if check.outcome is Outcome.UNSUPPORTED]
+    return whys[0] if whys else "no reason given"
+
+
+def _times(report: Report, *, verbose: bool) -> Iterator[str]:
+    found = times(report)
+    if not found:
+        return
+    yield ""
+    unsure = f" +- {report.uncertainty_s * _MS:g} ms" if report.uncertainty_s else ""
+    yield f"times in ms (time stamps: {printable(report.timestamp_source)}{unsure})"
+    rows: list[tuple[str, ...]] = [("", "count", "least", "median", "p95", "p99", "most")]
+    for name, measurements in found.items():
+        spread = distribution(measurements)
+        if spread.count < 2 and not verbose and len(found) > _NOTES_SHOWN:
+            continue
+        values = (
+            spread.minimum_s, spread.median_s, spread.p95_s, spread.p99_s, spread.maximum_s,
+        )  # fmt: skip
+        rows.append((_shown(name), f"{spread.count}", *(f"{value * _MS:.1f}" for value in values)))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    for row in rows:
+        cells = (f"{cell:>{width}}" for cell, width in zip(row[1:], widths[1:], strict=True))
+        yield f"  {row[0]:<{widths[0]}}  " + "  ".join(cells)
+
+
+# -- the list -------------------------------------------------------------------------------------
+
+
+def list_lines(cases: Sequence[Listed]) -> Iterator[str]:
+    """The catalogue, a line a case."""
+    width = max((len(case.title) for case in cases if case.can_be_run), default=0)
+    for case in cases:
+        if not case.can_be_run:
+            yield f"{case.id}  cannot be run: {case.title}"
+            continue
+        needs = f"  ({', '.join(case.requires)})" if case.requires else ""
+        yield f"{case.id}  {case.title:<{width}}  {case.clause}{needs}"
+    can_be_run = sum(case.can_be_run for case in cases)
+    yield f"{counted(len(cases), 'case')}, {can_be_run} of them can be run"
+
+
+# -- two runs -------------------------------------------------------------------------------------
+
+
+def difference_lines(found: Difference, old: Run, new: Run) -> Iterator[str]:
+    """What a run has made better, worse and slower."""
+    yield f"{old.source}, then {new.source}"
+    for line in found.conditions:
+        yield f"not the same: {line}"
+    for title, changes in (
+        ("worse", found.worse),
+        ("better", found.better),
+        ("new", found.new),
+        ("gone", found.gone),
+    ):
+        for change in changes:
+            yield f"{title:<6}  {_change(change)}"
+    for title, moved in (("slower", found.slower), ("faster", found.faster)):
+        for one in moved:
+            yield f"{title:<6}  {_moved(one)}"
+    yield (
+        f"{len(found.worse)} worse, {len(found.better)} better, {len(found.new)} new, "
+        f"{len(found.gone)} gone, {found.unchanged} unchanged; {len(found.slower)} slower and "
+        f"{len(found.faster)} faster by more than {found.threshold_percent:g} % and the uncertainty"
+    )
+
+
+def _change(change: Change) -> str:
+    before = "not judged" if change.before is None else change.before.value
+    after = "not judged" if change.after is None else change.after.value
+    why = f": {_short(change.reason)}" if change.reason else ""
+    return f"{change.case_id} {_short(change.title)}: {before}, now {after}{why}"
+
+
+def _moved(one: Slowdown) -> str:
+    return (
+        f"{one.name}, {one.figure}: {one.before_s * _MS:.1f} ms, now {one.after_s * _MS:.1f} ms "
+        f"({one.percent:+.0f} %)"
+    )
+
+
+def _short(text: str) -> str:
+    return text if len(text) <= _TEXT_LIMIT else text[: _TEXT_LIMIT - 3] + "..."
+
+
+def _shown(text: str) -> str:
+    return printable(text)

@@ -1,0 +1,1 @@
+"""The conformance suite: does a bootloader follow the protocol, case by case, and how fast."""

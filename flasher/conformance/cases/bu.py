@@ -1,0 +1,225 @@
+"""BU: faults of the bus. One frame after the other is lost, doubled, held up, swapped; the device's
+controller leaves the bus; somebody else uses the device's id.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Final
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.cases.bu_troubles import (
+    Trouble,
+    Troubles,
+    faults_of,
+    faulty,
+    off_bus_after,
+    off_bus_in_answer,
+)
+from flasher.conformance.hearing import Heard, Kind
+from flasher.conformance.model import Requirement, case
+from flasher.conformance.wire import (
+    ACK,
+    FEEDBACK,
+    REPORT,
+    REQUEST,
+    build,
+    packet_count,
+    packet_payload,
+    split,
+)
+
+_ENTRIES_MAX: Final = 60
+"""Resets and update commands on the way into a transfer; ends a device that never gets there."""
+_REPORTS_AT_ONCE: Final = 4
+
+
+@case(
+    "BU-01",
+    "frames lost, doubled, late and swapped",
+    clause="R10, R12",
+    stimulus="each frame of reset, update command, packet and end of transfer dropped, doubled, "
+    "delayed and swapped with the next one, in turn; frames of the answers dropped and doubled",
+    expectation="the upgrade by a patient host completes correctly, or is refused explicitly",
+    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    limit_s=1800.0,
+)
+def disturbed_frames(bench: Bench) -> None:
+    delay_s = 1.5 * bench.profile.limit("inter_frame_s")
+
+    def troubles(frames: int) -> Iterator[Trouble]:
+        for fault in faults_of(frames, delay_s):
+            yield Trouble(str(fault), faulty(fault), fault.incoming)
+
+    _upgrade_in_trouble(bench, troubles)
+
+
+@case(
+    "BU-02",
+    "the device goes bus-off",
+    clause="4.2",
+    stimulus="the device's controller leaves the bus for 0.2 s before, between and after the "
+    "frames of every message, and in the middle of its answers",
+    expectation="the device is back, and the upgrade by a patient host completes correctly",
+    requires={Requirement.DESTRUCTIVE, Requirement.BUS_OFF},
+    limit_s=1800.0,
+)
+def bus_off(bench: Bench) -> None:
+    def troubles(frames: int) -> Iterator[Trouble]:
+        for after in range(frames + 1):
+            name = f"bus-off after {after} of {frames} frames"
+            yield Trouble(name, off_bus_after(after), hits_answer=after == frames)
+        yield Trouble("bus-off in the middle of the answer", off_bus_in_answer, hits_answer=True)
+
+    _upgrade_in_trouble(bench, troubles)
+
+
+@case(
+    "BU-06",
+    "somebody else uses the id of the device's answers",
+    clause="1",
+    stimulus="answers that are not the device's on its own id, before its answer to each message "
+    "and between two of them",
+    expectation="the device does not mind them, or is back afterwards",
+    requires={Requirement.DESTRUCTIVE},
+)
+def same_id(bench: Bench) -> None:
+    image = bench.good_image
+    with bench.step("to the application"):
+        _say_as_device(bench)
+        bench.check_application()
+    with bench.step("to the announcing bootloader"):
+        bench.reset_to_bootloader()
+        _say_as_device(bench)
+        bench.update(len(image))
+    with bench.step("in the transfer"):
+        for number in range(1, packet_count(len(image)) + 1):
+            if number <= _REPORTS_AT_ONCE:
+                _say_as_device(bench)
+            bench.packet(image, number)
+        bench.end_transfer()
+        bench.check_application()
+        bench.check_stored(image)
+    bench.unsupported(
+        "frames of one id that begin in the same bit time", "it takes an injector to make them meet"
+    )
+
+
+# -- an upgrade in which something happens to every message --------------------------------------
+
+
+def _upgrade_in_trouble(bench: Bench, make: Callable[[int], Iterator[Trouble]]) -> None:
+    """Upgrade again and again until everything has happened, once in each message at the most."""
+    image = bench.good_image
+    troubles = Troubles(bench, image, make)
+    for _ in range(troubles.rounds_max):
+        if not troubles:
+            break
+        _enter(bench, image, troubles)
+        if not _send_packets(bench, image, troubles):
+            continue
+        if not _end(bench, image, troubles):
+            continue
+        bench.check_application(image)
+        bench.check_stored(image)
+    bench.check(not troubles, "the upgrades come to their end", "the device restarts in each one")
+
+
+def _enter(bench: Bench, image: bytes, troubles: Troubles) -> None:
+    """Reset and update command until request transfer. A device that hears only a part of them
+    announces, runs, erases or waits for packet 1: all right, as long as it gets there in the end.
+    """
+    limit = bench.profile.limit
+    names: list[str] = []
+    heard: Heard | None = None
+    message = "reset"
+    bench.forget()
+    for _ in range(_ENTRIES_MAX):
+        trouble = troubles.take(message)
+        names += [f"{message}, {trouble.name}"] if trouble.name else []
+        if message == "reset":
+            within_s = limit("feedback_s") if trouble.name else limit("first_version_s")
+            with trouble.send(bench, bench.words.reset()):
+                heard = bench.wait_for(Kind.BOOT_VERSION, Kind.REQUEST, within_s=within_s)
+        else:
+            within_s = bench.burst_s if trouble.name else limit("erase_s")
+            with trouble.send(bench, bench.words.update(len(image))) as sent:
+                heard = bench.request_or_version(sent.left_at, within_s)
+            if heard is None and not _application_answers(bench):
+                heard = _ask_again(bench, image)
+        if heard is not None and heard.kind is Kind.REQUEST:
+            break
+        message = "reset" if heard is None else "update command"
+    with bench.step("; ".join(names) or "undisturbed"):
+        is_there = heard is not None and heard.kind is Kind.REQUEST
+        bench.require(is_there, Kind.REQUEST.value, heard or "nothing in many tries")
+
+
+def _application_answers(bench: Bench) -> bool:
+    """True when it is known that the bootloader was left; false where nobody can be asked."""
+    return bench.words.has_version_query and bench.application_version() is not None
+
+
+def _ask_again(bench: Bench, image: bytes) -> Heard | None:
+    """The update command into the silence: request transfer may have been lost (UP-05)."""
+    sent = bench.send(bench.words.update(len(image)))
+    return bench.request_or_version(sent.left_at, bench.profile.limit("silence_s"))
+
+
+def _send_packets(bench: Bench, image: bytes, troubles: Troubles) -> bool:
+    """All packets, each one in its own trouble and then undisturbed until it is acknowledged.
+    False when the device restarted: it said so, and the upgrade begins anew (R11).
+    """
+    total, began_at = packet_count(len(image)), bench.now
+    for number in range(1, total + 1):
+        trouble = troubles.take("packet")
+        with bench.step(f"packet {number}, {trouble.name}" if trouble.name else "packets"):
+            frames = bench.words.packet(number, total, packet_payload(image, number))
+            with trouble.send(bench, frames):
+                heard = bench.wait_for(Kind.ACK, Kind.NAK, within_s=bench.profile.limit("ack_s"))
+            last = ""
+            if heard is None or heard.kind is not Kind.ACK or heard.number != number:
+                last = bench.insist_on_packet(image, number, began_at)
+            if last.startswith(Kind.BOOT_VERSION.value):
+                bench.info(f"the device restarts: {trouble.name}")
+                return False
+            if trouble.name or last:
+                bench.require(not last, f"ACK {number} in the end", last or "it")
+    return True
+
+
+def _end(bench: Bench, image: bytes, troubles: Troubles) -> bool:
+    """End of transfer, in one trouble after the other as long as it is not heard; false when the
+    device refused the image, twice and so explicitly (R6).
+    """
+    names: list[str] = []
+    heard: Heard | None = None
+    # Before the device takes the silence for a pause in the transfer (TX-12).
+    give_up_at = bench.now + bench.profile.limit("pause_s") / 2
+    while heard is None and bench.now < give_up_at and troubles.left["end of transfer"]:
+        trouble = troubles.take("end of transfer")
+        names.append(trouble.name)
+        with trouble.send(bench, bench.words.end()):
+            heard = bench.wait_for(
+                Kind.COMPLETE, Kind.NAK, within_s=bench.profile.limit("silence_s")
+            )
+        if trouble.hits_answer:
+            break
+    if heard is not None and heard.kind is Kind.COMPLETE:
+        return True
+    with bench.step("; ".join(names) or "end of transfer"):
+        done = bench.insist_on_end(image)
+    if not done.ok:
+        bench.info(f"{done.reason}: {'; '.join(names)}")
+    return "refused" not in done.reason
+
+
+# -- another device -------------------------------------------------------------------------------
+
+
+def _say_as_device(bench: Bench) -> None:
+    """Whole answers, and the first frame of one, on the device's own id."""
+    can_id = bench.words.to_tool
+    for command, data in ((FEEDBACK, b"ACK"), (REQUEST, bytes(2)), (ACK, b"\x01\x00")):
+        bench.send(split(can_id, build(can_id, REPORT, command, data)))
+    bench.send(split(can_id, build(can_id, REPORT, ACK, b"\x02\x00"))[:1])

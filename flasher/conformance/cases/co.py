@@ -1,0 +1,276 @@
+"""CO: others on the bus. Load, a babbling node, the upgrade of another target, and the traffic of
+chapter 3.
+
+The suite is the others too: it puts their frames between its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.hearing import Heard, Kind
+from flasher.conformance.model import Requirement, case
+from flasher.conformance.wire import (
+    ACK,
+    BOOT_VERSION,
+    COMPLETE,
+    READ,
+    REPORT,
+    REQUEST,
+    RawFrame,
+    Words,
+    build,
+    packet_count,
+    packet_payload,
+    split,
+)
+
+_FOREIGN_IDS: Final = (0x0A0, 0x1F4, 0x3C3, 0x555, 0x6FF)
+"""Ids that nobody of this protocol has."""
+_FOREIGN_DATA: Final = bytes.fromhex("A5C30F96D2E17B4C")
+_FOREIGN_BITS: Final = 111
+"""A frame of 8 bytes without stuff bits: so long is the gap that stays free."""
+_SHARE: Final = 9
+"""Frames of others to one of the upgrade, or to one free place: 90 % of the bus."""
+_LOAD_S: Final = 0.3
+_LOADED_PACKETS: Final = 24
+"""Packets that are sent under load; more of them show nothing new."""
+_BABBLE_ID: Final = 0x001
+_BABBLE_S: Final = 1.0
+_BABBLE_BURST: Final = 16
+
+_REPORTS: Final = (
+    # Of the motor controller.
+    (0x710, REPORT, 0x1305, b"READY"),
+    (0x710, REPORT, 0x1808, b"SHUTDOWN"),
+    (0x712, READ, 0x3009, b"HANDSHAKE"),
+    (0x712, READ, 0x3100, b""),
+    (0x712, READ, 0x3200, b""),
+    (0x712, READ, 0x3300, b""),
+    # Of the battery.
+    (0x720, REPORT, 0x1010, bytes(16)),
+    (0x720, REPORT, 0x1120, bytes(32)),
+    (0x720, REPORT, 0x1204, b"\x01\x00\x00\x00"),
+    (0x720, REPORT, 0x1308, b"SHUTDOWN"),
+    (0x720, REPORT, 0x1410, bytes(16)),
+    (0x720, REPORT, 0x1540, bytes(64)),
+    (0x720, REPORT, 0x160C, bytes(12)),
+    (0x721, REPORT, 0x3005, b"READY"),
+    # Of the on-board computer and the display.
+    (0x730, REPORT, 0x1405, b"READY"),
+    (0x732, READ, 0x5000, b""),
+    (0x732, READ, 0x5100, b""),
+    (0x732, READ, 0x5200, b""),
+    (0x732, READ, 0x5300, b""),
+    (0x740, REPORT, 0x1305, b"READY"),
+    (0x742, READ, 0x5000, b""),
+    (0x742, READ, 0x5100, b""),
+)
+"""Traffic of chapter 3 between other nodes: id, mode, command, data."""
+_QUERIES: Final = (
+    *(0x3000, 0x3100, 0x3300, 0x3400, 0x3500, 0x3600),
+    *(0x3700, 0x3800, 0x3900, 0x3B00, 0x3D00),
+)
+"""What the tool asks an application. Writes are left out: a device that took one by mistake would
+lose what only its manufacturer can give back."""
+_MEMORY_READ: Final = 0x4308
+
+
+@case(
+    "CO-01",
+    "bus load and a babbling node",
+    clause="1",
+    stimulus="90 % bus load of other ids around reset, update command and packets; a node that "
+    "takes the whole bus with id 001 for 1 s, in the announcements and in the transfer",
+    expectation="nothing fails under load; what the babbling node delays goes on after it",
+    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    choices=("up_04_burst",),
+)
+def load(bench: Bench) -> None:
+    image = bench.good_image
+    total = packet_count(len(image))
+    loaded = min(total, _LOADED_PACKETS)
+    limit = bench.profile.limit
+    with bench.step("a babbling node in the announcements"):
+        bench.reset_to_bootloader()
+        _babble(bench)
+        bench.check_application()
+    with bench.step("reset under load"):
+        _load(bench, _LOAD_S)
+        bench.send(list(_under_load(bench.words.reset())))
+        _expect_under_load(bench, Kind.BOOT_VERSION, limit("first_version_s"))
+        bench.wait_to_be_heard()
+    with bench.step("update command under load"):
+        bench.send(list(_under_load(bench.words.update(len(image)))))
+        _expect_under_load(bench, Kind.REQUEST, limit("erase_s"))
+    with bench.step("packets under load"):
+        for number in range(1, loaded):
+            frames = bench.words.packet(number, total, packet_payload(image, number))
+            bench.send(list(_under_load(frames)))
+            heard = _expect_under_load(bench, Kind.ACK, limit("ack_s"))
+            bench.require(heard.number == number, f"ACK {number}", heard)
+    with bench.step("a babbling node in the transfer"):
+        began_at = bench.now
+        bench.send_packet(image, loaded)
+        _babble(bench)
+        heard_all = bench.collect(limit("ack_s"))
+        if not any(one.kind is Kind.ACK and one.number == loaded for one in heard_all):
+            trouble = bench.insist_on_packet(image, loaded, began_at)
+            bench.require(not trouble, f"ACK {loaded}", trouble or "it")
+    with bench.step("the rest"):
+        bench.finish(image, loaded + 1)
+
+
+@case(
+    "CO-02",
+    "another target is upgraded at the same time",
+    clause="1",
+    stimulus="the upgrade of each other target, both sides of it, frame by frame between the "
+    "frames of the device's own upgrade",
+    expectation="no crosstalk: every packet is acknowledged once, and the image is right",
+    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    choices=("up_04_burst",),
+)
+def two_upgrades(bench: Bench) -> None:
+    image = bench.good_image
+    total = packet_count(len(image))
+    for other in bench.words.others():
+        with bench.step(f"beside the {other.target.upper()}"):
+            bench.reset_to_bootloader()
+            bench.wait_to_be_heard()
+            _between(bench, bench.words.update(len(image)), other.update(len(image)))
+            limit_s = bench.profile.limit("erase_s")
+            bench.expect(Kind.REQUEST, within_s=limit_s, ignoring=(Kind.BOOT_VERSION,))
+            _say_as(bench, other, REQUEST, bytes(2))
+            for number in range(1, total + 1):
+                _check_packet_beside(bench, other, image, number)
+            # A device that hears it ends here, or refuses.
+            bench.send(other.end())
+            _say_as(bench, other, COMPLETE, bytes(2))
+            bench.expect_silence(bench.profile.limit("silence_s"))
+            bench.end_transfer()
+            bench.check_application(image)
+            bench.check_stored(image)
+
+
+@case(
+    "CO-04",
+    "traffic of the application in the bootloader",
+    clause="5, R15",
+    stimulus="messages of chapter 3 to the device and between other nodes, during the "
+    "announcements, before packet 1, between packets and before the end",
+    expectation="ignored: no answer, and the upgrade goes on as if nothing had been said",
+    requires={Requirement.DESTRUCTIVE},
+)
+def application_traffic(bench: Bench) -> None:
+    image = bench.good_image
+    total = packet_count(len(image))
+    traffic = list(_traffic(bench.words))
+    with bench.step("during the announcements"):
+        bench.reset_to_bootloader()
+        bench.send(traffic)
+        heard = bench.collect(bench.profile.limit("version_spacing_s"))
+        others = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
+        bench.check(not others, "no answer", ", ".join(map(str, others)) or "nothing")
+        bench.update(len(image))
+    middle = max(1, total // 2)
+    for before, first, last in (("packet 1", 1, middle), ("a packet", middle + 1, total)):
+        with bench.step(f"before {before}"):
+            bench.send(traffic)
+            bench.expect_silence(ignoring=(Kind.BOOT_VERSION,) if first == 1 else ())
+            bench.packets(image, first, last)
+    with bench.step("before the end"):
+        bench.send(traffic)
+        bench.expect_silence()
+        bench.end_transfer()
+        bench.check_application(image)
+        bench.check_stored(image)
+
+
+# -- load -----------------------------------------------------------------------------------------
+
+
+def _foreign(count: int) -> Iterator[RawFrame]:
+    for index in range(count):
+        yield RawFrame(_FOREIGN_IDS[index % len(_FOREIGN_IDS)], _FOREIGN_DATA)
+
+
+def _under_load(frames: Sequence[RawFrame]) -> Iterator[RawFrame]:
+    """Frames of the upgrade, each one behind nine of others."""
+    for frame in frames:
+        yield from _foreign(_SHARE)
+        yield frame
+
+
+def _load(bench: Bench, for_s: float) -> None:
+    """Nine frames of others, then as much time as one takes, and so on."""
+    until = bench.now + for_s
+    while bench.now < until:
+        bench.send(list(_foreign(_SHARE)))
+        bench.wait(_FOREIGN_BITS / bench.port.bitrate_bps)
+
+
+def _expect_under_load(bench: Bench, kind: Kind, within_s: float) -> Heard:
+    """The next message of that kind, while the load goes on."""
+    until = bench.now + within_s
+    heard: Heard | None = None
+    while heard is None and bench.now < until:
+        bench.send(list(_foreign(_SHARE)))
+        heard = bench.wait_for(kind, within_s=_FOREIGN_BITS / bench.port.bitrate_bps)
+    return bench.require_heard(heard, kind.value, within_s)
+
+
+def _babble(bench: Bench) -> None:
+    until = bench.now + _BABBLE_S
+    while bench.now < until:
+        bench.send([RawFrame(_BABBLE_ID, bytes(8))] * _BABBLE_BURST)
+
+
+# -- another upgrade ------------------------------------------------------------------------------
+
+
+def _between(bench: Bench, own: Sequence[RawFrame], others: Sequence[RawFrame]) -> None:
+    """The frames of two messages in turn; the device's own message ends last."""
+    frames: list[RawFrame] = []
+    for index in range(max(len(own), len(others))):
+        frames += others[index : index + 1]
+        frames += own[index : index + 1]
+    bench.send(frames)
+
+
+def _say_as(bench: Bench, other: Words, command: int, data: bytes) -> None:
+    """What the other target answers."""
+    bench.send(split(other.to_tool, build(other.to_tool, REPORT, command, data)))
+
+
+def _check_packet_beside(bench: Bench, other: Words, image: bytes, number: int) -> None:
+    """A packet between the frames of the other target's, which has other bytes; then the other
+    target's next one alone.
+    """
+    total = packet_count(len(image))
+    payload = packet_payload(image, number)
+    inverse = bytes(byte ^ 0xFF for byte in payload)
+    own = bench.words.packet(number, total, payload)
+    _between(bench, own, other.packet(number, total, inverse))
+    bench.expect(Kind.ACK, within_s=bench.profile.limit("ack_s"), number=number)
+    _say_as(bench, other, ACK, number.to_bytes(2, "little"))
+    if number < total:
+        bench.send(other.packet(number + 1, total, inverse))
+    if number == 1:
+        _say_as(bench, other, BOOT_VERSION, other.boot_name.encode() + b"V1.0.0")
+        bench.expect_silence(bench.profile.limit("ack_s"))
+
+
+# -- chapter 3 ------------------------------------------------------------------------------------
+
+
+def _traffic(words: Words) -> Iterator[RawFrame]:
+    """All of it but what the device itself would say."""
+    for can_id, mode, command, data in _REPORTS:
+        if can_id & 0x0F0 != words.to_all & 0x0F0:
+            yield from split(can_id, build(can_id, mode, command, data))
+    for command in _QUERIES:
+        yield from words.message(READ, command)
+    yield from words.message(READ, _MEMORY_READ, bytes(4) + (128).to_bytes(4, "little"))

@@ -1,0 +1,218 @@
+"""What the cases about framing, checksum and gaps share: a transfer that is never ended. Whether
+its next packet is acknowledged shows what the device made of the bytes before.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Final
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.hearing import Heard, Kind, describe
+from flasher.conformance.wire import PACKET_BYTES, RawFrame, packet_count, packet_payload
+
+ACCEPTED: Final = "accepted"
+REJECTED: Final = "rejected"
+EITHER: Final = "either"
+PACKET_FRAMES: Final = 18
+"""CAN frames of a packet, all of them full."""
+_PACKETS: Final = 48
+"""More than any case here needs; a device that takes smaller images begins again."""
+_REST: Final = bytes(5)
+_QUIET_S: Final = 0.05
+"""Behind an ACK, for what else is said to the same bytes (R10)."""
+
+
+def stream(frames: Iterable[RawFrame]) -> bytes:
+    """The bytes that frames carry."""
+    return b"".join(frame.data for frame in frames)
+
+
+def is_as(wanted: str, taken: bool) -> bool:  # noqa: FBT001
+    """Whether something that was taken, or not, is as one of the three texts above says."""
+    return wanted == EITHER or taken == (wanted == ACCEPTED)
+
+
+class Probe:
+    """A transfer of `image` (some packets of chance by default) that goes on packet by packet.
+
+    With "accepted" the stimulus has to be acknowledged as the next packet. With "rejected" it must
+    not be, and NAK or silence are both right: which of them, with which number, is TX-01. With
+    "either" both will do. In every case the next packet as it should be has to be taken then.
+    """
+
+    def __init__(self, bench: Bench, image: bytes | None = None) -> None:
+        largest = bench.profile.number("largest_image_bytes")
+        wanted = bench.filler(_PACKETS) if image is None else image
+        # Some bytes more, as a whole number of packets is a matter of its own (UP-01).
+        self.image = (wanted + _REST)[:largest]
+        self.number = 1
+        """Of the packet that is next."""
+        self._bench = bench
+        self._taken_at = bench.now
+
+    def begin(self) -> None:
+        """From the running application to request transfer."""
+        self._bench.start_transfer(len(self.image))
+        self._taken_at = self._bench.now
+
+    def enter(self, frames: Sequence[RawFrame], wanted: str, *, reset: bool = True) -> None:
+        """Send what holds the update command to the announcing bootloader, judge whether it is
+        taken as `wanted`, and get request transfer in any case.
+        """
+        bench = self._bench
+        if reset:
+            bench.reset_to_bootloader()
+            bench.wait_to_be_heard()
+        sent = bench.send(frames)
+        heard = bench.request_or_version(sent.left_at, bench.profile.limit("erase_s"))
+        taken = heard is not None and heard.kind is Kind.REQUEST
+        bench.check(is_as(wanted, taken), f"update command {wanted}", heard or "no answer")
+        if not taken:
+            bench.update(len(self.image))
+        self.number, self._taken_at = 1, bench.now
+
+    def enter_past(self, *stimuli: Sequence[RawFrame]) -> None:
+        """At the first boot version, send what has to be rejected: it announces itself on, with NAK
+        at the most in between, and takes the update command then.
+        """
+        bench = self._bench
+        bench.reset_to_bootloader()
+        for frames in stimuli:
+            bench.send(frames)
+        is_burst = bench.profile.number("versions") > 1
+        half_s = bench.profile.limit("window_s") / 2
+        deadline = bench.now + (
+            4 * bench.profile.limit("version_spacing_s") if is_burst else half_s
+        )
+        heard: list[Heard] = []
+        while (one := bench.next_message(deadline - bench.now)) is not None:
+            heard.append(one)
+            if one.kind is not Kind.NAK:
+                break
+        ok = all(one.kind in (Kind.NAK, Kind.BOOT_VERSION) for one in heard)
+        goes_on = not is_burst or (bool(heard) and heard[-1].kind is Kind.BOOT_VERSION)
+        bench.require(ok and goes_on, "boot version, NAK at the most before it", describe(heard))
+        bench.update(len(self.image))
+        self.number, self._taken_at = 1, bench.now
+
+    def settle_s(self) -> float:
+        """Surely longer than a bootloader waits for the rest of a message."""
+        return 2 * self._bench.profile.limit("inter_frame_s")
+
+    # -- bytes ------------------------------------------------------------------------------------
+
+    def frames(self) -> list[RawFrame]:
+        """The next packet as it should be; begins a new transfer when all were sent."""
+        if self.number > packet_count(len(self.image)):
+            self._bench.leave_transfer()
+            self._bench.update(len(self.image))
+            self.number = 1
+        return self._packet(self.number)
+
+    def raw(self) -> bytes:
+        """The next packet, header to tail."""
+        return stream(self.frames())
+
+    def previous(self) -> list[RawFrame]:
+        """The packet that was stored last; there has to be one."""
+        return self._packet(self.number - 1)
+
+    def _packet(self, number: int) -> list[RawFrame]:
+        total = packet_count(len(self.image))
+        return self._bench.words.packet(number, total, packet_payload(self.image, number))
+
+    # -- stimuli ----------------------------------------------------------------------------------
+
+    def plain(self) -> None:
+        """The next packet as it should be; its ACK has to come, else the case ends."""
+        self.frames()
+        self._bench.forget()
+        self._bench.packet(self.image, self.number)
+        self._count()
+
+    def keep_alive(self) -> None:
+        """Send the next packet when none was taken for so long that the device may soon give the
+        transfer up (TX-12).
+        """
+        if self._bench.now - self._taken_at > self._bench.profile.limit("pause_s") / 2:
+            self._bench.wait(self.settle_s())
+            self.plain()
+
+    def offer(
+        self,
+        frames: Sequence[RawFrame],
+        wanted: str,
+        *,
+        gap_s: float = 0.0,
+        gaps: int = PACKET_FRAMES,
+        ignoring: Sequence[Kind] = (),
+    ) -> bool:
+        """Send `frames`, which hold the next packet, `gap_s` behind each of the first `gaps` of
+        them, and judge whether it is taken as `wanted`; sends it as it should be when it was not.
+        Messages of the kinds `ignoring` do not count. Returns whether it was taken.
+        """
+        bench = self._bench
+        bench.forget()
+        first = gaps + 1 if gap_s else 0
+        if first:
+            bench.send(frames[:first], gap_s=gap_s)
+        bench.send(frames[first:])
+        heard = self._answers()
+        taken = any(self._is_taken(one) for one in heard)
+        allowed = (Kind.NAK, *ignoring)
+        others = [one for one in heard if one.kind not in allowed and not self._is_taken(one)]
+        expected = {
+            ACCEPTED: f"ACK {self.number}",
+            REJECTED: "NAK or no answer",
+            EITHER: f"ACK {self.number}, NAK or no answer",
+        }
+        ok = is_as(wanted, taken) and not others
+        bench.check(ok, expected[wanted], describe(heard))
+        if taken:
+            self._count()
+        else:
+            self.plain()
+        return taken
+
+    def discard(self, frames: Sequence[RawFrame]) -> None:
+        """Send what has to be discarded: NAK or no answer, and after a pause the next packet is
+        taken. A device that takes it ends the case, as it may have stored anything.
+        """
+        bench = self._bench
+        bench.forget()
+        bench.send(frames)
+        heard = bench.collect(self.settle_s())
+        ok = all(one.kind is Kind.NAK for one in heard)
+        bench.require(ok, "NAK or no answer", describe(heard))
+        self.plain()
+
+    def check_stored(self) -> None:
+        """What was acknowledged is in the flash, and is right; the last packet of it may be on its
+        way (PW-01), and what the profile lets the device keep in memory.
+        """
+        bench = self._bench
+        written = (self.number - 2) * PACKET_BYTES - bench.profile.number("buffer_bytes")
+        if written > 0:
+            bench.check_stored(self.image[:written])
+        else:
+            bench.unsupported("the flash holds the image", "all of it may be in a buffer still")
+
+    def _count(self) -> None:
+        self.number += 1
+        self._taken_at = self._bench.now
+
+    def _is_taken(self, heard: Heard) -> bool:
+        return heard.kind is Kind.ACK and heard.number == self.number
+
+    def _answers(self) -> list[Heard]:
+        """What is heard up to the ACK of the next packet and shortly behind it."""
+        bench = self._bench
+        # Long enough, too, that nothing of it is left when the next packet comes.
+        deadline = bench.now + max(bench.profile.limit("ack_s"), self.settle_s())
+        heard: list[Heard] = []
+        while (one := bench.next_message(deadline - bench.now)) is not None:
+            heard.append(one)
+            if self._is_taken(one):
+                return heard + bench.collect(_QUIET_S)
+        return heard

@@ -1,0 +1,162 @@
+"""TM: timing. TM-01, TM-03 and TM-04 are the host's."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Final
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.cases.probing import ACCEPTED, EITHER, PACKET_FRAMES, Probe
+from flasher.conformance.hearing import Heard, Kind
+from flasher.conformance.model import Requirement, case
+from flasher.conformance.wire import packet_count
+
+_FEEDBACK: Final = "reset to general feedback"
+_FIRST: Final = "reset to first boot version"
+_SPACING: Final = "boot version to boot version"
+_REQUEST: Final = "update command to request transfer"
+_ANSWER: Final = "packet to ACK"
+_COMPLETE: Final = "end of transfer to complete"
+"""Names of the times, as all cases measure them."""
+_SHARES: Final = (0.0, 0.01, 0.1, 0.25, 0.5, 0.75, 0.9)
+"""Gaps between frames, as shares of `limits.inter_frame_s`."""
+_EDGE_S: Final = 0.001
+_RESETS: Final = 5
+_PACKETS: Final = 64
+"""So many packets, at the least, tell how their answers are spread."""
+_REST: Final = bytes(5)
+"""A whole number of packets is a matter of its own (UP-01)."""
+_PATIENCE: Final = 3
+"""A late answer is waited for so many times as long as it may take, so that the report has it."""
+
+
+@case(
+    "TM-02",
+    "gap between the frames of a message",
+    clause="R12",
+    stimulus="packets with gaps between their frames, from 0 to just below the inter-frame timeout",
+    expectation="accepted up to it (tm_02)",
+    requires={Requirement.DESTRUCTIVE, Requirement.TIMING},
+    choices=("tm_02",),
+)
+def gaps(bench: Bench) -> None:
+    limit_s = bench.profile.limit("inter_frame_s")
+    wanted = ACCEPTED if bench.profile.choice("tm_02") == "accepted" else EITHER
+    probe = Probe(bench)
+    probe.begin()
+    frame_s, pause_s = _longest_frame_s(bench), bench.profile.limit("pause_s")
+    edge_s = frame_s + 2 * bench.port.uncertainty_s + _EDGE_S
+    for gap_s in (*(share * limit_s for share in _SHARES), max(limit_s - edge_s, 0.0)):
+        with bench.step(f"{gap_s * 1000:.1f} ms"):
+            began_at = bench.elapsed_s
+            # The whole packet takes less than the pause that may end a transfer (TX-12).
+            gaps = min(int(pause_s / 2 / max(gap_s, frame_s)), PACKET_FRAMES) or 1
+            taken = probe.offer(probe.frames(), EITHER, gap_s=gap_s, gaps=gaps)
+            widest_s = _widest_s(bench, began_at)
+            bench.info(f"gap of {gap_s * 1000:.1f} ms: {'taken' if taken else 'not taken'}")
+            if wanted == EITHER:
+                continue
+            if widest_s < limit_s - bench.port.uncertainty_s:
+                got = "accepted" if taken else "no ACK"
+                expected = f"accepted with frames {widest_s * 1000:.1f} ms apart at the most"
+                bench.check(taken, expected, got)
+            else:
+                got = f"a frame was sent {widest_s * 1000:.1f} ms behind the one before"
+                bench.unsupported(f"frames less than {limit_s * 1000:g} ms apart", got)
+    probe.check_stored()
+
+
+@case(
+    "TM-05",
+    "times of an upgrade",
+    clause="4.2, R12",
+    stimulus="a transfer of many packets, an upgrade, and some resets",
+    expectation="each time within the profile's limits: reset to the first boot version, their "
+    "spacing, update command to request transfer, packet to ACK, end of transfer to complete",
+    requires={Requirement.DESTRUCTIVE, Requirement.TIMING, Requirement.LONG},
+)
+def times(bench: Bench) -> None:
+    image = bench.good_image
+    _enter(bench)
+    if packet_count(len(image)) < _PACKETS:
+        with bench.step("transfer of many packets"):
+            filler = (bench.filler(_PACKETS) + _REST)[: bench.profile.number("largest_image_bytes")]
+            bench.update(len(filler))
+            _measure_packets(bench, filler)
+            bench.leave_transfer()
+    with bench.step("upgrade"):
+        bench.update(len(image))
+        _measure_packets(bench, image)
+        sent = bench.send(bench.words.end())
+        limit_s = _PATIENCE * bench.profile.limit("complete_s")
+        heard = bench.wait_for(Kind.COMPLETE, within_s=limit_s)
+        found = bench.require_heard(heard, Kind.COMPLETE.value, limit_s)
+        bench.measure(_COMPLETE, found.at - sent.left_at)
+    for turn in range(_RESETS):
+        # Whether it starts each time is EN-01 and RS-03; what is measured by then is judged.
+        if not bench.application_runs():
+            break
+        with bench.step(f"reset {turn + 1}"):
+            _measure_burst(bench)
+    _judge(bench)
+
+
+def _judge(bench: Bench) -> None:
+    limit = bench.profile.limit
+    spacing_s, tolerance_s = limit("version_spacing_s"), limit("version_spacing_tolerance_s")
+    bench.check_measured(_FIRST, high_s=limit("first_version_s"))
+    if bench.profile.number("versions") > 1:
+        bench.check_measured(
+            _SPACING, low_s=spacing_s - tolerance_s, high_s=spacing_s + tolerance_s
+        )
+    bench.check_measured(_REQUEST, high_s=limit("erase_s"))
+    bench.check_measured(_ANSWER, high_s=limit("ack_s"))
+    bench.check_measured(_COMPLETE, high_s=limit("complete_s"))
+
+
+def _enter(bench: Bench) -> Heard:
+    """Reset; returns the first boot version. What is measured here is judged at the end."""
+    bench.forget()
+    sent = bench.send(bench.words.reset())
+    limit_s = _PATIENCE * bench.profile.limit("first_version_s")
+    feedback = bench.next_message(limit_s)
+    if feedback is not None and feedback.kind is Kind.FEEDBACK:
+        bench.measure(_FEEDBACK, feedback.at - sent.left_at)
+    is_there = feedback is not None and feedback.kind is Kind.BOOT_VERSION
+    first = feedback if is_there else bench.wait_for(Kind.BOOT_VERSION, within_s=limit_s)
+    found = bench.require_heard(first, Kind.BOOT_VERSION.value, limit_s)
+    bench.measure(_FIRST, found.at - sent.left_at)
+    return found
+
+
+def _measure_burst(bench: Bench) -> None:
+    """One reset and the whole burst."""
+    last = _enter(bench)
+    for _ in range(bench.profile.number("versions") - 1):
+        within_s = _PATIENCE * bench.profile.limit("version_spacing_s")
+        heard = bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
+        if heard is None:
+            break
+        bench.measure(_SPACING, heard.at - last.at)
+        last = heard
+    bench.collect(bench.burst_s)
+
+
+def _measure_packets(bench: Bench, image: bytes) -> None:
+    limit_s = _PATIENCE * bench.profile.limit("ack_s")
+    for number in range(1, packet_count(len(image)) + 1):
+        sent = bench.send_packet(image, number)
+        heard = bench.expect(Kind.ACK, within_s=limit_s, number=number)
+        bench.measure(_ANSWER, heard.at - sent.left_at)
+
+
+def _longest_frame_s(bench: Bench) -> float:
+    """A frame of 8 bytes on the wire, every stuff bit included."""
+    return (47 + 64 + 24) / bench.port.bitrate_bps
+
+
+def _widest_s(bench: Bench, since_s: float) -> float:
+    """The widest gap between the packet's frames, from end to end, as it came about."""
+    sent = [entry.at_s for entry in bench.trace if entry.sent and entry.at_s > since_s]
+    sent = sent[:PACKET_FRAMES]
+    return max(behind - before for before, behind in pairwise(sent))

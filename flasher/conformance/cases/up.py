@@ -1,0 +1,280 @@
+"""UP: the update command."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.hearing import Kind, describe
+from flasher.conformance.model import Requirement, case
+from flasher.conformance.wire import (
+    PACKET_BYTES,
+    READ,
+    UPDATE,
+    WRITE,
+    RawFrame,
+    packet_count,
+)
+
+_SIZES: Final = (1, 127, 128, 129, 78351)
+_SENT_WHOLE_PACKETS: Final = 2
+"""Images of that many packets are sent too, so that the device shows how many it expects."""
+_EDGE_S: Final = 0.001
+_FIRST_PACKETS: Final = 3
+
+
+@case(
+    "UP-01",
+    "sizes that are taken",
+    clause="4.1, A10B; R9",
+    stimulus="update command for 1, 127, 128, 129, 78351 bytes and the largest image",
+    expectation="request transfer within the erase limit, and the packets of that size are taken",
+    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+)
+def sizes(bench: Bench) -> None:
+    largest = bench.profile.number("largest_image_bytes")
+    bench.reset_to_bootloader()
+    for index, size in enumerate([*(size for size in _SIZES if size < largest), largest]):
+        with bench.step(f"{size} bytes"):
+            if index:
+                bench.leave_transfer()
+            bench.update(size)
+            if packet_count(size) <= _SENT_WHOLE_PACKETS:
+                bench.packets(bench.random.randbytes(size))
+    bench.leave_transfer()
+    bench.check_upgrade()
+
+
+@case(
+    "UP-02",
+    "sizes that are rejected",
+    clause="R9",
+    stimulus="update command for 0 bytes, more than the largest image, 2^32 - 1 bytes",
+    expectation="rejected before anything is erased: the old application starts",
+    requires={Requirement.DESTRUCTIVE},
+    choices=("up_02",),
+)
+def wrong_sizes(bench: Bench) -> None:
+    largest = bench.profile.number("largest_image_bytes")
+    for size in (0, largest + 1, 0xFFFF_FFFF):
+        check_update_rejected(bench, f"{size} bytes", bench.words.update(size))
+
+
+@case(
+    "UP-03",
+    "update command to the running application",
+    clause="R17",
+    stimulus="update command, packet and end of transfer without a reset before",
+    expectation="nothing erased; silence or general feedback (up_03)",
+    requires={Requirement.DESTRUCTIVE},
+    choices=("up_03",),
+)
+def without_reset(bench: Bench) -> None:
+    image = bench.good_image
+    stimuli = {
+        "update command": bench.words.update(len(image)),
+        "packet": bench.words.packet(1, packet_count(len(image)), bytes(PACKET_BYTES)),
+        "end of transfer": bench.words.end(),
+    }
+    choice = bench.profile.choice("up_03")
+    for step, frames in stimuli.items():
+        with bench.step(step):
+            bench.send(frames)
+            heard = bench.collect(bench.profile.limit("silence_s"))
+            feedbacks = [one for one in heard if one.kind is Kind.FEEDBACK]
+            allowed = {"either": (0, 1), "feedback": (1,), "silence": (0,)}[choice]
+            ok = len(feedbacks) == len(heard) and len(heard) in allowed
+            wanted = {"either": "general feedback or silence", "feedback": "general feedback"}
+            bench.check(ok, wanted.get(choice, choice), describe(heard))
+    bench.check_application()
+    with bench.step("after a restart"):
+        bench.reset_to_bootloader()
+        bench.collect(bench.burst_s)
+        bench.check_application()
+        bench.check_stored(image)
+
+
+@case(
+    "UP-04",
+    "when the update command is heard",
+    clause="4.2, 2; R2",
+    stimulus="update command at each boot version, just before and just after the window's end",
+    expectation="accepted inside the window; between the announcements and after the window as the "
+    "profile says (up_04_burst, up_04)",
+    requires={Requirement.DESTRUCTIVE, Requirement.TIMING},
+    choices=("up_04", "up_04_burst"),
+)
+def window(bench: Bench) -> None:
+    count = bench.profile.number("versions")
+    image = bench.good_image
+    for version in range(1, count + 1):
+        with bench.step(f"at boot version {version}"):
+            _enter_at(bench, version)
+            choice = bench.profile.choice("up_04_burst") if version < count else "accepted"
+            _offer_update(bench, choice)
+    edge_s = max(bench.profile.limit("window_tolerance_s"), 2 * bench.port.uncertainty_s) + _EDGE_S
+    window_s = bench.profile.limit("window_s")
+    with bench.step("just before the window's end"):
+        last_at = _enter_at(bench, count)
+        frames = bench.words.update(len(image))
+        on_wire_s = _wire_s(bench, frames)
+        bench.send(frames, at=last_at + window_s - edge_s - on_wire_s)
+        _expect_request(bench)
+        bench.finish(image)
+    with bench.step("just after the window's end"):
+        last_at = _enter_at(bench, count)
+        bench.wait_until(last_at + window_s + edge_s)
+        _offer_update(bench, bench.profile.choice("up_04"))
+
+
+@case(
+    "UP-05",
+    "update command repeated",
+    clause="R2, R16",
+    stimulus="update command twice before request transfer; again before packet 1",
+    expectation="one transfer, which begins at packet 1 and ends well",
+    requires={Requirement.DESTRUCTIVE},
+)
+def repeated(bench: Bench) -> None:
+    image = bench.good_image
+    update = bench.words.update(len(image))
+    quiet_s = bench.profile.limit("silence_s")
+    with bench.step("before request transfer"):
+        bench.reset_to_bootloader()
+        bench.wait_for_window()  # for a device that listens there only (UP-04)
+        bench.send(update + update)
+        _expect_request(bench)
+        heard = bench.collect(quiet_s)
+        more = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
+        bench.check(not more, "one request transfer", describe(more))
+        bench.finish(image)
+    with bench.step("before packet 1"):
+        bench.start_transfer(len(image))
+        bench.send(update)
+        heard = bench.collect(quiet_s)
+        more = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
+        requests = [one for one in more if one.kind is Kind.REQUEST]
+        ok = len(more) == len(requests) <= 1
+        bench.check(ok, "request transfer once more, or nothing", describe(more))
+        bench.finish(image)
+
+
+@case(
+    "UP-06",
+    "update command that is not for this device",
+    clause="4.1, A10B",
+    stimulus="names of other targets, wrong case, payload too short and too long, as a read",
+    expectation="rejected; the old application starts",
+    requires={Requirement.DESTRUCTIVE},
+    choices=("up_02",),
+)
+def wrong_names(bench: Bench) -> None:
+    for step, frames in _wrong_updates(bench):
+        check_update_rejected(bench, step, frames)
+
+
+@case(
+    "UP-08",
+    "update command in the middle of a transfer",
+    clause="R2",
+    stimulus="update command of the same size, and of another one, after packet 3",
+    expectation="starts over cleanly or rejects (up_08), and never mixes two images",
+    requires={Requirement.DESTRUCTIVE},
+    choices=("up_08",),
+)
+def in_transfer(bench: Bench) -> None:
+    image = bench.good_image
+    starts_over = bench.profile.choice("up_08") == "starts_over"
+    total = packet_count(len(image))
+    if total <= _FIRST_PACKETS:
+        bench.unsupported("a transfer of 4 packets or more", "the good image is too small")
+        return
+    for step, size in (("same size", len(image)), ("one packet less", len(image) - PACKET_BYTES)):
+        with bench.step(step):
+            begun_size = size if starts_over else len(image)
+            begun = bytes(byte ^ 0xFF for byte in image[:begun_size]) if starts_over else image
+            bench.start_transfer(begun_size)
+            bench.packets(begun, 1, _FIRST_PACKETS)
+            bench.send(bench.words.update(len(image) if starts_over else size))
+            if starts_over:
+                bench.expect(Kind.REQUEST, within_s=bench.profile.limit("erase_s"))
+                bench.finish(image)
+            else:
+                heard = bench.collect(bench.profile.limit("silence_s"))
+                others = [one for one in heard if one.kind is not Kind.NAK]
+                bench.check(not others, "no request transfer", describe(others))
+                bench.finish(image, _FIRST_PACKETS + 1)
+
+
+def _offer_update(bench: Bench, choice: str) -> None:
+    """Update command for the good image, taken or not as `choice` says; then the application, the
+    one that was there or the new one.
+    """
+    image, limit = bench.good_image, bench.profile.limit
+    bench.send(bench.words.update(len(image)))
+    if choice == "accepted":
+        _expect_request(bench)
+        bench.finish(image)
+        return
+    # One that took it against the profile shows no application when this time is over.
+    within_s = limit("erase_s") if choice == "either" else limit("silence_s")
+    request = bench.wait_for(Kind.REQUEST, within_s=within_s)
+    ok = request is None or choice == "either"
+    bench.check(ok, f"update command {choice}", request or "no request transfer")
+    if request is None:
+        bench.check_application()
+    else:
+        bench.finish(image)
+
+
+def _expect_request(bench: Bench) -> None:
+    """Request transfer follows; boot versions that are still on their way do not count."""
+    bench.expect(
+        Kind.REQUEST, within_s=bench.profile.limit("erase_s"), ignoring=(Kind.BOOT_VERSION,)
+    )
+
+
+def _enter_at(bench: Bench, version: int) -> float:
+    """Reset, and wait for that boot version of the burst (from 1); returns when it was there."""
+    heard = bench.reset_to_bootloader()
+    for _ in range(version - 1):
+        heard = bench.next_version()
+    return heard.at
+
+
+def _wire_s(bench: Bench, frames: list[RawFrame]) -> float:
+    """How long frames take on the wire at the most, every stuff bit included."""
+    bits = sum(47 + 8 * len(frame.data) + (33 + 8 * len(frame.data)) // 4 for frame in frames)
+    return bits / bench.port.bitrate_bps
+
+
+def _wrong_updates(bench: Bench) -> Iterator[tuple[str, list[RawFrame]]]:
+    words, size = bench.words, len(bench.good_image)
+    payload = words.update_text + size.to_bytes(4, "little")
+    for other in words.others():
+        yield f"name {other.update_text.decode()}", words.update(size, other.update_text)
+    yield "name in small letters", words.update(size, words.update_text.lower())
+    yield "name of zeros", words.update(size, bytes(7))
+    yield "payload too short", words.message(WRITE, 0xA10A, payload[:-1])
+    yield "payload too long", words.message(WRITE, 0xA10C, payload + b"\0")
+    yield "as a read", words.message(READ, UPDATE, payload)
+
+
+def check_update_rejected(bench: Bench, step: str, frames: list[RawFrame]) -> None:
+    """In the bootloader: no request transfer, an answer as up_02 says, and the old application
+    starts as if nothing had been said.
+    """
+    choice = bench.profile.choice("up_02")
+    with bench.step(step):
+        bench.reset_to_bootloader()
+        bench.send(frames)
+        heard = bench.collect(bench.burst_s + bench.profile.limit("silence_s"))
+        answers = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
+        naks = [one for one in answers if one.kind is Kind.NAK]
+        allowed = {"either": (0, 1), "nak": (1,), "silence": (0,)}[choice]
+        ok = len(answers) == len(naks) and len(naks) in allowed
+        wanted = {"either": "NAK or silence", "nak": "NAK"}.get(choice, choice)
+        bench.check(ok, f"rejected by {wanted}", describe(answers))
+        bench.check_application()
+        bench.check_stored(bench.good_image)

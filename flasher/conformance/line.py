@@ -1,0 +1,243 @@
+"""The bench's way to the bus: sends frames, puts messages together, records everything.
+
+Waiting is receiving until a time, and no wait goes beyond the case's own limit.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Final, NamedTuple
+
+from flasher.conformance.faults import Fault, FaultKind
+from flasher.conformance.hearing import Heard, Kind, Listener
+from flasher.conformance.model import CaseLimitReached, RunStopped, TraceEntry
+from flasher.conformance.subject import Port
+from flasher.conformance.wire import UPDATE, WRITE, RawFrame, Words
+
+TRACE_FRAMES: Final = 20_000
+"""Frames of a case that are kept: the newest ones."""
+_HEARD_LIMIT: Final = 50_000
+"""Messages that wait to be looked at; a babbling device fills no memory."""
+_ECHO_LIMIT_S: Final = 2.0
+"""A frame that has not left by then is taken as sent: its echo was lost."""
+_FRAME_BITS: Final = 47
+"""A frame without data and stuff bits, interframe space included."""
+_UPDATE_HEAD: Final = b"\x55\xaa" + bytes((WRITE, 2 + (UPDATE & 0xFF))) + UPDATE.to_bytes(2, "big")
+_POLL_S: Final = 0.2
+"""Longest single wait: the time after which a wish to stop is seen."""
+
+
+class Sent(NamedTuple):
+    """When a message began and when its last frame had left, in seconds."""
+
+    at: float
+    left_at: float
+
+
+class Line:
+    """Frames out, messages in, on one `Port`, for one case that may take `limit_s`."""
+
+    def __init__(
+        self,
+        port: Port,
+        words: Words,
+        limit_s: float,
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.port = port
+        self.words = words
+        self.began_at = port.now()
+        self.ends_at = self.began_at + limit_s
+        self.update_was_sent = False
+        """True once an update command went out: the application may be erased."""
+        self.hears_application = False
+        """Set by a case that cares about `Kind.APPLICATION`; else they are in the trace only."""
+        self.frames_sent = 0
+        self.frames_received = 0
+        self.left_at = self.began_at
+        """When the last frame sent had left."""
+        self._stopped = stopped
+        self._listener = Listener(words)
+        self._heard: deque[Heard] = deque(maxlen=_HEARD_LIMIT)
+        self._trace: deque[TraceEntry] = deque(maxlen=TRACE_FRAMES)
+        self._traced = 0
+        self._echoes_due = 0
+        self._faults: dict[tuple[bool, int], Fault] = {}
+        self._fault_origin = (0, 0)
+        self._swapped: RawFrame | None = None
+
+    # -- time -------------------------------------------------------------------------------------
+
+    @property
+    def now(self) -> float:
+        """The time, in seconds on the port's clock."""
+        return self.port.now()
+
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since the case began."""
+        return self.now - self.began_at
+
+    def wait(self, for_s: float) -> None:
+        """Let time pass; what is heard meanwhile waits to be looked at."""
+        self.wait_until(self.now + for_s)
+
+    def wait_until(self, moment: float) -> None:
+        """Let time pass until `moment`."""
+        while self.now < moment:
+            self._pump(moment)
+
+    # -- sending ----------------------------------------------------------------------------------
+
+    def send(
+        self, frames: Sequence[RawFrame], *, gap_s: float = 0.0, at: float | None = None
+    ) -> Sent:
+        """Send frames, `gap_s` of silence between them, from the time `at` on; returns when the
+        last one has left.
+        """
+        if at is not None:
+            self.wait_until(at)
+        began_at = self.now
+        for index, frame in enumerate(frames):
+            if index and gap_s:
+                self._wait_for_echoes()
+                self.wait(gap_s)
+            self._send_disturbed(frame)
+        if self._swapped is not None:
+            frame, self._swapped = self._swapped, None
+            self._send_frame(frame)
+        self._wait_for_echoes()
+        return Sent(began_at, self.left_at)
+
+    @contextmanager
+    def disturb(self, *faults: Fault) -> Iterator[None]:
+        """Let these faults happen inside the `with`; they count frames from its beginning."""
+        self._faults = {(fault.incoming, fault.index): fault for fault in faults}
+        self._fault_origin = (self.frames_sent, self.frames_received)
+        try:
+            yield
+        finally:
+            self._faults = {}
+
+    # -- receiving --------------------------------------------------------------------------------
+
+    def next_message(self, within_s: float) -> Heard | None:
+        """The next message that was heard, or None after `within_s`."""
+        deadline = self.now + within_s
+        while not self._heard:
+            if self.now >= deadline:
+                return None
+            self._pump(deadline)
+        return self._heard.popleft()
+
+    def wait_for(
+        self, *kinds: Kind, within_s: float, unlike: Callable[[Heard], bool] | None = None
+    ) -> Heard | None:
+        """The next message of one of `kinds`, others skipped; None after `within_s`. One for which
+        `unlike` is true is skipped too.
+        """
+        deadline = self.now + within_s
+        while (heard := self.next_message(deadline - self.now)) is not None:
+            if heard.kind in kinds and not (unlike is not None and unlike(heard)):
+                return heard
+        return None
+
+    def collect(self, for_s: float) -> list[Heard]:
+        """All that is heard in the next `for_s`, and what still waited."""
+        self.wait(for_s)
+        found = list(self._heard)
+        self._heard.clear()
+        return found
+
+    def forget(self) -> None:
+        """Forget what was heard so far and not looked at."""
+        self._heard.clear()
+
+    # -- trace ------------------------------------------------------------------------------------
+
+    @property
+    def trace(self) -> tuple[TraceEntry, ...]:
+        """The newest `TRACE_FRAMES` frames."""
+        return tuple(self._trace)
+
+    @property
+    def trace_dropped(self) -> int:
+        """Older frames that were not kept."""
+        return self._traced - len(self._trace)
+
+    # -- inside -----------------------------------------------------------------------------------
+
+    def _pump(self, deadline: float) -> None:
+        """Take one frame, or let time pass up to `deadline` (or a little, to look around)."""
+        now = self.now
+        if now >= self.ends_at:
+            raise CaseLimitReached(
+                f"not at an end after {self.ends_at - self.began_at:g} s, the case's own limit"
+            )
+        if self._stopped():
+            raise RunStopped("the run was stopped")
+        arrival = self.port.receive(min(deadline, self.ends_at, now + _POLL_S))
+        if arrival is None:
+            return
+        if arrival.is_echo:
+            self._echoes_due = max(self._echoes_due - 1, 0)
+            self.left_at = arrival.at
+            self._record(arrival.at, arrival.frame, sent=True)
+            return
+        self._record(arrival.at, arrival.frame, sent=False)
+        fault = self._faults.get((True, self.frames_received - self._fault_origin[1]))
+        self.frames_received += 1
+        copies = 1 if fault is None else {FaultKind.DROP: 0, FaultKind.DOUBLE: 2}[fault.kind]
+        for _ in range(copies):
+            self._heard.extend(
+                heard
+                for heard in self._listener.feed(arrival.frame, arrival.at)
+                if self.hears_application or heard.kind is not Kind.APPLICATION
+            )
+
+    def _send_disturbed(self, frame: RawFrame) -> None:
+        fault = self._faults.get((False, self.frames_sent - self._fault_origin[0]))
+        self.frames_sent += 1
+        held, self._swapped = self._swapped, None
+        if fault is None:
+            self._send_frame(frame)
+        elif fault.kind is FaultKind.DOUBLE:
+            self._send_frame(frame)
+            self._send_frame(frame)
+        elif fault.kind is FaultKind.DELAY:
+            self._wait_for_echoes()
+            self.wait(fault.delay_s)
+            self._send_frame(frame)
+        elif fault.kind is FaultKind.SWAP:
+            self._swapped = frame
+        if held is not None:
+            self._send_frame(held)
+
+    def _send_frame(self, frame: RawFrame) -> None:
+        if frame.can_id == self.words.to_device and frame.data.startswith(_UPDATE_HEAD):
+            self.update_was_sent = True
+        self.port.send(frame)
+        if self.port.echoes:
+            self._echoes_due += 1
+            return
+        wire_s = (_FRAME_BITS + 8 * len(frame.data)) / self.port.bitrate_bps
+        self.left_at = max(self.left_at, self.now) + wire_s
+        self._record(self.left_at, frame, sent=True)
+
+    def _wait_for_echoes(self) -> None:
+        """Until the last frame has left: its echo is there, or its time on the wire is over."""
+        if not self.port.echoes:
+            self.wait_until(self.left_at)
+            return
+        give_up_at = self.now + _ECHO_LIMIT_S
+        while self._echoes_due and self.now < give_up_at:
+            self._pump(give_up_at)
+        if self._echoes_due:
+            self._echoes_due = 0
+            self.left_at = self.now
+
+    def _record(self, at: float, frame: RawFrame, *, sent: bool) -> None:
+        self._traced += 1
+        self._trace.append(TraceEntry(at - self.began_at, sent, frame))

@@ -1,0 +1,274 @@
+"""The device model as a subject: a simulated bus on a virtual clock, so that no time is spent.
+
+This module and `real` are the edges where the suite meets the rest of flasher; what makes or judges
+bytes does not import them.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Final
+
+from flasher.bus.link import VirtualClock
+from flasher.bus.simulated import SimulatedBus
+from flasher.conformance.model import DeviceCrashed, Unsupported
+from flasher.conformance.profile import ConformanceProfile, Value
+from flasher.conformance.subject import Arrival
+from flasher.conformance.wire import RawFrame
+from flasher.device.faults import FaultInjector, InOperation, PowerCut
+from flasher.device.model import Device
+from flasher.device.profile import DeviceProfile
+from flasher.device.variants import find, make
+from flasher.errors import BusError, FlasherError
+from flasher.protocol.bittime import frame_bits
+from flasher.protocol.engine import Engine
+from flasher.protocol.frame import Frame
+from flasher.protocol.messages import BootVersion
+from flasher.protocol.spec import TARGETS, WELLING
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.protocol.wire import encode, split
+
+AREA_BYTES: Final = 256 * 1024
+"""The mock's application area: large enough for every case, small enough to be filled."""
+MOCK_PROFILE: Final = DeviceProfile(application_area_bytes=AREA_BYTES)
+_AT_ONCE: Final = float("-inf")
+_SPACING_TOLERANCE_S: Final = 0.005
+"""An announcement of the model waits for a few frames of others at the most."""
+_WINDOW_TOLERANCE_S: Final = 0.0005
+"""The model's clock is exact; only the time on the wire of the announcement is rounded."""
+
+
+def model_image(version: str, size_bytes: int) -> bytes:
+    """An image that the device model runs: `version` in it, its own checksum at its end."""
+    body = f"conformance {version}".encode("ascii") + b"\0"
+    body += bytes(index * 7 % 253 for index in range(size_bytes - len(body) - 4))
+    return body + zlib.crc32(body).to_bytes(4, "little")
+
+
+GOOD_IMAGE: Final = model_image("V2r0r1_20240131", 10 * 128 - 3)
+SECOND_IMAGE: Final = model_image("V1r9r0_20230517", 6 * 128)
+
+
+class _Witness:
+    """Hears every frame on the bus, as an engine that says nothing."""
+
+    done = False
+
+    def __init__(self, bus: SimulatedBus) -> None:
+        self.heard: deque[tuple[Frame, float]] = deque()
+        self._bus = bus
+
+    def receive(self, frame: Frame, now: float) -> None:
+        # It stands in for the adapter, which may be off the bus.
+        if self._bus.faults.takes_part:
+            self.heard.append((frame, now))
+
+    def tick(self, now: float) -> None:
+        """Nothing is ever due."""
+
+    def deadline(self) -> float | None:
+        return None
+
+    def next_frame(self, now: float) -> Frame | None:
+        return None
+
+    def frame_sent(self, now: float) -> None:
+        """Nothing is ever sent."""
+
+    def cancel(self, now: float) -> None:
+        """Nothing is under way."""
+
+    def take_events(self) -> Sequence[object]:
+        return ()
+
+
+class MockPort:
+    """A way onto a simulated bus: exact end times of all frames, the own ones included."""
+
+    echoes = True
+    timestamp_source = "simulated bus"
+    uncertainty_s = 0.0
+
+    def __init__(self, bus: SimulatedBus, bitrate_bps: int) -> None:
+        self.bitrate_bps = bitrate_bps
+        self._bus = bus
+        self._link = bus.link()
+        self._witness = _Witness(bus)
+        bus.attach(self._witness)
+        self._pending: deque[Frame] = deque()
+
+    def now(self) -> float:
+        """Virtual seconds."""
+        return self._bus.clock.now()
+
+    def send(self, frame: RawFrame) -> None:
+        """Queue a frame. Raises BusError for an adapter in trouble, DeviceCrashed."""
+        made = Frame(*frame)
+        self._pending.append(made)
+        with _crashes():
+            self._link.send(made)
+
+    def receive(self, deadline: float) -> Arrival | None:
+        """Let time pass until there is a frame or `deadline` has come. Raises as `send`."""
+        heard = self._witness.heard
+        while not heard:
+            if self.now() >= deadline:
+                return None
+            with _crashes():
+                self._bus.advance(deadline)
+            self._look_at_adapter()
+        frame, at = heard.popleft()
+        is_echo = bool(self._pending) and frame is self._pending[0]
+        if is_echo:
+            self._pending.popleft()
+        return Arrival(RawFrame(*frame), at, is_echo)
+
+    def drain(self) -> int:
+        """Forget what arrived."""
+        count = len(self._witness.heard)
+        self._witness.heard.clear()
+        self._pending.clear()
+        return count
+
+    def _look_at_adapter(self) -> None:
+        """The link has the same frames, which are known, and raises when it was unplugged."""
+        while (frame := self._link.receive(_AT_ONCE)) is not None:
+            if frame.is_error:
+                self._witness.heard.append((frame, self.now()))
+
+
+@contextmanager
+def _crashes() -> Iterator[None]:
+    """A device model that raises has done what a real part does not allow."""
+    try:
+        yield
+    except BusError:
+        raise
+    except FlasherError as error:
+        raise DeviceCrashed(f"the device stopped: {error.what}") from error
+
+
+class MockSubject:
+    """A device model, or a variant of it, with power, readback and the faults of a bus.
+
+    `make_device` gets the target's name and the profile (`variant_maker` for a variant). `others`
+    are further engines on the same bus.
+    """
+
+    has_power = True
+    has_readback = True
+    has_bus_off = True
+    has_timed_cuts = True
+
+    def __init__(
+        self,
+        target: str = "bms",
+        *,
+        profile: DeviceProfile = MOCK_PROFILE,
+        make_device: Callable[[str, DeviceProfile], Device] | None = None,
+        others: Sequence[Engine] = (),
+        name: str = "the built-in mock",
+        good_image: bytes = GOOD_IMAGE,
+        second_image: bytes | None = SECOND_IMAGE,
+    ) -> None:
+        self.name = name
+        self.target = target
+        self.good_image = good_image
+        self.second_image = second_image
+        self.device = (make_device or plain_device)(target, profile)
+        self.bus = SimulatedBus(WELLING.bitrate_bps, VirtualClock())
+        self._injector = FaultInjector(self.device)
+        for engine in (self._injector, *others):
+            self.bus.attach(engine)
+        self.port = MockPort(self.bus, WELLING.bitrate_bps)
+
+    def power(self, *, on: bool) -> None:
+        """Switch the device on or off now. Raises DeviceCrashed."""
+        with _crashes():
+            if on:
+                self.device.power_on(self.port.now())
+            else:
+                self.device.power_cut(self.port.now())
+
+    def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
+        """Cut the power in a flash operation to come, as `Subject` says."""
+        self._injector.set(PowerCut(off_s), InOperation(operation, share))
+
+    def take_cut(self) -> bool:
+        """True when the cut that was set has happened; none is set any more."""
+        happened = not self._injector.is_set
+        self._injector.clear()
+        return happened
+
+    def readback(self) -> bytes:
+        """The whole application area."""
+        return self.device.readback()
+
+    def bus_off(self, for_s: float) -> None:
+        """The device's controller leaves the bus for that long."""
+        self.device.bus_off(self.port.now(), for_s)
+
+
+def plain_device(target: str, profile: DeviceProfile) -> Device:
+    """The device model as it is. Raises Unsupported for a target that does not exist."""
+    if target not in TARGETS:
+        raise Unsupported(f"there is no target {target}")
+    return Device(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
+
+
+def variant_maker(name: str) -> Callable[[str, DeviceProfile], Device]:
+    """What makes a deliberately wrong device. Raises UsageError for a name that is none."""
+    variant = find(name)
+
+    def make_variant(target: str, profile: DeviceProfile) -> Device:
+        return make(variant, TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
+
+    return make_variant
+
+
+# -- the model's choices as the suite's -----------------------------------------------------------
+
+_FROM_MODEL: Final[dict[str, tuple[str, dict[str, str]]]] = {
+    "rs_02": ("reset_in_bootloader", {}),
+    "rs_03": ("without_application", {}),
+    "up_03": ("upgrade_in_application", {"general_feedback": "feedback"}),
+    "up_08": ("update_in_transfer", {"ignored": "rejected"}),
+    "tx_01": ("bad_packet", {}),
+    "tx_02": ("repeated_packet", {}),
+    "tx_03": ("older_packet", {}),
+    "tx_12": ("pause_in_transfer", {}),
+    "tx_13": ("reset_in_transfer", {}),
+    "en_02": ("repeated_end", {}),
+    "en_03": ("after_complete", {}),
+    "en_04": ("image_checksum", {}),
+}
+"""Key of the suite to the model's option and the values that are called differently."""
+
+
+def profile_of_mock(device: DeviceProfile = MOCK_PROFILE) -> ConformanceProfile:
+    """The conformance profile of a device model with these choices."""
+    given: dict[str, Value] = {}
+    for key, (option, renamed) in _FROM_MODEL.items():
+        value = str(getattr(device, option))
+        given[key] = renamed.get(value, value)
+    # The model's window begins when it queues an announcement, the suite's when it has arrived.
+    given["limits.window_s"] = device.window_s - _announcement_s(device)
+    given["limits.window_tolerance_s"] = _WINDOW_TOLERANCE_S
+    given["limits.version_spacing_s"] = DEFAULT_TIMINGS.boot_version_spacing_s
+    given["limits.version_spacing_tolerance_s"] = _SPACING_TOLERANCE_S
+    given["limits.pause_s"] = device.transfer_timeout_s
+    given["limits.refused_s"] = device.refused_hold_s + 1.0
+    given["device.application_bytes"] = device.application_area_bytes
+    given["device.largest_image_bytes"] = device.image_limit_bytes
+    return ConformanceProfile(given, source="the mock's own choices")
+
+
+def _announcement_s(device: DeviceProfile) -> float:
+    """How long a boot version takes on the wire."""
+    target = TARGETS["bms"]
+    message = BootVersion(target.boot_name, device.boot_version).to_message(target.answer_id)
+    frames = split(message.can_id, encode(message))
+    return sum(map(frame_bits, frames)) / WELLING.bitrate_bps

@@ -1,0 +1,157 @@
+"""From what a user says about his bench to a device under test and the profile that it is judged
+by; the command line and the pytest plugin both come here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from flasher import api
+from flasher.conformance.profile import ConformanceProfile, load_profile
+from flasher.conformance.real import (
+    HOST_UNCERTAINTY_S,
+    PowerControl,
+    Readback,
+    RealPort,
+    RealSubject,
+)
+from flasher.conformance.subject import Subject
+from flasher.device.profile import DeviceProfile, set_option
+from flasher.errors import UsageError
+from flasher.image.load import load
+from flasher.protocol.spec import WELLING
+from flasher.protocol.text import printable
+
+_ECHOING: Final[Mapping[str, Mapping[str, Any]]] = {
+    "socketcan": {"receive_own_messages": True},
+    "udp_multicast": {},
+}
+"""Back ends that give a frame back once it has left, with what they have to be told for it: answer
+times then begin at the echo. Elsewhere the end of a frame is reckoned from its length."""
+
+
+@dataclass(frozen=True)
+class BenchOptions:
+    """A bench as a user describes it; files by their names. `bus` are python-can's keywords,
+    `choices` are KEY=VALUE of the device model.
+    """
+
+    target: str
+    is_mock: bool = False
+    variant: str | None = None
+    choices: Sequence[str] = ()
+    profile: str | None = None
+    good_image: str | None = None
+    second_image: str | None = None
+    bus: Mapping[str, Any] = field(default_factory=dict)
+    power: PowerControl | None = None
+    readback: Readback | None = None
+    uncertainty_s: float = HOST_UNCERTAINTY_S
+
+
+@contextmanager
+def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProfile]]:
+    """The device under test and its profile. Raises UsageError, ImageError and BusError."""
+    check_bench(options)
+    profile = None if options.profile is None else load_profile(options.profile)
+    good = None if options.good_image is None else load(options.good_image).data
+    second = None if options.second_image is None else load(options.second_image).data
+    if second is not None and good is not None and len(second) >= len(good):
+        raise UsageError(
+            f"The second image is not smaller than the good one: {len(second):,} bytes, "
+            f"and {len(good):,}.",
+            remedy="Exchange the two, or name another one.",
+        )
+    if options.is_mock:
+        subject, profile = _mock(options, profile, good, second)
+        _check_size(subject.good_image, profile)
+        yield subject, profile
+        return
+    assert good is not None  # noqa: S101  check_bench
+    profile = profile or ConformanceProfile()
+    _check_size(good, profile)
+    asked = _ECHOING.get(options.bus.get("interface", ""))
+    bus = {**(asked or {}), **options.bus}
+    echoes = asked is not None and bus.get("receive_own_messages", True) is True
+    with api.connect(WELLING, **bus) as connection:
+        port = RealPort(
+            connection.link,
+            connection.clock,
+            int(options.bus.get("bitrate") or WELLING.bitrate_bps),
+            echoes=echoes,
+            uncertainty_s=options.uncertainty_s,
+        )
+        yield (
+            RealSubject(
+                port,
+                api.as_target(options.target).name,
+                good,
+                name=f"the device on {printable(connection.name)}",
+                second_image=second,
+                power=options.power,
+                readback=options.readback,
+            ),
+            profile,
+        )
+
+
+def check_bench(options: BenchOptions) -> None:
+    """Raises UsageError for a bench that makes no sense."""
+    if options.is_mock:
+        if options.power is not None or options.readback is not None:
+            raise UsageError("The mock has power control and readback of its own.")
+        return
+    if options.variant is not None or options.choices:
+        raise UsageError("Variants and choices of the device model are for the mock only.")
+    if options.good_image is None:
+        raise UsageError(
+            "A good image is required.",
+            cause="the device is erased and written many times, and has to run again in the end",
+            remedy="Name an image that is known to run on the device, or use the mock.",
+        )
+
+
+def device_profile(choices: Sequence[str]) -> DeviceProfile:
+    """The device model with these choices, each KEY=VALUE. Raises UsageError."""
+    from flasher.conformance.mock import MOCK_PROFILE  # noqa: PLC0415  only for the mock
+
+    profile = MOCK_PROFILE
+    for choice in choices:
+        key, equals, value = choice.partition("=")
+        if not equals:
+            raise UsageError(f"{printable(choice)}: write KEY=VALUE.")
+        profile = set_option(profile, key, value)
+    return profile
+
+
+def _check_size(good: bytes, profile: ConformanceProfile) -> None:
+    limit = profile.number("largest_image_bytes")
+    if len(good) > limit:
+        raise UsageError(
+            f"The good image has {len(good):,} bytes, and the profile allows {limit:,}.",
+            remedy="Correct device.largest_image_bytes in the profile, or name a smaller image.",
+        )
+
+
+def _mock(
+    options: BenchOptions,
+    profile: ConformanceProfile | None,
+    good: bytes | None,
+    second: bytes | None,
+) -> tuple[Subject, ConformanceProfile]:
+    from flasher.conformance import mock  # noqa: PLC0415  only for the mock
+
+    choices = device_profile(options.choices)
+    subject = mock.MockSubject(
+        api.as_target(options.target).name,
+        profile=choices,
+        make_device=None if options.variant is None else mock.variant_maker(options.variant),
+        name="the built-in mock" + (f", variant {options.variant}" if options.variant else ""),
+        good_image=good or mock.GOOD_IMAGE,
+        # The built-in second image belongs to the built-in good one.
+        second_image=second or (None if good else mock.SECOND_IMAGE),
+    )
+    return subject, profile or mock.profile_of_mock(choices)

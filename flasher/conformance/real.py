@@ -1,0 +1,236 @@
+"""A device on a real bus as a subject: any link, power by a command or a function, readback by a
+command that dumps the flash to a file.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import subprocess
+import tempfile
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from flasher.bus.link import Clock, Link, StampingLink
+from flasher.conformance.model import Unsupported
+from flasher.conformance.subject import Arrival
+from flasher.conformance.wire import RawFrame
+from flasher.errors import BusError, UsageError
+from flasher.protocol.frame import Frame
+
+PowerControl = Callable[[bool], None]
+"""Called with True to switch the device on."""
+Readback = Callable[[], bytes]
+"""Yields the application area from its first byte on."""
+HOST_UNCERTAINTY_S: Final = 0.002
+"""How far the time of a frame may be off: the adapter's driver, and where the kernel does not stamp
+the frame as it comes in, the computer's scheduler.
+"""
+_OWN_FRAMES: Final = 256
+_SWITCH: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
+_FILE: Final = "{file}"
+
+
+class RealPort:
+    """A link as the bench's port. `echoes` says that the adapter gives back what it sent."""
+
+    def __init__(
+        self,
+        link: Link,
+        clock: Clock,
+        bitrate_bps: int,
+        *,
+        echoes: bool = False,
+        uncertainty_s: float = HOST_UNCERTAINTY_S,
+    ) -> None:
+        self.bitrate_bps = bitrate_bps
+        self.echoes = echoes
+        self.uncertainty_s = uncertainty_s
+        self._link = link
+        self._clock = clock
+        self._stamps = link if isinstance(link, StampingLink) and link.stamp_source else None
+        source = "host" if self._stamps is None else self._stamps.stamp_source
+        self.timestamp_source = f"{source}, own frames by their echo" if echoes else source
+        self._last_at = clock.now()
+        self._own: deque[Frame] = deque(maxlen=_OWN_FRAMES)
+
+    def now(self) -> float:
+        """Seconds on the link's clock."""
+        return self._clock.now()
+
+    def send(self, frame: RawFrame) -> None:
+        """Hand a frame to the adapter. Raises Unsupported for a kind that a link cannot send."""
+        if frame.is_extended or frame.is_remote or frame.is_error:
+            raise Unsupported("the adapter sends standard data frames only")
+        made = Frame(*frame)
+        self._own.append(made)
+        self._link.send(made)
+
+    def receive(self, deadline: float) -> Arrival | None:
+        """The next frame with the time at which the kernel or, where that is not told, this process
+        had it.
+        """
+        while (frame := self._link.receive(deadline)) is not None:
+            at = self._moment()
+            is_own = self._take_own(frame)
+            if self.echoes or not is_own:
+                return Arrival(RawFrame(*frame), at, is_own)
+        return None
+
+    def _moment(self) -> float:
+        """When the frame received last was there; never before the one in front of it."""
+        stamped_at = None if self._stamps is None else self._stamps.received_at
+        self._last_at = max(self._last_at, self.now() if stamped_at is None else stamped_at)
+        return self._last_at
+
+    def _take_own(self, frame: Frame) -> bool:
+        """True for a frame of our own that came back. Where all of them should, one that was lost
+        on the way does not keep those behind it from being known.
+        """
+        if self.echoes and frame in self._own:
+            while self._own.popleft() != frame:
+                pass
+            return True
+        if self._own and frame == self._own[0]:
+            self._own.popleft()
+            return True
+        return False
+
+    def drain(self) -> int:
+        """Throw away what waits."""
+        self._own.clear()
+        return self._link.drain()
+
+
+class RealSubject:
+    """A device behind an open adapter. Without `power` and `readback` the cases that need them
+    are unsupported.
+    """
+
+    has_bus_off = False
+    has_timed_cuts = False
+
+    def __init__(
+        self,
+        port: RealPort,
+        target: str,
+        good_image: bytes,
+        *,
+        name: str,
+        second_image: bytes | None = None,
+        power: PowerControl | None = None,
+        readback: Readback | None = None,
+    ) -> None:
+        self.name = name
+        self.target = target
+        self.good_image = good_image
+        self.second_image = second_image
+        self.has_power = power is not None
+        self.has_readback = readback is not None
+        self.port = port
+        self._power = power
+        self._readback = readback
+
+    def power(self, *, on: bool) -> None:
+        """Switch the device. Raises Unsupported without control, BusError when it fails."""
+        if self._power is None:
+            raise Unsupported("the bench has no power control")
+        self._power(on)
+
+    def readback(self) -> bytes:
+        """The application area. Raises Unsupported without a way, BusError when it fails."""
+        if self._readback is None:
+            raise Unsupported("the bench has no readback")
+        return self._readback()
+
+    def bus_off(self, for_s: float) -> None:
+        """Not possible from outside. Raises Unsupported."""
+        raise Unsupported("a real device cannot be made to go bus-off")
+
+    def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
+        """Not possible from outside. Raises Unsupported."""
+        raise Unsupported("nobody sees from outside when a flash operation is under way")
+
+    def take_cut(self) -> bool:
+        """No cut was ever set."""
+        return False
+
+
+class PowerCommand:
+    """Power by a command such as `relay {on|off}`: the first word of the braces switches on.
+
+    Raises UsageError for a command without them.
+    """
+
+    def __init__(self, template: str, limit_s: float = 10.0) -> None:
+        if not _SWITCH.search(template):
+            raise UsageError(
+                f"The power command {template!a} does not say what is on and what is off.",
+                remedy="Write both in braces, as `relay 3 {on|off}`.",
+            )
+        self._template = _split(template, "power")
+        self._limit_s = limit_s
+
+    def __call__(self, on: bool) -> None:  # noqa: FBT001  it is the one argument
+        """Run the command. Raises BusError when it fails or takes too long."""
+        words = [_SWITCH.sub(r"\1" if on else r"\2", word) for word in self._template]
+        _run(words, self._limit_s, "power")
+
+
+class ReadbackCommand:
+    """Readback by a command such as `st-flash read {file} 0x8008000 0x18000`, which writes the
+    application area to a file. Raises UsageError for a command without `{file}`.
+    """
+
+    def __init__(self, template: str, limit_s: float = 60.0) -> None:
+        if _FILE not in template:
+            raise UsageError(
+                f"The readback command {template!a} names no file.",
+                remedy="Write {file} where its output file belongs.",
+            )
+        self._template = _split(template, "readback")
+        self._limit_s = limit_s
+
+    def __call__(self) -> bytes:
+        """Run the command and read its file. Raises BusError."""
+        with tempfile.TemporaryDirectory() as directory:
+            path = Path(directory) / "readback.bin"
+            words = [word.replace(_FILE, str(path)) for word in self._template]
+            _run(words, self._limit_s, "readback")
+            try:
+                return path.read_bytes()
+            except OSError as error:
+                raise BusError(
+                    "The readback command wrote no file.",
+                    where=shlex.join(words),
+                    cause=str(error.strerror),
+                ) from error
+
+
+def _split(template: str, what: str) -> Sequence[str]:
+    try:
+        words = shlex.split(template)
+    except ValueError as error:
+        raise UsageError(f"The {what} command {template!a} makes no sense: {error}.") from error
+    return words
+
+
+def _run(words: Sequence[str], limit_s: float, what: str) -> None:
+    shown: Mapping[str, str] = {"where": shlex.join(words)}
+    try:
+        done = subprocess.run(  # noqa: S603  the user's own command
+            words, check=False, capture_output=True, timeout=limit_s, stdin=subprocess.DEVNULL
+        )
+    except subprocess.TimeoutExpired as error:
+        raise BusError(f"The {what} command took longer than {limit_s:g} s.", **shown) from error
+    except OSError as error:
+        raise BusError(f"The {what} command cannot be run: {error.strerror}.", **shown) from error
+    if done.returncode:
+        said = done.stderr.decode(errors="replace").strip()[-300:]
+        raise BusError(
+            f"The {what} command failed with exit code {done.returncode}.",
+            cause=ascii(said)[1:-1],
+            **shown,
+        )

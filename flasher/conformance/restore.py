@@ -1,0 +1,147 @@
+"""Brings the device to the known state: the good image's application runs.
+
+Gently first, by the protocol, then by power. Says what it took, so that a case that leaves a device
+unreachable is told from one that merely leaves an upgrade unfinished.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.hearing import Kind
+from flasher.conformance.model import CaseEnded, CaseLimitReached, RunStopped
+from flasher.conformance.patient import Upgraded
+from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.subject import Subject
+from flasher.conformance.wire import version_in
+
+_MARGIN_S: Final = 60.0
+_ASK_S: Final = 0.4
+BY_NOTHING: Final = "it ran"
+BY_UPGRADE: Final = "upgrade"
+BY_POWER: Final = "power cycle, then upgrade"
+
+
+class Restored(NamedTuple):
+    """How it went: `how` is one of the texts above, empty when nothing helped for `reason`."""
+
+    how: str
+    reason: str = ""
+
+    @property
+    def ok(self) -> bool:
+        """True when the good image runs."""
+        return bool(self.how)
+
+
+def restore(
+    subject: Subject,
+    profile: ConformanceProfile,
+    *,
+    flash: bool,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Restored:
+    """Make the application of the good image run; with `flash` it is flashed in any case.
+
+    Raises BusError when the adapter fails, RunStopped when somebody wants to end the run.
+    """
+    reasons: list[str] = []
+    ways: list[tuple[str, Callable[[Bench], str]]] = []
+    if not flash:
+        ways.append((BY_NOTHING, _runs))
+    ways.append((BY_UPGRADE, _upgrade))
+    if subject.has_power:
+        ways.append((BY_POWER, _power_cycle))
+    for how, way in ways:
+        limit_s = _limit_s(subject, profile)
+        bench = Bench(subject, profile, limit_s=limit_s, stopped=stopped)
+        try:
+            reason = way(bench)
+        except RunStopped:
+            raise
+        except CaseLimitReached:
+            reason = f"not at an end after {limit_s:g} s"
+        except CaseEnded as ended:
+            reason = str(ended)
+        if not reason:
+            return Restored(how)
+        reasons.append(f"{how}: {reason}")
+    return Restored("", "; ".join(reasons))
+
+
+def is_reachable(
+    subject: Subject, profile: ConformanceProfile, stopped: Callable[[], bool] = lambda: False
+) -> bool:
+    """True when the bootloader announces itself after a reset, a pause or a power cycle: a device
+    that cannot be upgraded can still be judged. Raises as `restore`.
+    """
+    bench = Bench(subject, profile, limit_s=_limit_s(subject, profile), stopped=stopped)
+    within_s = profile.limit("first_version_s") + profile.limit("pause_s")
+    try:
+        bench.send(bench.words.reset())
+        if bench.wait_for(Kind.BOOT_VERSION, within_s=within_s) is not None:
+            return True
+        if subject.has_power:
+            bench.power_cycle()
+            return bench.wait_for(Kind.BOOT_VERSION, within_s=within_s) is not None
+    except RunStopped:
+        raise
+    except CaseEnded:
+        return False
+    return False
+
+
+def needs_power(profile: ConformanceProfile) -> bool:
+    """True when the profile leaves no other way out of a transfer than power."""
+    choices = (profile.choice("tx_12"), profile.choice("tx_13"), profile.choice("up_08"))
+    return choices == ("waits", "ignored", "rejected")
+
+
+def _limit_s(subject: Subject, profile: ConformanceProfile) -> float:
+    """How long one way may take: all waits that it can have, and the transfer at a slow pace."""
+    limit = profile.limit
+    waits_s = 3 * sum(
+        map(limit, ("first_version_s", "pause_s", "erase_s", "complete_s", "start_s"))
+    )
+    frames = len(subject.good_image) / 5.0
+    return waits_s + 4 * frames * 130 / subject.port.bitrate_bps + _MARGIN_S
+
+
+def _runs(bench: Bench) -> str:
+    wanted = version_in(bench.good_image)
+    if not bench.words.has_version_query or wanted is None:
+        return "" if bench.application_runs() else "no application answers"
+    found = bench.application_version(bench.profile.limit("start_s"))
+    return "" if found == wanted else f"version {found!a}, not {wanted}"
+
+
+def _upgrade(bench: Bench) -> str:
+    """By the protocol: the gentle way first, so that a device is not blamed for what a reset in the
+    midst of a transfer (TX-13), or an update command there (UP-08), does to it.
+    """
+    blind = bench.profile.choice("up_08") == "starts_over"
+    if not blind or _answers(bench):
+        reason = _after(bench, bench.upgrade(bench.good_image, blind=blind))
+    else:
+        reason = _after(bench, bench.upgrade(bench.good_image, reset=False, blind=True))
+    if reason and bench.profile.choice("tx_12") == "announces":
+        bench.wait(bench.profile.limit("pause_s"))
+        reason = _after(bench, bench.upgrade(bench.good_image, reset=_answers(bench)))
+    return reason
+
+
+def _answers(bench: Bench) -> bool:
+    """True when an application runs, or when nobody can ask for it."""
+    return not bench.words.has_version_query or bench.application_version(_ASK_S) is not None
+
+
+def _after(bench: Bench, ended: Upgraded) -> str:
+    return _runs(bench) if ended.ok else ended.reason
+
+
+def _power_cycle(bench: Bench) -> str:
+    bench.power_cycle()
+    ended = bench.upgrade(bench.good_image, reset=False)
+    return _runs(bench) if ended.ok else ended.reason

@@ -1,0 +1,166 @@
+"""Subjects and shortcuts for the tests of the suite."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock
+from flasher.conformance.model import CASES, Case, CaseResult, Requirement, Status
+from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.report import Report
+from flasher.conformance.runner import RunOptions, run
+from flasher.conformance.selection import Selection
+from flasher.device.model import Device
+from flasher.device.profile import DeviceProfile
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import TARGETS, WELLING
+
+PROFILE = profile_of_mock()
+
+
+class DeafDevice(Device):
+    """Hears nothing once it is told to hang; `hangs_for_good` survives a power cycle."""
+
+    hangs = False
+    hangs_for_good = False
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if not self.hangs:
+            super().receive(frame, now)
+
+    def deadline(self) -> float | None:
+        return None if self.hangs else super().deadline()
+
+    def next_frame(self, now: float) -> Frame | None:
+        return None if self.hangs else super().next_frame(now)
+
+    def power_cut(self, now: float) -> None:
+        self.hangs = self.hangs_for_good
+        super().power_cut(now)
+
+
+class RestlessDevice(Device):
+    """Loses its power for a moment after every 60th frame that it hears."""
+
+    heard = 0
+
+    def receive(self, frame: Frame, now: float) -> None:
+        super().receive(frame, now)
+        self.heard += 1
+        if self.heard % 60 == 0:
+            self.power_cut(now)
+            self.power_on(now)
+
+
+class Babbler:
+    """An engine that sends a frame of the highest priority every `period_s`."""
+
+    done = False
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._due = 0.0
+
+    def receive(self, frame: Frame, now: float) -> None:
+        pass
+
+    def tick(self, now: float) -> None:
+        pass
+
+    def deadline(self) -> float | None:
+        return self._due
+
+    def next_frame(self, now: float) -> Frame | None:
+        return Frame(0x001, bytes(8)) if now >= self._due else None
+
+    def frame_sent(self, now: float) -> None:
+        self._due = now + self._period_s
+
+    def cancel(self, now: float) -> None:
+        pass
+
+    def take_events(self) -> Sequence[object]:
+        return ()
+
+
+def maker(kind: type[Device]) -> Callable[[str, DeviceProfile], Device]:
+    """Makes devices of that class."""
+
+    def make_device(target: str, profile: DeviceProfile) -> Device:
+        return kind(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
+
+    return make_device
+
+
+def subject(
+    kind: type[Device] = Device, profile: DeviceProfile = MOCK_PROFILE, target: str = "bms"
+) -> MockSubject:
+    return MockSubject(target, profile=profile, make_device=maker(kind))
+
+
+def one(report: Report, case_id: str) -> CaseResult:
+    """The result of a case that was run once."""
+    (result,) = (result for result in report.results if result.case_id == case_id)
+    return result
+
+
+@dataclass
+class Log:
+    """A listener that writes down what it is told."""
+
+    lines: list[str] = field(default_factory=list)
+
+    def run_began(self, count: int) -> None:
+        self.lines.append(f"run of {count}")
+
+    def preparing(self, what: str) -> None:
+        self.lines.append(f"preparing {what}")
+
+    def case_began(self, case: Case, repeat: int) -> None:
+        self.lines.append(f"begins {case.id} {repeat}")
+
+    def case_ended(self, result: CaseResult) -> None:
+        self.lines.append(f"ends {result.case_id} {result.status.value}")
+
+
+def run_case(
+    action: Callable[[Bench], None],
+    *,
+    device: MockSubject | None = None,
+    profile: ConformanceProfile = PROFILE,
+    requires: frozenset[Requirement] = frozenset(),
+    limit_s: float = 300.0,
+    strict: bool = False,
+    before_others: bool = False,
+    log: Log | None = None,
+) -> Report:
+    """A run of one case that does `action` and is called FR-00; with `before_others`, RS-04 too."""
+    CASES["FR-00"] = Case(
+        "FR-00", "a test", "none", "something", "something", action, requires, limit_s=limit_s
+    )
+    try:
+        return run(
+            device or subject(),
+            profile,
+            selection=Selection(cases=("FR-00", "RS-04") if before_others else ("FR-00",)),
+            options=RunOptions(strict=strict),
+            listener=log,
+        )
+    finally:
+        del CASES["FR-00"]
+
+
+def status_of(action: Callable[[Bench], None]) -> Status:
+    return one(run_case(action), "FR-00").status
+
+
+def passes_once(bench: Bench) -> None:
+    """A case with one check that passes."""
+    bench.check(True, "something", "something")
+
+
+def fails_once(bench: Bench) -> None:
+    """A case with one check that fails."""
+    bench.check(False, "one", "two")

@@ -1,0 +1,124 @@
+"""The bench: faults on the line, waits, and the mock's powers."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.faults import Fault, FaultKind
+from flasher.conformance.hearing import Kind
+from flasher.conformance.mock import GOOD_IMAGE, MOCK_PROFILE, SECOND_IMAGE, profile_of_mock
+from flasher.conformance.model import CaseLimitReached, CaseStopped
+from flasher.conformance.wire import RawFrame
+
+from .bench import PROFILE, subject
+
+
+def made(limit_s: float = 100.0) -> Bench:
+    return Bench(subject(), PROFILE, limit_s=limit_s)
+
+
+def sent(bench: Bench) -> list[int]:
+    return [entry.frame.data[0] for entry in bench.trace if entry.sent]
+
+
+@pytest.mark.parametrize(
+    ("fault", "carried"),
+    [
+        (Fault(FaultKind.DROP, 1), [0, 2, 3]),
+        (Fault(FaultKind.DOUBLE, 1), [0, 1, 1, 2, 3]),
+        (Fault(FaultKind.SWAP, 1), [0, 2, 1, 3]),
+        (Fault(FaultKind.SWAP, 3), [0, 1, 2, 3]),
+        (Fault(FaultKind.DELAY, 1, delay_s=0.05), [0, 1, 2, 3]),
+    ],
+    ids=str,
+)
+def test_a_fault_befalls_one_frame(fault: Fault, carried: list[int]) -> None:
+    bench = made()
+    with bench.disturb(fault):
+        done = bench.send([RawFrame(0x7FF, bytes((number,))) for number in range(4)])
+    assert sent(bench) == carried
+    assert (done.left_at - done.at > 0.05) == (fault.kind is FaultKind.DELAY)
+
+
+def test_a_frame_of_the_device_can_be_lost_on_its_way() -> None:
+    bench = made()
+    with bench.disturb(Fault(FaultKind.DROP, 0, incoming=True)):
+        bench.send(bench.words.reset())
+        heard = bench.collect(0.04)
+    assert [one.kind for one in heard] == [Kind.DAMAGED]
+    with pytest.raises(ValueError, match="cannot be"):
+        Fault(FaultKind.SWAP, 0, incoming=True)
+
+
+def test_frames_can_be_sent_with_a_gap_and_at_a_time() -> None:
+    bench = made()
+    frames = [RawFrame(0x7FF, b"\0")] * 3
+    bench.send(frames, gap_s=0.01, at=1.0)
+    times = [entry.at_s for entry in bench.trace]
+    assert times[0] > 1.0
+    assert times[1] - times[0] > 0.01
+    assert times[2] - times[1] > 0.01
+
+
+def test_no_wait_goes_beyond_the_limit_of_the_case() -> None:
+    bench = made(limit_s=1.0)
+    with pytest.raises(CaseLimitReached):
+        bench.collect(100.0)
+    assert bench.elapsed_s <= 1.0
+
+
+def test_what_is_expected_and_does_not_come_ends_the_case() -> None:
+    bench = made()
+    with pytest.raises(CaseStopped):
+        bench.expect(Kind.ACK, within_s=0.1, number=3)
+    (check,) = bench.findings.checks
+    assert (check.expected, check.got) == ("ACK 3", "nothing within 0.1 s")
+
+
+@pytest.mark.parametrize("lost", [0, 5, 30, 200])
+def test_the_patient_host_gets_an_image_through_a_lost_frame(lost: int) -> None:
+    bench = made()
+    with bench.disturb(Fault(FaultKind.DROP, lost)):
+        ended = bench.upgrade(SECOND_IMAGE)
+    assert ended.ok or not lost, ended
+    if ended.ok:
+        bench.check_application(SECOND_IMAGE)
+        bench.check_stored(SECOND_IMAGE)
+        assert all(check.outcome.value == "pass" for check in bench.findings.checks)
+
+
+def test_power_can_be_cut_in_the_middle_of_a_flash_operation() -> None:
+    bench = made()
+    bench.reset_to_bootloader()
+    bench.subject.cut_in_operation(0, 0.5, 0.3)
+    bench.send(bench.words.update(len(GOOD_IMAGE)))
+    # Torn while it was erased: no application, and the bootloader announces itself.
+    assert bench.wait_for(Kind.REQUEST, within_s=0.2) is None
+    assert bench.subject.take_cut()
+    assert bench.wait_for(Kind.BOOT_VERSION, within_s=1.0) is not None
+    assert bench.application_version() is None
+    bench.check_upgrade()
+    bench.subject.cut_in_operation(10_000, 0.5, 0.1)
+    assert not bench.subject.take_cut()
+
+
+def test_a_device_that_is_off_the_bus_hears_nothing_for_that_long() -> None:
+    bench = made()
+    bench.bus_off(0.5)
+    assert bench.application_version(0.3) is None
+    assert bench.application_version(1.0) is not None
+
+
+@pytest.mark.parametrize("choice", ["nak_expected", "nak_received", "silence"])
+def test_a_packet_that_is_rejected_is_judged_by_the_profile(choice: Any) -> None:
+    device = replace(MOCK_PROFILE, bad_packet=choice)
+    bench = Bench(subject(profile=device), profile_of_mock(device), limit_s=100.0)
+    bench.start_transfer(len(GOOD_IMAGE))
+    bench.send_packet(GOOD_IMAGE, 4)
+    assert bench.check_packet_rejected(wanted=1, named=4)
+    bench.send_packet(GOOD_IMAGE, 1)
+    assert not bench.check_packet_rejected(wanted=1, named=1)

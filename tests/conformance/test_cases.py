@@ -1,0 +1,80 @@
+"""The cases on the mock: a right device passes them, by every choice, and a wrong one does not."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
+from flasher.conformance.model import CASES, Status
+from flasher.conformance.profile_keys import BY_PATH
+from flasher.conformance.runner import run
+from flasher.conformance.selection import GROUPS, Selection
+from flasher.device.variants import VARIANTS
+
+MINE = ("RS", "UP")
+WRONG = {name: one for name, one in VARIANTS.items() if one.clause.partition("-")[0] in MINE}
+
+
+def failed(
+    name: str | None = None, *, only: tuple[str, ...] = (), target: str = "bms", **choices: Any
+) -> list[str]:
+    """The cases of these groups, or `only` those, that a device does not pass."""
+    profile = replace(MOCK_PROFILE, **choices)
+    make_device = None if name is None else variant_maker(name)
+    subject = MockSubject(target, profile=profile, make_device=make_device)
+    # A variant's own choices are part of what it is.
+    judged_by = profile_of_mock(subject.device.profile)
+    selection = Selection(only) if only else Selection(groups=MINE)
+    report = run(subject, judged_by, selection=selection)
+    return [result.case_id for result in report.results if result.status is not Status.PASS]
+
+
+@pytest.mark.parametrize("target", ["wmc", "bms"])
+def test_the_mock_passes(target: str) -> None:
+    assert failed(target=target) == []
+
+
+def test_the_mock_passes_as_obc() -> None:
+    assert failed(target="obc", only=("RS-01", "RS-04", "UP-06")) == []
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"reset_in_bootloader": "restarts", "without_application": "listens"},
+        {"window_s": 0.05, "update_in_transfer": "ignored", "pause_in_transfer": "waits"},
+        {"pause_in_transfer": "waits", "reset_in_transfer": "restarts", "window_s": 1.0},
+        {"upgrade_in_application": "silence", "after_complete": "restarts"},
+        {"largest_image_bytes": 1300, "image_checksum": "crc32", "start_delay_s": 1.0},
+        {"erased_pages": "all", "erase_time_s": 0.01, "program_time_s": 0.02},
+    ],
+    ids=str,
+)
+def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, Any]) -> None:
+    assert failed(**choices) == []
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
+    clause = WRONG[name].clause
+    assert failed(name, only=(clause,)) == [clause]
+
+
+def test_a_choice_that_the_profile_does_not_state_fails() -> None:
+    device = replace(MOCK_PROFILE, reset_in_bootloader="restarts", update_in_transfer="ignored")
+    report = run(
+        MockSubject(profile=device),
+        profile_of_mock(),
+        selection=Selection(cases=("RS-02", "UP-08")),
+    )
+    assert [result.status for result in report.results] == [Status.FAIL, Status.FAIL]
+
+
+def test_every_case_says_all_that_a_report_shows() -> None:
+    for case_id, case in CASES.items():
+        assert case.group in GROUPS
+        assert all((case.title, case.clause, case.stimulus, case.expectation)), case_id
+        assert set(case.choices) <= set(BY_PATH), case_id

@@ -1,0 +1,143 @@
+"""BU, PW and CO on the mock: a right device passes by every choice, and each wrong one fails."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from flasher.conformance.mock import MockSubject, profile_of_mock, variant_maker
+from flasher.conformance.model import CASES, CaseResult, Outcome, Requirement, Status
+from flasher.conformance.runner import run
+from flasher.conformance.selection import Selection
+from flasher.conformance.wire import Words
+
+from .verdicts import cases_of, not_passed, variants_of, verdicts
+
+SHARES = ("0%", "50%", "100%")
+GROUPS = ("BU", "PW", "CO")
+MINE = tuple(case_id for group in GROUPS for case_id in cases_of(group))
+QUICK = tuple(case_id for case_id in MINE if case_id not in ("PW-01", "CO-01"))
+WRONG = {name: clause for group in GROUPS for name, clause in variants_of(group).items()}
+
+
+def result_of(case_id: str, variant: str | None = None, **powers: bool) -> CaseResult:
+    """A run of one case on a bench that lacks some powers."""
+    subject = MockSubject(make_device=None if variant is None else variant_maker(variant))
+    for name, value in powers.items():
+        setattr(subject, name, value)
+    report = run(subject, profile_of_mock(), selection=Selection(cases=(case_id,)))
+    return report.results[0]
+
+
+def not_judged(result: CaseResult) -> list[str]:
+    """What the bench could not do."""
+    return [check.expected for check in result.checks if check.outcome is Outcome.UNSUPPORTED]
+
+
+def test_the_mock_passes() -> None:
+    assert MINE == ("BU-01", "BU-02", "BU-06", "PW-01", "PW-02", "CO-01", "CO-02", "CO-04")
+    assert not_passed(*(case_id for case_id in MINE if case_id != "PW-01")) == []
+
+
+def test_a_target_without_a_version_query_passes() -> None:
+    assert not_passed(*QUICK, target="wmc") == []
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"reset_in_bootloader": "restarts", "without_application": "listens"},
+        {"window_s": 0.05, "update_in_transfer": "ignored", "pause_in_transfer": "waits"},
+        {"reset_in_transfer": "restarts", "window_s": 0.5, "after_complete": "restarts"},
+        {"bad_packet": "silence", "repeated_packet": "nak_next", "repeated_end": "silence"},
+    ],
+    ids=str,
+)
+def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, Any]) -> None:
+    assert not_passed(*QUICK, **choices) == []
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
+    assert verdicts([WRONG[name]], name) == {WRONG[name]: Status.FAIL}
+
+
+def test_one_image_and_readback_tell_a_torn_image_too() -> None:
+    for name in ("starts-torn-image", "record-first"):
+        assert verdicts(["PW-01"], name, with_second_image=False) == {"PW-01": Status.FAIL}
+    assert not_passed("PW-02", with_second_image=False) == []
+
+
+def test_versions_tell_a_torn_image_on_a_bench_without_readback() -> None:
+    result = result_of("PW-01", "record-first", has_readback=False)
+    assert result.status is Status.FAIL
+    assert result.first_failure is not None
+    assert "whole image" in result.first_failure.expected
+
+
+def test_a_bench_with_power_alone_judges_what_it_can_and_says_what_it_cannot() -> None:
+    result = result_of("PW-01", has_readback=False, has_timed_cuts=False)
+    assert result.status is Status.PASS
+    assert not_judged(result)[:2] == [
+        "power cuts before, in and after every flash operation",
+        "what was acknowledged is stored",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("case_id", "power"), [("PW-01", "has_power"), ("PW-02", "has_power"), ("BU-02", "has_bus_off")]
+)
+def test_what_a_bench_lacks_makes_a_case_unsupported(case_id: str, power: str) -> None:
+    assert result_of(case_id, None, **{power: False}).status is Status.UNSUPPORTED
+
+
+def test_frames_that_meet_in_one_bit_time_are_left_to_an_injector() -> None:
+    result = result_of("BU-06")
+    assert result.status is Status.PASS
+    assert not_judged(result) == ["frames of one id that begin in the same bit time"]
+
+
+def test_others_take_nine_tenths_of_the_bus() -> None:
+    own = Words("bms").to_device
+    trace = result_of("CO-01").trace
+    sent = [entry for entry in trace if entry.sent and entry.frame.can_id != 0x001]
+    share = sum(entry.frame.can_id != own for entry in sent) / len(sent)
+    assert 0.85 < share < 0.98
+    foreign = [entry.at_s for entry in sent if entry.frame.can_id != own]
+    # 200 full frames of 125 bits fill 100 ms.
+    assert max(sum(at <= one < at + 0.1 for one in foreign) for at in foreign[::100]) > 160
+
+
+def test_every_frame_of_every_message_is_disturbed() -> None:
+    """Each one in each way: as many steps as there are frames and ways."""
+    result = result_of("BU-01")
+    steps = " ".join(check.step for check in result.checks)
+    for frame in range(1, 19):
+        assert f"frame {frame} sent is dropped" in steps
+        assert f"frame {frame} sent is doubled" in steps
+        assert frame == 1 or f"frame {frame} sent is delayed" in steps
+        assert frame == 18 or f"frame {frame} sent is swapped" in steps
+
+
+def test_power_is_cut_at_every_frame_of_an_upgrade_and_in_every_flash_operation() -> None:
+    result = result_of("PW-01")
+    assert result.status is Status.PASS
+    steps = {check.step for check in result.checks}
+    assert {f"after frame {frame} of reset" for frame in (1, 2)} <= steps
+    assert {f"after frame {frame} of the update command" for frame in (1, 2, 3)} <= steps
+    packets = {f"after frame {f} of packet {n}" for f in range(1, 19) for n in range(1, 7)}
+    assert packets <= steps
+    assert {f"after frame {frame} of end of transfer" for frame in (1, 2)} <= steps
+    # A page to erase, six packets, the record.
+    operations = {
+        f"flash operation {n}, {share} of it done" for n in range(1, 9) for share in SHARES
+    }
+    assert operations <= steps
+
+
+def test_the_cases_say_what_they_do() -> None:
+    for case_id in MINE:
+        case = CASES[case_id]
+        assert Requirement.DESTRUCTIVE in case.requires
+        assert all((case.title, case.clause, case.stimulus, case.expectation))

@@ -1,0 +1,70 @@
+"""EN on the mock: a right device passes by every choice, and each wrong one fails its case."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from flasher.conformance.model import Status
+
+from .verdicts import cases_of, not_passed, variants_of, verdicts
+
+CASES = ("EN-01", "EN-02", "EN-04", "EN-07", "EN-08")
+WRONG = variants_of("EN")
+
+
+def test_the_mock_passes_with_images_that_carry_a_checksum() -> None:
+    assert tuple(cases_of("EN")) == CASES
+    assert not_passed(*CASES, image_checksum="crc32") == []
+
+
+def test_without_a_checksum_of_its_own_there_is_nothing_to_refuse_an_image_for() -> None:
+    assert verdicts(["EN-04"]) == {"EN-04": Status.UNSUPPORTED}
+
+
+def test_a_target_without_a_version_query_passes_all_but_the_version() -> None:
+    found = verdicts(CASES, target="obc", image_checksum="crc32")
+    assert found.pop("EN-08") is Status.UNSUPPORTED
+    assert set(found.values()) == {Status.PASS}
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"repeated_end": "silence", "without_application": "listens"},
+        {"after_complete": "restarts", "reset_in_bootloader": "restarts"},
+        {"start_delay_s": 1.0, "states": {"en_02": "either"}, "pause_in_transfer": "waits"},
+    ],
+    ids=str,
+)
+def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, Any]) -> None:
+    assert not_passed(*CASES, image_checksum="crc32", **choices) == []
+
+
+@pytest.mark.parametrize(
+    ("case_id", "states"),
+    [
+        ("EN-01", {"en_03": "restarts"}),
+        ("EN-02", {"en_02": "silence"}),
+        ("EN-04", {"en_02": "silence"}),
+    ],
+)
+def test_a_device_that_chooses_otherwise_than_its_profile_says_fails(
+    case_id: str, states: dict[str, str]
+) -> None:
+    assert not_passed(case_id, states=states, image_checksum="crc32") == [case_id]
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
+    assert not_passed(WRONG[name], variant=name) == [WRONG[name]]
+
+
+def test_without_a_second_image_the_rest_of_a_row_of_upgrades_is_judged() -> None:
+    found = verdicts(["EN-01", "EN-07", "EN-08"], with_second_image=False)
+    assert found == {
+        "EN-01": Status.PASS,
+        "EN-07": Status.PASS,
+        "EN-08": Status.UNSUPPORTED,
+    }

@@ -1,0 +1,301 @@
+"""`flasher conformance` as a user meets it: summary, selection, reports as files, exit codes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+from pathlib import Path
+
+import pytest
+
+from flasher.cli.conformance_replay import replay_commands
+from flasher.cli.conformance_run import exit_code
+from flasher.conformance.bench import Bench
+from flasher.conformance.cases import rs
+from flasher.conformance.cases.elsewhere import NOT_IMPLEMENTED
+from flasher.conformance.mock import MockPort
+from flasher.conformance.model import CASES
+from flasher.conformance.profile import load_profile
+from flasher.conformance.profile_keys import KEYS
+from flasher.conformance.selection import QUICK
+from flasher.errors import BusError, ExitCode
+from tests.cli.conftest import SAMPLES, Flasher
+
+from . import profile_table
+from .bench import fails_once, passes_once, run_case
+
+MOCK = ("conformance", "-t", "bms", "--mock")
+WRONG = (*MOCK, "--variant", "announces-three-times", "--case", "RS-01", "RS-04")
+
+
+def test_a_device_that_follows_the_protocol_passes(flasher: Flasher) -> None:
+    run = flasher(*MOCK, "--group", "rs")
+    assert run.code == 0
+    assert "RS  reset and boot version  5 pass" in run.out
+    assert "good image at the end: flashed and verified" in run.out
+    assert run.out.splitlines()[-1].startswith("passed: 5 pass;")
+    assert run.err == ""
+
+
+def test_a_failure_has_one_line_with_expected_got_and_a_command_that_repeats_it(
+    flasher: Flasher,
+) -> None:
+    run = flasher(*WRONG, "--seed", "a b", "--junit", "/dev/null")
+    assert run.code == 12
+    (line,) = (line for line in run.out.splitlines() if line.startswith("FAIL RS-01"))
+    assert "expected boot version; got nothing within" in line
+    command = shlex.split(line.partition("replay: ")[2])
+    assert command[:2] == ["flasher", "conformance"]
+    assert "--junit" not in command
+    again = flasher(*command[1:])
+    assert again.code == 12
+    assert line in again.out
+    assert "RS-04" not in again.out
+
+
+def test_the_replay_of_a_repetition_repeats_up_to_it() -> None:
+    words = shlex.split(
+        "conformance -t bms --profile 'my p.toml' --case TX-01 TX-02 -i socketcan --see 9 --rep 3 "
+        "--json --html=a.html -v --strict --bus-kwargs a=1 --trace-dir t -c can0"
+    )
+    report = run_case(passes_once)
+    command = replay_commands(report, words)["FR-00", 1]
+    assert shlex.split(command) == shlex.split(
+        "flasher conformance -t bms --profile 'my p.toml' -i socketcan --strict --bus-kwargs a=1 "
+        "-c can0 --case FR-00 --seed 1"
+    )
+
+
+def test_the_list_shows_what_can_be_run_and_what_cannot(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(NOT_IMPLEMENTED, "BU-99", "needs an injector")
+    run = flasher("conformance", "--list", "--case", "RS-05", "bu-99")
+    assert run.code == 0
+    assert "RS-05  power-up" in run.out
+    assert "BU-99  cannot be run: needs an injector" in run.out
+    everything, quick = (
+        flasher("conformance", "--list", *words, "--json").document["cases"]
+        for words in ((), ("--quick",))
+    )
+    assert [case["id"] for case in quick] == list(QUICK)
+    assert not any("long" in case["requires"] for case in quick)
+    assert len(quick) < len(everything)
+    assert all(case["title"] for case in everything)
+
+
+def test_a_quick_run_takes_less_than_a_minute_on_the_bus(flasher: Flasher) -> None:
+    report = flasher(*MOCK, "--quick", "--json").document["report"]
+    assert report["passed"]
+    assert report["duration_s"] < 60
+    assert len(report["results"]) == len(QUICK)
+
+
+def test_a_repeated_run_has_every_case_several_times(flasher: Flasher) -> None:
+    run = flasher(*MOCK, "--case", "RS-04", "--repeat", "3", "--json")
+    results = run.document["report"]["results"]
+    assert [result["repeat"] for result in results] == [1, 2, 3]
+    assert results[2]["replay"].endswith("--case RS-04 --seed 1 --repeat 3")
+
+
+def test_verbose_tells_every_case_on_both_streams(flasher: Flasher) -> None:
+    run = flasher(*MOCK, "--case", "RS-04", "-v")
+    assert "pass          RS-04  what is no reset" in run.out
+    assert "RS-04 pass (0 left)" in run.err
+
+
+def test_a_terminal_shows_which_case_runs_and_what_fails_at_once(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    run = flasher(*WRONG)
+    assert "RS-04 what is no reset" in run.err
+    assert "after RS-01" in run.err
+    assert "RS-01 fail: expected boot version; got nothing within 0.2 s (1 left)" in run.err
+    assert "0/2 " in run.err
+
+
+def test_all_files_are_written_with_what_they_are_for(flasher: Flasher, tmp_path: Path) -> None:
+    names = {"--junit": "a.xml", "--json-report": "a.json", "--html": "a.html"}
+    words = [word for option, name in names.items() for word in (option, str(tmp_path / name))]
+    run = flasher(*WRONG, *words, "--trace-dir", str(tmp_path / "new" / "traces"))
+    assert run.code == 12
+    assert (tmp_path / "a.xml").read_text().startswith("<?xml")
+    assert (tmp_path / "a.html").read_text().startswith("<!DOCTYPE html>")
+    document = json.loads((tmp_path / "a.json").read_text())
+    assert document["counts"]["fail"] == 1
+    (trace,) = (tmp_path / "new" / "traces").iterdir()
+    assert trace.name == "RS-01.log"
+    assert document["results"][0]["trace_file"] == "RS-01.log"
+    told = flasher("explain", trace)
+    assert told.code == 0
+    assert "boot version" in flasher("explain", trace, "--all").out
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        ((), 2, "-t/--target is required"),
+        (("-t", "bms"), 2, "good image is required"),
+        (("-t", "bms", "--mock", "--case", "RS-1"), 2, "Did you mean RS-0"),
+        (("-t", "bms", "--mock", "--group", "QQ"), 2, "There is no group"),
+        (("-t", "bms", "--mock", "--power-cmd", "relay {on|off}"), 2, "without --mock only"),
+        (("-t", "bms", "--variant", "no-crc-check"), 2, "with --mock only"),
+        (("-t", "bms", "--mock", "--variant", "no-such"), 2, "variant"),
+        (("-t", "bms", "--mock", "--set", "window_s"), 2, "write KEY=VALUE"),
+        (("-t", "bms", "--mock", "--profile", "no-such.toml"), 2, "cannot be read"),
+        (("-t", "bms", "--mock", "--html", "no-such-folder/a.html"), 2, "cannot be written"),
+        (("-t", "bms", "--mock", "--repeat", "0"), 2, "must be 1 or more"),
+        (("-t", "bms", "--mock", "--good-image", "no-such.hex"), 2, "no-such.hex"),
+        (
+            ("-t", "bms", "-i", "no-such-backend", "--good-image", str(SAMPLES / "bms.hex")),
+            2,
+            "no-such-backend",
+        ),
+    ],
+)
+def test_wrong_usage_is_told_before_anything_is_done(
+    flasher: Flasher, words: tuple[str, ...], code: int, said: str
+) -> None:
+    run = flasher("conformance", *words)
+    assert run.code == code
+    assert said in run.err
+    assert "Traceback" not in run.err
+    assert run.out == ""
+
+
+def test_a_second_image_that_is_not_smaller_is_refused(flasher: Flasher) -> None:
+    image = str(SAMPLES / "bms.hex")
+    run = flasher(*MOCK, "--good-image", image, "--second-image", image)
+    assert run.code == 2
+    assert "not smaller" in run.err
+
+
+def test_a_good_image_that_the_profile_does_not_allow_is_refused(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    profile = tmp_path / "p.toml"
+    profile.write_text("[device]\nlargest_image_bytes = 1000\n")
+    run = flasher(*MOCK, "--profile", profile)
+    assert run.code == 2
+    assert "the profile allows 1,000" in run.err
+
+
+@pytest.mark.parametrize(
+    ("words", "asked"),
+    [
+        (("-i", "socketcan"), True),
+        (("-i", "socketcan", "--bus-kwargs", "receive_own_messages=False"), False),
+        (("-i", "pcan"), None),
+    ],
+)
+def test_the_echo_of_own_frames_is_asked_for_where_there_is_one(
+    flasher: Flasher,
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    asked: bool | None,
+) -> None:
+    given: dict[str, object] = {}
+
+    def connect(_dialect: object, **bus: object) -> None:
+        given.update(bus)
+        raise BusError("not today")
+
+    monkeypatch.setattr("flasher.api.connect", connect)
+    run = flasher("conformance", "-t", "bms", "--good-image", SAMPLES / "bms.hex", *words)
+    assert run.code == ExitCode.BUS
+    assert given.get("receive_own_messages") is asked
+
+
+# -- how a run ends -------------------------------------------------------------------------------
+
+
+def test_an_interrupt_ends_the_run_with_a_report_of_what_was_run(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupt_at(monkeypatch, "RS-02")
+    run = flasher(*MOCK, "--group", "RS")
+    assert run.code == ExitCode.INTERRUPTED
+    assert "stopping: the device gets its good image back" in run.err
+    assert "RS  reset and boot version  1 pass, 4 not run" in run.out
+    assert "good image at the end: flashed and verified" in run.out
+
+
+def test_a_second_interrupt_ends_at_once(flasher: Flasher, monkeypatch: pytest.MonkeyPatch) -> None:
+    interrupt_at(monkeypatch, "RS-02", times=2)
+    run = flasher(*MOCK, "--group", "RS")
+    assert run.code == ExitCode.INTERRUPTED
+    assert "Interrupted at once" in run.err
+    assert run.out == ""
+
+
+def interrupt_at(monkeypatch: pytest.MonkeyPatch, case_id: str, times: int = 1) -> None:
+    def interrupted(bench: Bench) -> None:
+        for _ in range(times):
+            os.kill(os.getpid(), signal.SIGINT)
+        bench.wait(1.0)
+        rs.reset_again(bench)
+
+    case = CASES[case_id]
+    changed = type(case)(**{**vars(case), "run": interrupted})
+    monkeypatch.setitem(CASES, case_id, changed)
+
+
+def test_an_adapter_that_fails_gives_its_exit_code_and_the_report(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sound = MockPort.send
+
+    def send(port: MockPort, frame: object) -> None:
+        if port.now() > 3.0:
+            raise BusError("The adapter was unplugged.")
+        sound(port, frame)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(MockPort, "send", send)
+    run = flasher(*MOCK, "--group", "RS")
+    assert run.code == ExitCode.BUS
+    assert "the run is not complete" in run.err
+    assert "adapter" in run.err
+    assert "not run" in run.out
+
+
+def test_the_exit_code_says_how_a_run_ended() -> None:
+    assert exit_code(run_case(passes_once), was_stopped=False) is ExitCode.OK
+    assert exit_code(run_case(fails_once), was_stopped=False) is ExitCode.PARTIAL
+    # Stopped after the last case: nothing is missing.
+    assert exit_code(run_case(passes_once), was_stopped=True) is ExitCode.OK
+
+
+# -- the profile ----------------------------------------------------------------------------------
+
+
+def test_the_profile_that_is_printed_is_a_profile_with_every_key(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    path = tmp_path / "p.toml"
+    path.write_text(flasher("conformance", "profile").out)
+    assert load_profile(path).given == {}
+    for key in KEYS:
+        assert f"# {key.name} = " in path.read_text()
+    keys = flasher("conformance", "profile", "--json").document["keys"]
+    assert [key["key"] for key in keys] == [key.path for key in KEYS]
+
+
+def test_the_profile_of_the_mock_is_what_the_mock_is_judged_by(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    path = tmp_path / "p.toml"
+    choice = ("--set", "repeated_packet=nak_next")
+    path.write_text(flasher("conformance", "profile", "--mock", *choice).out)
+    assert load_profile(path).choice("tx_02") == "nak_next"
+    run = flasher(*MOCK, *choice, "--profile", path, "--case", "UP-04")
+    assert run.code == 0
+
+
+def test_the_guide_has_the_table_of_all_keys() -> None:
+    guide = profile_table.GUIDE.read_text(encoding="utf-8")
+    drawn = "draw it anew: python -m tests.conformance.profile_table"
+    assert guide == profile_table.with_table(guide), drawn
+    assert all(f"`{key.path}`" in guide for key in KEYS)

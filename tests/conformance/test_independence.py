@@ -1,0 +1,33 @@
+"""The contract that keeps the suite's bytes its own names every module that it has to name."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import flasher.conformance
+
+_PACKAGE = Path(flasher.conformance.__file__).parent
+_EDGES = {"mock", "real"}
+"""Where the suite meets the rest of flasher."""
+_REPORTING = {
+    *("diff", "html_report", "json_report", "junit", "listing", "summary", "traces"),
+    *("opening", "plugin", "plugin_bench", "plugin_hooks"),
+}
+"""What opens a bench, and what tells about a run: neither makes nor judges a byte."""
+
+
+def test_every_module_but_the_edges_is_under_the_contract() -> None:
+    project = tomllib.loads((_PACKAGE.parents[1] / "pyproject.toml").read_text(encoding="utf-8"))
+    contracts = project["tool"]["importlinter"]["contracts"]
+    (contract,) = (
+        one for one in contracts if "flasher.conformance.wire" in one.get("source_modules", ())
+    )
+    named = {name.removeprefix("flasher.conformance.") for name in contract["source_modules"]}
+    found = {path.stem for path in _PACKAGE.glob("*.py")} | {"cases"}
+    assert found - {"__init__"} - named <= _EDGES | _REPORTING
+    assert not named & (_EDGES | _REPORTING)
+    assert {"flasher.protocol", "flasher.host", "flasher.image", "flasher.device"} <= set(
+        contract["forbidden_modules"]
+    )
+    assert "allow_indirect_imports" not in contract

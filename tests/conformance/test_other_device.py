@@ -1,0 +1,172 @@
+"""A right device that others made: the referee of tests/peers, which shares no code with flasher.
+
+The suite has nothing to say against it once a profile tells its choices, neither when it is slow
+nor when it takes other ways that the document leaves open.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from typing import Final
+
+import pytest
+
+from flasher.bus.link import VirtualClock
+from flasher.bus.simulated import SimulatedBus
+from flasher.conformance.model import CASES, Status
+from flasher.conformance.profile import ConformanceProfile, Value
+from flasher.conformance.real import RealPort, RealSubject
+from flasher.conformance.runner import run
+from flasher.conformance.selection import Selection
+from flasher.protocol.spec import WELLING
+from tests.peers.scripted_device import ScriptedDevice
+
+_AREA_BYTES: Final = 12 * 1024
+_IMAGE: Final = b"V1r2r3_20220512." + random.Random(7).randbytes(9 * 128 - 3)
+_PROFILE: Final[dict[str, Value]] = {
+    "fr_01": "either",  # wants the whole header in its first frame
+    "fr_02": "lost",
+    "fr_04": "dropped",
+    "tx_03": "nak",
+    "tx_12": "waits",
+    "limits.window_s": 0.05,
+    "device.application_bytes": _AREA_BYTES,
+    "device.largest_image_bytes": _AREA_BYTES,
+}
+_AT_THE_BURST: Final = ("FR-07", "FR-08", "UP-04", "UP-05", "CO-01", "CO-02")
+_LONGEST: Final = ("CR-01", "CR-02", "TX-07", "BU-01", "PW-01", "SE-01")
+_BAD_PACKETS: Final = ("CR-03", "TX-01", "TX-03", "TX-04", "TX-06")
+
+
+class SlowDevice(ScriptedDevice):
+    """Writes each packet before it acknowledges it, and looks at the whole image at the end. Its
+    application thinks longer than the tool waits before it asks again.
+    """
+
+    def _ack(self, number: int, at: float) -> None:
+        super()._ack(number, at + 0.4)
+
+    def _answer(self, what: str, frames: list[bytes], at: float, number: int = 0) -> None:
+        super()._answer(what, frames, at + (6.0 if what == "complete" else 0.0), number)
+
+    def _hear_version_query(self, now: float) -> None:
+        if self.state == "application":
+            self.alarm(now + 0.25, super()._hear_version_query)
+
+
+class LateListener(ScriptedDevice):
+    """Takes the update command when the burst is over, for 0.2 s, and not before (R2)."""
+
+    def _hear_update(self, data: bytes, now: float) -> None:
+        has_application = self.completed or self.old_application_whole
+        if self.state != "announcing" or self._announced == 4 or not has_application:
+            super()._hear_update(data, now)
+
+    def _announce(self, now: float) -> None:
+        super()._announce(now)
+        if self.state == "announcing" and self._announced == 4:
+            self.clear_alarms()
+            self.alarm(now + 0.2, self._announce)
+
+
+class BurstAnnouncer(ScriptedDevice):
+    """Without an application it announces itself in bursts, a second of silence between them."""
+
+    def _announce(self, now: float) -> None:
+        whole = self.completed or self.old_application_whole
+        if self._announced == 4 and not whole:
+            self._announced = 0
+            self.alarm(now + 1.0, self._announce)
+            return
+        super()._announce(now)
+
+
+class ChoosyDevice(ScriptedDevice):
+    """Asks for a damaged packet again, and says nothing to one that makes no sense."""
+
+    def _nak(self, number: int, at: float) -> None:
+        if self.log[-1].what in ("damaged", "end"):
+            super()._nak(number, at)
+
+
+class PageDevice(ScriptedDevice):
+    """Keeps what it receives in memory until a page of 1 KiB is full, or the end has come."""
+
+    @property
+    def image(self) -> bytes:
+        written = len(self._stored) // 1024 * 1024
+        return super().image if self.completed else super().image[:written]
+
+
+def bench(device: ScriptedDevice) -> RealSubject:
+    """The device on a simulated bus, as a real one: no echoes, power by a function."""
+    clock = VirtualClock()
+    bus = SimulatedBus(WELLING.bitrate_bps, clock)
+    bus.attach(device)
+
+    def power(on: bool) -> None:
+        device.hush()
+        device.clear_alarms()
+        device.state = "off"
+        if on:
+            device.power_on(clock.now())
+
+    port = RealPort(bus.link(), clock, WELLING.bitrate_bps)
+    return RealSubject(
+        port, "bms", _IMAGE, name="another", power=power, readback=lambda: device.image
+    )
+
+
+def judged(kind: type[ScriptedDevice], cases: Sequence[str], **given: Value) -> dict[str, str]:
+    """What the suite holds against such a device: the first failure of each case."""
+    keys = {key.replace("__", "."): value for key, value in given.items()}
+    device = kind("bms", capacity_bytes=_AREA_BYTES)
+    profile = ConformanceProfile({**_PROFILE, **keys}, source="another product")
+    report = run(bench(device), profile, selection=Selection(cases=tuple(cases)))
+    assert report.final_image == "verified"
+    return {
+        result.case_id: f"{result.status.value}: {result.first_failure}"
+        for result in report.results
+        if result.status not in (Status.PASS, Status.UNSUPPORTED)
+    }
+
+
+def test_a_right_device_of_others_passes() -> None:
+    cases = [case_id for case_id in CASES if case_id not in _LONGEST]
+    assert judged(ScriptedDevice, cases) == {}
+
+
+@pytest.mark.parametrize(
+    ("kind", "cases", "choices"),
+    [
+        (
+            SlowDevice,
+            ("CR-03", "RS-01", "RS-02", "UP-03", "TX-02", "EN-01", "TM-05", "SE-01"),
+            {"en_02": "either"},
+        ),
+        (LateListener, _AT_THE_BURST, {"up_04_burst": "rejected", "limits__window_s": 0.2}),
+        (LateListener, ("UP-04",), {"up_04_burst": "either", "limits__window_s": 0.2}),
+        (BurstAnnouncer, ("RS-03",), {}),
+        (ChoosyDevice, _BAD_PACKETS, {"tx_01": "either", "tx_03": "silence"}),
+        (PageDevice, ("FR-03", "CR-03", "PW-01"), {"device__buffer_bytes": 1024}),
+    ],
+)
+def test_other_ways_that_the_document_leaves_open_pass(
+    kind: type[ScriptedDevice], cases: Sequence[str], choices: dict[str, Value]
+) -> None:
+    assert judged(kind, cases, **choices) == {}
+
+
+@pytest.mark.parametrize(
+    ("kind", "cases"),
+    [
+        (LateListener, ("FR-08", "UP-04")),
+        (ChoosyDevice, ("TX-04", "TX-06")),
+        (PageDevice, ("FR-03", "PW-01")),
+    ],
+)
+def test_a_profile_that_does_not_tell_of_them_fails_them(
+    kind: type[ScriptedDevice], cases: Sequence[str]
+) -> None:
+    assert set(judged(kind, cases)) == set(cases)

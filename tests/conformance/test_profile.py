@@ -1,0 +1,128 @@
+"""The profile: what a file may hold, and what is said of one that is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from flasher.conformance.mock import profile_of_mock
+from flasher.conformance.profile import (
+    ConformanceProfile,
+    check_deviations,
+    describe_keys,
+    load_profile,
+)
+from flasher.conformance.profile_keys import KEYS
+from flasher.device.profile import DeviceProfile
+from flasher.errors import UsageError
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "p.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_without_a_file_every_key_has_its_default() -> None:
+    profile = ConformanceProfile()
+    assert profile.choice("tx_02") == "ack"
+    assert profile.limit("erase_s") == 10.0
+    assert profile.number("largest_image_bytes") == 65535 * 128
+
+
+def test_every_default_is_allowed() -> None:
+    assert [key.path for key in KEYS if not key.accepts(key.default)] == []
+
+
+def test_a_file_gives_values_rationales_and_deviations(tmp_path: Path) -> None:
+    path = write(
+        tmp_path,
+        'tx_02 = "nak_next"\n'
+        'tx_12 = { value = "waits", rationale = "charger" }\n'
+        "[limits]\nerase_s = 2\n"
+        "[device]\nlargest_image_bytes = 0x1000\n"
+        '[deviations]\n"TX-03" = "fixed in V1.1.0"\n',
+    )
+    profile = load_profile(path)
+    assert profile.choice("tx_02") == "nak_next"
+    assert profile.choice("tx_12") == "waits"
+    assert profile.rationales == {"tx_12": "charger"}
+    assert profile.limit("erase_s") == 2.0
+    assert profile.number("largest_image_bytes") == 4096
+    assert profile.deviations == {"TX-03": "fixed in V1.1.0"}
+
+
+def test_what_is_written_reads_the_same(tmp_path: Path) -> None:
+    profile = ConformanceProfile(
+        {"tx_02": "nak_next", "limits.erase_s": 2.5, "device.versions": 3},
+        {"tx_02": 'says "so"\n'},
+        {"RS-01": "three announcements"},
+    )
+    read = load_profile(write(tmp_path, profile.to_toml()))
+    assert read.given == profile.given
+    assert read.rationales == profile.rationales
+    assert read.deviations == profile.deviations
+
+
+def test_a_written_default_profile_gives_nothing(tmp_path: Path) -> None:
+    assert load_profile(write(tmp_path, ConformanceProfile().to_toml())).given == {}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("tx_01_lost = 'nak'", "Did you mean tx_01_lost_frame?"),
+        ("[limits]\nerase = 1", "Did you mean limits.erase_s?"),
+        ("tx_02 = 'never'", "It is ack, nak_next"),
+        ("tx_02 = 1", "It is ack, nak_next"),
+        ("[limits]\nerase_s = -1", "It is seconds from 0 to 3600"),
+        ("[limits]\nerase_s = true", "It is seconds"),
+        ("[device]\nversions = 2.5", "It is a whole number from 1 to 100"),
+        ("tx_02 = { value = 'ack', why = 'x' }", "is a value, or a table"),
+        ("limits = 3", "[limits]"),
+        ("[deviations]\n'TX-3' = 'x'", "is no case"),
+        ("[deviations]\n'TX-03' = ''", "has no reason"),
+        ("[device]\napplication_bytes = 100", "more than device.application_bytes"),
+        ("[device]\nreset_data = 'RST'", "second byte"),
+        ("tx_02 = ", "no TOML"),
+    ],
+)
+def test_what_is_not_allowed_is_refused_with_its_key(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(UsageError) as raised:
+        load_profile(write(tmp_path, text))
+    assert said in str(raised.value)
+
+
+def test_a_file_that_is_not_there_is_a_mistake_of_the_user(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="cannot be read"):
+        load_profile(tmp_path / "none.toml")
+
+
+def test_a_deviation_of_a_case_that_does_not_exist_is_refused() -> None:
+    profile = ConformanceProfile(deviations={"RS-10": "why"})
+    with pytest.raises(UsageError, match="no case of the suite"):
+        check_deviations(profile, ["RS-01", "RS-02"])
+
+
+def test_the_table_of_the_documentation_has_every_key() -> None:
+    assert [path for path, *_ in describe_keys()] == [key.path for key in KEYS]
+
+
+def test_the_mocks_choices_become_the_suites() -> None:
+    device = DeviceProfile(
+        repeated_packet="nak_next",
+        update_in_transfer="ignored",
+        upgrade_in_application="silence",
+        transfer_timeout_s=2.0,
+        application_area_bytes=64 * 1024,
+        largest_image_bytes=1000,
+    )
+    profile = profile_of_mock(device)
+    assert profile.choice("tx_02") == "nak_next"
+    assert profile.choice("up_08") == "rejected"
+    assert profile.choice("up_03") == "silence"
+    assert profile.limit("pause_s") == 2.0
+    assert profile.number("largest_image_bytes") == 1000
+    # The announcement's 20 bytes take about 1.2 ms on the wire.
+    assert 0.1985 < profile.limit("window_s") < 0.199

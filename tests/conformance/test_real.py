@@ -1,0 +1,135 @@
+"""A device behind a link, as a real one is: no echoes, power and readback by commands."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from flasher.bus.link import VirtualClock
+from flasher.bus.simulated import SimulatedBus
+from flasher.conformance.mock import GOOD_IMAGE, MOCK_PROFILE, profile_of_mock
+from flasher.conformance.model import Status, Unsupported
+from flasher.conformance.real import PowerCommand, ReadbackCommand, RealPort, RealSubject
+from flasher.conformance.runner import run
+from flasher.conformance.selection import Selection
+from flasher.conformance.wire import RawFrame
+from flasher.device.model import Device
+from flasher.errors import BusError, UsageError
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import BMS, WELLING
+
+SCRIPT = "import sys; open(sys.argv[1], 'w').write(sys.argv[2])"
+
+
+def bench(*, has_power: bool) -> tuple[RealSubject, Device]:
+    clock = VirtualClock()
+    bus = SimulatedBus(WELLING.bitrate_bps, clock)
+    device = Device(BMS, bitrate_bps=WELLING.bitrate_bps, profile=MOCK_PROFILE)
+    bus.attach(device)
+
+    def power(on: bool) -> None:
+        (device.power_on if on else device.power_cut)(clock.now())
+
+    port = RealPort(bus.link(), clock, WELLING.bitrate_bps)
+    real = RealSubject(port, "bms", GOOD_IMAGE, name="a bench", power=power if has_power else None)
+    return real, device
+
+
+def test_a_device_without_power_control_passes_what_it_can() -> None:
+    real, device = bench(has_power=False)
+    report = run(real, profile_of_mock(), selection=Selection(groups=("RS", "UP")))
+    statuses = {result.case_id: result.status for result in report.results}
+    assert statuses.pop("RS-05") is Status.UNSUPPORTED
+    assert set(statuses.values()) == {Status.PASS}
+    assert report.final_image == "verified"
+    assert device.stored_image == GOOD_IMAGE
+
+
+def test_power_control_by_a_function_is_used() -> None:
+    real, _ = bench(has_power=True)
+    report = run(real, profile_of_mock(), selection=Selection(cases=("RS-05",)))
+    assert [result.status for result in report.results] == [Status.PASS]
+
+
+def test_own_frames_that_come_back_are_not_taken_for_others() -> None:
+    clock = VirtualClock()
+    bus = SimulatedBus(WELLING.bitrate_bps, clock)
+    port = RealPort(bus.link(), clock, WELLING.bitrate_bps)
+    other = bus.link()
+    frame = RawFrame(0x752, b"\x01\x02")
+    port.send(frame)
+    assert other.receive(1.0) is not None
+    for sent in (frame, RawFrame(0x752, b"\x03")):
+        other.send(Frame(*sent))
+    arrival = port.receive(2.0)
+    assert arrival is not None
+    assert arrival.frame.data == b"\x03"
+
+
+def test_one_echo_that_is_lost_does_not_hide_those_behind_it() -> None:
+    clock = VirtualClock()
+    bus = SimulatedBus(WELLING.bitrate_bps, clock)
+    port = RealPort(bus.link(), clock, WELLING.bitrate_bps, echoes=True)
+    others = bus.link()
+    frames = [RawFrame(0x752, bytes((number,))) for number in range(3)]
+    for frame in frames:
+        port.send(frame)
+    for frame in frames[1:]:
+        others.send(frame)  # type: ignore[arg-type]
+    arrivals = [port.receive(5.0) for _ in frames[1:]]
+    assert [(arrival.frame, arrival.is_echo) for arrival in arrivals if arrival] == [
+        (frame, True) for frame in frames[1:]
+    ]
+
+
+def test_what_a_link_cannot_send_is_unsupported() -> None:
+    real, _ = bench(has_power=False)
+    with pytest.raises(Unsupported):
+        real.port.send(RawFrame(0x752, b"", is_remote=True))
+    for action in (lambda: real.power(on=True), real.readback, lambda: real.bus_off(1.0)):
+        with pytest.raises(Unsupported):
+            action()
+
+
+@pytest.mark.parametrize(("on", "said"), [(True, "on"), (False, "off")])
+def test_the_power_command_says_on_or_off(tmp_path: Path, on: bool, said: str) -> None:
+    path = tmp_path / "said"
+    PowerCommand(f'{sys.executable} -c "{SCRIPT}" {path} {{on|off}}')(on)
+    assert path.read_text() == said
+
+
+@pytest.mark.parametrize(
+    ("command", "said"),
+    [
+        ("no-such-relay {on|off}", "cannot be run"),
+        (f'{sys.executable} -c "raise SystemExit(3)" {{on|off}}', "exit code 3"),
+    ],
+)
+def test_a_power_command_that_fails_is_an_error_of_the_bench(command: str, said: str) -> None:
+    with pytest.raises(BusError, match=said):
+        PowerCommand(command)(True)
+
+
+def test_a_power_command_that_hangs_is_cut() -> None:
+    command = PowerCommand(f'{sys.executable} -c "import time; time.sleep(60)" {{on|off}}', 0.1)
+    with pytest.raises(BusError, match="longer than"):
+        command(True)
+
+
+@pytest.mark.parametrize("template", ["relay on", "relay {on}", "relay '{on|off}"])
+def test_a_power_command_that_makes_no_sense_is_refused(template: str) -> None:
+    with pytest.raises(UsageError):
+        PowerCommand(template)
+
+
+def test_the_readback_command_yields_the_file_that_it_wrote() -> None:
+    assert ReadbackCommand(f'{sys.executable} -c "{SCRIPT}" {{file}} dump')() == b"dump"
+
+
+def test_a_readback_command_without_a_file_is_refused() -> None:
+    with pytest.raises(UsageError, match="names no file"):
+        ReadbackCommand("st-flash read")
+    with pytest.raises(BusError, match="wrote no file"):
+        ReadbackCommand(f'{sys.executable} -c "" {{file}}')()

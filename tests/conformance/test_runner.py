@@ -1,0 +1,406 @@
+"""How a run goes: verdicts, the known state, rescue, and ends that are not the planned one."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.cases.elsewhere import HOST_CASES, NOT_IMPLEMENTED
+from flasher.conformance.mock import MockSubject
+from flasher.conformance.model import CASES, Requirement, Status
+from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.runner import RunOptions, run
+from flasher.conformance.selection import Selection
+from flasher.conformance.wire import RawFrame
+from flasher.errors import UsageError
+
+from .bench import (
+    PROFILE,
+    Babbler,
+    DeafDevice,
+    Log,
+    RestlessDevice,
+    one,
+    run_case,
+    status_of,
+    subject,
+)
+
+
+def passes(bench: Bench) -> None:
+    bench.check(True, "something", "something")
+
+
+def fails(bench: Bench) -> None:
+    with bench.step("first"):
+        bench.check(True, "one", "one")
+    with bench.step("second"):
+        bench.check(False, "two", "three")
+
+
+def hang(bench: Bench) -> None:
+    """What a case does to a device that it kills."""
+    assert isinstance(bench.subject, MockSubject)
+    assert isinstance(bench.subject.device, DeafDevice)
+    bench.subject.device.hangs = True
+    passes(bench)
+
+
+# -- verdicts -------------------------------------------------------------------------------------
+
+
+def test_a_case_passes_when_its_checks_do() -> None:
+    report = run_case(passes)
+    assert one(report, "FR-00").status is Status.PASS
+    assert report.ok
+    assert report.final_image == "verified"
+
+
+def test_a_failed_check_is_in_the_result_with_its_step() -> None:
+    report = run_case(fails)
+    result = one(report, "FR-00")
+    assert result.status is Status.FAIL
+    failure = result.first_failure
+    assert failure is not None
+    assert (failure.step, failure.expected, failure.got) == ("second", "two", "three")
+    assert not report.ok
+
+
+def test_a_required_check_ends_the_case() -> None:
+    def stops(bench: Bench) -> None:
+        bench.require(False, "a", "b")
+        raise AssertionError
+
+    result = one(run_case(stops), "FR-00")
+    assert result.status is Status.FAIL
+    assert len(result.checks) == 1
+
+
+def test_a_case_that_judges_nothing_is_an_error_of_the_suite() -> None:
+    assert status_of(lambda _bench: None) is Status.ERROR
+
+
+def test_a_case_that_only_observes_is_information() -> None:
+    assert status_of(lambda bench: bench.info("seen")) is Status.INFO
+    assert status_of(lambda bench: bench.measure("a time", 0.1)) is Status.INFO
+
+
+def test_a_case_that_raises_is_an_error_and_the_run_goes_on() -> None:
+    def breaks(_bench: Bench) -> None:
+        raise ZeroDivisionError("division by zero")
+
+    report = run_case(breaks, before_others=True)
+    result = one(report, "FR-00")
+    assert result.status is Status.ERROR
+    assert "ZeroDivisionError" in result.note
+    assert one(report, "RS-04").status is Status.PASS
+
+
+def test_a_part_that_the_bench_cannot_do_is_said_and_the_rest_judged() -> None:
+    def partly(bench: Bench) -> None:
+        bench.unsupported("a thing", "no tool")
+        passes(bench)
+
+    assert status_of(partly) is Status.PASS
+    assert status_of(lambda bench: bench.unsupported("a thing", "no tool")) is Status.UNSUPPORTED
+
+
+def test_a_time_at_its_limit_is_inconclusive_within_the_uncertainty() -> None:
+    def timed(value_s: float) -> Status:
+        device = subject()
+        device.port.uncertainty_s = 0.002
+        action = lambda bench: bench.check_time("t", value_s, low_s=0.1, high_s=0.2)  # noqa: E731
+        return one(run_case(action, device=device), "FR-00").status
+
+    assert timed(0.15) is Status.PASS
+    assert timed(0.199) is Status.INCONCLUSIVE
+    assert timed(0.101) is Status.INCONCLUSIVE
+    assert timed(0.21) is Status.FAIL
+    assert timed(0.05) is Status.FAIL
+
+
+def test_a_documented_deviation_is_no_failure() -> None:
+    profile = ConformanceProfile(PROFILE.given, deviations={"FR-00": "by design"})
+    report = run_case(fails, profile=profile)
+    result = one(report, "FR-00")
+    assert (result.status, result.note) == (Status.DEVIATION, "by design")
+    assert report.ok
+
+
+def test_a_deviation_that_passes_is_reported_and_fails_a_strict_run() -> None:
+    profile = ConformanceProfile(PROFILE.given, deviations={"FR-00": "by design"})
+    report = run_case(passes, profile=profile)
+    assert one(report, "FR-00").status is Status.PASS
+    assert report.resolved_deviations == ("FR-00",)
+    assert report.ok
+    assert not run_case(passes, profile=profile, strict=True).ok
+
+
+# -- what a bench cannot do -----------------------------------------------------------------------
+
+
+def test_a_case_whose_requirement_is_missing_is_unsupported_with_the_reason() -> None:
+    device = subject()
+    device.has_power = False
+    report = run_case(passes, device=device, requires=frozenset({Requirement.POWER}))
+    result = one(report, "FR-00")
+    assert (result.status, result.note) == (Status.UNSUPPORTED, "needs power control")
+
+
+def test_a_case_that_software_cannot_do_is_in_the_report_with_the_reason(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(NOT_IMPLEMENTED, "BU-99", "needs an injector")
+    report = run(subject(), PROFILE, selection=Selection(cases=("BU-99",)))
+    result = one(report, "BU-99")
+    assert result.status is Status.UNSUPPORTED
+    assert "injector" in result.note
+
+
+def test_no_case_is_both_implemented_and_not() -> None:
+    assert not set(CASES) & set(NOT_IMPLEMENTED)
+    assert not set(HOST_CASES) & set(NOT_IMPLEMENTED)
+
+
+def test_what_is_not_selected_is_named() -> None:
+    report = run(subject(), PROFILE, selection=Selection(cases=("RS-04",)))
+    assert {case_id for case_id in CASES if case_id != "RS-04"} <= set(report.not_selected)
+
+
+def test_a_quick_run_leaves_out_what_is_long_unless_it_is_named() -> None:
+    assert not Selection(quick=True).has("UP-01", CASES["UP-01"].requires)
+    assert Selection(quick=True, cases=("UP-01",)).has("UP-01", CASES["UP-01"].requires)
+    assert Selection(groups=("UP",)).has("UP-01")
+    assert not Selection(groups=("UP",)).has("RS-01")
+
+
+@pytest.mark.parametrize(
+    ("selection", "said"),
+    [
+        (Selection(cases=("RS-1",)), "Did you mean RS-0"),
+        (Selection(groups=("XX",)), "There is no group"),
+    ],
+)
+def test_a_case_or_group_that_does_not_exist_is_refused(selection: Selection, said: str) -> None:
+    with pytest.raises(UsageError) as raised:
+        run(subject(), PROFILE, selection=selection)
+    assert said in str(raised.value)
+
+
+# -- the known state ------------------------------------------------------------------------------
+
+
+def test_the_device_has_the_good_image_before_a_case_and_after_it() -> None:
+    device = subject()
+
+    def erases(bench: Bench) -> None:
+        assert device.device.stored_image == device.good_image
+        bench.start_transfer(len(bench.good_image))
+        assert device.device.stored_image is None
+
+    report = run_case(erases, device=device)
+    assert device.device.stored_image == device.good_image
+    assert report.rescues == ()
+
+
+def test_a_case_that_leaves_the_power_off_is_tidied_up_after() -> None:
+    def leaves_off(bench: Bench) -> None:
+        bench.power_off()
+        passes(bench)
+
+    report = run_case(leaves_off, before_others=True)
+    assert one(report, "FR-00").status is Status.PASS
+    assert one(report, "RS-04").status is Status.PASS
+
+
+def test_a_device_that_only_a_power_cycle_brings_back_fails_the_case_and_the_run_goes_on() -> None:
+    report = run_case(hang, device=subject(DeafDevice), before_others=True)
+    result = one(report, "FR-00")
+    assert result.status is Status.FAIL
+    assert "power cycle" in (result.first_failure.got if result.first_failure else "")
+    assert [rescue.case_id for rescue in report.rescues] == ["FR-00"]
+    assert one(report, "RS-04").status is Status.PASS
+    assert report.final_image == "verified"
+
+
+@pytest.mark.parametrize("has_power", [False, True])
+def test_a_device_that_is_killed_ends_the_run_and_names_the_case(has_power: bool) -> None:
+    device = subject(DeafDevice)
+    assert isinstance(device.device, DeafDevice)
+    device.device.hangs_for_good = True
+    device.has_power = has_power
+    report = run_case(hang, device=device, before_others=True)
+    assert report.killed_by == "FR-00"
+    assert "could not be brought back" in report.stopped
+    assert one(report, "FR-00").status is Status.FAIL
+    assert one(report, "RS-04").status is Status.NOT_RUN
+    assert not report.ok
+    assert "not flashed" in report.final_image
+
+
+def test_a_device_that_is_deaf_from_the_start_ends_the_run_in_bounded_time() -> None:
+    device = subject(DeafDevice)
+    assert isinstance(device.device, DeafDevice)
+    device.device.hangs = device.device.hangs_for_good = True
+    report = run(device, PROFILE)
+    assert "before the first case" in report.stopped
+    assert {result.status for result in report.results} <= {Status.NOT_RUN, Status.UNSUPPORTED}
+    assert report.killed_by == ""
+    assert report.duration_s < 600
+
+
+def test_a_device_that_cannot_be_upgraded_is_judged_all_the_same() -> None:
+    report = run(
+        MockSubject("bms", good_image=bytes(300 * 1024)),
+        PROFILE,
+        selection=Selection(groups=("RS",)),
+    )
+    assert report.not_upgradable
+    assert report.stopped == ""
+    assert one(report, "RS-04").status in (Status.PASS, Status.FAIL)
+    assert not report.ok
+
+
+def test_an_adapter_that_is_unplugged_ends_the_run_with_a_true_report() -> None:
+    device = subject()
+
+    def unplug(bench: Bench) -> None:
+        device.bus.unplug()
+        bench.wait(1.0)
+
+    report = run_case(unplug, device=device, before_others=True)
+    assert one(report, "FR-00").status is Status.ERROR
+    assert "adapter failed in FR-00" in report.stopped
+    assert one(report, "RS-04").status is Status.NOT_RUN
+    assert not report.ok
+
+
+def test_a_node_that_babbles_beside_the_device_is_no_failure_of_it() -> None:
+    device = MockSubject("bms", others=[Babbler(0.002)])
+    report = run(device, PROFILE, selection=Selection(cases=("RS-01", "RS-04", "UP-05")))
+    assert report.ok
+
+
+def test_a_bus_that_is_taken_ends_the_run_in_bounded_time() -> None:
+    short = {f"limits.{name}_s": 0.02 for name in ("first_version", "pause", "erase", "silence")}
+    profile = ConformanceProfile({**PROFILE.given, **short})
+    device = MockSubject("bms", others=[Babbler(0.0)])
+    report = run(device, profile, selection=Selection(cases=("RS-01", "RS-04")))
+    assert "before the first case" in report.stopped
+    assert report.duration_s < 60
+
+
+def test_a_device_that_resets_at_random_is_not_taken_for_a_good_one() -> None:
+    report = run(
+        subject(RestlessDevice), PROFILE, selection=Selection(cases=("RS-01", "RS-04", "UP-05"))
+    )
+    assert not report.ok
+    assert report.duration_s < 1800
+
+
+# -- limits ---------------------------------------------------------------------------------------
+
+
+def test_a_case_that_does_not_end_is_ended() -> None:
+    def waits(bench: Bench) -> None:
+        while True:
+            bench.wait(10.0)
+
+    result = one(run_case(waits, limit_s=60.0), "FR-00")
+    assert result.status is Status.FAIL
+    assert "own limit" in result.note
+    assert result.duration_s <= 61
+
+
+def test_a_run_that_takes_too_long_reports_the_rest_as_not_run() -> None:
+    report = run(
+        subject(),
+        PROFILE,
+        selection=Selection(groups=("RS",)),
+        options=RunOptions(limit_s=5.0),
+    )
+    assert report.stopped
+    statuses = [result.status for result in report.results]
+    assert statuses[0] is Status.PASS
+    assert statuses[-1] is Status.NOT_RUN
+    assert report.final_image == "verified"
+
+
+def test_somebody_can_stop_the_run() -> None:
+    report = run(
+        subject(), PROFILE, selection=Selection(cases=("RS-01", "RS-04")), stopped=lambda: True
+    )
+    assert {result.status for result in report.results} == {Status.NOT_RUN}
+    assert report.stopped
+
+
+# -- the report -----------------------------------------------------------------------------------
+
+
+def test_the_same_seed_gives_the_same_report_and_chance_differs_by_case_and_repeat() -> None:
+    drawn: list[int] = []
+
+    def draws(bench: Bench) -> None:
+        drawn.append(bench.random.getrandbits(64))
+        passes(bench)
+
+    reports = [run_case(draws).to_dict() for _ in range(2)]
+    assert reports[0] == reports[1]
+    assert drawn[0] == drawn[1]
+
+    def twice(seed: str) -> object:
+        options = RunOptions(seed=seed, repeat=2)
+        return run(
+            subject(), PROFILE, selection=Selection(cases=("UP-01",)), options=options
+        ).to_dict()
+
+    assert twice("7") == twice("7")
+
+
+def test_a_case_is_repeated_with_a_seed_of_its_own() -> None:
+    report = run(
+        subject(), PROFILE, selection=Selection(cases=("RS-04",)), options=RunOptions(repeat=3)
+    )
+    assert [result.repeat for result in report.results] == [1, 2, 3]
+    assert len({result.seed for result in report.results}) == 3
+
+
+def test_a_listener_is_told_in_order() -> None:
+    log = Log()
+    run_case(passes, log=log)
+    assert log.lines == [
+        "run of 1",
+        "preparing before the first case",
+        "begins FR-00 1",
+        "preparing after FR-00",
+        "ends FR-00 pass",
+        "preparing at the end",
+    ]
+
+
+def test_the_report_is_json_with_everything_in_it() -> None:
+    report = run(subject(), PROFILE, selection=Selection(cases=("RS-01",)))
+    document = json.loads(json.dumps(report.to_dict()))
+    assert document["ok"] is True
+    (result,) = document["results"]
+    assert result["status"] == "pass"
+    assert result["trace"][0][1:4] == ["tx", 0x752, "55aa160742055245"]
+    assert [text["id"] for text in document["cases"]] == ["RS-01"]
+    assert document["profile"]["tx_02"] == "ack"
+
+
+def test_the_trace_keeps_the_newest_frames_and_counts_the_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("flasher.conformance.line.TRACE_FRAMES", 10)
+
+    def talks(bench: Bench) -> None:
+        for number in range(25):
+            bench.send([RawFrame(0x7FF, bytes((number,)))])
+        passes(bench)
+
+    result = one(run_case(talks), "FR-00")
+    assert [entry.frame.data[0] for entry in result.trace] == list(range(15, 25))
+    assert result.trace_dropped == 15

@@ -1,0 +1,42 @@
+"""Every wrong bootloader is caught by the case of its clause, and every case catches one.
+
+The table is docs/variants.md; the gate makes all of it anew, with `tests.variant_matrix --check`.
+"""
+
+from __future__ import annotations
+
+import pytest
+
+from flasher.conformance.model import CASES
+from flasher.device.variants import VARIANTS
+from tests.variant_matrix import Row, groups_passed, listed_rows, row_of
+
+LISTED = listed_rows()
+
+
+def test_the_table_has_every_variant() -> None:
+    assert list(LISTED) == list(VARIANTS)
+
+
+def test_every_variant_fails_the_case_of_its_clause() -> None:
+    assert [name for name, fails in LISTED.items() if VARIANTS[name].clause not in fails] == []
+
+
+def test_every_case_fails_on_a_variant_of_its_own_clause() -> None:
+    """None of them is deaf: each is right in everything but its clause."""
+    assert set(CASES) == {VARIANTS[name].clause for name in LISTED}
+
+
+def test_a_variant_fails_nothing_but_its_clause_and_what_it_says_that_it_touches() -> None:
+    for name, fails in LISTED.items():
+        variant = VARIANTS[name]
+        if variant.upgrade_works:
+            assert set(fails) <= {variant.clause, *variant.also}, name
+        passed = groups_passed(Row(name, fails, 0))
+        assert passed or not variant.upgrade_works, name
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_the_suite_says_what_the_table_says_of_the_case_of_the_clause(name: str) -> None:
+    clause = VARIANTS[name].clause
+    assert row_of(name, [clause]).fails == (clause,)

@@ -1,0 +1,152 @@
+"""The suite's own framing, held against messages that were computed elsewhere."""
+
+from __future__ import annotations
+
+import pytest
+
+from flasher.conformance import wire
+from flasher.conformance.hearing import Heard, Kind, Listener, describe
+from flasher.conformance.wire import RawFrame, Words, build, split
+
+BMS = Words("bms")
+
+
+def listen(payloads: str, can_id: int = 0x725, gap_s: float = 0.001) -> list[Heard]:
+    """What is made of frames, given in hexadecimal."""
+    listener = Listener(BMS)
+    return [
+        heard
+        for index, payload in enumerate(payloads.split())
+        for heard in listener.feed(RawFrame(can_id, bytes.fromhex(payload)), index * gap_s)
+    ]
+
+
+def said(frames: list[RawFrame]) -> str:
+    return " ".join(frame.data.hex().upper() for frame in frames)
+
+
+def test_the_crc_is_that_of_the_documents_example() -> None:
+    assert wire.message_crc(0x712, bytes.fromhex("1103220100")) == bytes.fromhex("01295122")
+
+
+@pytest.mark.parametrize(
+    ("target", "reset", "update", "end"),
+    [
+        (
+            "wmc",
+            "55AA160742055245 5345545FA4A5ABF0",
+            "55AA160DA10B574D 435F5550440F3201 007B315327F0",
+            "55AA1603A4010466 36C0FBF0",
+        ),
+        (
+            "bms",
+            "55AA160742055245 534554A41DA484F0",
+            "55AA160DA10B424D 535F5550440F3201 00327275D1F0",
+            "55AA1603A401042C 3D8A98F0",
+        ),
+        (
+            "obc",
+            "55AA160742055245 534554F28AA461F0",
+            "55AA160DA10B4F42 435F5550440F3201 00838EEA16F0",
+            "55AA1603A40104E9 8447D4F0",
+        ),
+    ],
+)
+def test_what_the_tool_says_is_byte_exact(target: str, reset: str, update: str, end: str) -> None:
+    words = Words(target)
+    assert said(words.reset()) == reset
+    assert said(words.update(78351)) == update
+    assert said(words.end()) == end
+
+
+def test_a_packet_is_18_whole_frames() -> None:
+    frames = BMS.packet(0x102, 0x304, bytes(128))
+    assert [len(frame.data) for frame in frames] == [8] * 18
+    assert frames[0].data == bytes.fromhex("55AA1687A3850102")
+    assert frames[1].data[:3] == bytes.fromhex("010403")
+
+
+@pytest.mark.parametrize(
+    ("payloads", "kind", "shown"),
+    [
+        ("55AA0C0555034143 4BB209FC46F0", Kind.FEEDBACK, "general feedback"),
+        (
+            "55AA0C0BC109424D 5356312E322E33E6 57D854F0",
+            Kind.BOOT_VERSION,
+            "boot version 'BMSV1.2.3'",
+        ),
+        ("55AA0C04C4020000 337142F8F0", Kind.REQUEST, "request transfer"),
+        ("55AA0C04C2020100 0027EA05F0", Kind.ACK, "ACK 1"),
+        ("55AA0C04C3020100 E883BC00F0", Kind.NAK, "NAK 1"),
+        ("55AA0C04C5020000 DBD514FDF0", Kind.COMPLETE, "complete"),
+    ],
+)
+def test_what_the_device_says_is_named(payloads: str, kind: Kind, shown: str) -> None:
+    (heard,) = listen(payloads)
+    assert heard.kind is kind
+    assert str(heard) == shown
+    assert (heard.first_at, heard.at) == (0.0, 0.001 * payloads.count(" "))
+
+
+@pytest.mark.parametrize(
+    "payloads",
+    [
+        "55AA0C04C2020100 0027EA05F1",  # tail
+        "55AA0C04C2020100 0027EA04F0",  # CRC
+        "11AA0C04C2020100",  # no header
+    ],
+)
+def test_what_is_damaged_is_said_to_be(payloads: str) -> None:
+    assert [heard.kind for heard in listen(payloads)] == [Kind.DAMAGED]
+
+
+def test_a_message_that_stops_midway_is_damaged_once_another_begins() -> None:
+    whole = "55AA0C04C2020100 0027EA05F0"
+    heard = listen(f"55AA0C04C2020100 {whole}", gap_s=0.2)
+    assert [one.kind for one in heard] == [Kind.DAMAGED, Kind.DAMAGED, Kind.DAMAGED]
+    listener = Listener(BMS)
+    frames = split(0x725, bytes.fromhex(whole.replace(" ", "")))
+    times = [(frames[0], 0.0), (frames[0], 0.2), (frames[1], 0.201)]
+    found = [one for frame, at in times for one in listener.feed(frame, at)]
+    assert [one.kind for one in found] == [Kind.DAMAGED, Kind.ACK]
+
+
+@pytest.mark.parametrize(
+    ("can_id", "command", "kinds"),
+    [
+        (0x720, wire.ACK, [Kind.OTHER]),  # a wrong id of the same sender
+        (0x720, 0x1402, [Kind.APPLICATION]),
+        (0x715, wire.ACK, []),  # another sender
+        (0x725, 0x1402, [Kind.OTHER]),
+    ],
+)
+def test_what_counts_depends_on_the_id(can_id: int, command: int, kinds: list[Kind]) -> None:
+    message = split(can_id, build(can_id, wire.REPORT, command, b"\1\0"))
+    assert [heard.kind for heard in listen(said(message), can_id=can_id)] == kinds
+
+
+def test_an_answer_with_other_data_is_another_message() -> None:
+    request = split(0x725, build(0x725, wire.REPORT, wire.REQUEST, b"\0\1"))
+    assert [heard.kind for heard in listen(said(request))] == [Kind.OTHER]
+
+
+def test_frames_that_are_no_payload_are_nothing() -> None:
+    listener = Listener(BMS)
+    for frame in (
+        RawFrame(0x725, b""),
+        RawFrame(0x725, b"\x55\xaa", is_extended=True),
+        RawFrame(0x725, b"\x55\xaa", is_remote=True),
+        RawFrame(0x725, b"\x55\xaa", is_error=True),
+    ):
+        assert list(listener.feed(frame, 0.0)) == []
+
+
+def test_many_messages_are_described_in_a_line() -> None:
+    (ack,) = listen("55AA0C04C2020100 0027EA05F0")
+    assert describe([ack] * 3) == "ACK 1 (3 times)"
+    assert describe([]) == "nothing"
+
+
+def test_an_image_that_names_two_versions_names_none() -> None:
+    assert wire.version_in(b"..V1r0r4_20220512..") == "V1r0r4_20220512"
+    assert wire.version_in(b"V1r0r4_20220512 V1r0r5_20220512") is None

@@ -1,0 +1,89 @@
+"""What the suite says about the mock and about wrong devices, in short."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import flasher.conformance.cases  # noqa: F401  registers the cases
+from flasher.conformance.bench import Bench
+from flasher.conformance.execute import execute
+from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
+from flasher.conformance.model import CASES, Case, Status
+from flasher.conformance.profile import ConformanceProfile, Value
+from flasher.conformance.selection import what_is_missing
+from flasher.device.variants import VARIANTS
+
+SMALL_AREA = {"application_area_bytes": 34 * 1024}
+"""272 packets: enough for all but images beyond 64 KiB, and quickly filled."""
+
+
+def verdicts(
+    cases: Sequence[str],
+    variant: str | None = None,
+    *,
+    target: str = "bms",
+    states: Mapping[str, Value] | None = None,
+    with_second_image: bool = True,
+    with_power: bool = True,
+    **choices: Any,
+) -> dict[str, Status]:
+    """The verdict on each case of a device with these choices, or of that variant.
+
+    The profile states what the device chooses, and `states` besides, or instead.
+    """
+    profile = replace(MOCK_PROFILE, **(SMALL_AREA | choices))
+    make_device = None if variant is None else variant_maker(variant)
+    subject = MockSubject(target, profile=profile, make_device=make_device)
+    if not with_second_image:
+        subject.second_image = None
+    if not with_power:
+        subject.has_power = False
+    # A variant's own choices are part of what it is.
+    stated = profile_of_mock(subject.device.profile)
+    judged_by = replace(stated, given={**stated.given, **(states or {})})
+    return {case_id: _verdict(CASES[case_id], subject, judged_by) for case_id in cases}
+
+
+def _verdict(case: Case, subject: MockSubject, profile: ConformanceProfile) -> Status:
+    """As a run of this case alone, but for what a run does afterwards."""
+    if what_is_missing(case, subject, profile):
+        return Status.UNSUPPORTED
+    bench = Bench.for_case(case, subject, profile, f"1/{case.id}/1", lambda: False)
+    _put_image(subject)
+    bench.wait(1.0)
+    bench.forget()
+    return execute(case, bench).status
+
+
+def _put_image(subject: MockSubject) -> None:
+    """As a debugger does it: no frame is spent on it."""
+    image, store = subject.good_image, subject.device.store
+    subject.power(on=False)
+    if store.image() != image:
+        for operation in store.erasing(len(image)):
+            if operation.data is None:
+                store.flash.erase_page(operation.address)
+        store.load(image)
+    subject.power(on=True)
+
+
+def not_passed(*cases: str, **kwargs: Any) -> list[str]:
+    """The cases that are not passed."""
+    found = verdicts(cases, **kwargs)
+    return [case_id for case_id, status in found.items() if status is not Status.PASS]
+
+
+def cases_of(group: str) -> list[str]:
+    """The cases of a group."""
+    return [case_id for case_id, case in CASES.items() if case.group == group]
+
+
+def variants_of(group: str) -> dict[str, str]:
+    """The variants of a group: name to the case that they fail."""
+    return {
+        name: variant.clause
+        for name, variant in VARIANTS.items()
+        if variant.clause.partition("-")[0] == group
+    }
