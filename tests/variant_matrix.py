@@ -1,0 +1,139 @@
+"""The matrix of wrong bootloaders and cases: which case catches which.
+
+    python -m tests.variant_matrix            runs the suite on every variant, writes the table
+    python -m tests.variant_matrix --check    the same, and compares: exit code 1 if it differs
+
+The table is docs/variants.md. The gate runs the check; a test runs each variant on the cases of its
+own clause only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import sys
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from flasher.conformance.cases.elsewhere import NOT_IMPLEMENTED
+from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
+from flasher.conformance.model import CASES, Status
+from flasher.conformance.runner import run
+from flasher.conformance.selection import Selection, in_order
+from flasher.device.variants import VARIANTS, Variant
+
+PATH: Final = Path(__file__).parents[1] / "docs" / "variants.md"
+TARGET: Final = "bms"
+AREA_BYTES: Final = 80 * 1024
+"""Smaller than the mock's own, since the largest image is sent often; larger than 16 bits tell."""
+_CAUGHT: Final = frozenset({Status.FAIL, Status.ERROR})
+
+_INTRODUCTION: Final = """\
+# Wrong bootloaders, and the cases that catch them
+
+Made by `python -m tests.variant_matrix`, which runs the whole suite on every variant of the device
+model; the gate runs it again and compares. `flasher mock --variant NAME` serves as one,
+`flasher conformance --mock --variant NAME -t bms` runs the suite on it.
+
+A variant violates one clause and is right in everything else. What it fails beside the case of
+its clause has the same stimulus in it; where no upgrade works, most cases that need one fail.
+"""
+
+
+class Row(NamedTuple):
+    """What the suite says of a variant: the cases that it fails, in the order of the catalogue."""
+
+    variant: str
+    fails: tuple[str, ...]
+    not_run: int
+    """Cases that were not run, since the device could not be brought back."""
+
+
+def row_of(name: str, cases: Sequence[str] = ()) -> Row:
+    """Run the suite, or these cases of it, on a variant."""
+    variant = VARIANTS[name]
+    changes: dict[str, Any] = {"application_area_bytes": AREA_BYTES, **variant.profile}
+    device = dataclasses.replace(MOCK_PROFILE, **changes)
+    subject = MockSubject(TARGET, profile=device, make_device=variant_maker(name))
+    report = run(subject, profile_of_mock(device), selection=Selection(cases=tuple(cases)))
+    failed = {result.case_id for result in report.results if result.status in _CAUGHT}
+    return Row(name, tuple(in_order(failed)), report.count(Status.NOT_RUN))
+
+
+def all_rows(jobs: int | None = None) -> list[Row]:
+    """Every variant, on as many processes as there are cores."""
+    with ProcessPoolExecutor(jobs or os.cpu_count()) as pool:
+        return list(pool.map(row_of, VARIANTS))
+
+
+def groups_passed(row: Row) -> str:
+    """The groups of which no case fails."""
+    failed = {case.partition("-")[0] for case in row.fails}
+    groups = dict.fromkeys(case.partition("-")[0] for case in in_order(CASES))
+    return " ".join(group for group in groups if group not in failed)
+
+
+def document(rows: Iterable[Row]) -> str:
+    """docs/variants.md."""
+    rows = list(rows)
+    lines = [_INTRODUCTION, "## By variant", ""]
+    lines += [
+        "| variant | clause | fails | passes the groups | what it does wrong |",
+        "|---|---|---|---|---|",
+    ]
+    for row in rows:
+        variant = VARIANTS[row.variant]
+        fails = _failed_text(row, variant)
+        lines.append(
+            f"| {row.variant} | {variant.clause} | {fails} | {groups_passed(row)} "
+            f"| {variant.summary} |"
+        )
+    lines += ["", "## By case", "", "| case | title | caught |", "|---|---|---|"]
+    for case_id in in_order(CASES):
+        caught = ", ".join(row.variant for row in rows if case_id in row.fails)
+        lines.append(f"| {case_id} | {CASES[case_id].title} | {caught} |")
+    if NOT_IMPLEMENTED:
+        lines += ["", "## Not done in software", ""]
+        lines += [f"- {case_id}: {reason}" for case_id, reason in NOT_IMPLEMENTED.items()]
+    return "\n".join([*lines, ""])
+
+
+def _failed_text(row: Row, variant: Variant) -> str:
+    cases = [f"**{case}**" if case == variant.clause else case for case in row.fails]
+    rest = [f"{row.not_run} not run"] if row.not_run else []
+    return ", ".join([*cases, *rest])
+
+
+def listed_rows() -> dict[str, tuple[str, ...]]:
+    """The variants of docs/variants.md with the cases that catch each."""
+    rows = {}
+    by_variant = PATH.read_text(encoding="utf-8").partition("## By case")[0]
+    for line in by_variant.splitlines():
+        cells = [cell.strip() for cell in line.strip("|").split("|")]
+        if line.startswith("| ") and cells[0] != "variant":
+            cases = (case.strip("* ") for case in cells[2].split(","))
+            rows[cells[0]] = tuple(case for case in cases if case in CASES)
+    return rows
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Write the table, or compare it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--check", action="store_true", help="compare with docs/variants.md")
+    parser.add_argument("--jobs", type=int, help="processes (default: as many as cores)")
+    options = parser.parse_args(words)
+    text = document(all_rows(options.jobs))
+    if not options.check:
+        PATH.write_text(text, encoding="utf-8")
+        return 0
+    if PATH.read_text(encoding="utf-8") == text:
+        return 0
+    sys.stderr.write(f"{PATH.name} is not what the suite says: python -m tests.variant_matrix\n")
+    return 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
