@@ -1,0 +1,103 @@
+"""The certificate of a unit: one HTML page to print, made of the records and nothing else.
+
+A unit that did not pass gets a page as well, and the page says so in its first line.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from typing import Final
+
+from flasher.errors import UsageError
+from flasher.report.base import Status, render_page
+from flasher.station.records.model import (
+    Measurement,
+    RunDetails,
+    RunKind,
+    RunState,
+    UnitLife,
+    UnitState,
+)
+
+EARLIER_SHOWN: Final = 50
+"""Earlier runs in the table; the page says how many more there are."""
+_WORDS: Final = {
+    UnitState.PASS: (Status.GOOD, "PASS", "This unit passed."),
+    UnitState.FAIL: (Status.BAD, "FAIL", "This unit did not pass: it is no good unit."),
+    UnitState.RECHECK: (
+        Status.WARNING,
+        "RECHECK",
+        "The last run of this unit did not come to a result. It has to be checked.",
+    ),
+    UnitState.RUNNING: (Status.NEUTRAL, "RUNNING", "This unit is being made: no result yet."),
+    UnitState.NEW: (Status.NEUTRAL, "NEW", "Nothing was done to this unit."),
+}
+_RUN_STATUS: Final = {
+    RunState.PASS: Status.GOOD,
+    RunState.FAIL: Status.BAD,
+    RunState.RUNNING: Status.NEUTRAL,
+}
+
+
+def render_certificate(life: UnitLife, made_at: datetime) -> str:
+    """The page. Raises UsageError for a unit without any run."""
+    last = life.last
+    if last is None:
+        raise UsageError(f"Nothing was done to {life.serial}: there is nothing to certify.")
+    status, word, sentence = _WORDS[life.state]
+    if life.is_virtual:
+        status = Status.WARNING  # never the colour of a product that passed
+    earlier = life.runs[:-1]
+    return render_page(
+        "certificate.html",
+        life=life,
+        last=last,
+        status=status,
+        word=word,
+        sentence=sentence,
+        is_virtual=life.is_virtual,
+        is_golden=last.run.kind is RunKind.GOLDEN,
+        measurements=[
+            (step, each, _limits(each), _verdict(each))
+            for step in last.steps
+            for each in step.measurements
+        ],
+        earlier=[(details.run, _run_status(details)) for details in earlier[-EARLIER_SHOWN:]],
+        earlier_left_out=max(0, len(earlier) - EARLIER_SHOWN),
+        moment=_moment,
+        number=_number,
+        made_at=_moment(made_at),
+    )
+
+
+def _run_status(details: RunDetails) -> Status:
+    return _RUN_STATUS.get(details.run.state, Status.WARNING)
+
+
+def _limits(each: Measurement) -> str:
+    """The limits in words."""
+    if each.value is None:
+        return each.expected if each.expected is not None else "any"
+    bounds = [
+        f"{word} {_number(bound)}"
+        for word, bound in (("from", each.low), ("to", each.high))
+        if bound is not None
+    ]
+    return f"{' '.join(bounds)} {each.unit}".strip() if bounds else "any"
+
+
+def _verdict(each: Measurement) -> str:
+    """Whether it is within its limits, where it has any."""
+    if not each.is_within:
+        return "outside"
+    has_limits = any(limit is not None for limit in (each.low, each.high, each.expected))
+    return "within" if has_limits else ""
+
+
+def _number(value: float) -> str:
+    """To a thousandth: times are not measured closer."""
+    return f"{round(value, 3):,.10g}"
+
+
+def _moment(moment: datetime | None) -> str:
+    return "" if moment is None else f"{moment:%Y-%m-%d %H:%M:%S} UTC"

@@ -1,0 +1,157 @@
+"""Every way in which a run can end: a stable code, whose fault it is, and what the operator does.
+
+The codes stand in the records for years: a code is never given another meaning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final, NamedTuple
+
+from flasher.host.table import Ending
+from flasher.station.records.model import RunState
+
+_NEXT: Final = "Take the unit out."
+_REPAIR: Final = "Put the unit aside as bad, with this code on its tag."
+_TECHNICIAN: Final = "Call the technician; the unit is not judged."
+
+
+class Code(NamedTuple):
+    """A code of the records. `may_retry` is False where another try cannot help or would harm."""
+
+    name: str
+    outcome: RunState
+    meaning: str
+    action: str
+    may_retry: bool = True
+
+
+def _fail(name: str, meaning: str, action: str = _REPAIR, *, may_retry: bool = True) -> Code:
+    return Code(name, RunState.FAIL, meaning, action, may_retry)
+
+
+def _error(name: str, meaning: str, action: str = _TECHNICIAN, *, may_retry: bool = False) -> Code:
+    return Code(name, RunState.ERROR, meaning, action, may_retry)
+
+
+OK: Final = Code(
+    "OK", RunState.PASS, "done and verified as the recipe asks", _NEXT, may_retry=False
+)
+OPERATOR_ABORT: Final = Code(
+    "OPERATOR_ABORT",
+    RunState.ABORTED,
+    "a person stopped the run",
+    "Scan the unit again to finish it.",
+    may_retry=False,
+)
+
+# -- the unit -------------------------------------------------------------------------------------
+
+NO_ANSWER: Final = _fail(
+    "NO_ANSWER", "the unit does not answer", "Check its plug and its key, then scan it again."
+)
+WRONG_HARDWARE: Final = _fail(
+    "WRONG_HARDWARE",
+    "the hardware is not one that the recipe lists",
+    "Put the unit aside: it belongs to another recipe.",
+    may_retry=False,
+)
+OLD_VERSION: Final = _fail(
+    "OLD_VERSION",
+    "the version that runs now must not be replaced by this one",
+    "Put the unit aside: it belongs to another recipe.",
+    may_retry=False,
+)
+IN_USE: Final = _fail(
+    "IN_USE", "the battery gives current", "Switch its loads off, then scan again."
+)
+NOT_FOR_DEVICE: Final = _fail(
+    "NOT_FOR_DEVICE",
+    "the image is not meant for this device, or its bootloader is not the right one",
+    "Put the unit aside: it belongs to another recipe.",
+    may_retry=False,
+)
+NO_BOOTLOADER: Final = _fail("NO_BOOTLOADER", "its bootloader does not announce itself")
+ERASE_FAILED: Final = _fail("ERASE_FAILED", "the bootloader does not begin the transfer")
+TRANSFER_FAILED: Final = _fail("TRANSFER_FAILED", "the transfer failed")
+REFUSED: Final = _fail("REFUSED", "the device refused the image at the end", may_retry=False)
+UNCONFIRMED: Final = _fail("UNCONFIRMED", "the final answer of the bootloader never came")
+OTHER_VERSION: Final = _fail("OTHER_VERSION", "the device runs another version than it was given")
+NOT_RUNNING: Final = _fail("NOT_RUNNING", "the new application does not answer")
+MEMORY_DIFFERS: Final = _fail("MEMORY_DIFFERS", "the memory differs from the image")
+WRITE_FAILED: Final = _fail("WRITE_FAILED", "the device does not confirm a write")
+WRITE_DIFFERS: Final = _fail("WRITE_DIFFERS", "a field reads back differently than written")
+CHANGED: Final = _fail("CHANGED", "a field that must not change has changed", may_retry=False)
+UNCHANGED_UNKNOWN: Final = _fail(
+    "UNCHANGED_UNKNOWN",
+    "a field that must not change could not be read before the first write",
+    "Put the unit aside: nothing was written, but it has no application to read from.",
+    may_retry=False,
+)
+LIMIT: Final = _fail("LIMIT", "a measurement is out of its limits")
+TOO_SLOW: Final = _fail("TOO_SLOW", "a step took longer than the recipe allows")
+NO_RESTART: Final = _fail("NO_RESTART", "the device did not restart")
+
+# -- the station ----------------------------------------------------------------------------------
+
+WRONG_UNIT: Final = _error(
+    "WRONG_UNIT",
+    "the unit's own serial number is not the one on the label",
+    "Compare label and unit: scan the label of the unit that is in the socket.",
+)
+TWO_DEVICES: Final = _error(
+    "TWO_DEVICES", "two devices of one kind answer", "Connect one unit to this socket only."
+)
+SECOND_TOOL: Final = _error(
+    "SECOND_TOOL", "a second tool speaks on the bus", "Disconnect the other tool, then scan again."
+)
+BUS: Final = _error(
+    "BUS",
+    "the adapter or the bus failed",
+    "Check the plugs of adapter and unit, then scan again.",
+    may_retry=True,
+)
+POWER: Final = _error("POWER", "the power command failed", may_retry=True)
+CANNOT_VERIFY: Final = _error(
+    "CANNOT_VERIFY", "a target cannot be asked, so it cannot be verified without a new flash"
+)
+RECIPE: Final = _error("RECIPE", "the recipe does not fit its own images or this unit")
+RECORD_NOT_SAVED: Final = _error("RECORD_NOT_SAVED", "the records could not be written")
+TRACE_NOT_SAVED: Final = _error("TRACE_NOT_SAVED", "the trace of the bus could not be written")
+PROCESS_DIED: Final = _error(
+    "PROCESS_DIED", "the process of the socket ended", "Scan the unit again; it is not judged."
+)
+PROCESS_HUNG: Final = _error(
+    "PROCESS_HUNG", "the process of the socket hung", "Scan the unit again; it is not judged."
+)
+INTERNAL: Final = _error("INTERNAL", "an internal error: a bug of flasher")
+
+CODES: Final[Mapping[str, Code]] = {
+    value.name: value for value in tuple(globals().values()) if isinstance(value, Code)
+}
+"""Every code by its name."""
+
+OF_ENDING: Final[Mapping[Ending, Code]] = {
+    Ending.UNCONFIRMED: UNCONFIRMED,
+    Ending.OTHER_VERSION: OTHER_VERSION,
+    Ending.REFUSED: REFUSED,
+    Ending.NO_BOOT_VERSION: NO_BOOTLOADER,
+    Ending.NO_ANNOUNCEMENT: NO_BOOTLOADER,
+    Ending.NO_REQUEST: ERASE_FAILED,
+    Ending.UNHEARING: ERASE_FAILED,
+    Ending.WRONG_DEVICE: NOT_FOR_DEVICE,
+    Ending.BOOT_TOO_OLD: NOT_FOR_DEVICE,
+    Ending.NOT_FOR_DEVICE: NOT_FOR_DEVICE,
+    Ending.TWO_DEVICES: TWO_DEVICES,
+    Ending.IN_USE: IN_USE,
+    Ending.SECOND_TOOL: SECOND_TOOL,
+    Ending.PACKET_FAILED: TRANSFER_FAILED,
+    Ending.RESTARTED: TRANSFER_FAILED,
+    Ending.BROKEN_PROTOCOL: TRANSFER_FAILED,
+    Ending.OUT_OF_TIME: TOO_SLOW,
+    Ending.CANCELLED: OPERATOR_ABORT,
+    Ending.UP_TO_DATE: RECIPE,
+}
+"""What a bad end of an upgrade is in the records."""
+NEED_POWER_CYCLE: Final = frozenset({NO_BOOTLOADER, ERASE_FAILED, TRANSFER_FAILED})
+"""After these a power cycle may reach the bootloader again."""

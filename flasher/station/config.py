@@ -1,0 +1,172 @@
+"""The station's own file: its name, where its records are, and its sockets.
+
+    name = "line-2"
+    records = "records.sqlite"
+
+    [[socket]]
+    name = "A"
+    interface = "slcan"
+    serial_number = "A50285BI"
+    power = "relay 3 {on|off}"
+
+    [[socket]]
+    name = "B"
+    mock = { bad = 0.1, slow = 0.1, seed = 7 }
+
+A socket finds its adapter by the adapter's serial number or by its place on the USB, never by the
+order in which the computer counted them (`adapters.resolve`).
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections import Counter
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from pydantic import Field, field_validator, model_validator
+
+from flasher.errors import UsageError
+from flasher.station.recipe import Part, Words
+from flasher.station.recipe_file import parse, read_file
+from flasher.station.records.database import DEFAULT_LOCK_TIMEOUT_S
+
+SOCKETS_MAX: Final = 64
+_WHAT: Final = "station file"
+_SWITCH: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
+_NOT_FOR_BUS: Final = frozenset({"interface", "channel", "serial_number", "usb_path"})
+Share = Annotated[float, Field(ge=0, le=1)]
+BusValue = bool | int | float | str
+
+
+class MockUnits(Part):
+    """What virtual units a socket without an adapter meets: shares of 1 of all units."""
+
+    bad: Share = 0.0
+    """They take the image, and then do not run it, or refuse it."""
+    slow: Share = 0.0
+    dead: Share = 0.0
+    """They never answer."""
+    seed: int = Field(default=1, ge=0)
+    """The same seed and serial number is the same unit."""
+
+    @model_validator(mode="after")
+    def _check_sum(self) -> MockUnits:
+        if self.bad + self.slow + self.dead > 1:
+            raise ValueError("bad, slow and dead are more than all units together")
+        return self
+
+
+class SocketConfig(Part):
+    """One socket: an adapter of its own, or virtual units."""
+
+    name: Words
+    interface: str = ""
+    """As python-can names it."""
+    channel: str = ""
+    serial_number: str = ""
+    """Of the adapter; it finds the channel."""
+    usb_path: str = ""
+    """Place of the adapter on the USB, as "1-1.4"; for adapters without a serial number."""
+    bus: dict[str, BusValue] = Field(default_factory=dict)
+    """Further keywords of python-can's bus."""
+    power: str = ""
+    """A command that switches the unit's power, with `{on|off}` for the two words."""
+    mock: MockUnits | None = None
+
+    @field_validator("channel", mode="before")
+    @classmethod
+    def _number_is_text(cls, value: Any) -> Any:
+        return str(value) if type(value) is int else value
+
+    @field_validator("power")
+    @classmethod
+    def _check_power(cls, value: str) -> str:
+        if value:
+            power_command(value, on=True)
+        return value
+
+    @model_validator(mode="after")
+    def _check_adapter(self) -> SocketConfig:
+        if self.mock is not None:
+            named = ("interface", "channel", "serial_number", "usb_path", "bus")
+            given = [key for key in named if getattr(self, key)]
+            if given:
+                raise ValueError(f"a mock socket has no adapter: leave {', '.join(given)} out")
+            return self
+        if not self.interface:
+            raise ValueError("it has neither an interface nor mock")
+        if self.serial_number and self.usb_path:
+            raise ValueError("give serial_number or usb_path, not both")
+        if not (self.channel or self.serial_number or self.usb_path):
+            raise ValueError("it has no channel, serial_number or usb_path to find its adapter by")
+        taken = sorted(_NOT_FOR_BUS & self.bus.keys())
+        if taken:
+            raise ValueError(f"{taken[0]} stands beside bus, not in it")
+        return self
+
+
+class StationConfig(Part):
+    """The whole file."""
+
+    name: Words = "station"
+    records: str = "records.sqlite"
+    """A file beside this one, or an SQLAlchemy URL."""
+    files: str = ""
+    """The folder of the attachments; empty: beside the file of the records."""
+    lock_timeout_s: float = Field(default=DEFAULT_LOCK_TIMEOUT_S, gt=0, le=60)
+    """How long a record waits for another program that holds the database."""
+    socket: tuple[SocketConfig, ...] = Field(min_length=1, max_length=SOCKETS_MAX)
+
+    @model_validator(mode="after")
+    def _check_sockets(self) -> StationConfig:
+        _no_two("name", [socket.name for socket in self.socket])
+        real = [socket for socket in self.socket if socket.mock is None]
+        for first in ("serial_number", "usb_path"):
+            named = [socket for socket in real if getattr(socket, first)]
+            _no_two(first, [f"{getattr(s, first)} {s.channel}".strip() for s in named])
+        plain = [s for s in real if not (s.serial_number or s.usb_path)]
+        _no_two("adapter", [f"{s.interface} {s.channel}" for s in plain])
+        return self
+
+
+def _no_two(what: str, values: list[str]) -> None:
+    twice = [value for value, count in Counter(values).items() if count > 1]
+    if twice:
+        raise ValueError(f"two sockets have the same {what} {twice[0]!a:.60}")
+
+
+def load_config(path: Path) -> StationConfig:
+    """The station's file. Relative places in it are beside it. Raises UsageError (RecipeError)
+    naming every key that is wrong.
+    """
+    config = parse(StationConfig, path, read_file(path, _WHAT), _WHAT)
+    here = path.parent
+    changes: dict[str, str] = {}
+    if "://" not in config.records:
+        changes["records"] = str(here / config.records)
+    if config.files:
+        changes["files"] = str(here / config.files)
+    return config.model_copy(update=changes)
+
+
+def mock_config(
+    count: int, units: MockUnits, *, name: str = "mock", records: str = "records.sqlite"
+) -> StationConfig:
+    """A station of virtual units: sockets 1 to `count`. Raises UsageError for a wrong count."""
+    if not 1 <= count <= SOCKETS_MAX:
+        raise UsageError(f"A station has 1 to {SOCKETS_MAX} sockets, not {count}.")
+    sockets = tuple(SocketConfig(name=str(number + 1), mock=units) for number in range(count))
+    return StationConfig(name=name, records=records, socket=sockets)
+
+
+def power_command(template: str, *, on: bool) -> list[str]:
+    """The words of a power command, to be run without a shell. Raises ValueError."""
+    words = shlex.split(template)
+    switches = [word for word in words if _SWITCH.search(word)]
+    if not words or len(switches) != 1 or len(_SWITCH.findall(switches[0])) != 1:
+        raise ValueError('power has one {on|off}, as in "relay 3 {on|off}"')
+    if _SWITCH.search(words[0]):
+        raise ValueError("power begins with the program, and {on|off} stands behind it")
+    return [_SWITCH.sub(lambda found: found[1 if on else 2], word) for word in words]

@@ -1,0 +1,174 @@
+"""What a station and the process of a socket say to each other: frozen dataclasses, on a pipe."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flasher.station.config import MockUnits
+from flasher.station.records.model import WriteId
+from flasher.station.run_model import RunNote, RunOrder, RunResult, StepReport
+
+# -- how a process is set up ----------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class VirtualUnits:
+    """What virtual units a socket meets, and with which serial numbers."""
+
+    units: MockUnits
+    first_number: int = 1
+    number_step: int = 1
+    speed: float = 1.0
+    """Times as fast as a real bus; 0 takes no time at all."""
+    arrive_after_s: float = 1.0
+    """From an empty socket to the next unit."""
+    leave_after_s: float = 1.0
+    """From the end of a run to the unit's leaving."""
+    count: int | None = None
+    """Units in all; None: without end."""
+
+
+@dataclass(frozen=True)
+class WorkerSetup:
+    """Everything that the process of a socket needs; nothing of it changes while it lives."""
+
+    socket: str
+    recipe: Path
+    files: Mapping[str, str]
+    """The recipe's files, each with its SHA-256: the process must work with the very same."""
+    bus: Mapping[str, Any] | None
+    """python-can's keywords; None: virtual units."""
+    virtual: VirtualUnits | None = None
+    power: str = ""
+    silence_s: float = 2.0
+    """A unit of which nothing was heard for so long is out."""
+    probe_s: float = 0.5
+    """How often a unit is asked whether it is there."""
+    reply_limit_s: float = 60.0
+    """How long it waits until the station has something on disk."""
+
+
+# -- from the station -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Begin:
+    """Run this unit; the trace goes to `trace`."""
+
+    order: RunOrder
+    trace: Path
+
+
+@dataclass(frozen=True)
+class Reply:
+    """The answer to an `Ask`. `error` is empty when it is on disk."""
+
+    number: int
+    write_id: WriteId | None = None
+    error: str = ""
+
+
+@dataclass(frozen=True)
+class Abort:
+    """A person stops the run."""
+
+
+@dataclass(frozen=True)
+class Quit:
+    """End; a run that goes on is stopped first."""
+
+
+ToWorker = Begin | Reply | Abort | Quit
+
+# -- from the process -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Ready:
+    """The adapter is open. `sees_units` is False when a unit that is there may say nothing."""
+
+    adapter: str
+    sees_units: bool
+
+
+@dataclass(frozen=True)
+class Beat:
+    """It is alive; said at least every second."""
+
+
+@dataclass(frozen=True)
+class AdapterDown:
+    """The adapter failed; it is tried again and again."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class PresenceChanged:
+    """A unit came or went. `label` is what a virtual unit has on it."""
+
+    is_there: bool
+    how: str = ""
+    label: str = ""
+
+
+@dataclass(frozen=True)
+class Intent:
+    """Note an act before it is done."""
+
+    target: str
+    what: str
+    value: str
+
+
+@dataclass(frozen=True)
+class Done:
+    """Note that it is done."""
+
+    write_id: WriteId
+    read_back: str | None
+
+
+@dataclass(frozen=True)
+class Ask:
+    """Put this on disk, then reply; the process does nothing meanwhile."""
+
+    number: int
+    what: Intent | Done | StepReport
+
+
+@dataclass(frozen=True)
+class Note:
+    """What goes on; nothing depends on it."""
+
+    note: RunNote
+
+
+@dataclass(frozen=True)
+class TraceFile:
+    """The closed trace of a run."""
+
+    path: Path
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Finished:
+    """The run is over; nothing of its outcome is on disk yet."""
+
+    result: RunResult
+    trace: TraceFile | None
+    """None when it could not be written."""
+
+
+@dataclass(frozen=True)
+class CannotWork:
+    """It ends, because it cannot do its work: a recipe that changed, a setting that is wrong."""
+
+    reason: str
+
+
+FromWorker = Ready | Beat | AdapterDown | PresenceChanged | Ask | Note | Finished | CannotWork

@@ -1,0 +1,280 @@
+"""What a recipe says: how one product is made, as data. `recipe_file` reads it, `recipe_check`
+holds it against its images and the protocol.
+
+    name = "Battery 36 V, line 2"
+    part = "BAT-36-10"
+    revision = "4"
+
+    [serial_number]
+    pattern = 'W(?P<year>[0-9]{2})(?P<week>[0-9]{2})[0-9]{3}'
+    example = "W2605002"
+
+    [[target]]
+    target = "bms"
+    image = "bms.hex"
+    sha256 = "5084b23b..."
+
+    [[write]]
+    target = "bms"
+    item = "serial-number"
+    values = ["{serial}"]
+"""
+
+from __future__ import annotations
+
+from datetime import time
+from enum import StrEnum
+from typing import Annotated, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from flasher.protocol.spec import TARGETS, Target, find_target
+from flasher.station import checkdigit
+from flasher.station.pattern import TEXT_MAX, pattern_of
+from flasher.station.steps import StepName, Verified
+
+_TIME_MAX_S: Final = 3600.0
+_TRIES_MAX: Final = 10
+
+Words = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
+Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+Seconds = Annotated[float, Field(gt=0, le=_TIME_MAX_S)]
+
+
+class Part(BaseModel):
+    """A table of a recipe: no unknown keys, nothing converted behind one's back, never changed."""
+
+    # Texts of TOML become words of ours (enums), but no number becomes a text or the reverse.
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+def _target_name(value: str) -> str:
+    target = find_target(value)
+    if target is None:
+        raise ValueError(f"there is no target {value!a:.20}; there are: {', '.join(TARGETS)}")
+    return target.name
+
+
+class TargetPart(Part):
+    """A table for one of the targets."""
+
+    target: str
+
+    _check_target = field_validator("target")(_target_name)
+
+    @property
+    def device(self) -> Target:
+        """The target itself."""
+        return TARGETS[self.target]
+
+
+class SerialNumber(Part):
+    """How serial numbers look."""
+
+    pattern: str
+    example: str = Field(min_length=1, max_length=TEXT_MAX)
+    """A good serial number; `station check` tries the whole recipe with it."""
+    check_digit: str = ""
+    """A method of `checkdigit.CHECKS`; empty: none."""
+    check_group: str = ""
+    """The group that the check digit is of; empty: the whole serial number."""
+    lot_group: str = ""
+    """The group that is the lot; empty: the lot does not stand in the serial number."""
+    number_group: str = ""
+    """The group with the running number."""
+    number_min: int = Field(default=0, ge=0)
+    number_max: int | None = Field(default=None, ge=0)
+
+    @field_validator("pattern")
+    @classmethod
+    def _check_pattern(cls, value: str) -> str:
+        pattern_of(value)
+        return value
+
+    @field_validator("check_digit")
+    @classmethod
+    def _check_method(cls, value: str) -> str:
+        if value and value not in checkdigit.CHECKS:
+            raise ValueError(f"it is one of {', '.join(checkdigit.CHECKS)}")
+        return value
+
+    @model_validator(mode="after")
+    def _check_example(self) -> SerialNumber:
+        groups = pattern_of(self.pattern).groups
+        for key in ("check_group", "lot_group", "number_group"):
+            name = getattr(self, key)
+            if name and name not in groups:
+                raise ValueError(f"{key} {name!a:.40} is no group of the pattern")
+        if not self.number_group and (self.number_min or self.number_max is not None):
+            raise ValueError("number_min and number_max need number_group")
+        self.read(self.example)
+        return self
+
+    def read(self, serial: str) -> dict[str, str]:
+        """The groups of a serial number. Raises ValueError saying why it is none."""
+        groups = pattern_of(self.pattern).match(serial)
+        if groups is None:
+            raise ValueError(f"{serial!a:.80} does not fit the pattern {self.pattern}")
+        checked = groups[self.check_group] if self.check_group else serial
+        if self.check_digit and not checkdigit.CHECKS[self.check_digit](checked):
+            raise ValueError(f"the check digit ({self.check_digit}) of {serial!a:.80} is wrong")
+        if self.number_group:
+            text = groups[self.number_group]
+            number = int(text) if text.isdecimal() else -1
+            most = self.number_max
+            if number < self.number_min or (most is not None and number > most):
+                bound = "any" if most is None else most
+                raise ValueError(f"the number {text!a} is not from {self.number_min} to {bound}")
+        return groups
+
+
+class Lot(Part):
+    """What holds for a lot."""
+
+    quantity_max: int | None = Field(default=None, ge=1)
+    """Units that may pass in one lot."""
+    required: bool = False
+    """A unit needs a lot: from its serial number, or given to the station."""
+
+
+class Verify(StrEnum):
+    """How far a target is to be verified."""
+
+    COMPLETED = "completed"
+    VERSION = "version"
+    MEMORY = "memory"
+
+    @property
+    def level(self) -> Verified:
+        """The level of the records."""
+        return Verified[self.name]
+
+
+class Firmware(TargetPart):
+    """A target, and what it is flashed with. Targets are done in the order of the recipe."""
+
+    image: str = Field(min_length=1)
+    manifest: str = ""
+    """Empty: the one beside the image, `IMAGE.toml`."""
+    sha256: Sha256
+    """Of the bytes to be sent, as in the manifest."""
+    base: int | None = Field(default=None, ge=0, lt=1 << 32)
+    hardware_versions: tuple[Words, ...] = ()
+    """Narrower than the manifest's, which hold as well; * stands for any text."""
+    previous_versions: tuple[Words, ...] = ()
+    """Running versions that it may replace; empty: as the manifest says."""
+    verify: Verify | None = None
+    """None: the version where the target can be asked for it, else completed."""
+
+
+class Write(TargetPart):
+    """Something to write to a unit, with values that are templates; see `template`."""
+
+    item: Words
+    values: tuple[str, ...] = Field(min_length=1)
+    manufacturer: bool = False
+    """Needed for what the document reserves for the manufacturer."""
+
+
+class Unchanged(TargetPart):
+    """Something that must read the same after the run as before it."""
+
+    item: Words
+
+
+class Limit(TargetPart):
+    """Something that is measured in a step, with its limits."""
+
+    step: Literal[StepName.IDENTIFY, StepName.CHECK, StepName.VERIFY] = StepName.CHECK
+    item: Words
+    field: Words
+    low: float | None = None
+    high: float | None = None
+    expected: str | None = None
+    """For a text; a template."""
+
+    @model_validator(mode="after")
+    def _check_limits(self) -> Limit:
+        has_range = self.low is not None or self.high is not None
+        if has_range == (self.expected is not None):
+            raise ValueError("give low or high (or both), or expected")
+        if self.low is not None and self.high is not None and self.low > self.high:
+            raise ValueError("low is above high")
+        return self
+
+
+class StepRule(Part):
+    """How long a step may take, and when it is tried again."""
+
+    time_limit_s: Seconds | None = None
+    tries: int = Field(default=1, ge=1, le=_TRIES_MAX)
+    pause_s: float = Field(default=0.0, ge=0, le=_TIME_MAX_S)
+    """Between two tries."""
+    power_cycle: bool = False
+    """Switch the socket off and on before a new try."""
+
+
+class Duplicate(StrEnum):
+    """What is done with a unit that has passed already."""
+
+    BLOCK = "block"
+    VERIFY_ONLY = "verify-only"
+    REFLASH_WITH_REASON = "reflash-with-reason"
+
+
+class Golden(Part):
+    """Known good units that test a socket before it may go on. Their runs count in no figure."""
+
+    serial_numbers: tuple[Words, ...] = Field(min_length=1)
+    shift_starts: tuple[time, ...] = ()
+    """Local times at which a shift starts; one must pass on each socket after each."""
+    every_h: float | None = Field(default=None, gt=0, le=24 * 31)
+
+    @model_validator(mode="after")
+    def _check_rule(self) -> Golden:
+        if not self.shift_starts and self.every_h is None:
+            raise ValueError("give shift_starts or every_h")
+        if any(start.tzinfo is not None for start in self.shift_starts):
+            raise ValueError("shift_starts are times of the clock on the wall, without a zone")
+        return self
+
+
+class Recipe(Part):
+    """A recipe. `target` and `write` are in the order in which they are done."""
+
+    name: Words
+    part: Words
+    """The product. A serial number is unique for its part."""
+    revision: Annotated[str, Field(min_length=1, max_length=64)]
+    notes: str = ""
+    profile: str = ""
+    """A target profile of `flasher profile`, in the recipe's folder."""
+    serial_number: SerialNumber
+    lot: Lot = Lot()
+    target: tuple[Firmware, ...] = Field(min_length=1)
+    write: tuple[Write, ...] = ()
+    unchanged: tuple[Unchanged, ...] = ()
+    limit: tuple[Limit, ...] = ()
+    step: dict[StepName, StepRule] = Field(default_factory=dict)
+    duplicate: Duplicate = Duplicate.BLOCK
+    golden: Golden | None = None
+    allow_completed_not_read_back: bool = True
+    """A target that cannot be asked for its version may pass; the record says so."""
+
+    @model_validator(mode="after")
+    def _check_targets(self) -> Recipe:
+        names = [firmware.target for firmware in self.target]
+        if len(set(names)) < len(names):
+            raise ValueError("a target is named twice in [[target]]")
+        for key in ("write", "unchanged", "limit"):
+            for part in getattr(self, key):
+                if part.target not in names:
+                    raise ValueError(f"[[{key}]] names {part.target}, which is no [[target]]")
+        return self
+
+    def rule(self, step: StepName) -> StepRule:
+        """The rule of a step; the usual one where the recipe gives none."""
+        return self.step.get(step, _USUAL)
+
+
+_USUAL: Final = StepRule()

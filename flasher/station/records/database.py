@@ -1,0 +1,275 @@
+"""Opens the database so that what is committed is on disk, and checks that it is what it must be.
+
+SQLite's safety is a matter of settings: each is set on every connection, and read back before the
+connection is used. A setting that does not hold (a network disk without WAL) is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+from sqlalchemy import Connection, Engine, create_engine, event, inspect, select, text
+from sqlalchemy.engine import URL, make_url
+from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+from sqlalchemy.pool import StaticPool
+
+from flasher.errors import UsageError
+from flasher.protocol.text import printable
+from flasher.station.records.errors import (
+    NOT_SAVED,
+    RecordError,
+    RecordsMovedError,
+    SchemaVersionError,
+    mapped,
+)
+from flasher.station.records.files import sync_folder
+from flasher.station.records.model import utc_text
+from flasher.station.records.schema import SCHEMA_VERSION, metadata, schema_info
+from flasher.station.records.triggers import trigger_statements
+
+DEFAULT_LOCK_TIMEOUT_S: Final = 5.0
+"""How long a write waits for another program that holds the database."""
+_SYNCHRONOUS_FULL: Final = 2
+_IMMEDIATE: Final = "flasher_immediate"
+_OPENED: Final = "flasher_file"
+"""Which file a connection has open."""
+
+
+@dataclass(frozen=True)
+class Location:
+    """Where the records are: the database, and the folder of its attachments."""
+
+    url: URL
+    folder: Path
+    shown: str
+    """For messages; without a password."""
+
+    @property
+    def file(self) -> Path | None:
+        """The database's file; None where it is no file."""
+        name = self.url.database
+        is_file = self.url.get_backend_name() == "sqlite" and name not in (None, "", ":memory:")
+        return Path(str(name)) if is_file else None
+
+
+def locate(url: str, folder: Path | None = None) -> Location:
+    """The records that a setting names: an SQLAlchemy URL, or the path of an SQLite file.
+
+    The attachments of a file lie beside it, in `NAME.files`; `folder` is needed for all else.
+    Raises UsageError for a URL that cannot be.
+    """
+    try:
+        parsed = make_url(url) if "://" in url else URL.create("sqlite", database=url)
+        backend = parsed.get_backend_name()
+        parsed.get_dialect()
+    except (ArgumentError, NoSuchModuleError, ValueError) as error:
+        raise UsageError(
+            f"{printable(url)!a:.100} names no database.",
+            remedy="Name a file, or an SQLAlchemy URL as postgresql+psycopg://user@host/name.",
+        ) from error
+    shown = printable(parsed.render_as_string(hide_password=True))
+    if backend == "sqlite" and parsed.query:
+        raise UsageError(
+            f"The database {shown} has options in its name, which records cannot be trusted with.",
+            remedy="Name the plain file.",
+        )
+    location = Location(parsed, folder or Path(), shown)
+    if folder is None:
+        if location.file is None:
+            raise UsageError(
+                f"For the database {shown}, the folder of the attachments has to be named.",
+                remedy="Give a folder on a disk of this computer.",
+            )
+        folder = location.file.with_name(location.file.name + ".files")
+    return Location(parsed, folder, shown)
+
+
+class Database:
+    """A database that holds what is committed. Open it with `open_database`."""
+
+    def __init__(self, location: Location, lock_timeout_s: float) -> None:
+        self.location = location
+        self._lock_timeout_ms = max(1, round(lock_timeout_s * 1000))
+        self.engine = self._engine()
+
+    @property
+    def backend(self) -> str:
+        """The name of the back end: sqlite, postgresql, ..."""
+        return self.engine.dialect.name
+
+    @contextmanager
+    def writing(self) -> Iterator[Connection]:
+        """One transaction that writes; durable when the block is left without an error.
+
+        Raises RecordError; nothing of the block was saved then.
+        """
+        with mapped(self.location.shown, writes=True), self.engine.connect() as bare:
+            connection = bare.execution_options(**{_IMMEDIATE: True})
+            self._check_place(bare)
+            with connection.begin():
+                if self.backend == "postgresql":
+                    # One writer at a time: the audit chain has one end.
+                    connection.execute(text("LOCK TABLE audit IN EXCLUSIVE MODE"))
+                yield connection
+            self._check_place(bare, has_log=True)
+
+    @contextmanager
+    def reading(self) -> Iterator[Connection]:
+        """One consistent view. Raises RecordError."""
+        with (
+            mapped(self.location.shown, writes=False),
+            self.engine.connect() as connection,
+            connection.begin(),
+        ):
+            yield connection
+
+    def _check_place(self, connection: Connection, *, has_log: bool = False) -> None:
+        """An open file can be moved or deleted: SQLite writes on, and nobody finds it again.
+
+        Raises RecordsMovedError.
+        """
+        file = self.location.file
+        if file is None:
+            return
+        is_there = _identity(file) == connection.info.get(_OPENED)
+        if has_log:
+            is_there = is_there and file.with_name(file.name + "-wal").exists()
+        if not is_there:
+            raise RecordsMovedError(
+                f"{NOT_SAVED}: the database was moved, deleted or replaced.",
+                where=self.location.shown,
+                remedy="Put it back with the files beside it; else start the station again.",
+            )
+
+    def close(self) -> None:
+        """Close all connections."""
+        self.engine.dispose()
+
+    def _engine(self) -> Engine:
+        if self.location.url.get_backend_name() != "sqlite":
+            return create_engine(self.location.url, isolation_level="READ COMMITTED")
+        options: dict[str, Any] = {"connect_args": {"timeout": self._lock_timeout_ms / 1000}}
+        if self.location.file is None:
+            options = {
+                "poolclass": StaticPool,
+                "connect_args": {"check_same_thread": False},
+            }
+        engine = create_engine(self.location.url, **options)
+        event.listen(engine, "connect", self._prepare_sqlite)
+        event.listen(engine, "begin", _begin_sqlite)
+        return engine
+
+    def _prepare_sqlite(self, connection: Any, record: Any) -> None:
+        if self.location.file is not None:
+            record.info[_OPENED] = _identity(self.location.file)
+        # Transactions are begun below, by hand: the driver's own begin too late, and without lock.
+        connection.isolation_level = None
+        wanted = {
+            # First: changing the journal already needs the lock.
+            "busy_timeout": self._lock_timeout_ms,
+            "journal_mode": "memory" if self.location.file is None else "wal",
+            "synchronous": _SYNCHRONOUS_FULL,
+            "foreign_keys": 1,
+            # Or REPLACE would delete without the triggers.
+            "recursive_triggers": 1,
+        }
+        for name, value in wanted.items():
+            connection.execute(f"PRAGMA {name} = {value}")
+            (found,) = connection.execute(f"PRAGMA {name}").fetchone()
+            if found != value:
+                raise RecordError(
+                    f"The database does not take {name} = {value}, but {printable(str(found))}.",
+                    where=self.location.shown,
+                    cause="it lies on a network disk, or on a disk that cannot be written",
+                    remedy="Keep the records on a disk of this computer.",
+                )
+
+
+def _identity(file: Path) -> tuple[int, int] | None:
+    """Which file has this name now; None: none."""
+    try:
+        found = file.stat()
+    except FileNotFoundError:
+        return None
+    return found.st_dev, found.st_ino
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    immediate = connection.get_execution_options().get(_IMMEDIATE, False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
+
+
+def open_database(
+    location: Location, now: datetime, *, lock_timeout_s: float, create: bool = True
+) -> Database:
+    """The database, with its tables and of the right version.
+
+    Without `create` a database that is not there is a UsageError: a report must not make one.
+    Raises RecordError, SchemaVersionError for records of another version.
+    """
+    if location.file is not None and not location.file.exists() and not create:
+        raise UsageError(
+            f"There are no records at {location.shown}.", remedy="Correct the name of the file."
+        )
+    database = Database(location, lock_timeout_s)
+    try:
+        _check_version(database, now, create=create)
+    except BaseException:
+        database.close()
+        raise
+    return database
+
+
+def _check_version(database: Database, now: datetime, *, create: bool) -> None:
+    with database.reading() as connection:
+        has_tables = inspect(connection).get_table_names()
+    if not has_tables and create:
+        _create(database, now)
+    where = database.location.shown
+    if has_tables and schema_info.name not in has_tables:
+        raise SchemaVersionError(
+            "The database holds something else than records of flasher.",
+            where=where,
+            remedy="Name another file, or an empty database.",
+        )
+    with database.reading() as connection:
+        version = connection.execute(select(schema_info.c.version)).scalar_one_or_none()
+    if version == SCHEMA_VERSION:
+        return
+    newer = version is not None and version > SCHEMA_VERSION
+    raise SchemaVersionError(
+        f"The records have version {version}; this flasher has version {SCHEMA_VERSION}.",
+        where=where,
+        cause="they were made by a newer flasher" if newer else "they were made by an older one",
+        remedy="Use that newer flasher."
+        if newer
+        else "Keep this file for reports with that older flasher, and begin a new one.",
+    )
+
+
+def _create(database: Database, now: datetime) -> None:
+    """All tables and triggers in one transaction, unless another process was faster."""
+    from flasher.station.records.chain import append  # noqa: PLC0415  it needs the tables
+
+    shown = database.location.shown
+    with mapped(shown, writes=True), database.engine.connect() as bare:
+        connection = bare.execution_options(**{_IMMEDIATE: True})
+        with connection.begin():
+            if database.backend == "postgresql":
+                connection.execute(text("SELECT pg_advisory_xact_lock(7052)"))
+            if inspect(connection).has_table(schema_info.name):
+                return
+            metadata.create_all(connection)
+            for statement in trigger_statements(database.backend):
+                connection.exec_driver_sql(statement)
+            connection.execute(
+                schema_info.insert().values(version=SCHEMA_VERSION, created_at=utc_text(now))
+            )
+            append(connection, now, "created", {"version": SCHEMA_VERSION})
+        if database.location.file is not None:
+            sync_folder(database.location.file.parent)

@@ -1,0 +1,176 @@
+"""Every way in which saving or reading the records can fail, and the one place that maps them.
+
+Whoever gets a `RecordError` from an operation that writes must not show PASS: nothing was saved.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from typing import ClassVar, Final
+
+from sqlalchemy import exc
+
+from flasher.errors import ExitCode, FlasherError
+
+NOT_SAVED: Final = "RECORD NOT SAVED"
+
+
+class RecordError(FlasherError):
+    """The records could not be written or read."""
+
+    exit_code: ClassVar[ExitCode] = ExitCode.USAGE
+    """Like a file that cannot be written: the user has to make room, or correct the setting."""
+
+
+class DiskFullError(RecordError):
+    """No room for the record."""
+
+
+class RecordsLockedError(RecordError):
+    """Another program holds the records, longer than the time allowed for it."""
+
+
+class RecordsReadOnlyError(RecordError):
+    """The records, or their folder, cannot be written."""
+
+
+class RecordsDamagedError(RecordError):
+    """The database is damaged, or is no database."""
+
+
+class SchemaVersionError(RecordError):
+    """The records were made by an older or a newer flasher."""
+
+
+class RuleBrokenError(RecordError):
+    """The database refused what would have made the records untrue."""
+
+
+class RecordsMovedError(RecordError):
+    """The file of the database is not where it was opened: what is written is kept nowhere."""
+
+
+class NotFoundError(RecordError):
+    """There is no such unit or run."""
+
+
+class StationBusyError(RecordError):
+    """Another process is this station already."""
+
+
+class Refusal(StrEnum):
+    """Why a unit cannot be claimed."""
+
+    UNIT_RUNNING = "UNIT_RUNNING"
+    SOCKET_BUSY = "SOCKET_BUSY"
+    DUPLICATE = "DUPLICATE"
+    REASON_NEEDED = "REASON_NEEDED"
+    LOT_FULL = "LOT_FULL"
+    LOT_NEEDED = "LOT_NEEDED"
+    GOLDEN_DUE = "GOLDEN_DUE"
+    NOT_GOLDEN = "NOT_GOLDEN"
+    OTHER_NATURE = "OTHER_NATURE"
+    """The records know this serial number as a virtual unit, and it is a real one; or the other way
+    round."""
+    WRONG_SERIAL = "WRONG_SERIAL"
+    RECIPE_CHANGED = "RECIPE_CHANGED"
+
+
+class ClaimRefusedError(FlasherError):
+    """The unit must not be run now; nothing was recorded and nothing was done to it."""
+
+    exit_code: ClassVar[ExitCode] = ExitCode.USAGE
+
+    def __init__(self, refusal: Refusal, what: str, *, remedy: str) -> None:
+        super().__init__(what, remedy=remedy)
+        self.refusal = refusal
+
+
+_KINDS: Final[dict[int, tuple[type[RecordError], str, str]]] = {
+    sqlite3.SQLITE_FULL: (DiskFullError, "the disk is full", "Make room on the disk, then retry."),
+    sqlite3.SQLITE_BUSY: (
+        RecordsLockedError,
+        "another program holds the database",
+        "End the program that holds it (a backup, a viewer, a second station), then retry.",
+    ),
+    sqlite3.SQLITE_LOCKED: (
+        RecordsLockedError,
+        "the database is locked",
+        "End the program that holds it, then retry.",
+    ),
+    sqlite3.SQLITE_READONLY: (
+        RecordsReadOnlyError,
+        "the database is read-only",
+        "Let this user write the file and its folder.",
+    ),
+    sqlite3.SQLITE_CANTOPEN: (
+        RecordsReadOnlyError,
+        "the database cannot be opened",
+        "Check that its folder exists and that this user may write there.",
+    ),
+    sqlite3.SQLITE_CORRUPT: (
+        RecordsDamagedError,
+        "the database is damaged",
+        "Stop. Keep the file, and go on with the last backup.",
+    ),
+    sqlite3.SQLITE_NOTADB: (
+        RecordsDamagedError,
+        "the file is no database",
+        "Name the right file, or go on with the last backup.",
+    ),
+    sqlite3.SQLITE_IOERR: (
+        RecordError,
+        "the disk does not read or write",
+        "Check the disk; do not go on before it works.",
+    ),
+    sqlite3.SQLITE_CONSTRAINT: (
+        RuleBrokenError,
+        "the database refuses it",
+        "This is a fault of the station: keep its log, and report it.",
+    ),
+}
+
+
+@contextmanager
+def mapped(where: str, *, writes: bool) -> Iterator[None]:
+    """Foreign errors inside become RecordErrors; `where` names the database for a person."""
+    try:
+        yield
+    except (exc.SQLAlchemyError, sqlite3.Error) as error:
+        raise record_error(error, where, writes=writes) from error
+    except OSError as error:
+        raise file_error(error, where, writes=writes) from error
+
+
+def record_error(error: Exception, where: str, *, writes: bool) -> RecordError:
+    """The error that stands for one of SQLAlchemy or a driver."""
+    original = getattr(error, "orig", None) or error
+    code = getattr(original, "sqlite_errorcode", None)
+    if code is None and isinstance(error, exc.IntegrityError):
+        code = sqlite3.SQLITE_CONSTRAINT
+    kind, why, remedy = _KINDS.get(
+        (code or 0) & 0xFF,
+        (RecordError, "the database does not work", "Check it, then start the station again."),
+    )
+    return kind(f"{_begin(writes=writes)}: {why}.", where=where, cause=str(original), remedy=remedy)
+
+
+def file_error(error: OSError, where: str, *, writes: bool) -> RecordError:
+    """The error that stands for one of the file system."""
+    import errno  # noqa: PLC0415  only where something failed
+
+    kind: type[RecordError] = RecordError
+    remedy = "Check the disk and the rights of the folder."
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        kind, remedy = DiskFullError, "Make room on the disk, then retry."
+    elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        kind, remedy = RecordsReadOnlyError, "Let this user write the file and its folder."
+    why = error.strerror or type(error).__name__
+    return kind(f"{_begin(writes=writes)}: {why}.", where=where, remedy=remedy)
+
+
+def _begin(*, writes: bool) -> str:
+    return NOT_SAVED if writes else "The records cannot be read"

@@ -1,0 +1,138 @@
+"""Files that belong to records: beside the database, named by their hash, whole or not there.
+
+A file is on disk, with its name, before any row names it. What no row names is left over from a
+crash and harms nothing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import datetime
+from pathlib import Path
+from typing import IO, Final
+
+from flasher.protocol.text import printable
+from flasher.station.records.errors import RecordError, RecordsDamagedError, file_error, mapped
+from flasher.station.records.model import AttachmentFile
+
+_CHUNK_BYTES: Final = 1 << 20
+_PART: Final = ".part-"
+_PART_AGE_S: Final = 86_400.0
+"""Another station may be writing into the same folder just now."""
+
+
+class FileStore:
+    """The folder of the attachments."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def add(self, kind: str, source: Path) -> AttachmentFile:
+        """Copy a file in. It is on disk when this returns. Raises RecordError."""
+        with mapped(printable(str(source)), writes=True), source.open("rb") as stream:
+            return self._add(kind, source.name, stream)
+
+    def _add(self, kind: str, name: str, stream: IO[bytes]) -> AttachmentFile:
+        shown = printable(str(self.folder))
+        with mapped(shown, writes=True):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            handle, part = tempfile.mkstemp(prefix=_PART, dir=self.folder)
+            try:
+                digest, size_bytes = hashlib.sha256(), 0
+                with os.fdopen(handle, "wb") as out:
+                    while chunk := stream.read(_CHUNK_BYTES):
+                        digest.update(chunk)
+                        out.write(chunk)
+                        size_bytes += len(chunk)
+                    out.flush()
+                    os.fsync(out.fileno())
+                sha256 = digest.hexdigest()
+                final = self.path(sha256)
+                if not final.parent.exists():
+                    final.parent.mkdir(exist_ok=True)
+                    sync_folder(self.folder)
+                # Also over a file of that name: its content can only be equal, or damaged.
+                Path(part).replace(final)
+                sync_folder(final.parent)
+            except BaseException:
+                with contextlib.suppress(OSError):
+                    Path(part).unlink(missing_ok=True)
+                raise
+        return AttachmentFile(kind, name, sha256, size_bytes)
+
+    def sweep(self, now: datetime) -> int:
+        """Take away what a crash left half written, a day later; how many files it was."""
+        swept = 0
+        oldest = now.timestamp() - _PART_AGE_S
+        with mapped(printable(str(self.folder)), writes=True):
+            for part in self.folder.glob(_PART + "*"):
+                if part.stat().st_mtime < oldest:
+                    part.unlink(missing_ok=True)
+                    swept += 1
+        return swept
+
+    def path(self, sha256: str) -> Path:
+        """Where the file with this hash lies."""
+        return self.folder / sha256[:2] / sha256
+
+    def read(self, sha256: str) -> bytes:
+        """The bytes of a file. Raises RecordsDamagedError when it is gone or was changed."""
+        path = self.path(sha256)
+        try:
+            data = path.read_bytes()
+        except FileNotFoundError as error:
+            raise RecordsDamagedError(
+                "An attachment is missing.",
+                where=printable(str(path)),
+                remedy="Fetch it from a backup.",
+            ) from error
+        except OSError as error:
+            raise file_error(error, printable(str(path)), writes=False) from error
+        if hashlib.sha256(data).hexdigest() != sha256:
+            raise RecordsDamagedError(
+                "An attachment is not what was stored: its hash differs.",
+                where=printable(str(path)),
+                remedy="Fetch it from a backup.",
+            )
+        return data
+
+    def check(self, sha256: str) -> str:
+        """What is wrong with a file, in words; empty when nothing is."""
+        try:
+            self.read(sha256)
+        except RecordError as error:
+            return error.what
+        return ""
+
+
+def sync_folder(folder: Path) -> None:
+    """Make sure that new names in a folder are on disk; nothing where the system cannot."""
+    if os.name == "nt":  # Windows has no handle for it, and journals names by itself
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def whole_file(path: Path) -> Iterator[Path]:
+    """A file to be written under another name, which takes its own when the block ends well; it is
+    on disk then.
+    """
+    part = path.with_name(f".{path.name}.part")
+    try:
+        yield part
+        with part.open("rb+") as written:
+            os.fsync(written.fileno())
+        part.replace(path)
+        sync_folder(path.parent)
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)

@@ -1,0 +1,330 @@
+"""What the records hand out and take: outcomes, what a run is claimed with, and how it ended."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from enum import StrEnum
+from pathlib import Path
+from typing import Final, NewType, Protocol
+
+from flasher.station.steps import Verified
+
+RunId = NewType("RunId", int)
+WriteId = NewType("WriteId", int)
+
+_UTC: Final = "+00:00"
+
+
+class Clock(Protocol):
+    """Where the records take the time from."""
+
+    def utc(self) -> datetime:
+        """Now, with the time zone UTC."""
+
+    def monotonic_s(self) -> float:
+        """Seconds that only go forward; comparable within one start of the computer."""
+
+
+def utc_text(moment: datetime) -> str:
+    """A moment as it stands in the records: UTC, of one length, so that text order is time order.
+
+    Raises ValueError for a moment without a time zone.
+    """
+    if moment.tzinfo is None:
+        raise ValueError("a time without a zone is no moment")
+    # isoformat: a report has ten thousands of them, and strftime takes twenty times as long.
+    return moment.astimezone(UTC).isoformat(timespec="microseconds").removesuffix(_UTC) + "Z"
+
+
+def utc_moment(text: str) -> datetime:
+    """The moment that `utc_text` wrote."""
+    return datetime.fromisoformat(text)
+
+
+class RunState(StrEnum):
+    """Where a run is, or how it ended."""
+
+    RUNNING = "RUNNING"
+    PASS = "PASS"  # noqa: S105  the word is no password
+    FAIL = "FAIL"
+    """The unit is bad."""
+    ERROR = "ERROR"
+    """The station could not tell: adapter, power, files."""
+    ABORTED = "ABORTED"
+    """A person stopped it."""
+    INTERRUPTED = "INTERRUPTED"
+    """The station died under it; `recover` found it."""
+
+
+OUTCOMES: Final = (RunState.PASS, RunState.FAIL, RunState.ERROR, RunState.ABORTED)
+"""What `finish` takes."""
+
+
+class RunKind(StrEnum):
+    """Why a run is made."""
+
+    PRODUCTION = "production"
+    RECHECK = "recheck"
+    """The last run of this unit ended in the open: the device decides what is still to do."""
+    VERIFY_ONLY = "verify-only"
+    """The unit has passed: nothing is flashed or written."""
+    REFLASH = "reflash"
+    """The unit has passed, and is done again for the reason given."""
+    GOLDEN = "golden"
+    """A known unit tests the station; it counts in no figure."""
+
+
+class UnitState(StrEnum):
+    """What is known of a unit: derived from its last run."""
+
+    NEW = "NEW"
+    RUNNING = "RUNNING"
+    PASS = "PASS"  # noqa: S105
+    FAIL = "FAIL"
+    RECHECK = "RECHECK"
+    """The last run ended in the open. The device has to be asked."""
+
+    @classmethod
+    def after(cls, last: RunState | None) -> UnitState:
+        """The state of a unit whose last run is in this state; None: it had none."""
+        if last is None:
+            return cls.NEW
+        if last in (RunState.RUNNING, RunState.PASS, RunState.FAIL):
+            return cls(last.value)
+        return cls.RECHECK
+
+
+class StepState(StrEnum):
+    """How one try of a step ended."""
+
+    PASS = "PASS"  # noqa: S105
+    FAIL = "FAIL"
+    ERROR = "ERROR"
+    SKIPPED = "SKIPPED"
+    """Not needed, as in a run that only verifies."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """A run that has begun; it is on disk."""
+
+    run_id: RunId
+    kind: RunKind
+    serial: str
+    part: str
+    unit_before: UnitState
+    runs_before: int
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A number with its limits, or a text with what was expected; exactly one of the two."""
+
+    name: str
+    value: float | None = None
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    text: str | None = None
+    expected: str | None = None
+
+    @property
+    def is_within(self) -> bool:
+        """True when nothing speaks against it."""
+        if self.value is None:
+            return self.expected is None or self.text == self.expected
+        return (self.low is None or self.value >= self.low) and (
+            self.high is None or self.value <= self.high
+        )
+
+
+@dataclass(frozen=True)
+class AttachmentFile:
+    """A file that belongs to a run, already stored by its hash."""
+
+    kind: str
+    name: str
+    sha256: str
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class Ending:
+    """How a run ended: all that `Store.finish` saves in its one transaction."""
+
+    state: RunState
+    code: str
+    """A short stable word for the cause, as "NO_ANSWER"; "OK" for a PASS."""
+    text: str
+    """What happened and what to do, for a person."""
+    verified: Mapping[str, Verified] = field(default_factory=dict)
+    """How far each target was verified, by the target's name."""
+    log_sha256: str | None = None
+    """The hash of the bus trace, which is one of the attachments."""
+    attachments: Sequence[AttachmentFile] = ()
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """One try of a step as recorded."""
+
+    position: int
+    name: str
+    try_number: int
+    state: StepState
+    begun_at: datetime
+    duration_s: float
+    code: str
+    text: str
+    measurements: tuple[Measurement, ...] = ()
+
+
+@dataclass(frozen=True)
+class WriteRecord:
+    """An act that cannot be taken back: what was intended, and what is known of it."""
+
+    write_id: WriteId
+    target: str
+    what: str
+    value: str
+    intended_at: datetime
+    verified_at: datetime | None
+    read_back: str | None
+    """What was read back; None where nothing was, or could be."""
+
+
+@dataclass(frozen=True)
+class TargetRecord:
+    """A target of a run: the image, how far it had to be verified and how far it was."""
+
+    target: str
+    image: str
+    image_sha256: str
+    version: str
+    required: Verified
+    reached: Verified | None
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """A run as recorded, without its parts."""
+
+    run_id: RunId
+    serial: str
+    part: str
+    lot: str | None
+    kind: RunKind
+    is_virtual: bool
+    """The unit was a virtual one, made by the program: no product."""
+    reason: str
+    state: RunState
+    code: str
+    text: str
+    begun_at: datetime
+    ended_at: datetime | None
+    duration_s: float | None
+    """None for a run that goes on or was interrupted: its end is not known."""
+    station: str
+    socket: str
+    operator: str
+    recipe: str
+    recipe_revision: str
+    recipe_sha256: str
+    verified: Verified | None
+    """The weakest of its targets; None where nothing is known."""
+    log_sha256: str | None
+
+
+@dataclass(frozen=True)
+class RunDetails:
+    """A run with all its parts."""
+
+    run: RunRecord
+    targets: tuple[TargetRecord, ...]
+    steps: tuple[StepRecord, ...]
+    writes: tuple[WriteRecord, ...]
+    attachments: tuple[AttachmentFile, ...]
+
+
+@dataclass(frozen=True)
+class UnitLife:
+    """A unit and everything that was ever done to it, the oldest run first."""
+
+    serial: str
+    part: str
+    state: UnitState
+    runs: tuple[RunDetails, ...]
+
+    @property
+    def is_virtual(self) -> bool:
+        """True for a unit that the program made; a unit is never both."""
+        return any(details.run.is_virtual for details in self.runs)
+
+    @property
+    def last(self) -> RunDetails | None:
+        """The last run; None for a unit without any."""
+        return self.runs[-1] if self.runs else None
+
+
+@dataclass(frozen=True)
+class RunFilter:
+    """Which runs a report is about; None is no bound."""
+
+    lot: str | None = None
+    recipe: str | None = None
+    since: datetime | None = None
+    """Begun at this moment or later."""
+    until: datetime | None = None
+    """Begun before this moment."""
+    serial: str | None = None
+    part: str | None = None
+
+
+@dataclass(frozen=True)
+class Figures:
+    """The figures of a report. Golden units count in none of them."""
+
+    runs: int
+    units: int
+    """Units with a run that told PASS from FAIL."""
+    passed: int
+    """Units whose last such run is a PASS."""
+    first_passed: int
+    """Units whose first such run is a PASS."""
+    by_state: Mapping[str, int]
+    failures: Mapping[str, int]
+    """Runs that are no PASS, by code; the most frequent first."""
+    duration_median_s: float | None
+    """Of runs that passed."""
+    duration_longest_s: float | None
+    virtual_runs: int = 0
+    """Runs of virtual units among all of these; none of them made a product."""
+
+    @property
+    def yield_share(self) -> float | None:
+        """Units passed in the end, as a share of 1; None without units."""
+        return self.passed / self.units if self.units else None
+
+    @property
+    def first_pass_share(self) -> float | None:
+        """Units passed at the first try, as a share of 1; None without units."""
+        return self.first_passed / self.units if self.units else None
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Something in the records that is not as it has to be."""
+
+    where: str
+    what: str
+
+
+@dataclass(frozen=True)
+class Backup:
+    """A copy that was made."""
+
+    path: Path
+    sha256: str
+    size_bytes: int

@@ -1,0 +1,264 @@
+"""Reading the records: a unit's life, runs, figures, and what is wrong with them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+from sqlalchemy import Connection, Select, case, func, select
+
+from flasher.protocol.text import printable
+from flasher.station.records import schema
+from flasher.station.records.chain import check_chain
+from flasher.station.records.database import Database
+from flasher.station.records.details import details_of
+from flasher.station.records.errors import NotFoundError
+from flasher.station.records.figures import figures_of
+from flasher.station.records.files import FileStore
+from flasher.station.records.model import (
+    Figures,
+    Problem,
+    RunDetails,
+    RunFilter,
+    RunId,
+    RunKind,
+    RunRecord,
+    RunState,
+    UnitLife,
+    UnitState,
+    utc_moment,
+    utc_text,
+)
+from flasher.station.steps import Verified
+
+_EVERYTHING: Final = RunFilter()
+
+
+class Records:
+    """What the records say. Every method raises RecordError when they cannot be read."""
+
+    def __init__(self, database: Database, files: FileStore) -> None:
+        self._database = database
+        self._files = files
+
+    def runs(self, chosen: RunFilter = _EVERYTHING) -> tuple[RunRecord, ...]:
+        """The runs of a filter, the oldest first."""
+        with self._database.reading() as connection:
+            rows = connection.execute(_filtered(_run_query(), chosen).order_by(schema.run.c.id))
+            return tuple(_run(row) for row in rows)
+
+    def table(
+        self, chosen: RunFilter = _EVERYTHING
+    ) -> list[dict[str, str | int | float | bool | None]]:
+        """The runs of a filter as plain rows, for reports over many of them: names as in
+        `RunRecord`, times as texts in UTC, verification by its word.
+        """
+        query = _filtered(_run_query(_table_columns()), chosen).order_by(schema.run.c.id)
+        with self._database.reading() as connection:
+            result = connection.execute(query)
+            names = tuple(result.keys())
+            return [dict(zip(names, row, strict=True)) for row in result]
+
+    def run(self, run_id: RunId) -> RunDetails:
+        """A run with its parts. Raises NotFoundError."""
+        with self._database.reading() as connection:
+            row = connection.execute(_run_query().where(schema.run.c.id == run_id)).one_or_none()
+            if row is None:
+                raise NotFoundError(f"There is no run {run_id}.")
+            return next(iter(details_of(connection, [_run(row)])))
+
+    def units(self, serial: str) -> tuple[UnitLife, ...]:
+        """The units with this serial number, one a part: the whole life of each."""
+        with self._database.reading() as connection:
+            rows = connection.execute(
+                select(schema.unit).where(schema.unit.c.serial == serial).order_by(schema.unit.c.id)
+            ).all()
+            return tuple(_life(connection, row) for row in rows)
+
+    def unit(self, serial: str, part: str | None = None) -> UnitLife:
+        """The one unit with this serial number. Raises NotFoundError, also for several parts."""
+        found = [life for life in self.units(serial) if part in (None, life.part)]
+        shown = printable(serial)
+        if not found:
+            raise NotFoundError(
+                f"There is no unit {shown} in the records.", remedy="Check the serial number."
+            )
+        if len(found) > 1:
+            parts = ", ".join(life.part for life in found)
+            raise NotFoundError(
+                f"{shown} is a serial number of several parts.", remedy=f"Name one of: {parts}."
+            )
+        return found[0]
+
+    def state(self, serial: str, part: str) -> UnitState:
+        """What is known of a unit; NEW for one that is not in the records."""
+        query = (
+            select(schema.run.c.state)
+            .join_from(schema.run, schema.unit)
+            .where(schema.unit.c.serial == serial, schema.unit.c.part == part)
+            .order_by(schema.run.c.id.desc())
+            .limit(1)
+        )
+        with self._database.reading() as connection:
+            last = connection.execute(query).scalar_one_or_none()
+        return UnitState.after(None if last is None else RunState(last))
+
+    def figures(self, chosen: RunFilter = _EVERYTHING) -> Figures:
+        """The figures of a filter."""
+        table = schema.run
+        columns = (
+            table.c.unit_id,
+            table.c.state,
+            table.c.code,
+            (table.c.ended_monotonic_s - table.c.begun_monotonic_s).label("duration_s"),
+            table.c.is_virtual,
+        )
+        query = _filtered(_joined(*columns), chosen).where(table.c.kind != RunKind.GOLDEN.value)
+        with self._database.reading() as connection:
+            rows = connection.execute(query.order_by(table.c.id)).all()
+        return figures_of(rows)
+
+    def natures(self) -> frozenset[bool]:
+        """Whose runs there are: True for virtual units, False for real ones."""
+        with self._database.reading() as connection:
+            found = connection.execute(select(schema.run.c.is_virtual).distinct()).scalars()
+            return frozenset(map(bool, found))
+
+    def problems(self) -> Iterator[Problem]:
+        """Everything that is not as it has to be."""
+        with self._database.reading() as connection:
+            if self._database.backend == "sqlite":
+                yield from _sqlite_problems(connection)
+            yield from check_chain(connection)
+            query = select(
+                schema.attachment.c.sha256, func.min(schema.attachment.c.run_id)
+            ).group_by(schema.attachment.c.sha256)
+            for sha256, run_id in connection.execute(query).all():
+                wrong = self._files.check(sha256)
+                if wrong:
+                    yield Problem(f"run {run_id}, attachment {sha256}", wrong)
+
+
+def state_of(connection: Connection, run_id: int) -> RunState:
+    """The state of a run. Raises NotFoundError."""
+    found = connection.execute(
+        select(schema.run.c.state).where(schema.run.c.id == run_id)
+    ).scalar_one_or_none()
+    if found is None:
+        raise NotFoundError(f"There is no run {run_id}.")
+    return RunState(found)
+
+
+# -- runs -----------------------------------------------------------------------------------------
+
+
+def _joined(*columns: Any) -> Select[Any]:
+    return (
+        select(*columns)
+        .join_from(schema.run, schema.unit, schema.run.c.unit_id == schema.unit.c.id)
+        .join(schema.recipe, schema.run.c.recipe_id == schema.recipe.c.id)
+        .outerjoin(schema.lot, schema.run.c.lot_id == schema.lot.c.id)
+    )
+
+
+_NAMES: Final = (
+    schema.unit.c.serial,
+    schema.unit.c.part,
+    schema.lot.c.name.label("lot"),
+    schema.station.c.name.label("station"),
+    schema.socket.c.name.label("socket"),
+    schema.operator.c.name.label("operator"),
+    schema.recipe.c.name.label("recipe"),
+    schema.recipe.c.revision.label("recipe_revision"),
+    schema.recipe.c.sha256.label("recipe_sha256"),
+)
+
+
+def _table_columns() -> tuple[Any, ...]:
+    run = schema.run.c
+    words = {int(level): level.name.lower() for level in Verified}
+    return (
+        run.id.label("run_id"),
+        *_NAMES[:3],
+        run.kind,
+        run.is_virtual,
+        run.state,
+        run.code,
+        run.text,
+        run.begun_at,
+        run.ended_at,
+        (run.ended_monotonic_s - run.begun_monotonic_s).label("duration_s"),
+        *_NAMES[3:],
+        case(words, value=run.verification_reached).label("verified"),
+        run.log_sha256,
+        run.reason,
+    )
+
+
+def _run_query(columns: tuple[Any, ...] = (schema.run, *_NAMES)) -> Select[Any]:
+    return (
+        _joined(*columns)
+        .join(schema.socket, schema.run.c.socket_id == schema.socket.c.id)
+        .join(schema.station, schema.socket.c.station_id == schema.station.c.id)
+        .join(schema.operator, schema.run.c.operator_id == schema.operator.c.id)
+    )
+
+
+def _filtered(query: Select[Any], chosen: RunFilter) -> Select[Any]:
+    bounds = {
+        schema.lot.c.name: chosen.lot,
+        schema.recipe.c.name: chosen.recipe,
+        schema.unit.c.serial: chosen.serial,
+        schema.unit.c.part: chosen.part,
+    }
+    for column, value in bounds.items():
+        if value is not None:
+            query = query.where(column == value)
+    if chosen.since is not None:
+        query = query.where(schema.run.c.begun_at >= utc_text(chosen.since))
+    if chosen.until is not None:
+        query = query.where(schema.run.c.begun_at < utc_text(chosen.until))
+    return query
+
+
+def _run(row: Any) -> RunRecord:
+    ended_s = row.ended_monotonic_s
+    reached = row.verification_reached
+    return RunRecord(
+        run_id=RunId(row.id),
+        serial=row.serial,
+        part=row.part,
+        lot=row.lot,
+        kind=RunKind(row.kind),
+        is_virtual=row.is_virtual,
+        reason=row.reason,
+        state=RunState(row.state),
+        code=row.code,
+        text=row.text,
+        begun_at=utc_moment(row.begun_at),
+        ended_at=None if row.ended_at is None else utc_moment(row.ended_at),
+        duration_s=None if ended_s is None else ended_s - row.begun_monotonic_s,
+        station=row.station,
+        socket=row.socket,
+        operator=row.operator,
+        recipe=row.recipe,
+        recipe_revision=row.recipe_revision,
+        recipe_sha256=row.recipe_sha256,
+        verified=None if reached is None else Verified(reached),
+        log_sha256=row.log_sha256,
+    )
+
+
+def _life(connection: Connection, unit: Any) -> UnitLife:
+    query = _run_query().where(schema.run.c.unit_id == unit.id).order_by(schema.run.c.id)
+    runs = tuple(details_of(connection, [_run(row) for row in connection.execute(query)]))
+    state = UnitState.after(runs[-1].run.state if runs else None)
+    return UnitLife(unit.serial, unit.part, state, runs)
+
+
+def _sqlite_problems(connection: Connection) -> Iterator[Problem]:
+    for (found,) in connection.exec_driver_sql("PRAGMA integrity_check").all():
+        if found != "ok":
+            yield Problem("database", printable(str(found)))
+    for row in connection.exec_driver_sql("PRAGMA foreign_key_check").all():
+        yield Problem(f"table {row[0]}, row {row[1]}", f"it names a missing row of {row[2]}")

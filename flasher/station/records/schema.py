@@ -1,0 +1,298 @@
+"""The tables of the records, with the rules that hold inside one row or one index.
+
+Rules over several rows are triggers (`triggers`). A change here is a new `SCHEMA_VERSION`.
+Times are texts in UTC of one length (`model.utc_text`); durations come from the monotonic clock.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    CheckConstraint,
+    Column,
+    Float,
+    ForeignKey,
+    Index,
+    Integer,
+    MetaData,
+    SmallInteger,
+    String,
+    Table,
+    Text,
+    UniqueConstraint,
+    text,
+)
+
+from flasher.station.records.model import RunKind, RunState, StepState
+from flasher.station.steps import Verified
+
+SCHEMA_VERSION: Final = 1
+
+metadata: Final = MetaData()
+
+_LEVELS: Final = f"BETWEEN {min(Verified)} AND {max(Verified)}"
+_UTC_SIZE: Final = 27
+_SHA256_SIZE: Final = 64
+
+
+def _key() -> Column[int]:
+    # SQLite counts by itself only in a plain INTEGER.
+    return Column("id", BigInteger().with_variant(Integer, "sqlite"), primary_key=True)
+
+
+def _to(table: str, *, nullable: bool = False, index: bool = False) -> Column[int]:
+    return Column(
+        f"{table}_id",
+        BigInteger().with_variant(Integer, "sqlite"),
+        ForeignKey(f"{table}.id", ondelete="RESTRICT"),
+        nullable=nullable,
+        index=index,
+    )
+
+
+def _text(name: str, size: int = 200) -> Column[str]:
+    return Column(name, String(size), nullable=False)
+
+
+def _utc(name: str, *, nullable: bool = False) -> Column[str]:
+    return Column(name, String(_UTC_SIZE), nullable=nullable)
+
+
+def _sha256(name: str, *, nullable: bool = False) -> Column[str]:
+    return Column(name, String(_SHA256_SIZE), nullable=nullable)
+
+
+def _one_of(column: str, words: Any) -> CheckConstraint:
+    allowed = ", ".join(f"'{word.value}'" for word in words)
+    return CheckConstraint(f"{column} IN ({allowed})", name=f"{column}_is_known")
+
+
+schema_info: Final = Table(
+    "schema_info",
+    metadata,
+    Column("version", Integer, primary_key=True, autoincrement=False),
+    _utc("created_at"),
+)
+
+station: Final = Table("station", metadata, _key(), _text("name"), UniqueConstraint("name"))
+
+socket: Final = Table(
+    "socket",
+    metadata,
+    _key(),
+    _to("station"),
+    _text("name"),
+    UniqueConstraint("station_id", "name"),
+)
+
+operator: Final = Table("operator", metadata, _key(), _text("name"), UniqueConstraint("name"))
+
+artifact: Final = Table(
+    "artifact",
+    metadata,
+    _key(),
+    _text("target", 16),
+    _text("name"),
+    _text("version", 64),
+    _sha256("sha256"),
+    Column("size_bytes", BigInteger, nullable=False),
+    UniqueConstraint("target", "sha256", "name"),
+    CheckConstraint("length(sha256) = 64", name="sha256_is_whole"),
+)
+
+recipe: Final = Table(
+    "recipe",
+    metadata,
+    _key(),
+    _text("name"),
+    _text("revision", 64),
+    _text("part"),
+    _sha256("sha256"),
+    Column("content", Text, nullable=False),
+    Column("verification_required", SmallInteger, nullable=False),
+    Column("allow_completed_not_read_back", Boolean, nullable=False),
+    UniqueConstraint("sha256"),
+    CheckConstraint("length(sha256) = 64", name="sha256_is_whole"),
+    CheckConstraint(f"verification_required {_LEVELS}", name="level_is_known"),
+)
+
+lot: Final = Table(
+    "lot",
+    metadata,
+    _key(),
+    _text("part"),
+    _text("name"),
+    UniqueConstraint("part", "name"),
+)
+
+unit: Final = Table(
+    "unit",
+    metadata,
+    _key(),
+    _text("part"),
+    _text("serial"),
+    UniqueConstraint("part", "serial"),
+    Index("unit_by_serial", "serial"),
+    CheckConstraint("serial <> '' AND part <> ''", name="unit_has_a_name"),
+)
+
+run: Final = Table(
+    "run",
+    metadata,
+    _key(),
+    _to("unit"),
+    _to("socket"),
+    _to("recipe"),
+    _to("lot", nullable=True, index=True),
+    _to("operator"),
+    _text("kind", 16),
+    Column("is_virtual", Boolean, nullable=False),
+    Column("reason", Text, nullable=False),
+    _text("state", 16),
+    _text("code", 64),
+    Column("text", Text, nullable=False),
+    _utc("begun_at"),
+    Column("begun_monotonic_s", Float, nullable=False),
+    _utc("ended_at", nullable=True),
+    Column("ended_monotonic_s", Float, nullable=True),
+    # Copied from the recipe, so that one row can be held against it.
+    Column("verification_required", SmallInteger, nullable=False),
+    Column("allow_completed_not_read_back", Boolean, nullable=False),
+    Column("verification_reached", SmallInteger, nullable=True),
+    _sha256("log_sha256", nullable=True),
+    Index("run_of_unit", "unit_id", "id"),
+    Index("run_by_begin", "begun_at"),
+    Index("run_of_recipe", "recipe_id", "begun_at"),
+    _one_of("state", RunState),
+    _one_of("kind", RunKind),
+    CheckConstraint("(state = 'RUNNING') = (ended_at IS NULL)", name="finished_has_an_end"),
+    CheckConstraint(
+        "state IN ('RUNNING', 'INTERRUPTED') OR ended_monotonic_s IS NOT NULL",
+        name="finished_has_a_duration",
+    ),
+    CheckConstraint(
+        "ended_monotonic_s IS NULL OR ended_monotonic_s >= begun_monotonic_s",
+        name="time_goes_forward",
+    ),
+    CheckConstraint(
+        "state <> 'PASS' OR (ended_at IS NOT NULL AND log_sha256 IS NOT NULL"
+        " AND length(log_sha256) = 64)",
+        name="pass_has_an_end_and_a_log",
+    ),
+    CheckConstraint(
+        "state <> 'PASS' OR (verification_reached IS NOT NULL"
+        " AND verification_reached >= verification_required)",
+        name="pass_is_verified",
+    ),
+    CheckConstraint(
+        f"state <> 'PASS' OR allow_completed_not_read_back"
+        f" OR verification_reached > {int(Verified.COMPLETED)}",
+        name="pass_is_read_back",
+    ),
+    CheckConstraint(f"verification_reached {_LEVELS}", name="reached_is_known"),
+    CheckConstraint(f"verification_required {_LEVELS}", name="required_is_known"),
+    CheckConstraint("state = 'RUNNING' OR code <> ''", name="finished_has_a_code"),
+    CheckConstraint("kind <> 'reflash' OR reason <> ''", name="reflash_has_a_reason"),
+)
+
+_RUNNING: Final = text("state = 'RUNNING'")
+# Partial: only SQLite and PostgreSQL have them here.
+for _name, _column in (
+    ("one_running_run_per_unit", run.c.unit_id),
+    ("one_running_run_per_socket", run.c.socket_id),
+):
+    Index(_name, _column, unique=True, sqlite_where=_RUNNING, postgresql_where=_RUNNING)
+
+run_target: Final = Table(
+    "run_target",
+    metadata,
+    _key(),
+    _to("run"),
+    _to("artifact"),
+    Column("position", SmallInteger, nullable=False),
+    _text("target", 16),
+    Column("required", SmallInteger, nullable=False),
+    Column("reached", SmallInteger, nullable=True),
+    UniqueConstraint("run_id", "target"),
+    CheckConstraint(f"required {_LEVELS} AND reached {_LEVELS}", name="levels_are_known"),
+)
+
+step: Final = Table(
+    "step",
+    metadata,
+    _key(),
+    _to("run"),
+    Column("position", Integer, nullable=False),
+    _text("name", 32),
+    Column("try_number", Integer, nullable=False),
+    _text("state", 16),
+    _text("code", 64),
+    Column("text", Text, nullable=False),
+    _utc("begun_at"),
+    Column("begun_monotonic_s", Float, nullable=False),
+    Column("duration_s", Float, nullable=False),
+    UniqueConstraint("run_id", "position"),
+    _one_of("state", StepState),
+    CheckConstraint("duration_s >= 0 AND try_number >= 1", name="step_is_possible"),
+)
+
+measurement: Final = Table(
+    "measurement",
+    metadata,
+    _key(),
+    _to("step", index=True),
+    _text("name"),
+    Column("value", Float, nullable=True),
+    _text("unit", 16),
+    Column("low", Float, nullable=True),
+    Column("high", Float, nullable=True),
+    Column("text", Text, nullable=True),
+    Column("expected", Text, nullable=True),
+    CheckConstraint("(value IS NULL) <> (text IS NULL)", name="number_or_text"),
+)
+
+device_write: Final = Table(
+    "device_write",
+    metadata,
+    _key(),
+    _to("run", index=True),
+    _text("target", 16),
+    _text("what", 64),
+    Column("value", Text, nullable=False),
+    _utc("intended_at"),
+    Column("intended_monotonic_s", Float, nullable=False),
+    _utc("verified_at", nullable=True),
+    Column("read_back", Text, nullable=True),
+    CheckConstraint("read_back IS NULL OR verified_at IS NOT NULL", name="read_back_is_verified"),
+)
+
+attachment: Final = Table(
+    "attachment",
+    metadata,
+    _key(),
+    _to("run", index=True),
+    _text("kind", 32),
+    _text("name"),
+    _sha256("sha256"),
+    Column("size_bytes", BigInteger, nullable=False),
+    UniqueConstraint("run_id", "kind", "name"),
+    CheckConstraint("length(sha256) = 64", name="sha256_is_whole"),
+)
+
+audit: Final = Table(
+    "audit",
+    metadata,
+    _key(),
+    _utc("at"),
+    _text("event", 32),
+    _to("run", nullable=True, index=True),
+    Column("data", Text, nullable=False),
+    _sha256("previous_hash"),
+    _sha256("hash"),
+    UniqueConstraint("previous_hash"),
+    UniqueConstraint("hash"),
+)
+"""Append-only; each row's hash covers the row and the hash before it (`audit`)."""

@@ -1,0 +1,165 @@
+"""Reports over many runs: figures and rows, as JSON, CSV and JUnit. Data in, text out."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from enum import Enum, IntEnum
+from typing import Any, Final
+from xml.etree import ElementTree as Xml
+
+from flasher.protocol.text import printable
+from flasher.station.records.model import (
+    Figures,
+    RunFilter,
+    RunKind,
+    RunState,
+    UnitLife,
+    utc_text,
+)
+from flasher.station.records.queries import Records
+
+SCHEMA_VERSION: Final = 1
+_FORMULA_STARTS: Final = ("=", "+", "-", "@", "\t", "\r")
+"""A spreadsheet takes a cell that begins so for a formula."""
+Row = dict[str, str | int | float | bool | None]
+
+
+@dataclass(frozen=True)
+class Report:
+    """Runs of a filter with their figures."""
+
+    chosen: RunFilter
+    figures: Figures
+    runs: list[Row]
+    """As `Records.table` gives them, the oldest first."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """The report in JSON's types; times are texts in UTC."""
+        shares = {
+            "yield_share": self.figures.yield_share,
+            "first_pass_share": self.figures.first_pass_share,
+        }
+        return {
+            "schema": SCHEMA_VERSION,
+            "filter": plain(self.chosen),
+            "figures": plain(self.figures) | shares,
+            "runs": self.runs,
+        }
+
+    def to_csv(self) -> str:
+        """One row a run under a line of headings, for a spreadsheet; empty without runs."""
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\r\n")
+        if self.runs:
+            writer.writerow(self.runs[0])
+        writer.writerows(map(_cell, run.values()) for run in self.runs)
+        return out.getvalue()
+
+    def to_junit(self) -> str:
+        """One test case a run: FAIL is a failure, ERROR and INTERRUPTED are errors, ABORTED is
+        skipped. Golden units are left out, as in the figures; a run that goes on is no result.
+        """
+        cases = [
+            run
+            for run in self.runs
+            if run["kind"] != RunKind.GOLDEN.value and run["state"] != RunState.RUNNING.value
+        ]
+        suite = Xml.Element("testsuite", _junit_counts(cases) | {"name": "station"})
+        for run in cases:
+            _junit_case(suite, run)
+        suites = Xml.Element("testsuites")
+        suites.append(suite)
+        Xml.indent(suites)
+        return Xml.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def make_report(records: Records, chosen: RunFilter) -> Report:
+    """The report of a filter. Raises RecordError."""
+    return Report(chosen, records.figures(chosen), records.table(chosen))
+
+
+def unit_document(life: UnitLife) -> dict[str, Any]:
+    """The whole life of a unit in JSON's types."""
+    return {"schema": SCHEMA_VERSION, **plain(life)}
+
+
+def plain(value: Any) -> Any:
+    """A record in JSON's types."""
+    if isinstance(value, datetime):
+        return utc_text(value)
+    if isinstance(value, IntEnum):
+        return value.name.lower()
+    if isinstance(value, Enum):
+        return value.value
+    if dataclasses.is_dataclass(value):
+        return {
+            field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)
+        }
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [plain(item) for item in value]
+    return value
+
+
+def _cell(value: object) -> str:
+    """A cell that a spreadsheet takes for what it is."""
+    if isinstance(value, str):
+        return f"'{value}" if value.startswith(_FORMULA_STARTS) else value
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.3f}"
+    return "" if value is None else str(value)
+
+
+_ELEMENTS: Final[dict[object, str]] = {
+    RunState.FAIL.value: "failure",
+    RunState.ERROR.value: "error",
+    RunState.INTERRUPTED.value: "error",
+    RunState.ABORTED.value: "skipped",
+}
+
+
+def _xml(text: str) -> str:
+    """A text as XML can hold it: it has no way to say control characters."""
+    return text if text.isascii() and text.isprintable() else printable(text)
+
+
+def _seconds(runs: list[Row]) -> float:
+    return sum(float(run["duration_s"] or 0.0) for run in runs)
+
+
+def _junit_counts(runs: list[Row]) -> dict[str, str]:
+    found = [_ELEMENTS.get(run["state"], "") for run in runs]
+    return {
+        "tests": str(len(runs)),
+        "failures": str(found.count("failure")),
+        "errors": str(found.count("error")),
+        "skipped": str(found.count("skipped")),
+        "time": f"{_seconds(runs):.3f}",
+    }
+
+
+def _junit_case(suite: Xml.Element, run: Row) -> None:
+    case = Xml.SubElement(
+        suite,
+        "testcase",
+        {
+            "classname": _xml(
+                f"{'virtual ' if run['is_virtual'] else ''}{run['recipe']} {run['recipe_revision']}"
+            ),
+            "name": _xml(str(run["serial"])),
+            "time": f"{_seconds([run]):.3f}",
+            "timestamp": str(run["begun_at"]),
+        },
+    )
+    element = _ELEMENTS.get(run["state"])
+    if element is not None:
+        told = {"type": _xml(str(run["code"])), "message": _xml(str(run["text"]))}
+        Xml.SubElement(case, element, told)

@@ -1,0 +1,106 @@
+"""The way of an outcome onto the disk: trace, last step, and one transaction that ends the run.
+
+It may be tried again after every failure, from any point; nothing is shown before it is through.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+from flasher.station import codes
+from flasher.station.codes import CODES, Code
+from flasher.station.records.errors import RuleBrokenError
+from flasher.station.records.model import Ending, RunState, StepState
+from flasher.station.records.store import Store
+from flasher.station.run_model import RunResult
+from flasher.station.socket_line import ActiveRun
+from flasher.station.steps import StepName
+
+TRACE: Final = "trace"
+TORN_TRACE: Final = "torn-trace"
+"""Of a process that died: its end is missing."""
+
+
+def save(store: Store, run: ActiveRun, now_s: Callable[[], float]) -> RunResult:
+    """Save how a run ended; what comes back is on disk. Raises RecordError."""
+    if run.result is None:
+        run.result = _judged(run)
+    if not run.attached:
+        _attach(store, run)
+    if not run.is_save_noted:
+        duration_s = max(0.0, now_s() - run.ended_s)
+        state = StepState.ERROR if run.result.code == codes.TRACE_NOT_SAVED.name else StepState.PASS
+        store.step(run.claim.run_id, StepName.SAVE.value, state, duration_s=duration_s)
+        run.is_save_noted = True
+    try:
+        store.finish(run.claim.run_id, _ending(run, run.result))
+    except RuleBrokenError as error:
+        # The records know better: it is no PASS. That is a bug, and the unit is not judged.
+        run.result = _worse(run.result, codes.INTERNAL, error.what)
+        store.finish(run.claim.run_id, _ending(run, run.result))
+    _forget_spooled(run)
+    return run.result
+
+
+def _judged(run: ActiveRun) -> RunResult:
+    if run.finished is None:
+        raise ValueError("a run that has not ended cannot be saved")
+    result = run.finished.result
+    if run.journal_error and result.outcome is not RunState.ABORTED:
+        return _worse(result, codes.RECORD_NOT_SAVED, run.journal_error)
+    return result
+
+
+def _attach(store: Store, run: ActiveRun) -> None:
+    """The trace, by its hash; a trace that is not the one which was closed is none."""
+    trace = run.finished.trace if run.finished is not None else None
+    if trace is None:
+        if run.trace.exists():
+            with suppress(FileNotFoundError):
+                run.attached = [store.add_file(TORN_TRACE, run.trace)]
+        if run.result is not None and run.result.outcome is RunState.PASS:
+            run.result = _worse(run.result, codes.TRACE_NOT_SAVED, "There is no trace of the bus.")
+        return
+    file = store.add_file(TRACE, trace.path)
+    if file.sha256 != trace.sha256 and run.result is not None:
+        words = "The trace on disk is not the one that was written."
+        run.result = _worse(run.result, codes.TRACE_NOT_SAVED, words)
+    run.attached = [file]
+
+
+def _ending(run: ActiveRun, result: RunResult) -> Ending:
+    code = CODES.get(result.code, codes.INTERNAL)
+    log = next((file.sha256 for file in run.attached if file.kind == TRACE), None)
+    text = " ".join(filter(None, (sentence(result.text), code.action)))
+    if result.outcome is RunState.PASS:
+        text = verified_words(result)
+    return Ending(result.outcome, code.name, text, result.verified, log, tuple(run.attached))
+
+
+def sentence(text: str) -> str:
+    """A text with a full stop, so that another sentence can follow."""
+    text = text.strip()
+    return text if not text or text.endswith((".", "!", "?")) else f"{text}."
+
+
+def verified_words(result: RunResult) -> str:
+    """How far each target was verified, as a person reads it."""
+    return "; ".join(f"{name}: {level.words}" for name, level in result.verified.items())
+
+
+def _worse(result: RunResult, code: Code, text: str) -> RunResult:
+    return replace(result, outcome=code.outcome, code=code.name, text=text, verified={})
+
+
+def _forget_spooled(run: ActiveRun) -> None:
+    """The records have their own copy."""
+    paths: list[Path] = [run.trace]
+    if run.finished is not None and run.finished.trace is not None:
+        paths.append(run.finished.trace.path)
+    for path in paths:
+        with suppress(OSError):
+            path.unlink(missing_ok=True)

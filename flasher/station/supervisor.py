@@ -1,0 +1,245 @@
+"""Starts, watches and restarts the processes of the sockets. One that dies or hangs is replaced;
+the others do not notice.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from typing import Any, Final, Protocol
+
+from flasher.station.messages import CannotWork, FromWorker, Quit, ToWorker, WorkerSetup
+from flasher.station.worker import worker_main
+
+HANG_S: Final = 10.0
+"""A process that says nothing for so long hangs: it beats every half second, and no call of an
+adapter takes longer than some seconds."""
+START_S: Final = 60.0
+"""A process that has only begun may take longer: it loads its adapter's driver."""
+RESTART_MIN_S: Final = 1.0
+RESTART_MAX_S: Final = 30.0
+_QUIT_S: Final = 5.0
+_MESSAGES_AT_ONCE: Final = 1000
+"""Taken from one process before the others have their turn."""
+
+
+class Port(Protocol):
+    """The station's end of one process."""
+
+    @property
+    def waitable(self) -> Any:
+        """For `multiprocessing.connection.wait`; None where there is nothing to wait for."""
+        ...
+
+    def send(self, message: ToWorker) -> bool:
+        """False when the process is gone."""
+        ...
+
+    def receive(self) -> FromWorker | None:
+        """The next message, None when there is none. Raises EOFError when the process is gone."""
+        ...
+
+    def kill(self) -> None:
+        """End the process at once, and wait for its end."""
+        ...
+
+    def join(self, limit_s: float) -> bool:
+        """Wait for its own end; False when it did not come."""
+        ...
+
+
+class ProcessPort:
+    """A process made with "spawn": nothing of the station is copied into it, on any system."""
+
+    def __init__(self, setup: WorkerSetup) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._channel, theirs = context.Pipe()
+        self._process = context.Process(
+            target=worker_main, args=(theirs, setup), name=f"socket {setup.socket}", daemon=True
+        )
+        self._process.start()
+        # The child has its own: only without this one its end is seen here.
+        theirs.close()
+
+    @property
+    def waitable(self) -> Connection[Any, Any]:
+        """The pipe."""
+        return self._channel
+
+    def send(self, message: ToWorker) -> bool:
+        """False when the process is gone."""
+        try:
+            self._channel.send(message)
+        except (OSError, ValueError):
+            return False
+        return True
+
+    def receive(self) -> FromWorker | None:
+        """The next message. Raises EOFError when the process is gone, OSError likewise."""
+        if not self._channel.poll():
+            return None
+        message: FromWorker = self._channel.recv()
+        return message
+
+    def kill(self) -> None:
+        """End it at once."""
+        self._process.kill()
+        self._process.join()
+        self._channel.close()
+
+    def join(self, limit_s: float) -> bool:
+        """Wait for its end."""
+        self._process.join(limit_s)
+        return self._process.exitcode is not None
+
+
+@dataclass(frozen=True)
+class WorkerLost:
+    """A process is gone and will be started again after `restart_in_s`; None: it will not."""
+
+    reason: str
+    hung: bool
+    restart_in_s: float | None
+
+
+Launch = Callable[[WorkerSetup], Port]
+
+
+class _Slot:
+    """What is known of one socket's process."""
+
+    def __init__(self, setup: WorkerSetup) -> None:
+        self.setup = setup
+        self.port: Port | None = None
+        self.heard_at = 0.0
+        self.is_new = True
+        self.start_at: float | None = 0.0
+        """When it is to be started; None: not by itself."""
+        self.pause_s = RESTART_MIN_S
+        self.reason = ""
+        """Why it said that it cannot work."""
+
+
+class Supervisor:
+    """All processes. `now` is a monotonic clock in seconds."""
+
+    def __init__(
+        self,
+        setups: Iterable[WorkerSetup],
+        now: Callable[[], float],
+        *,
+        launch: Launch = ProcessPort,
+        hang_s: float = HANG_S,
+    ) -> None:
+        self._slots = {setup.socket: _Slot(setup) for setup in setups}
+        self._now = now
+        self._launch = launch
+        self._hang_s = hang_s
+
+    @property
+    def waitables(self) -> Sequence[Any]:
+        """Where messages come from."""
+        ports = (slot.port for slot in self._slots.values())
+        return [port.waitable for port in ports if port is not None and port.waitable is not None]
+
+    @property
+    def ports(self) -> Mapping[str, Port]:
+        """The processes that are there, by socket."""
+        return {name: slot.port for name, slot in self._slots.items() if slot.port is not None}
+
+    def send(self, socket: str, message: ToWorker) -> bool:
+        """False when there is no process that could get it."""
+        port = self._slots[socket].port
+        return port is not None and port.send(message)
+
+    def wait(self, extra: Sequence[Any], limit_s: float) -> None:
+        """Return when there is something to receive, at the latest after `limit_s`."""
+        waitables = [*self.waitables, *extra]
+        if waitables:
+            with suppress(OSError):
+                wait(waitables, timeout=limit_s)
+
+    def poll(self) -> list[tuple[str, FromWorker | WorkerLost]]:
+        """What the processes said, and who of them is gone; starts those that are due."""
+        found: list[tuple[str, FromWorker | WorkerLost]] = []
+        for name, slot in self._slots.items():
+            if slot.port is None:
+                if slot.start_at is not None and self._now() >= slot.start_at:
+                    self._start(slot)
+                continue
+            messages, is_gone = self._receive(slot)
+            found += [(name, message) for message in messages]
+            # Looked at after everything that waited was read: a busy station is no hung process.
+            limit_s = START_S if slot.is_new else self._hang_s
+            if is_gone:
+                found.append((name, self._lose(slot, "its process ended", hung=False)))
+            elif self._now() - slot.heard_at > limit_s:
+                slot.port.kill()
+                reason = f"its process said nothing for {limit_s:g} s, and was ended"
+                found.append((name, self._lose(slot, reason, hung=True)))
+        return found
+
+    def replace(self, socket: str) -> None:
+        """End a process at once; it is started again at the next `poll`."""
+        slot = self._slots[socket]
+        if slot.port is not None:
+            slot.port.kill()
+            slot.port = None
+        slot.start_at = self._now()
+
+    def close(self) -> None:
+        """Let all processes end; those that do not in time are ended."""
+        ports = list(self.ports.values())
+        for port in ports:
+            port.send(Quit())
+        give_up_at = self._now() + _QUIT_S
+        for port in ports:
+            port.join(max(0.0, give_up_at - self._now()))
+            port.kill()
+        for slot in self._slots.values():
+            slot.port = slot.start_at = None
+
+    # -- one process ------------------------------------------------------------------------------
+
+    def _start(self, slot: _Slot) -> None:
+        slot.port = self._launch(slot.setup)
+        slot.heard_at = self._now()
+        slot.is_new, slot.start_at, slot.reason = True, None, ""
+
+    def _receive(self, slot: _Slot) -> tuple[list[FromWorker], bool]:
+        """Everything that it said, and whether it is gone."""
+        messages: list[FromWorker] = []
+        port = slot.port
+        if port is None:
+            return messages, True
+        try:
+            while len(messages) < _MESSAGES_AT_ONCE and (message := port.receive()) is not None:
+                messages.append(message)
+                if isinstance(message, CannotWork):
+                    slot.reason = message.reason
+        except (EOFError, OSError):
+            return messages, True
+        finally:
+            if messages:
+                slot.heard_at = self._now()
+                slot.is_new = False
+        return messages, False
+
+    def _lose(self, slot: _Slot, reason: str, *, hung: bool) -> WorkerLost:
+        if slot.port is not None and not hung:
+            slot.port.kill()
+        slot.port = None
+        if slot.reason:
+            # Starting it again would change nothing.
+            return WorkerLost(slot.reason, hung, None)
+        pause_s = slot.pause_s
+        slot.start_at = self._now() + pause_s
+        slot.pause_s = min(2 * pause_s, RESTART_MAX_S)
+        return WorkerLost(reason, hung, pause_s)
+
+    def worked(self, socket: str) -> None:
+        """The process of this socket has done its work: forget its failures."""
+        self._slots[socket].pause_s = RESTART_MIN_S

@@ -1,0 +1,134 @@
+"""What of a unit is read and held against the recipe: limits, what was written, what must stay."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Sequence
+from typing import Final
+
+from flasher.errors import NoAnswerError
+from flasher.host.items import Readable
+from flasher.host.write import WritePlan, field_changes
+from flasher.station import codes
+from flasher.station.recipe import Limit
+from flasher.station.recipe_check import codec_of, readable_of
+from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.records.model import Measurement, RunKind
+from flasher.station.run_model import RunOrder, StepFailedError, write_key
+from flasher.station.steps import StepName
+from flasher.station.template import Scan, fill
+from flasher.station.unit_device import UnitDevice
+
+BEFORE: Final = "before "
+"""Begins the names of measurements of what must not change."""
+
+
+class UnitReads:
+    """Reads of one run."""
+
+    def __init__(
+        self, order: RunOrder, recipe: LoadedRecipe, scan: Scan, devices: Sequence[UnitDevice]
+    ) -> None:
+        self._order = order
+        self._recipe = recipe
+        self._scan = scan
+        self._devices = {device.name: device for device in devices}
+        self._before: dict[str, str] = {}
+
+    # -- limits -----------------------------------------------------------------------------------
+
+    def limits(
+        self, step: StepName, askable: Collection[str] | None = None
+    ) -> Iterator[Measurement]:
+        """The measurements that the recipe wants in this step; a target that is not `askable` is
+        measured in no step before it runs an application. Raises NoAnswerError.
+        """
+        for limit in self._recipe.recipe.limit:
+            if limit.step is step and (askable is None or limit.target in askable):
+                yield self._measure(limit)
+
+    def _measure(self, limit: Limit) -> Measurement:
+        codec = codec_of(self._recipe, limit)
+        values = self._devices[limit.target].read(readable_of(self._recipe, limit))
+        value, shown = values[limit.field]
+        name = f"{limit.target} {limit.item} {limit.field}"
+        if limit.expected is not None:
+            return Measurement(name, text=shown, expected=fill(limit.expected, self._scan))
+        if not isinstance(value, int | float):
+            raise StepFailedError(codes.RECIPE, f"{name} is no number.")
+        return Measurement(name, float(value), codec.unit, low=limit.low, high=limit.high)
+
+    # -- what must not change ---------------------------------------------------------------------
+
+    def before(self, askable: Collection[str]) -> Iterator[Measurement]:
+        """Read what must not change, and remember it. What an interrupted run of this unit read
+        first holds before what is read now; a device that has no application cannot be asked.
+        """
+        known = self._order.known_before
+        for target, readable in self._unchanged():
+            if target in askable:
+                now = self._texts(target, readable)
+            else:
+                start = _name(target, readable, "")
+                now = {name: text for name, text in known.items() if name.startswith(start)}
+                if not now:
+                    raise StepFailedError(
+                        codes.UNCHANGED_UNKNOWN,
+                        f"{target} {readable.name} cannot be read: it runs no application.",
+                    )
+            for name, text in now.items():
+                first = known.get(name, text)
+                self._before[name] = first
+                if text != first:
+                    raise StepFailedError(
+                        codes.CHANGED, f"{name} was {first!a}, and is {text!a} now."
+                    )
+                yield Measurement(f"{BEFORE}{name}", text=first)
+
+    def unchanged(self, measured: list[Measurement]) -> None:
+        """Hold what must not change against what it was. Raises StepFailedError."""
+        for target, readable in self._unchanged():
+            for name, text in self._texts(target, readable).items():
+                first = self._before.get(name)
+                measured.append(Measurement(f"unchanged {name}", text=text, expected=first))
+                if text != first:
+                    raise StepFailedError(
+                        codes.CHANGED, f"{name} was {first!a}, and is {text!a} now."
+                    )
+
+    def _unchanged(self) -> Iterator[tuple[str, Readable]]:
+        for part in self._recipe.recipe.unchanged:
+            yield part.target, readable_of(self._recipe, part)
+
+    def _texts(self, target: str, readable: Readable) -> dict[str, str]:
+        fields = self._devices[target].read(readable)
+        return {_name(target, readable, field): shown for field, (_, shown) in fields.items()}
+
+    # -- what was written -------------------------------------------------------------------------
+
+    def written(self, plans: Sequence[WritePlan], measured: list[Measurement]) -> None:
+        """Read every written field once more. Raises StepFailedError for one that differs."""
+        for plan in plans:
+            key = write_key(plan.target.name, plan.writable.name)
+            read_back = plan.writable.read_back
+            if read_back is None:
+                measured.append(Measurement(key, text="written, cannot be read back"))
+                continue
+            try:
+                fields = self._devices[plan.target.name].read(read_back)
+            except NoAnswerError as error:
+                raise StepFailedError(codes.NOT_RUNNING, error.what) from error
+            wanted = {name: codec for name, codec in type(plan.content).LAYOUT if name in fields}
+            found = ", ".join(fields[name][1] for name in wanted)
+            expected = ", ".join(change.new for change in field_changes(plan, None))
+            if self._order.kind is RunKind.VERIFY_ONLY:
+                # Made on another day, perhaps: what it was given then is what it must have.
+                expected = self._order.written_before.get(key, expected)
+            measured.append(Measurement(key, text=found, expected=expected))
+            if found != expected:
+                raise StepFailedError(
+                    codes.WRITE_DIFFERS, f"{key} reads {found!a} instead of {expected!a}."
+                )
+
+
+def _name(target: str, readable: Readable, field: str) -> str:
+    return f"{target} {readable.name} {field}"

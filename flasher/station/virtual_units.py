@@ -1,0 +1,277 @@
+"""Units that are not there: they come into a socket, are good, slow, bad or dead, and leave again.
+
+For training, demonstration and tests. Each socket has a simulated bus of its own at the pace of a
+real one; what is decided about a unit follows from seed and serial number.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from enum import StrEnum
+from typing import Final
+
+from flasher.api import Connection
+from flasher.bus.link import Clock, PacedClock, VirtualClock
+from flasher.bus.simulated import SimulatedBus
+from flasher.device.model import Device
+from flasher.device.profile import DeviceProfile
+from flasher.errors import UsageError
+from flasher.image.release import Release
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import IMAGE_MAX_SIZE, VERSION_FIELD_SIZE, Dialect, Target
+from flasher.protocol.text import encode_text
+from flasher.station.config import MockUnits
+from flasher.station.messages import PresenceChanged, VirtualUnits
+from flasher.station.recipe import SerialNumber
+from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.unit_judging import SERIAL_ITEM
+
+NO_NUMBER: Final = "NONE"
+"""What a new unit has for a serial number."""
+OTHER_HARDWARE: Final = "V0r0r1_20200101"
+POWER_OFF_S: Final = 1.0
+SLOW_PROGRAM_S: Final = 0.01
+"""Ten times as long for each packet as a good unit takes."""
+SLOW_ERASE_S: Final = 0.02
+_DIGITS: Final = re.compile(r"[0-9]+")
+_SERIALS_TRIED: Final = 2000
+
+
+class Health(StrEnum):
+    """What a virtual unit is like."""
+
+    GOOD = "good"
+    SLOW = "slow"
+    REFUSES = "refuses the image"
+    WRONG_HARDWARE = "wrong hardware"
+    DEAD = "dead"
+
+
+def health_of(units: MockUnits, serial: str) -> Health:
+    """What the unit with this serial number is like."""
+    chance = random.Random(f"{units.seed} {serial}")  # noqa: S311  a play, no secret
+    at = chance.random()
+    if at < units.bad:
+        return chance.choice((Health.REFUSES, Health.WRONG_HARDWARE))
+    if at < units.bad + units.dead:
+        return Health.DEAD
+    return Health.SLOW if at < units.bad + units.dead + units.slow else Health.GOOD
+
+
+def serial_numbers(rule: SerialNumber, first: int, step: int) -> Iterator[str]:
+    """Serial numbers that fit a recipe: its example with other digits in its last number.
+
+    Raises UsageError where none is found.
+    """
+    places = list(_DIGITS.finditer(rule.example))
+    for number in range(first, first + step * _SERIALS_TRIED, step):
+        for place in reversed(places):
+            size = place.end() - place.start()
+            digits = f"{number % 10**size:0{size}d}"
+            serial = rule.example[: place.start()] + digits + rule.example[place.end() :]
+            if _fits(rule, serial):
+                yield serial
+                break
+    raise UsageError(
+        "There are no serial numbers for further virtual units.",
+        remedy="End the serial number of the recipe with a number, or begin anew.",
+    )
+
+
+def _fits(rule: SerialNumber, serial: str) -> bool:
+    try:
+        rule.read(serial)
+    except ValueError:
+        return False
+    return True
+
+
+class Place:
+    """Where one target of a unit sits: an engine, which is a device or nothing."""
+
+    def __init__(self) -> None:
+        self.device: Device | None = None
+        self._power_at: float | None = None
+        """When the power comes back."""
+
+    def put(self, device: Device, now: float) -> None:
+        """Put a device in. Its power comes with the socket: it passes through its bootloader."""
+        self.device = device
+        device.power_cut(now)
+        device.power_on(now)
+
+    def take(self) -> None:
+        """Take it out."""
+        self.device = self._power_at = None
+
+    def cycle(self, now: float) -> None:
+        """Switch off and, after a while, on."""
+        if self.device is not None and self.device.has_power:
+            self.device.power_cut(now)
+        self._power_at = now + POWER_OFF_S
+
+    # -- the engine interface: that of the device, where one is -----------------------------------
+
+    @property
+    def done(self) -> bool:
+        """It never is."""
+        return False
+
+    def receive(self, frame: Frame, now: float) -> None:
+        """A CAN frame arrived."""
+        if self.device is not None:
+            self.device.receive(frame, now)
+
+    def tick(self, now: float) -> None:
+        """The time that `deadline` asked for has come."""
+        if self._power_at is not None and now >= self._power_at:
+            self._power_at = None
+            if self.device is not None and not self.device.has_power:
+                self.device.power_on(now)
+        if self.device is not None:
+            self.device.tick(now)
+
+    def deadline(self) -> float | None:
+        """When it next wants `tick`."""
+        wanted = None if self.device is None else self.device.deadline()
+        if self._power_at is None:
+            return wanted
+        return self._power_at if wanted is None else min(wanted, self._power_at)
+
+    def next_frame(self, now: float) -> Frame | None:
+        """The next frame to send."""
+        return None if self.device is None else self.device.next_frame(now)
+
+    def frame_sent(self, now: float) -> None:
+        """It was accepted."""
+        if self.device is not None:
+            self.device.frame_sent(now)
+
+    def cancel(self, now: float) -> None:
+        """Nothing to end."""
+
+    def take_events(self) -> Sequence[object]:
+        """What the device reports."""
+        return () if self.device is None else self.device.take_events()
+
+
+class VirtualSocket:
+    """A socket with virtual units: a bus, the places on it, and who comes and goes."""
+
+    def __init__(
+        self, recipe: LoadedRecipe, virtual: VirtualUnits, clock: Clock | None = None
+    ) -> None:
+        self._recipe = recipe
+        self._virtual = virtual
+        made = PacedClock(virtual.speed) if virtual.speed else VirtualClock()
+        self.clock = clock or made
+        self.dialect = recipe.targets[0].profile.dialect
+        bus = SimulatedBus(self.dialect.bitrate_bps, self.clock)
+        self.places = {target.name: Place() for target in recipe.targets}
+        for place in self.places.values():
+            bus.attach(place)
+        self.connection = Connection(bus.link(), self.clock, "virtual units")
+        self._serials = serial_numbers(
+            recipe.recipe.serial_number, virtual.first_number, virtual.number_step
+        )
+        self._left = virtual.count
+        self.serial = ""
+        """The label of the unit in the socket; empty: none is."""
+        self._next_at: float | None = self.clock.now() + virtual.arrive_after_s
+
+    def step(self) -> PresenceChanged | None:
+        """Let a unit come or go in its time; None when nothing happened."""
+        now = self.clock.now()
+        if self._next_at is None or now < self._next_at:
+            return None
+        self._next_at = None
+        if self.serial:
+            self._leave(now)
+            return PresenceChanged(is_there=False, how="the virtual unit left")
+        if self._left == 0:
+            return None
+        if self._left is not None:
+            self._left -= 1
+        self.arrive(next(self._serials))
+        return PresenceChanged(is_there=True, how="a virtual unit came", label=self.serial)
+
+    def arrive(self, serial: str) -> Health:
+        """Put the unit with this label in."""
+        self.serial = serial
+        health = health_of(self._virtual.units, serial)
+        if health is not Health.DEAD:
+            for target in self._recipe.targets:
+                device = make_device(
+                    target.target, self.dialect, health, target.release, self._own_number(serial)
+                )
+                self.places[target.name].put(device, self.clock.now())
+        return health
+
+    def _own_number(self, label: str) -> str:
+        """What the unit says that it is: none yet where the recipe gives it its number, else what
+        its label says, as far as it has room for it.
+        """
+        if any(write.item == SERIAL_ITEM for write in self._recipe.recipe.write):
+            return NO_NUMBER
+        try:
+            encode_text(label, VERSION_FIELD_SIZE)
+        except ValueError:
+            return ""
+        return label
+
+    def run_ended(self) -> None:
+        """The verdict is known: somebody will take the unit out."""
+        self._next_at = self.clock.now() + self._virtual.leave_after_s
+
+    def _leave(self, now: float) -> None:
+        self.serial = ""
+        for place in self.places.values():
+            place.take()
+        self._next_at = now + self._virtual.arrive_after_s
+
+    # -- the power of the socket ------------------------------------------------------------------
+
+    def begin_cycle(self) -> None:
+        """Switch the unit off and on."""
+        for place in self.places.values():
+            place.cycle(self.clock.now())
+
+    def check(self) -> None:
+        """It never fails."""
+
+
+def make_device(
+    target: Target, dialect: Dialect, health: Health, release: Release, serial_number: str
+) -> Device:
+    """A device as it comes to the end of the line, with an older application."""
+    profile = DeviceProfile(
+        dialect=dialect.name,  # type: ignore[arg-type]
+        serial_number=serial_number,
+        hardware_version=_hardware(release, health),
+        application_area_bytes=_area_bytes(release.size_bytes),
+    )
+    if health is Health.SLOW:
+        profile = replace(profile, program_time_s=SLOW_PROGRAM_S, erase_time_s=SLOW_ERASE_S)
+    if health is Health.REFUSES:
+        # Its product wants a checksum in the image, which this image does not have.
+        profile = replace(profile, image_checksum="crc32")
+    return Device(target, bitrate_bps=dialect.bitrate_bps, profile=profile)
+
+
+def _hardware(release: Release, health: Health) -> str:
+    usual = DeviceProfile().hardware_version
+    if health is Health.WRONG_HARDWARE:
+        return OTHER_HARDWARE
+    if release.fits_hardware(usual):
+        return usual
+    return release.hardware_versions[0].replace("*", "20220512")[:15]
+
+
+def _area_bytes(size_bytes: int) -> int:
+    """Room for the image: a device with a smaller flash is made faster."""
+    page = DeviceProfile().page_size_bytes
+    pages = -(-2 * size_bytes // page) + 2
+    return min(pages * page, DeviceProfile().application_area_bytes, IMAGE_MAX_SIZE)

@@ -1,0 +1,247 @@
+"""The process of one socket: it opens the adapter, watches for units, and runs them.
+
+It is a process of its own so that an adapter's driver that crashes or hangs takes nothing with it.
+The processes are made by `multiprocessing` with "spawn" on every system: its pipes keep messages
+apart and can be waited for all together on Linux and Windows alike, which the standard streams of
+a subprocess cannot, and a driver that prints to them does no harm.
+
+It writes no records. Everything that has to be on disk is asked of the station (`Ask`), and it does
+nothing until the reply comes. When the pipe breaks, the station is dead: the message under way is
+finished, and there is no further one.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import shutil
+import signal
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Final
+
+from flasher.api import Connection, connect
+from flasher.errors import BusError, FlasherError, TransmitBlockedError, UsageError
+from flasher.log import log_event
+from flasher.protocol.text import printable
+from flasher.station import codes
+from flasher.station.messages import (
+    AdapterDown,
+    Begin,
+    CannotWork,
+    Finished,
+    PresenceChanged,
+    Ready,
+    TraceFile,
+    WorkerSetup,
+)
+from flasher.station.power import PowerCommand
+from flasher.station.presence import Presence
+from flasher.station.recipe_file import LoadedRecipe, load_recipe
+from flasher.station.records.model import RunState
+from flasher.station.run_model import (
+    PowerControl,
+    RunResult,
+)
+from flasher.station.unit_device import UnitDevice
+from flasher.station.unit_run import UnitRun
+from flasher.station.virtual_units import VirtualSocket
+from flasher.station.worker_line import IDLE_S, Channel, Line, LineJournal, StationGoneError
+from flasher.trace.recorder import Recorder
+
+_REOPEN_S: Final = 1.0
+
+
+class Worker:
+    """The work of the process, on an open connection."""
+
+    def __init__(
+        self,
+        setup: WorkerSetup,
+        recipe: LoadedRecipe,
+        line: Line,
+        connection: Connection,
+        virtual: VirtualSocket | None = None,
+    ) -> None:
+        self._recipe = recipe
+        self._line = line
+        self._connection = connection
+        self._virtual = virtual
+        self._power: PowerControl | None = PowerCommand(setup.power) if setup.power else virtual
+        self._journal = LineJournal(line, setup.reply_limit_s)
+        devices = [UnitDevice(each, connection, (), line.is_stopped) for each in recipe.targets]
+        self._presence = Presence(devices, silence_s=setup.silence_s, probe_s=setup.probe_s)
+        self._is_down = False
+        self._reopen_at = 0.0
+
+    def work(self) -> None:
+        """Until the station ends it or is gone."""
+        sees = self._virtual is not None or self._presence.sees_units
+        self._line.send(Ready(self._connection.name, sees))
+        if self._virtual is not None:
+            self._line.send(PresenceChanged(is_there=False, how="no virtual unit yet"))
+        while not self._line.is_over:
+            self._line.look()
+            begin = self._line.take_begin()
+            if begin is not None:
+                self._run(begin)
+            else:
+                self._watch()
+
+    # -- idle -------------------------------------------------------------------------------------
+
+    def _watch(self) -> None:
+        """Look for units for a moment."""
+        if self._is_down:
+            self._reopen()
+            return
+        link, clock = self._connection.link, self._connection.clock
+        try:
+            if self._virtual is None:
+                for frame in self._presence.probe(clock.now()):
+                    link.send(frame)
+            until = clock.now() + IDLE_S
+            heard = link.receive(until)
+            while heard is not None:
+                self._presence(heard, sent=False, now=clock.now())
+                heard = link.receive(until) if clock.now() < until else None
+        except TransmitBlockedError:
+            # Nobody is there to acknowledge: what waits must not be sent to the next unit.
+            self._is_down = True
+            self._reopen()
+        except BusError as error:
+            self._is_down = True
+            self._line.send(AdapterDown(error.what))
+        change = self._change()
+        if change is not None:
+            self._line.send(change)
+
+    def _change(self) -> PresenceChanged | None:
+        if self._virtual is not None:
+            return self._virtual.step()
+        return self._presence.change(self._connection.clock.now())
+
+    def _reopen(self) -> None:
+        now = time.monotonic()
+        if now < self._reopen_at:
+            self._line.look(IDLE_S)
+            return
+        self._reopen_at = now + _REOPEN_S
+        try:
+            self._connection.link.reopen()
+        except BusError:
+            return
+        self._is_down = False
+        self._presence.go_on(self._connection.clock.now())
+        self._line.send(Ready(self._connection.name, self._presence.sees_units))
+
+    # -- a run ------------------------------------------------------------------------------------
+
+    def _run(self, begin: Begin) -> None:
+        recorder: Recorder | None = None
+        try:
+            with ExitStack() as stack:
+                recorder = stack.enter_context(Recorder(begin.trace))
+                taps = (recorder, self._presence)
+                result = UnitRun(
+                    begin.order,
+                    self._recipe,
+                    self._connection,
+                    self._journal,
+                    taps=taps,
+                    tell=self._line.tell,
+                    cancelled=self._line.is_stopped,
+                    power=self._power,
+                ).run()
+        except StationGoneError:
+            return
+        except FlasherError as error:
+            result = _error_result(codes.TRACE_NOT_SAVED, error.what)
+        except Exception as error:  # noqa: BLE001  a bug must not cost the socket its process
+            log_event(error)
+            result = _error_result(codes.INTERNAL, f"{type(error).__name__}: {error}")
+        trace = self._close_trace(begin.trace, recorder)
+        if trace is None and result.outcome is RunState.PASS:
+            result = _error_result(codes.TRACE_NOT_SAVED, "The trace of the bus is not complete.")
+        self._line.send(Finished(result, trace))
+        if self._virtual is not None:
+            self._virtual.run_ended()
+
+    @staticmethod
+    def _close_trace(path: Path, recorder: Recorder | None) -> TraceFile | None:
+        """The closed trace, packed; None when it is not complete."""
+        if recorder is None or recorder.failure is not None:
+            return None
+        try:
+            return pack(path)
+        except OSError:
+            return None
+
+
+def pack(path: Path) -> TraceFile:
+    """A trace compressed beside itself, with its hash; the plain one is deleted. Raises OSError."""
+    packed = path.with_name(path.name + ".gz")
+    with path.open("rb") as plain, packed.open("wb") as raw:
+        # Without a name and time of its own: equal traces are equal files.
+        with gzip.GzipFile(filename="", mode="wb", compresslevel=6, fileobj=raw, mtime=0) as out:
+            shutil.copyfileobj(plain, out)
+        raw.flush()
+    path.unlink()
+    return TraceFile(packed, hashlib.sha256(packed.read_bytes()).hexdigest())
+
+
+def _error_result(code: codes.Code, text: str) -> RunResult:
+    return RunResult(code.outcome, code.name, printable(text), 0.0)
+
+
+@contextmanager
+def open_socket(
+    setup: WorkerSetup, recipe: LoadedRecipe
+) -> Iterator[tuple[Connection, VirtualSocket | None]]:
+    """The connection that a setup names. Raises UsageError, BusError."""
+    if setup.bus is None:
+        if setup.virtual is None:
+            raise UsageError(f"Socket {setup.socket} has neither an adapter nor virtual units.")
+        virtual = VirtualSocket(recipe, setup.virtual)
+        yield virtual.connection, virtual
+        return
+    with connect(recipe.targets[0].profile.dialect, **setup.bus) as connection:
+        yield connection, None
+
+
+def load_same(setup: WorkerSetup) -> LoadedRecipe:
+    """The recipe of the setup. Raises UsageError when it is not the one that the station has."""
+    recipe = load_recipe(setup.recipe)
+    if {str(path): sha256 for path, sha256 in recipe.files.items()} != dict(setup.files):
+        raise UsageError("The recipe, or a file that it names, was changed.")
+    return recipe
+
+
+def worker_main(channel: Channel, setup: WorkerSetup) -> None:
+    """The whole life of the process."""
+    # Ctrl-C is the station's business: it tells its processes what to do.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    line = Line(channel, time.monotonic)
+    with suppress(StationGoneError):
+        try:
+            recipe = load_same(setup)
+        except FlasherError as error:
+            line.send(CannotWork(error.what))
+            return
+        is_down = False
+        while not line.is_over:
+            try:
+                with open_socket(setup, recipe) as (connection, virtual):
+                    Worker(setup, recipe, line, connection, virtual).work()
+            except UsageError as error:
+                line.send(CannotWork(error.what))
+                return
+            except BusError as error:
+                if not is_down:
+                    line.send(AdapterDown(error.what))
+                is_down = True
+                wait_until = time.monotonic() + _REOPEN_S
+                while time.monotonic() < wait_until and not line.is_over:
+                    line.look(IDLE_S)

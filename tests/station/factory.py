@@ -1,0 +1,175 @@
+"""Recipes, clocks and records for the station's tests: small images, time that stands still."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass, field
+from datetime import UTC, date, datetime, timedelta
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from sqlalchemy import event
+
+from flasher.image.image import Image
+from flasher.image.manifest import release_of, to_toml
+from flasher.protocol.spec import BMS, WMC, Target
+from flasher.station.recipe_check import load_checked
+from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.records import Claim, Ending, RunId, RunState, StepState, Store
+from flasher.station.steps import Verified
+
+DAY = date(2026, 5, 17)
+SERIAL = "W2605002"
+BMS_VERSION = "V1r0r4_20220512"
+IMAGES = {
+    BMS: Image.from_bytes(b"BMS\0" + BMS_VERSION.encode() + bytes(200)),
+    WMC: Image.from_bytes(b"WMC\0" + b"V2r1r0_20230117" + bytes(100)),
+}
+HEAD = """\
+name = "Battery 36 V"
+part = "BAT-36"
+revision = "4"
+"""
+SERIAL_NUMBER = """
+[serial_number]
+pattern = 'W(?P<year>[0-9]{2})(?P<week>[0-9]{2})(?P<number>[0-9]{3})'
+example = "W2605002"
+"""
+
+
+def target_table(target: Target, more: str = "") -> str:
+    """A `[[target]]` for the image of a target."""
+    return (
+        f'\n[[target]]\ntarget = "{target.name}"\nimage = "{target.name}.bin"\n'
+        f'sha256 = "{IMAGES[target].sha256}"\n{more}'
+    )
+
+
+USUAL = HEAD + SERIAL_NUMBER + target_table(BMS)
+
+
+def write_recipe(folder: Path, text: str = USUAL) -> Path:
+    """A recipe with its images and manifests."""
+    for target, image in IMAGES.items():
+        (folder / f"{target.name}.bin").write_bytes(image.data)
+        manifest = to_toml(release_of(image, target))
+        (folder / f"{target.name}.bin.toml").write_text(manifest, encoding="utf-8")
+    path = folder / "recipe.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def make_recipe(folder: Path, text: str = USUAL) -> LoadedRecipe:
+    """A recipe, read and checked."""
+    return load_checked(write_recipe(folder, text), DAY)
+
+
+@dataclass
+class FakeClock:
+    """Stands still until it is told to go on."""
+
+    now: datetime = datetime(2026, 5, 17, 9, 0, tzinfo=UTC)
+    seconds: float = 100.0
+
+    def utc(self) -> datetime:
+        return self.now
+
+    def monotonic_s(self) -> float:
+        return self.seconds
+
+    def go_on(self, seconds: float) -> None:
+        self.now += timedelta(seconds=seconds)
+        self.seconds += seconds
+
+
+@cache
+def _empty_records() -> bytes:
+    """A database as a station makes it; made once, since its tables and rules take a while."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "records.sqlite"
+        Store.open(str(path), station="line-2", clock=FakeClock()).close()
+        return path.read_bytes()
+
+
+def _do_not_wait_for_the_disk(connection: Any, _record: object) -> None:
+    connection.execute("PRAGMA synchronous = OFF")
+
+
+@dataclass
+class Bench:
+    """A station's records with a recipe, and what a good run does to them."""
+
+    folder: Path
+    clock: FakeClock = field(default_factory=FakeClock)
+    lock_timeout_s: float = 0.02
+
+    def __post_init__(self) -> None:
+        self.recipe = make_recipe(self.folder)
+        self.path = self.folder / "records.sqlite"
+        self.trace = self.folder / "trace.asc"
+        self.trace.write_text("date Sun May 17\n", encoding="ascii")
+        self.path.write_bytes(_empty_records())
+        self.store = self.opened()
+        self.store.recover()
+
+    def opened(self, station: str = "line-2") -> Store:
+        store = Store.open(
+            str(self.path),
+            station=station,
+            clock=self.clock,
+            lock_timeout_s=self.lock_timeout_s,
+        )
+        # These tests pull no plug, and share the disk with each other.
+        event.listen(store.database.engine, "connect", _do_not_wait_for_the_disk)
+        store.database.close()
+        return store
+
+    def use(self, text: str) -> None:
+        """Go on with another recipe."""
+        self.recipe = make_recipe(self.folder, text)
+
+    def claim(
+        self,
+        serial: str = SERIAL,
+        socket: str = "A",
+        *,
+        lot: str = "",
+        reason: str = "",
+        is_virtual: bool = False,
+    ) -> Claim:
+        return self.store.claim(
+            serial, socket, self.recipe, "jo", lot=lot, reason=reason, is_virtual=is_virtual
+        )
+
+    def work(self, run_id: RunId) -> None:
+        """What comes before the end of a good run."""
+        write = self.store.intent(run_id, "bms", "flash", BMS_VERSION)
+        self.clock.go_on(8.0)
+        self.store.verified(write, BMS_VERSION)
+        self.store.step(run_id, "flash", StepState.PASS, duration_s=8.0)
+
+    def ending(self, state: RunState = RunState.PASS, code: str = "OK") -> Ending:
+        file = self.store.add_file("trace", self.trace)
+        verified = {"bms": Verified.VERSION} if state is RunState.PASS else {}
+        return Ending(state, code, "", verified, file.sha256, [file])
+
+    def make(
+        self,
+        state: RunState = RunState.PASS,
+        serial: str = SERIAL,
+        socket: str = "A",
+        *,
+        lot: str = "",
+        reason: str = "",
+        code: str = "",
+        is_virtual: bool = False,
+    ) -> RunId:
+        """A whole run."""
+        claim = self.claim(serial, socket, lot=lot, reason=reason, is_virtual=is_virtual)
+        run_id = claim.run_id
+        self.work(run_id)
+        code = code or ("OK" if state is RunState.PASS else "NO_ANSWER")
+        self.store.finish(run_id, self.ending(state, code))
+        self.clock.go_on(2.0)
+        return run_id

@@ -1,0 +1,161 @@
+"""A station whose sockets' processes are scripted: no bus, a clock that stands still."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import deque
+from pathlib import Path
+from typing import Any, TypeVar
+
+from flasher.station.events import SocketState, StationEvent
+from flasher.station.messages import (
+    Ask,
+    Begin,
+    Done,
+    Finished,
+    FromWorker,
+    Intent,
+    PresenceChanged,
+    Ready,
+    Reply,
+    ToWorker,
+    TraceFile,
+    WorkerSetup,
+)
+from flasher.station.options import StationOptions
+from flasher.station.records.model import Measurement, RunState, StepState
+from flasher.station.run_model import RunResult, StepReport
+from flasher.station.station import Station
+from flasher.station.steps import StepName, Verified
+from tests.station.factory import Bench
+
+Event = TypeVar("Event")
+
+
+class ScriptedPort:
+    """The process of a socket, as a script."""
+
+    def __init__(self, setup: WorkerSetup) -> None:
+        self.setup = setup
+        self.said: deque[FromWorker] = deque()
+        self.heard: list[ToWorker] = []
+        self.is_gone = False
+        self.killed = 0
+
+    @property
+    def waitable(self) -> Any:
+        return None
+
+    def send(self, message: ToWorker) -> bool:
+        if not self.is_gone:
+            self.heard.append(message)
+        return not self.is_gone
+
+    def receive(self) -> FromWorker | None:
+        if self.said:
+            return self.said.popleft()
+        if self.is_gone:
+            raise EOFError
+        return None
+
+    def kill(self) -> None:
+        self.killed += 1
+        self.is_gone = True
+
+    def join(self, limit_s: float) -> bool:
+        return True
+
+
+class LineBench:
+    """A station with sockets A, B, ..."""
+
+    def __init__(self, bench: Bench, sockets: str = "AB", *, sees_units: bool = True) -> None:
+        self.bench = bench
+        self.events: list[StationEvent] = []
+        self.ports: dict[str, ScriptedPort] = {}
+        setups = [WorkerSetup(name, bench.recipe.path, {}, None) for name in sockets]
+        self.station = Station(
+            bench.store,
+            bench.recipe,
+            setups,
+            operator="jo",
+            on_event=self.events.append,
+            options=StationOptions(arrival_limit_s=5.0, hang_s=10.0, end_limit_s=0.0),
+            clock=bench.clock,
+            launch=self._launch,
+        )
+        self.station.start()
+        for name in sockets:
+            self.say(name, Ready("a bus", sees_units))
+
+    def _launch(self, setup: WorkerSetup) -> ScriptedPort:
+        self.ports[setup.socket] = ScriptedPort(setup)
+        return self.ports[setup.socket]
+
+    def turn(self) -> None:
+        self.station.turn(0.0)
+
+    def say(self, socket: str, message: FromWorker) -> None:
+        self.ports[socket].said.append(message)
+        self.turn()
+
+    def arrive(self, socket: str) -> None:
+        self.say(socket, PresenceChanged(is_there=True, how="traffic"))
+
+    def leave(self, socket: str) -> None:
+        self.say(socket, PresenceChanged(is_there=False))
+
+    def scan(self, text: str) -> None:
+        self.station.submit(text)
+        self.turn()
+
+    def state(self, socket: str) -> SocketState:
+        return next(view.state for view in self.station.sockets if view.name == socket)
+
+    def of(self, kind: type[Event]) -> list[Event]:
+        """The events of a kind so far."""
+        return [event for event in self.events if isinstance(event, kind)]
+
+    def last(self, kind: type[Event]) -> Event:
+        return self.of(kind)[-1]
+
+    # -- what a process does ----------------------------------------------------------------------
+
+    def order(self, socket: str) -> Begin:
+        return next(m for m in reversed(self.ports[socket].heard) if isinstance(m, Begin))
+
+    def ask(self, socket: str, what: Intent | Done | StepReport) -> Reply:
+        """Ask the station to save something; its reply."""
+        port = self.ports[socket]
+        number = 1 + sum(isinstance(message, Reply) for message in port.heard)
+        self.say(socket, Ask(number, what))
+        reply = port.heard[-1]
+        assert isinstance(reply, Reply)
+        assert reply.number == number
+        return reply
+
+    def work(self, socket: str) -> None:
+        """A good run, up to its last step."""
+        reply = self.ask(socket, Intent("bms", "flash", "V1"))
+        assert reply.write_id is not None, reply.error
+        self.ask(socket, Done(reply.write_id, "V1"))
+        measured = (Measurement("bms version", text="V1"),)
+        report = StepReport(StepName.FLASH, "bms", 1, StepState.PASS, 1.0, measurements=measured)
+        self.ask(socket, report)
+
+    def trace(self, socket: str) -> TraceFile:
+        path = Path(str(self.order(socket).trace) + ".gz")
+        path.write_bytes(b"frames")
+        return TraceFile(path, hashlib.sha256(b"frames").hexdigest())
+
+    def end(self, socket: str, outcome: RunState = RunState.PASS, code: str = "OK") -> None:
+        verified = {"bms": Verified.VERSION} if outcome is RunState.PASS else {}
+        result = RunResult(outcome, code, "what happened", 2.0, verified)
+        self.say(socket, Finished(result, self.trace(socket)))
+
+    def make(self, socket: str, serial: str) -> None:
+        """A whole good run of a unit that comes."""
+        self.scan(serial)
+        self.arrive(socket)
+        self.work(socket)
+        self.end(socket)

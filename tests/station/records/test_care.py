@@ -1,0 +1,116 @@
+"""Backup and verification of the records."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from flasher.errors import UsageError
+from flasher.station.records import RecordsDamagedError, RunState, Store, UnitState
+from tests.station.factory import SERIAL, Bench
+
+
+def test_a_backup_made_while_a_unit_runs_is_whole_and_opens_by_itself(bench: Bench) -> None:
+    bench.make()
+    bench.claim("W2605003")
+    path = bench.folder / "backup.sqlite"
+    path.write_text("the backup of yesterday")
+    made = bench.store.backup(path)
+    assert made.size_bytes == path.stat().st_size
+    assert not list(bench.folder.glob(".*part*"))
+    bench.make(RunState.PASS, "W2605004", "B")
+    with Store.open(str(path), station="line-2", create=False) as copy:
+        assert not copy.verify()
+        assert copy.read.state(SERIAL, "BAT-36") is UnitState.PASS
+        assert copy.read.state("W2605004", "BAT-36") is UnitState.NEW
+
+
+def test_a_backup_that_fails_leaves_the_old_one(bench: Bench) -> None:
+    bench.make()
+    (file,) = bench.store.read.unit(SERIAL).runs[0].attachments
+    bench.store.files.path(file.sha256).unlink()
+    path = bench.folder / "backup.sqlite"
+    path.write_text("the backup of yesterday")
+    with pytest.raises(Exception, match="NOT SAVED"):
+        bench.store.backup(path)
+    assert path.read_text() == "the backup of yesterday"
+
+
+def test_a_backup_does_not_overwrite_the_records(bench: Bench) -> None:
+    with pytest.raises(UsageError, match="cannot replace"):
+        bench.store.backup(bench.path)
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """Records of a good and a bad unit, with nothing wrong in them."""
+    made = Bench(tmp_path_factory.mktemp("plant"))
+    made.make()
+    made.make(RunState.FAIL, "W2605003")
+    assert not made.store.verify()
+    yield made
+    made.store.close()
+
+
+def without_rules(connection: sqlite3.Connection) -> None:
+    """Someone with a database tool and time."""
+    names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall()
+    for (name,) in names:
+        connection.execute(f"DROP TRIGGER {name}")
+
+
+@pytest.mark.parametrize(
+    ("statement", "found"),
+    [
+        ("UPDATE run SET text = 'all was well' WHERE id = 1", "changed after it was finished"),
+        ("UPDATE run SET code = 'X' WHERE id = 1", "changed after it was finished"),
+        ("UPDATE step SET duration_s = 0.1", "changed after it was finished"),
+        ("UPDATE device_write SET read_back = 'V9'", "changed after it was finished"),
+        ("UPDATE unit SET serial = 'W9999999' WHERE id = 1", "changed after it was finished"),
+        ("UPDATE operator SET name = 'someone else'", "changed after it was finished"),
+        ("DELETE FROM attachment WHERE run_id = 1", "changed after it was finished"),
+        ("DELETE FROM audit WHERE id = 3", "chain is broken"),
+        ("UPDATE audit SET data = '{}' WHERE id = 3", "changed after it was written"),
+        ("DELETE FROM audit WHERE id = (SELECT max(id) FROM audit)", "does not know it"),
+        ("UPDATE step SET run_id = 77 WHERE id = 1", "missing row"),
+        ("DELETE FROM run WHERE id = 1", "missing"),
+    ],
+)
+def test_what_was_changed_behind_the_rules_is_found(
+    plant: Bench, tmp_path: Path, statement: str, found: str
+) -> None:
+    copy = tmp_path / "records.sqlite"
+    with contextlib.closing(sqlite3.connect(copy)) as other:
+        with contextlib.closing(sqlite3.connect(plant.path)) as original:
+            original.backup(other)
+        without_rules(other)
+        other.execute(statement)
+        other.commit()
+    folder = plant.store.files.folder
+    with Store.open(str(copy), station="x", folder=folder, create=False) as store:
+        assert found in " ".join(problem.what for problem in store.verify())
+
+
+@pytest.mark.parametrize("spoil", [lambda path: path.unlink(), lambda path: path.write_bytes(b"x")])
+def test_an_attachment_that_is_gone_or_changed_is_found(
+    bench: Bench, spoil: Callable[[Path], object]
+) -> None:
+    bench.make()
+    (file,) = bench.store.read.unit(SERIAL).runs[0].attachments
+    spoil(bench.store.files.path(file.sha256))
+    (problem,) = bench.store.verify()
+    assert file.sha256 in problem.where
+    with pytest.raises(RecordsDamagedError):
+        bench.store.files.read(file.sha256)
+
+
+def test_a_correction_is_a_new_row_and_part_of_the_chain(bench: Bench) -> None:
+    run_id = bench.make()
+    before = bench.store.read.run(run_id)
+    bench.store.correct(run_id, "jo", "wrong lot on the card, it was L2")
+    assert bench.store.read.run(run_id) == before
+    assert not bench.store.verify()

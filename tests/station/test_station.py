@@ -1,0 +1,618 @@
+"""The station: scans, sockets, claims, outcomes; and nothing is shown before it is saved."""
+
+from __future__ import annotations
+
+import sqlite3
+from typing import Any
+
+import pytest
+from sqlalchemy import event
+
+from flasher.errors import UsageError
+from flasher.station.events import (
+    LineResumed,
+    LineStopped,
+    OperatorPrompted,
+    RecordNotSaved,
+    RunEnded,
+    RunStarted,
+    ScanAccepted,
+    ScanRefused,
+    SocketChanged,
+    SocketState,
+    StepEnded,
+    UnitArrived,
+    UnitRemoved,
+    WorkerFailed,
+)
+from flasher.station.messages import (
+    Abort,
+    AdapterDown,
+    CannotWork,
+    Done,
+    Finished,
+    Intent,
+    PresenceChanged,
+    Ready,
+    TraceFile,
+)
+from flasher.station.records.errors import DiskFullError, RecordsLockedError
+from flasher.station.records.model import (
+    Measurement,
+    RunKind,
+    RunState,
+    StepState,
+    UnitState,
+    WriteId,
+)
+from flasher.station.run_model import RunResult, StepReport, flash_value
+from flasher.station.steps import StepName, Verified
+from tests.station.factory import SERIAL, USUAL, Bench
+from tests.station.line_bench import LineBench
+
+OTHER = "W2605003"
+THIRD = "W2605004"
+
+
+@pytest.fixture
+def line(bench: Bench) -> LineBench:
+    return LineBench(bench)
+
+
+# -- a unit's way ---------------------------------------------------------------------------------
+
+
+def test_a_unit_is_scanned_connected_run_and_shown(line: LineBench) -> None:
+    line.scan(SERIAL)
+    assert line.last(OperatorPrompted).text == f"Connect {SERIAL}."
+    line.arrive("A")
+    assert line.state("A") is SocketState.RUNNING
+    assert line.order("A").order.serial == SERIAL
+    line.work("A")
+    line.end("A")
+    ended = line.last(RunEnded)
+    assert (ended.outcome, ended.code, ended.action) == (RunState.PASS, "OK", "Take the unit out.")
+    assert ended.verified == (("bms", Verified.VERSION),)
+    assert line.state("A") is SocketState.PASS
+    run = line.bench.store.read.run(ended.run_id)
+    assert run.run.state is RunState.PASS
+    assert [step.name for step in run.steps] == ["flash bms", "save"]
+    assert line.bench.store.verify() == ()
+
+
+def test_pass_is_on_disk_before_it_is_shown(line: LineBench, bench: Bench) -> None:
+    """The very moment: a second look at the file, by somebody else, when the event comes."""
+    found: list[str] = []
+
+    def look(event: object) -> None:
+        shows = isinstance(event, SocketChanged) and event.state is SocketState.PASS
+        if shows or isinstance(event, RunEnded):
+            with sqlite3.connect(bench.path) as other:
+                found.extend(row[0] for row in other.execute("SELECT state FROM run"))
+
+    line.station._on_event = look
+    line.make("A", SERIAL)
+    assert found == ["PASS", "PASS"]
+
+
+def test_the_unit_before_the_label_works_as_well(line: LineBench) -> None:
+    line.arrive("B")
+    assert line.state("B") is SocketState.SCAN
+    line.scan(SERIAL)
+    assert line.state("B") is SocketState.RUNNING
+
+
+def test_a_finished_unit_is_not_begun_again_and_its_removal_makes_room(line: LineBench) -> None:
+    line.make("A", SERIAL)
+    line.turn()
+    line.arrive("A")
+    assert line.state("A") is SocketState.PASS
+    line.leave("A")
+    assert line.state("A") is SocketState.EMPTY
+    assert line.of(UnitRemoved) == [UnitRemoved("A")]
+
+
+def test_the_next_label_waits_until_the_finished_unit_is_out(line: LineBench) -> None:
+    line.make("A", SERIAL)
+    line.scan(OTHER)
+    assert line.state("A") is SocketState.PASS
+    line.leave("A")
+    line.arrive("A")
+    assert line.order("A").order.serial == OTHER
+
+
+def test_steps_are_told_when_they_are_saved(line: LineBench) -> None:
+    line.make("A", SERIAL)
+    assert [step.step for step in line.of(StepEnded)] == ["flash"]
+
+
+def test_a_unit_that_failed_may_be_scanned_again_where_it_is(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.end("A", RunState.FAIL, "NO_ANSWER")
+    assert line.state("A") is SocketState.FAIL
+    line.scan(SERIAL)
+    assert line.state("A") is SocketState.RUNNING
+
+
+def test_a_unit_that_has_just_passed_is_not_scanned_again(line: LineBench) -> None:
+    line.make("A", SERIAL)
+    line.scan(SERIAL)
+    assert line.last(ScanRefused).code == "JUST_PASSED"
+
+
+# -- which socket ---------------------------------------------------------------------------------
+
+
+def test_two_waiting_units_need_a_chosen_socket(line: LineBench) -> None:
+    line.arrive("A")
+    line.arrive("B")
+    line.scan(SERIAL)
+    assert line.last(OperatorPrompted).text == "Scan the socket of this unit."
+    line.scan("socket b")
+    assert line.order("B").order.serial == SERIAL
+    assert line.state("A") is SocketState.SCAN
+
+
+def test_a_socket_may_be_chosen_first(line: LineBench) -> None:
+    line.scan("SOCKET B")
+    line.scan(SERIAL)
+    assert line.state("B") is SocketState.SCAN
+    line.arrive("B")
+    assert line.order("B").order.serial == SERIAL
+
+
+def test_a_unit_that_is_not_seen_is_run_after_a_while_where_a_person_put_it(
+    line: LineBench,
+) -> None:
+    line.scan("SOCKET B")
+    line.scan(SERIAL)
+    line.bench.clock.go_on(4.0)
+    line.turn()
+    assert line.state("B") is SocketState.SCAN
+    line.say("B", Ready("a bus", sees_units=True))
+    line.bench.clock.go_on(2.0)
+    line.turn()
+    assert line.state("B") is SocketState.RUNNING
+
+
+def test_where_units_cannot_be_seen_the_scan_begins(bench: Bench) -> None:
+    line = LineBench(bench, "A", sees_units=False)
+    line.scan(SERIAL)
+    assert line.state("A") is SocketState.RUNNING
+    line.work("A")
+    line.end("A")
+    line.scan("FREE A")
+    assert line.state("A") is SocketState.EMPTY
+
+
+# -- wrong scans ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "code"),
+    [
+        ("HELLO", "WRONG_SERIAL"),
+        ("", "NOT_UNDERSTOOD"),
+        ("W26\x1b05002", "NOT_UNDERSTOOD"),
+        ("SOCKET", "NOT_UNDERSTOOD"),
+        ("SOCKET Z", "NO_SUCH_SOCKET"),
+        ("ABORT A", "NOT_RUNNING"),
+        ("RESUME", "NOT_STOPPED"),
+    ],
+)
+def test_a_wrong_scan_changes_nothing_and_says_what_to_do(
+    line: LineBench, text: str, code: str
+) -> None:
+    line.scan(text)
+    refused = line.last(ScanRefused)
+    assert refused.code == code
+    assert refused.remedy.endswith(".")
+    assert {view.state for view in line.station.sockets} == {SocketState.EMPTY}
+
+
+def test_a_label_behind_a_refused_socket_goes_to_no_other(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.arrive("B")
+    line.scan("SOCKET A")
+    line.scan(OTHER)
+    assert line.last(ScanRefused).code == "NO_SOCKET"
+    assert line.state("B") is SocketState.SCAN
+    line.scan(OTHER)
+    assert line.order("B").order.serial == OTHER
+
+
+def test_a_double_scan_is_one_scan(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.scan(SERIAL)
+    assert line.last(ScanRefused).code == "DOUBLE_SCAN"
+    line.arrive("A")
+    assert line.state("A") is SocketState.RUNNING
+    line.scan(SERIAL)
+    assert line.last(ScanRefused).code == "UNIT_RUNNING"
+
+
+def test_a_second_label_waits_for_the_first(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.scan(OTHER)
+    assert line.last(ScanRefused).code == "LABEL_WAITS"
+    line.scan("CANCEL")
+    line.scan(OTHER)
+    assert line.last(ScanAccepted).text == OTHER
+
+
+def test_a_scan_during_a_run_is_for_the_next_socket(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.scan(OTHER)
+    line.scan("SOCKET A")
+    assert line.last(ScanRefused).code == "SOCKET_BUSY"
+    line.arrive("B")
+    assert line.order("B").order.serial == OTHER
+
+
+def test_the_same_unit_cannot_be_in_two_sockets(line: LineBench) -> None:
+    line.scan("SOCKET A")
+    line.scan(SERIAL)
+    line.scan("SOCKET B")
+    line.scan(SERIAL)
+    assert line.last(ScanRefused).code == "DOUBLE_SCAN"
+    assert line.state("B") is SocketState.EMPTY
+
+
+def test_a_unit_that_passed_before_is_refused_by_the_records(line: LineBench) -> None:
+    line.make("A", SERIAL)
+    line.leave("A")
+    line.scan(SERIAL)
+    line.arrive("A")
+    refused = line.last(ScanRefused)
+    assert (refused.code, refused.socket) == ("DUPLICATE", "A")
+    assert line.state("A") is SocketState.SCAN
+    line.scan(OTHER)
+    assert line.state("A") is SocketState.RUNNING
+
+
+def test_a_recipe_that_was_changed_stops_the_line(line: LineBench) -> None:
+    line.bench.recipe.path.write_text("changed", encoding="utf-8")
+    line.scan(SERIAL)
+    line.arrive("A")
+    assert line.last(LineStopped).code == "RECIPE_CHANGED"
+    assert line.state("B") is SocketState.STOPPED
+    assert line.bench.store.read.runs() == ()
+
+
+def test_a_person_aborts_a_run(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.scan("ABORT A")
+    assert isinstance(line.ports["A"].heard[-1], Abort)
+    line.end("A", RunState.ABORTED, "OPERATOR_ABORT")
+    assert line.state("A") is SocketState.RECHECK
+
+
+# -- records that cannot be written ---------------------------------------------------------------
+
+
+def hold(bench: Bench) -> sqlite3.Connection:
+    """Somebody else holds the database."""
+    other = sqlite3.connect(bench.path, isolation_level=None)
+    other.execute("BEGIN IMMEDIATE")
+    return other
+
+
+def test_an_outcome_that_cannot_be_saved_is_never_green(line: LineBench, bench: Bench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.work("A")
+    other = hold(bench)
+    line.end("A")
+    assert line.of(RunEnded) == []
+    assert line.state("A") is SocketState.ERROR
+    assert line.last(RecordNotSaved).serial == SERIAL
+    assert "RECORD NOT SAVED" in line.last(LineStopped).reason
+    assert line.state("B") is SocketState.STOPPED
+    line.scan(OTHER)
+    assert line.last(ScanRefused).code == "LINE_STOPPED"
+    line.scan("RESUME")
+    assert line.last(ScanRefused).code == "STILL_NOT_SAVED"
+    other.execute("ROLLBACK")
+    line.scan("RESUME")
+    assert line.last(RunEnded).outcome is RunState.PASS
+    assert line.state("A") is SocketState.PASS
+    assert line.of(LineResumed)
+    other.close()
+
+
+@pytest.mark.parametrize("operation", ["intent", "verified", "step"])
+@pytest.mark.parametrize("kind", [DiskFullError, RecordsLockedError])
+def test_a_run_of_which_a_part_is_not_saved_cannot_pass(
+    line: LineBench,
+    bench: Bench,
+    monkeypatch: pytest.MonkeyPatch,
+    operation: str,
+    kind: type[DiskFullError],
+) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    with monkeypatch.context() as patch:
+
+        def fail(*_args: object, **_kwargs: object) -> None:
+            raise kind("RECORD NOT SAVED: no room.", remedy="Make room.")
+
+        patch.setattr(bench.store, operation, fail)
+        replies = [
+            line.ask("A", Intent("bms", "flash", "V1")),
+            line.ask("A", Done(WriteId(1), "V1")),
+            line.ask("A", StepReport(StepName.FLASH, "bms", 1, StepState.PASS, 1.0)),
+        ]
+    assert [bool(reply.error) for reply in replies].count(True) >= 1
+    # Even a process that would claim a PASS does not get one.
+    line.end("A")
+    ended = line.last(RunEnded)
+    assert (ended.outcome, ended.code) == (RunState.ERROR, "RECORD_NOT_SAVED")
+    assert line.state("A") is SocketState.RECHECK
+    assert line.station.is_line_stopped
+
+
+def test_a_full_disk_under_a_run_is_never_green(line: LineBench, bench: Bench) -> None:
+    """Not a made-up error: SQLite may take no further page."""
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.work("A")
+
+    def no_room(connection: Any, _record: object) -> None:
+        connection.execute("PRAGMA max_page_count = 1")
+
+    engine = bench.store.database.engine
+    event.listen(engine, "connect", no_room)
+    bench.store.database.close()
+    # A database with room left in its last page saves some more, and then no more.
+    for _ in range(200):
+        if line.ask("A", Intent("bms", "flash", "V" * 200)).error:
+            break
+    line.end("A")
+    assert SocketState.PASS not in {view.state for view in line.station.sockets}
+    assert all(ended.outcome is not RunState.PASS for ended in line.of(RunEnded))
+    assert "disk is full" in line.last(LineStopped).reason
+    event.remove(engine, "connect", no_room)
+    bench.store.database.close()
+    line.scan("RESUME")
+    assert line.last(RunEnded).code == "RECORD_NOT_SAVED"
+    assert bench.store.read.state(SERIAL, "BAT-36") is UnitState.RECHECK
+
+
+def test_a_claim_that_cannot_be_saved_begins_nothing(line: LineBench, bench: Bench) -> None:
+    other = hold(bench)
+    line.scan(SERIAL)
+    line.arrive("A")
+    other.close()
+    assert line.ports["A"].heard == []
+    assert line.state("A") is SocketState.STOPPED
+
+
+def test_a_trace_that_is_not_what_was_written_is_no_pass(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.work("A")
+    good = line.trace("A")
+    result = RunResult(RunState.PASS, "OK", "", 1.0, {"bms": Verified.VERSION})
+    line.say("A", Finished(result, TraceFile(good.path, "0" * 64)))
+    assert line.last(RunEnded).code == "TRACE_NOT_SAVED"
+
+
+def test_a_pass_that_the_records_know_better_is_none(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.ask("A", Intent("bms", "flash", "V1"))  # never verified
+    line.end("A")
+    ended = line.last(RunEnded)
+    assert (ended.outcome, ended.code) == (RunState.ERROR, "INTERNAL")
+    assert line.state("A") is SocketState.RECHECK
+
+
+# -- processes and adapters -----------------------------------------------------------------------
+
+
+def test_a_process_that_dies_costs_its_own_run_and_no_other(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.scan(OTHER)
+    line.arrive("B")
+    line.ports["A"].is_gone = True
+    line.turn()
+    assert line.last(RunEnded).code == "PROCESS_DIED"
+    assert line.bench.store.read.state(SERIAL, "BAT-36") is UnitState.RECHECK
+    assert line.state("B") is SocketState.RUNNING
+    line.work("B")
+    line.end("B")
+    assert line.state("B") is SocketState.PASS
+
+
+def test_a_process_that_hangs_is_ended_and_started_again(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    hanging = line.ports["A"]
+    line.bench.clock.go_on(9.0)
+    line.say("B", Ready("a bus", sees_units=True))
+    line.bench.clock.go_on(2.0)
+    line.turn()
+    assert hanging.killed == 1
+    assert line.last(RunEnded).code == "PROCESS_HUNG"
+    assert line.last(WorkerFailed).restart_in_s == 1.0
+    line.bench.clock.go_on(1.5)
+    line.turn()
+    assert line.ports["A"] is not hanging
+    line.say("A", Ready("a bus", sees_units=True))
+    line.arrive("A")
+    line.scan(SERIAL)
+    assert line.order("A").order.kind is RunKind.RECHECK
+
+
+def test_a_process_that_cannot_work_is_not_started_again(line: LineBench) -> None:
+    line.ports["A"].said.append(CannotWork("The recipe was changed."))
+    line.ports["A"].is_gone = True
+    line.turn()
+    line.bench.clock.go_on(5.0)
+    line.turn()
+    assert line.last(WorkerFailed) == WorkerFailed("A", "The recipe was changed.", None)
+    assert line.state("A") is SocketState.ERROR
+
+
+def test_an_unplugged_adapter_is_shown_and_comes_back(line: LineBench) -> None:
+    line.say("A", AdapterDown("no such device"))
+    assert line.state("A") is SocketState.ERROR
+    line.scan("SOCKET A")
+    assert line.last(ScanRefused).code == "SOCKET_BROKEN"
+    line.say("A", Ready("a bus", sees_units=True))
+    assert line.state("A") is SocketState.EMPTY
+
+
+def test_a_new_process_does_not_take_a_finished_unit_for_a_new_one(line: LineBench) -> None:
+    line.make("A", SERIAL)
+    line.ports["A"].is_gone = True
+    line.turn()
+    line.bench.clock.go_on(1.5)
+    line.turn()
+    line.say("A", Ready("a bus", sees_units=True))
+    line.arrive("A")
+    assert line.state("A") is SocketState.PASS
+    assert len(line.of(UnitArrived)) == 1
+
+
+# -- start and end --------------------------------------------------------------------------------
+
+
+def test_what_a_dead_station_left_is_found_at_the_start(bench: Bench) -> None:
+    run_id = bench.claim().run_id
+    bench.store.intent(run_id, "bms", "flash", "V1")
+    line = LineBench(bench)
+    line.scan(SERIAL)
+    line.arrive("A")
+    assert bench.store.read.run(run_id).run.state is RunState.INTERRUPTED
+    assert line.order("A").order.kind is RunKind.RECHECK
+
+
+def test_what_an_interrupted_run_flashed_and_read_back_is_told_to_the_next(bench: Bench) -> None:
+    run_id = bench.claim().run_id
+    target = bench.recipe.targets[0]
+    write = bench.store.intent(
+        run_id, "bms", "flash", flash_value(target.version, target.image.sha256)
+    )
+    bench.store.verified(write, target.version)
+    line = LineBench(bench)
+    line.scan(SERIAL)
+    line.arrive("A")
+    assert line.order("A").order.flashed_before == {"bms"}
+
+
+def test_a_station_that_ends_stops_its_runs_and_saves_them(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.station.abort_all()
+    line.turn()
+    assert any(isinstance(message, Abort) for message in line.ports["A"].heard)
+    line.end("A", RunState.ABORTED, "OPERATOR_ABORT")
+    line.station.close()
+    assert line.last(RunEnded).outcome is RunState.ABORTED
+
+
+def test_labels_of_virtual_units_may_scan_themselves(bench: Bench) -> None:
+    line = LineBench(bench)
+    line.station.options = type(line.station.options)(scans_labels=True)
+    line.say("A", PresenceChanged(is_there=True, how="a virtual unit came", label=SERIAL))
+    assert line.state("A") is SocketState.RUNNING
+    line.say("B", PresenceChanged(is_there=True, how="a virtual unit came", label=SERIAL))
+    assert line.last(ScanRefused).code == "UNIT_RUNNING"
+
+
+def test_figures_follow_the_runs(line: LineBench) -> None:
+    line.make("A", SERIAL)
+    figures = line.station.figures
+    assert (figures.units, figures.passed, figures.first_passed) == (1, 1, 1)
+
+
+def test_who_looks_on_cannot_stop_the_line(line: LineBench) -> None:
+    def fall(_event: object) -> None:
+        raise RuntimeError("a web page fell over")
+
+    line.station._on_event = fall
+    line.make("A", SERIAL)
+    assert line.state("A") is SocketState.PASS
+
+
+def test_a_reason_is_for_its_label_alone(bench: Bench) -> None:
+    bench.use(USUAL.replace('revision = "4"', 'revision = "4"\nduplicate = "reflash-with-reason"'))
+    for serial in (SERIAL, OTHER):
+        bench.make(serial=serial)
+    line = LineBench(bench)
+    line.scan("SOCKET B")
+    line.scan(OTHER)
+    line.scan("REASON customer return")
+    line.scan("SOCKET A")
+    line.scan(SERIAL)
+    line.arrive("B")
+    assert line.last(ScanRefused).code == "REASON_NEEDED"
+    line.arrive("A")
+    assert line.last(RunStarted).serial == SERIAL
+    assert bench.store.read.unit(SERIAL).runs[-1].run.reason == "customer return"
+
+
+def test_cause_and_action_are_two_sentences(line: LineBench, bench: Bench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    line.end("A", RunState.FAIL, "LIMIT")
+    said = bench.store.read.unit(SERIAL).runs[-1].run.text
+    assert said.startswith("what happened. Put the unit aside")
+
+
+def test_real_sockets_refuse_records_of_virtual_units(bench: Bench) -> None:
+    bench.make(is_virtual=True)
+    with pytest.raises(UsageError, match="hold virtual units"):
+        LineBench(bench)
+
+
+@pytest.mark.parametrize("reason", ["", "new label printed"])
+def test_what_must_not_change_is_held_over_a_fail_but_not_for_a_reworked_unit(
+    line: LineBench, reason: str
+) -> None:
+    for model in ("BM36", "destroyed"):
+        if reason:
+            line.scan(f"REASON {reason}")
+        line.scan(SERIAL)
+        if model == "BM36":
+            line.arrive("A")
+        known = dict(line.order("A").order.known_before)
+        read = (Measurement("before bms model", text=model),)
+        report = StepReport(StepName.CHECK, "", 1, StepState.PASS, 1.0, measurements=read)
+        line.ask("A", report)
+        line.ask("A", Intent("bms", "flash", "V1"))
+        line.end("A", RunState.FAIL, "TRANSFER_FAILED")
+    assert known == ({} if reason else {"bms model": "BM36"})
+
+
+def test_what_is_not_saved_is_said_in_one_line(line: LineBench, bench: Bench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    away = bench.path.with_name("away.sqlite")
+    bench.path.rename(away)
+    line.end("A")
+    assert line.state("A") is SocketState.ERROR
+    told = line.last(RecordNotSaved)
+    assert "\n" not in told.reason
+    assert told.remedy not in told.reason
+    away.rename(bench.path)
+    line.scan("RESUME")
+    assert not line.station.is_line_stopped
+
+
+def test_a_pass_of_a_first_run_that_flashed_nothing_is_none(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A")
+    read = (Measurement("bms version", text="V1"),)
+    report = StepReport(StepName.VERIFY, "", 1, StepState.PASS, 1.0, measurements=read)
+    line.ask("A", report)
+    line.end("A")
+    ended = line.last(RunEnded)
+    assert (ended.outcome, ended.code) == (RunState.ERROR, "INTERNAL")
+    assert "every target flashed" in ended.text or "refuses" in ended.text

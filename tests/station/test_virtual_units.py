@@ -1,0 +1,131 @@
+"""Virtual units: who comes, what it is like, and that it behaves so."""
+
+from __future__ import annotations
+
+from collections import Counter
+from itertools import islice
+from pathlib import Path
+
+import pytest
+
+from flasher.errors import UsageError
+from flasher.station.adapters import resolve
+from flasher.station.config import MockUnits, mock_config
+from flasher.station.messages import VirtualUnits
+from flasher.station.records.model import RunId, RunKind
+from flasher.station.run_model import RunOrder, RunResult
+from flasher.station.setups import worker_setups
+from flasher.station.unit_run import UnitRun
+from flasher.station.virtual_units import Health, VirtualSocket, health_of, serial_numbers
+from tests.station.factory import DAY, HEAD, SERIAL_NUMBER, USUAL, make_recipe
+from tests.station.unit_bench import WRITES, Notes
+
+MIXED = MockUnits(bad=0.2, slow=0.1, dead=0.1, seed=5)
+
+
+def test_the_same_seed_and_number_is_the_same_unit() -> None:
+    serials = [f"W{number:07d}" for number in range(500)]
+    first = [health_of(MIXED, serial) for serial in serials]
+    assert first == [health_of(MIXED, serial) for serial in serials]
+    counts = Counter(first)
+    bad = counts[Health.REFUSES] + counts[Health.WRONG_HARDWARE]
+    assert 60 < bad < 140
+    assert 25 < counts[Health.DEAD] < 80
+    assert 25 < counts[Health.SLOW] < 80
+
+
+def test_numbers_follow_the_recipe_and_sockets_do_not_meet(tmp_path: Path) -> None:
+    rule = make_recipe(tmp_path).recipe.serial_number
+    one = list(islice(serial_numbers(rule, 1, 2), 20))
+    two = list(islice(serial_numbers(rule, 2, 2), 20))
+    assert one[:2] == ["W0000001", "W0000003"]
+    assert len(set(one) | set(two)) == 40
+
+
+def test_check_digits_are_kept(tmp_path: Path) -> None:
+    text = USUAL.replace(
+        HEAD + SERIAL_NUMBER,
+        HEAD + "[serial_number]\npattern = '[0-9]{8}'\n"
+        'example = "12345674"\ncheck_digit = "luhn"\n',
+    )
+    rule = make_recipe(tmp_path, text).recipe.serial_number
+    for serial in islice(serial_numbers(rule, 1, 1), 10):
+        rule.read(serial)
+
+
+def test_a_rule_without_room_says_so(tmp_path: Path) -> None:
+    text = USUAL.replace("W(?P<year>[0-9]{2})(?P<week>[0-9]{2})(?P<number>[0-9]{3})", "W2605002")
+    rule = make_recipe(tmp_path, text).recipe.serial_number
+    with pytest.raises(UsageError, match="no serial numbers"):
+        list(serial_numbers(rule, 1, 3))
+
+
+def run_one(folder: Path, wanted: Health) -> RunResult:
+    """The run of a virtual unit that is so."""
+    recipe = make_recipe(folder, USUAL + WRITES)
+    socket = VirtualSocket(recipe, VirtualUnits(MIXED, speed=0))
+    serial = next(s for n in range(999) if health_of(MIXED, s := f"W2605{n:03d}") is wanted)
+    assert socket.arrive(serial) is wanted
+    order = RunOrder(RunId(1), RunKind.PRODUCTION, serial, DAY)
+    return UnitRun(order, recipe, socket.connection, Notes(), power=socket).run()
+
+
+@pytest.mark.parametrize(
+    ("health", "code"),
+    [
+        (Health.GOOD, "OK"),
+        (Health.SLOW, "OK"),
+        (Health.REFUSES, "REFUSED"),
+        (Health.DEAD, "NO_ANSWER"),
+    ],
+)
+def test_a_unit_behaves_as_it_is(tmp_path: Path, health: Health, code: str) -> None:
+    assert run_one(tmp_path, health).code == code
+
+
+def test_a_station_file_becomes_one_setup_a_socket(tmp_path: Path) -> None:
+    recipe = make_recipe(tmp_path)
+    config = mock_config(3, MIXED)
+    setups = worker_setups(resolve(config.socket, ()), recipe, first_number=10)
+    assert [setup.socket for setup in setups] == ["1", "2", "3"]
+    numbers = {
+        serial
+        for setup in setups
+        if setup.virtual is not None
+        for serial in islice(
+            serial_numbers(
+                recipe.recipe.serial_number, setup.virtual.first_number, setup.virtual.number_step
+            ),
+            5,
+        )
+    }
+    assert len(numbers) == 15
+    assert min(numbers) == "W0000010"
+
+
+def test_units_come_and_go(tmp_path: Path) -> None:
+    recipe = make_recipe(tmp_path)
+    socket = VirtualSocket(recipe, VirtualUnits(MockUnits(), speed=0, count=1))
+    assert socket.step() is None
+    socket.clock.wait_until(1.0)
+    came = socket.step()
+    assert came is not None
+    assert came.label == socket.serial
+    assert all(place.device for place in socket.places.values())
+    socket.run_ended()
+    socket.clock.wait_until(2.0)
+    gone = socket.step()
+    assert gone is not None
+    assert not gone.is_there
+    assert not any(place.device for place in socket.places.values())
+    socket.clock.wait_until(10.0)
+    assert socket.step() is None
+
+
+def test_a_unit_has_its_label_inside_where_the_recipe_writes_no_number(tmp_path: Path) -> None:
+    recipe = make_recipe(tmp_path, USUAL)
+    socket = VirtualSocket(recipe, VirtualUnits(MockUnits(), speed=0))
+    socket.arrive("W2605002")
+    order = RunOrder(RunId(1), RunKind.PRODUCTION, "W2605002", DAY)
+    result = UnitRun(order, recipe, socket.connection, Notes(), power=socket).run()
+    assert result.code == "OK", result.text

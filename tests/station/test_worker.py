@@ -1,0 +1,228 @@
+"""The process of a socket, in this process: what it asks, what it tells, and when it stops."""
+
+from __future__ import annotations
+
+import gzip
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flasher.api import Connection
+from flasher.bus.link import VirtualClock
+from flasher.bus.simulated import SimulatedBus
+from flasher.errors import UsageError
+from flasher.protocol.spec import WELLING
+from flasher.station.config import MockUnits
+from flasher.station.messages import (
+    Abort,
+    AdapterDown,
+    Ask,
+    Beat,
+    Begin,
+    Finished,
+    FromWorker,
+    Intent,
+    Note,
+    PresenceChanged,
+    Quit,
+    Ready,
+    Reply,
+    ToWorker,
+    VirtualUnits,
+    WorkerSetup,
+)
+from flasher.station.records.model import RunId, RunKind, RunState, WriteId
+from flasher.station.run_model import JournalError, RunOrder
+from flasher.station.virtual_units import VirtualSocket
+from flasher.station.worker import Worker, load_same
+from flasher.station.worker_line import Line, LineJournal
+from tests.station.factory import DAY, USUAL, make_recipe
+from tests.station.unit_bench import WRITES
+
+
+class FakeChannel:
+    """The pipe; `answer` is the station's side, and may raise OSError when it is dead."""
+
+    def __init__(self, answer: Callable[[FakeChannel, FromWorker], None]) -> None:
+        self.waiting: deque[ToWorker] = deque()
+        self.sent: list[FromWorker] = []
+        self.is_broken = False
+        self._answer = answer
+
+    def send(self, obj: Any, /) -> None:
+        if self.is_broken:
+            raise BrokenPipeError
+        self.sent.append(obj)
+        self._answer(self, obj)
+
+    def recv(self) -> Any:
+        if self.is_broken:
+            raise EOFError
+        return self.waiting.popleft()
+
+    def poll(self, timeout: float = 0.0) -> bool:
+        return self.is_broken or bool(self.waiting)
+
+    def of(self, kind: type[Any]) -> list[Any]:
+        return [message for message in self.sent if isinstance(message, kind)]
+
+
+class Socket:
+    """A worker with virtual units, and a station that says yes to everything."""
+
+    def __init__(self, folder: Path, units: MockUnits | None = None) -> None:
+        self.recipe = make_recipe(folder, USUAL + WRITES)
+        self.trace = folder / "run-1.log"
+        virtual = VirtualUnits(units or MockUnits(), speed=0, count=1)
+        files = {str(path): sha256 for path, sha256 in self.recipe.files.items()}
+        self.setup = WorkerSetup("A", self.recipe.path, files, None, virtual)
+        self.channel = FakeChannel(self.answer)
+        self.line = Line(self.channel, time.monotonic)
+        self.virtual = VirtualSocket(self.recipe, virtual)
+        self.error = ""
+
+    def answer(self, channel: FakeChannel, message: FromWorker) -> None:
+        match message:
+            case PresenceChanged(True, _, label):
+                order = RunOrder(RunId(1), RunKind.PRODUCTION, label, DAY)
+                channel.waiting.append(Begin(order, self.trace))
+            case Ask(number):
+                channel.waiting.append(Reply(number, WriteId(number), self.error))
+            case Finished():
+                channel.waiting.append(Quit())
+
+    def work(self) -> Finished | None:
+        worker = Worker(self.setup, self.recipe, self.line, self.virtual.connection, self.virtual)
+        worker.work()
+        ended = self.channel.of(Finished)
+        return ended[-1] if ended else None
+
+
+def test_a_unit_that_comes_is_run_and_its_trace_is_closed(tmp_path: Path) -> None:
+    socket = Socket(tmp_path)
+    ended = socket.work()
+    assert ended is not None
+    assert ended.result.outcome is RunState.PASS, ended.result.text
+    assert ended.trace is not None
+    lines = gzip.decompress(ended.trace.path.read_bytes()).decode("ascii").splitlines()
+    assert len(lines) > 50
+    assert not socket.trace.exists()
+    assert isinstance(socket.channel.sent[0], Ready)
+    assert socket.channel.of(Beat)
+    assert socket.channel.of(Note)
+
+
+def test_it_does_nothing_before_the_reply(tmp_path: Path) -> None:
+    socket = Socket(tmp_path)
+    socket.error = "RECORD NOT SAVED: the disk is full."
+    ended = socket.work()
+    assert ended is not None
+    assert ended.result.code == "RECORD_NOT_SAVED"
+    device = socket.virtual.places["bms"].device
+    assert device is not None
+    assert device.erase_count == 0
+
+
+@pytest.mark.parametrize("asks", [1, 4, 5, 8])
+def test_when_the_station_dies_it_ends_without_another_act(tmp_path: Path, asks: int) -> None:
+    socket = Socket(tmp_path)
+
+    def die(channel: FakeChannel, message: FromWorker) -> None:
+        if len(channel.of(Ask)) == asks:
+            channel.is_broken = True
+        else:
+            Socket.answer(socket, channel, message)
+
+    socket.channel._answer = die
+    assert socket.work() is None
+    assert socket.line.is_gone
+    device = socket.virtual.places["bms"].device
+    assert device is not None
+    # The fourth ask is the intent to flash: without its reply nothing was erased.
+    assert (device.erase_count == 0) == (asks <= 4)
+
+
+def test_a_person_aborts_between_two_messages(tmp_path: Path) -> None:
+    socket = Socket(tmp_path)
+
+    def abort(channel: FakeChannel, message: FromWorker) -> None:
+        Socket.answer(socket, channel, message)
+        if isinstance(message, Ask) and isinstance(message.what, Intent):
+            channel.waiting.append(Abort())
+
+    socket.channel._answer = abort
+    ended = socket.work()
+    assert ended is not None
+    assert ended.result.outcome is RunState.ABORTED
+
+
+def test_a_trace_that_cannot_be_written_is_no_pass(tmp_path: Path) -> None:
+    socket = Socket(tmp_path)
+    socket.trace = tmp_path / "not there" / "run-1.log"
+    ended = socket.work()
+    assert ended is not None
+    assert (ended.result.code, ended.trace) == ("TRACE_NOT_SAVED", None)
+
+
+def test_a_bug_in_a_run_does_not_end_the_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    socket = Socket(tmp_path)
+
+    def fall(*_args: object, **_kwargs: object) -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr("flasher.station.worker.UnitRun.run", fall)
+    ended = socket.work()
+    assert ended is not None
+    assert (ended.result.outcome, ended.result.code) == (RunState.ERROR, "INTERNAL")
+
+
+def test_a_station_that_does_not_save_in_time_is_not_waited_for() -> None:
+    now = [0.0]
+
+    def clock() -> float:
+        now[0] += 1.0
+        return now[0]
+
+    line = Line(FakeChannel(lambda _channel, _message: None), clock)
+    with pytest.raises(JournalError, match="did not save within 30 s"):
+        LineJournal(line, 30.0).intent("bms", "flash", "V1")
+
+
+def test_another_recipe_than_the_stations_is_refused(tmp_path: Path) -> None:
+    socket = Socket(tmp_path)
+    assert load_same(socket.setup).sha256 == socket.recipe.sha256
+    (tmp_path / "bms.bin.toml").write_bytes((tmp_path / "bms.bin.toml").read_bytes() + b"\n")
+    with pytest.raises(UsageError, match="was changed"):
+        load_same(socket.setup)
+
+
+# -- a real adapter -------------------------------------------------------------------------------
+
+
+def test_an_adapter_that_goes_is_told_once_and_opened_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    socket = Socket(tmp_path)
+    clock = VirtualClock()
+    bus = SimulatedBus(WELLING.bitrate_bps, clock)
+    connection = Connection(bus.link(), clock, "a bus")
+    monkeypatch.setattr("flasher.station.worker._REOPEN_S", 0.0)
+
+    def answer(channel: FakeChannel, message: FromWorker) -> None:
+        if isinstance(message, Ready):
+            if len(channel.of(Ready)) == 1:
+                bus.unplug(back_after_s=0.0)
+            else:
+                channel.waiting.append(Quit())
+
+    socket.channel._answer = answer
+    Worker(socket.setup, socket.recipe, socket.line, connection).work()
+    kinds = [type(m).__name__ for m in socket.channel.sent if not isinstance(m, Beat)]
+    assert kinds == ["Ready", "AdapterDown", "Ready"]
+    assert socket.channel.of(AdapterDown)[0].reason

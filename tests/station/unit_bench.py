@@ -1,0 +1,141 @@
+"""A unit in a socket, in no time at all: simulated bus, virtual clock, a journal that can fail."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from flasher.api import Connection
+from flasher.bus.link import VirtualClock
+from flasher.bus.simulated import SimulatedBus
+from flasher.device.model import Device
+from flasher.device.profile import DeviceProfile
+from flasher.protocol.spec import BMS, WELLING, Target
+from flasher.station.records.model import RunId, RunKind, StepState, WriteId
+from flasher.station.run_model import (
+    JournalError,
+    PowerControl,
+    RunNote,
+    RunOrder,
+    RunResult,
+    StepReport,
+    Texts,
+)
+from flasher.station.steps import StepName
+from flasher.station.unit_run import UnitRun
+from flasher.station.virtual_units import Place
+from tests.station.factory import DAY, SERIAL, USUAL, make_recipe
+
+WRITES = """
+[[write]]
+target = "bms"
+item = "serial-number"
+values = ["{serial}"]
+manufacturer = true
+
+[[write]]
+target = "bms"
+item = "user-string-1"
+values = ["made {date}"]
+"""
+NEW_UNIT = DeviceProfile(serial_number="NONE", application_area_bytes=8192)
+
+
+@dataclass
+class Notes:
+    """A journal in a list; `fails_at` is the number of the note that cannot be saved."""
+
+    rows: list[tuple[str, ...]] = field(default_factory=list)
+    reports: list[StepReport] = field(default_factory=list)
+    fails_at: int | None = None
+    on_note: Callable[[], None] = lambda: None
+
+    def _note(self, *row: str) -> None:
+        if self.fails_at is not None and len(self.rows) >= self.fails_at:
+            raise JournalError("RECORD NOT SAVED: the disk is full.")
+        self.rows.append(row)
+        self.on_note()
+
+    def intent(self, target: str, what: str, value: str) -> WriteId:
+        self._note("intent", target, what)
+        return WriteId(len(self.rows))
+
+    def verified(self, write_id: WriteId, read_back: str | None) -> None:
+        self._note("verified", str(read_back))
+
+    def step(self, report: StepReport) -> None:
+        self._note("step", report.name, report.state.value, report.code)
+        self.reports.append(report)
+
+
+class UnitBench:
+    """One unit and its run."""
+
+    def __init__(
+        self,
+        folder: Path,
+        text: str = USUAL + WRITES,
+        profile: DeviceProfile = NEW_UNIT,
+        targets: Sequence[Target] = (BMS,),
+    ) -> None:
+        self.recipe = make_recipe(folder, text)
+        self.clock = VirtualClock()
+        self.bus = SimulatedBus(WELLING.bitrate_bps, self.clock)
+        self.places = {target: Place() for target in targets}
+        for target, place in self.places.items():
+            self.bus.attach(place)
+            place.device = Device(target, bitrate_bps=WELLING.bitrate_bps, profile=profile)
+        self.connection = Connection(self.bus.link(), self.clock, "a simulated bus")
+        self.journal = Notes()
+        self.notes: list[RunNote] = []
+        self.is_cancelled: Callable[[], bool] = lambda: False
+        self.power: PowerControl | None = None
+
+    @property
+    def device(self) -> Device:
+        """The only unit, or the first."""
+        device = next(iter(self.places.values())).device
+        assert device is not None
+        return device
+
+    def run(
+        self,
+        kind: RunKind = RunKind.PRODUCTION,
+        serial: str = SERIAL,
+        *,
+        known_before: Texts | None = None,
+        flashed_before: frozenset[str] = frozenset(),
+        written_before: Texts | None = None,
+    ) -> RunResult:
+        order = RunOrder(
+            RunId(1),
+            kind,
+            serial,
+            DAY,
+            "",
+            known_before or {},
+            flashed_before,
+            written_before or {},
+        )
+        return UnitRun(
+            order,
+            self.recipe,
+            self.connection,
+            self.journal,
+            tell=self.notes.append,
+            cancelled=self._is_cancelled,
+            power=self.power,
+        ).run()
+
+    def _is_cancelled(self) -> bool:
+        return self.is_cancelled()
+
+    def step(self, name: StepName, target: str = "") -> StepReport:
+        """The last try of a step."""
+        found = [r for r in self.journal.reports if (r.step, r.target) == (name, target)]
+        return found[-1]
+
+    @property
+    def passed_steps(self) -> list[str]:
+        return [r.name for r in self.journal.reports if r.state is StepState.PASS]
