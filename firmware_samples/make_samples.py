@@ -19,6 +19,7 @@ from pathlib import Path
 BMS_BASE, BMS_SIZE = 0x0800_8000, 78_351
 WMC_BASE, WMC_TABLE_SIZE, WMC_GAP, WMC_CODE_SIZE = 0x0800_4000, 0x188, 0x878, 0x2400
 OBC_BASE, OBC_SIZE = 0x0800_2000, 4_000
+STATION_SIZE = 24_000
 STACK_TOP = 0x2000_5000
 IDENTITY_SIZE = 32
 
@@ -146,6 +147,8 @@ def good_files() -> dict[str, bytes]:
         ),
         "obc.bin": obc,
         "obc.elf": elf_file([(OBC_BASE, obc[:0x100]), (OBC_BASE + 0x100, obc[0x100:])]),
+        # For the station: small, so that a unit takes seconds.
+        "station/bms.bin": program("BMS", "V1r0r5_20230301", BMS_BASE, STATION_SIZE, 6),
     }
 
 
@@ -243,6 +246,7 @@ def make(folder: Path) -> None:
     """Write all files below `folder`."""
     bad = folder / "bad"
     bad.mkdir(parents=True, exist_ok=True)
+    (folder / "station").mkdir(exist_ok=True)
     for name, content in good_files().items():
         (folder / name).write_bytes(content)
     for name, content in bad_files().items():

@@ -40,6 +40,7 @@ COMMANDS: Final = {
     "doctor": ("doctor", "look at adapters, bus and traffic, and say what fixes what is wrong"),
     "conformance": ("conformance", "test a bootloader against the protocol, case by case"),
     "manifest": ("manifest", "create or check the release manifest of an image"),
+    "station": ("station", "flash unit after unit at the end of a line, with records"),
     "profile": ("profile", "what a target profile sets, and where each value comes from"),
 }
 """Name of each command, its module in this package, and its one-line help."""
@@ -58,7 +59,7 @@ examples:
 
 """
 _LOG: Final = logging.getLogger("flasher.cli")
-_CHANGING: Final = frozenset({"flash", "rescue", "write", "conformance"})
+_CHANGING: Final = frozenset({"flash", "rescue", "write", "conformance", "station"})
 """Commands that change a device."""
 _FOR_THE_FILE: Final = {"said": True}
 """What who types it sees anyway."""

@@ -32,6 +32,7 @@ PURPOSES: Final[Mapping[str, tuple[str, ...]]] = {
     "look at devices and the bus": ("info", "scan", "read", "write", "monitor"),
     "when something goes wrong": ("doctor", "explain"),
     "without hardware, and for bootloaders": ("mock", "conformance"),
+    "at the end of a production line": ("station",),
     "what a product does its own way": ("profile",),
 }
 """The commands by what they are for; one that is in none of them comes at the end."""
@@ -67,6 +68,7 @@ _EXIT_CODES: Final[Mapping[str, tuple[ExitCode, ...]]] = {
     "doctor": (ExitCode.BUS, _STOPS),
     "explain": (_STOPS,),
     "conformance": (ExitCode.IMAGE, *_ASKS, ExitCode.PARTIAL, _STOPS),
+    "station": (ExitCode.BUS, ExitCode.VERIFICATION, ExitCode.PARTIAL, _STOPS),
     "profile": (),
 }
 """What a command can end with besides done, wrong usage and a bug; another command: anything."""

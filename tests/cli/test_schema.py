@@ -111,6 +111,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("conformance", "-t", "bms", "--mock", "--case", "RS-01", "EN-04"),
         ("conformance", "--list"),
         ("conformance", "profile"),
+        ("station", "check", SAMPLES / "station" / "recipe.toml"),
 )  # fmt: skip
 
 

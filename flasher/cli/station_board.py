@@ -1,0 +1,169 @@
+"""What a running station is like now, made of its events alone: what every view of it shows."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from flasher.protocol.text import printable
+from flasher.station.events import (
+    FiguresChanged,
+    LineResumed,
+    LineStopped,
+    OperatorPrompted,
+    Progressed,
+    RecordNotSaved,
+    RunEnded,
+    RunStarted,
+    ScanAccepted,
+    ScanRefused,
+    SocketChanged,
+    SocketState,
+    StationEvent,
+    StationStarted,
+    StepStarted,
+    UnitArrived,
+    UnitRemoved,
+    WorkerFailed,
+)
+from flasher.station.records.model import Figures, RunState
+from flasher.station.scans import Word
+
+
+@dataclass
+class Row:
+    """One socket. Texts are safe to show."""
+
+    socket: str
+    state: SocketState = SocketState.STARTING
+    serial: str = ""
+    step: str = ""
+    share: float | None = None
+    """Of the step, from 0 to 1."""
+    left_s: float | None = None
+    note: str = ""
+    """What is awaited, what is wrong, or what to do."""
+    code: str = ""
+    """Of the last run here, while its unit is in the socket and did not pass."""
+    is_virtual: bool = False
+    """Its units are virtual: no product comes out of it."""
+
+
+@dataclass
+class Board:
+    """The whole station."""
+
+    rows: dict[str, Row] = field(default_factory=dict)
+    title: str = ""
+    figures: Figures | None = None
+    stopped: LineStopped | None = None
+    said: str = ""
+    """The answer to the last scan, or what somebody has to do."""
+    prompt: str = ""
+    """What somebody has to do about the label that was scanned last."""
+    is_refusal: bool = False
+    """True when `said` is a refusal."""
+    labels: dict[str, str] = field(default_factory=dict)
+    """Label of the virtual unit in a socket."""
+    ended: dict[str, RunEnded] = field(default_factory=dict)
+    """The last run of each unit, by its serial number."""
+    refused: list[ScanRefused] = field(default_factory=list)
+    waiting: set[str] = field(default_factory=set)
+    """Labels that were accepted, and have no socket yet."""
+    arrivals: int = 0
+    virtual_sockets: tuple[str, ...] = ()
+    broken: dict[str, str] = field(default_factory=dict)
+    """Sockets that will not work any more, with the reason."""
+
+    def apply(self, event: StationEvent) -> None:
+        """Take one event in."""
+        match event:
+            case StationStarted(_, recipe, revision, part, sockets):
+                self.title = printable(f"{event.station}: {recipe}, revision {revision}, {part}")
+                self.virtual_sockets = virtual = event.virtual_sockets
+                self.rows = {n: Row(printable(n), is_virtual=n in virtual) for n in sockets}
+                if virtual:
+                    self.title = f"{self.virtual_words} {self.title}"
+            case FiguresChanged(figures):
+                self.figures = figures
+            case LineStopped():
+                self.stopped = event
+            case LineResumed():
+                self.stopped = None
+            case ScanAccepted() | ScanRefused():
+                self._scanned(event)
+            case OperatorPrompted("", text, _):
+                # It comes just before the scan that it belongs to is accepted.
+                self.said = self.prompt = printable(text)
+                self.is_refusal = False
+            case UnitArrived(socket, _, label):
+                self.labels[socket] = label
+                self.arrivals += 1
+            case UnitRemoved(socket):
+                self.labels.pop(socket, None)
+            case WorkerFailed(socket, reason, restart_in_s):
+                if restart_in_s is None:
+                    self.broken[socket] = reason
+            case _:
+                self._socket(event)
+
+    def _scanned(self, event: ScanAccepted | ScanRefused) -> None:
+        if isinstance(event, ScanRefused):
+            self.refused.append(event)
+            self.waiting.discard(event.text)
+            text, self.is_refusal = f"{event.text}: {event.reason} {event.remedy}", True
+        else:
+            where = f" for socket {event.socket}" if event.socket else ""
+            text, self.is_refusal = f"{event.text}: {event.meaning}{where}", False
+            if event.meaning == "label" and not event.socket:
+                self.waiting.add(event.text)
+                text = f"{text}. {self.prompt}".rstrip(". ") + "."
+            elif event.meaning == Word.CANCEL.value.lower():
+                self.waiting.clear()
+        self.said, self.prompt = printable(text), ""
+
+    def _socket(self, event: StationEvent) -> None:
+        row = self.rows.get(getattr(event, "socket", ""))
+        if row is None:
+            return
+        match event:
+            case SocketChanged(_, state, serial, text):
+                row.state, row.serial, row.note = state, printable(serial), printable(text)
+                if state is SocketState.SCAN and not serial and self.labels.get(event.socket):
+                    row.note += f" It says {printable(self.labels[event.socket])}."
+                if state not in (SocketState.RUNNING, SocketState.SAVING):
+                    row.step, row.share, row.left_s = "", None, None
+                if not state.is_verdict:
+                    row.code = ""
+            case RunStarted(_, serial):
+                self.waiting.discard(serial)
+                row.code = ""
+            case StepStarted(_, _, step, try_number, target):
+                tries = f" try {try_number}" if try_number > 1 else ""
+                row.step = f"{step.value} {target}".strip() + tries
+                row.share, row.left_s, row.note = None, None, ""
+            case Progressed(_, _, _, share, left_s):
+                row.share, row.left_s = share, left_s
+            case OperatorPrompted(_, text, _):
+                row.note = printable(text)
+            case RecordNotSaved(_, _, _, reason):
+                row.note = printable(reason)
+            case RunEnded():
+                self.ended[event.serial] = event
+                row.code = "" if event.outcome is RunState.PASS else event.code
+            case _:
+                pass
+
+    @property
+    def virtual_words(self) -> str:
+        """That what passes here is no product; empty for a station of adapters."""
+        if not self.virtual_sockets:
+            return ""
+        if len(self.virtual_sockets) == len(self.rows):
+            return "VIRTUAL UNITS, no products."
+        names = ", ".join(map(printable, self.virtual_sockets))
+        return f"VIRTUAL UNITS in {names}, no products."
+
+    @property
+    def bad_units(self) -> tuple[RunEnded, ...]:
+        """Units whose last run is no PASS."""
+        return tuple(each for each in self.ended.values() if each.outcome is not RunState.PASS)

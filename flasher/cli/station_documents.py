@@ -1,0 +1,226 @@
+"""What `flasher station --json` prints, as types; see `flasher.cli.documents`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Final, TypedDict, get_args
+
+from flasher.cli.documents import plain_value
+from flasher.station.events import StationEvent
+from flasher.station.records.model import Figures, RunKind, RunState, UnitLife
+from flasher.trace.story import Cause, Story
+
+
+class RecipeFindingDocument(TypedDict):
+    """Something that speaks against a recipe."""
+
+    where: str
+    what: str
+    remedy: str
+
+
+class CheckedTargetDocument(TypedDict):
+    """A target of a recipe."""
+
+    target: str
+    image: str
+    sha256: str
+    size_bytes: int
+    version: str
+    """Empty when nobody says it."""
+    required: str
+    """How far it is verified, in words."""
+
+
+class StationCheckDocument(TypedDict):
+    """A recipe that can be used."""
+
+    recipe: str
+    part: str
+    revision: str
+    sha256: str
+    targets: list[CheckedTargetDocument]
+    sockets: dict[str, str]
+    """With --sockets: the adapter of each socket."""
+
+
+class FindingsDocument(TypedDict):
+    """Why a recipe cannot be used; beside the error."""
+
+    findings: list[RecipeFindingDocument]
+
+
+class FiguresDocument(TypedDict):
+    """The figures of runs. Golden units count in none of them."""
+
+    runs: int
+    units: int
+    """Units with a run that told PASS from FAIL."""
+    passed: int
+    first_passed: int
+    """Units whose first such run is a PASS."""
+    yield_share: float | None
+    """Of 1; null without units."""
+    first_pass_share: float | None
+    by_state: dict[str, int]
+    failures: dict[str, int]
+    """Runs that are no PASS, by code."""
+    duration_median_s: float | None
+    """Of runs that passed."""
+    duration_longest_s: float | None
+    virtual_runs: int
+    """Runs of virtual units among all of these: no products."""
+
+
+class EndedUnitDocument(TypedDict):
+    """How the last run of a unit ended, since the station began."""
+
+    serial: str
+    socket: str
+    run_id: int
+    outcome: Annotated[str, RunState]
+    code: str
+    text: str
+    action: str
+    """What the operator does now."""
+    duration_s: float
+    is_virtual: bool
+    """It was a virtual unit: no product."""
+
+
+class RefusedScanDocument(TypedDict):
+    """A scan that changed nothing."""
+
+    text: str
+    code: str
+    reason: str
+    remedy: str
+
+
+class StationRunDocument(TypedDict):
+    """What came of a station's work."""
+
+    station: str
+    recipe: str
+    revision: str
+    records: str
+    """Where they are; empty for virtual units that are recorded nowhere."""
+    is_complete: bool
+    """False when it was ended before the scans, or the virtual units, were used up."""
+    figures: FiguresDocument | None
+    """null when they cannot be read."""
+    units: list[EndedUnitDocument]
+    refused: list[RefusedScanDocument]
+
+
+class ReportedRunDocument(TypedDict):
+    """A run. Times are in UTC."""
+
+    run_id: int
+    serial: str
+    part: str
+    lot: str | None
+    kind: Annotated[str, RunKind]
+    is_virtual: bool
+    """The unit was a virtual one: no product."""
+    state: Annotated[str, RunState]
+    code: str
+    text: str
+    begun_at: str
+    ended_at: str | None
+    duration_s: float | None
+    station: str
+    socket: str
+    operator: str
+    recipe: str
+    recipe_revision: str
+    recipe_sha256: str
+    verified: str | None
+    """The weakest of its targets: completed, version or memory."""
+    log_sha256: str | None
+    reason: str
+
+
+class StationReportDocument(TypedDict):
+    """Runs with their figures."""
+
+    figures: FiguresDocument
+    runs: list[ReportedRunDocument]
+
+
+class UnitTraceDocument(TypedDict):
+    """A trace of a run, explained."""
+
+    run_id: int
+    sha256: str
+    cause: Annotated[str, Cause] | None
+    """null when it cannot be read."""
+    text: str
+    story: Annotated[dict[str, Any], Story] | None
+    """With --story."""
+
+
+class UnitDocument(TypedDict):
+    """The whole life of a unit."""
+
+    unit: Annotated[dict[str, Any], UnitLife]
+    traces: list[UnitTraceDocument]
+
+
+class BackupDocument(TypedDict):
+    """A copy of the records."""
+
+    path: str
+    sha256: str
+    size_bytes: int
+
+
+class ProblemDocument(TypedDict):
+    """Something in the records that is not as it has to be."""
+
+    where: str
+    what: str
+
+
+class VerifiedRecordsDocument(TypedDict):
+    """What was found wrong with the records."""
+
+    problems: list[ProblemDocument]
+
+
+DOCUMENTS: Final = (
+    StationCheckDocument,
+    FindingsDocument,
+    StationRunDocument,
+    StationReportDocument,
+    UnitDocument,
+    BackupDocument,
+    VerifiedRecordsDocument,
+)
+LINES: Final[tuple[type, ...]] = get_args(StationEvent)
+"""Every event of a station, as it happens."""
+
+
+def figures_document(figures: Figures) -> FiguresDocument:
+    """The figures as JSON."""
+    return FiguresDocument(
+        runs=figures.runs,
+        units=figures.units,
+        passed=figures.passed,
+        first_passed=figures.first_passed,
+        yield_share=figures.yield_share,
+        first_pass_share=figures.first_pass_share,
+        by_state={RunState(state).name.lower(): n for state, n in figures.by_state.items()},
+        failures=dict(figures.failures),
+        duration_median_s=figures.duration_median_s,
+        duration_longest_s=figures.duration_longest_s,
+        virtual_runs=figures.virtual_runs,
+    )
+
+
+def run_document(row: Mapping[str, Any]) -> ReportedRunDocument:
+    """A row of `Records.table` as JSON: choices by name in lower case, as everywhere."""
+    choices = {"kind": RunKind(row["kind"]), "state": RunState(row["state"])}
+    document: Any = {**row, **{key: plain_value(value) for key, value in choices.items()}}
+    checked: ReportedRunDocument = document
+    return checked

@@ -1,0 +1,123 @@
+"""A file of scans, worked off as a patient operator would: each label when a unit waits for it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from typing import Final
+
+from flasher.cli.station_keys import Submit
+from flasher.errors import UsageError
+from flasher.protocol.text import printable
+from flasher.station.scans import Command, Label, Word, understand
+from flasher.station.socket_line import SocketLine
+
+FILE_MAX_SIZE: Final = 4 * 1024 * 1024
+"""In bytes."""
+OPTION: Final = "--scans"
+
+
+def read_scans(path: str) -> list[str]:
+    """The scans of a file; empty lines and those that begin with # are none. Raises UsageError."""
+    shown = printable(path)
+    try:
+        with Path(path).open("rb") as file:
+            raw = file.read(FILE_MAX_SIZE + 1)
+        text = raw.decode("utf-8-sig")
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or "it is no text"
+        raise UsageError(
+            f"{shown} cannot be read: {reason}.", where=OPTION, remedy="Check its path."
+        ) from error
+    lines = [line.strip() for line in text.splitlines()]
+    scans = [line for line in lines if line and not line.startswith("#")]
+    if not scans or len(raw) > FILE_MAX_SIZE:
+        raise UsageError(
+            f"{shown} holds {'too many' if scans else 'no'} scans.",
+            where=OPTION,
+            remedy="One scan a line: a label, or a command.",
+        )
+    return scans
+
+
+class ScanFile:
+    """The scans of a file. A label goes to the socket that was named before it, else to the next
+    one in which a unit waits; a virtual unit gets its own label, where the file has it.
+
+    Units are waited for without end: the line is the clock.
+    """
+
+    def __init__(self, scans: list[str], sockets: Collection[str], submit: Submit) -> None:
+        """Raises UsageError for a socket that there is not."""
+        names = {name.lower() for name in sockets}
+        for each in map(understand, scans):
+            if not isinstance(each, Command) or each.word is not Word.SOCKET:
+                continue
+            if each.argument.lower() not in names:
+                raise UsageError(
+                    f"There is no socket {printable(each.argument)}.",
+                    where=OPTION,
+                    remedy=f"There are: {', '.join(map(printable, sockets))}.",
+                )
+        self.labels = frozenset(
+            label.serial for label in map(understand, scans) if isinstance(label, Label)
+        )
+        self._left = deque(scans)
+        self._submit = submit
+
+    @property
+    def is_used_up(self) -> bool:
+        """True when every scan was submitted."""
+        return not self._left
+
+    def turn(self, lines: Mapping[str, SocketLine], borne: Mapping[str, str]) -> None:
+        """Submit the next scan, when its time has come. `borne` are the labels of virtual units, by
+        their sockets. Raises UsageError where no socket can tell that a unit is in it.
+        """
+        if not self._left:
+            return
+        working = [line for line in lines.values() if line.can_work]
+        if working and not any(line.sees_units for line in working):
+            raise UsageError(
+                "No socket of this station sees whether a unit is in it.",
+                where=OPTION,
+                remedy="Scan each unit when it is in its socket.",
+            )
+        scan = understand(self._left[0])
+        if isinstance(scan, Label):
+            self._label(lines, borne)
+        elif isinstance(scan, Command) and scan.word is Word.SOCKET and len(self._left) > 1:
+            line = next(e for e in lines.values() if e.name.lower() == scan.argument.lower())
+            if _waits(line):
+                self._submit(self._left.popleft())
+                self._submit(self._left.popleft())
+        else:
+            self._submit(self._left.popleft())
+
+    def _label(self, lines: Mapping[str, SocketLine], borne: Mapping[str, str]) -> None:
+        """Give a label to a unit that waits."""
+        ahead = self._until_command()
+        for line in filter(_waits, lines.values()):
+            own = borne.get(line.name, "")
+            # A virtual unit whose label comes later in the file waits for it.
+            label = own if own in ahead else next((e for e in ahead if e not in borne.values()), "")
+            if label:
+                self._left.remove(label)
+                self._submit(f"{Word.SOCKET.value} {line.name}")
+                self._submit(label)
+                return
+
+    def _until_command(self) -> list[str]:
+        """The labels up to the next command."""
+        ahead: list[str] = []
+        for text in self._left:
+            if not isinstance(understand(text), Label):
+                break
+            ahead.append(text)
+        return ahead
+
+
+def _waits(line: SocketLine) -> bool:
+    """True when a unit is in the socket and wants a label."""
+    return line.is_free and line.is_there and line.sees_units

@@ -1,0 +1,526 @@
+"""`flasher station`: check, run with virtual units, report, unit, backup, verify."""
+
+from __future__ import annotations
+
+import csv
+import importlib.util
+import io
+import json
+import re
+import signal
+import sys
+from pathlib import Path
+from typing import Any, get_args
+from xml.etree import ElementTree as Xml
+
+import pytest
+
+from flasher.cli.main import main
+from flasher.cli.station_views import JsonLines
+from flasher.errors import ExitCode
+from flasher.station.codes import CODES
+from flasher.station.config import StationConfig
+from flasher.station.events import SocketState, StationEvent, StepStarted
+from flasher.station.messages import CannotWork
+from flasher.station.recipe import Part, Recipe
+from flasher.station.records import DiskFullError, RunState, StepState, Store
+from flasher.station.scans import Word
+from tests.cli.conftest import SAMPLES, Flasher, Run
+from tests.cli.station_threads import ThreadPort
+from tests.cli.test_schema import hold, hold_output
+from tests.schema_document import SCHEMA
+from tests.station.factory import SERIAL, USUAL, Bench, write_recipe
+
+RECIPE = SAMPLES / "station" / "recipe.toml"
+WRITE = """
+[[write]]
+target = "bms"
+item = "serial-number"
+values = ["{serial}"]
+manufacturer = true
+"""
+FAST = ("--mock-speed", "0", "--mock-dead", "0", "--mock-slow", "0")
+
+
+@pytest.fixture(scope="module")
+def schema() -> dict[str, Any]:
+    loaded: dict[str, Any] = json.loads(SCHEMA.read_text(encoding="utf-8"))
+    return loaded
+
+
+@pytest.fixture(autouse=True)
+def threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No processes, and nobody at a keyboard."""
+    monkeypatch.setattr("flasher.cli.station_run.LAUNCH", ThreadPort)
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+
+
+@pytest.fixture
+def recipe(tmp_path: Path) -> Path:
+    """A recipe with a small image."""
+    folder = tmp_path / "recipe"
+    folder.mkdir()
+    return write_recipe(folder, USUAL + WRITE)
+
+
+def lines_of(run: Run) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """The events, and the document behind them."""
+    *lines, document = [json.loads(line) for line in run.out.splitlines()]
+    return lines, document
+
+
+# -- check -----------------------------------------------------------------------------------------
+
+
+def test_the_sample_recipe_can_be_used(flasher: Flasher) -> None:
+    run = flasher("station", "check", RECIPE)
+    assert run.code == ExitCode.OK
+    assert "version read back" in run.out
+    assert "write:    BMS serial-number: BAT2620-0001" in run.out
+    document = flasher("station", "check", RECIPE, "--json").document
+    assert document["targets"][0]["version"] == "V1r0r5_20230301"
+
+
+def test_everything_that_speaks_against_a_recipe_is_said(
+    flasher: Flasher, recipe: Path, schema: dict[str, Any]
+) -> None:
+    text = recipe.read_text("utf-8").replace("part =", "parts =").replace("revision", "revison")
+    recipe.write_text(text, "utf-8")
+    run = flasher("station", "check", recipe)
+    assert run.code == ExitCode.USAGE
+    assert "Did you mean part?" in run.err
+    run = flasher("station", "check", recipe, "--json")
+    hold_output(schema, run.out, 2)
+    assert len(run.document["findings"]) >= 4
+
+
+def test_a_changed_image_is_found_before_the_shift(flasher: Flasher, recipe: Path) -> None:
+    (recipe.parent / "bms.bin").write_bytes(b"another image")
+    run = flasher("station", "check", recipe)
+    assert run.code == ExitCode.USAGE
+    assert "sha256" in run.err
+
+
+def test_the_sockets_are_checked_with_the_recipe(
+    flasher: Flasher, recipe: Path, tmp_path: Path
+) -> None:
+    sockets = tmp_path / "sockets.toml"
+    sockets.write_text('[[socket]]\nname = "A"\nmock = {}\n', "utf-8")
+    assert (
+        "socket A: virtual units" in flasher("station", "check", recipe, "--sockets", sockets).out
+    )
+    missing = 'interface = "socketcan"\nserial_number = "none-like-this"\n'
+    sockets.write_text(f'[[socket]]\nname = "A"\n{missing}', "utf-8")
+    run = flasher("station", "check", recipe, "--sockets", sockets)
+    assert run.code == ExitCode.BUS
+    assert "is plugged in" in run.err
+
+
+def test_without_the_extra_the_command_for_it_is_named(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = importlib.util.find_spec
+    monkeypatch.setattr(
+        importlib.util, "find_spec", lambda name: None if name == "sqlalchemy" else real(name)
+    )
+    run = flasher("station", "verify")
+    assert run.code == ExitCode.USAGE
+    assert "sqlalchemy" in run.err
+    assert "pip install 'welling-flasher[station]'" in run.err
+    assert flasher("station", "--help").code == ExitCode.OK
+
+
+# -- run -------------------------------------------------------------------------------------------
+
+
+def test_virtual_units_are_scanned_and_flashed_until_the_wanted_number(
+    flasher: Flasher, recipe: Path, schema: dict[str, Any]
+) -> None:
+    words = ("--mock-sockets", "2", "--units", "3", "--mock-bad", "0", *FAST)
+    run = flasher("station", "run", "--recipe", recipe, *words)
+    assert run.code == ExitCode.OK, "not a terminal: JSON lines without --json"
+    lines = hold_output(schema, run.out, 0)
+    _, document = lines_of(run)
+    assert [unit["outcome"] for unit in document["units"]] == ["pass"] * 3
+    assert document["figures"]["first_pass_share"] == 1.0
+    assert document["is_complete"]
+    assert document["records"] == "", "recorded nowhere"
+    kinds = [line["event"] for line in lines]
+    assert kinds[0] == "StationStarted"
+    assert kinds[-1] == "StationStopped"
+    assert kinds.count("RunEnded") == 3
+
+
+def test_a_file_of_scans_ends_the_station_and_a_bad_unit_is_exit_code_12(
+    flasher: Flasher, recipe: Path, tmp_path: Path
+) -> None:
+    scans = tmp_path / "scans.txt"
+    scans.write_text("# a lot\nOPERATOR Kim\nW2605002\nNO LABEL\nW2605003\n\n", "utf-8")
+    database = tmp_path / "plant.sqlite"
+    words = ("--recipe", recipe, "--scans", scans, "--database", database, "--mock-bad", "1")
+    run = flasher("station", "run", "--mock-sockets", "2", *words, *FAST)
+    assert run.code == ExitCode.PARTIAL
+    document = lines_of(run)[1]
+    assert {unit["serial"] for unit in document["units"]} == {"W2605002", "W2605003"}
+    for unit in document["units"]:
+        assert unit["outcome"] == "fail"
+        assert unit["code"] in ("WRONG_HARDWARE", "REFUSED")
+        assert unit["action"].startswith("Put the unit aside")
+    assert [each["text"] for each in document["refused"]] == ["NO LABEL"]
+    with Store.open(str(database), station="reader", create=False) as store:
+        (details,) = store.read.unit("W2605002").runs
+        assert details.run.operator == "Kim"
+        assert details.run.state is RunState.FAIL
+
+
+def test_a_label_of_the_file_that_is_refused_is_exit_code_12(
+    flasher: Flasher, recipe: Path, tmp_path: Path
+) -> None:
+    scans, database = tmp_path / "scans.txt", tmp_path / "plant.sqlite"
+    scans.write_text("W2605002\n", "utf-8")
+    words = ("--recipe", recipe, "--scans", scans, "--database", database, "--mock-bad", "0")
+    assert flasher("station", "run", "--mock-sockets", "1", *words, *FAST).code == ExitCode.OK
+    again = flasher("station", "run", "--mock-sockets", "1", *words, *FAST)
+    assert again.code == ExitCode.PARTIAL
+    _, document = lines_of(again)
+    assert document["units"] == []
+    assert document["refused"][0]["code"] == "DUPLICATE"
+
+
+def test_new_virtual_units_have_new_numbers(flasher: Flasher, recipe: Path, tmp_path: Path) -> None:
+    words = ("--recipe", recipe, "--database", tmp_path / "plant.sqlite", "--mock-bad", "0")
+    serials: list[str] = []
+    for _ in range(2):
+        run = flasher("station", "run", "--mock-sockets", "2", "--units", "2", *words, *FAST)
+        assert run.code == ExitCode.OK
+        serials += [unit["serial"] for unit in lines_of(run)[1]["units"]]
+    assert len(set(serials)) == 4
+
+
+def test_scans_come_from_a_pipe_and_lines_are_for_people(
+    flasher: Flasher, recipe: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stdin", io.StringIO("W2605002\nSOCKET 7\n"))
+    words = ("--mock-sockets", "1", "--scan-by-hand", "--mock-bad", "0", "--lines", *FAST)
+    run = flasher("station", "run", "--recipe", recipe, *words)
+    assert run.code == ExitCode.OK
+    passed = "W2605002  PASS (virtual unit): bms: version read back. Take the unit out."
+    assert f"socket 1  {passed}" in run.out
+    assert "refused NO_SUCH_SOCKET" in run.out
+    assert "1 unit: 1 passed, 0 failed; yield 100 %" in run.out
+
+
+def test_records_that_cannot_be_written_stop_the_line_and_nothing_passes(
+    flasher: Flasher, recipe: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def finish(*_: object) -> None:
+        raise DiskFullError("RECORD NOT SAVED: the disk is full.", remedy="Make room.")
+
+    monkeypatch.setattr(Store, "finish", finish)
+    words = ("--mock-sockets", "1", "--units", "2", "--mock-bad", "0", *FAST)
+    run = flasher("station", "run", "--recipe", recipe, *words)
+    assert run.code == ExitCode.USAGE
+    lines, document = lines_of(run)
+    assert document["error"]["kind"] == "RecordError"
+    assert document["error"]["remedy"] == "Make room."
+    assert document["units"] == []
+    shown = {line["state"] for line in lines if line["event"] == "SocketChanged"}
+    assert "pass" not in shown
+    assert {"RecordNotSaved", "LineStopped"} <= {line["event"] for line in lines}
+
+
+def test_sockets_that_can_never_work_end_the_station(
+    flasher: Flasher, recipe: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Broken(ThreadPort):
+        said = False
+
+        def receive(self) -> Any:
+            if not self.said:
+                self.said = True
+                return CannotWork("The recipe was changed.")
+            raise EOFError
+
+    monkeypatch.setattr("flasher.cli.station_run.LAUNCH", Broken)
+    run = flasher("station", "run", "--recipe", recipe, "--mock-sockets", "1", *FAST)
+    assert run.code == ExitCode.BUS
+    assert "The recipe was changed." in lines_of(run)[1]["error"]["what"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "either its sockets or virtual ones"),
+        (("--mock-sockets", "65"), "1 to 64 sockets"),
+        (("--mock-sockets", "2", "--mock-bad", "0.9", "--mock-slow", "0.9"), "more than all"),
+        (("--mock-sockets", "2", "--units", "2", "--scans", "scans.txt"), "Leave one of them"),
+        (("--mock-sockets", "2", "--scans", "none.txt"), "cannot be read"),
+        (("--mock-sockets", "2", "--scans", "empty.txt"), "holds no scans"),
+        (("--mock-sockets", "2", "--scans", "other.txt"), "There is no socket 9"),
+        (("--sockets", "real.toml", "--units", "2"), "is for virtual units"),
+    ],
+)
+def test_wrong_usage_says_what_is_wrong(
+    flasher: Flasher,
+    recipe: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    words: tuple[str, ...],
+    said: str,
+) -> None:
+    monkeypatch.chdir(recipe.parent)
+    Path("scans.txt").write_text("W2605002\n", "utf-8")
+    Path("empty.txt").write_text("# nothing\n", "utf-8")
+    Path("other.txt").write_text("SOCKET 9\nW2605002\n", "utf-8")
+    Path("real.toml").write_text(
+        '[[socket]]\nname = "A"\ninterface = "virtual"\nchannel = "x"\n', "utf-8"
+    )
+    run = flasher("station", "run", "--recipe", recipe, *words)
+    assert run.code == ExitCode.USAGE
+    assert said in run.err
+    assert "Traceback" not in run.err
+
+
+# -- records ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Records: a unit that failed and then passed, another one that is bad."""
+    folder = tmp_path_factory.mktemp("plant")
+    bench = Bench(folder)
+    bench.trace = folder / "run.log"
+    bench.trace.write_text("(1.0) can0 123#616263\n", "utf-8")
+    bench.make(RunState.FAIL)
+    bench.store.step(bench.claim().run_id, "connect", StepState.FAIL, duration_s=1.0)
+    bench.store.close()
+    # The process of a station died here: the next one finds it.
+    bench.store = bench.opened()
+    bench.store.recover()
+    bench.make()
+    bench.make(RunState.FAIL, "W2605003", code="REFUSED")
+    bench.store.close()
+    return folder / "records.sqlite"
+
+
+def test_a_report_has_figures_on_stdout_and_files_for_others(
+    flasher: Flasher, plant: Path, tmp_path: Path
+) -> None:
+    files = {name: tmp_path / name for name in ("runs.csv", "runs.json", "runs.xml")}
+    run = flasher(
+        "station", "report", "--database", plant, "--csv", files["runs.csv"],
+        "--json-report", files["runs.json"], "--junit", files["runs.xml"],
+        "--certificates", tmp_path / "pages",
+    )  # fmt: skip
+    assert run.code == ExitCode.OK
+    assert "2 units: 1 passed, 1 failed; yield 50 %, first pass 0 %" in run.out
+    assert "1 INTERRUPTED" in run.out
+    assert len(list(csv.DictReader(files["runs.csv"].read_text("utf-8").splitlines()))) == 4
+    assert json.loads(files["runs.json"].read_text("utf-8"))["figures"]["units"] == 2
+    assert Xml.parse(files["runs.xml"]).getroot().find("testsuite") is not None  # noqa: S314
+    pages = sorted(page.name for page in (tmp_path / "pages").iterdir())
+    assert pages == [f"{SERIAL}.html", "W2605003.html"]
+    assert "Flash certificate" in (tmp_path / "pages" / f"{SERIAL}.html").read_text("utf-8")
+
+
+def test_a_report_can_be_narrowed(flasher: Flasher, plant: Path) -> None:
+    words = ("station", "report", "--database", plant, "--json")
+    assert len(flasher(*words, "--serial", "W2605003").document["runs"]) == 1
+    assert flasher(*words, "--since", "2027-01-01").document["runs"] == []
+    assert len(flasher(*words, "--until", "2027-01-01T06:00").document["runs"]) == 4
+    wrong = flasher(*words, "--since", "yesterday")
+    assert wrong.code == ExitCode.USAGE
+    assert wrong.document["error"]["where"] == "--since"
+
+
+def test_the_whole_life_of_a_unit_with_its_traces(
+    flasher: Flasher, plant: Path, tmp_path: Path
+) -> None:
+    page = tmp_path / "page.html"
+    run = flasher("station", "unit", SERIAL, "--database", plant, "--certificate", page)
+    assert run.code == ExitCode.OK
+    first, *_ = run.out.splitlines()
+    assert first == f"{SERIAL}, part BAT-36: PASS"
+    assert [
+        line.split(": ")[1].split()[0] for line in run.out.splitlines() if line[:4] == "run "
+    ] == [
+        "FAIL",
+        "INTERRUPTED",
+        "PASS",
+    ]
+    assert "no upgrade, only traffic of other kinds" in run.out
+    assert SERIAL in page.read_text("utf-8")
+    full = flasher("station", "unit", SERIAL, "--database", plant, "--story")
+    assert "  | verdict: no upgrade" in full.out
+
+
+def test_json_of_the_records_is_as_described(
+    flasher: Flasher, plant: Path, tmp_path: Path, schema: dict[str, Any]
+) -> None:
+    for words in (
+        ("report",),
+        ("unit", SERIAL, "--story"),
+        ("verify",),
+        ("backup", tmp_path / "copy.sqlite"),
+    ):
+        run = flasher("station", *words, "--database", plant, "--json")
+        hold_output(schema, run.out, 0)
+    unit = flasher("station", "unit", SERIAL, "--database", plant, "--json").document
+    assert unit["unit"]["runs"][2]["run"]["state"] == "pass"
+    assert unit["traces"][0]["cause"] == "foreign_only"
+
+
+def test_a_backup_is_a_whole_copy(flasher: Flasher, plant: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "copy.sqlite"
+    assert flasher("station", "backup", copy, "--database", plant).code == ExitCode.OK
+    assert flasher("station", "verify", "--database", copy).code == ExitCode.OK
+    nowhere = flasher("station", "backup", tmp_path / "no" / "copy", "--database", plant)
+    assert nowhere.code == ExitCode.USAGE
+
+
+def test_a_changed_attachment_is_found(
+    flasher: Flasher, plant: Path, tmp_path: Path, schema: dict[str, Any]
+) -> None:
+    copy = tmp_path / "copy.sqlite"
+    flasher("station", "backup", copy, "--database", plant)
+    (trace,) = (path for path in tmp_path.rglob("*") if path.is_file() and path.parent != tmp_path)
+    trace.write_bytes(b"another one")
+    run = flasher("station", "verify", "--database", copy)
+    assert run.code == ExitCode.VERIFICATION
+    assert "its hash differs" in run.out
+    told = flasher("station", "verify", "--database", copy, "--json")
+    hold(schema, "document.station", told.document)
+    unit = flasher("station", "unit", SERIAL, "--database", copy)
+    assert unit.code == ExitCode.OK
+    assert "its hash differs" in unit.out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("unit", "W0000000"), "no unit W0000000"),
+        (("report", "--database", "none.sqlite"), "no records"),
+        (("report", "--csv", "no/folder.csv"), "folder does not exist"),
+    ],
+)
+def test_what_is_not_there_is_said(
+    flasher: Flasher, plant: Path, words: tuple[str, ...], said: str
+) -> None:
+    database = () if "--database" in words else ("--database", str(plant))
+    run = flasher("station", *words, *database)
+    assert run.code == ExitCode.USAGE
+    assert said in run.err
+
+
+def test_an_action_has_to_be_named() -> None:
+    assert main(["station"]) == ExitCode.USAGE
+
+
+# -- the guide -------------------------------------------------------------------------------------
+
+GUIDE = Path(__file__).parents[2] / "docs" / "station.md"
+
+
+def test_the_guide_lists_every_code_with_what_to_do() -> None:
+    guide = GUIDE.read_text(encoding="utf-8")
+    for code in CODES.values():
+        row = f"| `{code.name}` | {code.outcome.value} | {code.meaning} | {code.action} |"
+        assert row in guide
+
+
+@pytest.mark.parametrize("model", [Recipe, StationConfig], ids=lambda model: model.__name__)
+def test_the_guide_names_every_key(model: type[Part]) -> None:
+    guide = GUIDE.read_text(encoding="utf-8")
+    tables = [model]
+    for table in tables:
+        for name, field in table.model_fields.items():
+            tables += [part for part in parts_in(field.annotation) if part not in tables]
+            assert re.search(rf"`[^`]*\b{name}\b[^`]*`", guide), f"{table.__name__}.{name}"
+    assert len(tables) > 2
+
+
+def parts_in(annotation: Any) -> list[type[Part]]:
+    """The tables of a recipe in the type of a key."""
+    if isinstance(annotation, type) and issubclass(annotation, Part):
+        return [annotation]
+    return [part for argument in get_args(annotation) for part in parts_in(argument)]
+
+
+def test_the_guide_shows_the_sample_recipe_and_every_word_of_a_socket() -> None:
+    guide = GUIDE.read_text(encoding="utf-8")
+    assert RECIPE.read_text(encoding="utf-8") in guide
+    assert all(f"| {state.value} |" in guide for state in SocketState)
+    assert all(f"`{word.value}" in guide for word in Word)
+
+
+# -- Ctrl-C ----------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_finishes_what_runs_and_begins_no_further_unit(
+    flasher: Flasher, recipe: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    press_when(monkeypatch, "RunStarted", times=1)
+    words = ("--mock-sockets", "1", "--units", "3", "--mock-bad", "0", *FAST)
+    run = flasher("station", "run", "--recipe", recipe, *words)
+    assert run.code == ExitCode.INTERRUPTED
+    document = lines_of(run)[1]
+    assert [unit["outcome"] for unit in document["units"]] == ["pass"]
+    assert not document["is_complete"]
+    assert "Ctrl-C again" in run.err
+
+
+def test_a_second_ctrl_c_stops_the_runs_which_are_recorded_as_aborted(
+    flasher: Flasher, recipe: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    press_when(monkeypatch, "RunStarted", times=2)
+    database = tmp_path / "plant.sqlite"
+    slow = ("--mock-sockets", "1", "--mock-bad", "0", "--mock-dead", "0", "--mock-speed", "9")
+    run = flasher("station", "run", "--recipe", recipe, *slow, "--database", database)
+    assert run.code == ExitCode.INTERRUPTED
+    (unit,) = lines_of(run)[1]["units"]
+    assert (unit["outcome"], unit["code"]) == ("aborted", "OPERATOR_ABORT")
+    with Store.open(str(database), station="reader", create=False) as store:
+        assert [each.state for each in store.read.runs()] == [RunState.ABORTED]
+
+
+def press_when(monkeypatch: pytest.MonkeyPatch, event: str, *, times: int) -> None:
+    """Press Ctrl-C after the first event of this class, and again when a later step begins."""
+    left = [times]
+    seen: list[str] = []
+    show, refresh = JsonLines.show, JsonLines.refresh
+
+    def press() -> None:
+        if event in seen and left[0]:
+            left[0] -= 1
+            signal.raise_signal(signal.SIGINT)
+
+    def showing(self: JsonLines, shown: StationEvent) -> None:
+        seen.append(type(shown).__name__)
+        show(self, shown)
+        if left[0] < times and isinstance(shown, StepStarted):
+            press()
+
+    def refreshing(self: JsonLines) -> None:
+        refresh(self)
+        press()
+
+    monkeypatch.setattr(JsonLines, "show", showing)
+    monkeypatch.setattr(JsonLines, "refresh", refreshing)
+
+
+def test_virtual_units_stay_out_of_records_of_real_ones(flasher: Flasher, tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.make()
+    bench.store.close()
+    place = ("--recipe", tmp_path / "recipe.toml", "--database", bench.path)
+    words = (*place, "--units", "1", "--mock-bad", "0", *FAST)
+    refused = flasher("station", "run", "--mock-sockets", "1", *words)
+    assert refused.code == ExitCode.USAGE
+    assert "hold real units" in refused.err + refused.out
+    asked = flasher("station", "run", "--mock-sockets", "1", "--mix-virtual", *words)
+    assert asked.code == ExitCode.OK
+    (unit,) = lines_of(asked)[1]["units"]
+    assert unit["is_virtual"]
+    told = flasher("station", "unit", unit["serial"], "--database", bench.path)
+    assert "PASS, a VIRTUAL unit, no product" in told.out
+    report = flasher("station", "report", "--database", bench.path)
+    assert "VIRTUAL:  1 run of virtual units, no products" in report.out

@@ -1,0 +1,366 @@
+"""What a station's views show: the board made of events, the table, keys, files of scans."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import pytest
+from rich.console import Console
+
+from flasher.cli.documents import to_json
+from flasher.cli.output import Output
+from flasher.cli.station_board import Board
+from flasher.cli.station_documents import LINES
+from flasher.cli.station_keys import LineReader, Typing
+from flasher.cli.station_scans import ScanFile
+from flasher.cli.station_table import StationTable
+from flasher.cli.station_views import Table
+from flasher.errors import UsageError
+from flasher.station.events import (
+    FiguresChanged,
+    LineStopped,
+    OperatorPrompted,
+    Progressed,
+    RunEnded,
+    RunStarted,
+    ScanAccepted,
+    ScanRefused,
+    SocketChanged,
+    SocketState,
+    StationEvent,
+    StationStarted,
+    StepStarted,
+    UnitArrived,
+    WorkerFailed,
+)
+from flasher.station.records.model import Figures, RunId, RunKind, RunState
+from flasher.station.socket_line import SocketLine
+from flasher.station.steps import StepName
+from tests.cli.conftest import Flasher
+from tests.cli.station_threads import ThreadPort
+from tests.cli.test_schema import hold
+from tests.cli.test_schema import sample as sample_of
+from tests.cli.test_station import FAST, WRITE
+from tests.schema_document import SCHEMA
+from tests.station.factory import USUAL, write_recipe
+
+FIGURES = Figures(3, 3, 2, 1, {"PASS": 2, "FAIL": 1}, {"REFUSED": 1}, 4.8, 5.5)
+
+
+def ended(
+    outcome: RunState = RunState.FAIL, code: str = "REFUSED", serial: str = "W2"
+) -> Iterator[StationEvent]:
+    yield RunEnded(
+        "1", serial, RunId(1), RunKind.PRODUCTION, outcome, code, "No.", "Put it aside.", 1.0
+    )
+    yield SocketChanged("1", SocketState(outcome.value), serial, "Put it aside.")
+
+
+def board_of(*more: StationEvent, sockets: int = 4) -> Board:
+    board = Board()
+    names = tuple(str(number + 1) for number in range(sockets))
+    started = StationStarted("line-2", "Battery [b]", "4", "BAT-36", names, ())
+    states = (SocketChanged(name, SocketState.EMPTY) for name in names)
+    for event in (started, *states, *more):
+        board.apply(event)
+    return board
+
+
+def drawn(board: Board, *, width: int = 80, height: int = 24, typed: str = "") -> list[str]:
+    console = Console(width=width, height=height, file=io.StringIO(), color_system=None)
+    with console.capture() as capture:
+        console.print(StationTable(console).draw(board, typed))
+    return capture.get().splitlines()
+
+
+# -- the table -------------------------------------------------------------------------------------
+
+
+def test_a_row_says_socket_state_serial_number_step_percent_and_time_left() -> None:
+    board = board_of(
+        SocketChanged("2", SocketState.RUNNING, "W2605002"),
+        StepStarted("2", "W2605002", StepName.FLASH, 2, "bms"),
+        Progressed("2", "W2605002", StepName.FLASH, 0.419, 61.6, "bms"),
+    )
+    (row,) = [line for line in drawn(board) if "W2605002" in line]
+    assert row.split() == [
+        "2",
+        "RUNNING",
+        "W2605002",
+        "flash",
+        "bms",
+        "try",
+        "2",
+        "41",
+        "%",
+        "62",
+        "s",
+    ]
+
+
+def test_a_fail_shows_its_code_and_what_to_do_until_the_unit_is_out() -> None:
+    board = board_of(*ended())
+    lines = drawn(board)
+    at = next(number for number, line in enumerate(lines) if "FAIL" in line)
+    assert lines[at].split() == ["1", "FAIL", "W2", "REFUSED"]
+    assert lines[at + 1].strip() == "Put it aside."
+    assert "Put it aside." in next(line for line in drawn(board, width=160) if "FAIL" in line)
+    board.apply(SocketChanged("1", SocketState.EMPTY))
+    assert not any("REFUSED" in line or "aside" in line for line in drawn(board))
+
+
+def test_every_state_is_a_colour_and_a_word() -> None:
+    console = Console(width=80, height=24, file=io.StringIO(), color_system="standard",
+                      force_terminal=True)  # fmt: skip
+    plain = {}
+    for state in SocketState:
+        board = board_of(SocketChanged("1", state, "W2"), sockets=1)
+        with console.capture() as capture:
+            console.print(StationTable(console).draw(board))
+        (row,) = [line for line in capture.get().splitlines() if "W2" in line]
+        assert state.value in row
+        plain[state] = row.partition(state.value)[0]
+    assert plain[SocketState.PASS] != plain[SocketState.FAIL]
+
+
+def test_totals_stand_below_with_first_pass_yield_and_failures_by_cause() -> None:
+    text = "\n".join(drawn(board_of(FiguresChanged(FIGURES))))
+    assert "3 units: 2 passed, 1 failed; yield 66.6 %, first pass 33.3 %; median 4.80 s" in text
+    assert "REFUSED 1" in text
+
+
+def test_a_stopped_line_a_refused_scan_and_what_is_typed_are_shown() -> None:
+    board = board_of(
+        ScanRefused("X", "WRONG_SERIAL", "It is none.", "Scan the label."),
+        LineStopped("RECORD_NOT_SAVED", "The disk is full.", "Make room."),
+    )
+    text = "\n".join(drawn(board, typed="W26", width=120))
+    assert "LINE STOPPED  RECORD_NOT_SAVED: The disk is full. Make room. Then scan RESUME." in text
+    assert "X: It is none. Scan the label." in text
+    assert "scan> W26_" in text
+
+
+def test_what_is_shown_comes_escaped_and_is_no_markup() -> None:
+    board = board_of(ScanAccepted("[red]\x1b[2J", "label"), OperatorPrompted("1", "a\x1bb"))
+    text = "\n".join(drawn(board))
+    assert "\x1b" not in text
+    assert "[red]" in text
+    assert "Battery [b]" in text
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 120, 200])
+@pytest.mark.parametrize("height", [12, 24, 60])
+@pytest.mark.parametrize("sockets", [1, 4, 16, 64])
+def test_it_never_exceeds_the_window(width: int, height: int, sockets: int) -> None:
+    board = board_of(*ended(serial="W" * 64), FiguresChanged(FIGURES), sockets=sockets)
+    board.apply(LineStopped("X", "Y " * 80, "Z"))
+    board.apply(ScanRefused("X" * 64, "CODE", "why " * 60, "remedy"))
+    lines = drawn(board, width=width, height=height)
+    assert len(lines) <= height
+    assert all(len(line) <= width for line in lines)
+
+
+def test_rows_do_not_move_while_states_change() -> None:
+    before = [line[:2] for line in drawn(board_of())]
+    after = [line[:2] for line in drawn(board_of(*ended()))]
+    assert [line for line in after[:10] if line.strip()] == [
+        line for line in before[:10] if line.strip()
+    ]
+
+
+# -- the board -------------------------------------------------------------------------------------
+
+
+def test_the_last_run_of_a_unit_counts() -> None:
+    board = board_of(*ended(), *ended(RunState.PASS, "OK"), *ended(serial="W3"))
+    assert [each.serial for each in board.bad_units] == ["W3"]
+
+
+def test_labels_without_a_socket_wait_until_their_run_begins() -> None:
+    board = board_of(ScanAccepted("W2", "label"), ScanAccepted("W3", "label"))
+    assert board.waiting == {"W2", "W3"}
+    board.apply(RunStarted("1", "W2", RunId(1), RunKind.PRODUCTION))
+    assert board.waiting == {"W3"}
+    board.apply(ScanAccepted("CANCEL", "cancel"))
+    assert not board.waiting
+
+
+def test_what_to_do_with_a_label_stands_behind_it() -> None:
+    board = board_of(OperatorPrompted("", "Scan the socket."), ScanAccepted("W2", "label"))
+    assert board.said == "W2: label. Scan the socket."
+    board.apply(ScanAccepted("SOCKET 1", "socket", "1"))
+    assert board.said == "SOCKET 1: socket for socket 1"
+
+
+def test_the_label_of_a_virtual_unit_is_shown_to_be_typed() -> None:
+    board = board_of(
+        UnitArrived("1", "it came", "W7"), SocketChanged("1", SocketState.SCAN, "", "Scan it.")
+    )
+    assert board.rows["1"].note == "Scan it. It says W7."
+
+
+def test_a_socket_that_is_not_started_again_is_broken() -> None:
+    board = board_of(WorkerFailed("1", "it ended", 1.0))
+    assert not board.broken
+    board.apply(WorkerFailed("1", "the recipe changed", None))  # type: ignore[arg-type, unused-ignore]
+    assert board.broken == {"1": "the recipe changed"}
+
+
+# -- keys and files --------------------------------------------------------------------------------
+
+
+def test_keys_become_scans() -> None:
+    scans: list[str] = []
+    typing = Typing(scans.append)
+    typing.feed("W26x\x7f05")
+    assert typing.text == "W2605"
+    typing.feed("\x1b[A002\r\n\n  \nRES\x15RESUME\n")
+    assert scans == ["W2605002", "RESUME"]
+    assert typing.text == ""
+
+
+def test_a_pipe_is_read_to_its_end() -> None:
+    scans: list[str] = []
+    reader = LineReader(io.StringIO("W2\n\nRESUME\n"), scans.append)
+    reader.read()
+    assert reader.is_at_end
+    assert [scan.strip() for scan in scans] == ["W2", "RESUME"]
+
+
+def socket_line(name: str, *, is_there: bool = True) -> SocketLine:
+    state = SocketState.SCAN if is_there else SocketState.EMPTY
+    return SocketLine(name, state, is_there=is_there, can_work=True)
+
+
+def worked_off(scans: list[str], lines: list[SocketLine], borne: dict[str, str]) -> list[str]:
+    """What is submitted in one turn."""
+    submitted: list[str] = []
+    file = ScanFile(scans, [line.name for line in lines], submitted.append)
+    file.turn({line.name: line for line in lines}, borne)
+    return submitted
+
+
+def test_a_label_goes_to_the_next_socket_in_which_a_unit_waits() -> None:
+    lines = [socket_line("A", is_there=False), socket_line("B")]
+    assert worked_off(["W1", "W2"], lines, {}) == ["SOCKET B", "W1"]
+    assert worked_off(["W1"], lines[:1], {}) == []
+
+
+def test_a_label_goes_to_the_socket_that_is_named_before_it() -> None:
+    lines = [socket_line("A", is_there=False), socket_line("B")]
+    assert worked_off(["socket a", "W1"], lines, {}) == []
+    assert worked_off(["SOCKET B", "W1"], lines, {}) == ["SOCKET B", "W1"]
+
+
+def test_a_virtual_unit_gets_its_own_label() -> None:
+    lines = [socket_line("A"), socket_line("B")]
+    assert worked_off(["W1", "W2"], lines[1:], {"A": "W1", "B": "W2"}) == ["SOCKET B", "W2"]
+    assert worked_off(["W1", "W2"], lines, {"A": "V1", "B": "V2"}) == ["SOCKET A", "W1"]
+
+
+def test_commands_keep_their_place_between_labels() -> None:
+    lines = [socket_line("A")]
+    assert worked_off(["LOT 7", "W1"], lines, {}) == ["LOT 7"]
+    assert worked_off(["W1", "LOT 7", "W2"], lines, {"A": "W2"}) == ["SOCKET A", "W1"]
+
+
+def test_sockets_that_see_no_units_take_no_file() -> None:
+    line = socket_line("A")
+    line.sees_units = False
+    with pytest.raises(UsageError, match="sees whether"):
+        worked_off(["W1"], [line], {})
+
+
+# -- the whole, on a terminal ----------------------------------------------------------------------
+
+
+@pytest.mark.skipif(os.name == "nt", reason="terminals of POSIX")
+def test_on_a_terminal_the_table_is_refreshed_and_the_summary_stays(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    master, slave = os.openpty()
+    screen = io.StringIO()
+    monkeypatch.setattr(screen, "isatty", lambda: True)
+    for name, value in {"TERM": "xterm-256color", "COLUMNS": "100", "LINES": "30"}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr("flasher.cli.station_run.LAUNCH", ThreadPort)
+    monkeypatch.setattr("flasher.cli.station_views.REFRESH_S", 0.0)
+    recipe = write_recipe(tmp_path, USUAL + WRITE)
+    words = ("--mock-sockets", "2", "--units", "2", "--mock-bad", "0", *FAST)
+    with os.fdopen(slave, "r") as keys:
+        monkeypatch.setattr(sys, "stdin", keys)
+        monkeypatch.setattr(sys, "stdout", screen)
+        os.write(master, b"NONSENSE\n")
+        run = flasher("station", "run", "--recipe", recipe, *words)
+    os.close(master)
+    assert run.code == 0
+    shown, _, behind = screen.getvalue().rpartition("\x1b[?1049l")
+    assert "\x1b[?1049h" in shown
+    assert "RUNNING" in shown
+    assert "PASS" in shown
+    assert "NONSENSE" in shown, "what is typed is a scan"
+    assert "2 units: 2 passed, 0 failed; yield 100 %" in behind
+
+
+# -- JSON ------------------------------------------------------------------------------------------
+
+
+def sample(hint: Any) -> Any:
+    """A value of the type that a field of a station's event has."""
+    hint = getattr(hint, "__supertype__", hint)
+    if hint is Figures:
+        return FIGURES
+    if hint is bool:
+        return True
+    options = get_args(hint)
+    if type(None) in options:
+        return None
+    if options and Ellipsis in options:
+        return (sample(options[0]),) * 2
+    return tuple(map(sample, options)) if options else sample_of(hint)
+
+
+@pytest.mark.parametrize("event", LINES, ids=lambda event: event.__name__)
+def test_every_event_is_as_described(event: Any) -> None:
+    schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
+    made = event(**{name: sample(hint) for name, hint in get_type_hints(event).items()})
+    line = {"schema": 1, **to_json(made)}
+    hold(schema, f"line.{event.__name__}", json.loads(json.dumps(line)))
+
+
+# -- what must not be taken for something else -----------------------------------------------------
+
+
+def test_virtual_units_are_named_in_the_title_and_beside_their_pass() -> None:
+    board = Board()
+    board.apply(StationStarted("line-2", "Battery", "4", "P", ("1", "2"), (), ("2",)))
+    for name in ("1", "2"):
+        board.apply(SocketChanged(name, SocketState.PASS, f"W{name}"))
+    lines = drawn(board)
+    assert lines[0].startswith("VIRTUAL UNITS in 2, no products. line-2")
+    assert [line.split()[1:] for line in lines if "PASS" in line] == [
+        ["PASS", "W1"],
+        ["PASS", "W2", "virtual", "unit"],
+    ]
+
+
+def test_saving_is_drawn_before_the_disk_is_waited_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    view = Table(Output(), now=lambda: 0.0)
+    drawn_states: list[SocketState] = []
+
+    def update(*_args: object, **_more: object) -> None:
+        drawn_states.extend(row.state for row in view.board.rows.values())
+
+    monkeypatch.setattr(view._live, "update", update)
+    view(StationStarted("line-2", "Battery", "4", "P", ("1",), ()))
+    view(SocketChanged("1", SocketState.RUNNING, "W1"))
+    view(SocketChanged("1", SocketState.SAVING, "W1"))
+    assert drawn_states[-1] is SocketState.SAVING
