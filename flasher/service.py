@@ -13,7 +13,7 @@ from typing import Final, Protocol, TypedDict, Unpack
 
 from flasher.bus.link import Clock, Link
 from flasher.driver import Tap, drive
-from flasher.errors import InterruptedByUserError, NoAnswerError
+from flasher.errors import BusError, InterruptedByUserError, NoAnswerError
 from flasher.host.items import Readable, find, readable
 from flasher.host.query import Query, Request
 from flasher.host.read import MemoryRead
@@ -226,12 +226,20 @@ def info(
     """Ask a device everything that the documents let us ask; listen only where they give nothing.
 
     Silence is no error here: see `DeviceInfo.is_there`. Takes 12 s when nothing is answered by a
-    device that is heard, 4 s when it is not heard either.
+    device that is heard, 4 s when it is not heard either. Raises BusError when another tool speaks
+    on the bus: a question could end its upgrade.
     """
     asked = [entry for entry in readable(target, dialect).values() if not entry.field]
     requests = [Request(entry.item) for entry in asked]
     listen_s = INFO_LISTEN_S if asked else INFO_LISTEN_ONLY_S
     survey = _survey(connection, requests, listen_s, dialect, manner)
+    if requests and survey.other_tool_heard:
+        raise BusError(
+            "Another tool speaks on this bus; nothing was asked.",
+            where="while listening, before the first question",
+            cause="an upgrade or a test is under way",
+            remedy="Wait until it has ended. flasher monitor listens without asking.",
+        )
     done = dict(zip((entry.name for entry in asked), survey.queries, strict=False))
     readings = tuple(_reading(entry, done.get(entry.name)) for entry in asked)
     return DeviceInfo(target, dialect, readings, survey)

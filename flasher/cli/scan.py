@@ -115,7 +115,8 @@ def _lines(
     if guessed is not None and guessed is not asked:
         lines.append(f"          it was asked as {asked.name}: use --dialect {guessed.name}")
     for node, heard in sorted(survey.heard.items(), key=lambda pair: pair[0].value):
-        note = " (a tool like this one)" if node.name == "CDL" else ""
+        unasked = ": nothing was asked" if survey.other_tool_heard else ""
+        note = f" (another tool{unasked})" if node.name == "CDL" else ""
         lines += ["", f"{node.name}{note}", *heard_lines(heard)]
     if survey.foreign_frames:
         lines += ["", f"frames under ids of other protocols: {survey.foreign_frames}"]

@@ -46,7 +46,10 @@ class Heard:
 
 
 class Survey:
-    """Hears for `listen_s`, then asks `requests`. An engine; `heard` is there at any time."""
+    """Hears for `listen_s`, then asks `requests`, unless another tool was heard: a question in the
+    midst of its upgrade would look like a second tool to it. An engine; `heard` is there at any
+    time.
+    """
 
     def __init__(
         self,
@@ -61,6 +64,8 @@ class Survey:
         self.foreign_frames = 0
         """Frames under ids that the documents do not give."""
         self.cancelled = False
+        self.other_tool_heard = False
+        """Somebody else spoke as CDL while it listened, so that nothing was asked."""
         self._listen_s = listen_s
         self._dialect = dialect
         self._timings = timings
@@ -77,7 +82,8 @@ class Survey:
     @property
     def queries(self) -> Sequence[Query]:
         """The questions that were asked, in order."""
-        return self._queries.queries if self._has_listened else ()
+        was_asked = self._has_listened and not self.other_tool_heard
+        return self._queries.queries if was_asked else ()
 
     @property
     def faults(self) -> Faults | None:
@@ -122,6 +128,9 @@ class Survey:
                 self._take(reassembler.can_id, found)
         if self._listen_until is not None and now >= self._listen_until:
             self._listen_until = None
+            self.other_tool_heard = Node.CDL in self.heard
+            if self.other_tool_heard:
+                self._queries.cancel(now)
         if self._has_listened:
             self._queries.tick(now)
 

@@ -104,6 +104,17 @@ def test_what_is_heard_while_listening_belongs_to_its_sender() -> None:
     assert engine.heard[Node.OBC].frames == 2
 
 
+def test_a_tool_that_is_heard_while_listening_is_not_disturbed_by_questions() -> None:
+    engine = survey()
+    engine.tick(0.0)
+    engine.receive(Frame(0x752, bytes.fromhex("55AA1687A3850101")), 0.5)
+    engine.tick(1.0)
+    assert engine.next_frame(1.0) is None
+    assert engine.done
+    assert engine.other_tool_heard
+    assert engine.queries == ()
+
+
 def test_damage_is_counted_and_nothing_is_made_of_it() -> None:
     engine = survey()
     engine.tick(0.0)

@@ -6,6 +6,7 @@ import pytest
 
 from flasher import service
 from flasher.errors import (
+    BusError,
     InterruptedByUserError,
     NoAnswerError,
     UsageError,
@@ -224,6 +225,21 @@ def test_info_of_a_device_that_answers_half_is_bounded_and_says_what_is_missing(
     missing = {reading.item.command for reading in found.readings if reading.answer is None}
     assert missing == silent
     assert wire.clock.now() < 0.5 + 11 * 1.1
+
+
+def test_info_does_not_ask_into_the_dialogue_of_another_tool() -> None:
+    battery, tool = Battery(), Battery(silent=SILENT, repeats=((0x751, 0xA401, b"\x04"),))
+    with pytest.raises(BusError, match="Another tool speaks on this bus"):
+        service.info(wire_to(battery, tool))
+    assert battery.received == []
+
+
+def test_scan_shows_another_tool_and_asks_nothing_then() -> None:
+    battery, tool = Battery(), Battery(silent=SILENT, repeats=((0x751, 0xA401, b"\x04"),))
+    survey = service.scan(wire_to(battery, tool))
+    assert survey.other_tool_heard
+    assert set(survey.heard) == {Node.CDL}
+    assert battery.received == []
 
 
 def test_info_gives_an_absent_device_up_soon() -> None:
