@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from flasher import events
-from flasher.bus.health import TroubleKind, bus_off_error
+from flasher.bus.health import LinkHealth, TroubleKind, bus_off_error
 from flasher.bus.link import Clock, Link
 from flasher.driver import Tap, drive
 from flasher.errors import (
@@ -45,7 +45,8 @@ def run_session(
     interrupts a second time.
     """
     tell = on_event or (lambda _event: None)
-    _check_bus(link, "before anything was sent", session)
+    before = link.health()
+    _check_bus(link, "before anything was sent", session, before)
     try:
         while True:
             try:
@@ -71,17 +72,18 @@ def run_session(
     result = session.result
     silence = result.error()
     if isinstance(silence, NoAnswerError):
-        _check_bus(link, silence.where, session)
+        _check_bus(link, silence.where, session, before)
     return result
 
 
-def _check_bus(link: Link, where: str, session: Session) -> None:
+def _check_bus(link: Link, where: str, session: Session, before: LinkHealth) -> None:
     """Raise BusError when it is the bus that is silent, not the device, or when the adapter was
-    off the bus for a while and came back by itself: what was sent and said meanwhile is lost.
+    off the bus since `before` and came back by itself: what was sent and said meanwhile is lost.
     """
     health, where = link.health(), f"{where}; {link}"
     error, trouble = health.error(where), health.last_trouble
-    if error is None and trouble is not None and trouble.kinds & _WAS_OFF:
+    is_new = trouble is not before.last_trouble
+    if error is None and is_new and trouble is not None and trouble.kinds & _WAS_OFF:
         error = bus_off_error(where, "The adapter was off the bus for a while.")
     if error is not None:
         _say_what_is_left(error, session)

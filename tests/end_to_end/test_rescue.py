@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import pytest
 
-from flasher import events
+from flasher import api, events
 from flasher.device.profile import DeviceProfile
 from flasher.errors import BusError, ExitCode
 from flasher.events import Phase
@@ -270,6 +270,18 @@ def test_an_adapter_that_restarts_after_a_bus_off_in_any_phase_is_overcome_or_ex
             stage.flash()
         stage.wait(10.0)
     assert stage.flash().exit_code == ExitCode.OK
+    assert stage.has == IMAGE.data
+
+
+def test_a_bus_off_that_is_over_keeps_no_later_upgrade_from_starting() -> None:
+    stage = Stage()
+    link = stage.bus.link()
+    stage.bus.bus_off(0.5)
+    while (seen := link.receive(stage.clock.now() + 1.0)) is not None:
+        assert seen.is_error
+    connection = api.Connection(link, stage.clock, "the simulated bus")
+    result = api.upgrade(api.make_plan(IMAGE, "bms"), connection)
+    assert result.exit_code == ExitCode.OK
     assert stage.has == IMAGE.data
 
 
