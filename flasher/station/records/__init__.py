@@ -16,6 +16,7 @@ from flasher.station.records.errors import (
 )
 from flasher.station.records.model import (
     AttachmentFile,
+    AuditEvent,
     Backup,
     Claim,
     Clock,
@@ -50,6 +51,7 @@ __all__ = [
     "Figures",
     "Measurement",
     "NotFoundError",
+    "AuditEvent",
     "Problem",
     "RecordError",
     "RecordsDamagedError",

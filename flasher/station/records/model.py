@@ -76,6 +76,20 @@ class RunKind(StrEnum):
     """A known unit tests the station; it counts in no figure."""
 
 
+class AuditEvent(StrEnum):
+    """What a person did at the station, noted in the audit trail by `Store.note`."""
+
+    OPERATOR = "operator"
+    """Another person works from now on."""
+    RESUME = "resume"
+    """The line was stopped, and goes on."""
+    ABORT = "abort"
+    """A run was stopped by hand."""
+    REASON = "reason"
+    """Why a unit is done again."""
+    REFUSED_SCAN = "refused scan"
+
+
 class UnitState(StrEnum):
     """What is known of a unit: derived from its last run."""
 

@@ -20,11 +20,11 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 from sqlalchemy import select, update
 
@@ -55,6 +55,7 @@ from flasher.station.records.lock import StationLock
 from flasher.station.records.model import (
     OUTCOMES,
     AttachmentFile,
+    AuditEvent,
     Backup,
     Claim,
     Clock,
@@ -301,6 +302,13 @@ class Store:
                 verification_reached=weakest(connection, run_id),
                 log_sha256=ending.log_sha256,
             )
+
+    def note(self, event: AuditEvent, data: Mapping[str, Any], run_id: RunId | None = None) -> None:
+        """Add what a person did to the audit trail; on disk when it returns. `data` holds what
+        JSON can hold. Raises RecordError.
+        """
+        with self.database.writing() as connection:
+            chain.append(connection, self._clock.utc(), event.value, data, run_id)
 
     def correct(self, run_id: RunId, operator: str, text: str) -> None:
         """Add a remark to a finished run, which itself never changes."""

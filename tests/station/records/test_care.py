@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import sqlite3
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+from sqlalchemy import select
 
 from flasher.errors import UsageError
-from flasher.station.records import RecordsDamagedError, RunState, Store, UnitState
+from flasher.station.records import AuditEvent, RecordsDamagedError, RunState, Store, UnitState
+from flasher.station.records.schema import audit
 from tests.station.factory import SERIAL, Bench
 
 
@@ -113,4 +116,15 @@ def test_a_correction_is_a_new_row_and_part_of_the_chain(bench: Bench) -> None:
     before = bench.store.read.run(run_id)
     bench.store.correct(run_id, "jo", "wrong lot on the card, it was L2")
     assert bench.store.read.run(run_id) == before
+    assert not bench.store.verify()
+
+
+def test_what_a_person_did_at_the_station_is_part_of_the_chain(bench: Bench) -> None:
+    run_id = bench.claim().run_id
+    bench.store.note(AuditEvent.OPERATOR, {"before": "jo", "now": "al"})
+    bench.store.note(AuditEvent.ABORT, {"socket": "A", "by": "al"}, run_id)
+    with bench.store.database.reading() as connection:
+        rows = connection.execute(select(audit).order_by(audit.c.id.desc()).limit(2)).all()
+    assert [(row.event, row.run_id) for row in rows] == [("abort", run_id), ("operator", None)]
+    assert json.loads(rows[1].data) == {"before": "jo", "now": "al"}
     assert not bench.store.verify()
