@@ -154,8 +154,8 @@ def summary_of(described: type) -> str:
 def _field_texts(described: type) -> dict[str, str]:
     """The docstrings that stand behind the fields of a class, its bases' too."""
     texts: dict[str, str] = {}
-    for base in getattr(described, "__orig_bases__", ()):
-        if is_typeddict(base):
+    for base in getattr(described, "__orig_bases__", described.__bases__):
+        if is_typeddict(base) or dataclasses.is_dataclass(base):
             texts |= _field_texts(base)
     try:
         body = ast.parse(textwrap.dedent(inspect.getsource(described))).body[0]

@@ -73,7 +73,9 @@ def run(options: argparse.Namespace, output: Output) -> int:
             launch=LAUNCH,
         )
         if scans is not None:
-            session.file = ScanFile(scans, tuple(session.station.lines), session.station.submit)
+            session.file = ScanFile(
+                scans, [each.name for each in session.station.sockets], session.station.submit
+            )
         session.work()
         return session.report()
 
@@ -160,7 +162,7 @@ class _Session:
         try:
             self._check_sockets()
             if self.file is not None and not self.station.is_line_stopped:
-                self.file.turn(self.station.lines, self.view.board.labels)
+                self.file.turn(self.station.sockets, self.view.board.labels)
         except FlasherError as error:
             self._failure = error
             return True
@@ -174,7 +176,7 @@ class _Session:
     def _check_sockets(self) -> None:
         """Raises BusError when no socket will ever work again."""
         broken = self.view.board.broken
-        if broken.keys() >= self.station.lines.keys():
+        if broken.keys() >= {each.name for each in self.station.sockets}:
             name, reason = next(iter(broken.items()))
             raise BusError(
                 f"No socket can work; socket {printable(name)}: {printable(reason)}",
@@ -191,8 +193,7 @@ class _Session:
 
     def _is_quiet(self) -> bool:
         """True when nothing runs, and no label waits."""
-        lines = self.station.lines.values()
-        is_busy = any(line.run is not None or line.label for line in lines)
+        is_busy = any(socket.is_busy for socket in self.station.sockets)
         return not (is_busy or self.view.board.waiting)
 
     # -- its end ----------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -11,7 +11,7 @@ from flasher.cli.station_keys import Submit
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.scans import Command, Label, Word, understand
-from flasher.station.socket_line import SocketLine
+from flasher.station.station import SocketView
 
 FILE_MAX_SIZE: Final = 4 * 1024 * 1024
 """In bytes."""
@@ -71,14 +71,15 @@ class ScanFile:
         """True when every scan was submitted."""
         return not self._left
 
-    def turn(self, lines: Mapping[str, SocketLine], borne: Mapping[str, str]) -> None:
+    def turn(self, sockets: Iterable[SocketView], borne: Mapping[str, str]) -> None:
         """Submit the next scan, when its time has come. `borne` are the labels of virtual units, by
         their sockets. Raises UsageError where no socket can tell that a unit is in it.
         """
         if not self._left:
             return
-        working = [line for line in lines.values() if line.can_work]
-        if working and not any(line.sees_units for line in working):
+        sockets = tuple(sockets)
+        working = [socket for socket in sockets if socket.can_work]
+        if working and not any(socket.sees_units for socket in working):
             raise UsageError(
                 "No socket of this station sees whether a unit is in it.",
                 where=OPTION,
@@ -86,25 +87,27 @@ class ScanFile:
             )
         scan = understand(self._left[0])
         if isinstance(scan, Label):
-            self._label(lines, borne)
+            self._label(sockets, borne)
         elif isinstance(scan, Command) and scan.word is Word.SOCKET and len(self._left) > 1:
-            line = next(e for e in lines.values() if e.name.lower() == scan.argument.lower())
-            if _waits(line):
+            named = next(e for e in sockets if e.name.lower() == scan.argument.lower())
+            if named.awaits_label:
                 self._submit(self._left.popleft())
                 self._submit(self._left.popleft())
         else:
             self._submit(self._left.popleft())
 
-    def _label(self, lines: Mapping[str, SocketLine], borne: Mapping[str, str]) -> None:
+    def _label(self, sockets: Iterable[SocketView], borne: Mapping[str, str]) -> None:
         """Give a label to a unit that waits."""
         ahead = self._until_command()
-        for line in filter(_waits, lines.values()):
-            own = borne.get(line.name, "")
+        for socket in sockets:
+            if not (socket.awaits_label and socket.sees_units):
+                continue
+            own = borne.get(socket.name, "")
             # A virtual unit whose label comes later in the file waits for it.
             label = own if own in ahead else next((e for e in ahead if e not in borne.values()), "")
             if label:
                 self._left.remove(label)
-                self._submit(f"{Word.SOCKET.value} {line.name}")
+                self._submit(f"{Word.SOCKET.value} {socket.name}")
                 self._submit(label)
                 return
 
@@ -116,8 +119,3 @@ class ScanFile:
                 break
             ahead.append(text)
         return ahead
-
-
-def _waits(line: SocketLine) -> bool:
-    """True when a unit is in the socket and wants a label."""
-    return line.is_free and line.is_there and line.sees_units

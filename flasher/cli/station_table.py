@@ -22,6 +22,7 @@ WIDE: Final = 140
 _STYLES: Final = {
     SocketState.STARTING: "dim",
     SocketState.EMPTY: "dim",
+    SocketState.SILENT: "dim",
     SocketState.SCAN: "bold black on yellow",
     SocketState.RUNNING: "bold cyan",
     SocketState.SAVING: "bold blue",

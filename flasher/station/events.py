@@ -6,7 +6,7 @@ event that says PASS, and it leaves only after the outcome is in the records, on
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from flasher.station.records.model import Figures, RunId, RunKind, RunState, StepState
@@ -20,6 +20,8 @@ class SocketState(StrEnum):
     """Its process opens the adapter."""
     EMPTY = "EMPTY"
     """No unit is in it, and no label is meant for it."""
+    SILENT = "SILENT"
+    """Nothing is heard: no unit is in it, or one that sleeps."""
     SCAN = "SCAN"
     """A unit waits for its label, or a label for its unit; `SocketChanged.text` says which."""
     RUNNING = "RUNNING"
@@ -41,7 +43,15 @@ class SocketState(StrEnum):
 
 
 @dataclass(frozen=True)
-class StationStarted:
+class Timed:
+    """What all events have."""
+
+    at: str = field(default="", kw_only=True, compare=False)
+    """UTC, as 2026-05-17T09:00:00.123Z; given when the event leaves the station."""
+
+
+@dataclass(frozen=True)
+class StationStarted(Timed):
     """The station is ready. `recovered` are runs that a dead station left: INTERRUPTED now, their
     units RECHECK.
     """
@@ -57,7 +67,7 @@ class StationStarted:
 
 
 @dataclass(frozen=True)
-class SocketChanged:
+class SocketChanged(Timed):
     """A socket shows another state, or another text beside it."""
 
     socket: str
@@ -68,7 +78,7 @@ class SocketChanged:
 
 
 @dataclass(frozen=True)
-class UnitArrived:
+class UnitArrived(Timed):
     """A unit is in the socket. `label` is the label that only virtual units bring along."""
 
     socket: str
@@ -77,14 +87,14 @@ class UnitArrived:
 
 
 @dataclass(frozen=True)
-class UnitRemoved:
+class UnitRemoved(Timed):
     """Nothing was heard from the unit for long enough: it is out."""
 
     socket: str
 
 
 @dataclass(frozen=True)
-class ScanAccepted:
+class ScanAccepted(Timed):
     """What was scanned is understood: a label, or a command (`flasher.station.scans`)."""
 
     text: str
@@ -94,7 +104,7 @@ class ScanAccepted:
 
 
 @dataclass(frozen=True)
-class ScanRefused:
+class ScanRefused(Timed):
     """What was scanned changes nothing. `code` is a stable word, `remedy` one action."""
 
     text: str
@@ -105,7 +115,7 @@ class ScanRefused:
 
 
 @dataclass(frozen=True)
-class OperatorPrompted:
+class OperatorPrompted(Timed):
     """Somebody has to do something now, as to switch the unit off and on; within `limit_s`."""
 
     socket: str
@@ -114,7 +124,7 @@ class OperatorPrompted:
 
 
 @dataclass(frozen=True)
-class RunStarted:
+class RunStarted(Timed):
     """A unit is claimed; the run is in the records."""
 
     socket: str
@@ -126,7 +136,7 @@ class RunStarted:
 
 
 @dataclass(frozen=True)
-class StepStarted:
+class StepStarted(Timed):
     """A step of the run begins; tries count from 1. `target` is empty for steps of all targets."""
 
     socket: str
@@ -137,7 +147,7 @@ class StepStarted:
 
 
 @dataclass(frozen=True)
-class Progressed:
+class Progressed(Timed):
     """How far the step is: `share` from 0 to 1; `left_s` is None where nobody can tell."""
 
     socket: str
@@ -149,7 +159,7 @@ class Progressed:
 
 
 @dataclass(frozen=True)
-class StepEnded:
+class StepEnded(Timed):
     """One try of a step ended, and is in the records."""
 
     socket: str
@@ -164,7 +174,7 @@ class StepEnded:
 
 
 @dataclass(frozen=True)
-class RunEnded:
+class RunEnded(Timed):
     """A run is over **and its outcome is on disk**. `action` is what the operator does now."""
 
     socket: str
@@ -183,7 +193,7 @@ class RunEnded:
 
 
 @dataclass(frozen=True)
-class RecordNotSaved:
+class RecordNotSaved(Timed):
     """The outcome is not on disk: nothing may be shown green. It is tried again on RESUME."""
 
     socket: str
@@ -194,7 +204,7 @@ class RecordNotSaved:
 
 
 @dataclass(frozen=True)
-class LineStopped:
+class LineStopped(Timed):
     """No unit is begun any more until RESUME; runs that go on are ended properly."""
 
     code: str
@@ -203,12 +213,12 @@ class LineStopped:
 
 
 @dataclass(frozen=True)
-class LineResumed:
+class LineResumed(Timed):
     """What stopped the line is over."""
 
 
 @dataclass(frozen=True)
-class WorkerFailed:
+class WorkerFailed(Timed):
     """A socket's process ended or hung; a new one is started after `restart_in_s`."""
 
     socket: str
@@ -218,14 +228,14 @@ class WorkerFailed:
 
 
 @dataclass(frozen=True)
-class FiguresChanged:
+class FiguresChanged(Timed):
     """Totals of this recipe and lot since the station started."""
 
     figures: Figures
 
 
 @dataclass(frozen=True)
-class StationStopped:
+class StationStopped(Timed):
     """The station has ended; nothing is running."""
 
     station: str

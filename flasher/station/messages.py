@@ -108,11 +108,16 @@ class AdapterDown:
 
 @dataclass(frozen=True)
 class PresenceChanged:
-    """A unit came or went. `label` is what a virtual unit has on it."""
+    """A unit came or went, or said who it is. Said again after each run and each opening."""
 
     is_there: bool
     how: str = ""
     label: str = ""
+    """The label that a virtual unit bears."""
+    serial: str | None = None
+    """The serial number that the unit itself says; empty: it has none; None: not said yet."""
+    is_certain: bool = False
+    """Nothing is in the socket; else nothing is heard, which may be a unit that sleeps."""
 
 
 @dataclass(frozen=True)

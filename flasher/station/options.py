@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final
 
 from flasher.errors import UsageError
-from flasher.station.socket_line import SocketLine
+from flasher.station.line import ARRIVAL_LIMIT_S, SCAN_LIMIT_S
 from flasher.station.supervisor import HANG_S
 
 _APART: Final = (
@@ -19,9 +18,9 @@ _APART: Final = (
 class StationOptions:
     """What may be set; the defaults are for a line with people."""
 
-    arrival_limit_s: float = 20.0
-    """A label with a chosen socket waits so long for its unit to be seen; then the run begins all
-    the same, and says what is wrong with it."""
+    arrival_limit_s: float = ARRIVAL_LIMIT_S
+    scan_limit_s: float = SCAN_LIMIT_S
+    """Both as `flasher.station.line.Line` has them."""
     hang_s: float = HANG_S
     end_limit_s: float = 30.0
     """How long runs may take to end when the station is ended."""
@@ -31,14 +30,12 @@ class StationOptions:
     """Real and virtual units may share the records; one serial number is never both."""
 
 
-def check_natures(
-    known: frozenset[bool], lines: Iterable[SocketLine], options: StationOptions
-) -> None:
-    """Whether these sockets may use records that know virtual units (True), real ones (False).
+def check_natures(known: frozenset[bool], own: frozenset[bool], options: StationOptions) -> None:
+    """Whether sockets may use records that know virtual units (True), real ones (False); `own`:
+    the same of the sockets.
 
     Raises UsageError: a PASS of a virtual unit must not be taken for one of a product.
     """
-    own = frozenset(line.is_virtual for line in lines)
     if options.mixes_virtual or len(own | known) < len((True, False)):
         return
     if len(own) > 1:

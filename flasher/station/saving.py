@@ -7,22 +7,43 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
 
 from flasher.station import codes
 from flasher.station.codes import CODES, Code
+from flasher.station.messages import Finished
 from flasher.station.records.errors import RuleBrokenError
-from flasher.station.records.model import Ending, RunState, StepState
+from flasher.station.records.model import AttachmentFile, Claim, Ending, RunState, StepState
 from flasher.station.records.store import Store
-from flasher.station.run_model import RunResult
-from flasher.station.socket_line import ActiveRun
+from flasher.station.run_model import RunOrder, RunResult
 from flasher.station.steps import StepName
 
 TRACE: Final = "trace"
 TORN_TRACE: Final = "torn-trace"
 """Of a process that died: its end is missing."""
+
+
+@dataclass
+class ActiveRun:
+    """A run that is claimed and not yet in the records with its end."""
+
+    claim: Claim
+    trace: Path
+    begun_s: float
+    order: RunOrder
+    where: str = StepName.CONNECT.value
+    """The step that goes on, with its target."""
+    journal_error: str = ""
+    """Something of it could not be saved: it cannot pass any more."""
+    finished: Finished | None = None
+    """Its end, once the process said it."""
+    ended_s: float = 0.0
+    attached: list[AttachmentFile] = field(default_factory=list)
+    result: RunResult | None = None
+    """The end as it is to be saved; tried again until it is."""
+    is_save_noted: bool = False
 
 
 def save(store: Store, run: ActiveRun, now_s: Callable[[], float]) -> RunResult:

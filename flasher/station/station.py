@@ -1,4 +1,4 @@
-"""A running station: sockets, scans and records brought together. A library with events.
+"""A running station: the processes of its sockets, its records, and the `Line` that decides.
 
     with Store.open(...) as store:
         station = Station(store, recipe, setups, operator="jo", on_event=print)
@@ -6,57 +6,105 @@
 
 One thread does everything: it is the only one that writes records. A run is begun when its claim is
 on disk; a socket's process does nothing that cannot be taken back before the intent is on disk; and
-`RunEnded`, the one event that says PASS, leaves after the outcome is on disk.
-
-Which socket a label is for: the one that was chosen by SOCKET; else the one socket in which a unit
-waits for its label; else the socket into which the next unit comes. Where two units wait, the
-station asks for the socket. One label waits at a time.
+`RunEnded`, the one event that says PASS, leaves after the outcome is on disk. Which label is for
+which unit is decided by `flasher.station.line`.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
 from typing import Final
 
 from flasher.log import log_event
-from flasher.station.commit import Committing
-from flasher.station.desk import Desk
+from flasher.station import codes, line
+from flasher.station.codes import CODES
 from flasher.station.events import (
     FiguresChanged,
-    SocketChanged,
+    OperatorPrompted,
+    Progressed,
+    RecordNotSaved,
+    RunEnded,
+    RunStarted,
     SocketState,
     StationEvent,
     StationStarted,
     StationStopped,
-    UnitArrived,
-    UnitRemoved,
+    StepEnded,
+    StepStarted,
     WorkerFailed,
 )
+from flasher.station.history import before_of
+from flasher.station.line import Line
 from flasher.station.messages import (
     Abort,
     AdapterDown,
     Ask,
     Begin,
+    Done,
     Finished,
     FromWorker,
+    Intent,
     Note,
     PresenceChanged,
     Ready,
+    Reply,
     WorkerSetup,
 )
 from flasher.station.options import StationOptions, check_natures
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.errors import RecordError
-from flasher.station.records.model import Clock, Figures, RunFilter
+from flasher.station.records.errors import ClaimRefusedError, RecordError, Refusal
+from flasher.station.records.model import (
+    AuditEvent,
+    Claim,
+    Clock,
+    Figures,
+    RunFilter,
+    RunId,
+    RunState,
+)
 from flasher.station.records.store import Store, SystemClock
-from flasher.station.socket_line import SocketLine, SocketView
+from flasher.station.run_model import (
+    Progress,
+    Prompt,
+    RunNote,
+    RunOrder,
+    RunResult,
+    StepBegan,
+    StepReport,
+)
+from flasher.station.saving import ActiveRun, save, verified_words
+from flasher.station.socket import Phase, Socket
 from flasher.station.supervisor import Launch, ProcessPort, Supervisor, WorkerLost
 
 TURN_S: Final = 0.1
 """How long a turn of the loop waits at the most."""
+SPOOL: Final = "open"
+"""Folder of the traces of runs that go on, beside the attachments."""
 EventHandler = Callable[[StationEvent], None]
+
+
+@dataclass(frozen=True)
+class SocketView:
+    """A socket for somebody who looks; `Station.sockets`."""
+
+    name: str
+    state: SocketState
+    text: str
+    serial: str
+    is_there: bool
+    """A unit is heard in it."""
+    can_work: bool
+    sees_units: bool
+    awaits_label: bool
+    """A unit is in it that has no label yet."""
+    is_busy: bool
+    """A run goes on, is not saved yet, or has its label."""
 
 
 class Station:
@@ -84,15 +132,20 @@ class Station:
         self.clock: Clock = clock or SystemClock()
         self._on_event = on_event
         setups = tuple(setups)
-        self.lines = {
-            setup.socket: SocketLine(setup.socket, is_virtual=setup.virtual is not None)
-            for setup in setups
-        }
+        self.line = Line(
+            [Socket(each.socket, is_virtual=each.virtual is not None) for each in setups],
+            recipe.recipe.serial_number.read,
+            operator=operator,
+            lot=lot,
+            arrival_limit_s=self.options.arrival_limit_s,
+            scan_limit_s=self.options.scan_limit_s,
+            scans_labels=self.options.scans_labels,
+        )
         self.supervisor = Supervisor(
             setups, self.clock.monotonic_s, launch=launch, hang_s=self.options.hang_s
         )
-        self.committing = Committing(self)
-        self._desk = Desk(self, operator=operator, lot=lot)
+        self._runs: dict[str, ActiveRun] = {}
+        """Runs that are claimed and not saved yet, by their sockets."""
         self._scans: deque[str] = deque()
         self._wake_receiver, self._wake_sender = multiprocessing.Pipe(duplex=False)
         self._started_at = self.clock.utc()
@@ -107,9 +160,15 @@ class Station:
 
         Raises RecordError; UsageError for records of the other kind of units.
         """
-        check_natures(self.store.read.natures(), self.lines.values(), self.options)
+        sockets = self.line.sockets
+        check_natures(
+            self.store.read.natures(),
+            frozenset(each.is_virtual for each in sockets.values()),
+            self.options,
+        )
         recovered = self.store.recover()
-        self.committing.spool.mkdir(parents=True, exist_ok=True)
+        self._find_interrupted(recovered)
+        self._spool.mkdir(parents=True, exist_ok=True)
         self._is_open = True
         rule = self.recipe.recipe
         self.tell(
@@ -118,13 +177,11 @@ class Station:
                 rule.name,
                 rule.revision,
                 rule.part,
-                tuple(self.lines),
+                tuple(sockets),
                 recovered,
-                tuple(line.name for line in self.lines.values() if line.is_virtual),
+                tuple(each.name for each in sockets.values() if each.is_virtual),
             )
         )
-        for line in self.lines.values():
-            self.tell(SocketChanged(line.name, line.state))
         self.turn(0.0)
 
     def submit(self, text: str) -> None:
@@ -163,13 +220,16 @@ class Station:
             self.supervisor.wait([self._wake_receiver], limit_s)
         while self._wake_receiver.poll():
             self._wake_receiver.recv_bytes()
+        self.line.is_closing = self._is_stopping
         for socket, message in self.supervisor.poll():
-            self._hear(self.lines[socket], message)
+            self._hear(socket, message)
         while self._scans:
-            self._desk.scan(self._scans.popleft())
+            self.line.scan(self._scans.popleft(), self._now)
+            self._carry_out()
         if self._is_aborting:
             self._abort_running()
-        self._begin_due()
+        self.line.tick(self._now)
+        self._carry_out()
 
     def close(self) -> None:
         """End all processes. Runs that go on are stopped, and saved if they say their end in time;
@@ -180,8 +240,8 @@ class Station:
         self._is_open = False
         self._is_stopping = True
         self._abort_running()
-        give_up_at = self.clock.monotonic_s() + self.options.end_limit_s
-        while self.is_running and self.clock.monotonic_s() < give_up_at:
+        give_up_at = self._now + self.options.end_limit_s
+        while self.is_running and self._now < give_up_at:
             self.turn(TURN_S)
         self.supervisor.close()
         self.tell(StationStopped(self.store.station))
@@ -189,22 +249,34 @@ class Station:
     @property
     def is_running(self) -> bool:
         """True while a run goes on that has not said its end."""
-        return any(
-            line.run is not None and line.run.finished is None for line in self.lines.values()
-        )
+        return any(socket.is_running for socket in self.line.sockets.values())
 
     @property
     def is_line_stopped(self) -> bool:
         """True from `LineStopped` to `LineResumed`."""
-        return self.committing.stopped is not None
+        return self.line.stopped is not None
 
     @property
     def sockets(self) -> tuple[SocketView, ...]:
         """All sockets as they are now."""
-        return tuple(
-            SocketView(line.name, line.state, line.text, line.label or line.serial, line.is_there)
-            for line in self.lines.values()
-        )
+        views = []
+        for socket in self.line.sockets.values():
+            state, serial, text = socket.shown or (SocketState.STARTING, "", "")
+            is_busy = socket.phase is not Phase.REST or bool(socket.label)
+            views.append(
+                SocketView(
+                    socket.name,
+                    state,
+                    text,
+                    serial,
+                    socket.is_there,
+                    socket.can_work,
+                    socket.sees_units,
+                    socket.awaits_label,
+                    is_busy,
+                )
+            )
+        return tuple(views)
 
     @property
     def figures(self) -> Figures:
@@ -214,114 +286,281 @@ class Station:
         )
         return self.store.read.figures(chosen)
 
-    # -- for the parts of the station -------------------------------------------------------------
+    # -- the line and the world -------------------------------------------------------------------
+
+    @property
+    def _now(self) -> float:
+        return self.clock.monotonic_s()
+
+    @property
+    def _spool(self) -> Path:
+        """Where traces are written until they are saved."""
+        return self.store.files.folder / SPOOL
 
     def tell(self, event: StationEvent) -> None:
         """An event leaves."""
         try:
-            self._on_event(event)
+            self._on_event(replace(event, at=_utc_text(self.clock.utc())))
         except Exception as error:  # noqa: BLE001  who looks on must not stop the line
             log_event(error)
 
-    def show(self, line: SocketLine, state: SocketState, text: str = "") -> None:
-        """A socket shows something else."""
-        if (line.state, line.text) != (state, text):
-            line.state, line.text = state, text
-            self.tell(SocketChanged(line.name, state, line.label or line.serial, text))
+    def _feed(self, socket: str, what: line.SocketInput) -> None:
+        self.line.feed(socket, what, self._now)
+        self._carry_out()
 
-    def show_rest(self, line: SocketLine) -> None:
-        """Show what a socket without a run waits for."""
-        if not line.can_work:
-            return
-        if self.committing.stopped is not None:
-            self.show(line, SocketState.STOPPED, self.committing.stopped.reason)
-        elif line.label:
-            self.show(line, SocketState.SCAN, f"Connect {line.label}.")
-        elif line.is_there:
-            self.show(line, SocketState.SCAN, "Scan the label of the unit.")
-        else:
-            line.serial = ""
-            self.show(line, SocketState.EMPTY)
+    def _carry_out(self) -> None:
+        """Do what the line wants done, and tell it what came of it, until it wants nothing."""
+        while effects := self.line.take():
+            for effect in effects:
+                match effect:
+                    case line.Tell(event):
+                        self.tell(event)
+                    case line.Claim():
+                        self.line.feed(effect.socket, self._claim(effect), self._now)
+                        self._begin(effect.socket)
+                    case line.Abort(socket):
+                        self.supervisor.send(socket, Abort())
+                    case line.Resume(sockets):
+                        saved = [self._save(socket) for socket in sockets]  # every one is tried
+                        self.line.resumed(self._now, all_saved=all(saved))
+                    case line.Audit(what, data):
+                        self._audit(what, data)
 
-    def tell_figures(self) -> None:
-        """The totals may have changed."""
-        try:
-            self.tell(FiguresChanged(self.figures))
-        except RecordError as error:
-            log_event(error)
-
-    # -- what the processes say -------------------------------------------------------------------
-
-    def _hear(self, line: SocketLine, message: FromWorker | WorkerLost) -> None:
+    def _hear(self, socket: str, message: FromWorker | WorkerLost) -> None:
         match message:
             case Ready(_, sees_units):
-                line.can_work, line.sees_units = True, sees_units
-                if line.run is None and not line.state.is_verdict:
-                    self.show_rest(line)
+                self._feed(socket, line.Ready(sees_units))
             case AdapterDown(reason):
-                self._lose(line, reason)
+                self._feed(socket, line.Down(reason))
             case PresenceChanged():
-                self._presence(line, message)
+                self._feed(socket, message)
             case Ask(number, what):
-                self.committing.answer(line, number, what)
+                self._answer(socket, number, what)
             case Note(note):
-                self.committing.pass_on(line, note)
+                self._pass_on(socket, note)
             case Finished():
-                self.supervisor.worked(line.name)
-                self.committing.end(line, message)
+                self.supervisor.worked(socket)
+                self._end(socket, message)
             case WorkerLost(reason, hung, restart_in_s):
-                self.committing.end_lost(line, reason, hung=hung)
-                self._lose(line, reason)
-                self.tell(WorkerFailed(line.name, reason, restart_in_s))
+                self._end_lost(socket, reason, hung=hung)
+                self._feed(socket, line.Down(reason))
+                self.tell(WorkerFailed(socket, reason, restart_in_s))
             case _:
                 pass  # beats and last words: the supervisor has taken note
 
-    def _lose(self, line: SocketLine, reason: str) -> None:
-        """The socket cannot work for now. A verdict stays; a label has to be scanned again."""
-        line.can_work = False
-        line.label, line.begin_at_s = "", None
-        if line.run is None and not line.state.is_verdict:
-            self.show(line, SocketState.ERROR, reason)
-
-    def _presence(self, line: SocketLine, change: PresenceChanged) -> None:
-        was_there, line.is_there = line.is_there, change.is_there
-        if not change.is_there:
-            if was_there:
-                self.tell(UnitRemoved(line.name))
-            if line.run is None and (was_there or not line.state.is_verdict):
-                self._desk.forget_unit(line)
-                self.show_rest(line)
-            return
-        if was_there:
-            return  # its process is new, the unit is not
-        self.tell(UnitArrived(line.name, change.how, change.label))
-        if line.run is None:
-            # A new unit: the verdict on the one before is read.
-            self._desk.arrived(line, change.label if self.options.scans_labels else "")
-
-    # -- beginning and ending ---------------------------------------------------------------------
-
-    def _begin_due(self) -> None:
-        if self._is_stopping or self.is_line_stopped:
-            return
-        now_s = self.clock.monotonic_s()
-        for line in self.lines.values():
-            is_due = line.begin_at_s is not None and now_s >= line.begin_at_s
-            if line.label and line.can_work and line.run is None and (line.is_there or is_due):
-                self._desk.claiming.begin(line)
-
-    def send_begin(self, line: SocketLine, begin: Begin) -> bool:
-        """Give a process its order; False when it is gone."""
-        return self.supervisor.send(line.name, begin)
-
-    def abort(self, line: SocketLine) -> None:
-        """Stop the run of a socket at its next safe place."""
-        self.supervisor.send(line.name, Abort())
-
     def _abort_running(self) -> None:
-        for line in self.lines.values():
-            if line.run is not None and line.run.finished is None:
-                self.abort(line)
+        for socket in self.line.sockets.values():
+            if socket.phase is Phase.RUN:
+                self.supervisor.send(socket.name, Abort())
 
     def _wake(self) -> None:
         self._wake_sender.send_bytes(b"x")
+
+    def _find_interrupted(self, runs: Iterable[RunId]) -> None:
+        """Tell the line in which sockets the units of interrupted runs were."""
+        for run_id in runs:
+            run = self.store.read.run(run_id).run
+            socket = self.line.sockets.get(run.socket)
+            if socket is not None:
+                socket.interrupted = run.serial
+
+    def _audit(self, what: AuditEvent, data: Mapping[str, str]) -> None:
+        try:
+            self.store.note(what, data)
+        except RecordError as error:
+            self._not_saved("", "", None, error)
+            self.line.stop(codes.RECORD_NOT_SAVED.name, error.what, error.remedy)
+
+    # -- beginning --------------------------------------------------------------------------------
+
+    def _claim(self, order: line.Claim) -> line.SocketInput:
+        """Have the run in the records, on disk."""
+        serial, socket = order.serial, self.line.sockets[order.socket]
+        part = self.recipe.recipe.part
+        try:
+            lives = self.store.read.units(serial)
+            life = next((life for life in lives if life.part == part), None)
+            before = before_of(life, self.recipe, is_reworked=bool(order.reason))
+            claim = self.store.claim(
+                serial,
+                order.socket,
+                self.recipe,
+                order.operator,
+                lot=order.lot,
+                reason=order.reason,
+                is_virtual=socket.is_virtual,
+            )
+        except ClaimRefusedError as error:
+            is_changed = error.refusal is Refusal.RECIPE_CHANGED
+            return line.NotClaimed(error.refusal.value, error.what, error.remedy, is_changed)
+        except RecordError as error:
+            self._not_saved(order.socket, serial, None, error)
+            return line.NotSaved(error.what, error.remedy)
+        trace = self._spool / f"run-{claim.run_id}.log"
+        run_order = RunOrder(
+            claim.run_id,
+            claim.kind,
+            claim.serial,
+            self.clock.utc().astimezone().date(),
+            order.lot,
+            before.known_before,
+            before.flashed_before,
+            before.written_before,
+        )
+        self._runs[order.socket] = ActiveRun(claim, trace, self._now, order=run_order)
+        return line.Claimed()
+
+    def _begin(self, socket: str) -> None:
+        """Let the process of a socket work on what was claimed, if anything was."""
+        run = self._runs.get(socket)
+        if run is None or run.finished is not None:
+            return
+        claim = run.claim
+        self.tell(
+            RunStarted(
+                socket,
+                claim.serial,
+                claim.run_id,
+                claim.kind,
+                self.line.sockets[socket].is_virtual,
+            )
+        )
+        if not self.supervisor.send(socket, Begin(run.order, run.trace)):
+            self._end_lost(socket, codes.PROCESS_DIED.meaning, hung=False)
+
+    # -- while a run goes on ----------------------------------------------------------------------
+
+    def _answer(self, socket: str, number: int, what: Intent | Done | StepReport) -> None:
+        """Put something on disk, then let the process go on."""
+        run = self._runs.get(socket)
+        if run is None or run.finished is not None:
+            reply = Reply(number, error="The run is not one of this station.")
+            self.supervisor.send(socket, reply)
+            return
+        write_id, run_id = None, run.claim.run_id
+        try:
+            match what:
+                case Intent():
+                    write_id = self.store.intent(run_id, what.target, what.what, what.value)
+                case Done():
+                    self.store.verified(what.write_id, what.read_back)
+                case StepReport():
+                    self._save_step(socket, run.claim, what)
+        except RecordError as error:
+            run.journal_error = _said(error)
+            self._not_saved(socket, run.claim.serial, run_id, error)
+            self._feed(socket, line.NotSaved(error.what, error.remedy))
+            self.supervisor.send(socket, Reply(number, error=error.what))
+        else:
+            self.supervisor.send(socket, Reply(number, write_id))
+
+    def _save_step(self, socket: str, claim: Claim, report: StepReport) -> None:
+        self.store.step(
+            claim.run_id,
+            report.name,
+            report.state,
+            duration_s=report.duration_s,
+            code=report.code,
+            text=report.text,
+            measurements=report.measurements,
+        )
+        self.tell(
+            StepEnded(
+                socket,
+                claim.serial,
+                report.step,
+                report.try_number,
+                report.state,
+                report.duration_s,
+                report.code,
+                report.text,
+                report.target,
+            )
+        )
+
+    def _pass_on(self, socket: str, note: RunNote) -> None:
+        """What a run says becomes an event."""
+        run = self._runs.get(socket)
+        if run is None:
+            return
+        serial = run.claim.serial
+        match note:
+            case StepBegan(step, target, try_number):
+                run.where = f"{step.value} {target}".strip()
+                self.tell(StepStarted(socket, serial, step, try_number, target))
+            case Progress(step, target, share, left_s):
+                self.tell(Progressed(socket, serial, step, share, left_s, target))
+            case Prompt(text, limit_s):
+                self.tell(OperatorPrompted(socket, text, limit_s))
+
+    # -- its end ----------------------------------------------------------------------------------
+
+    def _end(self, socket: str, finished: Finished) -> None:
+        """The process said how the run ended: save it, then show it."""
+        run = self._runs.get(socket)
+        if run is None or run.finished is not None:
+            return
+        run.finished = finished
+        run.ended_s = self._now
+        self._feed(socket, line.Ended())
+        self._save(socket)
+        self._carry_out()
+
+    def _end_lost(self, socket: str, reason: str, *, hung: bool) -> None:
+        """The process is gone, and its run with it."""
+        run = self._runs.get(socket)
+        if run is None or run.finished is not None:
+            return
+        code = codes.PROCESS_HUNG if hung else codes.PROCESS_DIED
+        result = RunResult(
+            code.outcome, code.name, f"In {run.where}: {reason}.", self._now - run.begun_s
+        )
+        self._end(socket, Finished(result, None))
+
+    def _save(self, socket: str) -> bool:
+        """Save the end of a run, and show it when it is on disk; False when it is not."""
+        run = self._runs[socket]
+        claim = run.claim
+        try:
+            result = save(self.store, run, self.clock.monotonic_s)
+        except RecordError as error:
+            self._not_saved(socket, claim.serial, claim.run_id, error)
+            self.line.feed(socket, line.NotSaved(error.what, error.remedy), self._now)
+            return False
+        del self._runs[socket]
+        code = CODES[result.code]
+        text = verified_words(result) if result.outcome is RunState.PASS else result.text
+        self.tell(
+            RunEnded(
+                socket,
+                claim.serial,
+                claim.run_id,
+                claim.kind,
+                result.outcome,
+                code.name,
+                text,
+                code.action,
+                max(result.duration_s, run.ended_s - run.begun_s),
+                tuple(result.verified.items()),
+                self.line.sockets[socket].is_virtual,
+            )
+        )
+        self.line.feed(socket, line.Saved(result.outcome, code.action), self._now)
+        with suppress(RecordError):
+            self.tell(FiguresChanged(self.figures))
+        return True
+
+    def _not_saved(
+        self, socket: str, serial: str, run_id: RunId | None, error: RecordError
+    ) -> None:
+        self.tell(RecordNotSaved(socket, serial, run_id, _said(error), error.remedy))
+
+
+def _said(error: RecordError) -> str:
+    """What is wrong and where, in one line; what to do stands elsewhere."""
+    where = f" ({error.where})" if error.where else ""
+    return f"{error.what.rstrip('.')}{where}."
+
+
+def _utc_text(moment: datetime) -> str:
+    return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"

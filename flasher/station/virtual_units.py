@@ -190,7 +190,7 @@ class VirtualSocket:
         self._next_at = None
         if self.serial:
             self._leave(now)
-            return PresenceChanged(is_there=False, how="the virtual unit left")
+            return PresenceChanged(is_there=False, how="the virtual unit left", is_certain=True)
         if self._left == 0:
             return None
         if self._left is not None:

@@ -48,7 +48,7 @@ from flasher.station.run_model import (
 from flasher.station.unit_device import UnitDevice
 from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import VirtualSocket
-from flasher.station.worker_line import IDLE_S, Channel, Line, LineJournal, StationGoneError
+from flasher.station.worker_pipe import IDLE_S, Channel, PipeJournal, StationGoneError, StationPipe
 from flasher.trace.recorder import Recorder
 
 _REOPEN_S: Final = 1.0
@@ -61,30 +61,34 @@ class Worker:
         self,
         setup: WorkerSetup,
         recipe: LoadedRecipe,
-        line: Line,
+        pipe: StationPipe,
         connection: Connection,
         virtual: VirtualSocket | None = None,
     ) -> None:
         self._recipe = recipe
-        self._line = line
+        self._pipe = pipe
         self._connection = connection
         self._virtual = virtual
         self._power: PowerControl | None = PowerCommand(setup.power) if setup.power else virtual
-        self._journal = LineJournal(line, setup.reply_limit_s)
-        devices = [UnitDevice(each, connection, (), line.is_stopped) for each in recipe.targets]
+        self._journal = PipeJournal(pipe, setup.reply_limit_s)
+        devices = [UnitDevice(each, connection, (), pipe.is_stopped) for each in recipe.targets]
         self._presence = Presence(devices, silence_s=setup.silence_s, probe_s=setup.probe_s)
         self._is_down = False
+        """The adapter failed."""
+        self._is_blocked = False
+        """Its queue holds what nobody takes."""
         self._reopen_at = 0.0
 
     def work(self) -> None:
         """Until the station ends it or is gone."""
         sees = self._virtual is not None or self._presence.sees_units
-        self._line.send(Ready(self._connection.name, sees))
+        self._pipe.send(Ready(self._connection.name, sees))
         if self._virtual is not None:
-            self._line.send(PresenceChanged(is_there=False, how="no virtual unit yet"))
-        while not self._line.is_over:
-            self._line.look()
-            begin = self._line.take_begin()
+            how = "no virtual unit yet"
+            self._pipe.send(PresenceChanged(is_there=False, how=how, is_certain=True))
+        while not self._pipe.is_over:
+            self._pipe.look()
+            begin = self._pipe.take_begin()
             if begin is not None:
                 self._run(begin)
             else:
@@ -94,7 +98,7 @@ class Worker:
 
     def _watch(self) -> None:
         """Look for units for a moment."""
-        if self._is_down:
+        if self._is_down or self._is_blocked:
             self._reopen()
             return
         link, clock = self._connection.link, self._connection.clock
@@ -109,14 +113,14 @@ class Worker:
                 heard = link.receive(until) if clock.now() < until else None
         except TransmitBlockedError:
             # Nobody is there to acknowledge: what waits must not be sent to the next unit.
-            self._is_down = True
+            self._is_blocked = True
             self._reopen()
         except BusError as error:
             self._is_down = True
-            self._line.send(AdapterDown(error.what))
+            self._pipe.send(AdapterDown(error.what))
         change = self._change()
         if change is not None:
-            self._line.send(change)
+            self._pipe.send(change)
 
     def _change(self) -> PresenceChanged | None:
         if self._virtual is not None:
@@ -126,16 +130,18 @@ class Worker:
     def _reopen(self) -> None:
         now = time.monotonic()
         if now < self._reopen_at:
-            self._line.look(IDLE_S)
+            self._pipe.look(IDLE_S)
             return
         self._reopen_at = now + _REOPEN_S
         try:
             self._connection.link.reopen()
         except BusError:
             return
-        self._is_down = False
-        self._presence.go_on(self._connection.clock.now())
-        self._line.send(Ready(self._connection.name, self._presence.sees_units))
+        self._is_blocked = False
+        if self._is_down:
+            self._is_down = False
+            self._presence.begin()
+            self._pipe.send(Ready(self._connection.name, self._presence.sees_units))
 
     # -- a run ------------------------------------------------------------------------------------
 
@@ -144,15 +150,14 @@ class Worker:
         try:
             with ExitStack() as stack:
                 recorder = stack.enter_context(Recorder(begin.trace))
-                taps = (recorder, self._presence)
                 result = UnitRun(
                     begin.order,
                     self._recipe,
                     self._connection,
                     self._journal,
-                    taps=taps,
-                    tell=self._line.tell,
-                    cancelled=self._line.is_stopped,
+                    taps=(recorder,),
+                    tell=self._pipe.tell,
+                    cancelled=self._pipe.is_stopped,
                     power=self._power,
                 ).run()
         except StationGoneError:
@@ -165,9 +170,13 @@ class Worker:
         trace = self._close_trace(begin.trace, recorder)
         if trace is None and result.outcome is RunState.PASS:
             result = _error_result(codes.TRACE_NOT_SAVED, "The trace of the bus is not complete.")
-        self._line.send(Finished(result, trace))
+        self._pipe.send(Finished(result, trace))
         if self._virtual is not None:
             self._virtual.run_ended()
+        # What waits was said in the run, and says nothing of who is there now.
+        with suppress(BusError):
+            self._connection.link.drain()
+        self._presence.begin()
 
     @staticmethod
     def _close_trace(path: Path, recorder: Recorder | None) -> TraceFile | None:
@@ -223,25 +232,25 @@ def worker_main(channel: Channel, setup: WorkerSetup) -> None:
     """The whole life of the process."""
     # Ctrl-C is the station's business: it tells its processes what to do.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    line = Line(channel, time.monotonic)
+    pipe = StationPipe(channel, time.monotonic)
     with suppress(StationGoneError):
         try:
             recipe = load_same(setup)
         except FlasherError as error:
-            line.send(CannotWork(error.what))
+            pipe.send(CannotWork(error.what))
             return
         is_down = False
-        while not line.is_over:
+        while not pipe.is_over:
             try:
                 with open_socket(setup, recipe) as (connection, virtual):
-                    Worker(setup, recipe, line, connection, virtual).work()
+                    Worker(setup, recipe, pipe, connection, virtual).work()
             except UsageError as error:
-                line.send(CannotWork(error.what))
+                pipe.send(CannotWork(error.what))
                 return
             except BusError as error:
                 if not is_down:
-                    line.send(AdapterDown(error.what))
+                    pipe.send(AdapterDown(error.what))
                 is_down = True
                 wait_until = time.monotonic() + _REOPEN_S
-                while time.monotonic() < wait_until and not line.is_over:
-                    line.look(IDLE_S)
+                while time.monotonic() < wait_until and not pipe.is_over:
+                    pipe.look(IDLE_S)

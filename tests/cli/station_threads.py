@@ -11,7 +11,7 @@ from typing import Any
 
 from flasher.station.messages import FromWorker, ToWorker, WorkerSetup
 from flasher.station.worker import Worker, load_same, open_socket
-from flasher.station.worker_line import Line, StationGoneError
+from flasher.station.worker_pipe import StationGoneError, StationPipe
 
 
 class ThreadPort:
@@ -49,9 +49,9 @@ class ThreadPort:
 
 
 def _work(channel: Connection[Any, Any], setup: WorkerSetup) -> None:
-    line = Line(channel, time.monotonic)
+    pipe = StationPipe(channel, time.monotonic)
     with suppress(StationGoneError):
         recipe = load_same(setup)
         with open_socket(setup, recipe) as (connection, virtual):
-            Worker(setup, recipe, line, connection, virtual).work()
+            Worker(setup, recipe, pipe, connection, virtual).work()
     channel.close()

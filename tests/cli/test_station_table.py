@@ -40,7 +40,7 @@ from flasher.station.events import (
     WorkerFailed,
 )
 from flasher.station.records.model import Figures, RunId, RunKind, RunState
-from flasher.station.socket_line import SocketLine
+from flasher.station.station import SocketView
 from flasher.station.steps import StepName
 from tests.cli.conftest import Flasher
 from tests.cli.station_threads import ThreadPort
@@ -233,48 +233,57 @@ def test_a_pipe_is_read_to_its_end() -> None:
     assert [scan.strip() for scan in scans] == ["W2", "RESUME"]
 
 
-def socket_line(name: str, *, is_there: bool = True) -> SocketLine:
+def socket_view(name: str, *, is_there: bool = True, sees_units: bool = True) -> SocketView:
     state = SocketState.SCAN if is_there else SocketState.EMPTY
-    return SocketLine(name, state, is_there=is_there, can_work=True)
+    return SocketView(
+        name,
+        state,
+        text="",
+        serial="",
+        is_there=is_there,
+        can_work=True,
+        sees_units=sees_units,
+        awaits_label=is_there,
+        is_busy=False,
+    )
 
 
-def worked_off(scans: list[str], lines: list[SocketLine], borne: dict[str, str]) -> list[str]:
+def worked_off(scans: list[str], sockets: list[SocketView], borne: dict[str, str]) -> list[str]:
     """What is submitted in one turn."""
     submitted: list[str] = []
-    file = ScanFile(scans, [line.name for line in lines], submitted.append)
-    file.turn({line.name: line for line in lines}, borne)
+    file = ScanFile(scans, [socket.name for socket in sockets], submitted.append)
+    file.turn(sockets, borne)
     return submitted
 
 
 def test_a_label_goes_to_the_next_socket_in_which_a_unit_waits() -> None:
-    lines = [socket_line("A", is_there=False), socket_line("B")]
+    lines = [socket_view("A", is_there=False), socket_view("B")]
     assert worked_off(["W1", "W2"], lines, {}) == ["SOCKET B", "W1"]
     assert worked_off(["W1"], lines[:1], {}) == []
 
 
 def test_a_label_goes_to_the_socket_that_is_named_before_it() -> None:
-    lines = [socket_line("A", is_there=False), socket_line("B")]
+    lines = [socket_view("A", is_there=False), socket_view("B")]
     assert worked_off(["socket a", "W1"], lines, {}) == []
     assert worked_off(["SOCKET B", "W1"], lines, {}) == ["SOCKET B", "W1"]
 
 
 def test_a_virtual_unit_gets_its_own_label() -> None:
-    lines = [socket_line("A"), socket_line("B")]
+    lines = [socket_view("A"), socket_view("B")]
     assert worked_off(["W1", "W2"], lines[1:], {"A": "W1", "B": "W2"}) == ["SOCKET B", "W2"]
     assert worked_off(["W1", "W2"], lines, {"A": "V1", "B": "V2"}) == ["SOCKET A", "W1"]
 
 
 def test_commands_keep_their_place_between_labels() -> None:
-    lines = [socket_line("A")]
+    lines = [socket_view("A")]
     assert worked_off(["LOT 7", "W1"], lines, {}) == ["LOT 7"]
     assert worked_off(["W1", "LOT 7", "W2"], lines, {"A": "W2"}) == ["SOCKET A", "W1"]
 
 
 def test_sockets_that_see_no_units_take_no_file() -> None:
-    line = socket_line("A")
-    line.sees_units = False
+    blind = socket_view("A", sees_units=False)
     with pytest.raises(UsageError, match="sees whether"):
-        worked_off(["W1"], [line], {})
+        worked_off(["W1"], [blind], {})
 
 
 # -- the whole, on a terminal ----------------------------------------------------------------------

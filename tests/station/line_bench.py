@@ -67,10 +67,19 @@ class ScriptedPort:
 
 
 class LineBench:
-    """A station with sockets A, B, ..."""
+    """A station with sockets A, B, ...; at the start the processes say that they are empty."""
 
-    def __init__(self, bench: Bench, sockets: str = "AB", *, sees_units: bool = True) -> None:
+    def __init__(
+        self,
+        bench: Bench,
+        sockets: str = "AB",
+        *,
+        sees_units: bool = True,
+        are_empty: bool = True,
+        scans_labels: bool = False,
+    ) -> None:
         self.bench = bench
+        self.sees_units = sees_units
         self.events: list[StationEvent] = []
         self.ports: dict[str, ScriptedPort] = {}
         setups = [WorkerSetup(name, bench.recipe.path, {}, None) for name in sockets]
@@ -80,13 +89,17 @@ class LineBench:
             setups,
             operator="jo",
             on_event=self.events.append,
-            options=StationOptions(arrival_limit_s=5.0, hang_s=10.0, end_limit_s=0.0),
+            options=StationOptions(
+                arrival_limit_s=5.0, hang_s=10.0, end_limit_s=0.0, scans_labels=scans_labels
+            ),
             clock=bench.clock,
             launch=self._launch,
         )
         self.station.start()
         for name in sockets:
             self.say(name, Ready("a bus", sees_units))
+            if sees_units and are_empty:
+                self.leave(name)
 
     def _launch(self, setup: WorkerSetup) -> ScriptedPort:
         self.ports[setup.socket] = ScriptedPort(setup)
@@ -99,10 +112,15 @@ class LineBench:
         self.ports[socket].said.append(message)
         self.turn()
 
-    def arrive(self, socket: str) -> None:
-        self.say(socket, PresenceChanged(is_there=True, how="traffic"))
+    def arrive(self, socket: str, serial: str | None = "") -> None:
+        """A unit is heard that says this serial number: empty, it has none; None, not said yet."""
+        self.say(socket, PresenceChanged(is_there=True, how="traffic", serial=serial))
 
     def leave(self, socket: str) -> None:
+        self.say(socket, PresenceChanged(is_there=False, is_certain=True))
+
+    def fall_silent(self, socket: str) -> None:
+        """Nothing is heard any more: the unit was removed, or it sleeps."""
         self.say(socket, PresenceChanged(is_there=False))
 
     def scan(self, text: str) -> None:
@@ -152,6 +170,8 @@ class LineBench:
         verified = {"bms": Verified.VERSION} if outcome is RunState.PASS else {}
         result = RunResult(outcome, code, "what happened", 2.0, verified)
         self.say(socket, Finished(result, self.trace(socket)))
+        if self.sees_units:
+            self.say(socket, PresenceChanged(is_there=True, how="traffic"))
 
     def make(self, socket: str, serial: str) -> None:
         """A whole good run of a unit that comes."""

@@ -7,10 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from flasher.protocol.contents import VersionInformation
+from flasher.protocol.fields import Text
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import BootVersion
-from flasher.protocol.spec import BMS, WMC
-from flasher.protocol.wire import encode, split
+from flasher.protocol.spec import BMS, WMC, Mode
+from flasher.protocol.wire import Message, encode, split
 from flasher.station.presence import Presence
 from flasher.station.unit_device import UnitDevice
 from tests.station.unit_bench import UnitBench
@@ -68,12 +70,39 @@ def test_it_is_asked_in_its_time(presence: Presence) -> None:
     assert presence.probe(0.5) == first
 
 
-def test_an_adapter_that_was_away_does_not_remove_a_unit(presence: Presence) -> None:
+def test_after_a_time_in_which_nothing_could_be_heard_nothing_is_known(presence: Presence) -> None:
     presence(TRAFFIC, sent=False, now=1.0)
     presence.change(1.0)
-    presence.go_on(60.0)
-    assert presence.change(61.0) is None
-    assert presence.change(62.0) is not None
+    presence.begin()
+    assert presence.change(60.0) is None
+    presence(TRAFFIC, sent=False, now=61.0)
+    change = presence.change(61.0)
+    assert change is not None
+    assert change.is_there, "said once more, although it was there before"
+
+
+def version_answer(serial: str) -> list[Frame]:
+    content = VersionInformation(*map(Text, ("BM36", serial, "V1r2r0", "V1r0r0")))
+    return split(0x720, encode(Message(0x720, Mode.REPORT, 0x1540, content.data())))
+
+
+def test_a_version_answer_says_which_unit_it_is(presence: Presence) -> None:
+    presence(TRAFFIC, sent=False, now=1.0)
+    change = presence.change(1.0)
+    assert change is not None
+    assert change.serial is None, "not said yet"
+    for serial in ("", "W2605002"):
+        for frame in version_answer(serial):
+            presence(frame, sent=False, now=1.5)
+        change = presence.change(1.5)
+        assert change is not None
+        assert (change.is_there, change.serial) == (True, serial)
+        assert presence.change(1.5) is None
+    assert presence.change(9.0) is not None, "silent"
+    presence(TRAFFIC, sent=False, now=10.0)
+    change = presence.change(10.0)
+    assert change is not None
+    assert change.serial is None, "it may be another unit"
 
 
 def test_a_unit_that_cannot_be_asked_is_said_to_be_unseen(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def line(bench: Bench) -> LineBench:
 
 def test_a_unit_is_scanned_connected_run_and_shown(line: LineBench) -> None:
     line.scan(SERIAL)
-    assert line.last(OperatorPrompted).text == f"Connect {SERIAL}."
+    assert line.last(OperatorPrompted).text == f"Put {SERIAL} into socket A."
     line.arrive("A")
     assert line.state("A") is SocketState.RUNNING
     assert line.order("A").order.serial == SERIAL
@@ -99,6 +99,8 @@ def test_the_unit_before_the_label_works_as_well(line: LineBench) -> None:
     line.arrive("B")
     assert line.state("B") is SocketState.SCAN
     line.scan(SERIAL)
+    assert line.state("B") is SocketState.SCAN, "it may be the label of a unit on the table"
+    line.scan("SOCKET B")
     assert line.state("B") is SocketState.RUNNING
 
 
@@ -114,9 +116,12 @@ def test_a_finished_unit_is_not_begun_again_and_its_removal_makes_room(line: Lin
 
 def test_the_next_label_waits_until_the_finished_unit_is_out(line: LineBench) -> None:
     line.make("A", SERIAL)
-    line.scan(OTHER)
+    line.scan("SOCKET A")
+    assert line.last(ScanRefused).code == "TAKE_OUT"
     assert line.state("A") is SocketState.PASS
     line.leave("A")
+    line.scan("SOCKET A")
+    line.scan(OTHER)
     line.arrive("A")
     assert line.order("A").order.serial == OTHER
 
@@ -148,7 +153,8 @@ def test_two_waiting_units_need_a_chosen_socket(line: LineBench) -> None:
     line.arrive("A")
     line.arrive("B")
     line.scan(SERIAL)
-    assert line.last(OperatorPrompted).text == "Scan the socket of this unit."
+    asked = f"Scan the card of the socket that {SERIAL} is in, or goes into."
+    assert line.last(OperatorPrompted).text == asked
     line.scan("socket b")
     assert line.order("B").order.serial == SERIAL
     assert line.state("A") is SocketState.SCAN
@@ -219,6 +225,7 @@ def test_a_label_behind_a_refused_socket_goes_to_no_other(line: LineBench) -> No
     line.scan(OTHER)
     assert line.last(ScanRefused).code == "NO_SOCKET"
     assert line.state("B") is SocketState.SCAN
+    line.scan("SOCKET B")
     line.scan(OTHER)
     assert line.order("B").order.serial == OTHER
 
@@ -269,6 +276,7 @@ def test_a_unit_that_passed_before_is_refused_by_the_records(line: LineBench) ->
     refused = line.last(ScanRefused)
     assert (refused.code, refused.socket) == ("DUPLICATE", "A")
     assert line.state("A") is SocketState.SCAN
+    line.scan("SOCKET A")
     line.scan(OTHER)
     assert line.state("A") is SocketState.RUNNING
 
@@ -465,6 +473,8 @@ def test_an_unplugged_adapter_is_shown_and_comes_back(line: LineBench) -> None:
     line.scan("SOCKET A")
     assert line.last(ScanRefused).code == "SOCKET_BROKEN"
     line.say("A", Ready("a bus", sees_units=True))
+    assert line.state("A") is SocketState.STARTING, "what is in it now is not known yet"
+    line.leave("A")
     assert line.state("A") is SocketState.EMPTY
 
 
@@ -488,7 +498,7 @@ def test_what_a_dead_station_left_is_found_at_the_start(bench: Bench) -> None:
     bench.store.intent(run_id, "bms", "flash", "V1")
     line = LineBench(bench)
     line.scan(SERIAL)
-    line.arrive("A")
+    line.scan("SOCKET A")
     assert bench.store.read.run(run_id).run.state is RunState.INTERRUPTED
     assert line.order("A").order.kind is RunKind.RECHECK
 
@@ -502,7 +512,7 @@ def test_what_an_interrupted_run_flashed_and_read_back_is_told_to_the_next(bench
     bench.store.verified(write, target.version)
     line = LineBench(bench)
     line.scan(SERIAL)
-    line.arrive("A")
+    line.scan("SOCKET A")
     assert line.order("A").order.flashed_before == {"bms"}
 
 
@@ -518,8 +528,7 @@ def test_a_station_that_ends_stops_its_runs_and_saves_them(line: LineBench) -> N
 
 
 def test_labels_of_virtual_units_may_scan_themselves(bench: Bench) -> None:
-    line = LineBench(bench)
-    line.station.options = type(line.station.options)(scans_labels=True)
+    line = LineBench(bench, scans_labels=True)
     line.say("A", PresenceChanged(is_there=True, how="a virtual unit came", label=SERIAL))
     assert line.state("A") is SocketState.RUNNING
     line.say("B", PresenceChanged(is_there=True, how="a virtual unit came", label=SERIAL))

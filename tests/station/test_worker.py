@@ -39,7 +39,7 @@ from flasher.station.records.model import RunId, RunKind, RunState, WriteId
 from flasher.station.run_model import JournalError, RunOrder
 from flasher.station.virtual_units import VirtualSocket
 from flasher.station.worker import Worker, load_same
-from flasher.station.worker_line import Line, LineJournal
+from flasher.station.worker_pipe import PipeJournal, StationPipe
 from tests.station.factory import DAY, USUAL, make_recipe
 from tests.station.unit_bench import WRITES
 
@@ -81,7 +81,7 @@ class Socket:
         files = {str(path): sha256 for path, sha256 in self.recipe.files.items()}
         self.setup = WorkerSetup("A", self.recipe.path, files, None, virtual)
         self.channel = FakeChannel(self.answer)
-        self.line = Line(self.channel, time.monotonic)
+        self.line = StationPipe(self.channel, time.monotonic)
         self.virtual = VirtualSocket(self.recipe, virtual)
         self.error = ""
 
@@ -189,9 +189,9 @@ def test_a_station_that_does_not_save_in_time_is_not_waited_for() -> None:
         now[0] += 1.0
         return now[0]
 
-    line = Line(FakeChannel(lambda _channel, _message: None), clock)
+    pipe = StationPipe(FakeChannel(lambda _channel, _message: None), clock)
     with pytest.raises(JournalError, match="did not save within 30 s"):
-        LineJournal(line, 30.0).intent("bms", "flash", "V1")
+        PipeJournal(pipe, 30.0).intent("bms", "flash", "V1")
 
 
 def test_another_recipe_than_the_stations_is_refused(tmp_path: Path) -> None:

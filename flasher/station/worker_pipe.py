@@ -49,7 +49,7 @@ class StationGoneError(Exception):
     """The pipe is broken: nobody would record what is done now."""
 
 
-class Line:
+class StationPipe:
     """The pipe, with beats, and what arrived out of its time."""
 
     def __init__(self, channel: Channel, now: Callable[[], float]) -> None:
@@ -128,11 +128,11 @@ class Line:
                 self.is_over = True
 
 
-class LineJournal:
+class PipeJournal:
     """A `Journal` kept by the station."""
 
-    def __init__(self, line: Line, limit_s: float) -> None:
-        self._line = line
+    def __init__(self, pipe: StationPipe, limit_s: float) -> None:
+        self._pipe = pipe
         self._limit_s = limit_s
         self._number = 0
 
@@ -153,8 +153,8 @@ class LineJournal:
 
     def _ask(self, what: Intent | Done | StepReport) -> Reply:
         self._number += 1
-        self._line.send(Ask(self._number, what))
-        reply = self._line.await_reply(self._number, self._limit_s)
+        self._pipe.send(Ask(self._number, what))
+        reply = self._pipe.await_reply(self._number, self._limit_s)
         if reply.error:
             raise JournalError(reply.error)
         return reply

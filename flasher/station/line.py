@@ -1,0 +1,633 @@
+"""The line of a station as a pure machine: which label runs in which socket, and what is shown.
+
+    scans, units that come and go, what a socket's process said, what is saved, the time
+        -> Line ->
+    events for whoever looks on, claims, aborts, and lines of the audit trail
+
+It opens nothing and reads no clock: times are seconds on the station's monotonic clock. The shell
+around it (`flasher.station.station`) carries its effects out and tells it what came of them. The
+rule by which labels get their sockets stands in `flasher.station.placing`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar, Final
+
+from flasher.protocol.text import printable
+from flasher.station import codes
+from flasher.station.events import (
+    LineResumed,
+    LineStopped,
+    OperatorPrompted,
+    ScanAccepted,
+    ScanRefused,
+    SocketChanged,
+    StationEvent,
+    UnitArrived,
+    UnitRemoved,
+)
+from flasher.station.messages import PresenceChanged
+from flasher.station.placing import (
+    Refused,
+    check_first,
+    check_fits,
+    check_free,
+    check_known,
+    check_service,
+    place,
+    still_there,
+    was_in,
+)
+from flasher.station.records.errors import Refusal
+from flasher.station.records.model import AuditEvent, RunState
+from flasher.station.scans import Command, Label, Nonsense, Word, understand
+from flasher.station.socket import LastRun, Phase, Seen, Socket, Why
+
+ARRIVAL_LIMIT_S: Final = 20.0
+SCAN_LIMIT_S: Final = 120.0
+SHORT_OUTAGE_S: Final = 5.0
+"""Nobody swaps a unit in the time in which a process is started again."""
+IDENTIFY_S: Final = 3.0
+"""A unit that was just switched on tells its serial number in less, if it has an application."""
+_RESUME: Final = Word.RESUME.value.lower()
+
+
+# -- what the line is told, and what it wants done ------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Ready:
+    """The socket can work. `sees_units` is False where a unit that is there may say nothing."""
+
+    sees_units: bool
+
+
+@dataclass(frozen=True)
+class Down:
+    """The socket cannot work for now: its adapter failed, or its process is gone."""
+
+    reason: str
+
+
+@dataclass(frozen=True)
+class Claimed:
+    """The records have the run that was asked for; the process of the socket works on it."""
+
+
+@dataclass(frozen=True)
+class NotClaimed:
+    """The records refuse it. `code` is a stable word; with `stops_line` nothing else may begin."""
+
+    code: str
+    reason: str
+    remedy: str
+    stops_line: bool = False
+
+
+@dataclass(frozen=True)
+class Ended:
+    """The process of the socket said how the run ended; nothing of it is on disk."""
+
+
+@dataclass(frozen=True)
+class Saved:
+    """How the run ended is on disk. `action` is what the operator does now."""
+
+    outcome: RunState
+    action: str
+
+
+@dataclass(frozen=True)
+class NotSaved:
+    """Something of the socket's run is not on disk."""
+
+    reason: str
+    remedy: str
+
+
+SocketInput = Ready | Down | PresenceChanged | Claimed | NotClaimed | Ended | Saved | NotSaved
+
+
+@dataclass(frozen=True)
+class Claim:
+    """Ask the records for a run of this unit; `Claimed`, `NotClaimed` or `NotSaved` answers."""
+
+    socket: str
+    serial: str
+    operator: str
+    lot: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Resume:
+    """Try once more to save how the runs of these sockets ended; then call `Line.resumed`."""
+
+    sockets: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Abort:
+    """Stop the run of this socket at its next safe place."""
+
+    socket: str
+
+
+@dataclass(frozen=True)
+class Tell:
+    """An event for whoever looks on."""
+
+    event: StationEvent
+
+
+@dataclass(frozen=True)
+class Audit:
+    """Something that a person did, for the audit trail."""
+
+    what: AuditEvent
+    data: Mapping[str, str]
+
+
+Effect = Claim | Resume | Abort | Tell | Audit
+
+
+# -- the line -------------------------------------------------------------------------------------
+
+
+CheckSerial = Callable[[str], object]
+"""Raises ValueError for a text that is no serial number of the recipe."""
+
+
+class Line:
+    """All sockets and the scans. After each call, `take` has the effects, in their order.
+
+    `arrival_limit_s`: so long a label with a scanned socket waits until its unit is heard; then its
+    run begins all the same, and says what is wrong. `scan_limit_s`: a label whose unit does not
+    come, or a socket without its label, is forgotten after it.
+    """
+
+    def __init__(
+        self,
+        sockets: Iterable[Socket],
+        check_serial: CheckSerial,
+        *,
+        operator: str,
+        lot: str = "",
+        arrival_limit_s: float = ARRIVAL_LIMIT_S,
+        scan_limit_s: float = SCAN_LIMIT_S,
+        scans_labels: bool = False,
+    ) -> None:
+        self.sockets = {socket.name: socket for socket in sockets}
+        self.operator = operator
+        self.lot = lot
+        self.stopped: LineStopped | None = None
+        """Why the line stands."""
+        self.is_closing = False
+        """No further run is begun."""
+        self._check_serial = check_serial
+        self._arrival_limit_s = arrival_limit_s
+        self._scan_limit_s = scan_limit_s
+        self._scans_labels = scans_labels
+        self._effects: list[Effect] = []
+        self._label = ""
+        """The label that waits for the card of its socket."""
+        self._chosen: Socket | None = None
+        """The socket whose card was scanned, and that waits for its label."""
+        self._is_choice_refused = False
+        """A card was scanned in vain: the label behind it must not go to another socket."""
+        self._forget_at_s: float | None = None
+        self._reason = ""
+        """Given by REASON, for the next label."""
+        self._reasons: dict[str, str] = {}
+        """Of labels: sockets that begin in between must not take each other's."""
+
+    @property
+    def waiting_label(self) -> str:
+        """The label that waits for the card of its socket; empty where none does."""
+        return self._label
+
+    def take(self) -> list[Effect]:
+        """What is to be done now; asked again after each effect that was answered."""
+        effects, self._effects = self._effects, []
+        return effects
+
+    # -- the table of a socket --------------------------------------------------------------------
+
+    def feed(self, name: str, what: SocketInput, now: float) -> None:
+        """Something happened in a socket. A pair that the table lacks cannot happen (KeyError)."""
+        socket = self.sockets[name]
+        self._TABLE[socket.phase][type(what)](self, socket, what, now)
+        self._go_on(now)
+
+    def _ready(self, socket: Socket, what: Ready, now: float) -> None:
+        if socket.can_work:
+            return  # an adapter that was opened anew between two looks at it
+        was_short = now - socket.out_since_s <= SHORT_OUTAGE_S
+        socket.is_last_there = socket.is_last_there and was_short
+        socket.out_of_service, socket.sees_units = None, what.sees_units
+        if not what.sees_units:
+            socket.seen = Seen.SILENT
+
+    def _down(self, socket: Socket, what: Down, now: float) -> None:
+        if socket.can_work or not socket.out_since_s:
+            socket.out_since_s = now
+        socket.out_of_service = what.reason or "It cannot work."
+        self._drop_label(socket, f"Socket {socket.name} is out of service.", "when it works again")
+        # What happens in it cannot be seen now.
+        socket.seen, socket.own, socket.is_own_known = Seen.UNKNOWN, None, False
+
+    def _unit(self, socket: Socket, what: PresenceChanged, now: float) -> None:
+        """A unit is heard, says who it is, or is heard no more."""
+        if not what.is_there:
+            self._silent(socket, is_certain=what.is_certain)
+            return
+        is_new = socket.hear(what, is_serial=self._is_serial(what.serial or ""))
+        if is_new:
+            self._tell(UnitArrived(socket.name, what.how, what.label))
+        if socket.phase is not Phase.REST:
+            return
+        if what.label and self._scans_labels and not socket.label:
+            self._scan_borne(socket, what.label, now)
+        elif is_new and socket.label and socket.why is Why.NAMED:
+            self._arrived_where_named(socket, what.label, now)
+        elif self._label and socket.own == self._label and socket.awaits_label:
+            serial = self._label
+            self._forget_scans()
+            self._bind(socket, serial, Why.SAID, now)
+        elif is_new:
+            self._arrived_elsewhere(socket)
+
+    def _silent(self, socket: Socket, *, is_certain: bool) -> None:
+        if not socket.fall_silent(is_certain=is_certain):
+            return
+        self._tell(UnitRemoved(socket.name))
+        if socket.why is Why.NAMED:
+            socket.begin_at_s = None  # the one that arrived was not the one
+        else:
+            # It was meant for the unit that was there.
+            self._drop_label(socket, "Its unit is not heard any more.", "when it is connected")
+
+    def _arrived_where_named(self, socket: Socket, borne: str, now: float) -> None:
+        if borne and borne != socket.label:
+            label, reason = socket.label, f"The unit in socket {socket.name} bears {borne}."
+            socket.label = ""
+            self._refuse(label, "OTHER_UNIT", reason, f"Scan {borne}.", socket)
+        else:
+            # It may be one that woke up: it is asked who it is before anything begins.
+            socket.begin_at_s = now if borne else now + IDENTIFY_S
+
+    def _arrived_elsewhere(self, socket: Socket) -> None:
+        named = next((e for e in self.sockets.values() if e.label and e.why is Why.NAMED), None)
+        if named is not None and socket.awaits_label:
+            text = (
+                f"Wrong socket: {printable(named.label)} goes into socket {named.name}. "
+                f"If it stays here, scan SOCKET {socket.name}, then its label."
+            )
+            self._tell(OperatorPrompted(socket.name, text))
+
+    def _claimed(self, socket: Socket, _what: Claimed, _now: float) -> None:
+        socket.phase = Phase.RUN
+        socket.last, socket.is_last_there, socket.note = None, False, ""
+        for each in self.sockets.values():
+            if each is socket or each.interrupted == socket.serial:
+                each.interrupted = ""
+        self._reasons.pop(socket.serial, None)
+
+    def _not_claimed(self, socket: Socket, what: NotClaimed, _now: float) -> None:
+        serial, socket.phase, socket.serial = socket.serial, Phase.REST, ""
+        self._refuse(serial, what.code, what.reason, what.remedy, socket)
+        socket.note = f"{what.reason} {what.remedy}"
+        if what.stops_line:
+            self.stop(what.code, what.reason, what.remedy)
+
+    def _claim_failed(self, socket: Socket, what: NotSaved, _now: float) -> None:
+        socket.phase, socket.serial = Phase.REST, ""
+        self.stop(codes.RECORD_NOT_SAVED.name, what.reason, what.remedy)
+
+    def _ended(self, socket: Socket, _what: Ended, now: float) -> None:
+        socket.phase = Phase.SAVE
+        socket.last, socket.is_last_there = LastRun(socket.serial), True
+        # In the run it may have got its number: what is heard from now on counts.
+        socket.own, socket.is_own_known = None, False
+        if not socket.is_virtual and socket.sees_units:
+            socket.seen = Seen.UNKNOWN
+
+    def _saved(self, socket: Socket, what: Saved, _now: float) -> None:
+        socket.phase, socket.note, socket.serial = Phase.REST, "", ""
+        if socket.last is not None:
+            socket.last = replace(socket.last, outcome=what.outcome, action=what.action)
+
+    def _not_saved(self, socket: Socket, what: NotSaved, _now: float) -> None:
+        """A part of a run, or its end: nothing of it can pass, and no other unit is begun."""
+        if socket.phase is Phase.SAVE:
+            socket.note = what.reason
+        self.stop(codes.RECORD_NOT_SAVED.name, what.reason, what.remedy)
+
+    # -- scans ------------------------------------------------------------------------------------
+
+    def scan(self, text: str, now: float) -> None:
+        """Something was scanned."""
+        shown = printable(text.strip())[:80]
+        try:
+            meaning, socket = self._understand(text, now)
+        except Refused as refused:
+            self._refuse(shown, refused.code, refused.reason, refused.remedy)
+        else:
+            if meaning != _RESUME:  # `resumed` says what came of it
+                name = "" if socket is None else socket.name
+                self._tell(ScanAccepted(shown, meaning, name))
+        self._go_on(now)
+
+    def _understand(self, text: str, now: float) -> tuple[str, Socket | None]:
+        """What a scan means, and for which socket. Raises Refused."""
+        was_refused, self._is_choice_refused = self._is_choice_refused, False
+        match understand(text):
+            case Label(serial):
+                if was_refused:
+                    raise Refused(
+                        "NO_SOCKET",
+                        "The socket that was scanned before it cannot take it.",
+                        "Scan the card of a socket that can, then the label again.",
+                    )
+                return "label", self._take_label(serial, now)
+            case Command(word, argument):
+                return word.value.lower(), self._COMMANDS[word](self, argument, now)
+            case Nonsense(why):
+                raise Refused("NOT_UNDERSTOOD", why, "Scan the label again.")
+
+    def _take_label(self, serial: str, now: float) -> Socket | None:
+        """The socket that a label is for; None while it waits for one. Raises Refused."""
+        self._check_label(serial)
+        chosen = self._chosen
+        if chosen is not None:
+            check_fits(self.sockets, chosen, serial)
+            for each in self.sockets.values():
+                if each.label == serial and each.why is not Why.NAMED:
+                    raise Refused("DOUBLE_SCAN", "It was scanned already.", each.wanted)
+                if each.label == serial:
+                    each.label, each.begin_at_s = "", None  # it was put elsewhere
+            self._forget_scans()
+            self._bind(chosen, serial, Why.SAID, now)
+            return chosen
+        check_first(self.sockets, serial, self._label)
+        placed = place(self.sockets, serial)
+        if placed is None:
+            self._keep_waiting(serial, now)
+            return None
+        socket, why = placed
+        self._bind(socket, serial, why, now)
+        if why is not Why.SAID and not socket.is_due(now):
+            self._tell(OperatorPrompted(socket.name, socket.wanted))
+        return socket
+
+    def _check_label(self, serial: str) -> None:
+        """Raises Refused for what is no label of this recipe, or can be run by nobody now."""
+        if self.stopped is not None:
+            reason = f"The line stands: {self.stopped.reason}"
+            raise Refused("LINE_STOPPED", reason, self.stopped.remedy)
+        try:
+            self._check_serial(serial)
+        except ValueError as error:
+            raise Refused(
+                Refusal.WRONG_SERIAL.value,
+                f"No serial number of this recipe: {error}.",
+                "Scan the label of the unit.",
+            ) from error
+        check_known(self.sockets, serial)
+
+    def _keep_waiting(self, serial: str, now: float) -> None:
+        if not any(each.can_work for each in self.sockets.values()):
+            raise Refused(
+                "SOCKET_BROKEN", "No socket works.", "Mend one of them, then scan it again."
+            )
+        self._label, self._forget_at_s = serial, now + self._scan_limit_s
+        shown, before = printable(serial), was_in(self.sockets, serial)
+        words = f"Scan the card of the socket that {shown} is in, or goes into."
+        if before is not None:
+            words = (
+                f"{shown} was in socket {before.name}. "
+                f"If it is still there, scan SOCKET {before.name}; else the card of its socket."
+            )
+        self._tell(OperatorPrompted("", words))
+
+    def _take_socket(self, argument: str, now: float) -> Socket:
+        self._is_choice_refused = True  # until nothing speaks against it
+        socket = self._named(argument)
+        check_free(socket)
+        check_service(socket)
+        last = socket.holds
+        if last is not None and last.outcome is RunState.PASS:
+            raise still_there(socket, last)
+        if socket.label:
+            # The label is there, and a person says that the unit is: do not wait for more.
+            check_fits(self.sockets, socket, socket.label)
+            socket.why, socket.begin_at_s = Why.SAID, now
+        elif self._label:
+            check_fits(self.sockets, socket, self._label)
+            serial = self._label
+            self._forget_scans()
+            self._bind(socket, serial, Why.SAID, now)
+        else:
+            self._forget_scans()
+            self._chosen, self._forget_at_s = socket, now + self._scan_limit_s
+        self._is_choice_refused = False
+        return socket
+
+    def _named(self, name: str) -> Socket:
+        found = next((e for e in self.sockets.values() if e.name.lower() == name.lower()), None)
+        if found is None:
+            remedy = f"There are: {', '.join(self.sockets)}."
+            raise Refused("NO_SUCH_SOCKET", "There is no such socket.", remedy)
+        return found
+
+    def _abort(self, argument: str, _now: float) -> Socket:
+        socket = self._named(argument)
+        if socket.phase is not Phase.RUN:
+            raise Refused("NOT_RUNNING", f"Nothing runs in socket {socket.name}.", "Nothing to do.")
+        self._audit(AuditEvent.ABORT, socket=socket.name, serial=socket.serial)
+        self._effects.append(Abort(socket.name))
+        return socket
+
+    def _free(self, argument: str, _now: float) -> Socket:
+        socket = self._named(argument)
+        check_free(socket)
+        self._drop_label(socket, f"Socket {socket.name} is free.", "when it is connected")
+        socket.last, socket.is_last_there, socket.interrupted, socket.note = None, False, "", ""
+        if socket.can_work and not (socket.is_there and socket.sees_units):
+            socket.seen = Seen.EMPTY
+        return socket
+
+    def _cancel(self, _argument: str, _now: float) -> None:
+        self._forget_scans()
+        self._reason = ""
+        self._reasons.clear()
+        for socket in self.sockets.values():
+            if socket.phase is Phase.REST:
+                socket.label, socket.begin_at_s = "", None
+
+    def _set_lot(self, argument: str, _now: float) -> None:
+        self.lot = argument
+
+    def _set_operator(self, argument: str, _now: float) -> None:
+        self._audit(AuditEvent.OPERATOR, before=self.operator, now=argument)
+        self.operator = argument
+
+    def _give_reason(self, argument: str, _now: float) -> None:
+        self._audit(AuditEvent.REASON, text=argument)
+        self._reason = argument
+
+    def _resume(self, _argument: str, _now: float) -> None:
+        if self.stopped is None:
+            raise Refused("NOT_STOPPED", "The line is not stopped.", "Nothing to do.")
+        self._audit(AuditEvent.RESUME, code=self.stopped.code)
+        unsaved = [each.name for each in self.sockets.values() if each.phase is Phase.SAVE]
+        self._effects.append(Resume(tuple(unsaved)))
+
+    def resumed(self, now: float, *, all_saved: bool) -> None:
+        """What came of `Resume`: the line goes on, or stands where it stood."""
+        word = Word.RESUME.value
+        if all_saved:
+            self.stopped = None
+            self._tell(ScanAccepted(word, _RESUME))
+            self._tell(LineResumed())
+        else:
+            self._refuse(
+                word, "STILL_NOT_SAVED", "It still cannot be saved.", "Mend the cause first."
+            )
+        self._go_on(now)
+
+    # -- the time, and what is due ----------------------------------------------------------------
+
+    def tick(self, now: float) -> None:
+        """Time has passed."""
+        if self._forget_at_s is not None and now >= self._forget_at_s:
+            if self._label:
+                reason = "No card of a socket was scanned for it."
+                self._refuse(self._label, "FORGOTTEN", reason, "Scan it again.")
+            elif self._chosen is not None:
+                text = f"SOCKET {self._chosen.name}"
+                self._refuse(text, "FORGOTTEN", "No label was scanned for it.", "Scan it again.")
+            self._forget_scans()
+        for socket in self.sockets.values():
+            waits = socket.label and socket.begin_at_s is None and socket.phase is Phase.REST
+            if waits and now >= socket.forget_at_s:
+                self._drop_label(socket, "Its unit did not come.", "with its unit")
+        self._go_on(now)
+
+    def _go_on(self, now: float) -> None:
+        """Begin what is due, then show what has changed."""
+        for socket in self.sockets.values():
+            if self.stopped is None and not self.is_closing and socket.is_due(now):
+                serial, socket.label, socket.begin_at_s = socket.label, "", None
+                socket.phase, socket.serial = Phase.CLAIM, serial
+                reason = self._reasons.get(serial, "")
+                self._effects.append(Claim(socket.name, serial, self.operator, self.lot, reason))
+        for socket in self.sockets.values():
+            shown = socket.view(self.stopped, is_only=len(self.sockets) == 1)
+            if socket.shown != shown and socket.phase is not Phase.CLAIM:
+                socket.shown = shown
+                state, serial, text = shown
+                self._tell(SocketChanged(socket.name, state, serial, text))
+
+    def _bind(self, socket: Socket, serial: str, why: Why, now: float) -> None:
+        """The label is the one of the unit in this socket, or of the one that comes into it."""
+        if self._reason:
+            self._reasons[serial], self._reason = self._reason, ""
+        was_here = serial in (socket.interrupted, socket.last.serial if socket.last else "")
+        socket.label, socket.why, socket.note = serial, why, ""
+        socket.begin_at_s, socket.forget_at_s = None, now + self._scan_limit_s
+        if why is Why.NAMED:
+            return  # the unit that has passed is shown until it has left
+        socket.last, socket.is_last_there = None, False
+        if not socket.sees_units or (was_here and why is Why.SAID):
+            socket.begin_at_s = now  # it may sit in its bootloader, and say nothing
+        elif why is Why.SAID or (why is Why.ONLY and was_here):
+            socket.begin_at_s = now + self._arrival_limit_s
+
+    def _drop_label(self, socket: Socket, reason: str, when: str) -> None:
+        label, socket.label, socket.begin_at_s = socket.label, "", None
+        if label:
+            self._refuse(label, "FORGOTTEN", reason, f"Scan it again {when}.", socket)
+
+    def _forget_scans(self) -> None:
+        self._label, self._chosen, self._forget_at_s = "", None, None
+
+    def stop(self, code: str, reason: str, remedy: str) -> None:
+        """Begin no unit until RESUME. Labels are forgotten: units may be swapped meanwhile."""
+        if self.stopped is not None:
+            return
+        self.stopped = LineStopped(code, reason, remedy)
+        self._tell(self.stopped)
+        if self._label:
+            self._refuse(self._label, "FORGOTTEN", "The line was stopped.", "Scan it again.")
+        self._forget_scans()
+        for socket in self.sockets.values():
+            self._drop_label(socket, "The line was stopped.", "when it goes on")
+
+    def _is_serial(self, text: str) -> bool:
+        """True for a serial number of this recipe."""
+        try:
+            self._check_serial(text)
+        except ValueError:
+            return False
+        return True
+
+    # -- effects ----------------------------------------------------------------------------------
+
+    def _tell(self, event: StationEvent) -> None:
+        self._effects.append(Tell(event))
+
+    def _refuse(
+        self, text: str, code: str, reason: str, remedy: str, socket: Socket | None = None
+    ) -> None:
+        name = "" if socket is None else socket.name
+        self._tell(ScanRefused(text, code, reason, remedy, name))
+        self._audit(AuditEvent.REFUSED_SCAN, text=text, code=code, socket=name)
+
+    def _audit(self, what: AuditEvent, **data: str) -> None:
+        self._effects.append(Audit(what, data))
+
+    def _scan_borne(self, socket: Socket, label: str, now: float) -> None:
+        """Scan the label that a virtual unit bears, as an operator would with the socket's card."""
+        try:
+            self._check_label(label)
+        except Refused as refused:
+            self._refuse(label, refused.code, refused.reason, refused.remedy, socket)
+        else:
+            self._tell(ScanAccepted(label, "label", socket.name))
+            self._bind(socket, label, Why.SAID, now)
+
+    # -- the tables -------------------------------------------------------------------------------
+
+    _TABLE: ClassVar[Mapping[Phase, Mapping[type, Callable[..., None]]]] = {
+        Phase.REST: {Ready: _ready, Down: _down, PresenceChanged: _unit},
+        Phase.CLAIM: {Claimed: _claimed, NotClaimed: _not_claimed, NotSaved: _claim_failed},
+        Phase.RUN: {
+            Ready: _ready,
+            Down: _down,
+            PresenceChanged: _unit,
+            NotSaved: _not_saved,
+            Ended: _ended,
+        },
+        Phase.SAVE: {
+            Ready: _ready,
+            Down: _down,
+            PresenceChanged: _unit,
+            NotSaved: _not_saved,
+            Saved: _saved,
+        },
+    }
+    """What happens in a socket, by where its run is."""
+    _COMMANDS: ClassVar[Mapping[Word, Callable[[Line, str, float], Socket | None]]] = {
+        Word.SOCKET: _take_socket,
+        Word.CANCEL: _cancel,
+        Word.ABORT: _abort,
+        Word.FREE: _free,
+        Word.LOT: _set_lot,
+        Word.OPERATOR: _set_operator,
+        Word.REASON: _give_reason,
+        Word.RESUME: _resume,
+    }
+    """What a card does."""

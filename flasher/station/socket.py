@@ -1,0 +1,258 @@
+"""What a station knows of one socket: its process, the unit in it, its label and its last run.
+
+A unit is known by what is heard of it. One that falls silent may sleep, and is not taken for one
+that was removed, unless it would tell its serial number when it is heard again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import Enum
+from typing import Final
+
+from flasher.protocol.text import printable
+from flasher.station.events import LineStopped, SocketState
+from flasher.station.messages import PresenceChanged
+from flasher.station.records.model import RunState
+
+Shown = tuple[SocketState, str, str]
+"""State, serial number and text of a socket."""
+_STATES: Final = {
+    RunState.PASS: SocketState.PASS,
+    RunState.FAIL: SocketState.FAIL,
+    RunState.ERROR: SocketState.RECHECK,
+    RunState.ABORTED: SocketState.RECHECK,
+}
+
+
+class Phase(Enum):
+    """Where a socket's run is."""
+
+    REST = "no run"
+    CLAIM = "the records are asked for a run"
+    RUN = "its process works on the unit"
+    SAVE = "the run is over, its end is not on disk"
+
+
+class Seen(Enum):
+    """What is known of a unit in the socket."""
+
+    UNKNOWN = "nothing is known since its process began"
+    THERE = "it is heard"
+    SILENT = "nothing is heard: no unit, or one that sleeps"
+    EMPTY = "no unit is in it"
+
+
+class Why(Enum):
+    """Why a label is the one of the unit in a socket."""
+
+    NAMED = "the station named the socket: the unit has to arrive there, from now on"
+    SAID = "a person scanned the socket's card with it, or the unit itself says so"
+    ONLY = "the station has one socket"
+
+
+@dataclass(frozen=True)
+class LastRun:
+    """The last run in a socket, while its unit may be there."""
+
+    serial: str
+    outcome: RunState | None = None
+    """None until it is on disk."""
+    action: str = ""
+    has_talked: bool = False
+    """Its unit was heard after the run."""
+    has_said: bool = False
+    """Its unit said its serial number after the run."""
+
+
+@dataclass
+class Socket:
+    """A socket as the line knows it. Only `Line` changes it."""
+
+    name: str
+    is_virtual: bool = False
+    phase: Phase = Phase.REST
+    out_of_service: str | None = ""
+    """Why it cannot work; empty while it starts, None when it can."""
+    sees_units: bool = True
+    seen: Seen = Seen.UNKNOWN
+    own: str | None = None
+    """The serial number that the unit itself says; empty: it has none; None: not said yet."""
+    is_own_known: bool = False
+    """`own` is a serial number of the recipe: the unit can be told from others."""
+    borne: str = ""
+    """The label that a virtual unit bears."""
+    label: str = ""
+    """The label of the next run."""
+    why: Why = Why.SAID
+    begin_at_s: float | None = None
+    """When the run begins although no unit is heard, or although it does not say who it is."""
+    forget_at_s: float = 0.0
+    """When a label is forgotten whose unit does not come."""
+    serial: str = ""
+    """The unit of the run that goes on."""
+    last: LastRun | None = None
+    is_last_there: bool = False
+    """The unit of the last run may be there, and nothing was heard that may be another one."""
+    interrupted: str = ""
+    """The unit of a run that a dead station left in this socket."""
+    note: str = ""
+    """What is wrong with the label that was scanned last, or with the save."""
+    out_since_s: float = 0.0
+    """Since when it is out of service."""
+    shown: Shown | None = None
+    """What was told last."""
+
+    @property
+    def can_work(self) -> bool:
+        """True when its process runs and its adapter is open."""
+        return self.out_of_service is None
+
+    @property
+    def is_there(self) -> bool:
+        """True while a unit is heard in it."""
+        return self.seen is Seen.THERE
+
+    @property
+    def is_running(self) -> bool:
+        """True from the claim until the process said the end of the run."""
+        return self.phase in (Phase.CLAIM, Phase.RUN)
+
+    @property
+    def verdict(self) -> LastRun | None:
+        """The last run, as long as its unit is believed to be in the socket."""
+        last = self.last
+        if last is None or last.outcome is None or self.seen is Seen.EMPTY:
+            return None
+        return last if self.is_last_there else None
+
+    @property
+    def holds(self) -> LastRun | None:
+        """The last run, while its unit is still heard, or nothing speaks against it yet."""
+        return None if self.seen is Seen.SILENT else self.verdict
+
+    @property
+    def awaits_label(self) -> bool:
+        """True when a unit is in it that has no label yet."""
+        is_free = self.can_work and self.phase is Phase.REST and not self.label
+        return is_free and self.is_there and self.verdict is None
+
+    @property
+    def is_starting(self) -> bool:
+        """True while nobody can say whether a unit is in it."""
+        if self.phase is not Phase.REST or self.verdict is not None:
+            return False
+        is_listening = self.sees_units and self.seen is Seen.UNKNOWN
+        return self.out_of_service == "" or (self.can_work and is_listening)
+
+    # -- the unit in it ---------------------------------------------------------------------------
+
+    def hear(self, what: PresenceChanged, *, is_serial: bool) -> bool:
+        """A unit is heard, or says who it is; `is_serial`: by a number of the recipe. True when it
+        is another one than before.
+        """
+        before, self.seen = self.seen, Seen.THERE
+        if what.serial is not None:
+            self.own, self.is_own_known = what.serial, is_serial
+        is_new = self._is_new(before) or bool(what.label)
+        if is_new:
+            self.borne, self.note = what.label, ""
+        return is_new
+
+    def _is_new(self, before: Seen) -> bool:
+        last = self.last
+        if last is None:
+            return before is not Seen.THERE
+        if self.own == last.serial:
+            self.last = replace(last, has_talked=True, has_said=True)
+            self.is_last_there = True
+            return False
+        says_other = self.own is not None and (last.has_said or self.is_own_known)
+        if says_other or before in (Seen.SILENT, Seen.EMPTY):
+            # Another unit; or one that was silent for a while, and does not say who it is.
+            was_last, self.is_last_there = self.is_last_there, False
+            return was_last or before is not Seen.THERE
+        self.last = replace(last, has_talked=True)
+        return False
+
+    def fall_silent(self, *, is_certain: bool) -> bool:
+        """Nothing is heard any more, or nothing is in it for certain. True when a unit was."""
+        before = self.seen
+        is_out = is_certain or self.is_own_known or before is Seen.EMPTY
+        self.seen = Seen.EMPTY if is_out else Seen.SILENT
+        self.own, self.is_own_known, self.borne, self.note = None, False, "", ""
+        return before is Seen.THERE
+
+    def is_of_another(self, label: str) -> bool:
+        """True when the unit that is heard says that it is another one than the label's."""
+        return self.is_there and self.is_own_known and self.own != label
+
+    def is_due(self, now: float) -> bool:
+        """True when the unit of its label is there, as far as that can be known."""
+        if not (self.label and self.can_work and self.phase is Phase.REST):
+            return False
+        is_time = self.begin_at_s is not None and now >= self.begin_at_s
+        if self.why is Why.NAMED:
+            # It has arrived, and said who it is or has had the time for it.
+            has_arrived = self.is_there and self.begin_at_s is not None
+            is_time = has_arrived and (self.own is not None or is_time)
+        else:
+            is_time = self.is_there or is_time
+        return is_time and not self.is_of_another(self.label)
+
+    # -- what it shows ----------------------------------------------------------------------------
+
+    @property
+    def wanted(self) -> str:
+        """What its label waits for."""
+        shown = printable(self.label)
+        if self.why is not Why.NAMED:
+            return f"Connect {shown}."
+        if self.verdict is not None:
+            return f"Take {printable(self.verdict.serial)} out, then connect {shown}."
+        return f"Put {shown} into socket {self.name}."
+
+    def view(self, stopped: LineStopped | None, *, is_only: bool) -> Shown:
+        """What it shows; `stopped`: why the line stands; `is_only`: the station has no other."""
+        if self.is_running:
+            return SocketState.RUNNING, self.serial, ""
+        if self.phase is Phase.SAVE:
+            return SocketState.ERROR if self.note else SocketState.SAVING, self.serial, self.note
+        last = self.verdict
+        if last is not None and last.outcome is not None:
+            return _STATES[last.outcome], last.serial, last.action
+        if self.out_of_service is not None:
+            state = SocketState.ERROR if self.out_of_service else SocketState.STARTING
+            return state, self.label, self.out_of_service
+        if stopped is not None:
+            return SocketState.STOPPED, "", stopped.reason
+        if self.label:
+            own = printable(self.own or "")
+            other = f"The unit in it says that it is {own}. " * self.is_of_another(self.label)
+            return SocketState.SCAN, self.label, other + self.wanted
+        if self.is_starting:
+            return SocketState.STARTING, "", "Listening for a unit."
+        return self._view_free("" if is_only else f" and SOCKET {self.name}")
+
+    def _view_free(self, card: str) -> Shown:
+        """Without a label; `card` is what has to be scanned with it."""
+        borne = f" It bears {printable(self.borne)}." if self.borne else ""
+        if self.interrupted:
+            text = f"{printable(self.interrupted)} was interrupted here: scan its label{card}."
+            return SocketState.SCAN, self.interrupted, text + borne
+        if self.note:
+            return SocketState.SCAN, "", self.note + borne
+        if self.is_there:
+            return SocketState.SCAN, "", self._asked_for(card) + borne
+        if self.seen is Seen.EMPTY:
+            return SocketState.EMPTY, "", ""
+        return SocketState.SILENT, "", "Nothing is heard: no unit, or one that sleeps."
+
+    def _asked_for(self, card: str) -> str:
+        if self.is_own_known:
+            return f"It says that it is {printable(self.own or '')}: scan its label."
+        last = self.last
+        if last is None or last.outcome is None:
+            return f"Scan the label of the unit{card}."
+        was = f"After {_STATES[last.outcome].value} of {printable(last.serial)} nothing was heard"
+        return f"{was}. If this is another unit, scan its label{card}."
