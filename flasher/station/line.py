@@ -35,6 +35,7 @@ from flasher.station.placing import (
     check_fits,
     check_free,
     check_known,
+    check_one_socket,
     check_service,
     place,
     still_there,
@@ -47,8 +48,12 @@ from flasher.station.socket import LastRun, Phase, Seen, Socket, Why
 
 ARRIVAL_LIMIT_S: Final = 20.0
 SCAN_LIMIT_S: Final = 120.0
-SHORT_OUTAGE_S: Final = 5.0
-"""Nobody swaps a unit in the time in which a process is started again."""
+CARD_LIMIT_S: Final = 15.0
+"""A card and its label are scanned one after the other: what comes later is another unit's."""
+SHORT_OUTAGE_S: Final = 3.0
+"""Nobody swaps a unit in less, the time in which a process is started again."""
+REACH_S: Final = 2.0
+"""Nobody reads a prompt and connects a unit in less: one that is heard sooner was there before."""
 IDENTIFY_S: Final = 3.0
 """A unit that was just switched on tells its serial number in less, if it has an application."""
 _RESUME: Final = Word.RESUME.value.lower()
@@ -224,7 +229,7 @@ class Line:
     def _ready(self, socket: Socket, what: Ready, now: float) -> None:
         if socket.can_work:
             return  # an adapter that was opened anew between two looks at it
-        was_short = now - socket.out_since_s <= SHORT_OUTAGE_S
+        was_short = now - socket.out_since_s < SHORT_OUTAGE_S
         socket.is_last_there = socket.is_last_there and was_short
         socket.out_of_service, socket.sees_units = None, what.sees_units
         if not what.sees_units:
@@ -235,14 +240,17 @@ class Line:
             socket.out_since_s = now
         socket.out_of_service = what.reason or "It cannot work."
         self._drop_label(socket, f"Socket {socket.name} is out of service.", "when it works again")
-        # What happens in it cannot be seen now.
-        socket.seen, socket.own, socket.is_own_known = Seen.UNKNOWN, None, False
+        # What happens in it cannot be seen now. What was silent before stays doubtful.
+        socket.own, socket.is_own_known = None, False
+        if socket.seen is not Seen.SILENT:
+            socket.seen = Seen.UNKNOWN
 
     def _unit(self, socket: Socket, what: PresenceChanged, now: float) -> None:
         """A unit is heard, says who it is, or is heard no more."""
         if not what.is_there:
             self._silent(socket, is_certain=what.is_certain)
             return
+        was_silent = socket.seen in (Seen.SILENT, Seen.EMPTY)
         is_new = socket.hear(what, is_serial=self._is_serial(what.serial or ""))
         if is_new:
             self._tell(UnitArrived(socket.name, what.how, what.label))
@@ -250,7 +258,7 @@ class Line:
             return
         if what.label and self._scans_labels and not socket.label:
             self._scan_borne(socket, what.label, now)
-        elif is_new and socket.label and socket.why is Why.NAMED:
+        elif (is_new or was_silent) and socket.label and socket.why is Why.NAMED:
             self._arrived_where_named(socket, what.label, now)
         elif self._label and socket.own == self._label and socket.awaits_label:
             serial = self._label
@@ -270,9 +278,14 @@ class Line:
             self._drop_label(socket, "Its unit is not heard any more.", "when it is connected")
 
     def _arrived_where_named(self, socket: Socket, borne: str, now: float) -> None:
-        if borne and borne != socket.label:
-            label, reason = socket.label, f"The unit in socket {socket.name} bears {borne}."
-            socket.label = ""
+        if not borne and now < socket.bound_at_s + REACH_S:
+            self._drop_label(
+                socket,
+                f"A unit was in socket {socket.name} already.",
+                "with the card of its socket",
+            )
+        elif borne and borne != socket.label:
+            label, reason = socket.let_go(), f"The unit in socket {socket.name} bears {borne}."
             self._refuse(label, "OTHER_UNIT", reason, f"Scan {borne}.", socket)
         else:
             # It may be one that woke up: it is asked who it is before anything begins.
@@ -359,18 +372,11 @@ class Line:
 
     def _take_label(self, serial: str, now: float) -> Socket | None:
         """The socket that a label is for; None while it waits for one. Raises Refused."""
-        self._check_label(serial)
         chosen = self._chosen
         if chosen is not None:
-            check_fits(self.sockets, chosen, serial)
-            for each in self.sockets.values():
-                if each.label == serial and each.why is not Why.NAMED:
-                    raise Refused("DOUBLE_SCAN", "It was scanned already.", each.wanted)
-                if each.label == serial:
-                    each.label, each.begin_at_s = "", None  # it was put elsewhere
-            self._forget_scans()
-            self._bind(chosen, serial, Why.SAID, now)
+            self._take_for_chosen(chosen, serial, now)
             return chosen
+        self._check_label(serial)
         check_first(self.sockets, serial, self._label)
         placed = place(self.sockets, serial)
         if placed is None:
@@ -382,11 +388,33 @@ class Line:
             self._tell(OperatorPrompted(socket.name, socket.wanted))
         return socket
 
-    def _check_label(self, serial: str) -> None:
-        """Raises Refused for what is no label of this recipe, or can be run by nobody now."""
+    def _take_for_chosen(self, chosen: Socket, serial: str, now: float) -> None:
+        """A label behind the card of its socket. Raises Refused: the card was for this label."""
+        try:
+            self._check_label(serial)
+            check_free(chosen)
+            check_fits(self.sockets, chosen, serial)
+            check_one_socket(self.sockets, chosen, serial)
+        except Refused:
+            self._forget_scans()
+            raise
+        was_here = chosen.label == serial
+        for each in self.sockets.values():
+            if each is chosen or each.label == serial:
+                each.let_go()  # what was scanned for it before, or it was put elsewhere
+        self._forget_scans()
+        self._bind(chosen, serial, Why.SAID, now)
+        if was_here:
+            chosen.begin_at_s = now  # said twice: do not wait until it is heard
+
+    def _check_line(self) -> None:
         if self.stopped is not None:
             reason = f"The line stands: {self.stopped.reason}"
-            raise Refused("LINE_STOPPED", reason, self.stopped.remedy)
+            raise Refused("LINE_STOPPED", reason, f"{self.stopped.remedy} Then scan RESUME.")
+
+    def _check_label(self, serial: str) -> None:
+        """Raises Refused for what is no label of this recipe, or can be run by nobody now."""
+        self._check_line()
         try:
             self._check_serial(serial)
         except ValueError as error:
@@ -415,23 +443,22 @@ class Line:
     def _take_socket(self, argument: str, now: float) -> Socket:
         self._is_choice_refused = True  # until nothing speaks against it
         socket = self._named(argument)
+        self._check_line()
         check_free(socket)
         check_service(socket)
         last = socket.holds
         if last is not None and last.outcome is RunState.PASS:
             raise still_there(socket, last)
-        if socket.label:
-            # The label is there, and a person says that the unit is: do not wait for more.
-            check_fits(self.sockets, socket, socket.label)
-            socket.why, socket.begin_at_s = Why.SAID, now
-        elif self._label:
+        if self._label:
             check_fits(self.sockets, socket, self._label)
             serial = self._label
             self._forget_scans()
             self._bind(socket, serial, Why.SAID, now)
         else:
             self._forget_scans()
-            self._chosen, self._forget_at_s = socket, now + self._scan_limit_s
+            # Its label waits until it is said whether it is another one.
+            self._chosen, self._forget_at_s = socket, now + CARD_LIMIT_S
+            socket.is_chosen = True
         self._is_choice_refused = False
         return socket
 
@@ -464,8 +491,7 @@ class Line:
         self._reason = ""
         self._reasons.clear()
         for socket in self.sockets.values():
-            if socket.phase is Phase.REST:
-                socket.label, socket.begin_at_s = "", None
+            socket.let_go()
 
     def _set_lot(self, argument: str, _now: float) -> None:
         self.lot = argument
@@ -512,7 +538,7 @@ class Line:
             self._forget_scans()
         for socket in self.sockets.values():
             waits = socket.label and socket.begin_at_s is None and socket.phase is Phase.REST
-            if waits and now >= socket.forget_at_s:
+            if waits and now >= socket.bound_at_s + self._scan_limit_s:
                 self._drop_label(socket, "Its unit did not come.", "with its unit")
         self._go_on(now)
 
@@ -537,7 +563,7 @@ class Line:
             self._reasons[serial], self._reason = self._reason, ""
         was_here = serial in (socket.interrupted, socket.last.serial if socket.last else "")
         socket.label, socket.why, socket.note = serial, why, ""
-        socket.begin_at_s, socket.forget_at_s = None, now + self._scan_limit_s
+        socket.begin_at_s, socket.bound_at_s = None, now
         if why is Why.NAMED:
             return  # the unit that has passed is shown until it has left
         socket.last, socket.is_last_there = None, False
@@ -547,11 +573,15 @@ class Line:
             socket.begin_at_s = now + self._arrival_limit_s
 
     def _drop_label(self, socket: Socket, reason: str, when: str) -> None:
-        label, socket.label, socket.begin_at_s = socket.label, "", None
+        label = socket.let_go()
         if label:
             self._refuse(label, "FORGOTTEN", reason, f"Scan it again {when}.", socket)
 
     def _forget_scans(self) -> None:
+        if self._chosen is not None:
+            self._chosen.is_chosen = False
+            why = f"SOCKET {self._chosen.name} was scanned, and not its label."
+            self._drop_label(self._chosen, why, "with the card")
         self._label, self._chosen, self._forget_at_s = "", None, None
 
     def stop(self, code: str, reason: str, remedy: str) -> None:

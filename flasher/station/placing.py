@@ -3,8 +3,7 @@
 A label that is scanned alone belongs to
 
 - the only socket of a station that has one;
-- the socket whose unit says that this is its serial number, or ran there last without a PASS and
-  was heard ever since;
+- the socket whose unit says that this is its serial number;
 - the socket that the station names, when the unit comes there afterwards. It names only one of
   which it knows that nothing is in it.
 
@@ -95,10 +94,7 @@ def _where_it_is(sockets: Sockets, serial: str) -> Socket | None:
     """The socket in which this very unit is heard."""
     idle = [e for e in sockets.values() if e.can_work and e.phase is Phase.REST]
     said = [each for each in idle if each.is_there and each.own == serial]
-    if len(said) == 1:
-        return said[0]
-    ran = (each for each in idle if each.holds is not None and each.holds.serial == serial)
-    return next(ran, None)
+    return said[0] if len(said) == 1 else None
 
 
 def check_free(socket: Socket) -> None:
@@ -131,7 +127,8 @@ def check_first(sockets: Sockets, serial: str, waiting: str) -> None:
     """Raises Refused for a label that was scanned already, or behind one that still waits."""
     for each in sockets.values():
         if each.label == serial:
-            raise Refused("DOUBLE_SCAN", "It was scanned already.", each.wanted)
+            again = f"If it is there, scan SOCKET {each.name}, then the label."
+            raise Refused("DOUBLE_SCAN", "It was scanned already.", f"{each.wanted} {again}")
         if each.label and each.why is Why.NAMED:
             raise one_at_a_time(each.label, each.wanted)
     if waiting:
@@ -159,6 +156,14 @@ def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
                 f"The unit in socket {each.name} says that it is {printable(serial)}.",
                 f"Compare the labels of the units in the sockets {each.name} and {socket.name}.",
             )
+
+
+def check_one_socket(sockets: Sockets, socket: Socket, serial: str) -> None:
+    """Raises Refused for a label that a person gave to another socket."""
+    for each in sockets.values():
+        if each is not socket and each.label == serial and each.why is not Why.NAMED:
+            reason = f"It was scanned for socket {each.name}."
+            raise Refused("DOUBLE_SCAN", reason, f"{each.wanted} Or scan CANCEL.")
 
 
 def one_at_a_time(label: str, remedy: str) -> Refused:

@@ -87,13 +87,15 @@ class Socket:
     why: Why = Why.SAID
     begin_at_s: float | None = None
     """When the run begins although no unit is heard, or although it does not say who it is."""
-    forget_at_s: float = 0.0
-    """When a label is forgotten whose unit does not come."""
+    bound_at_s: float = 0.0
+    """When it got its label."""
     serial: str = ""
     """The unit of the run that goes on."""
     last: LastRun | None = None
     is_last_there: bool = False
     """The unit of the last run may be there, and nothing was heard that may be another one."""
+    is_chosen: bool = False
+    """Its card was scanned, and the label of its unit comes next."""
     interrupted: str = ""
     """The unit of a run that a dead station left in this socket."""
     note: str = ""
@@ -156,7 +158,7 @@ class Socket:
             self.own, self.is_own_known = what.serial, is_serial
         is_new = self._is_new(before) or bool(what.label)
         if is_new:
-            self.borne, self.note = what.label, ""
+            self.borne = what.label
         return is_new
 
     def _is_new(self, before: Seen) -> bool:
@@ -180,8 +182,15 @@ class Socket:
         before = self.seen
         is_out = is_certain or self.is_own_known or before is Seen.EMPTY
         self.seen = Seen.EMPTY if is_out else Seen.SILENT
-        self.own, self.is_own_known, self.borne, self.note = None, False, "", ""
+        self.own, self.is_own_known, self.borne = None, False, ""
         return before is Seen.THERE
+
+    def let_go(self) -> str:
+        """The label is not the one of this socket any more; returns it."""
+        label, self.label, self.begin_at_s = self.label, "", None
+        if label and self.seen is Seen.EMPTY:
+            self.seen = Seen.SILENT  # its unit may have been put in, and sleep
+        return label
 
     def is_of_another(self, label: str) -> bool:
         """True when the unit that is heard says that it is another one than the label's."""
@@ -189,7 +198,8 @@ class Socket:
 
     def is_due(self, now: float) -> bool:
         """True when the unit of its label is there, as far as that can be known."""
-        if not (self.label and self.can_work and self.phase is Phase.REST):
+        is_free = self.can_work and self.phase is Phase.REST and not self.is_chosen
+        if not (self.label and is_free):
             return False
         is_time = self.begin_at_s is not None and now >= self.begin_at_s
         if self.why is Why.NAMED:
@@ -218,12 +228,15 @@ class Socket:
             return SocketState.RUNNING, self.serial, ""
         if self.phase is Phase.SAVE:
             return SocketState.ERROR if self.note else SocketState.SAVING, self.serial, self.note
+        if self.is_chosen:
+            words = "Scan the label of the unit that is in this socket, or goes into it."
+            return SocketState.SCAN, self.label, words
         last = self.verdict
         if last is not None and last.outcome is not None:
             return _STATES[last.outcome], last.serial, last.action
         if self.out_of_service is not None:
             state = SocketState.ERROR if self.out_of_service else SocketState.STARTING
-            return state, self.label, self.out_of_service
+            return state, self.label, self.out_of_service or (self.wanted if self.label else "")
         if stopped is not None:
             return SocketState.STOPPED, "", stopped.reason
         if self.label:

@@ -113,7 +113,10 @@ class LineBench:
         self.turn()
 
     def arrive(self, socket: str, serial: str | None = "") -> None:
-        """A unit is heard that says this serial number: empty, it has none; None, not said yet."""
+        """A unit is heard that says this serial number: empty, it has none; None, not said yet.
+        A person needs a moment to connect it.
+        """
+        self.bench.clock.go_on(2.0)
         self.say(socket, PresenceChanged(is_there=True, how="traffic", serial=serial))
 
     def leave(self, socket: str) -> None:
@@ -126,6 +129,9 @@ class LineBench:
     def scan(self, text: str) -> None:
         self.station.submit(text)
         self.turn()
+
+    def text(self, socket: str) -> str:
+        return next(view.text for view in self.station.sockets if view.name == socket)
 
     def state(self, socket: str) -> SocketState:
         return next(view.state for view in self.station.sockets if view.name == socket)

@@ -12,6 +12,7 @@ from flasher.protocol.fields import Text
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import BootVersion
 from flasher.protocol.spec import BMS, WMC, Mode
+from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message, encode, split
 from flasher.station.presence import Presence
 from flasher.station.unit_device import UnitDevice
@@ -82,7 +83,8 @@ def test_after_a_time_in_which_nothing_could_be_heard_nothing_is_known(presence:
 
 
 def version_answer(serial: str) -> list[Frame]:
-    content = VersionInformation(*map(Text, ("BM36", serial, "V1r2r0", "V1r0r0")))
+    texts = ("BM36", serial, "V1r2r0", "V1r0r0")
+    content = VersionInformation(*(Text(encode_text(text, 16)) for text in texts))
     return split(0x720, encode(Message(0x720, Mode.REPORT, 0x1540, content.data())))
 
 

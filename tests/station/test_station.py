@@ -28,6 +28,7 @@ from flasher.station.events import (
 from flasher.station.messages import (
     Abort,
     AdapterDown,
+    Beat,
     CannotWork,
     Done,
     Finished,
@@ -137,6 +138,8 @@ def test_a_unit_that_failed_may_be_scanned_again_where_it_is(line: LineBench) ->
     line.end("A", RunState.FAIL, "NO_ANSWER")
     assert line.state("A") is SocketState.FAIL
     line.scan(SERIAL)
+    assert "If it is still there, scan SOCKET A" in line.last(OperatorPrompted).text
+    line.scan("SOCKET A")
     assert line.state("A") is SocketState.RUNNING
 
 
@@ -158,6 +161,163 @@ def test_two_waiting_units_need_a_chosen_socket(line: LineBench) -> None:
     line.scan("socket b")
     assert line.order("B").order.serial == SERIAL
     assert line.state("A") is SocketState.SCAN
+
+
+def test_a_label_that_is_scanned_while_sockets_start_goes_to_no_unit(bench: Bench) -> None:
+    """Two units wait, only the label of B's is scanned: the first one to be heard is A's."""
+    line = LineBench(bench, are_empty=False)
+    line.scan(OTHER)
+    refused = line.last(ScanRefused)
+    assert (refused.code, refused.reason) == (
+        "STARTING",
+        "Socket A is still starting: it is not known what is in it.",
+    )
+    line.arrive("A")
+    line.arrive("B")
+    assert line.of(RunStarted) == []
+    line.scan("SOCKET B")
+    line.scan(OTHER)
+    assert line.order("B").order.serial == OTHER
+
+
+def test_silence_is_no_empty_socket(bench: Bench) -> None:
+    """A unit that sleeps in A would take the label of one that is still on the table."""
+    line = LineBench(bench, are_empty=False)
+    for socket in "AB":
+        line.fall_silent(socket)
+        assert line.state(socket) is SocketState.SILENT
+    line.scan(SERIAL)
+    assert line.last(OperatorPrompted).text.startswith("Scan the card of the socket")
+    line.arrive("A")
+    assert line.of(RunStarted) == []
+
+
+def test_a_unit_that_says_its_own_number_needs_no_card(line: LineBench) -> None:
+    line.arrive("A")
+    line.arrive("B", OTHER)
+    line.scan(OTHER)
+    assert line.order("B").order.serial == OTHER
+
+
+def test_a_unit_in_another_socket_than_named_is_not_begun(line: LineBench) -> None:
+    line.scan(SERIAL)
+    assert line.last(OperatorPrompted).text == f"Put {SERIAL} into socket A."
+    line.arrive("B")
+    said = line.last(OperatorPrompted)
+    assert said.socket == "B"
+    assert said.text.startswith(f"Wrong socket: {SERIAL} goes into socket A.")
+    assert line.of(RunStarted) == []
+    line.scan("SOCKET B")
+    line.scan(SERIAL)
+    assert line.order("B").order.serial == SERIAL, "what the message says is accepted"
+
+
+def test_another_unit_in_the_named_socket_is_not_begun(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A", OTHER)
+    assert line.of(RunStarted) == []
+    assert line.text("A").startswith(f"The unit in it says that it is {OTHER}.")
+    line.leave("A")
+    line.arrive("A", SERIAL)
+    assert line.last(RunStarted).serial == SERIAL
+
+
+def test_a_unit_that_was_there_before_its_socket_was_named_is_not_begun(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.say("A", PresenceChanged(is_there=True, how="traffic", serial=""))
+    assert line.last(ScanRefused).code == "FORGOTTEN"
+    assert line.of(RunStarted) == []
+
+
+def test_who_announces_itself_is_asked_who_it_is_before_it_is_begun(line: LineBench) -> None:
+    line.scan(SERIAL)
+    line.arrive("A", None)
+    assert line.of(RunStarted) == []
+    line.bench.clock.go_on(3.0)
+    line.turn()
+    assert line.last(RunStarted).serial == SERIAL, "it has no application that could say it"
+
+
+def test_a_label_without_its_unit_is_forgotten(line: LineBench) -> None:
+    line.scan(SERIAL)
+    for _ in range(13):  # processes beat meanwhile
+        line.bench.clock.go_on(9.5)
+        for port in line.ports.values():
+            port.said.append(Beat())
+        line.turn()
+    assert line.last(ScanRefused).code == "FORGOTTEN"
+    line.arrive("A")
+    assert line.of(RunStarted) == []
+
+
+def test_a_card_is_for_the_next_label_only(line: LineBench) -> None:
+    line.scan("SOCKET B")
+    line.scan("HELLO")
+    assert line.last(ScanRefused).code == "WRONG_SERIAL"
+    line.scan(SERIAL)
+    assert line.last(OperatorPrompted).text == f"Put {SERIAL} into socket A."
+
+
+def test_a_process_that_dies_takes_the_waiting_label_with_it_and_no_pass(line: LineBench) -> None:
+    line.make("A", SERIAL)
+    line.scan(OTHER)
+    assert line.last(OperatorPrompted).text == f"Put {OTHER} into socket B."
+    line.ports["A"].is_gone = line.ports["B"].is_gone = True
+    line.turn()
+    assert line.last(ScanRefused).text == OTHER
+    line.bench.clock.go_on(1.5)
+    line.turn()
+    for socket in "AB":
+        line.say(socket, Ready("a bus", sees_units=True))
+    line.arrive("A", SERIAL)
+    line.arrive("B")
+    assert line.state("A") is SocketState.PASS
+    assert len(line.of(RunStarted)) == 1
+
+
+def test_the_unit_of_an_interrupted_run_is_asked_for_where_it_was(bench: Bench) -> None:
+    bench.claim(socket="B")
+    line = LineBench(bench)
+    assert line.text("B") == f"{SERIAL} was interrupted here: scan its label and SOCKET B."
+    line.scan(SERIAL)
+    assert "If it is still there, scan SOCKET B" in line.last(OperatorPrompted).text
+    line.arrive("A")
+    assert line.of(RunStarted) == []
+    line.scan("SOCKET B")
+    assert line.order("B").order.kind is RunKind.RECHECK, "also where nothing is heard of it"
+
+
+def test_green_goes_when_it_may_be_another_unit(line: LineBench) -> None:
+    line.make("A", SERIAL)
+    line.fall_silent("A")
+    assert line.state("A") is SocketState.PASS, "it may sleep"
+    line.arrive("A", "")
+    assert line.state("A") is SocketState.SCAN
+    assert line.text("A").startswith(f"After PASS of {SERIAL} nothing was heard.")
+
+
+def test_a_socket_out_of_service_is_that(line: LineBench) -> None:
+    line.say("A", AdapterDown("no such device"))
+    line.scan(SERIAL)
+    assert line.last(OperatorPrompted).text == f"Put {SERIAL} into socket B."
+    line.scan("CANCEL")
+    line.say("B", AdapterDown("no such device"))
+    line.scan(SERIAL)
+    assert line.last(ScanRefused).code == "SOCKET_BROKEN"
+
+
+def test_what_a_person_does_is_audited(line: LineBench, bench: Bench) -> None:
+    for text in ("OPERATOR Kim", "REASON reworked", "HELLO"):
+        line.scan(text)
+    with sqlite3.connect(bench.path) as other:
+        rows = other.execute("SELECT event, data FROM audit ORDER BY id").fetchall()
+    events = [row[0] for row in rows]
+    assert events[-3:] == ["operator", "reason", "refused scan"]
+    assert "WRONG_SERIAL" in rows[-1][1]
+
+
+def test_events_carry_the_time_in_utc(line: LineBench) -> None:
+    assert {event.at for event in line.events} == {"2026-05-17T09:00:00.000Z"}
 
 
 def test_a_socket_may_be_chosen_first(line: LineBench) -> None:
@@ -454,6 +614,7 @@ def test_a_process_that_hangs_is_ended_and_started_again(line: LineBench) -> Non
     line.say("A", Ready("a bus", sees_units=True))
     line.arrive("A")
     line.scan(SERIAL)
+    line.scan("SOCKET A")
     assert line.order("A").order.kind is RunKind.RECHECK
 
 
@@ -591,6 +752,8 @@ def test_what_must_not_change_is_held_over_a_fail_but_not_for_a_reworked_unit(
         line.scan(SERIAL)
         if model == "BM36":
             line.arrive("A")
+        else:
+            line.scan("SOCKET A")
         known = dict(line.order("A").order.known_before)
         read = (Measurement("before bms model", text=model),)
         report = StepReport(StepName.CHECK, "", 1, StepState.PASS, 1.0, measurements=read)

@@ -1,0 +1,144 @@
+"""Ten thousand steps of a line with units that sleep, processes that die and a careless operator;
+and the same steps with faults put into the line, each of which they have to find.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from flasher.station import line, placing
+from flasher.station.events import SocketChanged
+from flasher.station.line import Line
+from flasher.station.messages import PresenceChanged
+from flasher.station.records.model import RunState
+from flasher.station.socket import Phase, Seen, Socket, Why
+from tests.station.line_world import Walk, World
+
+STEPS = 100
+Plant = Callable[[pytest.MonkeyPatch], None]
+
+
+def walks(sockets: tuple[str, ...], steps: int) -> Counter[str]:
+    """Walk; what was seen. Raises AssertionError with the way to what must not be."""
+    seen: Counter[str] = Counter()
+    for seed in range(steps // STEPS):
+        world = World(seed, sockets)
+        try:
+            Walk(world).go(STEPS)
+        except AssertionError as error:
+            story = "\n".join(world.story[-40:])
+            raise AssertionError(f"seed {seed}: {error}\n{story}") from error
+        seen += world.seen
+    return seen
+
+
+@pytest.mark.parametrize("sockets", [("A",), ("A", "B", "C")])
+def test_no_label_runs_on_another_unit_and_nobody_is_stuck(sockets: tuple[str, ...]) -> None:
+    seen = walks(sockets, 10_000)
+    assert seen["run"] > 1000
+    if len(sockets) > 1:
+        ways = ("named", "card", "said by the unit")
+        assert all(seen[way] > 20 for way in ways), seen
+
+
+# -- faults that the steps have to find -----------------------------------------------------------
+
+
+def handle(
+    patch: pytest.MonkeyPatch, phase: Phase, what: type, handler: Callable[..., None]
+) -> None:
+    """Put another handler into the line's table."""
+    patch.setitem(Line._TABLE, phase, {**Line._TABLE[phase], what: handler})
+
+
+def bind_to_the_first_arrival(patch: pytest.MonkeyPatch) -> None:
+    def arrived(self: Line, socket: Socket) -> None:
+        if self._label:
+            serial, self._label = self._label, ""
+            self._bind(socket, serial, Why.SAID, 0.0)
+
+    patch.setattr(Line, "_arrived_elsewhere", arrived)
+
+
+def forget_a_removal(patch: pytest.MonkeyPatch) -> None:
+    def unit(self: Line, socket: Socket, what: PresenceChanged, now: float) -> None:
+        if what.is_there:
+            Line._unit(self, socket, what, now)
+
+    handle(patch, Phase.REST, PresenceChanged, unit)
+
+
+def show_pass_before_it_is_saved(patch: pytest.MonkeyPatch) -> None:
+    def ended(self: Line, socket: Socket, what: Any, now: float) -> None:
+        Line._ended(self, socket, what, now)
+        Line._saved(self, socket, line.Saved(RunState.PASS, ""), now)
+        socket.shown = socket.view(None, is_only=False)
+        self._tell(SocketChanged(socket.name, *socket.shown))
+        socket.phase = Phase.SAVE
+
+    handle(patch, Phase.RUN, line.Ended, ended)
+
+
+def take_silence_for_an_empty_socket(patch: pytest.MonkeyPatch) -> None:
+    real = Socket.fall_silent
+    patch.setattr(Socket, "fall_silent", lambda self, **_: real(self, is_certain=True))
+
+
+def name_a_socket_of_which_nothing_is_known(patch: pytest.MonkeyPatch) -> None:
+    def place(sockets: placing.Sockets, serial: str) -> tuple[Socket, Why] | None:
+        try:
+            found = placing.place(sockets, serial)
+        except placing.Refused:
+            found = None
+        free = (e for e in sockets.values() if e.can_work and e.phase is Phase.REST)
+        unknown = next((e for e in free if e.seen is not Seen.THERE and not e.label), None)
+        return found or (None if unknown is None else (unknown, Why.NAMED))
+
+    patch.setattr(line, "place", place)
+
+
+def take_who_wakes_for_the_unit_that_passed(patch: pytest.MonkeyPatch) -> None:
+    real = Socket._is_new
+
+    def is_new(self: Socket, before: Seen) -> bool:
+        was_there = self.is_last_there
+        found = real(self, before)
+        self.is_last_there = was_there or self.is_last_there
+        return found
+
+    patch.setattr(Socket, "_is_new", is_new)
+
+
+def keep_a_label_over_the_death_of_its_process(patch: pytest.MonkeyPatch) -> None:
+    def drop(self: Line, socket: Socket, *_: object) -> None:
+        if self.stopped is not None:
+            socket.label = ""
+
+    patch.setattr(Line, "_drop_label", drop)
+
+
+def never_resume(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Line, "resumed", lambda *_, **__: None)
+
+
+@pytest.mark.parametrize(
+    "plant",
+    [
+        bind_to_the_first_arrival,
+        forget_a_removal,
+        show_pass_before_it_is_saved,
+        take_silence_for_an_empty_socket,
+        name_a_socket_of_which_nothing_is_known,
+        take_who_wakes_for_the_unit_that_passed,
+        keep_a_label_over_the_death_of_its_process,
+        never_resume,
+    ],
+)
+def test_a_fault_in_the_line_is_found(plant: Plant, monkeypatch: pytest.MonkeyPatch) -> None:
+    plant(monkeypatch)
+    with pytest.raises((AssertionError, KeyError)):
+        walks(("A", "B", "C"), 50_000)
