@@ -46,6 +46,8 @@ class Row:
     """Of the last run here, while its unit is in the socket and did not pass."""
     is_virtual: bool = False
     """Its units are virtual: no product comes out of it."""
+    borne: str = ""
+    """The label that the virtual unit in it bears: what a trainee has to type."""
 
 
 @dataclass
@@ -97,9 +99,11 @@ class Board:
                 self.is_refusal = False
             case UnitArrived(socket, _, label):
                 self.labels[socket] = label
+                self.rows[socket].borne = printable(label)
                 self.arrivals += 1
             case UnitRemoved(socket):
                 self.labels.pop(socket, None)
+                self.rows[socket].borne = ""
             case WorkerFailed(socket, reason, restart_in_s):
                 if restart_in_s is None:
                     self.broken[socket] = reason
@@ -128,8 +132,6 @@ class Board:
         match event:
             case SocketChanged(_, state, serial, text):
                 row.state, row.serial, row.note = state, printable(serial), printable(text)
-                if state is SocketState.SCAN and not serial and self.labels.get(event.socket):
-                    row.note += f" It says {printable(self.labels[event.socket])}."
                 if state not in (SocketState.RUNNING, SocketState.SAVING):
                     row.step, row.share, row.left_s = "", None, None
                 if not state.is_verdict:

@@ -15,7 +15,7 @@ from rich.text import Text
 from flasher.cli.station_board import Board, Row
 from flasher.cli.station_text import figures_line
 from flasher.protocol.text import printable
-from flasher.station.events import SocketState
+from flasher.station.events import LineStopped, SocketState
 
 WIDE: Final = 140
 """From this width on, what to do stands in the row; else below it."""
@@ -124,7 +124,7 @@ def _row(row: Row, width: int, *, is_wide: bool, in_row: bool) -> Text:
     cells = [
         _cell(row.socket, socket),
         _cell(f" {row.state.value} ", _STATE_WIDTH, _STYLES[row.state]),
-        _cell(row.serial, serial),
+        _cell(row.serial or row.borne, serial, "" if row.serial else "italic"),
         _cell(doing, step, "bold" if row.code else ""),
         Text(f"{percent:>{_PERCENT_WIDTH}}"),
         Text(f"{left:>{_LEFT_WIDTH}}"),
@@ -149,9 +149,9 @@ def _foot(board: Board, typed: str | None, width: int, height: int) -> list[Text
     else:
         lines += [Text("no unit yet"), Text()]
     if board.stopped is not None:
-        stop = board.stopped
-        text = f" LINE STOPPED  {stop.code}: {stop.reason} {stop.remedy} Then scan RESUME. "
-        lines.append(Text(printable(text), style="bold white on red"))
+        room = max(2, height // 4)
+        for text in _stopped_lines(board.stopped, width - 2, room):
+            lines.append(Text(f" {text:<{width - 2}} ", style="bold white on red"))
     said_lines = _SAID_LINES if height >= _HIGH else 1
     said = textwrap.wrap(board.said, width)[:said_lines]
     said += [""] * (said_lines - len(said))
@@ -160,6 +160,18 @@ def _foot(board: Board, typed: str | None, width: int, height: int) -> list[Text
         lines.append(Text(f"scan> {printable(typed)}_"))
     lines.append(Text(_KEYS, style="dim"))
     return [_cut(line, width) for line in lines]
+
+
+def _stopped_lines(stop: LineStopped, width: int, room: int) -> list[str]:
+    """Why the line stands and what to do; where there is no room for all, what to do is kept."""
+    remedy = printable(f"{stop.remedy} Then scan RESUME.")
+    reason = printable(f"LINE STOPPED  {stop.code}: {stop.reason}")
+    lines = textwrap.wrap(f"{reason} {remedy}", width)
+    if len(lines) <= room:
+        return lines
+    ends = textwrap.wrap(remedy, width)
+    begins = textwrap.wrap(reason, width, max_lines=max(room - len(ends), 1), placeholder=" ...")
+    return [*begins, *ends]
 
 
 def _cell(text: str, width: int, style: str = "") -> Text:

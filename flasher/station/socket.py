@@ -183,6 +183,8 @@ class Socket:
         is_out = is_certain or self.is_own_known or before is Seen.EMPTY
         self.seen = Seen.EMPTY if is_out else Seen.SILENT
         self.own, self.is_own_known, self.borne = None, False, ""
+        if is_certain:
+            self.last = None
         return before is Seen.THERE
 
     def let_go(self) -> str:

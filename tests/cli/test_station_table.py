@@ -200,9 +200,19 @@ def test_what_to_do_with_a_label_stands_behind_it() -> None:
 
 def test_the_label_of_a_virtual_unit_is_shown_to_be_typed() -> None:
     board = board_of(
-        UnitArrived("1", "it came", "W7"), SocketChanged("1", SocketState.SCAN, "", "Scan it.")
+        UnitArrived("1", "it came", "W7"),
+        SocketChanged("1", SocketState.SCAN, "", "Scan it."),
+        sockets=64,
     )
-    assert board.rows["1"].note == "Scan it. It says W7."
+    for height in (12, 60):  # also where there is no room for what to do
+        assert any("W7" in line for line in drawn(board, width=60, height=height))
+
+
+def test_what_to_do_for_a_stopped_line_is_never_cut_off() -> None:
+    stop = LineStopped("RECORD_NOT_SAVED", "The disk is full, " * 20, "Make room on this disk.")
+    for width in (40, 80):
+        text = " ".join(" ".join(drawn(board_of(stop), width=width, height=24)).split())
+        assert "Make room on this disk. Then scan RESUME." in text
 
 
 def test_a_socket_that_is_not_started_again_is_broken() -> None:

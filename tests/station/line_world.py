@@ -512,7 +512,7 @@ class Walk:
             self.end: 6,
             self.insert: 2,
             self.remove: 3,
-            self.sleep: 2,
+            self.sleep: 4,
             self.stray_scan: 2,
             self.lose_process: 1,
             self.break_disk: 1,

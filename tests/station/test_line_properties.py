@@ -85,7 +85,13 @@ def show_pass_before_it_is_saved(patch: pytest.MonkeyPatch) -> None:
 
 def take_silence_for_an_empty_socket(patch: pytest.MonkeyPatch) -> None:
     real = Socket.fall_silent
-    patch.setattr(Socket, "fall_silent", lambda self, **_: real(self, is_certain=True))
+
+    def fall_silent(self: Socket, *, is_certain: bool) -> bool:
+        was_there = real(self, is_certain=is_certain)
+        self.seen = Seen.EMPTY
+        return was_there
+
+    patch.setattr(Socket, "fall_silent", fall_silent)
 
 
 def name_a_socket_of_which_nothing_is_known(patch: pytest.MonkeyPatch) -> None:
