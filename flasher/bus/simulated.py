@@ -33,22 +33,30 @@ DEFAULT_QUEUE_FRAMES = 32
 
 
 class _Node:
-    """Somebody on the bus: what it has to send, and who hears for it."""
+    """Somebody on the bus: what it has to send."""
 
-    def __init__(
-        self, engine: Engine | None = None, on_event: Callable[[object], None] | None = None
-    ) -> None:
-        self.engine = engine
-        self.on_event = on_event
+    def __init__(self) -> None:
         self.outbox: deque[tuple[float, Frame]] = deque()
         """Frames to send, with the time at which each was queued."""
+
+
+class _Host(_Node):
+    """Driven from outside, through a link."""
+
+    def __init__(self) -> None:
+        super().__init__()
         self.inbox: deque[Frame] = deque()
 
-    def hear(self, frame: Frame, now: float) -> None:
-        if self.engine is None:
-            self.inbox.append(frame)
-        else:
-            self.engine.receive(frame, now)
+
+class _Device(_Node):
+    """An engine, driven by the bus."""
+
+    def __init__(self, engine: Engine, on_event: Callable[[object], None] | None) -> None:
+        super().__init__()
+        self.engine = engine
+        self.on_event = on_event
+        self.deadline: float | None = None
+        """The engine's, since it was served."""
 
 
 class SimulatedBus:
@@ -64,6 +72,9 @@ class SimulatedBus:
         self._bitrate_bps = bitrate_bps
         self._disturbance = disturbance
         self._nodes: list[_Node] = []
+        """All hosts and devices, in the order in which they came."""
+        self._hosts: list[_Host] = []
+        self._devices: list[_Device] = []
         self._sending: tuple[_Node, Frame] | None = None
         self._sending_ends_at = 0.0
         self.faults = AdapterFaults()
@@ -102,73 +113,78 @@ class SimulatedBus:
 
     def attach(self, engine: Engine, on_event: Callable[[object], None] | None = None) -> None:
         """Put a device on the bus; `on_event` is told what it reports."""
-        self._nodes.append(_Node(engine, on_event))
+        device = _Device(engine, on_event)
+        self._nodes.append(device)
+        self._devices.append(device)
 
     def link(self, queue_frames: int = DEFAULT_QUEUE_FRAMES) -> SimulatedLink:
         """A way onto the bus for somebody who drives it from outside."""
-        node = _Node()
-        self._nodes.append(node)
-        return SimulatedLink(self, node, queue_frames)
+        host = _Host()
+        self._nodes.append(host)
+        self._hosts.append(host)
+        return SimulatedLink(self, host, queue_frames)
 
     def advance(self, limit: float) -> None:
         """Let time pass up to the next thing that happens, `limit` at the latest."""
-        now = self.clock.now()
-        self._report_faults(now)
-        self._serve_engines(now)
+        self._report_faults()
+        self._serve_devices(self.clock.now())
         self._arbitrate()
         moment = limit
-        if (due := self.faults.deadline()) is not None:
-            moment = min(moment, due)
-        if self._sending is not None:
-            moment = min(moment, self._sending_ends_at)
-        for node in self._nodes:
-            wanted = node.engine.deadline() if node.engine and not node.outbox else None
-            if wanted is not None:
-                moment = min(moment, wanted)
+        if (due := self.faults.deadline()) is not None and due < moment:
+            moment = due
+        if self._sending is not None and self._sending_ends_at < moment:
+            moment = self._sending_ends_at
+        for device in self._devices:
+            wanted = device.deadline
+            if wanted is not None and wanted < moment and not device.outbox:
+                moment = wanted
         self.clock.wait_until(moment)
         if self._sending is not None and self._sending_ends_at <= moment:
-            self._deliver()
-        self._report_faults(self.clock.now())
+            self._deliver(*self._sending)
+        self._report_faults()
 
-    def _report_faults(self, now: float) -> None:
-        for report in self.faults.tick(now):
-            for node in self._nodes:
-                if node.engine is None:
-                    node.inbox.append(report)
+    def _report_faults(self) -> None:
+        due, now = self.faults.deadline(), self.clock.now()
+        if due is not None and due <= now:
+            for report in self.faults.tick(now):
+                for host in self._hosts:
+                    host.inbox.append(report)
 
     def _silence_hosts(self) -> None:
-        """What the host had queued, or was sending, is gone."""
-        for node in self._nodes:
-            if node.engine is None:
-                node.outbox.clear()
-        if self._sending is not None and self._sending[0].engine is None:
+        """What the hosts had queued, or were sending, is gone."""
+        for host in self._hosts:
+            host.outbox.clear()
+        if self._sending is not None and self._sending[0] in self._hosts:
             self._sending = None
 
-    def _serve_engines(self, now: float) -> None:
+    def _serve_devices(self, now: float) -> None:
         """Let every device do what it wants to do now: one frame each waits for the wire."""
-        for node in self._nodes:
-            engine = node.engine
-            if engine is None:
-                continue
-            wanted = engine.deadline()
-            if wanted is not None and wanted <= now:
+        anything_happened = False
+        for device in self._devices:
+            engine = device.engine
+            device.deadline = engine.deadline()
+            if device.deadline is not None and device.deadline <= now:
+                anything_happened = True
                 engine.tick(now)
-            if not node.outbox:
-                frame = engine.next_frame(now)
-                if frame is not None:
-                    node.outbox.append((now, frame))
-                    engine.frame_sent(now)
+            if not device.outbox and (frame := engine.next_frame(now)) is not None:
+                anything_happened = True
+                device.outbox.append((now, frame))
+                engine.frame_sent(now)
             for event in engine.take_events():
-                if node.on_event is not None:
-                    node.on_event(event)
+                anything_happened = True
+                if device.on_event is not None:
+                    device.on_event(event)
+        if anything_happened:
+            for device in self._devices:
+                device.deadline = device.engine.deadline()
 
     def _arbitrate(self) -> None:
         if self._sending is not None:
             return
         waiting = [node for node in self._nodes if node.outbox]
-        if not self.faults.takes_part:
-            self._try_in_vain([node for node in waiting if node.engine is None])
-            waiting = [node for node in waiting if node.engine is not None]
+        if waiting and not self.faults.takes_part:
+            self._try_in_vain(host for host in self._hosts if host.outbox)
+            waiting = [device for device in self._devices if device.outbox]
         if not waiting:
             return
         winner = min(waiting, key=lambda node: node.outbox[0][1].can_id)
@@ -181,32 +197,33 @@ class SimulatedBus:
         self._sending_ends_at = begins_at + duration_s
         self.busy_s += duration_s
 
-    def _try_in_vain(self, hosts: Iterable[_Node]) -> None:
-        for node in hosts:
-            queued_at, frame = node.outbox[0]
+    def _try_in_vain(self, hosts: Iterable[_Host]) -> None:
+        for host in hosts:
+            queued_at, frame = host.outbox[0]
             duration_s = frame_bits(frame) / self._bitrate_bps
             self.faults.try_in_vain(queued_at, duration_s, 1 / self._bitrate_bps)
 
-    def _deliver(self) -> None:
-        if self._sending is None:
-            return
-        sender, frame = self._sending
+    def _deliver(self, sender: _Node, frame: Frame) -> None:
         self._sending = None
         self.frames_carried += 1
         ends_at = self._sending_ends_at
         frames = self._disturbance(frame, ends_at) if self._disturbance else (frame,)
         for carried in frames:
-            for node in self._nodes:
-                if node is not sender and (node.engine or self.faults.takes_part):
-                    node.hear(carried, self.clock.now())
+            now = self.clock.now()
+            for device in self._devices:
+                if device is not sender:
+                    device.engine.receive(carried, now)
+            for host in self._hosts:
+                if host is not sender and self.faults.takes_part:
+                    host.inbox.append(carried)
 
 
 class SimulatedLink:
     """The host's adapter on a simulated bus."""
 
-    def __init__(self, bus: SimulatedBus, node: _Node, queue_frames: int) -> None:
+    def __init__(self, bus: SimulatedBus, host: _Host, queue_frames: int) -> None:
         self._bus = bus
-        self._node = node
+        self._host = host
         self._queue_frames = queue_frames
         self._health = HealthKeeper(Layout.SOCKETCAN)
         self._opened_at = bus.faults.times_unplugged
@@ -220,7 +237,7 @@ class SimulatedLink:
         clock = self._bus.clock
         give_up_at = clock.now() + SEND_LIMIT_S
         self._check("sending")
-        while len(self._node.outbox) >= self._queue_frames:
+        while len(self._host.outbox) >= self._queue_frames:
             if clock.now() >= give_up_at:
                 self._health.is_blocked = True
                 raise TransmitBlockedError(
@@ -233,11 +250,11 @@ class SimulatedLink:
             self._check("sending")
         self._health.sent += 1
         if not self._bus.faults.is_off:  # as drivers do until they have reported it
-            self._node.outbox.append((clock.now(), frame))
+            self._host.outbox.append((clock.now(), frame))
 
     def receive(self, deadline: float) -> Frame | None:
         """Let time pass until a frame arrives or the deadline comes."""
-        inbox = self._node.inbox
+        inbox = self._host.inbox
         self._check_plugged("receiving")
         while not inbox:
             if self._bus.clock.now() >= deadline:
@@ -250,10 +267,10 @@ class SimulatedLink:
 
     def drain(self) -> int:
         """Forget what has arrived, but not what the adapter reported."""
-        count = len(self._node.inbox)
-        for frame in self._node.inbox:
+        count = len(self._host.inbox)
+        for frame in self._host.inbox:
             self._health.hear(frame)
-        self._node.inbox.clear()
+        self._host.inbox.clear()
         return count
 
     def close(self) -> None:
@@ -273,8 +290,8 @@ class SimulatedLink:
         if faults.is_off:
             raise bus_off_error(str(self))
         self._opened_at = faults.times_unplugged
-        self._node.inbox.clear()
-        self._node.outbox.clear()
+        self._host.inbox.clear()
+        self._host.outbox.clear()
         self._health.reset()
 
     def health(self) -> LinkHealth:

@@ -85,17 +85,17 @@ class AdapterFaults:
 
     def deadline(self) -> float | None:
         """When something is to happen next."""
+        if self._back_at is None and not self._reports:
+            return None
         times = [at for at, _ in self._reports]
         if self._back_at is not None:
             times.append(self._back_at)
-        return min(times, default=None)
+        return min(times)
 
     def tick(self, now: float) -> list[Frame]:
         """Come back when it is time; the error frames that the adapter reports now."""
         if self._back_at is not None and self._back_at <= now:
             self.come_back(now)
-        if not self._reports:
-            return []
         due = [frame for at, frame in self._reports if at <= now]
         self._reports = [(at, frame) for at, frame in self._reports if at > now]
         return due

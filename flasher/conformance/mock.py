@@ -114,12 +114,12 @@ class MockPort:
     def receive(self, deadline: float) -> Arrival | None:
         """Let time pass until there is a frame or `deadline` has come. Raises as `send`."""
         heard = self._witness.heard
-        while not heard:
-            if self.now() >= deadline:
-                return None
-            with _crashes():
+        with _crashes():
+            while not heard:
+                if self.now() >= deadline:
+                    return None
                 self._bus.advance(deadline)
-            self._look_at_adapter()
+                self._look_at_adapter()
         frame, at = heard.popleft()
         is_echo = bool(self._pending) and frame is self._pending[0]
         if is_echo:

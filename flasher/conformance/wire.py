@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 import struct
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 READ: Final = 0x11
@@ -74,6 +75,7 @@ def crc(covered: bytes) -> int:
     return register
 
 
+@lru_cache(maxsize=4096)  # the same images are sent again and again
 def message_crc(can_id: int, body: bytes) -> bytes:
     """The CRC field of a message; `body` is mode to last data byte."""
     return struct.pack(">I", crc(b"\x55\xaa" + struct.pack(">H", can_id) + body))

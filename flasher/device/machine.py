@@ -49,6 +49,8 @@ class Machine(ABC):
             can_id: self.reassembler_type(can_id, timings.inter_frame_timeout_s)
             for can_id in sorted(own_ids | application.hears)
         }
+        self._half_received: dict[int, Reassembler] = {}
+        """Those of them that may hold a part of a message."""
         self._transmitter = Transmitter(bitrate_bps)
         self._events: list[object] = []
         self._due: float | None = None
@@ -75,7 +77,12 @@ class Machine(ABC):
         reassembler = self._reassemblers.get(frame.can_id)
         if reassembler is None or not frame.is_payload:
             return
-        for found in reassembler.feed(frame.data, now):
+        completed = reassembler.feed(frame.data, now)
+        if reassembler.deadline() is None:
+            self._half_received.pop(frame.can_id, None)
+        else:
+            self._half_received[frame.can_id] = reassembler
+        for found in completed:
             self._take(found, now)
 
     def tick(self, now: float) -> None:
@@ -95,7 +102,7 @@ class Machine(ABC):
         wanted = self._transmitter.deadline()
         if self._is_cancelled:
             return wanted
-        others = [reassembler.deadline() for reassembler in self._reassemblers.values()]
+        others = [reassembler.deadline() for reassembler in self._half_received.values()]
         others += (self._due, self._off_bus_until)
         if self._runs_application:
             others.append(self.application.deadline())
@@ -120,6 +127,8 @@ class Machine(ABC):
 
     def take_events(self) -> Sequence[object]:
         """What happened since the last call."""
+        if not self._events:
+            return ()
         events, self._events = self._events, []
         return events
 

@@ -11,7 +11,7 @@ import difflib
 import math
 import types
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from flasher.errors import UsageError
@@ -144,9 +144,8 @@ class DeviceProfile:
         return frozenset(map(_parse_query, self.silent_queries.split(",")))
 
     def __post_init__(self) -> None:
-        hints = get_type_hints(type(self))
-        for field in dataclasses.fields(self):
-            _check(field.name, hints[field.name], getattr(self, field.name))
+        for key, hint in _hints().items():
+            _check(key, hint, getattr(self, key))
         self._check_sizes()
         for key in ("model", "serial_number", "hardware_version", "factory_version"):
             try:
@@ -178,7 +177,7 @@ def set_option(profile: DeviceProfile, key: str, text: str) -> DeviceProfile:
     Whole numbers take 0x and the suffixes K and M. Raises UsageError, naming what is known, for
     an unknown key and for a value that is not allowed.
     """
-    hints = get_type_hints(DeviceProfile)
+    hints = _hints()
     if key not in hints:
         raise UsageError(
             f"the device model has no option {key!a}",
@@ -191,7 +190,7 @@ def set_option(profile: DeviceProfile, key: str, text: str) -> DeviceProfile:
 
 def describe_options() -> list[tuple[str, str, str]]:
     """All options as (key, allowed values with the default first, one line of help)."""
-    hints = get_type_hints(DeviceProfile)
+    hints = _hints()
     return [
         (field.name, _describe_values(hints[field.name], field.default), field.metadata[_HELP])
         for field in dataclasses.fields(DeviceProfile)
@@ -199,6 +198,12 @@ def describe_options() -> list[tuple[str, str, str]]:
 
 
 # -- values ---------------------------------------------------------------------------------------
+
+
+@cache  # evaluating them takes longer than all that is checked by them
+def _hints() -> dict[str, Any]:
+    """The types of all options."""
+    return get_type_hints(DeviceProfile)
 
 
 def _is_choice(hint: object) -> bool:

@@ -13,7 +13,7 @@ columns are combined as big integers, so that the C library does the work for a 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from functools import cache
+from functools import cache, lru_cache
 from typing import Final
 
 from flasher.protocol.frame import Frame
@@ -85,6 +85,7 @@ def fixed_bits(size: int) -> int:
     return _HEAD_BITS + 8 * size + _CRC_BITS + _UNSTUFFED_TAIL_BITS
 
 
+@lru_cache(maxsize=4096)  # a repeated message, an image that is sent again and again
 def frame_bits(frame: Frame) -> int:
     """Bit times of one frame, interframe space included."""
     can_id, data = frame[0], frame[1]
