@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Final
 
 from flasher.bus.link import VirtualClock
@@ -108,13 +108,13 @@ class MockPort:
         """Queue a frame. Raises BusError for an adapter in trouble, DeviceCrashed."""
         made = Frame(*frame)
         self._pending.append(made)
-        with _crashes():
+        with _CRASHES:
             self._link.send(made)
 
     def receive(self, deadline: float) -> Arrival | None:
         """Let time pass until there is a frame or `deadline` has come. Raises as `send`."""
         heard = self._witness.heard
-        with _crashes():
+        with _CRASHES:
             while not heard:
                 if self.now() >= deadline:
                     return None
@@ -140,15 +140,15 @@ class MockPort:
                 self._witness.heard.append((frame, self.now()))
 
 
-@contextmanager
-def _crashes() -> Iterator[None]:
+class _Crashes(AbstractContextManager[None]):
     """A device model that raises has done what a real part does not allow."""
-    try:
-        yield
-    except BusError:
-        raise
-    except FlasherError as error:
-        raise DeviceCrashed(f"the device stopped: {error.what}") from error
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        if isinstance(error, FlasherError) and not isinstance(error, BusError):
+            raise DeviceCrashed(f"the device stopped: {error.what}") from error
+
+
+_CRASHES: Final = _Crashes()
 
 
 class MockSubject:
@@ -187,7 +187,7 @@ class MockSubject:
 
     def power(self, *, on: bool) -> None:
         """Switch the device on or off now. Raises DeviceCrashed."""
-        with _crashes():
+        with _CRASHES:
             if on:
                 self.device.power_on(self.port.now())
             else:

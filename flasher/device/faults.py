@@ -127,8 +127,11 @@ class FaultInjector:
 
     def deadline(self) -> float | None:
         """When the device or a fault next wants `tick`."""
-        wanted = (self.device.deadline(), self._due, self._power_due)
-        return min((moment for moment in wanted if moment is not None), default=None)
+        wanted = self.device.deadline()
+        for moment in (self._due, self._power_due):
+            if moment is not None and (wanted is None or moment < wanted):
+                wanted = moment
+        return wanted
 
     def next_frame(self, now: float) -> Frame | None:
         """The next frame to send."""
