@@ -2,7 +2,8 @@
 
     python -m tests.benchmarks.simulated_upgrades [--upgrades N]
 
-Each upgrade is whole (reset to complete, an image of 2 KiB), on a bus, a device and a clock of its own.
+Each upgrade is whole (reset to complete, an image of 2 KiB), with a bus, a device and a clock of
+its own.
 The clock is virtual, so nothing waits. CPU time is counted, not the time of day.
 """
 
