@@ -47,6 +47,7 @@ from tests.cli.station_threads import ThreadPort
 from tests.cli.test_schema import hold
 from tests.cli.test_schema import sample as sample_of
 from tests.cli.test_station import FAST, WRITE
+from tests.loops import each
 from tests.schema_document import SCHEMA
 from tests.station.factory import USUAL, write_recipe
 
@@ -154,9 +155,9 @@ def test_what_is_shown_comes_escaped_and_is_no_markup() -> None:
     assert "Battery [b]" in text
 
 
-@pytest.mark.parametrize("width", [40, 60, 80, 120, 200])
-@pytest.mark.parametrize("height", [12, 24, 60])
-@pytest.mark.parametrize("sockets", [1, 4, 16, 64])
+@each("width", [40, 60, 80, 120, 200])
+@each("height", [12, 24, 60])
+@each("sockets", [1, 4, 16, 64])
 def test_it_never_exceeds_the_window(width: int, height: int, sockets: int) -> None:
     board = board_of(*ended(serial="W" * 64), FiguresChanged(FIGURES), sockets=sockets)
     board.apply(LineStopped("X", "Y " * 80, "Z"))

@@ -6,10 +6,9 @@ import ast
 from functools import cache
 from pathlib import Path
 
-import pytest
-
 from flasher.conformance.cases.elsewhere import HOST_CASES, NOT_IMPLEMENTED
 from flasher.conformance.model import CASES
+from tests.loops import each
 
 from .host_rows import HOST_ROWS
 
@@ -49,7 +48,7 @@ def functions(path: Path) -> frozenset[str]:
     )
 
 
-@pytest.mark.parametrize("row", HOST_ROWS)
+@each("row", HOST_ROWS)
 def test_the_tests_of_a_row_exist(row: str) -> None:
     assert HOST_ROWS[row]
     for node in HOST_ROWS[row]:

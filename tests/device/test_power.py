@@ -14,6 +14,7 @@ from flasher.protocol import messages
 from flasher.protocol.frame import Frame
 from flasher.protocol.wire import split
 from tests.device.bench import READ_VERSION, SMALL, Bench, image_of, packets_of
+from tests.loops import each
 
 OLD = image_of(700, "V1r5r0_20250101", seed=3)
 NEW = image_of(600)
@@ -99,9 +100,9 @@ def cut_at(bench: Bench, operation: int, share: float) -> None:
     cycle_power(bench)
 
 
-@pytest.mark.parametrize("profile", PROFILES.values(), ids=PROFILES)
-@pytest.mark.parametrize("moment", MOMENTS)
-@pytest.mark.parametrize("operation", range(OPERATIONS))
+@each("profile", PROFILES.values())
+@each("moment", MOMENTS)
+@each("operation", range(OPERATIONS))
 def test_a_power_cut_at_any_flash_operation_never_leaves_a_mixture_that_boots(
     operation: int, moment: str, profile: DeviceProfile
 ) -> None:
@@ -122,9 +123,9 @@ def test_a_power_cut_at_any_flash_operation_never_leaves_a_mixture_that_boots(
     assert bench.device.stored_image == NEW
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
-@pytest.mark.parametrize("second", range(0, OPERATIONS, 3))
-@pytest.mark.parametrize("first", range(1, OPERATIONS, 4))
+@each("share", [0.0, 0.3, 0.7])
+@each("second", range(0, OPERATIONS, 3))
+@each("first", range(1, OPERATIONS, 4))
 def test_a_second_power_cut_during_the_rescue_is_no_worse(
     first: int, second: int, share: float
 ) -> None:
@@ -146,7 +147,7 @@ def test_the_upgrade_is_as_many_frames_as_the_cuts_below_go_through() -> None:
     assert len(upgrade_frames(bench_with_old())) == ALL_FRAMES
 
 
-@pytest.mark.parametrize("heard", range(ALL_FRAMES + 1))
+@each("heard", range(ALL_FRAMES + 1))
 def test_a_power_cut_at_any_received_frame_leaves_the_old_application_or_none(heard: int) -> None:
     """PW-01. The cut comes 1 ms after the frame: the flash is at work when that frame was the last
     one of a message.

@@ -13,6 +13,7 @@ from flasher.device.profile import DeviceProfile, describe_options, set_option
 from flasher.device.table import State
 from flasher.protocol.spec import BMS, TARGETS, WELLING, Target
 from tests.device.bench import image_of
+from tests.loops import each
 from tests.peers.dialogue import strays
 from tests.peers.scripted_host import HostScript, ScriptedHost
 from tests.peers.virtual_wire import run
@@ -45,9 +46,7 @@ def test_a_plain_upgrade_of_every_target_completes(target: Target) -> None:
     assert_upgraded(*upgrade(target=target))
 
 
-@pytest.mark.parametrize(
-    ("key", "value"), [choice for choice in CHOICES if choice != ("image_checksum", "crc32")]
-)
+@each("key, value", [choice for choice in CHOICES if choice != ("image_checksum", "crc32")])
 def test_a_plain_upgrade_completes_with_every_choice_of_the_profile(key: str, value: str) -> None:
     assert_upgraded(*upgrade(profile=set_option(DeviceProfile(), key, value)))
 

@@ -21,6 +21,7 @@ from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Target
 from tests.device.bench import image_of
 from tests.device.tool import REQUEST_ID, Tool, packet_wire, update_wire
 from tests.end_to_end import world
+from tests.loops import each
 from tests.peers.wording import READ, REPORT, build, crc, payloads
 
 PROFILE = DeviceProfile(application_area_bytes=64 * 1024)
@@ -481,14 +482,14 @@ def make_right(variant: Variant) -> Device:
     return Device(BMS, bitrate_bps=WELLING.bitrate_bps, profile=profile)
 
 
-@pytest.mark.parametrize("name", ACTS)
+@each("name", ACTS)
 def test_a_variant_does_wrong_what_the_right_device_does_right(name: str) -> None:
     act, right, wrong = ACTS[name]
     assert act(Tool(make_right(VARIANTS[name]))) == right
     assert act(Tool(make_wrong(name))) == wrong
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+@each("name", VARIANTS)
 def test_apart_from_its_fault_a_variant_can_be_upgraded(name: str) -> None:
     body = image_of(1100)
     image = body + zlib.crc32(body).to_bytes(4, "little")
@@ -502,7 +503,7 @@ def test_every_case_about_a_bootloader_has_a_variant_that_fails_it() -> None:
     assert sorted({variant.clause for variant in VARIANTS.values()}) == sorted(DEVICE_CASES)
 
 
-@pytest.mark.parametrize("name", VARIANTS)
+@each("name", VARIANTS)
 def test_a_variant_is_described_in_one_line_and_names_cases_that_exist(name: str) -> None:
     variant = VARIANTS[name]
     assert variant.name == name
@@ -511,8 +512,8 @@ def test_a_variant_is_described_in_one_line_and_names_cases_that_exist(name: str
     assert "\n" not in variant.summary
 
 
-@pytest.mark.parametrize("target", [WMC, OBC], ids=["wmc", "obc"])
-@pytest.mark.parametrize("name", VARIANTS)
+@each("target", [WMC, OBC])
+@each("name", VARIANTS)
 def test_a_variant_is_made_for_every_target_with_or_without_an_application(
     name: str, target: Target
 ) -> None:

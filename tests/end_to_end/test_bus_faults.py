@@ -21,6 +21,7 @@ from flasher.image.plan import plan
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC
 from tests.end_to_end.world import Traffic, upgrade
+from tests.loops import each
 
 IMAGE = random.Random(3).randbytes(300)
 SMALL = DeviceProfile(application_area_bytes=16 * 1024)
@@ -73,11 +74,10 @@ def flipped(frame: Frame) -> list[Frame]:
     return [frame._replace(data=bytes([frame.data[0] ^ 0x10]) + frame.data[1:])]
 
 
-@pytest.mark.parametrize("index", range(TOTAL))
-@pytest.mark.parametrize(
+@each("index", range(TOTAL))
+@each(
     "fate",
     [lambda _frame: [], lambda frame: [frame, frame], flipped],
-    ids=["lost", "doubled", "flipped"],
 )
 def test_one_disturbed_frame_anywhere_never_ends_in_a_wrong_image(
     fate: Callable[[Frame], list[Frame]], index: int
@@ -87,7 +87,7 @@ def test_one_disturbed_frame_anywhere_never_ends_in_a_wrong_image(
     judge(upgrade(device, image=IMAGE, disturbance=at(index, fate)), device)
 
 
-@pytest.mark.parametrize("index", range(TOTAL - 1))
+@each("index", range(TOTAL - 1))
 def test_two_swapped_frames_anywhere_never_end_in_a_wrong_image(index: int) -> None:
     held: list[Frame] = []
     seen = iter(range(1_000_000))

@@ -22,6 +22,7 @@ from flasher.image.plan import plan
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING
 from tests.end_to_end.world import upgrade
+from tests.loops import each
 from tests.peers.wording import REPORT, build, payloads
 
 IMAGE = random.Random(6).randbytes(300)
@@ -83,7 +84,7 @@ def test_the_frames_are_those_of_an_upgrade() -> None:
     assert len(carried) == len(FRAMES)
 
 
-@pytest.mark.parametrize("index", FRAMES)
+@each("index", FRAMES)
 def test_one_late_frame_anywhere_never_ends_in_a_wrong_image(index: int) -> None:
     """BU-01."""
     sender, seen = Sender(), iter(range(1_000_000))
@@ -98,7 +99,7 @@ def test_one_late_frame_anywhere_never_ends_in_a_wrong_image(index: int) -> None
     judge(upgrade(device, image=IMAGE, disturbance=hold, others=(sender,)), device)
 
 
-@pytest.mark.parametrize("index", FRAMES)
+@each("index", FRAMES)
 def test_a_device_that_goes_bus_off_at_any_frame_is_upgraded_or_the_end_is_explicit(
     index: int,
 ) -> None:
@@ -113,7 +114,7 @@ def test_a_device_that_goes_bus_off_at_any_frame_is_upgraded_or_the_end_is_expli
     judge(upgrade(device, image=IMAGE, disturbance=go_off), device)
 
 
-@pytest.mark.parametrize("index", FRAMES)
+@each("index", FRAMES)
 def test_somebody_who_speaks_with_the_devices_id_is_overcome_or_the_end_is_explicit(
     index: int,
 ) -> None:

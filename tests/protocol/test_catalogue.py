@@ -23,6 +23,7 @@ from flasher.protocol.spec import (
 )
 from flasher.protocol.wire import Message
 from tests import messages_document
+from tests.loops import each
 
 from .cases import CASES, Case, case
 
@@ -116,8 +117,8 @@ ROWS: Final = (
 )
 # fmt: on
 
-every_row = pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row.can_id:X}-{row.command:X}")
-every_item = pytest.mark.parametrize("item", ITEMS, ids=lambda item: item.name.replace(" ", "-"))
+every_row = each("row", ROWS)
+every_item = each("item", ITEMS)
 
 
 def message_of(item: Item, fill: int = 0x00) -> Message:

@@ -25,6 +25,7 @@ from flasher.protocol.messages import (
     decode,
 )
 from flasher.protocol.wire import Message, encode
+from tests.loops import each
 
 from .cases import CASES
 
@@ -61,9 +62,7 @@ def _message(can_id: int, text: str) -> Message:
     return Message(can_id, raw[0], int.from_bytes(raw[1:3], "big"), raw[3:])
 
 
-every_row = pytest.mark.parametrize(
-    ("row", "can_id", "text"), _ROWS, ids=[f"{row}"[:40] for row, _, _ in _ROWS]
-)
+every_row = each("row, can_id, text", _ROWS)
 
 
 @every_row
@@ -79,7 +78,7 @@ def test_the_documents_bytes_become_the_row(row: Row, can_id: int, text: str) ->
 
 
 @every_row
-@pytest.mark.parametrize("mode", [0x00, 0x0C, 0x11, 0x16, 0xFF])
+@each("mode", [0x00, 0x0C, 0x11, 0x16, 0xFF])
 def test_a_row_in_another_mode_is_malformed(row: Row, can_id: int, text: str, mode: int) -> None:
     message = _message(can_id, text)
     if mode == message.mode:

@@ -7,6 +7,7 @@ from typing import Final
 import pytest
 
 from flasher.protocol.wire import Damage, DamageReason, Message, encode
+from tests.loops import each
 
 from .cases import (
     INTER_FRAME_TIMEOUT_S,
@@ -32,11 +33,11 @@ def _packet(payload: bytes) -> Message:
 # -- before and between messages --------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
+@each(
     "junk",
     [b"\x00", b"\x01\x02\x03", b"\x55", b"\x55\x55", b"\xaa", b"\xf0" * 8, b"\x55\x00\xaa" * 5],
 )
-@pytest.mark.parametrize("size_bytes", range(1, 9))
+@each("size_bytes", range(1, 9))
 def test_junk_before_a_header_is_reported_and_skipped(junk: bytes, size_bytes: int) -> None:
     found = feed_all(make_reassembler(_ID), pieces(junk + _RESET.wire, size_bytes))
     assert found == [Damage(_ID, DamageReason.JUNK, junk), _RESET.message]
@@ -64,7 +65,7 @@ def test_a_frame_without_bytes_changes_nothing() -> None:
 # -- header and tail inside data (FR-03) ------------------------------------------------------
 
 
-@pytest.mark.parametrize("position", range(128))
+@each("position", range(128))
 def test_a_header_inside_data_starts_nothing(position: int) -> None:
     message = _packet(bytes(position) + b"\x55\xaa")
     if position == 127:

@@ -5,13 +5,12 @@ from __future__ import annotations
 import itertools
 import random
 
-import pytest
-
 from flasher.protocol.wire import Damage, DamageReason, encode, split
+from tests.loops import each
 
 from .cases import CASES, Case, feed_all, make_reassembler, pieces
 
-every_case = pytest.mark.parametrize("vector", CASES, ids=lambda vector: vector.name)
+every_case = each("vector", CASES)
 
 
 def test_the_case_table_holds_all_three_targets_and_enough_messages() -> None:

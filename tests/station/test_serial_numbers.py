@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from flasher.station.checkdigit import CHECKS
 from flasher.station.pattern import TEXT_MAX, WAYS_MAX, Pattern
 from flasher.station.template import Scan, check, fill, uses_lot
+from tests.loops import each
 
 STANDARD_EXAMPLES = {
     "luhn": ["79927398713", "4111111111111111"],
@@ -45,8 +46,8 @@ def test_a_wrong_character_is_found_wherever_it_stands(method: str) -> None:
                     assert not CHECKS[method](wrong), wrong
 
 
-@pytest.mark.parametrize("method", CHECKS)
-@pytest.mark.parametrize("text", ["", "0", "\u0661\u0662", "12 4", "12-4", "\x00\x00\x00"])
+@each("method", CHECKS)
+@each("text", ["", "0", "\u0661\u0662", "12 4", "12-4", "\x00\x00\x00"])
 def test_what_is_no_number_has_no_right_check_digit(method: str, text: str) -> None:
     assert not CHECKS[method](text)
 
