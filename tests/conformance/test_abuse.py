@@ -103,6 +103,7 @@ def test_a_deaf_device_was_never_judged() -> None:
     assert exit_code(report, was_stopped=False) is ExitCode.NO_ANSWER
 
 
+@pytest.mark.no_cover
 def test_a_device_that_resets_at_random_fails_and_the_run_goes_on() -> None:
     report = run(MockSubject("bms", make_device=maker(MoodyDevice)), PROFILE, selection=SELECTION)
     assert_true_report(report)
@@ -110,6 +111,7 @@ def test_a_device_that_resets_at_random_fails_and_the_run_goes_on() -> None:
     assert exit_code(report, was_stopped=False) is ExitCode.PARTIAL
 
 
+@pytest.mark.no_cover
 def test_behind_a_node_that_takes_the_whole_bus_nothing_can_be_judged() -> None:
     report = run(MockSubject("bms", others=[Babbler(0.0)]), IMPATIENT, selection=SELECTION)
     assert_true_report(report)
@@ -127,6 +129,7 @@ class BabblingDevice(Device):
         return 0.0
 
 
+@pytest.mark.no_cover
 def test_a_device_that_babbles_on_its_own_id_does_not_keep_the_run_from_its_end() -> None:
     report = run(
         MockSubject("bms", make_device=maker(BabblingDevice)), IMPATIENT, selection=SELECTION
@@ -135,6 +138,7 @@ def test_a_device_that_babbles_on_its_own_id_does_not_keep_the_run_from_its_end(
     assert report.count(Status.PASS) == 0
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("case_id", ["RS-01", "RS-03", "EN-01"])
 def test_an_adapter_unplugged_midway_leaves_the_verdicts_so_far(case_id: str) -> None:
     subject = MockSubject("bms")

@@ -41,6 +41,7 @@ def test_the_mock_passes_as_obc() -> None:
     assert failed(target="obc", only=("RS-01", "RS-04", "UP-06")) == []
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize(
     "choices",
     [
@@ -57,6 +58,7 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, A
     assert failed(**choices) == []
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
     clause = WRONG[name].clause

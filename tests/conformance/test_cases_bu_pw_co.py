@@ -44,6 +44,7 @@ def test_a_target_without_a_version_query_passes() -> None:
     assert not_passed(*QUICK, target="wmc") == []
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize(
     "choices",
     [
@@ -58,6 +59,7 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, A
     assert not_passed(*QUICK, **choices) == []
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
     assert verdicts([WRONG[name]], name) == {WRONG[name]: Status.FAIL}
@@ -120,6 +122,7 @@ def test_every_frame_of_every_message_is_disturbed() -> None:
         assert frame == 18 or f"frame {frame} sent is swapped" in steps
 
 
+@pytest.mark.no_cover
 def test_power_is_cut_at_every_frame_of_an_upgrade_and_in_every_flash_operation() -> None:
     result = result_of("PW-01")
     assert result.status is Status.PASS

@@ -29,6 +29,7 @@ def test_a_target_without_a_version_query_passes_all_but_the_version() -> None:
     assert set(found.values()) == {Status.PASS}
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize(
     "choices",
     [
@@ -56,6 +57,7 @@ def test_a_device_that_chooses_otherwise_than_its_profile_says_fails(
     assert not_passed(case_id, states=states, image_checksum="crc32") == [case_id]
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
     assert not_passed(WRONG[name], variant=name) == [WRONG[name]]

@@ -57,6 +57,7 @@ def test_the_mock_passes(target: str, only: tuple[str, ...]) -> None:
     assert failed(report(target=target, only=only)) == []
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize(
     ("only", "choices"),
     [
@@ -84,14 +85,17 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(
     assert failed(report(only=only, **choices)) == []
 
 
+@pytest.mark.no_cover
 def test_a_device_that_says_nothing_to_damaged_packets_is_judged_all_the_same() -> None:
     assert failed(report(only=("CR-02",), bad_packet="silence", pause_in_transfer="waits")) == []
 
 
+@pytest.mark.no_cover
 def test_no_damaged_packet_is_taken_by_the_mock() -> None:
     assert failed(report(only=LONGEST)) == []
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
     clause = WRONG[name].clause

@@ -21,6 +21,7 @@ def test_a_target_without_a_version_query_passes() -> None:
     assert not_passed("SE-03", "SE-04", target="wmc") == []
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize(
     ("cases", "choices"),
     [
@@ -38,6 +39,7 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(
     assert not_passed(*cases, **choices) == []
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
     assert not_passed(WRONG[name], variant=name) == [WRONG[name]]

@@ -28,6 +28,7 @@ def test_a_target_without_a_version_query_passes(target: str) -> None:
     assert not_passed("TX-01", "TX-13", target=target) == []
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize(
     ("cases", "choices"),
     [
@@ -90,6 +91,7 @@ def test_a_device_that_chooses_otherwise_than_its_profile_says_fails(
     assert not_passed(case_id, states=states) == [case_id]
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
     size = LARGE if name == "sixteen-bit-offsets" else {}

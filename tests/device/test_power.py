@@ -100,6 +100,7 @@ def cut_at(bench: Bench, operation: int, share: float) -> None:
     cycle_power(bench)
 
 
+@pytest.mark.no_cover
 @each("profile", PROFILES.values())
 @each("moment", MOMENTS)
 @each("operation", range(OPERATIONS))
@@ -123,6 +124,7 @@ def test_a_power_cut_at_any_flash_operation_never_leaves_a_mixture_that_boots(
     assert bench.device.stored_image == NEW
 
 
+@pytest.mark.no_cover
 @each("share", [0.0, 0.3, 0.7])
 @each("second", range(0, OPERATIONS, 3))
 @each("first", range(1, OPERATIONS, 4))
@@ -147,6 +149,7 @@ def test_the_upgrade_is_as_many_frames_as_the_cuts_below_go_through() -> None:
     assert len(upgrade_frames(bench_with_old())) == ALL_FRAMES
 
 
+@pytest.mark.no_cover
 @each("heard", range(ALL_FRAMES + 1))
 def test_a_power_cut_at_any_received_frame_leaves_the_old_application_or_none(heard: int) -> None:
     """PW-01. The cut comes 1 ms after the frame: the flash is at work when that frame was the last

@@ -74,6 +74,7 @@ def flipped(frame: Frame) -> list[Frame]:
     return [frame._replace(data=bytes([frame.data[0] ^ 0x10]) + frame.data[1:])]
 
 
+@pytest.mark.no_cover
 @each("index", range(TOTAL))
 @each(
     "fate",
@@ -87,6 +88,7 @@ def test_one_disturbed_frame_anywhere_never_ends_in_a_wrong_image(
     judge(upgrade(device, image=IMAGE, disturbance=at(index, fate)), device)
 
 
+@pytest.mark.no_cover
 @each("index", range(TOTAL - 1))
 def test_two_swapped_frames_anywhere_never_end_in_a_wrong_image(index: int) -> None:
     held: list[Frame] = []

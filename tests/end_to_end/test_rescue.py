@@ -32,6 +32,7 @@ COMPLETE = bytes.fromhex("55AA0C04C5020000")
 # -- the device's power ---------------------------------------------------------------------------
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("number", range(1, PACKETS + 1))
 def test_a_device_that_lost_power_at_any_packet_is_rescued(number: int) -> None:
     """Every other one announces itself at power-up only."""
@@ -169,6 +170,7 @@ def test_a_refusal_at_the_end_leaves_a_device_that_can_be_rescued() -> None:
 # -- the adapter ----------------------------------------------------------------------------------
 
 
+@pytest.mark.no_cover
 @pytest.mark.parametrize("number", range(1, PACKETS + 1))
 def test_an_adapter_that_fails_at_any_packet_is_exit_4_or_overcome(number: int) -> None:
     """In turn: pulled out for good, pulled out and back, bus-off that restarts by itself."""

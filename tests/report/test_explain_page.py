@@ -145,6 +145,7 @@ def test_very_long_texts_are_cut() -> None:
     assert len(html) < 60_000
 
 
+@pytest.mark.no_cover
 def test_the_largest_upgrade_makes_a_page_of_bounded_size() -> None:
     html = render(stories.story(stories.upgrade(65_535)))
     assert len(html.encode()) < MEGABYTE / 4
