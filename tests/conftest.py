@@ -13,3 +13,10 @@ from flasher.cli.recording import BUNDLE_FOLDER
 def bundles_elsewhere(tmp_path_factory: pytest.TempPathFactory) -> None:
     """For processes that a test starts too."""
     os.environ[BUNDLE_FOLDER] = str(tmp_path_factory.mktemp("bundles"))
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """For `-n auto`: one worker more than there are cores, since tests wait for other processes and
+    for buses at real pace a third of their time.
+    """
+    return (os.cpu_count() or 1) + 1
