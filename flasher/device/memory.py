@@ -53,13 +53,18 @@ class Flash:
         """Pages erased to the end."""
         self.program_count = 0
         """Program operations carried out to the end."""
-        self._cells = bytearray((ERASED,)) * size_bytes
-        self._erased_units = bytearray((True,)) * (size_bytes // program_unit_bytes)
+        self._erased_page = bytes((ERASED,)) * page_size_bytes
+        self._pages: dict[int, bytearray] = {}
+        """By offset, those that are not erased: of megabytes, few pages are ever used."""
+        self._used_units: set[int] = set()
 
     def read(self, address: int, size_bytes: int) -> bytes:
         """The bytes there. Raises FlashRangeError."""
         offset = self._offset(address, size_bytes)
-        return bytes(self._cells[offset : offset + size_bytes])
+        first = offset - offset % self.page_size_bytes
+        pages = range(first, offset + size_bytes, self.page_size_bytes)
+        found = b"".join(self._pages.get(page, self._erased_page) for page in pages)
+        return found[offset - first :][:size_bytes]
 
     def erase_page(self, address: int) -> None:
         """Erase the page that begins at `address`.
@@ -67,9 +72,8 @@ class Flash:
         Raises FlashRangeError, FlashAlignmentError.
         """
         offset = self._page_offset(address)
-        end = offset + self.page_size_bytes
-        self._cells[offset:end] = bytes((ERASED,)) * self.page_size_bytes
-        self._mark(offset, self.page_size_bytes, erased=True)
+        self._pages.pop(offset, None)
+        self._used_units.difference_update(self._units(offset, self.page_size_bytes))
         self.erase_count += 1
 
     def program(self, address: int, data: bytes) -> None:
@@ -78,8 +82,8 @@ class Flash:
         Raises FlashRangeError, FlashAlignmentError, FlashNotErasedError.
         """
         offset = self._programmable_offset(address, data)
-        self._cells[offset : offset + len(data)] = data
-        self._mark(offset, len(data), erased=False)
+        self._put(offset, data)
+        self._used_units.update(self._units(offset, len(data)))
         self.program_count += 1
 
     def tear_erase(self, address: int, fraction: float) -> None:
@@ -90,8 +94,8 @@ class Flash:
         """
         offset = self._page_offset(address)
         done_bytes = int(fraction * self.page_size_bytes)
-        self._cells[offset : offset + done_bytes] = bytes((ERASED,)) * done_bytes
-        self._mark(offset, self.page_size_bytes, erased=False)
+        self._put(offset, self._erased_page[:done_bytes])
+        self._used_units.update(self._units(offset, self.page_size_bytes))
 
     def tear_program(self, address: int, data: bytes, fraction: float) -> None:
         """Leave programming interrupted after `fraction` of its time (0 to 1): units before that
@@ -101,8 +105,8 @@ class Flash:
         unit = self.program_unit_bytes
         whole_bytes = min(int(fraction * len(data)) // unit * unit, len(data) - unit)
         done_bytes = whole_bytes + unit // 2
-        self._cells[offset : offset + done_bytes] = data[:done_bytes]
-        self._mark(offset, whole_bytes + unit, erased=False)
+        self._put(offset, data[:done_bytes])
+        self._used_units.update(self._units(offset, whole_bytes + unit))
 
     def _offset(self, address: int, size_bytes: int) -> int:
         offset = address - self.start
@@ -129,17 +133,26 @@ class Flash:
                 f"{len(data)} bytes at 0x{address:08X} are not whole program units",
                 where=f"{unit} bytes a unit",
             )
-        if not all(self._erased_units[offset // unit : (offset + len(data)) // unit]):
+        if not self._used_units.isdisjoint(self._units(offset, len(data))):
             raise FlashNotErasedError(
                 f"{len(data)} bytes at 0x{address:08X} are programmed without having been erased",
                 where=f"page 0x{address - offset % self.page_size_bytes:08X}",
             )
         return offset
 
-    def _mark(self, offset: int, size_bytes: int, *, erased: bool) -> None:
-        first = offset // self.program_unit_bytes
-        units = size_bytes // self.program_unit_bytes
-        self._erased_units[first : first + units] = bytes((erased,)) * units
+    def _put(self, offset: int, data: bytes) -> None:
+        """Let the cells hold `data`, whatever a real part would allow."""
+        while data:
+            place = offset % self.page_size_bytes
+            page = self._pages.setdefault(offset - place, bytearray(self._erased_page))
+            part = data[: self.page_size_bytes - place]
+            page[place : place + len(part)] = part
+            offset, data = offset + len(part), data[len(part) :]
+
+    def _units(self, offset: int, size_bytes: int) -> range:
+        """The program units that lie there."""
+        unit = self.program_unit_bytes
+        return range(offset // unit, (offset + size_bytes) // unit)
 
 
 class Operation(NamedTuple):

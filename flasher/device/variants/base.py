@@ -90,11 +90,10 @@ class PlainFlash(Flash):
             super().program(address, data)
         except FlashNotErasedError:
             offset = self._offset(address, len(data))
-            old = self._cells[offset : offset + len(data)]
-            self._cells[offset : offset + len(data)] = bytes(
-                before & after for before, after in zip(old, data, strict=True)
-            )
-            self._mark(offset, len(data), erased=False)
+            old = self.read(address, len(data))
+            both = bytes(before & after for before, after in zip(old, data, strict=True))
+            self._put(offset, both)
+            self._used_units.update(self._units(offset, len(data)))
             self.program_count += 1
         except FlashRangeError:
             return
