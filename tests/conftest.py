@@ -1,4 +1,4 @@
-"""What holds for every test: failures leave their bundles where nobody has to clear them away."""
+"""What holds for every test: what it leaves, it leaves where nobody has to clear it away."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from flasher.cli.recording import BUNDLE_FOLDER
 def bundles_elsewhere(tmp_path_factory: pytest.TempPathFactory) -> None:
     """For processes that a test starts too."""
     os.environ[BUNDLE_FOLDER] = str(tmp_path_factory.mktemp("bundles"))
+    # Signing keys of stations.
+    os.environ["XDG_DATA_HOME"] = str(tmp_path_factory.mktemp("data"))
 
 
 def pytest_xdist_auto_num_workers() -> int:

@@ -288,8 +288,6 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Records: a unit that failed and then passed, another one that is bad."""
     folder = tmp_path_factory.mktemp("plant")
     bench = Bench(folder)
-    bench.trace = folder / "run.log"
-    bench.trace.write_text("(1.0) can0 123#616263\n", "utf-8")
     bench.make(RunState.FAIL)
     bench.store.step(bench.claim().run_id, "connect", StepState.FAIL, duration_s=1.0)
     bench.store.close()
@@ -347,10 +345,10 @@ def test_the_whole_life_of_a_unit_with_its_traces(
         "INTERRUPTED",
         "PASS",
     ]
-    assert "no upgrade, only traffic of other kinds" in run.out
+    assert "said complete, and is running version" in run.out
     assert SERIAL in page.read_text("utf-8")
     full = flasher("station", "unit", SERIAL, "--database", plant, "--story")
-    assert "  | verdict: no upgrade" in full.out
+    assert "  | verdict: completed" in full.out
 
 
 def test_json_of_the_records_is_as_described(
@@ -366,7 +364,7 @@ def test_json_of_the_records_is_as_described(
         hold_output(schema, run.out, 0)
     unit = flasher("station", "unit", SERIAL, "--database", plant, "--json").document
     assert unit["unit"]["runs"][2]["run"]["state"] == "pass"
-    assert unit["traces"][0]["cause"] == "foreign_only"
+    assert unit["traces"][0]["cause"] == "completed"
 
 
 def test_a_backup_is_a_whole_copy(flasher: Flasher, plant: Path, tmp_path: Path) -> None:
@@ -382,8 +380,8 @@ def test_a_changed_attachment_is_found(
 ) -> None:
     copy = tmp_path / "copy.sqlite"
     flasher("station", "backup", copy, "--database", plant)
-    (trace,) = (path for path in tmp_path.rglob("*") if path.is_file() and path.parent != tmp_path)
-    trace.write_bytes(b"another one")
+    for trace in tmp_path.glob("copy.sqlite.files/*/*"):
+        trace.write_bytes(b"another one")
     run = flasher("station", "verify", "--database", copy)
     assert run.code == ExitCode.VERIFICATION
     assert "its hash differs" in run.out

@@ -16,8 +16,9 @@ from flasher.image.manifest import release_of, to_toml
 from flasher.protocol.spec import BMS, WMC, Target
 from flasher.station.recipe_check import load_checked
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records import Claim, Ending, RunId, RunState, StepState, Store
+from flasher.station.records import Claim, Ending, Keeping, RunId, RunState, StepState, Store
 from flasher.station.steps import Verified
+from tests.station.traces import run_messages, write_trace
 
 DAY = date(2026, 5, 17)
 SERIAL = "W2605002"
@@ -103,12 +104,13 @@ class Bench:
     folder: Path
     clock: FakeClock = field(default_factory=FakeClock)
     lock_timeout_s: float = 0.02
+    heads: Path | None = None
+    _traces: int = 0
 
     def __post_init__(self) -> None:
         self.recipe = make_recipe(self.folder)
         self.path = self.folder / "records.sqlite"
-        self.trace = self.folder / "trace.asc"
-        self.trace.write_text("date Sun May 17\n", encoding="ascii")
+        self.trace = self.traced(SERIAL)
         self.path.write_bytes(_empty_records())
         self.store = self.opened()
         self.store.recover()
@@ -118,12 +120,25 @@ class Bench:
             str(self.path),
             station=station,
             clock=self.clock,
+            keeping=Keeping(self.keys, self.heads),
             lock_timeout_s=self.lock_timeout_s,
         )
         # These tests pull no plug, and share the disk with each other.
         event.listen(store.database.engine, "connect", _do_not_wait_for_the_disk)
         store.database.close()
         return store
+
+    @property
+    def keys(self) -> Path:
+        """Where the station's key is, and the heads beside it."""
+        return self.folder / "keys"
+
+    def traced(self, serial: str) -> Path:
+        """The trace of a good run of this unit, another one each time."""
+        self._traces += 1
+        said = run_messages(serial, BMS_VERSION, IMAGES[BMS])
+        path = self.folder / f"run-{self._traces}.log.gz"
+        return write_trace(path, said, at_s=1_779_000_000.0 + self._traces)
 
     def use(self, text: str) -> None:
         """Go on with another recipe."""
@@ -149,8 +164,10 @@ class Bench:
         self.store.verified(write, BMS_VERSION)
         self.store.step(run_id, "flash", StepState.PASS, duration_s=8.0)
 
-    def ending(self, state: RunState = RunState.PASS, code: str = "OK") -> Ending:
-        file = self.store.add_file("trace", self.trace)
+    def ending(
+        self, state: RunState = RunState.PASS, code: str = "OK", trace: Path | None = None
+    ) -> Ending:
+        file = self.store.add_file("trace", trace or self.trace)
         verified = {"bms": Verified.VERSION} if state is RunState.PASS else {}
         return Ending(state, code, "", verified, file.sha256, [file])
 
@@ -170,6 +187,6 @@ class Bench:
         run_id = claim.run_id
         self.work(run_id)
         code = code or ("OK" if state is RunState.PASS else "NO_ANSWER")
-        self.store.finish(run_id, self.ending(state, code))
+        self.store.finish(run_id, self.ending(state, code, self.traced(serial)))
         self.clock.go_on(2.0)
         return run_id

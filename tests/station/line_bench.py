@@ -168,9 +168,10 @@ class LineBench:
         self.ask(socket, report)
 
     def trace(self, socket: str) -> TraceFile:
-        path = Path(str(self.order(socket).trace) + ".gz")
-        path.write_bytes(b"frames")
-        return TraceFile(path, hashlib.sha256(b"frames").hexdigest())
+        begin = self.order(socket)
+        path = Path(str(begin.trace) + ".gz")
+        self.bench.traced(begin.order.serial).replace(path)
+        return TraceFile(path, hashlib.sha256(path.read_bytes()).hexdigest())
 
     def end(self, socket: str, outcome: RunState = RunState.PASS, code: str = "OK") -> None:
         verified = {"bms": Verified.VERSION} if outcome is RunState.PASS else {}

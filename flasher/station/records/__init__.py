@@ -3,8 +3,10 @@
 from flasher.station.records.errors import (
     ClaimRefusedError,
     DiskFullError,
+    KeyMissingError,
     NotFoundError,
     RecordError,
+    RecordsCutError,
     RecordsDamagedError,
     RecordsLockedError,
     RecordsMovedError,
@@ -13,6 +15,7 @@ from flasher.station.records.errors import (
     RuleBrokenError,
     SchemaVersionError,
     StationBusyError,
+    UnprovenError,
 )
 from flasher.station.records.model import (
     AttachmentFile,
@@ -21,6 +24,7 @@ from flasher.station.records.model import (
     Claim,
     Clock,
     Ending,
+    Examination,
     Figures,
     Measurement,
     Problem,
@@ -38,6 +42,7 @@ from flasher.station.records.model import (
     WriteId,
     WriteRecord,
 )
+from flasher.station.records.signing import Keeping
 from flasher.station.records.store import Store, SystemClock
 
 __all__ = [
@@ -48,12 +53,16 @@ __all__ = [
     "Clock",
     "DiskFullError",
     "Ending",
+    "Examination",
     "Figures",
+    "Keeping",
+    "KeyMissingError",
     "Measurement",
     "NotFoundError",
     "AuditEvent",
     "Problem",
     "RecordError",
+    "RecordsCutError",
     "RecordsDamagedError",
     "RecordsLockedError",
     "RecordsMovedError",
@@ -75,6 +84,7 @@ __all__ = [
     "TargetRecord",
     "UnitLife",
     "UnitState",
+    "UnprovenError",
     "WriteId",
     "WriteRecord",
 ]

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
-from flasher.station.records.database import Database
+from flasher.station.records.database import Database, read_only_sqlite
 from flasher.station.records.errors import RecordsDamagedError, mapped
 from flasher.station.records.files import FileStore, whole_file
 from flasher.station.records.model import Backup
@@ -47,7 +47,7 @@ def make_backup(database: Database, files: FileStore, path: Path) -> Backup:
 
 def _copy(source: Path, part: Path) -> None:
     with (
-        contextlib.closing(sqlite3.connect(source)) as original,
+        contextlib.closing(read_only_sqlite(source)) as original,
         contextlib.closing(sqlite3.connect(part)) as copy,
     ):
         original.backup(copy)

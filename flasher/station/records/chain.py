@@ -1,58 +1,89 @@
-"""The audit trail: append-only rows, each hashed together with the hash of the row before it.
+"""The audit trail: append-only rows, one chain a station, each row hashed together with the hash of
+the row before it, and signed with the station's key.
 
-The row of a finished run also holds a digest over the run and all its parts, so that a change made
-behind the triggers' back is found by `check_chain` and `run_digest`.
+The row of a finished run holds the digests of the run and of all that belongs to it, so that a
+change made behind the triggers' back is found and named (`checking`).
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from datetime import datetime
 from typing import Any, Final
 
-from sqlalchemy import Connection, select
+from sqlalchemy import Connection, func, select
 
-from flasher.station.records.model import Problem, utc_text
-from flasher.station.records.schema import (
-    artifact,
-    attachment,
-    audit,
-    device_write,
-    lot,
-    measurement,
-    operator,
-    recipe,
-    run,
-    run_target,
-    socket,
-    step,
-    unit,
-)
+from flasher.station.records.heads import Head
+from flasher.station.records.keys import SigningKey
+from flasher.station.records.model import utc_text
+from flasher.station.records.schema import audit, station
 
 GENESIS: Final = "0" * 64
 """The hash before the first row."""
+BEGUN: Final = "begun"
+"""The first row of a chain: which records, their schema, the public key."""
+CLAIMED: Final = "claimed"
 FINISHED: Final = "finished"
 INTERRUPTED: Final = "interrupted"
+MIGRATED: Final = "migrated"
+MIGRATED_RUN: Final = "migrated run"
+KEY_ROTATED: Final = "key rotated"
+"""Signed with the key before; the rows that follow with the one that it names."""
+KEY_LOST: Final = "key lost"
+"""Signed with the new key, since the one before is gone."""
+CLOCK: Final = "clock"
+"""A person has said that the clock is right, though records of a later time are there."""
+RESTORED: Final = "restored"
+"""A person has said that the records are an older copy, and what they lack is lost."""
+_KEYS: Final = (BEGUN, KEY_ROTATED, KEY_LOST)
 
 
-def append(
-    connection: Connection,
-    now: datetime,
-    event: str,
-    data: Mapping[str, Any],
-    run_id: int | None = None,
-) -> None:
-    """Add a row to the trail, in the transaction of what it tells."""
-    previous = connection.execute(
-        select(audit.c.hash).order_by(audit.c.id.desc()).limit(1)
-    ).scalar_one_or_none()
-    row = {"at": utc_text(now), "event": event, "run_id": run_id, "data": canonical(data)}
-    before = previous or GENESIS
-    connection.execute(
-        audit.insert().values(**row, previous_hash=before, hash=_row_hash(before, row))
-    )
+class Trail:
+    """The end of a station's chain, in a transaction that writes."""
+
+    def __init__(self, connection: Connection, station_name: str, key: SigningKey) -> None:
+        self.connection = connection
+        self.station = station_name
+        self.key = key
+        self.head: Head | None = None
+        """The last row that was added here; None while there is none."""
+
+    def append(
+        self, now: datetime, event: str, data: Mapping[str, Any], run_id: int | None = None
+    ) -> None:
+        """Add a row, in the transaction of what it tells."""
+        station_id = self._station_id()
+        last = self.connection.execute(
+            select(audit.c.number, audit.c.hash)
+            .where(audit.c.station_id == station_id)
+            .order_by(audit.c.number.desc())
+            .limit(1)
+        ).one_or_none()
+        number, before = (1, GENESIS) if last is None else (last.number + 1, last.hash)
+        row: dict[str, Any] = {
+            "number": number,
+            "at": utc_text(now),
+            "event": event,
+            "run_id": run_id,
+            "data": canonical(data),
+            "previous_hash": before,
+        }
+        found = row_hash(self.station, row)
+        signature = self.key.sign(found)
+        self.connection.execute(
+            audit.insert().values(**row, station_id=station_id, hash=found, signature=signature)
+        )
+        self.head = Head(self.station, number, row["at"], found, signature, self.key.public)
+
+    def _station_id(self) -> int:
+        query = select(station.c.id).where(station.c.name == self.station)
+        found = self.connection.execute(query).scalar_one_or_none()
+        if found is None:
+            made = self.connection.execute(station.insert().values(name=self.station))
+            found = made.inserted_primary_key[0]  # type: ignore[index]  # its key is one column
+        return int(found)
 
 
 def canonical(data: Any) -> str:
@@ -60,77 +91,56 @@ def canonical(data: Any) -> str:
     return json.dumps(data, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
 
 
-def _row_hash(previous: str, row: Mapping[Any, Any]) -> str:
-    return _hash([previous, row["at"], row["event"], row["run_id"], row["data"]])
-
-
-def _hash(data: Any) -> str:
+def digest(data: Any) -> str:
+    """The hash of data that JSON can hold."""
     return hashlib.sha256(canonical(data).encode("ascii")).hexdigest()
 
 
-def run_digest(connection: Connection, run_id: int) -> str:
-    """The digest over a run and everything that belongs to it, names instead of keys of tables."""
-    head = connection.execute(
-        select(
-            run,
-            unit.c.part,
-            unit.c.serial,
-            socket.c.name.label("socket_name"),
-            operator.c.name.label("operator_name"),
-            recipe.c.sha256.label("recipe_sha256"),
-            lot.c.name.label("lot_name"),
-        )
-        .join_from(run, unit)
-        .join(socket)
-        .join(operator)
-        .join(recipe)
-        .outerjoin(lot, run.c.lot_id == lot.c.id)
-        .where(run.c.id == run_id)
-    ).one()
-    parts: list[Any] = [list(head)]
-    steps = select(step.c.id).where(step.c.run_id == run_id)
-    for query in (
-        select(run_target, artifact.c.sha256, artifact.c.version)
-        .join_from(run_target, artifact)
-        .where(run_target.c.run_id == run_id)
-        .order_by(run_target.c.id),
-        select(step).where(step.c.run_id == run_id).order_by(step.c.id),
-        select(measurement).where(measurement.c.step_id.in_(steps)).order_by(measurement.c.id),
-        select(device_write).where(device_write.c.run_id == run_id).order_by(device_write.c.id),
-        select(attachment).where(attachment.c.run_id == run_id).order_by(attachment.c.id),
-    ):
-        parts.append([list(row) for row in connection.execute(query)])  # noqa: PERF401
-    return _hash(parts)
+def row_hash(station_name: str, row: Mapping[Any, Any]) -> str:
+    """The hash of an audit row; it covers the chain up to it."""
+    columns = ("previous_hash", "number", "at", "event", "run_id", "data")
+    return digest([station_name, *(row[name] for name in columns)])
 
 
-def check_chain(connection: Connection) -> Iterator[Problem]:
-    """What is wrong with the trail, and with the runs that it vouches for."""
-    before = GENESIS
-    vouched: set[int] = set()
-    for row in connection.execute(select(audit).order_by(audit.c.id)).mappings().all():
-        where = f"audit row {row['id']}"
-        if row["previous_hash"] != before:
-            yield Problem(where, "the chain is broken: the row before it is missing or changed")
-        if row["hash"] != _row_hash(row["previous_hash"], row):
-            yield Problem(where, "it was changed after it was written")
-        before = row["hash"]
-        if row["event"] in (FINISHED, INTERRUPTED) and row["run_id"] is not None:
-            vouched.add(row["run_id"])
-            yield from _check_run(connection, row["run_id"], row["data"])
-    finished = select(run.c.id).where(run.c.state != "RUNNING").order_by(run.c.id)
-    for run_id in connection.execute(finished).scalars():
-        if run_id not in vouched:
-            yield Problem(f"run {run_id}", "it is finished, but the audit trail does not know it")
+def key_of(event: str, data: Mapping[str, Any]) -> str | None:
+    """The public key that a row brings into force; None for other rows."""
+    found = data.get("key") if event in _KEYS else None
+    return found if isinstance(found, str) else None
 
 
-def _check_run(connection: Connection, run_id: int, data: str) -> Iterator[Problem]:
-    exists = connection.execute(select(run.c.id).where(run.c.id == run_id)).one_or_none()
-    if exists is None:
-        yield Problem(f"run {run_id}", "it is missing")
-        return
-    try:
-        stated = json.loads(data).get("digest")
-    except (ValueError, AttributeError):
-        stated = None
-    if stated != run_digest(connection, run_id):
-        yield Problem(f"run {run_id}", "it was changed after it was finished")
+def key_in_force(connection: Connection, station_name: str) -> str | None:
+    """The public key with which the next row is signed; None before the first row."""
+    query = (
+        _rows_of(station_name, audit.c.event, audit.c.data)
+        .where(audit.c.event.in_(_KEYS))
+        .order_by(audit.c.number.desc())
+        .limit(1)
+    )
+    row = connection.execute(query).one_or_none()
+    return None if row is None else key_of(row.event, json.loads(row.data))
+
+
+def hash_at(connection: Connection, station_name: str, number: int) -> str | None:
+    """The hash of a row; None where the chain has no such row."""
+    query = _rows_of(station_name, audit.c.hash).where(audit.c.number == number)
+    return connection.execute(query).scalar_one_or_none()
+
+
+def latest(connection: Connection, station_name: str) -> str | None:
+    """The latest time in the chain since a person last released the clock; None without rows."""
+    released = (
+        _rows_of(station_name, func.coalesce(func.max(audit.c.number), 0))
+        .where(audit.c.event == CLOCK)
+        .scalar_subquery()
+    )
+    query = (
+        _rows_of(station_name, audit.c.at)
+        .where(audit.c.number >= released)
+        .order_by(audit.c.at.desc())
+        .limit(1)
+    )
+    return connection.execute(query).scalar_one_or_none()
+
+
+def _rows_of(station_name: str, *columns: Any) -> Any:
+    return select(*columns).join_from(audit, station).where(station.c.name == station_name)

@@ -5,8 +5,8 @@ so that two sockets cannot both find the last place of a lot free.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import datetime
-from typing import Any
+from datetime import datetime, timedelta
+from typing import Any, Final
 
 from sqlalchemy import Connection, func, select
 
@@ -15,7 +15,9 @@ from flasher.protocol.text import printable
 from flasher.station import golden
 from flasher.station.recipe import Duplicate
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records import schema
+from flasher.station.records import chain, schema
+from flasher.station.records.chain import Trail
+from flasher.station.records.digests import CLAIMED, digests_of
 from flasher.station.records.errors import ClaimRefusedError, Refusal
 from flasher.station.records.model import (
     Claim,
@@ -28,6 +30,9 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.rows import add_targets, insert, named, recipe_row
 from flasher.station.records.schema import recipe, run, socket, station, unit
+
+CLOCK_TOLERANCE: Final = timedelta(minutes=5)
+"""A clock that is set by the network goes back a little now and then."""
 
 
 @dataclass(frozen=True)
@@ -85,12 +90,12 @@ def make_order(
     return Order(serial, socket, loaded, operator, scan.lot, reason, is_virtual)
 
 
-def begin_run(
-    connection: Connection, order: Order, station_name: str, now: datetime, monotonic_s: float
-) -> Claim:
+def begin_run(trail: Trail, order: Order, now: datetime, monotonic_s: float) -> Claim:
     """Begin a run when every rule allows it. Raises ClaimRefusedError."""
+    connection = trail.connection
+    _check_clock(trail, now)
     unit_id = named(connection, schema.unit, part=order.part, serial=order.serial)
-    station_id = named(connection, schema.station, name=station_name)
+    station_id = named(connection, schema.station, name=trail.station)
     socket_id = named(connection, schema.socket, station_id=station_id, name=order.socket)
     lot_id = None
     if order.lot:
@@ -102,7 +107,7 @@ def begin_run(
         schema.run,
         unit_id=unit_id,
         socket_id=socket_id,
-        recipe_id=recipe_row(connection, loaded, now),
+        recipe_id=recipe_row(trail, loaded, now),
         lot_id=lot_id,
         operator_id=named(connection, schema.operator, name=order.operator),
         kind=kind.value,
@@ -117,7 +122,23 @@ def begin_run(
         allow_completed_not_read_back=loaded.recipe.allow_completed_not_read_back,
     )
     add_targets(connection, run_id, loaded.targets)
+    digests = digests_of(connection, [run_id])[run_id]
+    data = {"serial": order.serial, "digests": {name: digests[name] for name in CLAIMED}}
+    trail.append(now, chain.CLAIMED, data, run_id)
     return Claim(RunId(run_id), kind, order.serial, order.part, before, count)
+
+
+def _check_clock(trail: Trail, now: datetime) -> None:
+    """A clock that was set back would put this run before those that were made."""
+    last = chain.latest(trail.connection, trail.station)
+    if last is not None and now < utc_moment(last) - CLOCK_TOLERANCE:
+        raise ClaimRefusedError(
+            Refusal.CLOCK,
+            f"The clock says {utc_text(now)[:19]} UTC, but {trail.station} has records of"
+            f" {last[:19]} UTC.",
+            remedy="Set the clock of this computer. If the clock is right and that record is not:"
+            " end the station, then flasher station accept clock.",
+        )
 
 
 def kind_of(

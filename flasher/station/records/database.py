@@ -6,12 +6,16 @@ connection is used. A setting that does not hold (a network disk without WAL) is
 
 from __future__ import annotations
 
+import os
+import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
+from uuid import uuid4
 
 from sqlalchemy import Connection, Engine, create_engine, event, inspect, select, text
 from sqlalchemy.engine import URL, make_url
@@ -92,8 +96,9 @@ def locate(url: str, folder: Path | None = None) -> Location:
 class Database:
     """A database that holds what is committed. Open it with `open_database`."""
 
-    def __init__(self, location: Location, lock_timeout_s: float) -> None:
+    def __init__(self, location: Location, lock_timeout_s: float, *, read_only: bool) -> None:
         self.location = location
+        self._read_only = read_only
         self._lock_timeout_ms = max(1, round(lock_timeout_s * 1000))
         self.engine = self._engine()
 
@@ -103,8 +108,9 @@ class Database:
         return self.engine.dialect.name
 
     @contextmanager
-    def writing(self) -> Iterator[Connection]:
-        """One transaction that writes; durable when the block is left without an error.
+    def writing(self, *locks: str) -> Iterator[Connection]:
+        """One transaction that writes; durable when the block is left without an error. SQLite has
+        one writer at a time; elsewhere those with a lock of the same name wait for each other.
 
         Raises RecordError; nothing of the block was saved then.
         """
@@ -113,8 +119,11 @@ class Database:
             self._check_place(bare)
             with connection.begin():
                 if self.backend == "postgresql":
-                    # One writer at a time: the audit chain has one end.
-                    connection.execute(text("LOCK TABLE audit IN EXCLUSIVE MODE"))
+                    for name in locks:
+                        connection.execute(
+                            text("SELECT pg_advisory_xact_lock(7052, hashtext(:name))"),
+                            {"name": name},
+                        )
                 yield connection
             self._check_place(bare, has_log=True)
 
@@ -152,13 +161,19 @@ class Database:
 
     def _engine(self) -> Engine:
         if self.location.url.get_backend_name() != "sqlite":
-            return create_engine(self.location.url, isolation_level="READ COMMITTED")
+            return create_engine(
+                self.location.url,
+                isolation_level="READ COMMITTED",
+                execution_options={"postgresql_readonly": self._read_only},
+            )
         options: dict[str, Any] = {"connect_args": {"timeout": self._lock_timeout_ms / 1000}}
         if self.location.file is None:
             options = {
                 "poolclass": StaticPool,
                 "connect_args": {"check_same_thread": False},
             }
+        elif self._read_only:
+            options["creator"] = partial(read_only_sqlite, self.location.file)
         engine = create_engine(self.location.url, **options)
         event.listen(engine, "connect", self._prepare_sqlite)
         event.listen(engine, "begin", _begin_sqlite)
@@ -169,6 +184,10 @@ class Database:
             record.info[_OPENED] = _identity(self.location.file)
         # Transactions are begun below, by hand: the driver's own begin too late, and without lock.
         connection.isolation_level = None
+        if self._read_only:
+            connection.execute(f"PRAGMA busy_timeout = {self._lock_timeout_ms}")
+            connection.execute("PRAGMA query_only = 1")
+            return
         wanted = {
             # First: changing the journal already needs the lock.
             "busy_timeout": self._lock_timeout_ms,
@@ -190,6 +209,17 @@ class Database:
                 )
 
 
+def read_only_sqlite(file: Path) -> sqlite3.Connection:
+    """A connection that changes nothing: not the file, not its journal, and beside it no file where
+    none can be made.
+    """
+    log = file.with_name(file.name + "-wal")
+    # Without a log nobody writes, and none can be made where the folder is read-only.
+    is_still = not log.exists() and not os.access(file.parent, os.W_OK)
+    uri = f"{file.resolve().as_uri()}?mode=ro{'&immutable=1' if is_still else ''}"
+    return sqlite3.connect(uri, uri=True, check_same_thread=False)
+
+
 def _identity(file: Path) -> tuple[int, int] | None:
     """Which file has this name now; None: none."""
     try:
@@ -205,7 +235,12 @@ def _begin_sqlite(connection: Connection) -> None:
 
 
 def open_database(
-    location: Location, now: datetime, *, lock_timeout_s: float, create: bool = True
+    location: Location,
+    now: datetime,
+    *,
+    lock_timeout_s: float,
+    create: bool = True,
+    read_only: bool = False,
 ) -> Database:
     """The database, with its tables and of the right version.
 
@@ -216,7 +251,7 @@ def open_database(
         raise UsageError(
             f"There are no records at {location.shown}.", remedy="Correct the name of the file."
         )
-    database = Database(location, lock_timeout_s)
+    database = Database(location, lock_timeout_s, read_only=read_only)
     try:
         _check_version(database, now, create=create)
     except BaseException:
@@ -248,14 +283,12 @@ def _check_version(database: Database, now: datetime, *, create: bool) -> None:
         cause="they were made by a newer flasher" if newer else "they were made by an older one",
         remedy="Use that newer flasher."
         if newer
-        else "Keep this file for reports with that older flasher, and begin a new one.",
+        else "Bring them up to date, with a backup made first: flasher station migrate.",
     )
 
 
 def _create(database: Database, now: datetime) -> None:
     """All tables and triggers in one transaction, unless another process was faster."""
-    from flasher.station.records.chain import append  # noqa: PLC0415  it needs the tables
-
     shown = database.location.shown
     with mapped(shown, writes=True), database.engine.connect() as bare:
         connection = bare.execution_options(**{_IMMEDIATE: True})
@@ -268,8 +301,9 @@ def _create(database: Database, now: datetime) -> None:
             for statement in trigger_statements(database.backend):
                 connection.exec_driver_sql(statement)
             connection.execute(
-                schema_info.insert().values(version=SCHEMA_VERSION, created_at=utc_text(now))
+                schema_info.insert().values(
+                    version=SCHEMA_VERSION, created_at=utc_text(now), records_id=uuid4().hex
+                )
             )
-            append(connection, now, "created", {"version": SCHEMA_VERSION})
         if database.location.file is not None:
             sync_folder(database.location.file.parent)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import datetime
 from typing import Any
 
 from sqlalchemy import Connection, func, select, update
 
 from flasher.station.records import chain, schema
+from flasher.station.records.chain import Trail
+from flasher.station.records.digests import digests_of
 from flasher.station.records.errors import NotFoundError
-from flasher.station.records.model import Ending, Measurement, RunState, utc_text
+from flasher.station.records.model import AttachmentFile, Ending, Measurement, RunState, utc_text
 from flasher.station.records.rows import insert
 
 
@@ -64,9 +66,9 @@ def is_saved(connection: Connection, run_id: int, ending: Ending) -> bool:
     return tuple(row) == (ending.state.value, ending.code, ending.text, ending.log_sha256)
 
 
-def add_ending(connection: Connection, run_id: int, ending: Ending) -> None:
-    """The attachments of an ending, and how far each target was verified."""
-    for file in ending.attachments:
+def add_attachments(connection: Connection, run_id: int, files: Iterable[AttachmentFile]) -> None:
+    """Name stored files in the records of a run."""
+    for file in files:
         connection.execute(
             schema.attachment.insert().values(
                 run_id=run_id,
@@ -76,6 +78,11 @@ def add_ending(connection: Connection, run_id: int, ending: Ending) -> None:
                 size_bytes=file.size_bytes,
             )
         )
+
+
+def add_ending(connection: Connection, run_id: int, ending: Ending) -> None:
+    """The attachments of an ending, and how far each target was verified."""
+    add_attachments(connection, run_id, ending.attachments)
     for target, reached in ending.verified.items():
         changed = connection.execute(
             update(schema.run_target)
@@ -86,8 +93,9 @@ def add_ending(connection: Connection, run_id: int, ending: Ending) -> None:
         one_row(changed.rowcount, f"target {target} of run {run_id}")
 
 
-def end_run(connection: Connection, run_id: int, now: datetime, **values: Any) -> None:
+def end_run(trail: Trail, run_id: int, now: datetime, **values: Any) -> None:
     """End a run, and let the audit trail vouch for it and all its parts."""
+    connection = trail.connection
     begun_at = connection.execute(
         select(schema.run.c.begun_at).where(schema.run.c.id == run_id)
     ).scalar_one()
@@ -99,8 +107,8 @@ def end_run(connection: Connection, run_id: int, now: datetime, **values: Any) -
     )
     interrupted = values["state"] == RunState.INTERRUPTED.value
     event = chain.INTERRUPTED if interrupted else chain.FINISHED
-    data = {"state": values["state"], "digest": chain.run_digest(connection, run_id)}
-    chain.append(connection, now, event, data, run_id)
+    digests = digests_of(connection, [run_id])[run_id]
+    trail.append(now, event, {"state": values["state"], "digests": digests}, run_id)
 
 
 def weakest(connection: Connection, run_id: int) -> int | None:

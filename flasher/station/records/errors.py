@@ -61,6 +61,20 @@ class StationBusyError(RecordError):
     """Another process is this station already."""
 
 
+class KeyMissingError(RecordError):
+    """The station cannot sign: its key is not there, or is not the one of its audit chain."""
+
+
+class RecordsCutError(RecordError):
+    """The records lack what this station has written: they are an older copy, or were cut."""
+
+
+class UnprovenError(RecordError):
+    """The records were changed: what they say is not certified."""
+
+    exit_code: ClassVar[ExitCode] = ExitCode.VERIFICATION
+
+
 class Refusal(StrEnum):
     """Why a unit cannot be claimed."""
 
@@ -77,6 +91,8 @@ class Refusal(StrEnum):
     round."""
     WRONG_SERIAL = "WRONG_SERIAL"
     RECIPE_CHANGED = "RECIPE_CHANGED"
+    CLOCK = "CLOCK"
+    """The computer's clock is behind what this station has recorded."""
 
 
 class ClaimRefusedError(FlasherError):

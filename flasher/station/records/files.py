@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,10 +19,11 @@ from typing import IO, Final
 
 from flasher.protocol.text import printable
 from flasher.station.records.errors import RecordError, RecordsDamagedError, file_error, mapped
-from flasher.station.records.model import AttachmentFile
+from flasher.station.records.model import TORN_TRACE, TRACE, AttachmentFile
 
 _CHUNK_BYTES: Final = 1 << 20
 _PART: Final = ".part-"
+_SUFFIX: Final = re.compile(r"(?:\.[a-z0-9]{1,4}){1,2}$")
 _PART_AGE_S: Final = 86_400.0
 """Another station may be writing into the same folder just now."""
 
@@ -64,6 +66,42 @@ class FileStore:
                     Path(part).unlink(missing_ok=True)
                 raise
         return AttachmentFile(kind, name, sha256, size_bytes)
+
+    @property
+    def spool(self) -> Path:
+        """Where the traces of runs that go on are written, until they are saved."""
+        return self.folder / "open"
+
+    def add_spooled(self, run_id: int) -> list[AttachmentFile]:
+        """Store the trace that a run of a dead station left. Raises RecordError."""
+        plain, packed = self._spooled(run_id)
+        # A process that died while it packed the trace has left both, and the plain one is whole.
+        for path, kind in ((plain, TORN_TRACE), (packed, TRACE)):
+            if path.is_file() and path.stat().st_size:
+                return [self.add(kind, path)]
+        return []
+
+    def forget_spooled(self, run_id: int) -> None:
+        """Take away the trace of a run that is stored by its hash now."""
+        for path in self._spooled(run_id):
+            with contextlib.suppress(OSError):  # one that stays harms nothing
+                path.unlink(missing_ok=True)
+
+    def _spooled(self, run_id: int) -> tuple[Path, Path]:
+        plain = self.spool / f"run-{run_id}.log"
+        return plain, plain.with_name(plain.name + ".gz")
+
+    @contextmanager
+    def named(self, file: AttachmentFile) -> Iterator[Path]:
+        """The bytes of an attachment under a name of our own with its suffix, for readers that go
+        by the suffix: what stands in the records is nobody's path. Raises RecordError.
+        """
+        suffix = _SUFFIX.search(file.name)
+        data = self.read(file.sha256)
+        with tempfile.TemporaryDirectory(prefix="flasher-") as folder:
+            path = Path(folder) / f"trace{suffix[0] if suffix else ''}"
+            path.write_bytes(data)
+            yield path
 
     def sweep(self, now: datetime) -> int:
         """Take away what a crash left half written, a day later; how many files it was."""

@@ -154,6 +154,12 @@ class Measurement:
         )
 
 
+TRACE: Final = "trace"
+"""Kind of the attachment: the whole trace of the bus."""
+TORN_TRACE: Final = "torn-trace"
+"""Of a process that died: its end is missing."""
+
+
 @dataclass(frozen=True)
 class AttachmentFile:
     """A file that belongs to a run, already stored by its hash."""
@@ -333,6 +339,42 @@ class Problem:
 
     where: str
     what: str
+    runs: tuple[int, ...] = ()
+    """The runs that it is about; empty when it is about all of them."""
+
+
+@dataclass(frozen=True)
+class KeptHeads:
+    """What a station's chain was held against."""
+
+    station: str
+    path: Path
+    first: int
+    """Number of the first audit row whose head is kept there: from 1 where all of them are."""
+    last: int
+
+
+@dataclass(frozen=True)
+class Examination:
+    """What was found in the records, and what could be looked at."""
+
+    problems: tuple[Problem, ...]
+    remarks: tuple[str, ...]
+    """What a person should know, though nothing is wrong with it."""
+    kept: tuple[KeptHeads, ...]
+    unkept: tuple[str, ...]
+    """Stations whose chains could not be held against heads that are kept elsewhere."""
+    traces: int
+    """PASS runs that were held against their own traces."""
+
+    @property
+    def is_checked_elsewhere(self) -> bool:
+        """True when every chain was held, from its first row, against heads kept elsewhere."""
+        return not self.unkept and all(each.first == 1 for each in self.kept)
+
+    def of_run(self, run_id: RunId) -> tuple[Problem, ...]:
+        """What speaks against one run."""
+        return tuple(each for each in self.problems if not each.runs or run_id in each.runs)
 
 
 @dataclass(frozen=True)

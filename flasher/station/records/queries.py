@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection
 from typing import Any, Final
 
-from sqlalchemy import Connection, Select, case, func, select
+from sqlalchemy import Connection, Select, case, select
 
 from flasher.protocol.text import printable
 from flasher.station.records import schema
-from flasher.station.records.chain import check_chain
 from flasher.station.records.database import Database
 from flasher.station.records.details import details_of
 from flasher.station.records.errors import NotFoundError
 from flasher.station.records.figures import figures_of
-from flasher.station.records.files import FileStore
 from flasher.station.records.model import (
     Figures,
-    Problem,
     RunDetails,
     RunFilter,
     RunId,
@@ -37,9 +34,8 @@ _EVERYTHING: Final = RunFilter()
 class Records:
     """What the records say. Every method raises RecordError when they cannot be read."""
 
-    def __init__(self, database: Database, files: FileStore) -> None:
+    def __init__(self, database: Database) -> None:
         self._database = database
-        self._files = files
 
     def runs(self, chosen: RunFilter = _EVERYTHING) -> tuple[RunRecord, ...]:
         """The runs of a filter, the oldest first."""
@@ -124,19 +120,13 @@ class Records:
             found = connection.execute(select(schema.run.c.is_virtual).distinct()).scalars()
             return frozenset(map(bool, found))
 
-    def problems(self) -> Iterator[Problem]:
-        """Everything that is not as it has to be."""
-        with self._database.reading() as connection:
-            if self._database.backend == "sqlite":
-                yield from _sqlite_problems(connection)
-            yield from check_chain(connection)
-            query = select(
-                schema.attachment.c.sha256, func.min(schema.attachment.c.run_id)
-            ).group_by(schema.attachment.c.sha256)
-            for sha256, run_id in connection.execute(query).all():
-                wrong = self._files.check(sha256)
-                if wrong:
-                    yield Problem(f"run {run_id}, attachment {sha256}", wrong)
+
+def run_records(connection: Connection, run_ids: Collection[int]) -> list[RunRecord]:
+    """These runs, in the order of their ids; one that is not there, or names what is not there, is
+    left out.
+    """
+    query = _run_query().where(schema.run.c.id.in_(run_ids)).order_by(schema.run.c.id)
+    return [_run(row) for row in connection.execute(query)]
 
 
 def state_of(connection: Connection, run_id: int) -> RunState:
@@ -254,11 +244,3 @@ def _life(connection: Connection, unit: Any) -> UnitLife:
     runs = tuple(details_of(connection, [_run(row) for row in connection.execute(query)]))
     state = UnitState.after(runs[-1].run.state if runs else None)
     return UnitLife(unit.serial, unit.part, state, runs)
-
-
-def _sqlite_problems(connection: Connection) -> Iterator[Problem]:
-    for (found,) in connection.exec_driver_sql("PRAGMA integrity_check").all():
-        if found != "ok":
-            yield Problem("database", printable(str(found)))
-    for row in connection.exec_driver_sql("PRAGMA foreign_key_check").all():
-        yield Problem(f"table {row[0]}, row {row[1]}", f"it names a missing row of {row[2]}")

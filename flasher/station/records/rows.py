@@ -13,7 +13,7 @@ from sqlalchemy import Connection, Table, select
 
 from flasher.station.recipe_file import LoadedRecipe, LoadedTarget
 from flasher.station.records import schema
-from flasher.station.records.chain import append
+from flasher.station.records.chain import Trail
 
 
 def named(connection: Connection, table: Table, **key: Any) -> int:
@@ -30,8 +30,9 @@ def insert(connection: Connection, table: Table, **values: Any) -> int:
     return int(key[0])
 
 
-def recipe_row(connection: Connection, loaded: LoadedRecipe, now: datetime) -> int:
+def recipe_row(trail: Trail, loaded: LoadedRecipe, now: datetime) -> int:
     """The recipe with its whole text, so that it can be read years later."""
+    connection = trail.connection
     table = schema.recipe
     query = select(table.c.id).where(table.c.sha256 == loaded.sha256)
     found = connection.execute(query).scalar_one_or_none()
@@ -39,7 +40,7 @@ def recipe_row(connection: Connection, loaded: LoadedRecipe, now: datetime) -> i
         return int(found)
     recipe = loaded.recipe
     facts = {"name": recipe.name, "revision": recipe.revision, "sha256": loaded.sha256}
-    append(connection, now, "recipe", facts)
+    trail.append(now, "recipe", facts)
     return insert(
         connection,
         table,

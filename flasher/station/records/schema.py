@@ -29,13 +29,15 @@ from sqlalchemy import (
 from flasher.station.records.model import RunKind, RunState, StepState
 from flasher.station.steps import Verified
 
-SCHEMA_VERSION: Final = 1
+SCHEMA_VERSION: Final = 2
 
 metadata: Final = MetaData()
 
 _LEVELS: Final = f"BETWEEN {min(Verified)} AND {max(Verified)}"
 _UTC_SIZE: Final = 27
 _SHA256_SIZE: Final = 64
+_SIGNATURE_SIZE: Final = 88
+"""64 bytes in base64."""
 
 
 def _key() -> Column[int]:
@@ -75,7 +77,9 @@ schema_info: Final = Table(
     metadata,
     Column("version", Integer, primary_key=True, autoincrement=False),
     _utc("created_at"),
+    _text("records_id", 32),
 )
+"""`records_id` tells these records, and every copy of them, from all others."""
 
 station: Final = Table("station", metadata, _key(), _text("name"), UniqueConstraint("name"))
 
@@ -286,13 +290,19 @@ audit: Final = Table(
     "audit",
     metadata,
     _key(),
+    _to("station"),
+    Column("number", BigInteger, nullable=False),
     _utc("at"),
     _text("event", 32),
     _to("run", nullable=True, index=True),
     Column("data", Text, nullable=False),
     _sha256("previous_hash"),
     _sha256("hash"),
-    UniqueConstraint("previous_hash"),
+    _text("signature", _SIGNATURE_SIZE),
+    UniqueConstraint("station_id", "number"),
+    UniqueConstraint("station_id", "previous_hash"),
     UniqueConstraint("hash"),
+    Index("audit_by_time", "station_id", "at"),
 )
-"""Append-only; each row's hash covers the row and the hash before it (`audit`)."""
+"""Append-only, one chain a station; each row's hash covers the row and the hash before it, and is
+signed with the station's key (`chain`)."""

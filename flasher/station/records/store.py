@@ -20,17 +20,18 @@ from __future__ import annotations
 import math
 import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from sqlalchemy import select, update
 
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import chain, queries, schema
 from flasher.station.records.backup import make_backup
+from flasher.station.records.checking import Examiner
 from flasher.station.records.claims import begin_run, make_order
 from flasher.station.records.database import (
     DEFAULT_LOCK_TIMEOUT_S,
@@ -39,6 +40,7 @@ from flasher.station.records.database import (
     open_database,
 )
 from flasher.station.records.endings import (
+    add_attachments,
     add_ending,
     add_step,
     end_run,
@@ -46,10 +48,7 @@ from flasher.station.records.endings import (
     one_row,
     weakest,
 )
-from flasher.station.records.errors import (
-    RecordError,
-    RuleBrokenError,
-)
+from flasher.station.records.errors import RuleBrokenError
 from flasher.station.records.files import FileStore
 from flasher.station.records.lock import StationLock
 from flasher.station.records.model import (
@@ -60,6 +59,7 @@ from flasher.station.records.model import (
     Claim,
     Clock,
     Ending,
+    Examination,
     Measurement,
     Problem,
     RunId,
@@ -69,8 +69,10 @@ from flasher.station.records.model import (
     utc_text,
 )
 from flasher.station.records.rows import insert
+from flasher.station.records.signing import Keeping, Signer
 from flasher.station.records.triggers import limits_of
 
+_USUAL: Final = Keeping()
 _ONLY_FINITE = "a number that is no number cannot be recorded"
 
 
@@ -89,11 +91,14 @@ class SystemClock:
 class Store:
     """The records. Open with `Store.open`; a context manager."""
 
-    def __init__(self, database: Database, station: str, clock: Clock) -> None:
+    def __init__(
+        self, database: Database, station: str, clock: Clock, keeping: Keeping = _USUAL
+    ) -> None:
         self.database = database
         self.station = station
         self.files = FileStore(database.location.folder)
-        self.read = queries.Records(database, self.files)
+        self.signer = Signer(database, station, clock.utc, keeping)
+        self.read = queries.Records(database)
         self._clock = clock
         lock_name = "station-" + re.sub(r"[^A-Za-z0-9_-]", "_", station) + ".lock"
         self._lock = StationLock(database.location.folder / lock_name)
@@ -108,18 +113,25 @@ class Store:
         folder: Path | None = None,
         lock_timeout_s: float = DEFAULT_LOCK_TIMEOUT_S,
         create: bool = True,
+        read_only: bool = False,
+        keeping: Keeping = _USUAL,
     ) -> Self:
         """The records at an SQLAlchemy URL, or in an SQLite file; made when they are not there and
         `create` is true. `folder` holds the attachments (beside an SQLite file by default).
+        `read_only` changes nothing, not even the journal.
 
         Raises UsageError for a place that cannot be, SchemaVersionError, or another RecordError.
         """
         clock = clock or SystemClock()
         location = locate(url, folder)
         database = open_database(
-            location, clock.utc(), lock_timeout_s=lock_timeout_s, create=create
+            location,
+            clock.utc(),
+            lock_timeout_s=lock_timeout_s,
+            create=create and not read_only,
+            read_only=read_only,
         )
-        return cls(database, station, clock)
+        return cls(database, station, clock, keeping)
 
     def close(self) -> None:
         """Close the database and let another process be the station."""
@@ -144,17 +156,26 @@ class Store:
 
     # -- beginning --------------------------------------------------------------------------------
 
-    def recover(self) -> tuple[RunId, ...]:
-        """Become the station (one process at a time), and end what a dead one left running: these
-        runs become INTERRUPTED, their units RECHECK. Call it once at start.
+    def become_station(self) -> None:
+        """Let this process, and no other, write the station's chain.
 
-        Raises StationBusyError, RecordError.
+        Raises StationBusyError; KeyMissingError, RecordsCutError; another RecordError.
         """
         self._lock.acquire()
+        self.signer.begin()
+
+    def recover(self) -> tuple[RunId, ...]:
+        """Become the station (one process at a time), and end what a dead one left running: these
+        runs become INTERRUPTED, with the traces that they left; their units RECHECK. Call it once
+        at start.
+
+        Raises StationBusyError; KeyMissingError, RecordsCutError; another RecordError.
+        """
+        self.become_station()
         now = self._clock.utc()
         self.files.sweep(now)
-        with self.database.writing() as connection:
-            left = connection.execute(
+        with self.signer.writing() as trail:
+            left = trail.connection.execute(
                 select(schema.run.c.id)
                 .join_from(schema.run, schema.socket)
                 .join(schema.station)
@@ -166,14 +187,17 @@ class Store:
             ).scalars()
             found = tuple(RunId(run_id) for run_id in left)
             for run_id in found:
+                add_attachments(trail.connection, run_id, self.files.add_spooled(run_id))
                 end_run(
-                    connection,
+                    trail,
                     run_id,
                     now,
                     state=RunState.INTERRUPTED.value,
                     code="STATION_DIED",
                     text="The station ended before this run did. The unit has to be checked.",
                 )
+        for run_id in found:
+            self.files.forget_spooled(run_id)
         return found
 
     def claim(
@@ -191,17 +215,13 @@ class Store:
 
         Raises ClaimRefusedError, RecordError (before `recover` too).
         """
-        if not self._lock.is_held:
-            raise RecordError(
-                "This process is not the station: it has not looked for interrupted runs.",
-                remedy="Call recover() first.",
-            )
         now = self._clock.utc()
         order = make_order(
             serial, socket, recipe, operator, lot, reason, now, is_virtual=is_virtual
         )
-        with self.database.writing() as connection:
-            return begin_run(connection, order, self.station, now, self._clock.monotonic_s())
+        # One claim at a time, of all stations: two must not find the last place of a lot free.
+        with self.signer.writing("claims") as trail:
+            return begin_run(trail, order, now, self._clock.monotonic_s())
 
     # -- while it runs ----------------------------------------------------------------------------
 
@@ -287,19 +307,19 @@ class Store:
             if wrong:
                 raise RuleBrokenError(f"{file.name}: {wrong}", where=f"run {run_id}")
         now = self._clock.utc()
-        with self.database.writing() as connection:
-            if is_saved(connection, run_id, ending):
+        with self.signer.writing() as trail:
+            if is_saved(trail.connection, run_id, ending):
                 return
-            add_ending(connection, run_id, ending)
+            add_ending(trail.connection, run_id, ending)
             end_run(
-                connection,
+                trail,
                 run_id,
                 now,
                 state=ending.state.value,
                 code=ending.code,
                 text=ending.text,
                 ended_monotonic_s=self._clock.monotonic_s(),
-                verification_reached=weakest(connection, run_id),
+                verification_reached=weakest(trail.connection, run_id),
                 log_sha256=ending.log_sha256,
             )
 
@@ -307,16 +327,15 @@ class Store:
         """Add what a person did to the audit trail; on disk when it returns. `data` holds what
         JSON can hold. Raises RecordError.
         """
-        with self.database.writing() as connection:
-            chain.append(connection, self._clock.utc(), event.value, data, run_id)
+        with self.signer.writing() as trail:
+            trail.append(self._clock.utc(), event.value, data, run_id)
 
     def correct(self, run_id: RunId, operator: str, text: str) -> None:
         """Add a remark to a finished run, which itself never changes."""
-        with self.database.writing() as connection:
-            queries.state_of(connection, run_id)
-            chain.append(
-                connection, self._clock.utc(), "correction", {"by": operator, "text": text}, run_id
-            )
+        with self.signer.writing() as trail:
+            queries.state_of(trail.connection, run_id)
+            data = {"by": operator, "text": text}
+            trail.append(self._clock.utc(), "correction", data, run_id)
 
     # -- care -------------------------------------------------------------------------------------
 
@@ -328,4 +347,16 @@ class Store:
 
     def verify(self) -> tuple[Problem, ...]:
         """Everything that is not as it has to be: database, audit trail, runs, attachments."""
-        return tuple(self.read.problems())
+        return self.examine().problems
+
+    def examine(self, runs: Collection[RunId] | None = None) -> Examination:
+        """What holds of the records and what does not, with the reasons; of these runs, or of all.
+
+        Raises RecordError when they cannot be read.
+        """
+        return Examiner(self.database, self.files, self.signer.place).examine(runs)
+
+    def release_clock(self, operator: str, reason: str) -> None:
+        """Note that the clock is right, though records of a later time are there."""
+        with self.signer.writing() as trail:
+            trail.append(self._clock.utc(), chain.CLOCK, {"by": operator, "reason": reason})

@@ -200,8 +200,9 @@ _PART_RULES: Final = (
         "audit_chain",
         "audit",
         "BEFORE INSERT",
-        "EXISTS (SELECT 1 FROM audit) AND NEW.previous_hash <>"
-        " (SELECT hash FROM audit ORDER BY id DESC LIMIT 1)",
+        "EXISTS (SELECT 1 FROM audit WHERE station_id = NEW.station_id)"
+        " AND NOT EXISTS (SELECT 1 FROM audit WHERE station_id = NEW.station_id"
+        " AND number = NEW.number - 1 AND hash = NEW.previous_hash)",
         "an audit row names the hash of the row before it",
     ),
 )

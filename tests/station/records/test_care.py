@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
-import sqlite3
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -46,56 +44,6 @@ def test_a_backup_that_fails_leaves_the_old_one(bench: Bench) -> None:
 def test_a_backup_does_not_overwrite_the_records(bench: Bench) -> None:
     with pytest.raises(UsageError, match="cannot replace"):
         bench.store.backup(bench.path)
-
-
-@pytest.fixture(scope="module")
-def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """Records of a good and a bad unit, with nothing wrong in them."""
-    made = Bench(tmp_path_factory.mktemp("plant"))
-    made.make()
-    made.make(RunState.FAIL, "W2605003")
-    assert not made.store.verify()
-    yield made
-    made.store.close()
-
-
-def without_rules(connection: sqlite3.Connection) -> None:
-    """Someone with a database tool and time."""
-    names = connection.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall()
-    for (name,) in names:
-        connection.execute(f"DROP TRIGGER {name}")
-
-
-@pytest.mark.parametrize(
-    ("statement", "found"),
-    [
-        ("UPDATE run SET text = 'all was well' WHERE id = 1", "changed after it was finished"),
-        ("UPDATE run SET code = 'X' WHERE id = 1", "changed after it was finished"),
-        ("UPDATE step SET duration_s = 0.1", "changed after it was finished"),
-        ("UPDATE device_write SET read_back = 'V9'", "changed after it was finished"),
-        ("UPDATE unit SET serial = 'W9999999' WHERE id = 1", "changed after it was finished"),
-        ("UPDATE operator SET name = 'someone else'", "changed after it was finished"),
-        ("DELETE FROM attachment WHERE run_id = 1", "changed after it was finished"),
-        ("DELETE FROM audit WHERE id = 3", "chain is broken"),
-        ("UPDATE audit SET data = '{}' WHERE id = 3", "changed after it was written"),
-        ("DELETE FROM audit WHERE id = (SELECT max(id) FROM audit)", "does not know it"),
-        ("UPDATE step SET run_id = 77 WHERE id = 1", "missing row"),
-        ("DELETE FROM run WHERE id = 1", "missing"),
-    ],
-)
-def test_what_was_changed_behind_the_rules_is_found(
-    plant: Bench, tmp_path: Path, statement: str, found: str
-) -> None:
-    copy = tmp_path / "records.sqlite"
-    with contextlib.closing(sqlite3.connect(copy)) as other:
-        with contextlib.closing(sqlite3.connect(plant.path)) as original:
-            original.backup(other)
-        without_rules(other)
-        other.execute(statement)
-        other.commit()
-    folder = plant.store.files.folder
-    with Store.open(str(copy), station="x", folder=folder, create=False) as store:
-        assert found in " ".join(problem.what for problem in store.verify())
 
 
 @pytest.mark.parametrize("spoil", [lambda path: path.unlink(), lambda path: path.write_bytes(b"x")])

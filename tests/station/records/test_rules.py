@@ -259,7 +259,7 @@ def test_a_step_does_not_pass_with_a_measurement_out_of_limits(
         "DELETE FROM operator",
         "UPDATE audit SET data = '{}'",
         "DELETE FROM audit",
-        f"INSERT INTO audit VALUES (99, 'x', 'x', NULL, '', '{SHA}', '{SHA}')",
+        f"INSERT INTO audit VALUES (99, 1, 9, 'x', 'x', NULL, '', '{SHA}', '{SHA}', 'x')",
         "INSERT INTO unit SELECT 99, part, serial FROM unit",
         "INSERT INTO station SELECT 99, name FROM station",
         "UPDATE operator SET name = 'X'",

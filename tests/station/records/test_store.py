@@ -63,7 +63,7 @@ def test_a_finished_run_says_what_was_done(bench: Bench) -> None:
     assert (write.what, write.read_back) == ("flash", BMS_VERSION)
     (file,) = details.attachments
     assert file.sha256 == run.log_sha256
-    assert bench.store.files.read(file.sha256) == bench.trace.read_bytes()
+    assert bench.store.files.read(file.sha256) == (bench.folder / file.name).read_bytes()
     assert not bench.store.verify()
 
 

@@ -1,0 +1,334 @@
+"""What is wrong with the records: database, schema, audit chains, runs, attachments, traces."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from itertools import islice
+from typing import Any, Final
+
+from sqlalchemy import Connection, func, select
+
+from flasher.errors import UsageError
+from flasher.protocol.text import printable
+from flasher.station.records import chain, schema
+from flasher.station.records.database import Database
+from flasher.station.records.details import details_of
+from flasher.station.records.digests import BATCH, NAMED, OWN, digests_of
+from flasher.station.records.errors import RecordError
+from flasher.station.records.files import FileStore
+from flasher.station.records.fingerprint import differences, fingerprint_of
+from flasher.station.records.heads import Head
+from flasher.station.records.keys import fingerprint, is_signed
+from flasher.station.records.model import (
+    TRACE,
+    AttachmentFile,
+    Examination,
+    KeptHeads,
+    Problem,
+    RunDetails,
+    RunId,
+    RunState,
+)
+from flasher.station.records.proof import contradictions, hear
+from flasher.station.records.queries import run_records
+from flasher.station.records.signing import KeptPlace
+from flasher.trace.reader import read_trace
+
+_ENDINGS: Final = (chain.FINISHED, chain.INTERRUPTED, chain.MIGRATED_RUN)
+_RUNS_NAMED: Final = 5
+
+
+class Examiner:
+    """One examination of the records."""
+
+    def __init__(self, database: Database, files: FileStore, place: KeptPlace) -> None:
+        self._database = database
+        self._files = files
+        self._place = place
+        self._remarks: list[str] = []
+        self._kept: list[KeptHeads] = []
+        self._unkept: list[str] = []
+        self._traces = 0
+        self._nameless = 0
+        self._claims: dict[int, Mapping[str, str]] = {}
+        """The digests that the chains state for each run, at its claim."""
+        self._endings: dict[int, Mapping[str, str]] = {}
+        """And at its end."""
+
+    def examine(self, runs: Collection[RunId] | None = None) -> Examination:
+        """Look at everything, and of the runs at these or at all."""
+        with self._database.reading() as connection:
+            problems = tuple(self._problems(connection, runs))
+        if self._nameless:
+            self._remarks.append(
+                f"{self._nameless} PASS of devices that name no serial number: their traces do not"
+                " tell which unit it was"
+            )
+        return Examination(
+            problems, tuple(self._remarks), tuple(self._kept), tuple(self._unkept), self._traces
+        )
+
+    def _problems(
+        self, connection: Connection, runs: Collection[RunId] | None
+    ) -> Iterator[Problem]:
+        if self._database.backend == "sqlite":
+            yield from _sqlite_problems(connection)
+        yield from self._chains(connection)
+        query = select(schema.run.c.id).order_by(schema.run.c.id)
+        chosen = list(connection.execute(query).scalars())
+        for run_id in sorted((self._claims.keys() | self._endings.keys()) - set(chosen)):
+            yield Problem(f"run {run_id}", "it is missing: the audit trail knows it", (run_id,))
+        if runs is not None:
+            chosen = sorted(set(chosen) & set(runs))
+        changed: dict[tuple[str, str], list[int]] = defaultdict(list)
+        for batch in _batches(chosen):
+            yield from self._runs(connection, batch, changed)
+        for (part, _), run_ids in changed.items():
+            shown = ", ".join(map(str, run_ids[:_RUNS_NAMED]))
+            more = f" and {len(run_ids) - _RUNS_NAMED} more" if len(run_ids) > _RUNS_NAMED else ""
+            what = f"changed after it was recorded: {NAMED[part]}"
+            yield Problem(f"{part} of run {shown}{more}", what, tuple(run_ids))
+        yield from self._traces_used_twice(connection)
+
+    # -- chains -----------------------------------------------------------------------------------
+
+    def _chains(self, connection: Connection) -> Iterator[Problem]:
+        info = connection.execute(select(schema.schema_info)).mappings().one()
+        records_id, found = info["records_id"], fingerprint_of(connection)
+        names = list(connection.execute(select(schema.station.c.name)).scalars())
+        kept_of = self._place.files(records_id, names)
+        for name in dict.fromkeys([*names, *kept_of]):
+            rows = connection.execute(
+                select(schema.audit)
+                .join_from(schema.audit, schema.station)
+                .where(schema.station.c.name == name)
+                .order_by(schema.audit.c.number)
+            )
+            hashes: dict[int, str] = {}
+            restored: dict[int, int] = {}
+            yield from self._chain(name, rows.mappings(), records_id, found, hashes, restored)
+            yield from self._heads(name, kept_of.get(name), hashes, restored)
+
+    def _chain(
+        self,
+        name: str,
+        rows: Iterable[Mapping[Any, Any]],
+        records_id: str,
+        found: Mapping[str, str],
+        hashes: dict[int, str],
+        restored: dict[int, int],
+    ) -> Iterator[Problem]:
+        """Go along one chain; fills the hashes of its rows, and which heads were given up."""
+        before, key = chain.GENESIS, None
+        stated: Mapping[str, str] = {}
+        shown = printable(name)
+        for expected, row in enumerate(rows, 1):
+            where = f"audit row {row['number']} of {shown}"
+            data = _data(row["data"])
+            if row["previous_hash"] != before or row["number"] != expected:
+                yield Problem(where, "the chain is broken: the row before it is missing or changed")
+            if row["hash"] != chain.row_hash(name, row):
+                yield Problem(where, "it was changed after it was written")
+            following = chain.key_of(row["event"], data)
+            if following is not None and row["event"] != chain.KEY_ROTATED:
+                key = following  # which signs itself
+            if key is None or not is_signed(row["hash"], row["signature"], key):
+                yield Problem(where, "it is not signed with the key of the station")
+            key = following or key
+            before, hashes[row["number"]] = row["hash"], row["hash"]
+            if row["event"] == chain.BEGUN and data.get("records") != records_id:
+                yield Problem(where, "its chain is that of other records")
+            stated = data.get("schema", stated)
+            if row["event"] == chain.RESTORED:
+                restored[row["number"]] = int(data.get("lost_to", 0))
+            self._note(shown, row, data)
+            self._vouch(row, data)
+            for each in data.get("problems", ()):
+                yield Problem(where, f"found at the migration: {printable(str(each))}")
+        if hashes:
+            for thing, what in differences(stated, found):
+                yield Problem(f"schema, {printable(thing)}", what)
+
+    def _note(self, shown: str, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
+        said = f"{row['at'][:10]} by {printable(str(data.get('by')))}"
+        match row["event"]:
+            case chain.KEY_LOST:
+                self._remarks.append(
+                    f"{shown}: the key was declared lost on {said}; it signs with"
+                    f" {fingerprint(data['key'])} since"
+                )
+            case chain.RESTORED:
+                self._remarks.append(
+                    f"{shown}: rows {row['number']} to {data['lost_to']} of an earlier chain were"
+                    f" given up as lost on {said}"
+                )
+            case chain.CLOCK:
+                self._remarks.append(f"{shown}: the clock was released on {said}")
+            case _:
+                pass
+
+    def _vouch(self, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
+        digests = data.get("digests")
+        if row["run_id"] is None or not isinstance(digests, dict):
+            return
+        if row["event"] in _ENDINGS:
+            self._endings[row["run_id"]] = digests
+        elif row["event"] == chain.CLAIMED:
+            self._claims[row["run_id"]] = digests
+
+    def _heads(
+        self,
+        name: str,
+        kept: tuple[Head | int, ...] | None,
+        hashes: Mapping[int, str],
+        restored: Mapping[int, int],
+    ) -> Iterator[Problem]:
+        """Hold a chain against the heads that are kept of it."""
+        shown = printable(name)
+        place = printable(str(self._place.folder))
+        if not kept:
+            if hashes:
+                self._unkept.append(name)
+                if self._place.is_named:
+                    yield Problem(f"heads of {shown}", f"none of these records is kept in {place}")
+            return
+        heads = [each for each in kept if isinstance(each, Head)]
+        for line in (each for each in kept[:-1] if not isinstance(each, Head)):
+            yield Problem(f"heads of {shown}", f"line {line} in {place} is no head")
+        held = _counting(heads, hashes, restored)
+        missing = [head for head in held if head.number not in hashes]
+        other = [head for head in held if hashes.get(head.number, head.hash) != head.hash]
+        if missing:
+            last = max(missing, key=lambda head: head.number)
+            yield Problem(
+                f"audit trail of {shown}",
+                f"it ends at row {max(hashes, default=0)}, but row {last.number} of {last.at} is"
+                f" kept in {place}: its end was cut off, or this is an older copy",
+            )
+        if other:
+            first = min(other, key=lambda head: head.number)
+            yield Problem(
+                f"audit trail of {shown}",
+                f"row {first.number} of {first.at} is not the one that is kept in {place}: the"
+                " chain was made anew",
+            )
+        if held:
+            numbers = [head.number for head in held]
+            path = self._place.folder
+            self._kept.append(KeptHeads(name, path, min(numbers), max(numbers)))
+
+    # -- runs -------------------------------------------------------------------------------------
+
+    def _runs(
+        self, connection: Connection, run_ids: list[int], changed: dict[tuple[str, str], list[int]]
+    ) -> Iterator[Problem]:
+        digests = digests_of(connection, run_ids)
+        for details in details_of(connection, run_records(connection, run_ids)):
+            run_id = details.run.run_id
+            where = f"run {run_id}"
+            is_over = details.run.state is not RunState.RUNNING
+            stated = {**self._claims.get(run_id, {}), **self._endings.get(run_id, {})}
+            if not stated:
+                yield Problem(where, "the audit trail does not know it", (run_id,))
+            elif is_over != (run_id in self._endings):
+                what = "it is finished" if is_over else "it goes on"
+                yield Problem(where, f"{what}, but the audit trail says otherwise", (run_id,))
+            wrong = [part for part in stated if stated[part] != digests[run_id].get(part)]
+            for part in wrong:
+                if part in NAMED:
+                    changed[part, digests[run_id][part]].append(run_id)
+            own = [OWN.get(part, part) for part in wrong if part not in NAMED]
+            if own:
+                what = f"changed after it was recorded: {', '.join(own)}"
+                yield Problem(where, what, (run_id,))
+            yield from self._attachments(details)
+
+    def _attachments(self, details: RunDetails) -> Iterator[Problem]:
+        run = details.run
+        traces = [
+            file
+            for file in details.attachments
+            if file.kind == TRACE and file.sha256 == run.log_sha256
+        ]
+        for file in details.attachments:
+            wrong = self._files.check(file.sha256)
+            if wrong:
+                where = f"run {run.run_id}, attachment {file.sha256}"
+                yield Problem(where, wrong, (run.run_id,))
+                if file in traces:
+                    return
+        if run.state is RunState.PASS:
+            yield from self._trace(details, traces)
+
+    def _trace(self, details: RunDetails, traces: list[AttachmentFile]) -> Iterator[Problem]:
+        """Hold a PASS against its own trace."""
+        run = details.run
+        where = f"run {run.run_id}, PASS of {printable(run.serial)}"
+        if not traces:
+            yield Problem(where, "there is no trace to hold it against", (run.run_id,))
+            return
+        try:
+            with self._files.named(traces[0]) as path:
+                heard = hear((target.target for target in details.targets), read_trace(path))
+        except (UsageError, RecordError) as error:
+            what = f"its trace cannot be read: {error.cause or error.what}"
+            yield Problem(where, what, (run.run_id,))
+            return
+        self._traces += 1
+        self._nameless += not any(each.serial for each in heard.values())
+        for what in contradictions(details, heard):
+            yield Problem(where, f"its trace says otherwise: {what}", (run.run_id,))
+
+    @staticmethod
+    def _traces_used_twice(connection: Connection) -> Iterator[Problem]:
+        run = schema.run.c
+        query = (
+            select(run.log_sha256)
+            .where(run.state == RunState.PASS.value)
+            .group_by(run.log_sha256)
+            .having(func.count() > 1)
+        )
+        for sha256 in connection.execute(query).scalars().all():
+            of_trace = select(run.id).where(run.log_sha256 == sha256).order_by(run.id)
+            run_ids = tuple(connection.execute(of_trace).scalars())
+            shown = ", ".join(map(str, run_ids[:_RUNS_NAMED]))
+            yield Problem(f"runs {shown}", "they have one and the same trace", run_ids)
+
+
+def _counting(
+    heads: list[Head], hashes: Mapping[int, str], restored: Mapping[int, int]
+) -> list[Head]:
+    """The heads without those that a person gave up, when older records were put back."""
+    given_up: set[int] = set()
+    for number, lost_to in restored.items():
+        given_up_at = len(heads)
+        for index, head in enumerate(heads):
+            if (head.number, head.hash) == (number, hashes[number]):
+                given_up_at = index
+        earlier = enumerate(heads[:given_up_at])
+        given_up |= {index for index, head in earlier if number <= head.number <= lost_to}
+    return [head for index, head in enumerate(heads) if index not in given_up]
+
+
+def _batches(keys: Iterable[int]) -> Iterator[list[int]]:
+    rest = iter(keys)
+    while batch := list(islice(rest, BATCH)):
+        yield batch
+
+
+def _data(text: str) -> dict[str, Any]:
+    try:
+        found = json.loads(text)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def _sqlite_problems(connection: Connection) -> Iterator[Problem]:
+    for (found,) in connection.exec_driver_sql("PRAGMA integrity_check").all():
+        if found != "ok":
+            yield Problem("database", printable(str(found)))
+    for row in connection.exec_driver_sql("PRAGMA foreign_key_check").all():
+        yield Problem(f"table {row[0]}, row {row[1]}", f"it names a missing row of {row[2]}")

@@ -1,0 +1,75 @@
+"""The heads of audit chains, kept outside of the records: one line for each commit.
+
+The chain alone cannot tell that its end was cut off, or that it is an older copy of itself. A file
+that only grows, in another place, can.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from flasher.protocol.text import printable
+from flasher.station.records.errors import mapped
+from flasher.station.records.files import sync_folder
+
+
+@dataclass(frozen=True)
+class Head:
+    """The end of a station's chain at some moment, signed."""
+
+    station: str
+    number: int
+    """Of the audit row in the station's chain, from 1."""
+    at: str
+    hash: str
+    signature: str
+    key: str
+    """The public key, in hexadecimal digits."""
+
+
+class HeadsFile:
+    """The kept heads of one station; `append` is the only change that is ever made."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def append(self, head: Head) -> None:
+        """Add a line; on disk when this returns. Raises RecordError."""
+        line = json.dumps(asdict(head), sort_keys=True).encode("ascii") + b"\n"
+        with mapped(printable(str(self.path)), writes=True):
+            is_new = not self.path.exists()
+            if is_new:
+                self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            handle = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
+            with os.fdopen(handle, "rb+", buffering=0) as file:
+                size = file.seek(0, os.SEEK_END)
+                if size:
+                    file.seek(size - 1)
+                    if file.read(1) != b"\n":
+                        line = b"\n" + line  # behind half a line, which a crash has left
+                file.write(line)
+                os.fsync(file.fileno())
+            if is_new:
+                sync_folder(self.path.parent)
+
+    def read(self) -> tuple[Head | int, ...]:
+        """The heads in the order in which they were kept; in place of a line that is no head its
+        number, from 1. Empty without a file. Raises RecordError.
+        """
+        if not self.path.exists():
+            return ()
+        with mapped(printable(str(self.path)), writes=False):
+            lines = self.path.read_bytes().splitlines()
+        return tuple(_heads(lines))
+
+
+def _heads(lines: list[bytes]) -> Iterator[Head | int]:
+    for number, line in enumerate(lines, 1):
+        try:
+            yield Head(**json.loads(line))
+        except (ValueError, TypeError):
+            yield number

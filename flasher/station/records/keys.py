@@ -1,0 +1,118 @@
+"""The signing key of a station (Ed25519), in a file outside of the records.
+
+Whoever can write the database, but has not this file, cannot make a chain that verifies.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import re
+from pathlib import Path
+from typing import Final
+
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+)
+from platformdirs import user_data_path
+
+from flasher.protocol.text import printable
+from flasher.station.records.errors import KeyMissingError, mapped
+from flasher.station.records.files import sync_folder
+
+_MODE: Final = 0o600
+_CONTEXT: Final = b"flasher station audit row "
+"""What is signed says what it is, so that no signature can stand for something else."""
+
+
+def default_folder() -> Path:
+    """Where keys and heads are kept when the user names no place."""
+    return user_data_path("flasher", appauthor=False) / "station"
+
+
+def file_name(station: str, records_id: str, suffix: str) -> str:
+    """The name of a station's file for these records: unlike for unlike stations."""
+    plain = re.sub(r"[^A-Za-z0-9_-]", "_", station)[:40]
+    mark = hashlib.sha256(f"{records_id} {station}".encode()).hexdigest()[:12]
+    return f"{plain}-{mark}{suffix}"
+
+
+def fingerprint(public: str) -> str:
+    """What a person compares: the first 16 digits of the hash of a public key, in groups."""
+    digits = hashlib.sha256(bytes.fromhex(public)).hexdigest()[:16]
+    return "-".join(digits[at : at + 4] for at in range(0, 16, 4))
+
+
+def is_signed(row_hash: str, signature: str, public: str) -> bool:
+    """True when the holder of the key signed this hash."""
+    try:
+        key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(public))
+        key.verify(base64.b64decode(signature, validate=True), _CONTEXT + row_hash.encode())
+    except (InvalidSignature, ValueError):
+        return False
+    return True
+
+
+class SigningKey:
+    """A private key. `public` is the public one, 64 hexadecimal digits."""
+
+    def __init__(self, key: Ed25519PrivateKey) -> None:
+        self._key = key
+        self.public = key.public_key().public_bytes_raw().hex()
+
+    @classmethod
+    def make(cls, path: Path) -> SigningKey:
+        """A new key, on disk when this returns, for this user alone. Raises RecordError."""
+        key = Ed25519PrivateKey.generate()
+        text = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+        with mapped(printable(str(path)), writes=True):
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _MODE)
+            with os.fdopen(handle, "wb") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            sync_folder(path.parent)
+        return cls(key)
+
+    @classmethod
+    def load(cls, path: Path) -> SigningKey | None:
+        """The key in a file; None when there is no file. Raises KeyMissingError for a file that is
+        no key or that others may read, RecordError for one that cannot be read.
+        """
+        shown = printable(str(path))
+        if not path.exists():
+            return None
+        try:
+            with mapped(shown, writes=False):
+                if os.name != "nt" and path.stat().st_mode & 0o077:
+                    raise KeyMissingError(
+                        "Others may read the signing key of the station.",
+                        where=shown,
+                        remedy=f"chmod 600 {shown}",
+                    )
+                data = path.read_bytes()
+            key = load_pem_private_key(data, password=None)
+        except (ValueError, TypeError, UnsupportedAlgorithm) as error:
+            raise _no_key(shown) from error
+        if not isinstance(key, Ed25519PrivateKey):
+            raise _no_key(shown)
+        return cls(key)
+
+    def sign(self, row_hash: str) -> str:
+        """The signature of a row's hash, in base64."""
+        return base64.b64encode(self._key.sign(_CONTEXT + row_hash.encode())).decode("ascii")
+
+
+def _no_key(shown: str) -> KeyMissingError:
+    return KeyMissingError(
+        "The signing key of the station cannot be used: the file holds no Ed25519 key.",
+        where=shown,
+        remedy="Put the right file back; if it is lost: flasher station key --lost.",
+    )

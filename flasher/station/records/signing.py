@@ -1,0 +1,221 @@
+"""Writes that the audit chain vouches for: signed with the station's key, and their heads kept."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cached_property
+from pathlib import Path
+from threading import Lock
+
+from sqlalchemy import select
+
+from flasher.protocol.text import printable
+from flasher.station.records import chain
+from flasher.station.records.database import Database
+from flasher.station.records.errors import KeyMissingError, RecordError, RecordsCutError
+from flasher.station.records.fingerprint import fingerprint_of
+from flasher.station.records.heads import Head, HeadsFile
+from flasher.station.records.keys import SigningKey, default_folder, file_name, fingerprint
+from flasher.station.records.schema import SCHEMA_VERSION, schema_info
+
+
+@dataclass(frozen=True)
+class KeptPlace:
+    """The folder in which the heads of audit chains are kept."""
+
+    folder: Path
+    is_named: bool
+    """The user named it, so that the heads have to be there."""
+
+    def file(self, station: str, records_id: str) -> HeadsFile:
+        """The heads of one station's chain."""
+        return HeadsFile(self.folder / file_name(station, records_id, ".heads"))
+
+    def files(self, records_id: str, stations: Iterable[str]) -> dict[str, tuple[Head | int, ...]]:
+        """The heads that are kept of these records, by station; also of stations that the records
+        do not name. Raises RecordError.
+        """
+        found = {name: self.file(name, records_id).read() for name in stations}
+        if self.folder.is_dir():
+            for path in sorted(self.folder.glob("*.heads")):
+                heads = HeadsFile(path).read()
+                name = next((each.station for each in heads if isinstance(each, Head)), None)
+                if name is not None and path == self.file(name, records_id).path:
+                    found[name] = heads
+        return {name: heads for name, heads in found.items() if heads}
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """Where the signing key of a station is kept, and the heads of its chain; None: the place of
+    this user, and beside the key.
+    """
+
+    keys: Path | None = None
+    heads: Path | None = None
+
+
+class Signer:
+    """The key and the kept heads of one station. Nothing is read or made before `begin`."""
+
+    def __init__(
+        self,
+        database: Database,
+        station: str,
+        now: Callable[[], datetime],
+        keeping: Keeping,
+    ) -> None:
+        self._database = database
+        self._station = station
+        self._now = now
+        self.keys = keeping.keys or default_folder()
+        self.place = KeptPlace(keeping.heads or self.keys, is_named=keeping.heads is not None)
+        self._key: SigningKey | None = None
+        self._unkept: deque[Head] = deque()
+        self._keeping = Lock()
+
+    @cached_property
+    def records_id(self) -> str:
+        """What tells these records from others."""
+        with self._database.reading() as connection:
+            return str(connection.execute(select(schema_info.c.records_id)).scalar_one())
+
+    @property
+    def key_file(self) -> Path:
+        """Where the key of this station is kept."""
+        return self.keys / file_name(self._station, self.records_id, ".key")
+
+    def begin(self) -> None:
+        """Have the key ready; where the chain has not begun, make the key and begin it.
+
+        Raises KeyMissingError; RecordsCutError for records that lack rows of which the heads are
+        kept; RecordError.
+        """
+        self._check_cut()
+        self._load()
+
+    @contextmanager
+    def writing(self, *locks: str) -> Iterator[chain.Trail]:
+        """One transaction with the end of the chain; on disk, and its head kept, when the block is
+        left without an error. Raises RecordError: then it may be tried again.
+        """
+        if self._key is None:
+            raise RecordError(
+                "This process is not the station: it has not looked for interrupted runs.",
+                remedy="Call recover() first.",
+            )
+        with self._database.writing(*locks, f"chain of {self._station}") as connection:
+            trail = chain.Trail(connection, self._station, self._key)
+            yield trail
+        if trail.head is not None:
+            self._unkept.append(trail.head)
+        self._keep_heads()
+
+    def rotate(self, operator: str) -> str:
+        """Sign with a new key from now on; its fingerprint. The one before is deleted."""
+        path, following = self.key_file, self._following()
+        following.unlink(missing_ok=True)  # of a rotation that was not committed
+        key = SigningKey.make(following)
+        with self.writing() as trail:
+            trail.append(self._now(), chain.KEY_ROTATED, {"key": key.public, "by": operator})
+        following.replace(path)
+        self._key = key
+        return fingerprint(key.public)
+
+    def replace_lost(self, operator: str, reason: str) -> str:
+        """Go on with a new key, since the one before is gone; its fingerprint."""
+        path = self.key_file
+        if path.exists():
+            lost = path.with_name(path.name + ".unusable")
+            path.replace(lost)
+        self._key = SigningKey.make(path)
+        with self.writing() as trail:
+            data = {"key": self._key.public, "by": operator, "reason": reason}
+            trail.append(self._now(), chain.KEY_LOST, data)
+        return fingerprint(self._key.public)
+
+    def accept_restored(self, operator: str, reason: str) -> int:
+        """Go on with records that lack rows of which the heads are kept; how many rows are lost."""
+        kept = [head for head in self._kept() if not self._is_there(head)]
+        if not kept:
+            return 0
+        self._load()
+        with self.writing() as trail:
+            lost_to = max(head.number for head in kept)
+            data = {"lost_to": lost_to, "by": operator, "reason": reason}
+            trail.append(self._now(), chain.RESTORED, data)
+            assert trail.head is not None  # noqa: S101  it has just been added
+            return lost_to - trail.head.number + 1
+
+    # -- the key and the heads --------------------------------------------------------------------
+
+    def _load(self) -> None:
+        with self._database.reading() as connection:
+            public = chain.key_in_force(connection, self._station)
+        path, following = self.key_file, self._following()
+        loaded = SigningKey.load(path)
+        if public is None:
+            self._key = loaded or SigningKey.make(path)
+            self._begin_chain()
+            return
+        if loaded is None or loaded.public != public:
+            # A rotation that was committed, and not ended.
+            loaded = SigningKey.load(following)
+            if loaded is None or loaded.public != public:
+                raise KeyMissingError(
+                    f"The signing key of {self._station} (fingerprint {fingerprint(public)}) is"
+                    " not there.",
+                    where=printable(str(path)),
+                    remedy="Put the file back, or name its folder with --keys; if it is lost:"
+                    " flasher station key --lost.",
+                )
+            following.replace(path)
+        self._key = loaded
+
+    def _keep_heads(self) -> None:
+        """Also those of a commit before, which could not be kept then."""
+        with self._keeping:
+            while self._unkept:
+                self._heads_file.append(self._unkept[0])
+                self._unkept.popleft()
+
+    @property
+    def _heads_file(self) -> HeadsFile:
+        return self.place.file(self._station, self.records_id)
+
+    def _following(self) -> Path:
+        return self.key_file.with_suffix(".new")
+
+    def _begin_chain(self) -> None:
+        assert self._key is not None  # noqa: S101
+        with self.writing() as trail:
+            data = {
+                "key": self._key.public,
+                "records": self.records_id,
+                "version": SCHEMA_VERSION,
+                "schema": fingerprint_of(trail.connection),
+            }
+            trail.append(self._now(), chain.BEGUN, data)
+
+    def _kept(self) -> list[Head]:
+        return [each for each in self._heads_file.read() if isinstance(each, Head)]
+
+    def _is_there(self, head: Head) -> bool:
+        with self._database.reading() as connection:
+            return chain.hash_at(connection, self._station, head.number) == head.hash
+
+    def _check_cut(self) -> None:
+        kept = self._kept()
+        if kept and not self._is_there(kept[-1]):
+            raise RecordsCutError(
+                f"These records lack what {self._station} wrote up to {kept[-1].at}: they are an"
+                " older copy, or their end was cut off.",
+                where=self._database.location.shown,
+                cause=f"audit row {kept[-1].number} is kept in {self._heads_file.path}",
+                remedy="Put the right records back (flasher station verify names what is missing);"
+                " if they are lost: flasher station accept restored.",
+            )
