@@ -14,8 +14,15 @@ from flasher.cli import arguments
 from flasher.cli.output import Output
 from flasher.errors import UsageError
 
-_EXTRA: Final = ("pydantic", "sqlalchemy")
+_EXTRA: Final = ("cryptography", "platformdirs", "pydantic", "sqlalchemy")
 """Packages of the extra."""
+_MODULES: Final = {
+    "run": "station_run",
+    "check": "station_check",
+    "report": "station_records",
+    "unit": "station_records",
+    **dict.fromkeys(("backup", "verify", "key", "accept", "migrate"), "station_care"),
+}
 DEFAULT_RECORDS: Final = "records.sqlite"
 _DESCRIPTION = """\
 Flash unit after unit at the end of a line, several sockets at a time, by a recipe. A PASS is shown
@@ -30,7 +37,8 @@ examples:
   flasher station report --lot L17 --csv runs.csv --certificates pages
   flasher station unit W2605002 --certificate W2605002.html
   flasher station backup /mnt/plant/records.sqlite
-  flasher station verify
+  flasher station verify --heads /mnt/plant/heads
+  flasher station key
 """
 _RUN_EPILOG = """\
 A scan is the label of a unit, or a command: SOCKET A, CANCEL, ABORT A, FREE A, LOT 4711,
@@ -68,7 +76,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     backup = actions.add_parser("backup", help="copy the records while the station runs")
     backup.add_argument("file", type=Path, metavar="FILE", help="where the copy goes")
     _add_records(backup)
-    _add_records(actions.add_parser("verify", help="records and attachments against their hashes"))
+    _add_records(actions.add_parser("verify", help="tell whether the records were changed"))
+    _add_key(actions.add_parser("key", help="the key that signs the records"))
+    accept = actions.add_parser("accept", help="let the station go on, and note who said so")
+    accept.add_argument(
+        "what",
+        choices=("clock", "restored"),
+        help="clock: it is right, though records of a later time are there; restored: the records "
+        "are an older copy, and what they lack is lost",
+    )
+    _add_who(accept)
+    _add_records(accept)
+    migrate = actions.add_parser(
+        "migrate", help="bring records of an older flasher up to date; a backup is made first"
+    )
+    _add_records(migrate)
 
 
 def _add_records(parser: argparse.ArgumentParser) -> None:
@@ -82,7 +104,35 @@ def _add_records(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--files", type=Path, metavar="DIR", help="the folder of traces (default: beside the file)"
     )
+    group.add_argument(
+        "--keys",
+        type=Path,
+        metavar="DIR",
+        help="the folder of the signing key (default: of --sockets, else a place of this user)",
+    )
+    group.add_argument(
+        "--heads",
+        type=Path,
+        metavar="DIR",
+        help="the folder where the signed heads of the audit "
+        "trails are kept, best on another computer (default: of --sockets, else beside the key)",
+    )
     group.add_argument("--sockets", type=Path, metavar="FILE", help="the station's file (TOML)")
+
+
+def _add_who(parser: argparse.ArgumentParser, *, needs_reason: bool = True) -> None:
+    parser.add_argument("--operator", metavar="NAME", help="who says so (default: the login)")
+    parser.add_argument("--reason", required=needs_reason, metavar="TEXT", help="why")
+
+
+def _add_key(parser: argparse.ArgumentParser) -> None:
+    change = parser.add_mutually_exclusive_group()
+    change.add_argument("--rotate", action="store_true", help="sign with a new key from now on")
+    change.add_argument(
+        "--lost", action="store_true", help="the key is gone: go on with a new one (needs --reason)"
+    )
+    _add_who(parser, needs_reason=False)
+    _add_records(parser)
 
 
 def _add_run(parser: argparse.ArgumentParser) -> None:
@@ -190,9 +240,6 @@ def run(options: argparse.Namespace, output: Output) -> int:
             f"The station needs packages that are not installed: {', '.join(missing)}.",
             remedy="pip install 'welling-flasher[station]'",
         )
-    modules = {"run": "station_run", "check": "station_check"}
-    module: Any = importlib.import_module(
-        f"flasher.cli.{modules.get(options.action, 'station_records')}"
-    )
+    module: Any = importlib.import_module(f"flasher.cli.{_MODULES[options.action]}")
     code: int = module.run(options, output)
     return code

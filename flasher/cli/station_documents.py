@@ -182,10 +182,57 @@ class ProblemDocument(TypedDict):
     what: str
 
 
+class KeptHeadsDocument(TypedDict):
+    """What the audit trail of a station was held against."""
+
+    station: str
+    path: str
+    first: int
+    """Number of the first audit row of which a head is kept there."""
+    last: int
+
+
 class VerifiedRecordsDocument(TypedDict):
-    """What was found wrong with the records."""
+    """What was found in the records, and what they could be held against."""
 
     problems: list[ProblemDocument]
+    remarks: list[str]
+    kept: list[KeptHeadsDocument]
+    unkept: list[str]
+    """Stations of which no heads are kept: older records would look the same."""
+    traces: int
+    """Runs that passed and were held against their own traces."""
+    is_checked_elsewhere: bool
+    """Every audit trail was held, from its first row, against heads that are kept elsewhere."""
+
+
+class SigningKeyDocument(TypedDict):
+    """The key that signs a station's audit trail."""
+
+    station: str
+    fingerprint: str
+    public: str
+    """The public key, in hexadecimal digits."""
+    file: str
+    heads: str
+    """Where the signed heads of the audit trail are kept."""
+
+
+class AcceptedDocument(TypedDict):
+    """What a person let the station go on with."""
+
+    station: str
+    what: str
+
+
+class MigratedDocument(TypedDict):
+    """Records that were brought up to date."""
+
+    station: str
+    runs: int
+    backup: str
+    problems: list[str]
+    """What was wrong with them before."""
 
 
 DOCUMENTS: Final = (
@@ -196,6 +243,9 @@ DOCUMENTS: Final = (
     UnitDocument,
     BackupDocument,
     VerifiedRecordsDocument,
+    SigningKeyDocument,
+    AcceptedDocument,
+    MigratedDocument,
 )
 LINES: Final[tuple[type, ...]] = get_args(StationEvent)
 """Every event of a station, as it happens."""

@@ -1,16 +1,14 @@
-"""`flasher station report`, `unit`, `backup` and `verify`: what the records say. They need no
-station, and may be asked while one runs.
+"""`flasher station report` and `unit`: what the records say. They need no station, change nothing,
+and may be asked while one runs.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import re
-import tempfile
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -18,15 +16,12 @@ from urllib.parse import quote
 
 from flasher.cli.documents import plain_value
 from flasher.cli.files import check_writable, write_whole
-from flasher.cli.output import Output, byte_count, counted
+from flasher.cli.output import Output, counted
 from flasher.cli.station import DEFAULT_RECORDS
 from flasher.cli.station_documents import (
-    BackupDocument,
-    ProblemDocument,
     StationReportDocument,
     UnitDocument,
     UnitTraceDocument,
-    VerifiedRecordsDocument,
     figures_document,
     run_document,
 )
@@ -34,50 +29,81 @@ from flasher.cli.station_text import figure_lines, unit_lines
 from flasher.errors import ExitCode, FlasherError, UsageError
 from flasher.protocol.text import printable
 from flasher.station.config import load_config
-from flasher.station.records import AttachmentFile, RecordError, RunFilter, RunId, Store, UnitLife
+from flasher.station.records import (
+    AttachmentFile,
+    Examination,
+    Keeping,
+    RecordError,
+    RunFilter,
+    RunId,
+    RunState,
+    Store,
+    UnitLife,
+    UnprovenError,
+)
 from flasher.station.records.database import DEFAULT_LOCK_TIMEOUT_S
+from flasher.station.records.model import TORN_TRACE, TRACE
 from flasher.station.reports import Report, make_report
 from flasher.trace.source import explain_path
 from flasher.trace.story import Story
 
-TRACE_KINDS: Final = ("trace", "torn-trace")
-_SUFFIX: Final = re.compile(r"(?:\.[a-z0-9]{1,4}){1,2}$")
 _READER: Final = "report"
 """Who reads is no station: it claims no unit."""
 
 
 def run(options: argparse.Namespace, output: Output) -> int:
     """Run the command; returns the exit code."""
-    actions: dict[str, Callable[[argparse.Namespace, Output, Store], int]] = {
-        "report": _report,
-        "unit": _unit,
-        "backup": _backup,
-        "verify": _verify,
-    }
-    with closing(_open(options)) as store:
-        return actions[options.action](options, output, store)
+    action = {"report": _report, "unit": _unit}[options.action]
+    with closing(open_to_read(options)) as store:
+        return action(options, output, store)
 
 
-def records_of(options: argparse.Namespace) -> tuple[str, Path | None, float]:
-    """Where the options say that the records are: file or URL, folder of the files, and how long a
-    lock is waited for in seconds. Raises UsageError.
-    """
-    database, files = options.database, options.files
-    lock_timeout_s = DEFAULT_LOCK_TIMEOUT_S
-    if options.sockets is not None:
-        config = load_config(options.sockets)
-        if database is None:
-            database = config.records
-            files = files or (Path(config.files) if config.files else None)
-        lock_timeout_s = config.lock_timeout_s
-    return database or DEFAULT_RECORDS, files, lock_timeout_s
+@dataclass(frozen=True)
+class RecordsPlace:
+    """Where the options say that the records are, and what belongs to them."""
+
+    url: str
+    """A file, or an SQLAlchemy URL."""
+    files: Path | None
+    lock_timeout_s: float
+    keeping: Keeping
+    station: str | None
+    """The station's name, where the options name its file."""
+
+    def open(self, station: str, *, create: bool = True, read_only: bool = False) -> Store:
+        """The records as a station opens them. Raises UsageError, RecordError."""
+        return Store.open(
+            self.url,
+            station=station,
+            folder=self.files,
+            lock_timeout_s=self.lock_timeout_s,
+            create=create,
+            read_only=read_only,
+            keeping=self.keeping,
+        )
 
 
-def _open(options: argparse.Namespace) -> Store:
-    url, files, lock_timeout_s = records_of(options)
-    return Store.open(
-        url, station=_READER, folder=files, lock_timeout_s=lock_timeout_s, create=False
-    )
+def records_of(options: argparse.Namespace) -> RecordsPlace:
+    """Where the options say that the records are. Raises UsageError."""
+    config = load_config(options.sockets) if options.sockets is not None else None
+    database, files, keys, heads = options.database, options.files, options.keys, options.heads
+    if config is None:
+        return RecordsPlace(
+            database or DEFAULT_RECORDS, files, DEFAULT_LOCK_TIMEOUT_S, Keeping(keys, heads), None
+        )
+    if database is None:
+        database, files = config.records, files or _path(config.files)
+    keeping = Keeping(keys or _path(config.keys), heads or _path(config.heads))
+    return RecordsPlace(database, files, config.lock_timeout_s, keeping, config.name)
+
+
+def _path(text: str) -> Path | None:
+    return Path(text) if text else None
+
+
+def open_to_read(options: argparse.Namespace) -> Store:
+    """The records as they are: nothing of them is changed. Raises UsageError, RecordError."""
+    return records_of(options).open(_READER, read_only=True)
 
 
 # -- many runs ------------------------------------------------------------------------------------
@@ -99,15 +125,17 @@ def _report(options: argparse.Namespace, output: Output, store: Store) -> int:
         if path is not None:
             write_whole(path, make(report).encode("utf-8"), option)
             output.progress(f"written: {printable(str(path))}")
-    if options.certificates is not None:
-        _certificates(options.certificates, report, store, output)
-    output.document(
-        StationReportDocument(
-            figures=figures_document(report.figures),
-            runs=[run_document(row) for row in report.runs],
-        )
+    code = ExitCode.OK
+    if options.certificates is not None and _certificates(
+        options.certificates, report, store, output
+    ):
+        code = ExitCode.VERIFICATION
+    document = StationReportDocument(
+        figures=figures_document(report.figures),
+        runs=[run_document(row) for row in report.runs],
     )
-    return ExitCode.OK
+    output.document(document, exit_code=code)
+    return code
 
 
 def _report_json(report: Report) -> str:
@@ -139,7 +167,8 @@ def _moment(text: str | None, option: str) -> datetime | None:
         ) from error
 
 
-def _certificates(folder: Path, report: Report, store: Store, output: Output) -> None:
+def _certificates(folder: Path, report: Report, store: Store, output: Output) -> int:
+    """Write the pages; for how many units there is none, since their records were changed."""
     option = "--certificates"
     try:
         folder.mkdir(exist_ok=True)
@@ -151,19 +180,41 @@ def _certificates(folder: Path, report: Report, store: Store, output: Output) ->
         ) from error
     units = sorted({(str(row["serial"]), str(row["part"])) for row in report.runs})
     serials = [serial for serial, _ in units]
-    for serial, part in units:
+    lives = [store.read.unit(serial, part) for serial, part in units]
+    examined = store.examine({life.runs[-1].run.run_id for life in lives})
+    refused = 0
+    for life in lives:
         # Two parts may have one serial number; no name leads out of the folder.
-        name = serial if serials.count(serial) == 1 else f"{part} {serial}"
+        name = life.serial if serials.count(life.serial) == 1 else f"{life.part} {life.serial}"
         page = folder / f"{quote(name, safe=' ').replace('.', '%2E')}.html"
-        write_whole(page, certificate(store.read.unit(serial, part)), option)
-    output.progress(f"written: {counted(len(units), 'page')} in {printable(str(folder))}")
+        try:
+            write_whole(page, certificate(store, life, examined), option)
+        except UnprovenError as error:
+            refused += 1
+            output.result(printable(f"no page for {life.serial}: {error.cause}"))
+    written = counted(len(units) - refused, "page")
+    output.progress(f"written: {written} in {printable(str(folder))}")
+    return refused
 
 
-def certificate(life: UnitLife) -> bytes:
-    """The page of a unit."""
+def certificate(store: Store, life: UnitLife, examined: Examination | None = None) -> bytes:
+    """The page of a unit. Raises UnprovenError where its records were changed."""
     from flasher.station.certificate import render_certificate  # noqa: PLC0415  loads jinja2
 
-    return render_certificate(life, datetime.now(UTC)).encode("utf-8")
+    last = life.runs[-1].run if life.runs else None
+    head = None
+    if last is not None and last.state is not RunState.RUNNING:
+        examined = examined or store.examine({last.run_id})
+        problems = examined.of_run(last.run_id)
+        if problems:
+            raise UnprovenError(
+                f"No certificate for {printable(life.serial)}: its records were changed.",
+                cause=f"{problems[0].where}: {problems[0].what}",
+                remedy="Look at all of it with flasher station verify.",
+            )
+        head = store.read.head_of(last.run_id)
+    is_kept = examined is not None and examined.is_checked_elsewhere
+    return render_certificate(life, datetime.now(UTC), head, is_kept=is_kept).encode("utf-8")
 
 
 # -- one unit -------------------------------------------------------------------------------------
@@ -177,14 +228,14 @@ def _unit(options: argparse.Namespace, output: Output, store: Store) -> int:
     traces = []
     for details in life.runs:
         for file in details.attachments:
-            if file.kind in TRACE_KINDS:
+            if file.kind in (TRACE, TORN_TRACE):
                 found = explained(store, file)
                 told.setdefault(details.run.run_id, []).append(found)
                 traces.append(_trace_document(details.run.run_id, file, found, full=options.story))
     for line in unit_lines(life, told, full=options.story):
         output.result(line)
     if options.certificate is not None:
-        write_whole(options.certificate, certificate(life), "--certificate")
+        write_whole(options.certificate, certificate(store, life), "--certificate")
         output.progress(f"page: {printable(str(options.certificate))}")
     output.document(UnitDocument(unit=plain_value(life), traces=traces))
     return ExitCode.OK
@@ -192,13 +243,8 @@ def _unit(options: argparse.Namespace, output: Output, store: Store) -> int:
 
 def explained(store: Store, file: AttachmentFile) -> Story | str:
     """The story of a trace in the records; or in words why there is none."""
-    suffix = _SUFFIX.search(file.name)
     try:
-        data = store.files.read(file.sha256)
-        with tempfile.TemporaryDirectory(prefix="flasher-") as folder:
-            # Under a name of our own: what stands in the records is nobody's path.
-            path = Path(folder) / f"trace{suffix[0] if suffix else ''}"
-            path.write_bytes(data)
+        with store.files.named(file) as path:
             return replace(explain_path(path), source=printable(file.name))
     except RecordError as error:
         return error.what
@@ -222,32 +268,3 @@ def _trace_document(
         text=found.verdict.text,
         story=plain_value(found) if full else None,
     )
-
-
-# -- care -----------------------------------------------------------------------------------------
-
-
-def _backup(options: argparse.Namespace, output: Output, store: Store) -> int:
-    check_writable(options.file, "FILE")
-    made = store.backup(options.file)
-    output.result(f"{printable(str(made.path))}: {byte_count(made.size_bytes)}, checked")
-    output.result(f"  sha256: {made.sha256}")
-    output.result(f"  traces: {printable(made.path.name)}.files beside it")
-    output.document(
-        BackupDocument(path=str(made.path), sha256=made.sha256, size_bytes=made.size_bytes)
-    )
-    return ExitCode.OK
-
-
-def _verify(_options: argparse.Namespace, output: Output, store: Store) -> int:
-    problems = store.verify()
-    for each in problems:
-        output.result(f"{printable(each.where)}: {printable(each.what)}")
-    for limit in store.limits:
-        output.progress(f"note: {limit}")
-    good = "records and attachments are as they were written"
-    output.result(f"{counted(len(problems), 'problem')}" if problems else good)
-    code = ExitCode.VERIFICATION if problems else ExitCode.OK
-    found = [ProblemDocument(where=each.where, what=each.what) for each in problems]
-    output.document(VerifiedRecordsDocument(problems=found), exit_code=code)
-    return code

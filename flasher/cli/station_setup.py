@@ -17,7 +17,7 @@ from flasher.station.adapters import Resolved, detect, resolve
 from flasher.station.config import MockUnits, SocketConfig, StationConfig, load_config, mock_config
 from flasher.station.messages import VirtualUnits, WorkerSetup
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records import Store
+from flasher.station.records import Keeping, Store
 from flasher.station.virtual_units import serial_numbers
 
 _LEAVE_S: Final = 2.0
@@ -83,12 +83,15 @@ def opened_records(options: argparse.Namespace, config: StationConfig) -> Iterat
     if options.mock_sockets is not None and options.database is None:
         with (
             tempfile.TemporaryDirectory(prefix="flasher-station-") as folder,
-            Store.open(str(Path(folder) / "records.sqlite"), station=config.name) as store,
+            Store.open(
+                str(Path(folder) / "records.sqlite"),
+                station=config.name,
+                keeping=Keeping(Path(folder) / "keys"),
+            ) as store,
         ):
             yield store
         return
-    url, files, lock_timeout_s = records_of(options)
-    with Store.open(url, station=config.name, folder=files, lock_timeout_s=lock_timeout_s) as store:
+    with records_of(options).open(config.name) as store:
         yield store
 
 

@@ -1,4 +1,5 @@
-"""The certificate of a unit: one HTML page to print, made of the records and nothing else.
+"""The certificate of a unit: one HTML page to print on one A4 sheet, and an annex, made of the
+records and nothing else.
 
 A unit that did not pass gets a page as well, and the page says so in its first line.
 """
@@ -10,6 +11,8 @@ from typing import Final
 
 from flasher.errors import UsageError
 from flasher.report.base import Status, render_page
+from flasher.station.records.heads import Head
+from flasher.station.records.keys import fingerprint
 from flasher.station.records.model import (
     Measurement,
     RunDetails,
@@ -21,6 +24,8 @@ from flasher.station.records.model import (
 
 EARLIER_SHOWN: Final = 50
 """Earlier runs in the table; the page says how many more there are."""
+_WRITES_ON_SHEET: Final = 6
+"""Further ones stand in the annex."""
 _WORDS: Final = {
     UnitState.PASS: (Status.GOOD, "PASS", "This unit passed."),
     UnitState.FAIL: (Status.BAD, "FAIL", "This unit did not pass: it is no good unit."),
@@ -39,8 +44,14 @@ _RUN_STATUS: Final = {
 }
 
 
-def render_certificate(life: UnitLife, made_at: datetime) -> str:
-    """The page. Raises UsageError for a unit without any run."""
+def render_certificate(
+    life: UnitLife, made_at: datetime, head: Head | None, *, is_kept: bool
+) -> str:
+    """The page. `head` is the signed audit row that vouches for the last run, None while it goes
+    on; `is_kept` when the chain was held against heads that are kept elsewhere.
+
+    Raises UsageError for a unit without any run.
+    """
     last = life.last
     if last is None:
         raise UsageError(f"Nothing was done to {life.serial}: there is nothing to certify.")
@@ -56,6 +67,11 @@ def render_certificate(life: UnitLife, made_at: datetime) -> str:
         word=word,
         sentence=sentence,
         is_virtual=life.is_virtual,
+        head=head,
+        key=fingerprint(head.key) if head else "",
+        is_kept=is_kept,
+        writes=last.writes[:_WRITES_ON_SHEET],
+        further_writes=last.writes[_WRITES_ON_SHEET:],
         is_golden=last.run.kind is RunKind.GOLDEN,
         measurements=[
             (step, each, _limits(each), _verdict(each))

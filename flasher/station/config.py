@@ -115,6 +115,10 @@ class StationConfig(Part):
     """A file beside this one, or an SQLAlchemy URL."""
     files: str = ""
     """The folder of the attachments; empty: beside the file of the records."""
+    keys: str = ""
+    """The folder of the signing key; empty: a place of this user."""
+    heads: str = ""
+    """The folder in which the signed heads of the audit trail are kept; empty: beside the key."""
     lock_timeout_s: float = Field(default=DEFAULT_LOCK_TIMEOUT_S, gt=0, le=60)
     """How long a record waits for another program that holds the database."""
     socket: tuple[SocketConfig, ...] = Field(min_length=1, max_length=SOCKETS_MAX)
@@ -146,8 +150,9 @@ def load_config(path: Path) -> StationConfig:
     changes: dict[str, str] = {}
     if "://" not in config.records:
         changes["records"] = str(here / config.records)
-    if config.files:
-        changes["files"] = str(here / config.files)
+    for key in ("files", "keys", "heads"):
+        if getattr(config, key):
+            changes[key] = str(here / getattr(config, key))
     return config.model_copy(update=changes)
 
 

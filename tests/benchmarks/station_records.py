@@ -16,8 +16,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from flasher.cli.station_records import certificate
 from flasher.protocol.spec import BMS
-from flasher.station.certificate import render_certificate
 from flasher.station.records import (
     Ending,
     Measurement,
@@ -25,7 +25,6 @@ from flasher.station.records import (
     RunState,
     StepState,
     Store,
-    SystemClock,
 )
 from flasher.station.reports import make_report, unit_document
 from flasher.station.steps import StepName, Verified
@@ -106,7 +105,7 @@ def measure(folder: Path, runs: int) -> None:
     fill(bench, runs)
     print(f"  {runs} runs made in {time.perf_counter() - began:.0f} s")
     bench.store.close()
-    with Store.open(str(bench.path), station="report", clock=SystemClock(), create=False) as store:
+    with Store.open(str(bench.path), station="report", create=False) as store:
         records = store.read
         timed("figures of all runs", records.figures)
         timed("figures of one lot", lambda: records.figures(RunFilter(lot="L001")))
@@ -115,8 +114,7 @@ def measure(folder: Path, runs: int) -> None:
         timed("report of all as JSON document", lambda: make_report(records, RunFilter()).to_dict())
         timed("report of all as JUnit", lambda: make_report(records, RunFilter()).to_junit())
         timed("one unit", lambda: unit_document(records.unit("W0000017")))
-        now = SystemClock().utc()
-        timed("certificate", lambda: render_certificate(records.unit("W0000017"), now))
+        timed("certificate", lambda: certificate(store, records.unit("W0000017")))
         timed("backup", lambda: store.backup(folder / "backup.sqlite"))
         began = time.perf_counter()
         problems = store.verify()

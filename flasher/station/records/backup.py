@@ -35,7 +35,7 @@ def make_backup(database: Database, files: FileStore, path: Path) -> Backup:
         raise UsageError("A backup cannot replace the database itself.", remedy="Name another.")
     with mapped(printable(str(path)), writes=True):
         with whole_file(path) as part:
-            _copy(source, part)
+            copy_sqlite(source, part)
             names = _check(part)
             target = FileStore(path.with_name(path.name + ".files"))
             for sha256 in names:
@@ -45,7 +45,8 @@ def make_backup(database: Database, files: FileStore, path: Path) -> Backup:
     return Backup(path, hashlib.sha256(data).hexdigest(), len(data))
 
 
-def _copy(source: Path, part: Path) -> None:
+def copy_sqlite(source: Path, part: Path) -> None:
+    """A consistent copy of a database that others may be using."""
     with (
         contextlib.closing(read_only_sqlite(source)) as original,
         contextlib.closing(sqlite3.connect(part)) as copy,

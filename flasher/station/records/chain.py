@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import Any, Final
 
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, func, select, true
 
 from flasher.station.records.heads import Head
 from flasher.station.records.keys import SigningKey
@@ -37,6 +37,8 @@ CLOCK: Final = "clock"
 """A person has said that the clock is right, though records of a later time are there."""
 RESTORED: Final = "restored"
 """A person has said that the records are an older copy, and what they lack is lost."""
+ENDINGS: Final = (FINISHED, INTERRUPTED, MIGRATED_RUN)
+"""Rows that vouch for a run as it ended."""
 _KEYS: Final = (BEGUN, KEY_ROTATED, KEY_LOST)
 
 
@@ -96,6 +98,15 @@ def digest(data: Any) -> str:
     return hashlib.sha256(canonical(data).encode("ascii")).hexdigest()
 
 
+def data_of(text: str) -> dict[str, Any]:
+    """What `canonical` wrote; empty for what is nothing of it."""
+    try:
+        found = json.loads(text)
+    except ValueError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
 def row_hash(station_name: str, row: Mapping[Any, Any]) -> str:
     """The hash of an audit row; it covers the chain up to it."""
     columns = ("previous_hash", "number", "at", "event", "run_id", "data")
@@ -108,16 +119,36 @@ def key_of(event: str, data: Mapping[str, Any]) -> str | None:
     return found if isinstance(found, str) else None
 
 
-def key_in_force(connection: Connection, station_name: str) -> str | None:
-    """The public key with which the next row is signed; None before the first row."""
+def key_in_force(
+    connection: Connection, station_name: str, before: int | None = None
+) -> str | None:
+    """The public key that signs the row of number `before`, or the next one; None before the first
+    row.
+    """
     query = (
         _rows_of(station_name, audit.c.event, audit.c.data)
         .where(audit.c.event.in_(_KEYS))
+        .where(true() if before is None else audit.c.number < before)
         .order_by(audit.c.number.desc())
         .limit(1)
     )
     row = connection.execute(query).one_or_none()
-    return None if row is None else key_of(row.event, json.loads(row.data))
+    return None if row is None else key_of(row.event, data_of(row.data))
+
+
+def head_of(connection: Connection, run_id: int) -> Head | None:
+    """The row that vouches for a finished run, as a head; None where there is none."""
+    row = connection.execute(
+        select(audit, station.c.name)
+        .join_from(audit, station)
+        .where(audit.c.run_id == run_id, audit.c.event.in_(ENDINGS))
+        .order_by(audit.c.id.desc())
+        .limit(1)
+    ).one_or_none()
+    if row is None:
+        return None
+    key = key_in_force(connection, row.name, row.number)
+    return Head(row.name, row.number, row.at, row.hash, row.signature, key or "")
 
 
 def hash_at(connection: Connection, station_name: str, number: int) -> str | None:

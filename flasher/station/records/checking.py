@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from itertools import islice
 from typing import Any, Final
 
 from sqlalchemy import Connection, func, select
@@ -15,7 +13,7 @@ from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.database import Database
 from flasher.station.records.details import details_of
-from flasher.station.records.digests import BATCH, NAMED, OWN, digests_of
+from flasher.station.records.digests import NAMED, OWN, batches, digests_of
 from flasher.station.records.errors import RecordError
 from flasher.station.records.files import FileStore
 from flasher.station.records.fingerprint import differences, fingerprint_of
@@ -36,7 +34,6 @@ from flasher.station.records.queries import run_records
 from flasher.station.records.signing import KeptPlace
 from flasher.trace.reader import read_trace
 
-_ENDINGS: Final = (chain.FINISHED, chain.INTERRUPTED, chain.MIGRATED_RUN)
 _RUNS_NAMED: Final = 5
 
 
@@ -83,7 +80,7 @@ class Examiner:
         if runs is not None:
             chosen = sorted(set(chosen) & set(runs))
         changed: dict[tuple[str, str], list[int]] = defaultdict(list)
-        for batch in _batches(chosen):
+        for batch in batches(chosen):
             yield from self._runs(connection, batch, changed)
         for (part, _), run_ids in changed.items():
             shown = ", ".join(map(str, run_ids[:_RUNS_NAMED]))
@@ -107,7 +104,7 @@ class Examiner:
                 .order_by(schema.audit.c.number)
             )
             hashes: dict[int, str] = {}
-            restored: dict[int, int] = {}
+            restored: dict[int, range] = {}
             yield from self._chain(name, rows.mappings(), records_id, found, hashes, restored)
             yield from self._heads(name, kept_of.get(name), hashes, restored)
 
@@ -118,7 +115,7 @@ class Examiner:
         records_id: str,
         found: Mapping[str, str],
         hashes: dict[int, str],
-        restored: dict[int, int],
+        restored: dict[int, range],
     ) -> Iterator[Problem]:
         """Go along one chain; fills the hashes of its rows, and which heads were given up."""
         before, key = chain.GENESIS, None
@@ -126,7 +123,7 @@ class Examiner:
         shown = printable(name)
         for expected, row in enumerate(rows, 1):
             where = f"audit row {row['number']} of {shown}"
-            data = _data(row["data"])
+            data = chain.data_of(row["data"])
             if row["previous_hash"] != before or row["number"] != expected:
                 yield Problem(where, "the chain is broken: the row before it is missing or changed")
             if row["hash"] != chain.row_hash(name, row):
@@ -142,7 +139,7 @@ class Examiner:
                 yield Problem(where, "its chain is that of other records")
             stated = data.get("schema", stated)
             if row["event"] == chain.RESTORED:
-                restored[row["number"]] = int(data.get("lost_to", 0))
+                restored[row["number"]] = range(data["lost_from"], data["lost_to"] + 1)
             self._note(shown, row, data)
             self._vouch(row, data)
             for each in data.get("problems", ()):
@@ -161,8 +158,8 @@ class Examiner:
                 )
             case chain.RESTORED:
                 self._remarks.append(
-                    f"{shown}: rows {row['number']} to {data['lost_to']} of an earlier chain were"
-                    f" given up as lost on {said}"
+                    f"{shown}: rows {data['lost_from']} to {data['lost_to']} of an earlier chain"
+                    f" were given up as lost on {said}"
                 )
             case chain.CLOCK:
                 self._remarks.append(f"{shown}: the clock was released on {said}")
@@ -173,7 +170,7 @@ class Examiner:
         digests = data.get("digests")
         if row["run_id"] is None or not isinstance(digests, dict):
             return
-        if row["event"] in _ENDINGS:
+        if row["event"] in chain.ENDINGS:
             self._endings[row["run_id"]] = digests
         elif row["event"] == chain.CLAIMED:
             self._claims[row["run_id"]] = digests
@@ -183,7 +180,7 @@ class Examiner:
         name: str,
         kept: tuple[Head | int, ...] | None,
         hashes: Mapping[int, str],
-        restored: Mapping[int, int],
+        restored: Mapping[int, range],
     ) -> Iterator[Problem]:
         """Hold a chain against the heads that are kept of it."""
         shown = printable(name)
@@ -298,32 +295,18 @@ class Examiner:
 
 
 def _counting(
-    heads: list[Head], hashes: Mapping[int, str], restored: Mapping[int, int]
+    heads: list[Head], hashes: Mapping[int, str], restored: Mapping[int, range]
 ) -> list[Head]:
     """The heads without those that a person gave up, when older records were put back."""
     given_up: set[int] = set()
-    for number, lost_to in restored.items():
+    for number, lost in restored.items():
         given_up_at = len(heads)
         for index, head in enumerate(heads):
             if (head.number, head.hash) == (number, hashes[number]):
                 given_up_at = index
         earlier = enumerate(heads[:given_up_at])
-        given_up |= {index for index, head in earlier if number <= head.number <= lost_to}
+        given_up |= {index for index, head in earlier if head.number in lost}
     return [head for index, head in enumerate(heads) if index not in given_up]
-
-
-def _batches(keys: Iterable[int]) -> Iterator[list[int]]:
-    rest = iter(keys)
-    while batch := list(islice(rest, BATCH)):
-        yield batch
-
-
-def _data(text: str) -> dict[str, Any]:
-    try:
-        found = json.loads(text)
-    except ValueError:
-        return {}
-    return found if isinstance(found, dict) else {}
 
 
 def _sqlite_problems(connection: Connection) -> Iterator[Problem]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import Any, Final
 
 from sqlalchemy import Connection, Table, select
@@ -38,12 +39,19 @@ _OUTCOME: Final = frozenset(
     ["state", "code", "text", "ended_at", "ended_monotonic_s", "verification_reached", "log_sha256"]
 )
 """Columns of a run that its end writes."""
-BATCH: Final = 500
+_BATCH: Final = 500
 """Keys in one IN (...): every back end takes so many."""
 
 
+def batches(run_ids: Iterable[int]) -> Iterator[list[int]]:
+    """Runs in parts of a size that `digests_of` takes."""
+    rest = iter(run_ids)
+    while some := list(islice(rest, _BATCH)):
+        yield some
+
+
 def digests_of(connection: Connection, run_ids: Sequence[int]) -> dict[int, dict[str, str]]:
-    """The digests of runs (at most BATCH), by what they cover; a run that is not there is left
+    """The digests of runs, by what they cover; a run that is not there is left
     out.
     """
     named = _Named(connection)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import os
+import re
 from pathlib import Path
 from typing import IO
 
@@ -17,6 +18,11 @@ class StationLock:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._file: IO[str] | None = None
+
+    @classmethod
+    def of(cls, station: str, folder: Path) -> StationLock:
+        """The lock of a station, beside its attachments."""
+        return cls(folder / f"station-{re.sub(r'[^A-Za-z0-9_-]', '_', station)}.lock")
 
     @property
     def is_held(self) -> bool:

@@ -8,11 +8,12 @@ from typing import Any, Final
 from sqlalchemy import Connection, Select, case, select
 
 from flasher.protocol.text import printable
-from flasher.station.records import schema
+from flasher.station.records import chain, schema
 from flasher.station.records.database import Database
 from flasher.station.records.details import details_of
 from flasher.station.records.errors import NotFoundError
 from flasher.station.records.figures import figures_of
+from flasher.station.records.heads import Head
 from flasher.station.records.model import (
     Figures,
     RunDetails,
@@ -113,6 +114,17 @@ class Records:
         with self._database.reading() as connection:
             rows = connection.execute(query.order_by(table.c.id)).all()
         return figures_of(rows)
+
+    def stations(self) -> tuple[str, ...]:
+        """The names of all stations."""
+        with self._database.reading() as connection:
+            query = select(schema.station.c.name).order_by(schema.station.c.id)
+            return tuple(connection.execute(query).scalars())
+
+    def head_of(self, run_id: RunId) -> Head | None:
+        """The signed audit row that vouches for a finished run; None where there is none."""
+        with self._database.reading() as connection:
+            return chain.head_of(connection, run_id)
 
     def natures(self) -> frozenset[bool]:
         """Whose runs there are: True for virtual units, False for real ones."""

@@ -13,14 +13,35 @@ from threading import Lock
 
 from sqlalchemy import select
 
+from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.records import chain
 from flasher.station.records.database import Database
-from flasher.station.records.errors import KeyMissingError, RecordError, RecordsCutError
+from flasher.station.records.errors import (
+    KeyMissingError,
+    NotFoundError,
+    RecordError,
+    RecordsCutError,
+)
 from flasher.station.records.fingerprint import fingerprint_of
 from flasher.station.records.heads import Head, HeadsFile
 from flasher.station.records.keys import SigningKey, default_folder, file_name, fingerprint
 from flasher.station.records.schema import SCHEMA_VERSION, schema_info
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """Where the signing key of a station is kept, and the heads of its chain; None: the place of
+    this user, and beside the key.
+    """
+
+    keys: Path | None = None
+    heads: Path | None = None
+
+
+def key_folder(keeping: Keeping) -> Path:
+    """Where the key is kept."""
+    return keeping.keys or default_folder()
 
 
 @dataclass(frozen=True)
@@ -30,6 +51,11 @@ class KeptPlace:
     folder: Path
     is_named: bool
     """The user named it, so that the heads have to be there."""
+
+    @classmethod
+    def of(cls, keeping: Keeping) -> KeptPlace:
+        """The folder that was named, or the one of the keys."""
+        return cls(keeping.heads or key_folder(keeping), is_named=keeping.heads is not None)
 
     def file(self, station: str, records_id: str) -> HeadsFile:
         """The heads of one station's chain."""
@@ -49,16 +75,6 @@ class KeptPlace:
         return {name: heads for name, heads in found.items() if heads}
 
 
-@dataclass(frozen=True)
-class Keeping:
-    """Where the signing key of a station is kept, and the heads of its chain; None: the place of
-    this user, and beside the key.
-    """
-
-    keys: Path | None = None
-    heads: Path | None = None
-
-
 class Signer:
     """The key and the kept heads of one station. Nothing is read or made before `begin`."""
 
@@ -72,8 +88,8 @@ class Signer:
         self._database = database
         self._station = station
         self._now = now
-        self.keys = keeping.keys or default_folder()
-        self.place = KeptPlace(keeping.heads or self.keys, is_named=keeping.heads is not None)
+        self._keys = key_folder(keeping)
+        self.place = KeptPlace.of(keeping)
         self._key: SigningKey | None = None
         self._unkept: deque[Head] = deque()
         self._keeping = Lock()
@@ -87,7 +103,19 @@ class Signer:
     @property
     def key_file(self) -> Path:
         """Where the key of this station is kept."""
-        return self.keys / file_name(self._station, self.records_id, ".key")
+        return self._keys / file_name(self._station, self.records_id, ".key")
+
+    @property
+    def public(self) -> str:
+        """The public key that is in force. Raises NotFoundError before the chain has begun."""
+        with self._database.reading() as connection:
+            found = chain.key_in_force(connection, self._station)
+        if found is None:
+            raise NotFoundError(
+                f"{printable(self._station)} has signed nothing in these records.",
+                remedy="Its key is made when the station first runs. Name its file with --sockets.",
+            )
+        return found
 
     def begin(self) -> None:
         """Have the key ready; where the chain has not begun, make the key and begin it.
@@ -115,8 +143,8 @@ class Signer:
             self._unkept.append(trail.head)
         self._keep_heads()
 
-    def rotate(self, operator: str) -> str:
-        """Sign with a new key from now on; its fingerprint. The one before is deleted."""
+    def rotate(self, operator: str) -> None:
+        """Sign with a new key from now on. The one before is deleted."""
         path, following = self.key_file, self._following()
         following.unlink(missing_ok=True)  # of a rotation that was not committed
         key = SigningKey.make(following)
@@ -124,11 +152,19 @@ class Signer:
             trail.append(self._now(), chain.KEY_ROTATED, {"key": key.public, "by": operator})
         following.replace(path)
         self._key = key
-        return fingerprint(key.public)
 
-    def replace_lost(self, operator: str, reason: str) -> str:
-        """Go on with a new key, since the one before is gone; its fingerprint."""
+    def replace_lost(self, operator: str, reason: str) -> None:
+        """Go on with a new key, since the one before is gone. Raises UsageError when it is not."""
         path = self.key_file
+        try:
+            self._load()
+        except KeyMissingError:
+            pass
+        else:
+            raise UsageError(
+                f"The key is there: {printable(str(path))}.",
+                remedy="If others may have it: flasher station key --rotate.",
+            )
         if path.exists():
             lost = path.with_name(path.name + ".unusable")
             path.replace(lost)
@@ -136,7 +172,6 @@ class Signer:
         with self.writing() as trail:
             data = {"key": self._key.public, "by": operator, "reason": reason}
             trail.append(self._now(), chain.KEY_LOST, data)
-        return fingerprint(self._key.public)
 
     def accept_restored(self, operator: str, reason: str) -> int:
         """Go on with records that lack rows of which the heads are kept; how many rows are lost."""
@@ -145,11 +180,10 @@ class Signer:
             return 0
         self._load()
         with self.writing() as trail:
-            lost_to = max(head.number for head in kept)
-            data = {"lost_to": lost_to, "by": operator, "reason": reason}
-            trail.append(self._now(), chain.RESTORED, data)
-            assert trail.head is not None  # noqa: S101  it has just been added
-            return lost_to - trail.head.number + 1
+            numbers = [head.number for head in kept]
+            lost = {"lost_from": min(numbers), "lost_to": max(numbers)}
+            trail.append(self._now(), chain.RESTORED, {**lost, "by": operator, "reason": reason})
+        return lost["lost_to"] - lost["lost_from"] + 1
 
     # -- the key and the heads --------------------------------------------------------------------
 
@@ -180,11 +214,12 @@ class Signer:
         """Also those of a commit before, which could not be kept then."""
         with self._keeping:
             while self._unkept:
-                self._heads_file.append(self._unkept[0])
+                self.heads_file.append(self._unkept[0])
                 self._unkept.popleft()
 
     @property
-    def _heads_file(self) -> HeadsFile:
+    def heads_file(self) -> HeadsFile:
+        """Where the heads of this station's chain are kept."""
         return self.place.file(self._station, self.records_id)
 
     def _following(self) -> Path:
@@ -202,7 +237,7 @@ class Signer:
             trail.append(self._now(), chain.BEGUN, data)
 
     def _kept(self) -> list[Head]:
-        return [each for each in self._heads_file.read() if isinstance(each, Head)]
+        return [each for each in self.heads_file.read() if isinstance(each, Head)]
 
     def _is_there(self, head: Head) -> bool:
         with self._database.reading() as connection:
@@ -215,7 +250,7 @@ class Signer:
                 f"These records lack what {self._station} wrote up to {kept[-1].at}: they are an"
                 " older copy, or their end was cut off.",
                 where=self._database.location.shown,
-                cause=f"audit row {kept[-1].number} is kept in {self._heads_file.path}",
+                cause=f"audit row {kept[-1].number} is kept in {self.heads_file.path}",
                 remedy="Put the right records back (flasher station verify names what is missing);"
                 " if they are lost: flasher station accept restored.",
             )

@@ -18,7 +18,6 @@ operation has a connection of its own, and writers wait for each other.
 from __future__ import annotations
 
 import math
-import re
 import time
 from collections.abc import Collection, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
@@ -100,8 +99,7 @@ class Store:
         self.signer = Signer(database, station, clock.utc, keeping)
         self.read = queries.Records(database)
         self._clock = clock
-        lock_name = "station-" + re.sub(r"[^A-Za-z0-9_-]", "_", station) + ".lock"
-        self._lock = StationLock(database.location.folder / lock_name)
+        self._lock = StationLock.of(station, database.location.folder)
 
     @classmethod
     def open(
@@ -358,5 +356,21 @@ class Store:
 
     def release_clock(self, operator: str, reason: str) -> None:
         """Note that the clock is right, though records of a later time are there."""
+        self.become_station()
         with self.signer.writing() as trail:
             trail.append(self._clock.utc(), chain.CLOCK, {"by": operator, "reason": reason})
+
+    def accept_restored(self, operator: str, reason: str) -> int:
+        """Go on with an older copy of the records; how many audit rows it lacks."""
+        self._lock.acquire()
+        return self.signer.accept_restored(operator, reason)
+
+    def rotate_key(self, operator: str) -> None:
+        """Sign with a new key from now on."""
+        self.become_station()
+        self.signer.rotate(operator)
+
+    def replace_lost_key(self, operator: str, reason: str) -> None:
+        """Go on with a new key, since the one before is gone. Raises UsageError when it is not."""
+        self._lock.acquire()
+        self.signer.replace_lost(operator, reason)

@@ -7,6 +7,7 @@ differs. Other back ends have none of it: `limits_of` says so.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Final, NamedTuple
 
 _RUN_IS_OVER: Final = "(SELECT state FROM run WHERE id = {row}.run_id) <> 'RUNNING'"
@@ -258,14 +259,26 @@ RULES: Final = (
 
 def trigger_statements(dialect: str) -> list[str]:
     """The SQL that makes the triggers; empty for a back end that has none here."""
+    return _statements(dialect, RULES)
+
+
+def final_table(dialect: str, table: str) -> list[str]:
+    """The SQL that makes triggers which keep a table as it is."""
+    said = f"{table} is final"
+    events = ("INSERT", "UPDATE", "DELETE")
+    rules = (Rule(f"{table}_{e.lower()}", table, f"BEFORE {e}", "1 = 1", said) for e in events)
+    return _statements(dialect, rules)
+
+
+def _statements(dialect: str, rules: Iterable[Rule]) -> list[str]:
     if dialect == "sqlite":
         return [
             f"CREATE TRIGGER {rule.name} {rule.event} ON {rule.table} WHEN {rule.when}"
             f" BEGIN SELECT RAISE(ABORT, '{rule.text}'); END"
-            for rule in RULES
+            for rule in rules
         ]
     if dialect == "postgresql":
-        return [statement for rule in RULES for statement in _postgresql(rule)]
+        return [statement for rule in rules for statement in _postgresql(rule)]
     return []
 
 
