@@ -24,8 +24,9 @@ from flasher.station.records.model import (
 
 EARLIER_SHOWN: Final = 50
 """Earlier runs in the table; the page says how many more there are."""
-_WRITES_ON_SHEET: Final = 6
-"""Further ones stand in the annex."""
+_WRITES_ON_SHEET: Final = 4
+"""With more of them, or longer ones, all stand in the annex in full."""
+_TEXT_ON_SHEET: Final = 40
 _WORDS: Final = {
     UnitState.PASS: (Status.GOOD, "PASS", "This unit passed."),
     UnitState.FAIL: (Status.BAD, "FAIL", "This unit did not pass: it is no good unit."),
@@ -71,7 +72,13 @@ def render_certificate(
         key=fingerprint(head.key) if head else "",
         is_kept=is_kept,
         writes=last.writes[:_WRITES_ON_SHEET],
-        further_writes=last.writes[_WRITES_ON_SHEET:],
+        text_limit=_TEXT_ON_SHEET,
+        has_more_writes=len(last.writes) > _WRITES_ON_SHEET
+        or any(
+            len(text or "") > _TEXT_ON_SHEET
+            for write in last.writes
+            for text in (write.value, write.read_back)
+        ),
         is_golden=last.run.kind is RunKind.GOLDEN,
         measurements=[
             (step, each, _limits(each), _verdict(each))
