@@ -49,8 +49,8 @@ class Trail:
         self.connection = connection
         self.station = station_name
         self.key = key
-        self.head: Head | None = None
-        """The last row that was added here; None while there is none."""
+        self.heads: list[Head] = []
+        """The rows that were added here."""
 
     def append(
         self, now: datetime, event: str, data: Mapping[str, Any], run_id: int | None = None
@@ -77,7 +77,8 @@ class Trail:
         self.connection.execute(
             audit.insert().values(**row, station_id=station_id, hash=found, signature=signature)
         )
-        self.head = Head(self.station, number, row["at"], found, signature, self.key.public)
+        head = Head(self.station, number, row["at"], found, signature, self.key.public)
+        self.heads.append(head)
 
     def _station_id(self) -> int:
         query = select(station.c.id).where(station.c.name == self.station)

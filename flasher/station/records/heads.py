@@ -1,4 +1,4 @@
-"""The heads of audit chains, kept outside of the records: one line for each commit.
+"""The heads of audit chains, kept outside of the records: one line for each row.
 
 The chain alone cannot tell that its end was cut off, or that it is an older copy of itself. A file
 that only grows, in another place, can.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -37,9 +37,11 @@ class HeadsFile:
     def __init__(self, path: Path) -> None:
         self.path = path
 
-    def append(self, head: Head) -> None:
-        """Add a line; on disk when this returns. Raises RecordError."""
-        line = json.dumps(asdict(head), sort_keys=True).encode("ascii") + b"\n"
+    def append(self, heads: Iterable[Head]) -> None:
+        """Add a line for each; on disk when this returns. Raises RecordError."""
+        lines = b"".join(
+            json.dumps(asdict(head), sort_keys=True).encode("ascii") + b"\n" for head in heads
+        )
         with mapped(printable(str(self.path)), writes=True):
             is_new = not self.path.exists()
             if is_new:
@@ -50,8 +52,8 @@ class HeadsFile:
                 if size:
                     file.seek(size - 1)
                     if file.read(1) != b"\n":
-                        line = b"\n" + line  # behind half a line, which a crash has left
-                file.write(line)
+                        lines = b"\n" + lines  # behind half a line, which a crash has left
+                file.write(lines)
                 os.fsync(file.fileno())
             if is_new:
                 sync_folder(self.path.parent)

@@ -90,8 +90,7 @@ def migrate(
         except BaseException:
             path.unlink(missing_ok=True)
             raise
-        if trail.head is not None:
-            KeptPlace.of(keeping).file(station, records_id).append(trail.head)
+        KeptPlace.of(keeping).file(station, records_id).append(trail.heads)
     return Migrated(station, runs, backup, problems)
 
 

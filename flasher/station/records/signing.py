@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -91,7 +90,7 @@ class Signer:
         self._keys = key_folder(keeping)
         self.place = KeptPlace.of(keeping)
         self._key: SigningKey | None = None
-        self._unkept: deque[Head] = deque()
+        self._unkept: list[Head] = []
         self._keeping = Lock()
 
     @cached_property
@@ -139,8 +138,7 @@ class Signer:
         with self._database.writing(*locks, f"chain of {self._station}") as connection:
             trail = chain.Trail(connection, self._station, self._key)
             yield trail
-        if trail.head is not None:
-            self._unkept.append(trail.head)
+        self._unkept += trail.heads
         self._keep_heads()
 
     def rotate(self, operator: str) -> None:
@@ -174,10 +172,17 @@ class Signer:
             trail.append(self._now(), chain.KEY_LOST, data)
 
     def accept_restored(self, operator: str, reason: str) -> int:
-        """Go on with records that lack rows of which the heads are kept; how many rows are lost."""
-        kept = [head for head in self._kept() if not self._is_there(head)]
-        if not kept:
-            return 0
+        """Go on with records that lack rows of which the heads are kept; how many rows are lost.
+
+        Raises UsageError when nothing is missing.
+        """
+        heads = self._kept()
+        if not heads or self._is_there(heads[-1]):
+            raise UsageError(
+                "Nothing is missing: the records hold the last row of which a head is kept.",
+                remedy="Start the station.",
+            )
+        kept = [head for head in heads if not self._is_there(head)]
         self._load()
         with self.writing() as trail:
             numbers = [head.number for head in kept]
@@ -213,9 +218,10 @@ class Signer:
     def _keep_heads(self) -> None:
         """Also those of a commit before, which could not be kept then."""
         with self._keeping:
-            while self._unkept:
-                self.heads_file.append(self._unkept[0])
-                self._unkept.popleft()
+            some = list(self._unkept)
+            if some:
+                self.heads_file.append(some)
+                del self._unkept[: len(some)]
 
     @property
     def heads_file(self) -> HeadsFile:
