@@ -32,6 +32,7 @@ from flasher.trace.steps import MAX_STEPS, StepList, step_of
 from flasher.trace.story import (
     Cause,
     Recorded,
+    Step,
     Story,
     UpgradeStory,
     Verdict,
@@ -46,6 +47,8 @@ _WALL_TIME_FROM: Final = 1e8
 """Stamps from here on (1973) are wall time, smaller ones count from some start."""
 _BEGINNERS: Final = (Command.RESET, Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER)
 """Messages of the tool that make an upgrade."""
+_OF_BOOTLOADERS: Final = frozenset(Command) - {Command.READ_VERSION, Command.VERSION_INFORMATION}
+"""Commands that are no word of an application."""
 _BURST_S: Final = 1.0
 """An announcement so short before an update command is a part of the upgrade."""
 _SHUTDOWN: Final = 0x1308
@@ -168,7 +171,22 @@ class _Reading:
             dialogue.device(said)
         return dialogue
 
+    def _end_of_restart(self, target: Target, piece: Piece) -> None:
+        """A device that announced itself, was told of no update, and answers as an application now
+        was restarted: that was no upgrade.
+        """
+        dialogue = self._open.get(target)
+        is_application = piece.seen.kind in (Kind.MESSAGE, Kind.UNKNOWN)
+        if dialogue is None or not dialogue.is_restart or not is_application:
+            return
+        if piece.seen.command not in _OF_BOOTLOADERS:
+            del self._open[target]
+            for line in dialogue.steps.lines():
+                if isinstance(line, Step):
+                    self._outside.add(line)
+
     def _device(self, target: Target, piece: Piece) -> None:
+        self._end_of_restart(target, piece)
         dialogue = self._open.get(target)
         if dialogue is not None:
             dialogue.device(piece)
@@ -185,6 +203,8 @@ class _Reading:
         """A message between other nodes, or to all of them."""
         seen = piece.seen
         if seen.kind is Kind.MESSAGE and seen.can_id == BMS.broadcast_id:
+            if seen.command == Command.VERSION_INFORMATION:
+                self._end_of_restart(BMS, piece)
             battery = self._open.get(BMS)
             if seen.command == Command.VERSION_INFORMATION and battery is not None:
                 battery.version(piece)

@@ -83,6 +83,11 @@ class Facts:
     """What the tool's id said that this upgrade does not explain."""
     interleaving: Interleaving = field(default_factory=Interleaving)
 
+    @property
+    def is_restart(self) -> bool:
+        """So far the device was restarted and announced itself, and was told of no update."""
+        return self.is_announced and not self.updates and self.phase is Phase.BOOT
+
     def enter(self, phase: Phase, at_s: float) -> None:
         """A phase begins, or goes on."""
         if self.phase is not phase:

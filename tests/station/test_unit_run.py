@@ -13,8 +13,13 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WMC
 from flasher.station.codes import CODES, OF_ENDING
 from flasher.station.records.model import RunKind, RunState, StepState
+from flasher.station.records.proof import hear
 from flasher.station.run_model import Progress, Prompt
 from flasher.station.steps import StepName, Verified
+from flasher.trace.reader import read_trace
+from flasher.trace.recorder import Recorder
+from flasher.trace.source import explain_path
+from flasher.trace.story import Cause
 from tests.station.factory import BMS_VERSION, IMAGES, SERIAL, USUAL, target_table
 from tests.station.unit_bench import NEW_UNIT, WRITES, UnitBench
 
@@ -51,6 +56,22 @@ def test_a_good_unit_passes_through_every_step_in_order(tmp_path: Path) -> None:
         SERIAL,
         "made 20260517",
     )
+
+
+def test_the_trace_of_a_good_unit_tells_all_of_it_and_its_restart_is_no_upgrade(
+    tmp_path: Path,
+) -> None:
+    bench = UnitBench(tmp_path)
+    with Recorder(tmp_path / "run.log") as recorder:
+        bench.taps = (recorder,)
+        assert bench.run().outcome is RunState.PASS
+    story = explain_path(tmp_path / "run.log")
+    assert story.verdict.cause is Cause.COMPLETED
+    assert len(story.upgrades) == 1
+    heard = hear(["bms"], read_trace(tmp_path / "run.log"))["bms"]
+    assert heard.sent_sha256 == IMAGES[BMS].sha256
+    assert heard.is_complete
+    assert (heard.version, heard.serial, heard.written_serial) == (BMS_VERSION, SERIAL, SERIAL)
 
 
 def test_what_cannot_be_taken_back_is_noted_before_and_after(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.device.model import Device
 from flasher.device.profile import DeviceProfile
+from flasher.driver import Tap
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.station.records.model import RunId, RunKind, StepState, WriteId
 from flasher.station.run_model import (
@@ -91,6 +92,7 @@ class UnitBench:
         self.notes: list[RunNote] = []
         self.is_cancelled: Callable[[], bool] = lambda: False
         self.power: PowerControl | None = None
+        self.taps: Sequence[Tap] = ()
 
     @property
     def device(self) -> Device:
@@ -123,6 +125,7 @@ class UnitBench:
             self.recipe,
             self.connection,
             self.journal,
+            taps=self.taps,
             tell=self.notes.append,
             cancelled=self._is_cancelled,
             power=self.power,
