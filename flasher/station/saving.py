@@ -9,20 +9,23 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Final
 
 from flasher.station import codes
 from flasher.station.codes import CODES, Code
 from flasher.station.messages import Finished
 from flasher.station.records.errors import RuleBrokenError
-from flasher.station.records.model import AttachmentFile, Claim, Ending, RunState, StepState
+from flasher.station.records.model import (
+    TORN_TRACE,
+    TRACE,
+    AttachmentFile,
+    Claim,
+    Ending,
+    RunState,
+    StepState,
+)
 from flasher.station.records.store import Store
 from flasher.station.run_model import RunOrder, RunResult
 from flasher.station.steps import StepName
-
-TRACE: Final = "trace"
-TORN_TRACE: Final = "torn-trace"
-"""Of a process that died: its end is missing."""
 
 
 @dataclass

@@ -18,7 +18,6 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
-from pathlib import Path
 from typing import Final
 
 from flasher.log import log_event
@@ -84,8 +83,6 @@ from flasher.station.supervisor import Launch, ProcessPort, Supervisor, WorkerLo
 
 TURN_S: Final = 0.1
 """How long a turn of the loop waits at the most."""
-SPOOL: Final = "open"
-"""Folder of the traces of runs that go on, beside the attachments."""
 EventHandler = Callable[[StationEvent], None]
 
 
@@ -168,7 +165,7 @@ class Station:
         )
         recovered = self.store.recover()
         self._find_interrupted(recovered)
-        self._spool.mkdir(parents=True, exist_ok=True)
+        self.store.files.spool.mkdir(parents=True, exist_ok=True)
         self._is_open = True
         rule = self.recipe.recipe
         self.tell(
@@ -292,11 +289,6 @@ class Station:
     def _now(self) -> float:
         return self.clock.monotonic_s()
 
-    @property
-    def _spool(self) -> Path:
-        """Where traces are written until they are saved."""
-        return self.store.files.folder / SPOOL
-
     def tell(self, event: StationEvent) -> None:
         """An event leaves."""
         try:
@@ -396,7 +388,7 @@ class Station:
         except RecordError as error:
             self._not_saved(order.socket, serial, None, error)
             return line.NotSaved(error.what, error.remedy)
-        trace = self._spool / f"run-{claim.run_id}.log"
+        trace = self.store.files.spooled(claim.run_id)
         run_order = RunOrder(
             claim.run_id,
             claim.kind,

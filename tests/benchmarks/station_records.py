@@ -14,12 +14,12 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from flasher.cli.station_records import certificate
 from flasher.protocol.spec import BMS
 from flasher.station.records import (
     Ending,
+    Keeping,
     Measurement,
     RunFilter,
     RunState,
@@ -42,16 +42,15 @@ BAD_EVERY = 17
 
 def fill(bench: Bench, runs: int) -> None:
     """`runs` runs: every 17th unit fails first and passes then."""
-    file = bench.store.add_file("trace", bench.trace)
     serial, bad = 0, False
     for _ in range(runs):
         if not bad:
             serial += 1
         bad = not bad and serial % BAD_EVERY == 0
-        one_run(bench, f"W{serial:07d}", file, bad=bad)
+        one_run(bench, f"W{serial:07d}", bad=bad)
 
 
-def one_run(bench: Bench, serial: str, file: Any, *, bad: bool) -> None:
+def one_run(bench: Bench, serial: str, *, bad: bool) -> None:
     """A run with the steps, writes and measurements of a usual recipe."""
     store = bench.store
     lot = f"L{int(serial[1:]) // UNITS_PER_LOT:03d}"
@@ -59,12 +58,15 @@ def one_run(bench: Bench, serial: str, file: Any, *, bad: bool) -> None:
     voltage = Measurement("voltage", 36.2, "V", 30.0, 42.0)
     for name in (StepName.CONNECT, StepName.IDENTIFY, StepName.CHECK):
         store.step(run_id, name, StepState.PASS, duration_s=0.3, measurements=[voltage])
-    for what, value in (("flash", BMS_VERSION), ("serial-number", serial)):
+    for what, value in (("flash", BMS_VERSION), ("user-string-1", serial)):
         write = store.intent(run_id, "bms", what, value)
         store.verified(write, value)
         store.step(run_id, what, StepState.PASS, duration_s=2.0)
     state = StepState.FAIL if bad else StepState.PASS
     store.step(run_id, StepName.VERIFY, state, duration_s=1.0)
+    trace = bench.traced(serial)
+    file = store.add_file("trace", trace)
+    trace.unlink()
     verified = {} if bad else {"bms": Verified.VERSION}
     outcome, code = (RunState.FAIL, "VERSION") if bad else (RunState.PASS, "OK")
     store.finish(run_id, Ending(outcome, code, "", verified, file.sha256, [file]))
@@ -95,17 +97,17 @@ def measure(folder: Path, runs: int) -> None:
     bench.recipe = make_recipe(folder, HEAD + SERIAL_NUMBER + target_table(BMS))
     fast = bench.store
     fast.close()
-    with Store.open(str(bench.path), station="line-2") as bench.store:
+    keeping = Keeping(bench.keys)
+    with Store.open(str(bench.path), station="line-2", keeping=keeping) as bench.store:
         bench.store.recover()
-        file = bench.store.add_file("trace", bench.trace)
-        timed("one durable run of 12 commits", lambda: durable(bench, file))
+        timed("one durable run of 12 commits", lambda: durable(bench))
     bench.store = fast
     bench.store.recover()
     began = time.perf_counter()
     fill(bench, runs)
     print(f"  {runs} runs made in {time.perf_counter() - began:.0f} s")
     bench.store.close()
-    with Store.open(str(bench.path), station="report", create=False) as store:
+    with Store.open(str(bench.path), station="report", read_only=True, keeping=keeping) as store:
         records = store.read
         timed("figures of all runs", records.figures)
         timed("figures of one lot", lambda: records.figures(RunFilter(lot="L001")))
@@ -127,11 +129,11 @@ def measure(folder: Path, runs: int) -> None:
 _durable = 9_000_000
 
 
-def durable(bench: Bench, file: Any) -> None:
+def durable(bench: Bench) -> None:
     """One run with the settings of a station."""
     global _durable  # noqa: PLW0603  a serial number for each repetition
     _durable += 1
-    one_run(bench, f"W{_durable}", file, bad=False)
+    one_run(bench, f"W{_durable}", bad=False)
 
 
 if __name__ == "__main__":

@@ -18,11 +18,11 @@ from flasher.image.load import load
 from flasher.image.manifest import release_of, to_toml
 from flasher.protocol.spec import BMS
 from flasher.station.config import MockUnits
-from flasher.station.events import RunEnded, StationEvent, StepEnded
+from flasher.station.events import RunEnded, RunStarted, StationEvent, StepEnded
 from flasher.station.messages import VirtualUnits, WorkerSetup
 from flasher.station.options import StationOptions
 from flasher.station.recipe_file import LoadedRecipe, load_recipe
-from flasher.station.records import RunState, Store
+from flasher.station.records import Keeping, RunState, Store
 from flasher.station.station import Station
 from flasher.station.steps import StepName
 
@@ -64,6 +64,10 @@ class Measured:
     def __init__(self, sockets: int, units: int) -> None:
         self.flash_s: list[float] = []
         self.run_s: list[float] = []
+        self.beside_s: list[float] = []
+        """Of each unit: from its begin to its saved end, without its steps."""
+        self._steps_s: dict[str, float] = {}
+        self._begun_s: dict[str, float] = {}
         self.bad = 0
         self.wall_s = self.cpu_s = self.station_cpu_s = 0.0
         self._wanted = sockets * units
@@ -87,7 +91,9 @@ class Measured:
             for at in range(sockets)
         ]
         cpu_before, own_before = _children_cpu_s(), time.process_time()
-        with Store.open(str(folder / "records.sqlite"), station="benchmark") as store:
+        keeping = Keeping(folder / "keys")
+        records = str(folder / "records.sqlite")
+        with Store.open(records, station="benchmark", keeping=keeping) as store:
             options = StationOptions(scans_labels=True)
             station = Station(
                 store, recipe, setups, operator="jo", on_event=self._hear, options=options
@@ -99,12 +105,19 @@ class Measured:
         self.station_cpu_s = time.process_time() - own_before
 
     def _hear(self, event: StationEvent) -> None:
+        now = time.monotonic()
         match event:
-            case StepEnded(step=StepName.FLASH):
-                self.flash_s.append(event.duration_s)
+            case RunStarted():
+                self._begun_s[event.serial], self._steps_s[event.serial] = now, 0.0
+            case StepEnded():
+                self._steps_s[event.serial] += event.duration_s
+                if event.step is StepName.FLASH:
+                    self.flash_s.append(event.duration_s)
             case RunEnded():
                 if event.outcome is RunState.PASS:
                     self.run_s.append(event.duration_s)
+                    taken_s = now - self._begun_s[event.serial]
+                    self.beside_s.append(taken_s - self._steps_s[event.serial])
                 else:
                     self.bad += 1
 
@@ -120,7 +133,9 @@ def main() -> None:
     parser.add_argument("--units", type=int, default=2, help="units in each socket")
     options = parser.parse_args()
     print(f"{os.cpu_count()} cores; times in seconds, against one socket alone")
-    print("sockets  flash median     longest          run median       CPU/unit  station CPU/unit")
+    print(
+        "sockets  flash median     longest          run median       beside steps  CPU/unit  station CPU/unit"
+    )
     alone: Measured | None = None
     for sockets in options.sockets:
         found = Measured(sockets, options.units)
@@ -132,6 +147,7 @@ def main() -> None:
             f"{sockets:>7}  {flash:6.2f} ({flash / base - 1:+6.1%})"
             f"  {max(found.flash_s):6.2f} ({max(found.flash_s) / base - 1:+6.1%})"
             f"  {run:6.2f} ({run / base_run - 1:+6.1%})"
+            f"  {statistics.median(found.beside_s):12.3f}"
             f"  {found.cpu_s / count:7.2f}  {found.station_cpu_s / count:9.3f}"
             + (f"  {found.bad} NOT PASSED" if found.bad else ""),
             flush=True,

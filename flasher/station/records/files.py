@@ -87,8 +87,12 @@ class FileStore:
             with contextlib.suppress(OSError):  # one that stays harms nothing
                 path.unlink(missing_ok=True)
 
+    def spooled(self, run_id: int) -> Path:
+        """Where the trace of a run is written while it goes on."""
+        return self.spool / f"run-{run_id}.log"
+
     def _spooled(self, run_id: int) -> tuple[Path, Path]:
-        plain = self.spool / f"run-{run_id}.log"
+        plain = self.spooled(run_id)
         return plain, plain.with_name(plain.name + ".gz")
 
     @contextmanager
