@@ -6,12 +6,12 @@ import argparse
 from contextlib import closing
 from typing import Final
 
-from flasher.cli.documents import plain_value
 from flasher.cli.files import check_writable
 from flasher.cli.output import Output, byte_count, counted
 from flasher.cli.station_documents import (
     AcceptedDocument,
     BackupDocument,
+    KeptHeadsDocument,
     MigratedDocument,
     ProblemDocument,
     SigningKeyDocument,
@@ -98,7 +98,12 @@ def _verify(output: Output, store: Store) -> int:
     document = VerifiedRecordsDocument(
         problems=[ProblemDocument(where=each.where, what=each.what) for each in found.problems],
         remarks=list(found.remarks),
-        kept=plain_value(found.kept),
+        kept=[
+            KeptHeadsDocument(
+                station=each.station, path=str(each.path), first=each.first, last=each.last
+            )
+            for each in found.kept
+        ],
         unkept=list(found.unkept),
         traces=found.traces,
         is_checked_elsewhere=found.is_checked_elsewhere,
@@ -115,10 +120,8 @@ def _say_what_was_checked(found: Examination, output: Output) -> None:
     for name in found.unkept:
         output.result(f"  {printable(name)}: no heads are kept; an older copy would look the same")
     for each in found.kept:
-        rows = f"rows {each.first:,} to {each.last:,}"
-        output.result(
-            f"  {printable(each.station)}: {rows} held against {printable(str(each.path))}"
-        )
+        rows = f"{each.station}: rows {each.first:,} to {each.last:,}"
+        output.result(printable(f"  {rows} held against the heads in {each.path}"))
         if each.first > 1:
             output.result(f"    the rows before row {each.first:,} are held against no kept head")
     output.result(f"  {counted(found.traces, 'trace')} of runs that passed agree with the records")
@@ -140,7 +143,9 @@ def _key(options: argparse.Namespace, output: Output, store: Store) -> int:
     shown = fingerprint(signer.public)
     output.result(f"{printable(store.station)}: key {shown}")
     output.result(f"  public: {signer.public}")
-    output.result(f"  file:   {printable(str(signer.key_file))}")
+    is_there = signer.key_file.exists()
+    where = printable(str(signer.key_file))
+    output.result(f"  file:   {where}" + ("" if is_there else " (NOT THERE)"))
     output.result(f"  heads:  {printable(str(signer.heads_file.path))}")
     output.document(
         SigningKeyDocument(
@@ -148,6 +153,7 @@ def _key(options: argparse.Namespace, output: Output, store: Store) -> int:
             fingerprint=shown,
             public=signer.public,
             file=str(signer.key_file),
+            is_there=is_there,
             heads=str(signer.heads_file.path),
         )
     )

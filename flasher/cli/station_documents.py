@@ -214,6 +214,8 @@ class SigningKeyDocument(TypedDict):
     public: str
     """The public key, in hexadecimal digits."""
     file: str
+    is_there: bool
+    """The file is where it has to be."""
     heads: str
     """Where the signed heads of the audit trail are kept."""
 

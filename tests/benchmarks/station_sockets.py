@@ -133,9 +133,8 @@ def main() -> None:
     parser.add_argument("--units", type=int, default=2, help="units in each socket")
     options = parser.parse_args()
     print(f"{os.cpu_count()} cores; times in seconds, against one socket alone")
-    print(
-        "sockets  flash median     longest          run median       beside steps  CPU/unit  station CPU/unit"
-    )
+    print("sockets  flash median     longest          run median       ", end="")
+    print("beside steps  CPU/unit  station CPU/unit")
     alone: Measured | None = None
     for sockets in options.sockets:
         found = Measured(sockets, options.units)

@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from flasher.cli.main import main
+from tests import schema_document
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
 
@@ -42,6 +43,14 @@ def bundle_folder(
     folder = tmp_path_factory.mktemp("bundles")
     monkeypatch.setenv("FLASHER_BUNDLE_DIR", str(folder))
     return folder
+
+
+@pytest.fixture(scope="session")
+def schema() -> dict[str, Any]:
+    """What `--json` prints, as it is published."""
+    loaded = json.loads(schema_document.SCHEMA.read_text(encoding="utf-8"))
+    assert isinstance(loaded, dict)
+    return loaded
 
 
 @pytest.fixture

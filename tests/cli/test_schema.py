@@ -26,13 +26,6 @@ MOCK = ("-t", "bms", "--mock", "--mock-speed", "0")
 OBC = SAMPLES / "obc.bin"
 
 
-@pytest.fixture(scope="module")
-def schema() -> dict[str, Any]:
-    loaded = json.loads(schema_document.SCHEMA.read_text(encoding="utf-8"))
-    assert isinstance(loaded, dict)
-    return loaded
-
-
 def hold(schema: Mapping[str, Any], name: str, instance: object) -> None:
     """Raises ValidationError where the instance is not what the definition says."""
     chosen = {"$defs": schema["$defs"], "$ref": f"#/$defs/{name}"}

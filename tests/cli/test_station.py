@@ -28,7 +28,6 @@ from flasher.station.scans import Word
 from tests.cli.conftest import SAMPLES, Flasher, Run
 from tests.cli.station_threads import ThreadPort
 from tests.cli.test_schema import hold, hold_output
-from tests.schema_document import SCHEMA
 from tests.station.factory import SERIAL, USUAL, Bench, write_recipe
 
 RECIPE = SAMPLES / "station" / "recipe.toml"
@@ -40,12 +39,6 @@ values = ["{serial}"]
 manufacturer = true
 """
 FAST = ("--mock-speed", "0", "--mock-dead", "0", "--mock-slow", "0")
-
-
-@pytest.fixture(scope="module")
-def schema() -> dict[str, Any]:
-    loaded: dict[str, Any] = json.loads(SCHEMA.read_text(encoding="utf-8"))
-    return loaded
 
 
 @pytest.fixture(autouse=True)

@@ -370,7 +370,8 @@ class Examination:
     @property
     def is_checked_elsewhere(self) -> bool:
         """True when every chain was held, from its first row, against heads kept elsewhere."""
-        return not self.unkept and all(each.first == 1 for each in self.kept)
+        are_whole = all(each.first == 1 for each in self.kept)
+        return bool(self.kept) and not self.unkept and are_whole
 
     def of_run(self, run_id: RunId) -> tuple[Problem, ...]:
         """What speaks against one run."""

@@ -1,0 +1,149 @@
+"""`flasher station verify`, `key`, `accept` and `migrate`, as a person meets them."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing
+from datetime import timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flasher.errors import ExitCode
+from flasher.station.records import RunState
+from tests.cli.conftest import Flasher
+from tests.cli.test_schema import hold_output
+from tests.station.factory import SERIAL, Bench
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Iterator[Bench]:
+    made = Bench(tmp_path)
+    yield made
+    made.store.close()
+
+
+@pytest.fixture
+def place(bench: Bench) -> tuple[str, ...]:
+    """Options that name the records of a good and a bad unit."""
+    bench.make()
+    bench.make(RunState.FAIL, "W2605003")
+    bench.store.close()
+    return ("--database", str(bench.path), "--keys", str(bench.keys))
+
+
+def test_verify_says_what_the_records_were_held_against(
+    flasher: Flasher, bench: Bench, place: tuple[str, ...], schema: dict[str, Any]
+) -> None:
+    run = flasher("station", "verify", *place)
+    assert run.code == ExitCode.OK
+    assert run.out.splitlines() == [
+        "records, traces and audit trails are as they were written",
+        f"  line-2: rows 1 to 6 held against the heads in {bench.keys}",
+        "  1 trace of runs that passed agree with the records",
+    ]
+    told = flasher("station", "verify", *place, "--json")
+    hold_output(schema, told.out, 0)
+    assert told.document["is_checked_elsewhere"]
+    without = flasher("station", "verify", "--database", bench.path, "--keys", bench.folder)
+    assert without.code == ExitCode.OK
+    assert "NOT CHECKED against a head kept elsewhere" in without.out
+    assert "as they were written" not in without.out
+    named = flasher("station", "verify", *place, "--heads", bench.folder)
+    assert named.code == ExitCode.VERIFICATION
+    assert "none of these records is kept" in named.out
+
+
+def test_a_unit_whose_records_were_changed_gets_no_page(
+    flasher: Flasher, bench: Bench, place: tuple[str, ...], tmp_path: Path
+) -> None:
+    good = flasher("station", "unit", SERIAL, *place, "--certificate", tmp_path / "good.html")
+    assert good.code == ExitCode.OK
+    page = (tmp_path / "good.html").read_text("utf-8")
+    assert "Signed audit row" in page
+    assert "Held against heads that are kept outside of the records." in page
+    with closing(sqlite3.connect(bench.path)) as db:
+        rule = db.execute("SELECT sql FROM sqlite_master WHERE name = 'run_update'").fetchone()[0]
+        db.execute("DROP TRIGGER run_update")
+        db.execute("UPDATE run SET text = 'all was well' WHERE id = 2")
+        db.execute(rule)
+        db.commit()
+    bad = flasher("station", "unit", "W2605003", *place, "--certificate", tmp_path / "bad.html")
+    assert bad.code == ExitCode.VERIFICATION
+    assert "its records were changed" in bad.err
+    assert not (tmp_path / "bad.html").exists()
+    both = flasher("station", "report", *place, "--certificates", tmp_path / "pages")
+    assert both.code == ExitCode.VERIFICATION
+    assert "no page for W2605003: run 2: changed after it was recorded: the run itself" in both.out
+    assert [path.name for path in (tmp_path / "pages").iterdir()] == [f"{SERIAL}.html"]
+
+
+def test_a_key_is_shown_rotated_and_replaced(
+    flasher: Flasher, bench: Bench, place: tuple[str, ...], schema: dict[str, Any]
+) -> None:
+    shown = flasher("station", "key", *place, "--json")
+    hold_output(schema, shown.out, 0)
+    rotated = flasher("station", "key", *place, "--rotate", "--json").document
+    assert rotated["public"] != shown.document["public"]
+    (key,) = bench.keys.glob("*.key")
+    key.unlink()
+    assert "NOT THERE" in flasher("station", "key", *place).out
+    assert flasher("station", "key", *place, "--lost").code == ExitCode.USAGE
+    lost = flasher("station", "key", *place, "--lost", "--reason", "the disk died")
+    assert lost.code == ExitCode.OK
+    verified = flasher("station", "verify", *place)
+    assert verified.code == ExitCode.OK
+    assert "the key was declared lost" in verified.err
+
+
+def test_a_clock_is_released_by_a_person_with_a_reason(
+    flasher: Flasher, bench: Bench, place: tuple[str, ...], schema: dict[str, Any]
+) -> None:
+    words = ("station", "accept", "clock", *place)
+    assert flasher(*words).code == ExitCode.USAGE
+    run = flasher(*words, "--operator", "Jo", "--reason", "a wrong date was set", "--json")
+    hold_output(schema, run.out, 0)
+    assert "the clock was released" in flasher("station", "verify", *place).err
+    bench.clock.now += timedelta(days=400)
+    nothing = flasher("station", "accept", "restored", *place, "--reason", "x")
+    assert nothing.code == ExitCode.USAGE
+    assert "Nothing is missing" in nothing.err
+
+
+def test_which_station_is_meant_has_to_be_clear(
+    flasher: Flasher, bench: Bench, place: tuple[str, ...]
+) -> None:
+    other = bench.opened("line-3")
+    other.recover()
+    other.close()
+    run = flasher("station", "key", *place)
+    assert run.code == ExitCode.USAGE
+    assert "line-2, line-3" in run.err
+    Path(bench.folder / "sockets.toml").write_text(
+        'name = "line-3"\nrecords = "records.sqlite"\nkeys = "keys"\n'
+        '[[socket]]\nname = "A"\nmock = {}\n',
+        encoding="utf-8",
+    )
+    named = flasher("station", "key", "--sockets", bench.folder / "sockets.toml")
+    assert named.out.startswith("line-3: key ")
+
+
+def test_records_of_version_1_are_read_after_migration(
+    flasher: Flasher, tmp_path: Path, schema: dict[str, Any]
+) -> None:
+    old = tmp_path / "records.sqlite"
+    sample = Path(__file__).parents[1] / "station" / "records" / "version_1.sql"
+    with closing(sqlite3.connect(old)) as db:
+        db.executescript(sample.read_text("utf-8"))
+    place = ("--database", old, "--keys", tmp_path / "keys")
+    refused = flasher("station", "unit", SERIAL, *place)
+    assert refused.code == ExitCode.USAGE
+    assert "flasher station migrate" in refused.err
+    done = flasher("station", "migrate", *place, "--json")
+    hold_output(schema, done.out, 0)
+    assert done.document["runs"] == 3
+    assert Path(done.document["backup"]).is_file()
+    assert "PASS" in flasher("station", "unit", SERIAL, *place).out
+    assert flasher("station", "migrate", *place).code == ExitCode.USAGE
