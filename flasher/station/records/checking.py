@@ -47,6 +47,8 @@ class Examiner:
         self._remarks: list[str] = []
         self._kept: list[KeptHeads] = []
         self._unkept: list[str] = []
+        self._schema: dict[tuple[str, str], None] = {}
+        """How the schema differs from what any chain states of it, each difference once."""
         self._traces = 0
         self._nameless = 0
         self._claims: dict[int, Mapping[str, str]] = {}
@@ -107,6 +109,8 @@ class Examiner:
             restored: dict[int, range] = {}
             yield from self._chain(name, rows.mappings(), records_id, found, hashes, restored)
             yield from self._heads(name, kept_of.get(name), hashes, restored)
+        for thing, what in self._schema:
+            yield Problem(f"schema, {printable(thing)}", what)
 
     def _chain(
         self,
@@ -145,8 +149,7 @@ class Examiner:
             for each in data.get("problems", ()):
                 yield Problem(where, f"found at the migration: {printable(str(each))}")
         if hashes:
-            for thing, what in differences(stated, found):
-                yield Problem(f"schema, {printable(thing)}", what)
+            self._schema |= dict.fromkeys(differences(stated, found))
 
     def _note(self, shown: str, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
         said = f"{row['at'][:10]} by {printable(str(data.get('by')))}"

@@ -14,21 +14,24 @@ _SQLITE: Final = """
 SELECT type || ' ' || name, sql FROM sqlite_master WHERE name NOT LIKE 'sqlite_stat%'
 """
 _POSTGRESQL: Final = """
-SELECT 'trigger ' || t.tgname, pg_get_triggerdef(t.oid) || t.tgenabled
+SELECT 'trigger ' || t.tgname, pg_get_triggerdef(t.oid) || t.tgenabled::text
 FROM pg_trigger t JOIN pg_class c ON c.oid = t.tgrelid
 WHERE NOT t.tgisinternal AND c.relnamespace = current_schema()::regnamespace
 UNION ALL
 SELECT 'function ' || proname, pg_get_functiondef(oid) FROM pg_proc
 WHERE pronamespace = current_schema()::regnamespace AND prokind = 'f'
 UNION ALL
-SELECT 'constraint ' || conrelid::regclass || '.' || conname, pg_get_constraintdef(oid)
-FROM pg_constraint WHERE connamespace = current_schema()::regnamespace AND contype <> 'n'
+SELECT 'constraint ' || c.relname || '.' || conname, pg_get_constraintdef(o.oid)
+FROM pg_constraint o JOIN pg_class c ON c.oid = o.conrelid
+WHERE connamespace = current_schema()::regnamespace AND contype <> 'n'
 UNION ALL
 SELECT 'index ' || indexname, indexdef FROM pg_indexes WHERE schemaname = current_schema()
 UNION ALL
-SELECT 'column ' || table_name || '.' || column_name,
-    data_type || ' ' || is_nullable || ' ' || COALESCE(character_maximum_length, 0)
-FROM information_schema.columns WHERE table_schema = current_schema()
+SELECT 'column ' || c.relname || '.' || attname,
+    format_type(atttypid, atttypmod) || attnotnull::text
+FROM pg_attribute JOIN pg_class c ON c.oid = attrelid
+WHERE c.relnamespace = current_schema()::regnamespace AND c.relkind = 'r'
+    AND attnum > 0 AND NOT attisdropped
 """
 _QUERIES: Final = {"sqlite": _SQLITE, "postgresql": _POSTGRESQL}
 
