@@ -23,7 +23,7 @@ from flasher.station.records.schema import audit, station
 GENESIS: Final = "0" * 64
 """The hash before the first row."""
 BEGUN: Final = "begun"
-"""The first row of a chain: which records, their schema, the public key."""
+"""The first row of a chain: the station, which records, their schema, the public key."""
 CLAIMED: Final = "claimed"
 FINISHED: Final = "finished"
 INTERRUPTED: Final = "interrupted"
@@ -72,7 +72,7 @@ class Trail:
             "data": canonical(data),
             "previous_hash": before,
         }
-        found = row_hash(self.station, row)
+        found = row_hash(row)
         signature = self.key.sign(found)
         self.connection.execute(
             audit.insert().values(**row, station_id=station_id, hash=found, signature=signature)
@@ -91,7 +91,7 @@ class Trail:
 
 def canonical(data: Any) -> str:
     """One text for equal data."""
-    return json.dumps(data, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return json.dumps(data, sort_keys=True, separators=(",", ":"), ensure_ascii=True, default=repr)
 
 
 def digest(data: Any) -> str:
@@ -108,10 +108,10 @@ def data_of(text: str) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-def row_hash(station_name: str, row: Mapping[Any, Any]) -> str:
+def row_hash(row: Mapping[Any, Any]) -> str:
     """The hash of an audit row; it covers the chain up to it."""
     columns = ("previous_hash", "number", "at", "event", "run_id", "data")
-    return digest([station_name, *(row[name] for name in columns)])
+    return digest([row[name] for name in columns])
 
 
 def key_of(event: str, data: Mapping[str, Any]) -> str | None:

@@ -18,7 +18,7 @@ from flasher.station.records.errors import RecordError
 from flasher.station.records.files import FileStore
 from flasher.station.records.fingerprint import differences, fingerprint_of
 from flasher.station.records.heads import Head
-from flasher.station.records.keys import fingerprint, is_signed
+from flasher.station.records.keys import is_signed
 from flasher.station.records.model import (
     TRACE,
     AttachmentFile,
@@ -126,11 +126,12 @@ class Examiner:
         stated: Mapping[str, str] = {}
         shown = printable(name)
         for expected, row in enumerate(rows, 1):
-            where = f"audit row {row['number']} of {shown}"
+            where = f"audit row {expected} of {shown}"
             data = chain.data_of(row["data"])
             if row["previous_hash"] != before or row["number"] != expected:
                 yield Problem(where, "the chain is broken: the row before it is missing or changed")
-            if row["hash"] != chain.row_hash(name, row):
+            is_whole = row["hash"] == chain.row_hash(row)
+            if not is_whole:
                 yield Problem(where, "it was changed after it was written")
             following = chain.key_of(row["event"], data)
             if following is not None and row["event"] != chain.KEY_ROTATED:
@@ -138,16 +139,16 @@ class Examiner:
             if key is None or not is_signed(row["hash"], row["signature"], key):
                 yield Problem(where, "it is not signed with the key of the station")
             key = following or key
-            before, hashes[row["number"]] = row["hash"], row["hash"]
-            if row["event"] == chain.BEGUN and data.get("records") != records_id:
-                yield Problem(where, "its chain is that of other records")
-            stated = data.get("schema", stated)
+            before, hashes[expected] = row["hash"], row["hash"]
+            if not is_whole:
+                continue  # what it says counts for nothing
+            stated = _table(data.get("schema")) or stated
             if row["event"] == chain.RESTORED:
-                restored[row["number"]] = range(data["lost_from"], data["lost_to"] + 1)
+                restored[expected] = _lost(data)
             self._note(shown, row, data)
             self._vouch(row, data)
-            for each in data.get("problems", ()):
-                yield Problem(where, f"found at the migration: {printable(str(each))}")
+            for what in _contradictions(name, records_id, row["event"], data):
+                yield Problem(where, what)
         if hashes:
             self._schema |= dict.fromkeys(differences(stated, found))
 
@@ -155,14 +156,12 @@ class Examiner:
         said = f"{row['at'][:10]} by {printable(str(data.get('by')))}"
         match row["event"]:
             case chain.KEY_LOST:
-                self._remarks.append(
-                    f"{shown}: the key was declared lost on {said}; it signs with"
-                    f" {fingerprint(data['key'])} since"
-                )
+                self._remarks.append(f"{shown}: the key was declared lost on {said}")
             case chain.RESTORED:
+                lost = _lost(data)
                 self._remarks.append(
-                    f"{shown}: rows {data['lost_from']} to {data['lost_to']} of an earlier chain"
-                    f" were given up as lost on {said}"
+                    f"{shown}: rows {lost.start} to {lost.stop - 1} of an earlier chain were given"
+                    f" up as lost on {said}"
                 )
             case chain.CLOCK:
                 self._remarks.append(f"{shown}: the clock was released on {said}")
@@ -170,8 +169,8 @@ class Examiner:
                 pass
 
     def _vouch(self, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
-        digests = data.get("digests")
-        if row["run_id"] is None or not isinstance(digests, dict):
+        digests = _table(data.get("digests"))
+        if row["run_id"] is None or not digests:
             return
         if row["event"] in chain.ENDINGS:
             self._endings[row["run_id"]] = digests
@@ -224,25 +223,46 @@ class Examiner:
     def _runs(
         self, connection: Connection, run_ids: list[int], changed: dict[tuple[str, str], list[int]]
     ) -> Iterator[Problem]:
-        digests = digests_of(connection, run_ids)
-        for details in details_of(connection, run_records(connection, run_ids)):
-            run_id = details.run.run_id
+        for run_id, digests in digests_of(connection, run_ids).items():
             where = f"run {run_id}"
-            is_over = details.run.state is not RunState.RUNNING
-            stated = {**self._claims.get(run_id, {}), **self._endings.get(run_id, {})}
-            if not stated:
+            claim, ending = self._claims.get(run_id, {}), self._endings.get(run_id, {})
+            if not claim and not ending:
                 yield Problem(where, "the audit trail does not know it", (run_id,))
-            elif is_over != (run_id in self._endings):
-                what = "it is finished" if is_over else "it goes on"
-                yield Problem(where, f"{what}, but the audit trail says otherwise", (run_id,))
-            wrong = [part for part in stated if stated[part] != digests[run_id].get(part)]
-            for part in wrong:
-                if part in NAMED:
-                    changed[part, digests[run_id][part]].append(run_id)
-            own = [OWN.get(part, part) for part in wrong if part not in NAMED]
+            wrong = {
+                part: digests.get(part, "")
+                for stated in (claim, ending)
+                for part in stated
+                if stated[part] != digests.get(part)
+            }
+            for part in wrong.keys() & NAMED.keys():
+                changed[part, wrong[part]].append(run_id)
+            own = [words for part, words in OWN.items() if part in wrong]
             if own:
                 what = f"changed after it was recorded: {', '.join(own)}"
                 yield Problem(where, what, (run_id,))
+        yield from self._parts(connection, run_ids)
+
+    def _parts(self, connection: Connection, run_ids: list[int]) -> Iterator[Problem]:
+        """What the runs are, and their attachments."""
+        try:
+            found = tuple(details_of(connection, run_records(connection, run_ids)))
+        except ValueError as error:  # a word or a time that no station writes
+            if len(run_ids) > 1:
+                for run_id in run_ids:
+                    yield from self._parts(connection, [run_id])
+            else:
+                said = printable(f"{error!s:.100}")
+                what = f"it cannot be read: {said}"
+                yield Problem(f"run {run_ids[0]}", what, tuple(run_ids))
+            return
+        for details in found:
+            run_id = details.run.run_id
+            is_over = details.run.state is not RunState.RUNNING
+            is_known = run_id in self._claims or run_id in self._endings
+            if is_known and is_over != (run_id in self._endings):
+                what = "it is finished" if is_over else "it goes on"
+                what += ", but the audit trail says otherwise"
+                yield Problem(f"run {run_id}", what, (run_id,))
             yield from self._attachments(details)
 
     def _attachments(self, details: RunDetails) -> Iterator[Problem]:
@@ -310,6 +330,36 @@ def _counting(
         earlier = enumerate(heads[:given_up_at])
         given_up |= {index for index, head in earlier if head.number in lost}
     return [head for index, head in enumerate(heads) if index not in given_up]
+
+
+def _contradictions(
+    name: str, records_id: str, event: str, data: Mapping[str, Any]
+) -> Iterator[str]:
+    """In what an intact row does not fit these records."""
+    if event == chain.BEGUN and data.get("records") != records_id:
+        yield "the chain is that of other records"
+    if event == chain.BEGUN and data.get("station") != name:
+        yield f"the chain is that of the station {printable(str(data.get('station')))}"
+    if event == chain.MIGRATED:
+        yield from (
+            f"found at the migration: {printable(str(x))}" for x in _list(data.get("problems"))
+        )
+
+
+def _table(value: Any) -> Mapping[str, str]:
+    return value if isinstance(value, dict) else {}
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
+
+
+def _lost(data: Mapping[str, Any]) -> range:
+    """The rows that a person gave up; none where it is not said."""
+    first, last = data.get("lost_from"), data.get("lost_to")
+    if isinstance(first, int) and isinstance(last, int):
+        return range(first, last + 1)
+    return range(0)
 
 
 def _sqlite_problems(connection: Connection) -> Iterator[Problem]:

@@ -72,6 +72,8 @@ class HeadsFile:
 def _heads(lines: list[bytes]) -> Iterator[Head | int]:
     for number, line in enumerate(lines, 1):
         try:
-            yield Head(**json.loads(line))
+            head = Head(**json.loads(line))
         except (ValueError, TypeError):
             yield number
+        else:
+            yield head if isinstance(head.number, int) else number

@@ -22,7 +22,7 @@ from flasher.station.records import chain, schema
 from flasher.station.records.backup import copy_sqlite
 from flasher.station.records.chain import Trail
 from flasher.station.records.database import Database, locate
-from flasher.station.records.digests import batches, digests_of
+from flasher.station.records.digests import CLAIMED, batches, digests_of
 from flasher.station.records.files import whole_file
 from flasher.station.records.fingerprint import fingerprint_of
 from flasher.station.records.keys import SigningKey, file_name
@@ -137,8 +137,14 @@ def _vouch(trail: Trail, records_id: str) -> tuple[tuple[str, ...], int]:
     now = datetime.now(UTC)
     problems = tuple(_old_problems(connection))
     end = connection.execute(select(_OLD.c.hash).order_by(_OLD.c.id.desc()).limit(1))
-    data = {"key": trail.key.public, "records": records_id, "version": schema.SCHEMA_VERSION}
-    trail.append(now, chain.BEGUN, {**data, "schema": fingerprint_of(connection)})
+    begun = {
+        "key": trail.key.public,
+        "station": trail.station,
+        "records": records_id,
+        "version": schema.SCHEMA_VERSION,
+        "schema": fingerprint_of(connection),
+    }
+    trail.append(now, chain.BEGUN, begun)
     was = {"version": 1, "hash": end.scalar_one_or_none(), "problems": problems}
     trail.append(now, chain.MIGRATED, was)
     run = schema.run
@@ -148,6 +154,8 @@ def _vouch(trail: Trail, records_id: str) -> tuple[tuple[str, ...], int]:
         for run_id, digests in sorted(digests_of(connection, some).items()):
             is_over = states[run_id] != "RUNNING"
             event = chain.MIGRATED_RUN if is_over else chain.CLAIMED
+            if not is_over:
+                digests = {name: digests[name] for name in CLAIMED}  # noqa: PLW2901
             trail.append(now, event, {"state": states[run_id], "digests": digests}, run_id)
     return problems, len(states)
 

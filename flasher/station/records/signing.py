@@ -236,6 +236,7 @@ class Signer:
         with self.writing() as trail:
             data = {
                 "key": self._key.public,
+                "station": self._station,
                 "records": self.records_id,
                 "version": SCHEMA_VERSION,
                 "schema": fingerprint_of(trail.connection),
