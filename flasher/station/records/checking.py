@@ -1,29 +1,25 @@
-"""What is wrong with the records: database, schema, audit chains, runs, attachments, traces."""
+"""What is wrong with the records: the database, its runs, attachments and traces."""
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import Any, Final
+from collections.abc import Collection, Iterator
+from typing import Final
 
 from sqlalchemy import Connection, func, select
 
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
-from flasher.station.records import chain, schema
+from flasher.station.records import schema
 from flasher.station.records.database import Database
 from flasher.station.records.details import details_of
 from flasher.station.records.digests import NAMED, OWN, batches, digests_of
 from flasher.station.records.errors import RecordError
 from flasher.station.records.files import FileStore
-from flasher.station.records.fingerprint import differences, fingerprint_of
-from flasher.station.records.heads import Head
-from flasher.station.records.keys import is_signed
 from flasher.station.records.model import (
     TRACE,
     AttachmentFile,
     Examination,
-    KeptHeads,
     Problem,
     RunDetails,
     RunId,
@@ -32,6 +28,7 @@ from flasher.station.records.model import (
 from flasher.station.records.proof import contradictions, hear
 from flasher.station.records.queries import run_records
 from flasher.station.records.signing import KeptPlace
+from flasher.station.records.trails import TrailsCheck
 from flasher.trace.reader import read_trace
 
 _RUNS_NAMED: Final = 5
@@ -43,30 +40,26 @@ class Examiner:
     def __init__(self, database: Database, files: FileStore, place: KeptPlace) -> None:
         self._database = database
         self._files = files
-        self._place = place
-        self._remarks: list[str] = []
-        self._kept: list[KeptHeads] = []
-        self._unkept: list[str] = []
-        self._schema: dict[tuple[str, str], None] = {}
-        """How the schema differs from what any chain states of it, each difference once."""
+        self._trails = TrailsCheck(place)
         self._traces = 0
         self._nameless = 0
-        self._claims: dict[int, Mapping[str, str]] = {}
-        """The digests that the chains state for each run, at its claim."""
-        self._endings: dict[int, Mapping[str, str]] = {}
-        """And at its end."""
 
     def examine(self, runs: Collection[RunId] | None = None) -> Examination:
         """Look at everything, and of the runs at these or at all."""
         with self._database.reading() as connection:
             problems = tuple(self._problems(connection, runs))
+        trails = self._trails
         if self._nameless:
-            self._remarks.append(
+            trails.remarks.append(
                 f"{self._nameless} PASS of devices that name no serial number: their traces do not"
                 " tell which unit it was"
             )
         return Examination(
-            problems, tuple(self._remarks), tuple(self._kept), tuple(self._unkept), self._traces
+            problems,
+            tuple(trails.remarks),
+            tuple(trails.kept),
+            tuple(trails.unkept),
+            self._traces,
         )
 
     def _problems(
@@ -74,10 +67,12 @@ class Examiner:
     ) -> Iterator[Problem]:
         if self._database.backend == "sqlite":
             yield from _sqlite_problems(connection)
-        yield from self._chains(connection)
+        yield from self._trails.problems(connection)
         query = select(schema.run.c.id).order_by(schema.run.c.id)
         chosen = list(connection.execute(query).scalars())
-        for run_id in sorted((self._claims.keys() | self._endings.keys()) - set(chosen)):
+        for run_id in sorted(
+            (self._trails.claims.keys() | self._trails.endings.keys()) - set(chosen)
+        ):
             yield Problem(f"run {run_id}", "it is missing: the audit trail knows it", (run_id,))
         if runs is not None:
             chosen = sorted(set(chosen) & set(runs))
@@ -91,133 +86,6 @@ class Examiner:
             yield Problem(f"{part} of run {shown}{more}", what, tuple(run_ids))
         yield from self._traces_used_twice(connection)
 
-    # -- chains -----------------------------------------------------------------------------------
-
-    def _chains(self, connection: Connection) -> Iterator[Problem]:
-        info = connection.execute(select(schema.schema_info)).mappings().one()
-        records_id, found = info["records_id"], fingerprint_of(connection)
-        names = list(connection.execute(select(schema.station.c.name)).scalars())
-        kept_of = self._place.files(records_id, names)
-        for name in dict.fromkeys([*names, *kept_of]):
-            rows = connection.execute(
-                select(schema.audit)
-                .join_from(schema.audit, schema.station)
-                .where(schema.station.c.name == name)
-                .order_by(schema.audit.c.number)
-            )
-            hashes: dict[int, str] = {}
-            restored: dict[int, range] = {}
-            yield from self._chain(name, rows.mappings(), records_id, found, hashes, restored)
-            yield from self._heads(name, kept_of.get(name), hashes, restored)
-        for thing, what in self._schema:
-            yield Problem(f"schema, {printable(thing)}", what)
-
-    def _chain(
-        self,
-        name: str,
-        rows: Iterable[Mapping[Any, Any]],
-        records_id: str,
-        found: Mapping[str, str],
-        hashes: dict[int, str],
-        restored: dict[int, range],
-    ) -> Iterator[Problem]:
-        """Go along one chain; fills the hashes of its rows, and which heads were given up."""
-        before, key = chain.GENESIS, None
-        stated: Mapping[str, str] = {}
-        shown = printable(name)
-        for expected, row in enumerate(rows, 1):
-            where = f"audit row {expected} of {shown}"
-            data = chain.data_of(row["data"])
-            if row["previous_hash"] != before or row["number"] != expected:
-                yield Problem(where, "the chain is broken: the row before it is missing or changed")
-            is_whole = row["hash"] == chain.row_hash(row)
-            if not is_whole:
-                yield Problem(where, "it was changed after it was written")
-            following = chain.key_of(row["event"], data)
-            if following is not None and row["event"] != chain.KEY_ROTATED:
-                key = following  # which signs itself
-            if key is None or not is_signed(row["hash"], row["signature"], key):
-                yield Problem(where, "it is not signed with the key of the station")
-            key = following or key
-            before, hashes[expected] = row["hash"], row["hash"]
-            if not is_whole:
-                continue  # what it says counts for nothing
-            stated = _table(data.get("schema")) or stated
-            if row["event"] == chain.RESTORED:
-                restored[expected] = _lost(data)
-            self._note(shown, row, data)
-            self._vouch(row, data)
-            for what in _contradictions(name, records_id, row["event"], data):
-                yield Problem(where, what)
-        if hashes:
-            self._schema |= dict.fromkeys(differences(stated, found))
-
-    def _note(self, shown: str, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
-        said = f"{row['at'][:10]} by {printable(str(data.get('by')))}"
-        match row["event"]:
-            case chain.KEY_LOST:
-                self._remarks.append(f"{shown}: the key was declared lost on {said}")
-            case chain.RESTORED:
-                lost = _lost(data)
-                self._remarks.append(
-                    f"{shown}: rows {lost.start} to {lost.stop - 1} of an earlier chain were given"
-                    f" up as lost on {said}"
-                )
-            case chain.CLOCK:
-                self._remarks.append(f"{shown}: the clock was released on {said}")
-            case _:
-                pass
-
-    def _vouch(self, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
-        digests = _table(data.get("digests"))
-        if row["run_id"] is None or not digests:
-            return
-        if row["event"] in chain.ENDINGS:
-            self._endings[row["run_id"]] = digests
-        elif row["event"] == chain.CLAIMED:
-            self._claims[row["run_id"]] = digests
-
-    def _heads(
-        self,
-        name: str,
-        kept: tuple[Head | int, ...] | None,
-        hashes: Mapping[int, str],
-        restored: Mapping[int, range],
-    ) -> Iterator[Problem]:
-        """Hold a chain against the heads that are kept of it."""
-        shown = printable(name)
-        place = printable(str(self._place.folder))
-        if not kept:
-            if hashes:
-                self._unkept.append(name)
-                if self._place.is_named:
-                    yield Problem(f"heads of {shown}", f"none of these records is kept in {place}")
-            return
-        heads = [each for each in kept if isinstance(each, Head)]
-        for line in (each for each in kept[:-1] if not isinstance(each, Head)):
-            yield Problem(f"heads of {shown}", f"line {line} in {place} is no head")
-        held = _counting(heads, hashes, restored)
-        missing = [head for head in held if head.number not in hashes]
-        other = [head for head in held if hashes.get(head.number, head.hash) != head.hash]
-        if missing:
-            last = max(missing, key=lambda head: head.number)
-            yield Problem(
-                f"audit trail of {shown}",
-                f"it ends at row {max(hashes, default=0)}, but row {last.number} of {last.at} is"
-                f" kept in {place}: its end was cut off, or this is an older copy",
-            )
-        if other:
-            first = min(other, key=lambda head: head.number)
-            yield Problem(
-                f"audit trail of {shown}",
-                f"row {first.number} of {first.at} is not the one that is kept in {place}: the"
-                " chain was made anew",
-            )
-        if held:
-            numbers = [head.number for head in held]
-            path = self._place.folder
-            self._kept.append(KeptHeads(name, path, min(numbers), max(numbers)))
-
     # -- runs -------------------------------------------------------------------------------------
 
     def _runs(
@@ -225,7 +93,10 @@ class Examiner:
     ) -> Iterator[Problem]:
         for run_id, digests in digests_of(connection, run_ids).items():
             where = f"run {run_id}"
-            claim, ending = self._claims.get(run_id, {}), self._endings.get(run_id, {})
+            claim, ending = (
+                self._trails.claims.get(run_id, {}),
+                self._trails.endings.get(run_id, {}),
+            )
             if not claim and not ending:
                 yield Problem(where, "the audit trail does not know it", (run_id,))
             wrong = {
@@ -258,8 +129,8 @@ class Examiner:
         for details in found:
             run_id = details.run.run_id
             is_over = details.run.state is not RunState.RUNNING
-            is_known = run_id in self._claims or run_id in self._endings
-            if is_known and is_over != (run_id in self._endings):
+            is_known = run_id in self._trails.claims or run_id in self._trails.endings
+            if is_known and is_over != (run_id in self._trails.endings):
                 what = "it is finished" if is_over else "it goes on"
                 what += ", but the audit trail says otherwise"
                 yield Problem(f"run {run_id}", what, (run_id,))
@@ -315,51 +186,6 @@ class Examiner:
             run_ids = tuple(connection.execute(of_trace).scalars())
             shown = ", ".join(map(str, run_ids[:_RUNS_NAMED]))
             yield Problem(f"runs {shown}", "they have one and the same trace", run_ids)
-
-
-def _counting(
-    heads: list[Head], hashes: Mapping[int, str], restored: Mapping[int, range]
-) -> list[Head]:
-    """The heads without those that a person gave up, when older records were put back."""
-    given_up: set[int] = set()
-    for number, lost in restored.items():
-        given_up_at = len(heads)
-        for index, head in enumerate(heads):
-            if (head.number, head.hash) == (number, hashes[number]):
-                given_up_at = index
-        earlier = enumerate(heads[:given_up_at])
-        given_up |= {index for index, head in earlier if head.number in lost}
-    return [head for index, head in enumerate(heads) if index not in given_up]
-
-
-def _contradictions(
-    name: str, records_id: str, event: str, data: Mapping[str, Any]
-) -> Iterator[str]:
-    """In what an intact row does not fit these records."""
-    if event == chain.BEGUN and data.get("records") != records_id:
-        yield "the chain is that of other records"
-    if event == chain.BEGUN and data.get("station") != name:
-        yield f"the chain is that of the station {printable(str(data.get('station')))}"
-    if event == chain.MIGRATED:
-        yield from (
-            f"found at the migration: {printable(str(x))}" for x in _list(data.get("problems"))
-        )
-
-
-def _table(value: Any) -> Mapping[str, str]:
-    return value if isinstance(value, dict) else {}
-
-
-def _list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else []
-
-
-def _lost(data: Mapping[str, Any]) -> range:
-    """The rows that a person gave up; none where it is not said."""
-    first, last = data.get("lost_from"), data.get("lost_to")
-    if isinstance(first, int) and isinstance(last, int):
-        return range(first, last + 1)
-    return range(0)
 
 
 def _sqlite_problems(connection: Connection) -> Iterator[Problem]:
