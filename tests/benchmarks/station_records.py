@@ -98,7 +98,9 @@ def measure(folder: Path, runs: int) -> None:
     fast = bench.store
     fast.close()
     keeping = Keeping(bench.keys)
-    with Store.open(str(bench.path), station="line-2", keeping=keeping) as bench.store:
+    with Store.open(
+        str(bench.path), station="line-2", clock=bench.clock, keeping=keeping
+    ) as bench.store:
         bench.store.recover()
         timed("one durable run of 12 commits", lambda: durable(bench))
     bench.store = fast
