@@ -1,4 +1,4 @@
-"""Intel HEX: the scan before the library, and the library.
+"""Intel HEX.
 
 Record: colon, then in hex digits size, 16-bit address, type, data and check sum; all bytes
 together add up to 0. Types: 00 data, 01 end, 02 extended segment address (times 16), 03 and 05
@@ -7,13 +7,9 @@ start address (of no use here), 04 extended linear address (upper 16 bits).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from io import StringIO
 from typing import BinaryIO, Final
 
-from intelhex import IntelHex
-
-from flasher.image.records import Run, Runs, Scanner, shown
+from flasher.image.records import Scanner, shown
 from flasher.image.segments import SparseBytes
 
 FORMAT: Final = "Intel HEX"
@@ -27,70 +23,26 @@ _SEGMENT_SIZE: Final = 0x1_0000
 def read(file: BinaryIO, source: str, into: SparseBytes) -> None:
     """All data of an Intel HEX file. Raises ImageError with the line number on any damage."""
     scanner = Scanner(file, source, FORMAT)
-    for run in scan(scanner):
-        into.add(run.start, scanner.agreed(run, _read_run), run.place)
-
-
-def _read_run(run: Run) -> tuple[int, bytes]:
-    reader = IntelHex(StringIO("\n".join(run.lines)))
-    return reader.minaddr(), reader.tobinstr()
-
-
-def scan(scanner: Scanner) -> Iterator[Run]:
-    """The runs of a file, every record checked."""
-    runs = Runs()
-    area = _Area(scanner)
+    offset = 0
+    is_linear = False
     for text in scanner.lines():
         record = _parse(scanner, text)
-        kind, size = record[3], record[0]
+        kind, data = record[3], record[_HEAD_SIZE:-1]
         address = int.from_bytes(record[1:3], "big")
-        if kind == _DATA and size:
-            start = area.place(address, size)
-            for run in runs.add(start, size, text, scanner.line):
-                yield area.in_context(run)
+        if kind == _DATA and data:
+            # Only under an extended linear address may a record go on beyond 64 KiB: elsewhere the
+            # format has it wrap around and programs do not agree on it.
+            if not is_linear and address + len(data) > _SEGMENT_SIZE:
+                raise scanner.refuse("the record runs past the end of its 64 KiB segment")
+            scanner.check_end(offset + address + len(data))
+            into.add(offset + address, data, scanner.place)
         elif kind in (_SEGMENT, _LINEAR):
-            for run in runs.take():
-                yield area.in_context(run)
-            area.move(kind, address, record[_HEAD_SIZE:-1], text)
+            if address:
+                raise scanner.refuse("an extended address record has an address of its own")
+            is_linear = kind == _LINEAR
+            offset = int.from_bytes(data, "big") << (16 if is_linear else 4)
         elif kind == _END:
             scanner.ended = True
-    for run in runs.take():
-        yield area.in_context(run)
-
-
-class _Area:
-    """Where the 16-bit addresses of data records lie, as the extended records have it."""
-
-    def __init__(self, scanner: Scanner) -> None:
-        self._scanner = scanner
-        self._offset = 0
-        self._is_linear = False
-        self._record: str | None = None
-
-    def move(self, kind: int, address: int, data: bytes, text: str) -> None:
-        if address:
-            raise self._scanner.refuse("an extended address record has an address of its own")
-        self._is_linear = kind == _LINEAR
-        self._offset = int.from_bytes(data, "big") << (16 if self._is_linear else 4)
-        self._record = text
-
-    def place(self, address: int, size: int) -> int:
-        """The absolute address of a data record.
-
-        Only under an extended linear address may a record go on beyond 64 KiB: elsewhere the
-        format has it wrap around and programs do not agree on it.
-        """
-        if not self._is_linear and address + size > _SEGMENT_SIZE:
-            raise self._scanner.refuse("the record runs past the end of its 64 KiB segment")
-        start = self._offset + address
-        self._scanner.check_end(start + size)
-        return start
-
-    def in_context(self, run: Run) -> Run:
-        """The run with the extended record in front that the library needs to place it."""
-        if self._record is not None:
-            run.lines.insert(0, self._record)
-        return run
 
 
 def _parse(scanner: Scanner, text: str) -> bytes:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import os
-import stat
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import BinaryIO, Final
 
 from flasher.errors import ImageError, UsageError
+from flasher.files import opened
 from flasher.image import elf, hexfile, srec
 from flasher.image.cortexm import check_starts_inside
 from flasher.image.detect import HEAD_SIZE, Format, detect
@@ -22,7 +19,7 @@ from flasher.protocol.text import find_firmware_version, printable
 DEFAULT_FILL_GAPS_UP_TO: Final = 4096
 """In bytes. Covers the room between a vector table and the code; a larger gap is another part."""
 FILE_MAX_SIZE: Final = 128 * 1024 * 1024
-"""In bytes: the largest image in the most wasteful records; a larger file is not read at all."""
+"""In bytes, of any format but a raw binary: beyond, a file is not read at all."""
 FORMATS: Final = tuple(form.value for form in Format)
 """The words that `format` takes."""
 _READERS: Final = {Format.HEX: hexfile.read, Format.SREC: srec.read, Format.ELF: elf.read}
@@ -44,12 +41,12 @@ def load(
     sent; other bytes of the file are left out. Gaps up to `fill_gaps_up_to` bytes are filled with
     FF, from the range's start on. `allow_outside_vector` waives the merged-file rule of R8.
 
-    Raises ImageError when the file cannot be used, UsageError when there is no such file or the
-    options make no sense.
+    Raises ImageError when the file cannot be used, UsageError when there is no such file, it is no
+    regular one, or the options make no sense.
     """
     _check_options(format, base, range_, fill_gaps_up_to)
     source = printable(os.fspath(path))
-    with _opened(path, source) as (file, size_bytes):
+    with opened(path, None, error=ImageError) as (file, size_bytes):
         form = Format(format) if format else _detect(file, source)
         sparse = SparseBytes(source, range_)
         if form is Format.BIN:
@@ -88,35 +85,6 @@ def _check_options(
         )
     if fill_gaps_up_to < 0:
         raise UsageError(f"gaps cannot be filled up to {fill_gaps_up_to} bytes")
-
-
-@contextmanager
-def _opened(path: str | os.PathLike[str], source: str) -> Iterator[tuple[BinaryIO, int]]:
-    """The open file and its size in bytes; only a regular file is ever opened."""
-    try:
-        status = Path(path).stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise ImageError(
-                f"{source} is {'a directory' if stat.S_ISDIR(status.st_mode) else 'no file'}",
-                remedy="name a firmware file; what comes through a pipe has to be saved first",
-            )
-        opened = Path(path).open("rb")  # noqa: SIM115  closed below, where reading may fail too
-    except (FileNotFoundError, NotADirectoryError, ValueError) as error:
-        raise UsageError(f"there is no file '{source}'", remedy="correct the name") from error
-    except OSError as error:
-        raise _unreadable(source, error) from error
-    try:
-        with opened as file:
-            yield file, status.st_size
-    except OSError as error:
-        raise _unreadable(source, error) from error
-
-
-def _unreadable(source: str, error: OSError) -> ImageError:
-    return ImageError(
-        f"{source} cannot be read: {error.strerror or error}",
-        remedy="make the file readable for this user, or copy it to this computer",
-    )
 
 
 def _detect(file: BinaryIO, source: str) -> Format:

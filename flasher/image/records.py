@@ -1,71 +1,27 @@
 """What Intel HEX and S-record files have in common: lines of hex digits with a check sum.
 
-The libraries that read these formats accept some damage in silence and hold a file many times over.
-So a streaming scan of ours stands before them. It checks every record and cuts the file into runs:
-consecutive records whose bytes follow each other, at most `RUN_MAX_BYTES`. Each run goes through
-the library alone, and scan and library must agree about it.
+Every record is checked and decoded in one pass, in constant memory. Libraries that read these
+formats accept a missing end record, addresses that wrap around and bytes that contradict each
+other, and hold a file many times over; in the tests they are the referees.
 """
 
 from __future__ import annotations
 
 from binascii import Error as HexError
 from binascii import unhexlify
-from bisect import bisect_right
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import BinaryIO, Final
 
 from flasher.errors import ImageError
 from flasher.image.image import ADDRESS_SPACE
 
-RUN_MAX_BYTES: Final = 16_384
+LINES_MAX: Final = 1_200_000
+"""The largest image has 1,048,560 records of eight bytes, and programs write 16 or 32. Bounds the
+time that a file takes which is none: its lines may be blank."""
 _LINE_MAX: Final = 1024
 """Longer than any record of either format."""
 _SHOWN_MAX: Final = 40
-
-
-@dataclass
-class Run:
-    """Records that follow each other without a gap: `size_bytes` from address `start` on."""
-
-    start: int
-    size_bytes: int = 0
-    lines: list[str] = field(default_factory=list)
-    """The records as they stand in the file, without line ends."""
-    places: list[tuple[int, int]] = field(default_factory=list)
-    """Address and line number of each record."""
-
-    @property
-    def end(self) -> int:
-        return self.start + self.size_bytes
-
-    def place(self, address: int) -> str:
-        """The line that holds an address of this run."""
-        index = bisect_right(self.places, address, key=lambda place: place[0]) - 1
-        return f"line {self.places[index][1]}"
-
-
-class Runs:
-    """Collects records into runs; what is complete is handed out by `add` and `take`."""
-
-    def __init__(self) -> None:
-        self._run: Run | None = None
-
-    def add(self, address: int, size_bytes: int, text: str, line: int) -> Iterator[Run]:
-        """Take a record; the run before it, if it does not belong to that one."""
-        run = self._run
-        if run is None or run.end != address or run.size_bytes + size_bytes > RUN_MAX_BYTES:
-            yield from self.take()
-            run = self._run = Run(address)
-        run.lines.append(text)
-        run.places.append((address, line))
-        run.size_bytes += size_bytes
-
-    def take(self) -> Iterator[Run]:
-        """What has been collected, if anything."""
-        if self._run:
-            yield self._run
-        self._run = None
 
 
 @dataclass
@@ -93,6 +49,11 @@ class Scanner:
             if len(raw) == _LINE_MAX:
                 raise self.refuse(
                     "the line is longer than any record", "not such a file, or lost line ends"
+                )
+            if self.line > LINES_MAX:
+                raise self.refuse(
+                    f"it has more than {LINES_MAX:,} lines",
+                    "not such a file, or one with records of very few bytes",
                 )
             text = raw.strip()
             if not text:
@@ -127,22 +88,14 @@ class Scanner:
         """The error for the line read last."""
         return ImageError(
             f"{self.source} is a damaged {self.format} file: {what}",
-            where=f"line {self.line}",
+            where=self.place(0),
             cause=cause or "damaged while it was copied, or edited by hand",
             remedy="copy or make the file again",
         )
 
-    def agreed(self, run: Run, read: Callable[[Run], tuple[int, bytes]]) -> bytes:
-        """The bytes of a run by the library; raises ImageError if it sees another run."""
-        start, data = read(run)
-        if (start, len(data)) != (run.start, run.size_bytes):
-            raise ImageError(
-                f"{self.source}: two ways of reading the {self.format} file disagree",
-                where=f"{run.place(run.start)}: {run.size_bytes} bytes at 0x{run.start:08X}, "
-                f"or {len(data)} bytes at 0x{start:08X}",
-                remedy="convert the file to another format, and report this file",
-            )
-        return data
+    def place(self, _address: int) -> str:
+        """Where the record read last stands."""
+        return f"line {self.line}"
 
 
 def shown(text: str) -> str:

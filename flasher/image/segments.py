@@ -37,11 +37,14 @@ class SparseBytes:
         """
         if not data:
             return
-        self.note(start, start + len(data))
         if self.window:
+            self.note(start, start + len(data))
             data = data[max(0, self.window[0] - start) : max(0, self.window[1] - start)]
             start = max(start, self.window[0])
         end = start + len(data)
+        if self._starts and self._end(-1) == start:  # what follows on the last piece, as most does
+            self._insert(len(self._starts), start, data)
+            return
         index = max(0, bisect_right(self._starts, start) - 1)
         while start < end:
             if index < len(self._starts) and self._end(index) <= start:

@@ -1,4 +1,4 @@
-"""Motorola S-record: the scan before the library, and the library.
+"""Motorola S-record.
 
 Record: S and type digit, then in hex digits the count of what follows, an address, data and check
 sum; count to check sum add up to FF. Types: 0 header, 1 2 3 data with 16, 24, 32-bit address, 5 6
@@ -8,10 +8,9 @@ count shows as well that nothing was lost, so it is taken for an end.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import BinaryIO, Final
 
-from flasher.image.records import Run, Runs, Scanner, shown
+from flasher.image.records import Scanner, shown
 from flasher.image.segments import SparseBytes
 
 FORMAT: Final = "Motorola S-record"
@@ -27,25 +26,10 @@ _ENDS: Final = "789"
 def read(file: BinaryIO, source: str, into: SparseBytes) -> None:
     """All data of an S-record file. Raises ImageError with the line number on any damage."""
     scanner = Scanner(file, source, FORMAT)
-    for run in scan(scanner):
-        into.add(run.start, scanner.agreed(run, _read_run), run.place)
-
-
-def _read_run(run: Run) -> tuple[int, bytes]:
-    from bincopy import BinFile  # noqa: PLC0415  a fifth of the time that flasher takes to load
-
-    reader = BinFile()
-    reader.add_srec("\n".join(run.lines))
-    return reader.minimum_address, bytes(reader.as_binary())
-
-
-def scan(scanner: Scanner) -> Iterator[Run]:
-    """The runs of a file, every record checked."""
-    runs = Runs()
     data_records = 0
     first_line = 0
     for text in scanner.lines():
-        kind, address, size = _parse(scanner, text)
+        kind, address, data = _parse(scanner, text)
         first_line = first_line or scanner.line
         if kind == _HEADER and scanner.line != first_line:
             raise scanner.refuse(
@@ -54,9 +38,8 @@ def scan(scanner: Scanner) -> Iterator[Run]:
             )
         if kind in _DATA:
             data_records += 1
-            scanner.check_end(address + size)
-            if size:
-                yield from runs.add(address, size, text, scanner.line)
+            scanner.check_end(address + len(data))
+            into.add(address, data, scanner.place)
         scanner.counted = kind in _COUNTS
         if scanner.counted and address != data_records:
             raise scanner.refuse(
@@ -65,16 +48,16 @@ def scan(scanner: Scanner) -> Iterator[Run]:
             )
         if kind in _ENDS:
             scanner.ended = True
-    yield from runs.take()
 
 
-def _parse(scanner: Scanner, text: str) -> tuple[str, int, int]:
-    """Type, address and size of the data of one record."""
+def _parse(scanner: Scanner, text: str) -> tuple[str, int, bytes]:
+    """Type, address and data of one record."""
     kind = text[1:2]
     if text[0] != "S" or kind not in _ADDRESS_SIZES:
         raise scanner.refuse(f"{shown(text)} does not start with S and a record type")
     record = scanner.unhex(text[2:], text)
-    size = len(record) - 1 - _ADDRESS_SIZES[kind] - 1
+    data_at = 1 + _ADDRESS_SIZES[kind]
+    size = len(record) - data_at - 1
     if size < 0 or len(record) != 1 + record[0]:
         raise scanner.refuse(f"{shown(text)} does not have the length that it states")
     if sum(record) & 0xFF != 0xFF:
@@ -82,4 +65,4 @@ def _parse(scanner: Scanner, text: str) -> tuple[str, int, int]:
         raise scanner.refuse(f"the check sum is {record[-1]:02X}, computed {computed:02X}")
     if size and kind in _COUNTS + _ENDS:
         raise scanner.refuse(f"a record of type S{kind} holds {size} bytes of data")
-    return kind, int.from_bytes(record[1 : 1 + _ADDRESS_SIZES[kind]], "big"), size
+    return kind, int.from_bytes(record[1:data_at], "big"), record[data_at:-1]

@@ -16,7 +16,6 @@ from intelhex import IntelHex
 from flasher.errors import ImageError
 from flasher.image import elf, hexfile, srec
 from flasher.image.load import load
-from flasher.image.records import RUN_MAX_BYTES, Run, Scanner
 from flasher.image.segments import SparseBytes
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
@@ -176,29 +175,6 @@ def test_a_count_holds_no_data(tmp_path: Path) -> None:
 def test_a_data_record_without_data_counts_and_adds_nothing(tmp_path: Path) -> None:
     text = "S1040010AA41\nS1030090 6C\n".replace(" ", "") + "S5030002FA\n"
     assert load(write(tmp_path, "app.s19", text)).data == b"\xaa"
-
-
-def test_a_long_stretch_is_read_in_bounded_runs() -> None:
-    writer = bincopy.BinFile()
-    writer.add_binary(bytes(range(256)) * 256, 0x0800_0000)
-    text = writer.as_ihex(32)
-    scanner = Scanner(io.BytesIO(text.encode()), "app.hex", hexfile.FORMAT)
-    runs = list(hexfile.scan(scanner))
-    assert max(run.size_bytes for run in runs) == RUN_MAX_BYTES
-    assert sum(run.size_bytes for run in runs) == 0x1_0000
-
-
-@pytest.mark.parametrize("module", [hexfile, srec], ids=["hex", "srec"])
-def test_a_library_that_sees_other_bytes_than_the_scan_is_not_believed(
-    module: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def misread(run: Run) -> tuple[int, bytes]:
-        return run.start + 1, bytes(run.size_bytes)
-
-    monkeypatch.setattr(module, "_read_run", misread)
-    text = GOOD_HEX if module is hexfile else GOOD_SREC
-    with pytest.raises(ImageError, match=r"two ways of reading(.|\n)*line 2"):
-        load(write(tmp_path, "app", text))
 
 
 # -- ELF ------------------------------------------------------------------------------------------

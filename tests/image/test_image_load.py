@@ -276,14 +276,14 @@ def test_options_that_make_no_sense_are_wrong_usage(
 
 
 def test_a_directory_is_refused() -> None:
-    with pytest.raises(ImageError, match="is a directory"):
+    with pytest.raises(UsageError, match="is a directory"):
         load(SAMPLES)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no named pipes")
 def test_a_named_pipe_is_refused_without_waiting_for_it(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(ImageError, match="is no file"):
+    with pytest.raises(UsageError, match="is no regular file"):
         load(tmp_path / "pipe")
 
 
@@ -294,7 +294,7 @@ def test_an_unreadable_file_is_refused_with_the_system_s_reason(
     def denied(*_: object, **__: object) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr(Path, method, denied)
+    monkeypatch.setattr(os, method, denied)
     with pytest.raises(ImageError, match="cannot be read: Permission denied"):
         load("app.hex" if method == "stat" else SAMPLES / "wmc.hex")
 

@@ -1,0 +1,167 @@
+"""The one gate for every file that is read, and for what TOML and JSON files hold.
+
+A name may lead to anything: a pipe that nobody writes to, a device, a link to itself, a file larger
+than the memory. Only a regular file of a stated size passes, and it is opened for reading alone.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import stat
+import tomllib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, BinaryIO, Final
+
+from flasher.errors import FlasherError, UsageError
+from flasher.protocol.text import printable
+
+TOML_MAX_SIZE: Final = 256 * 1024
+"""In bytes, of any file of settings."""
+JSON_MAX_SIZE: Final = 4 * 1024 * 1024
+"""In bytes, of a report. What JSON holds takes up to thirty times its size in memory."""
+_DEPTH_MAX: Final = 32
+_NUMBER_BITS_MAX: Final = 64
+_DOTS_MAX: Final = 128
+"""In a line of TOML. The time that tomllib takes grows with the square of the parts of a key."""
+_OPEN_FLAGS: Final = (
+    os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+)  # a pipe that took the place of the file in this moment must not hold us up
+
+
+@contextmanager
+def opened(
+    path: str | os.PathLike[str],
+    max_size: int | None,
+    *,
+    what: str = "",
+    error: type[FlasherError] = UsageError,
+    if_missing: str = "Correct the name.",
+    may_grow: bool = False,
+) -> Iterator[tuple[BinaryIO, int]]:
+    """A regular file of at most `max_size` bytes, or of any size, open for reading; and its size
+    in bytes.
+
+    `what` says in messages what kind of file was wanted. A recording that is still written to
+    `may_grow`; any other file must not change until the end of the block.
+
+    Raises UsageError when there is no such file or it is no regular one; `error` when it is too
+    large, changes, or cannot be read, here or in the block.
+    """
+    shown = printable(os.fspath(path))
+    subject = f"The {what} {shown}" if what else shown
+    try:
+        _check_regular(os.stat(path), subject)  # noqa: PTH116  a name that is no path fails here
+        descriptor = os.open(path, _OPEN_FLAGS)
+    except (FileNotFoundError, NotADirectoryError, ValueError) as missing:
+        raise UsageError(
+            f"{subject} cannot be read: there is no file of this name.", remedy=if_missing
+        ) from missing
+    except OSError as problem:
+        raise _unreadable(subject, problem, error) from problem
+    try:
+        with open(descriptor, "rb") as file:  # noqa: PTH123  a descriptor is no path
+            before = os.fstat(descriptor)
+            _check_regular(before, subject)
+            if max_size is not None and before.st_size > max_size:
+                raise error(
+                    f"{subject} is too large: {before.st_size:,} bytes, where at most "
+                    f"{max_size:,} are read.",
+                    cause="another file than the one that was meant",
+                )
+            if not before.st_size and os.read(descriptor, 1):
+                raise _no_regular(subject)  # as in /proc: made up while it is read
+            yield file, before.st_size
+            after = os.fstat(descriptor)
+    except OSError as problem:
+        raise _unreadable(subject, problem, error) from problem
+    is_shorter = after.st_size < before.st_size
+    if is_shorter or (after.st_mtime_ns != before.st_mtime_ns and not may_grow):
+        raise error(
+            f"{subject} cannot be read: it changed meanwhile.",
+            cause="another program writes it",
+            remedy="Try again when that has ended, or copy the file.",
+        )
+
+
+def read(
+    path: str | os.PathLike[str],
+    max_size: int,
+    *,
+    what: str = "",
+    error: type[FlasherError] = UsageError,
+    if_missing: str = "Correct the name.",
+) -> bytes:
+    """All bytes of a file. Raises as `opened`."""
+    with opened(path, max_size, what=what, error=error, if_missing=if_missing) as (file, size):
+        return file.read(size)
+
+
+def parse_toml(raw: bytes) -> dict[str, Any]:
+    """What a TOML file holds. Raises ValueError saying why it is none, or holds a number that is
+    not finite or has more than 64 bits.
+    """
+    text = raw.decode("utf-8-sig")  # some editors write a BOM, which is no part of TOML
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.count(".") > _DOTS_MAX and not line.lstrip().startswith("#"):
+            raise ValueError(f"more than {_DOTS_MAX} dots (at line {number})")
+    try:
+        document = tomllib.loads(text)
+    except RecursionError as error:
+        raise ValueError("nested too deep") from error
+    _check_values(document)
+    return document
+
+
+def parse_json(raw: bytes) -> Any:
+    """What a JSON file holds. Raises ValueError as `parse_toml`."""
+    try:
+        document = json.loads(raw)
+    except RecursionError as error:
+        raise ValueError("nested too deep") from error
+    _check_values(document)
+    return document
+
+
+def _check_values(document: object) -> None:
+    level: list[object] = [document]
+    for _ in range(_DEPTH_MAX):
+        inner: list[object] = []
+        for value in level:
+            if isinstance(value, dict):
+                inner += value.values()
+            elif isinstance(value, list):
+                inner += value
+            elif isinstance(value, float) and not math.isfinite(value):
+                raise ValueError("a number in it is not finite")
+            elif isinstance(value, int) and value.bit_length() > _NUMBER_BITS_MAX:
+                raise ValueError(f"a number in it has more than {_NUMBER_BITS_MAX} bits")
+        level = inner
+    if level:
+        raise ValueError("nested too deep")
+
+
+def _check_regular(status: os.stat_result, subject: str) -> None:
+    if stat.S_ISDIR(status.st_mode):
+        raise UsageError(
+            f"{subject} cannot be read: it is a directory.", remedy="Name a file in it."
+        )
+    if not stat.S_ISREG(status.st_mode):
+        raise _no_regular(subject)
+
+
+def _no_regular(subject: str) -> UsageError:
+    return UsageError(
+        f"{subject} cannot be read: it is no regular file.",
+        cause="a pipe, a device or another special file",
+        remedy="Name a file on a disk; what comes through a pipe has to be saved first.",
+    )
+
+
+def _unreadable(subject: str, problem: OSError, error: type[FlasherError]) -> FlasherError:
+    return error(
+        f"{subject} cannot be read: {printable(problem.strerror or str(problem))}.",
+        remedy="Make the file readable for this user, or copy it to this computer.",
+    )
