@@ -42,6 +42,14 @@ def did_you_mean(
     return f"Did you mean {spelled(close[0])}? " if close else ""
 
 
+def printable(text: str) -> str:
+    """`text` with everything but printable ASCII escaped."""
+    return "".join(
+        char if char.isascii() and char.isprintable() else char.encode("unicode_escape").decode()
+        for char in text
+    )
+
+
 class FlasherError(Exception):
     """Base of all errors that flasher raises on purpose.
 

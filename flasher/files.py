@@ -13,14 +13,14 @@ import stat
 import tomllib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any, BinaryIO, Final
+from io import BufferedReader
+from typing import Any, Final
 
-from flasher.errors import FlasherError, UsageError
-from flasher.protocol.text import printable
+from flasher.errors import FlasherError, UsageError, printable
 
 TOML_MAX_SIZE: Final = 256 * 1024
 """In bytes, of any file of settings."""
-JSON_MAX_SIZE: Final = 4 * 1024 * 1024
+JSON_MAX_SIZE: Final = 8 * 1024 * 1024
 """In bytes, of a report. What JSON holds takes up to thirty times its size in memory."""
 _DEPTH_MAX: Final = 32
 _NUMBER_BITS_MAX: Final = 64
@@ -40,7 +40,7 @@ def opened(
     error: type[FlasherError] = UsageError,
     if_missing: str = "Correct the name.",
     may_grow: bool = False,
-) -> Iterator[tuple[BinaryIO, int]]:
+) -> Iterator[tuple[BufferedReader, int]]:
     """A regular file of at most `max_size` bytes, or of any size, open for reading; and its size
     in bytes.
 
@@ -99,9 +99,30 @@ def read(
         return file.read(size)
 
 
+def read_toml(
+    path: str | os.PathLike[str],
+    *,
+    what: str,
+    error: type[FlasherError] = UsageError,
+    if_missing: str = "Correct the name.",
+) -> dict[str, Any]:
+    """What a TOML file of settings holds. Raises as `opened`, and `error` when it is none."""
+    raw = read(path, TOML_MAX_SIZE, what=what, error=error, if_missing=if_missing)
+    try:
+        return parse_toml(raw)
+    except ValueError as problem:
+        shown = printable(os.fspath(path))
+        raise error(
+            f"The {what} {shown} is no TOML file that can be read: {printable(str(problem))}.",
+            where=shown,
+            remedy="Texts stand in quotes, lists in brackets, tables as [name], numbers as 0x4205 "
+            "or 0.5.",
+        ) from problem
+
+
 def parse_toml(raw: bytes) -> dict[str, Any]:
-    """What a TOML file holds. Raises ValueError saying why it is none, or holds a number that is
-    not finite or has more than 64 bits.
+    """What a TOML file holds; a number in it may be `inf` or `nan`, as the format has them. Raises
+    ValueError saying why it is none, or has whole numbers of more than 64 bits.
     """
     text = raw.decode("utf-8-sig")  # some editors write a BOM, which is no part of TOML
     for number, line in enumerate(text.splitlines(), 1):
@@ -111,21 +132,23 @@ def parse_toml(raw: bytes) -> dict[str, Any]:
         document = tomllib.loads(text)
     except RecursionError as error:
         raise ValueError("nested too deep") from error
-    _check_values(document)
+    _check_values(document, all_finite=False)
     return document
 
 
 def parse_json(raw: bytes) -> Any:
-    """What a JSON file holds. Raises ValueError as `parse_toml`."""
+    """What a JSON file holds. Raises ValueError as `parse_toml`, and for a number that is infinite,
+    which Python's reader takes and the format has not.
+    """
     try:
         document = json.loads(raw)
     except RecursionError as error:
         raise ValueError("nested too deep") from error
-    _check_values(document)
+    _check_values(document, all_finite=True)
     return document
 
 
-def _check_values(document: object) -> None:
+def _check_values(document: object, *, all_finite: bool) -> None:
     level: list[object] = [document]
     for _ in range(_DEPTH_MAX):
         inner: list[object] = []
@@ -134,7 +157,7 @@ def _check_values(document: object) -> None:
                 inner += value.values()
             elif isinstance(value, list):
                 inner += value
-            elif isinstance(value, float) and not math.isfinite(value):
+            elif all_finite and isinstance(value, float) and not math.isfinite(value):
                 raise ValueError("a number in it is not finite")
             elif isinstance(value, int) and value.bit_length() > _NUMBER_BITS_MAX:
                 raise ValueError(f"a number in it has more than {_NUMBER_BITS_MAX} bits")

@@ -284,7 +284,7 @@ def test_a_byte_order_mark_does_no_harm(tmp_path: Path) -> None:
 
 
 def test_a_file_that_was_asked_for_must_be_there(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="cannot be read: No such file"):
+    with pytest.raises(UsageError, match="cannot be read: there is no file"):
         load_profile(tmp_path / "none.toml", BMS)
     with pytest.raises(UsageError, match="cannot be read"):
         load_profile(tmp_path, BMS)

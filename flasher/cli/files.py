@@ -6,9 +6,14 @@ import contextlib
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from secrets import token_hex
+from typing import Final
 
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
+
+_LINKS_MAX: Final = 40
+"""As many links in a row as the system follows."""
 
 
 def check_writable(path: Path, option: str, *, is_appended_to: bool = False) -> None:
@@ -55,12 +60,13 @@ def _is_same(path: Path, other: Path) -> bool:
 
 
 def write_whole(path: Path, data: bytes, option: str) -> None:
-    """Write a file whole or not at all, where a link leads to. What is no regular file (a pipe, a
-    device) is written into, not replaced. Raises UsageError, with the `option` that named the file,
-    when it cannot be written.
+    """Write a file whole or not at all, where a link leads to, unless another user laid the link.
+    What is no regular file (a pipe, a device) is written into, not replaced. Raises UsageError,
+    with the `option` that named the file, when it cannot be written.
     """
     try:
         # Inside: a link that leads to itself cannot be resolved.
+        _check_links(path, option)
         path = path.resolve(strict=False)
         is_special = path.exists() and not path.is_file()
         if is_special:
@@ -72,10 +78,24 @@ def write_whole(path: Path, data: bytes, option: str) -> None:
         raise _not_written(path, option, reason) from error
 
 
+def _check_links(path: Path, option: str) -> None:
+    """Raises UsageError for a link of another user: who may write into the folder (/tmp) could
+    have it lead to any file of this user. Links of the system are followed.
+    """
+    for _ in range(_LINKS_MAX):
+        if not path.is_symlink():
+            return
+        if hasattr(os, "geteuid") and path.lstat().st_uid not in (0, os.geteuid()):
+            raise _not_written(path, option, "it is a link that another user laid")
+        path = path.parent / path.readlink()
+
+
 def _replace(path: Path, data: bytes) -> None:
-    part = path.with_name(f".{path.name}.part")
+    # A name that nobody knows before, and "x": what is laid there already is never followed.
+    part = path.with_name(f".flasher-{token_hex(8)}.part")
     try:
-        part.write_bytes(data)
+        with part.open("xb") as file:
+            file.write(data)
         part.replace(path)
     except BaseException:  # an interrupt too leaves nothing half written
         with contextlib.suppress(OSError):

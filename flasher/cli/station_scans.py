@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
-from pathlib import Path
 from typing import Final
 
 from flasher.cli.station_keys import Submit
 from flasher.errors import UsageError
+from flasher.files import read
 from flasher.protocol.text import printable
 from flasher.station.scans import Command, Label, Word, understand
 from flasher.station.station import SocketView
@@ -21,20 +21,16 @@ OPTION: Final = "--scans"
 def read_scans(path: str) -> list[str]:
     """The scans of a file; empty lines and those that begin with # are none. Raises UsageError."""
     shown = printable(path)
+    raw = read(path, FILE_MAX_SIZE, what="file of scans")
     try:
-        with Path(path).open("rb") as file:
-            raw = file.read(FILE_MAX_SIZE + 1)
         text = raw.decode("utf-8-sig")
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or "it is no text"
-        raise UsageError(
-            f"{shown} cannot be read: {reason}.", where=OPTION, remedy="Check its path."
-        ) from error
+    except ValueError as error:
+        raise UsageError(f"{shown} cannot be read: it is no text.", where=OPTION) from error
     lines = [line.strip() for line in text.splitlines()]
     scans = [line for line in lines if line and not line.startswith("#")]
-    if not scans or len(raw) > FILE_MAX_SIZE:
+    if not scans:
         raise UsageError(
-            f"{shown} holds {'too many' if scans else 'no'} scans.",
+            f"{shown} holds no scans.",
             where=OPTION,
             remedy="One scan a line: a label, or a command.",
         )

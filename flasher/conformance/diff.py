@@ -6,7 +6,6 @@ counts with its worst verdict.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +15,7 @@ from flasher.conformance.json_report import SCHEMA_VERSION, status_name
 from flasher.conformance.model import Status
 from flasher.conformance.summary import GRAVITY, worst
 from flasher.errors import UsageError
+from flasher.files import JSON_MAX_SIZE, parse_json, read
 from flasher.protocol.text import printable
 
 THRESHOLD_PERCENT: Final = 10.0
@@ -105,12 +105,13 @@ class Difference:
 def read_run(path: Path) -> Run:
     """Read a report. Raises UsageError for a file that cannot be read or is no report."""
     shown = printable(str(path))
+    raw = read(path, JSON_MAX_SIZE, what="report")
     try:
-        document = json.loads(path.read_bytes())
-    except OSError as error:
-        raise UsageError(f"{shown} cannot be read: {error.strerror}.") from error
-    except (ValueError, RecursionError) as error:
-        raise _no_report(shown, "it is no JSON") from error
+        document = parse_json(raw)
+    except ValueError as error:
+        raise _no_report(
+            shown, f"it is no JSON that can be read ({printable(str(error))})"
+        ) from error
     if isinstance(document, dict) and isinstance(document.get("report"), dict):
         document = document["report"]  # what --json prints
     if not isinstance(document, dict) or "report_schema" not in document:

@@ -17,14 +17,13 @@ from __future__ import annotations
 import json
 import os
 import re
-import tomllib
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Final
 
 from flasher.conformance.profile_keys import BY_PATH, CHOICES, DEVICE, KEYS, LIMITS, Key
-from flasher.errors import UsageError, did_you_mean
+from flasher.errors import UsageError, did_you_mean, printable
+from flasher.files import read_toml
 
 DEVIATIONS: Final = "deviations"
 _TABLES: Final = (LIMITS, DEVICE)
@@ -121,22 +120,7 @@ def load_profile(path: str | os.PathLike[str]) -> ConformanceProfile:
     """Read a profile. Raises UsageError for a file that cannot be read, is no TOML, or holds what
     is not allowed.
     """
-    shown = ascii(os.fspath(path))[1:-1]
-    try:
-        text = Path(path).read_bytes().decode("utf-8-sig")
-        document = tomllib.loads(text)
-    except OSError as error:
-        raise UsageError(
-            f"The profile {shown} cannot be read: {error.strerror}.",
-            remedy="Check the path that --profile names.",
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(
-            f"The profile {shown} is no TOML file: {ascii(str(error))[1:-1]}.",
-            where=shown,
-            remedy="Texts stand in quotes, tables as [name], numbers as 0x4205 or 0.5.",
-        ) from error
-    return read_profile(document, shown)
+    return read_profile(read_toml(path, what="profile"), printable(os.fspath(path)))
 
 
 def read_profile(document: Mapping[str, Any], source: str) -> ConformanceProfile:

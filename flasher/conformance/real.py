@@ -18,6 +18,7 @@ from flasher.conformance.model import Unsupported
 from flasher.conformance.subject import Arrival
 from flasher.conformance.wire import RawFrame
 from flasher.errors import BusError, UsageError
+from flasher.files import read
 from flasher.protocol.frame import Frame
 
 PowerControl = Callable[[bool], None]
@@ -31,6 +32,8 @@ the frame as it comes in, the computer's scheduler.
 _OWN_FRAMES: Final = 256
 _SWITCH: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 _FILE: Final = "{file}"
+_READBACK_MAX_SIZE: Final = 64 * 1024 * 1024
+"""In bytes; what a device holds is far smaller."""
 
 
 class RealPort:
@@ -200,12 +203,12 @@ class ReadbackCommand:
             words = [word.replace(_FILE, str(path)) for word in self._template]
             _run(words, self._limit_s, "readback")
             try:
-                return path.read_bytes()
-            except OSError as error:
+                return read(path, _READBACK_MAX_SIZE)
+            except UsageError as error:
                 raise BusError(
-                    "The readback command wrote no file.",
+                    "The readback command wrote no file that can be read.",
                     where=shlex.join(words),
-                    cause=str(error.strerror),
+                    cause=error.what,
                 ) from error
 
 

@@ -18,15 +18,14 @@ not trustworthy then.
 from __future__ import annotations
 
 import os
-import stat
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
 import tomli_w
 
-from flasher.errors import ImageError, UsageError
+from flasher.errors import ImageError
+from flasher.files import read_toml
 from flasher.image.manifest_keys import (
     FORMAT_KEY,
     FORMAT_VERSION,
@@ -49,8 +48,6 @@ __all__ = [
 ]
 
 SUFFIX: Final = ".toml"
-FILE_MAX_SIZE: Final = 64 * 1024
-"""In bytes; a larger file is no manifest, and is not read."""
 
 
 def manifest_path(image_path: str | os.PathLike[str]) -> Path:
@@ -76,11 +73,17 @@ def find_release(
 def read_release(path: str | os.PathLike[str]) -> Release:
     """The release that a manifest states.
 
-    Raises UsageError when there is no such file, ImageError naming file and key when it cannot be
-    read, is no TOML, has another format version, or holds a key or a value that is not allowed.
+    Raises UsageError when there is no such file or it is no regular one, ImageError naming file and
+    key when it cannot be read, is no TOML, has another format version, or holds a key or a value
+    that is not allowed.
     """
     shown = printable(os.fspath(path))
-    document = _document(path, shown)
+    document = read_toml(
+        path,
+        what="manifest",
+        error=ImageError,
+        if_missing="Correct the name, or write it with `flasher manifest create`.",
+    )
     _check_format(document, shown)
     values: dict[str, Any] = {}
     for key, value in document.items():
@@ -104,30 +107,6 @@ def read_release(path: str | os.PathLike[str]) -> Release:
             remedy="Write it anew with `flasher manifest create --force`.",
         )
     return Release(**values, source=os.fspath(path))
-
-
-def _document(path: str | os.PathLike[str], shown: str) -> dict[str, Any]:
-    try:
-        status = Path(path).stat()
-        if not stat.S_ISREG(status.st_mode) or status.st_size > FILE_MAX_SIZE:
-            kind = "too large for one" if stat.S_ISREG(status.st_mode) else "no file"
-            raise ImageError(f"The manifest {shown} is {kind}.", remedy="Name a manifest.")
-        # A BOM, as some editors write it, is no part of TOML.
-        return tomllib.loads(Path(path).read_bytes().decode("utf-8-sig"))
-    except (FileNotFoundError, NotADirectoryError) as error:
-        raise UsageError(
-            f"There is no manifest {shown}.",
-            remedy="Correct the name, or write it with `flasher manifest create`.",
-        ) from error
-    except OSError as error:
-        raise ImageError(f"The manifest {shown} cannot be read: {error.strerror}.") from error
-    # Also what tomllib lets through: an endless number, tables nested without end.
-    except (ValueError, RecursionError) as error:
-        raise ImageError(
-            f"The manifest {shown} is no TOML file: {printable(str(error))}.",
-            remedy="Texts stand in quotes, lists in brackets, as `flasher manifest create` "
-            "writes them.",
-        ) from error
 
 
 def _check_format(document: Mapping[str, Any], shown: str) -> None:

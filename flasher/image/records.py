@@ -16,7 +16,7 @@ from typing import BinaryIO, Final
 from flasher.errors import ImageError
 from flasher.image.image import ADDRESS_SPACE
 
-LINES_MAX: Final = 1_200_000
+LINES_MAX: Final = 1_100_000
 """The largest image has 1,048,560 records of eight bytes, and programs write 16 or 32. Bounds the
 time that a file takes which is none: its lines may be blank."""
 _LINE_MAX: Final = 1024

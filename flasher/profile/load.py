@@ -15,13 +15,13 @@ from __future__ import annotations
 
 import os
 import platform
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Final
 
 from flasher.errors import UsageError
+from flasher.files import read_toml
 from flasher.profile.keys import GROUPS, KEYS, explain_unknown, read_value
 from flasher.profile.model import ApplicationArea, Profile, VersionQuery, sent_ids
 from flasher.protocol.contents import VersionInformation
@@ -47,14 +47,14 @@ def load_profile(
     environment: Mapping[str, str] | None = None,
 ) -> Profile:
     """The profile of a target: of the file `path`, else of the first `flasher.toml` that
-    `find_profile` finds, else the defaults.
+    `find_profile` finds, else the defaults. With os.devnull as `path` no file is looked for.
 
     Raises UsageError naming file and key for a file that cannot be read, is no TOML, or holds a key
     or a value that is not allowed.
     """
     found = Path(path) if path is not None else find_profile(working_directory, environment)
     given: dict[str, Any] = {}
-    if found is not None:
+    if found is not None and found != Path(os.devnull):
         given = _read(found).for_target(target)
     return _build(target, dialect, given, str(found))
 
@@ -110,21 +110,8 @@ class _Contents:
 
 
 def _read(path: Path) -> _Contents:
+    document = read_toml(path, what="profile")
     shown = printable(str(path))
-    try:
-        # A BOM, as some editors write it, is no part of TOML.
-        document = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except OSError as error:
-        raise UsageError(
-            f"The profile {shown} cannot be read: {error.strerror}.",
-            remedy="Check the path that --profile names.",
-        ) from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(
-            f"The profile {shown} is no TOML file: {printable(str(error))}.",
-            where=shown,
-            remedy="Texts stand in quotes, tables as [name], numbers as 0x4205 or 0.5.",
-        ) from error
     tables: dict[str, dict[str, Any]] = {}
     common: dict[str, Any] = {}
     for key, value in document.items():

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Final, Self
 
+from flasher.errors import printable as printable  # noqa: PLC0414  most have it from here
 from flasher.protocol.spec import TEXT_END, TEXT_FILLER
 
 FIRMWARE_VERSION_FORM: Final = "Vxrxrx_YYYYMMDD"
@@ -74,14 +75,6 @@ def decode_text(field: bytes) -> str:
     if end and rest.strip(TEXT_FILLER):
         text = field
     return printable(text.decode("latin-1")).rstrip()
-
-
-def printable(text: str) -> str:
-    """`text` with everything but printable ASCII escaped."""
-    return "".join(
-        char if char.isascii() and char.isprintable() else char.encode("unicode_escape").decode()
-        for char in text
-    )
 
 
 def find_firmware_version(data: bytes) -> str | None:

@@ -28,8 +28,9 @@ from typing import Annotated, Any, Final
 from pydantic import Field, field_validator, model_validator
 
 from flasher.errors import UsageError
+from flasher.files import TOML_MAX_SIZE, read
 from flasher.station.recipe import Part, Words
-from flasher.station.recipe_file import parse, read_file
+from flasher.station.recipe_file import parse
 from flasher.station.records.database import DEFAULT_LOCK_TIMEOUT_S
 
 SOCKETS_MAX: Final = 64
@@ -145,7 +146,7 @@ def load_config(path: Path) -> StationConfig:
     """The station's file. Relative places in it are beside it. Raises UsageError (RecipeError)
     naming every key that is wrong.
     """
-    config = parse(StationConfig, path, read_file(path, _WHAT), _WHAT)
+    config = parse(StationConfig, path, read(path, TOML_MAX_SIZE, what=_WHAT), _WHAT)
     here = path.parent
     changes: dict[str, str] = {}
     if "://" not in config.records:

@@ -9,8 +9,6 @@ from __future__ import annotations
 import difflib
 import hashlib
 import os
-import stat
-import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import date
@@ -21,9 +19,10 @@ from typing import Any, Final, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from flasher.errors import FlasherError, UsageError
+from flasher.files import TOML_MAX_SIZE, opened, parse_toml, read
 from flasher.host.write import WritePlan, plan_write
 from flasher.image.image import Image
-from flasher.image.load import load
+from flasher.image.load import FILE_MAX_SIZE, load
 from flasher.image.manifest import Release, manifest_path, read_release
 from flasher.profile.load import load_profile
 from flasher.profile.model import Profile
@@ -36,8 +35,6 @@ from flasher.station.template import Scan, fill
 Model = TypeVar("Model", bound=BaseModel)
 _UNKNOWN_KEY: Final = "unknown key."
 FINDINGS_SHOWN: Final = 8
-FILE_MAX_SIZE: Final = 256 * 1024
-"""In bytes; a larger file is no recipe, and is not read."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +119,7 @@ class LoadedRecipe:
         """True while recipe, images, manifests and profile on disk are those that were read."""
         try:
             return all(_sha256(path) == sha256 for path, sha256 in self.files.items())
-        except OSError:
+        except FlasherError:
             return False
 
     def scan(self, serial: str, day: date, lot: str = "") -> Scan:
@@ -160,7 +157,7 @@ def load_recipe(path: Path) -> LoadedRecipe:
     not try values: `recipe_check.check_recipe` does.
     """
     findings: list[Finding] = []
-    raw = read_file(path, "recipe")
+    raw = read(path, TOML_MAX_SIZE, what="recipe")
     recipe = parse(Recipe, path, raw)
     files = {path: hashlib.sha256(raw).hexdigest()}
     targets = []
@@ -175,34 +172,19 @@ def load_recipe(path: Path) -> LoadedRecipe:
 
 
 def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
-def read_file(path: Path, what: str) -> bytes:
-    """The bytes of a small TOML file. Raises UsageError when there is none."""
-    shown = printable(str(path))
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode) or status.st_size > FILE_MAX_SIZE:
-            raise UsageError(f"The {what} {shown} is no file, or too large for one.")
-        return path.read_bytes()
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise UsageError(
-            f"The {what} {shown} cannot be read: {reason}.", remedy="Check its path."
-        ) from error
+    with opened(path, FILE_MAX_SIZE) as (file, _):
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def parse(model: type[Model], path: Path, raw: bytes, what: str = "recipe") -> Model:
     """A TOML file as a checked model. Raises RecipeError with all that is wrong."""
     try:
-        document = tomllib.loads(raw.decode("utf-8-sig"))
-        return model.model_validate(document)
+        return model.model_validate(parse_toml(raw))
     except ValidationError as error:
         # An unknown key first: it may be why another one is missing.
         found = sorted(_findings(model, error), key=lambda each: each.what != _UNKNOWN_KEY)
         raise RecipeError(path, tuple(found), what) from error
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         no_toml = Finding(
             printable(str(path)),
             f"it is no TOML file: {printable(str(error))}.",
@@ -288,9 +270,6 @@ def _load_target(
             findings.append(Finding(where, "a file changed while it was read.", "Try again."))
     except ValueError as error:
         findings.append(Finding(where, f"{error}.", "Copy it there, and name it by its name."))
-    except OSError as error:
-        name = printable(str(error.filename))
-        findings.append(Finding(where, f"{name} cannot be read: {error.strerror}."))
     except FlasherError as error:
         findings.append(Finding(where, error.what, error.remedy))
     if len(findings) > before:

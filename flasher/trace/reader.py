@@ -1,48 +1,122 @@
-"""Reads recorded traces of any format that python-can knows, as frames with their times."""
+"""Reads recorded traces of the formats that python-can knows, as frames with their times.
+
+python-can parses what a file holds; what it is given of a file is bounded here, since its readers
+take a line, a container or a database of any size and read on for ever.
+"""
 
 from __future__ import annotations
 
+import gzip
+import math
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from functools import partial
+from io import BufferedIOBase, BytesIO
+from pathlib import Path
+from typing import BinaryIO, Final, TextIO, cast
 
 import can
 
 from flasher.errors import UsageError
+from flasher.files import opened
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
+from flasher.trace.blf import UnpackedBlf
+from flasher.trace.bounds import FILE_MAX_SIZE, Bounds, Lines, UnfitError, check_unpacked
+from flasher.trace.database import frames_of_database
 
 SUFFIXES = ".asc .blf .csv .db .log .mf4 .trc, also with .gz behind it"
+_WHOLE_MAX_SIZE: Final = 64 * 1024 * 1024
+"""In bytes, of a format that is not read piece by piece."""
+_PIECE_SIZE: Final = 65_536
+_TIME_MAX_S: Final = 1e11
+"""About the year 5000. Beyond, and before its negative, no clock tells the time."""
+_STANDARD_ID_MAX, _EXTENDED_ID_MAX = 0x7FF, 0x1FFF_FFFF
+_DATA_MAX: Final = 8
+_LINE_READERS: Final = {
+    ".asc": can.ASCReader,
+    ".csv": can.CSVReader,
+    ".log": can.CanutilsLogReader,
+    ".trc": can.TRCReader,
+}
+_OTHERS: Final = (".blf", ".db", ".mf4")
 
 
 def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
     """Time in seconds and frame, one after the other, as they stand in the file; CAN FD frames are
     left out. Times are those of the file: seconds since its start or since 1970.
 
-    Raises UsageError for a file that cannot be opened, whose suffix python-can does not know, or
-    whose content is not what the suffix says.
+    Raises UsageError for a file that cannot be opened, whose suffix is not known, or whose content
+    is not what the suffix says.
     """
-    name = os.fspath(path)
-    shown = printable(name)
-    count = 0
-    try:
-        with can.LogReader(name) as reader:
-            for message in reader:
-                count += 1
-                if not message.is_fd:
-                    yield message.timestamp, _frame(message)
-    except OSError as error:
-        raise UsageError(f"{shown} cannot be read: {error.strerror or error}.") from error
-    except Exception as error:
-        if isinstance(error, ValueError) and "log format" in str(error):
-            raise UsageError(
-                f"{shown}: no trace format has this suffix.", remedy=f"Known are {SUFFIXES}."
-            ) from error
+    shown = printable(os.fspath(path))
+    suffixes = [suffix.lower() for suffix in Path(path).suffixes]
+    is_packed = suffixes[-1:] == [".gz"]
+    suffix = "".join(suffixes[-2:-1] if is_packed else suffixes[-1:])
+    if suffix not in (*_LINE_READERS, *_OTHERS):
         raise UsageError(
-            f"{shown} is not a trace of the format that its suffix says.",
-            where=f"behind frame {count:,}" if count else "at its beginning",
-            cause=printable(f"{type(error).__name__}: {error!s:.100}"),
-            remedy="Record it again, or rename it to the suffix of its format.",
-        ) from error
+            f"{shown}: no trace format has this suffix.", remedy=f"Known are {SUFFIXES}."
+        )
+    with opened(path, FILE_MAX_SIZE, may_grow=True) as (file, size):
+        bounds = Bounds()
+        try:
+            source: BufferedIOBase = file
+            if is_packed:
+                source = gzip.GzipFile(fileobj=file)
+                check_unpacked(iter(partial(source.read, _PIECE_SIZE), b""), size)
+                source.seek(0)
+            for at_s, frame in _frames(suffix, source, size, Path(path), bounds):
+                bounds.frames += 1
+                _check(at_s, frame)
+                yield at_s, frame
+        except NotImplementedError as error:
+            raise UsageError(
+                f"{shown}: this trace format needs a package that is not installed.",
+                cause=printable(str(error)),
+                remedy="Install it, or convert the trace to .asc, .blf or .log.",
+            ) from error
+        except Exception as error:
+            if isinstance(error, OSError) and not isinstance(error, gzip.BadGzipFile):
+                raise
+            reason = "" if isinstance(error, UnfitError) else f"{type(error).__name__}: "
+            raise UsageError(
+                f"{shown} is not a trace of the format that its suffix says.",
+                where=f"behind frame {bounds.frames:,}" if bounds.frames else "at its beginning",
+                cause=printable(f"{reason}{error!s:.100}"),
+                remedy="Record it again, or rename it to the suffix of its format.",
+            ) from error
+
+
+def _frames(
+    suffix: str, source: BufferedIOBase, size: int, path: Path, bounds: Bounds
+) -> Iterator[tuple[float, Frame]]:
+    """What the reader of the format makes of a file. Raises whatever it raises."""
+    if suffix == ".db":
+        yield from frames_of_database(source, path)
+        return
+    reader: Iterable[can.Message]
+    if suffix == ".blf":
+        reader = can.BLFReader(cast("BinaryIO", UnpackedBlf(source, size, bounds)))
+    elif suffix == ".mf4":
+        whole = source.read(_WHOLE_MAX_SIZE + 1)
+        if len(whole) > _WHOLE_MAX_SIZE:
+            raise UnfitError(f"it has more than {_WHOLE_MAX_SIZE:,} bytes")
+        reader = can.MF4Reader(BytesIO(whole))
+    else:
+        reader = _LINE_READERS[suffix](cast("TextIO", Lines(source, bounds)))
+    for message in reader:
+        # Not every format marks CAN FD; no other frame has as many bytes.
+        if not message.is_fd and len(message.data) <= _DATA_MAX:
+            yield message.timestamp, _frame(message)
+
+
+def _check(at_s: float, frame: Frame) -> None:
+    """Raises UnfitError for a time or an id that no bus can have."""
+    if not math.isfinite(at_s) or abs(at_s) > _TIME_MAX_S:
+        raise UnfitError(f"a frame has the time {at_s!r}")
+    is_long = frame.is_extended or frame.is_error
+    if not 0 <= frame.can_id <= (_EXTENDED_ID_MAX if is_long else _STANDARD_ID_MAX):
+        raise UnfitError(f"a frame has the id {frame.can_id:#x}")
 
 
 def _frame(message: can.Message) -> Frame:

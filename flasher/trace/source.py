@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import shlex
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-from flasher.errors import UsageError
+from flasher.errors import FlasherError, UsageError
+from flasher.files import JSON_MAX_SIZE, parse_json, read
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
 from flasher.trace.bundle import REPORT, TRACE
@@ -17,9 +17,6 @@ from flasher.trace.explain import explain
 from flasher.trace.explanations import EXPLANATIONS
 from flasher.trace.reader import read_trace
 from flasher.trace.story import Cause, Recorded, Story, Verdict
-
-_MAX_REPORT_SIZE: Final = 16 * 1024 * 1024
-"""More is none of ours, and is cut: which makes it no JSON."""
 
 
 def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool = False) -> Story:
@@ -106,10 +103,11 @@ def _report(path: Path) -> dict[str, Any]:
     try:
         if not path.exists():
             return {}
-        with path.open("rb") as file:
-            loaded = json.loads(file.read(_MAX_REPORT_SIZE))
-    except (OSError, ValueError, RecursionError) as error:
-        raise _no_report(path, f"{type(error).__name__}: {error!s:.100}") from error
+        loaded = parse_json(read(path, JSON_MAX_SIZE))
+    except FlasherError as error:
+        raise _no_report(path, error.what) from error
+    except (OSError, ValueError) as error:
+        raise _no_report(path, str(error)) from error
     if not isinstance(loaded, dict):
         raise _no_report(path, "it holds no JSON object")
     return loaded

@@ -53,7 +53,7 @@ def test_can_fd_frames_are_left_out(tmp_path: Path) -> None:
 
 
 def test_a_missing_file_is_wrong_usage(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="cannot be read: No such file"):
+    with pytest.raises(UsageError, match="cannot be read: there is no file"):
         list(read_trace(tmp_path / "none.asc"))
 
 
