@@ -20,7 +20,7 @@ from flasher.errors import FlasherError, UsageError, printable
 
 TOML_MAX_SIZE: Final = 256 * 1024
 """In bytes, of any file of settings."""
-JSON_MAX_SIZE: Final = 8 * 1024 * 1024
+JSON_MAX_SIZE: Final = 6 * 1024 * 1024
 """In bytes, of a report. What JSON holds takes up to thirty times its size in memory."""
 _DEPTH_MAX: Final = 32
 _NUMBER_BITS_MAX: Final = 64

@@ -288,15 +288,18 @@ def test_a_folder_in_the_place_of_the_file_is_refused_too(serve: Serve, tmp_path
     assert "it is a folder" in run.err
 
 
-@pytest.mark.parametrize("failing", ["write_bytes", "replace"])
+@pytest.mark.parametrize("failing", ["open", "replace"])
 def test_a_disk_that_fills_up_leaves_the_old_file_and_no_half_one(
     serve: Serve, host: Host, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: str
 ) -> None:
-    real_write = Path.write_bytes
+    real_open = Path.open
 
-    def fail(path: Path, data: Any) -> int:
-        if failing == "write_bytes":
-            real_write(path, data[:100])
+    def fail(path: Path, *others: Any, **named: Any) -> Any:
+        if path.suffix != ".part":
+            return real_open(path, *others, **named)
+        if failing == "open":
+            with real_open(path, "wb") as file:
+                file.write(b"half")
         raise OSError(errno.ENOSPC, "No space left on device")
 
     out = tmp_path / "out.bin"

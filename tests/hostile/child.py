@@ -16,6 +16,8 @@ import tempfile
 
 # What most of them need, once.
 import flasher.cli.station_check
+import flasher.conformance.diff
+import flasher.conformance.runner
 import flasher.trace.source  # noqa: F401
 from flasher.cli.main import main
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.campaigns.hostile_files import READERS, Campaign
 from tests.hostile.files import ROWS
 
 TIME_LIMIT_S = 4.0
@@ -68,3 +69,12 @@ def test_no_file_hurts_whoever_reads_it(tmp_path: Path, part: int) -> None:
     assert not wrong, "\n".join(wrong)
     assert state(tmp_path) == before
     shutil.rmtree(tmp_path)
+
+
+def test_files_damaged_at_random_are_read_or_refused(tmp_path: Path) -> None:
+    """A sample of `python -m tests.campaigns.hostile_files`."""
+    campaign = Campaign(tmp_path, seed=20)
+    for _ in range(250):
+        campaign.once()
+    assert not campaign.problems
+    assert {name.partition(":")[0] for name in campaign.counts} == set(READERS)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gc
+import sqlite3
 import warnings
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 
@@ -85,3 +87,82 @@ def test_a_name_with_an_escape_sequence_is_shown_harmlessly(tmp_path: Path) -> N
     with pytest.raises(UsageError) as caught:
         list(read_trace(tmp_path / "a\x1b[2Jb.asc"))
     assert "\x1b" not in str(caught.value)
+
+
+def test_a_blf_file_is_read_as_python_can_reads_it(tmp_path: Path) -> None:
+    """Through containers that cut objects in two, packed and not, with CAN FD objects in them."""
+    path = tmp_path / "trace.blf"
+    for level in (0, 9):
+        with can.BLFWriter(path, compression_level=level, max_container_size=1000) as writer:
+            for number in range(500):
+                is_fd = number % 5 == 0
+                data = bytes([number & 0xFF]) * (number % 9 + 12 * (is_fd and number % 2))
+                writer(
+                    can.Message(
+                        timestamp=1.7e9 + number / 128,
+                        arbitration_id=number,
+                        is_extended_id=number % 3 == 0,
+                        is_remote_frame=number % 7 == 0 and not is_fd,
+                        is_error_frame=number % 11 == 0 and not is_fd,
+                        is_fd=is_fd,
+                        data=b"" if number % 7 == 0 else data,
+                    )
+                )
+        with can.LogReader(path) as reader:
+            expected = [
+                (message.timestamp, message.arbitration_id, bytes(message.data))
+                for message in reader
+                if not message.is_fd
+            ]
+        assert len(expected) == 400
+        assert [(at, frame.can_id, frame.data) for at, frame in read_trace(path)] == expected
+
+
+def test_frames_in_front_of_a_cut_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "trace.blf"
+    with can.BLFWriter(path, max_container_size=1000) as writer:
+        for number in range(100):
+            writer(can.Message(timestamp=1.7e9 + number, arbitration_id=number))
+    path.write_bytes(path.read_bytes()[:-20])
+    found: list[Frame] = []
+    with pytest.raises(UsageError, match="is not a trace") as caught:
+        found.extend(frame for _, frame in read_trace(path))
+    assert "ends within an object" in caught.value.cause
+    assert "behind frame" in caught.value.where
+
+
+@pytest.mark.parametrize("mode", ["wal", "delete"])
+def test_a_database_that_is_still_written_is_read_whole_and_left_alone(
+    tmp_path: Path, mode: str
+) -> None:
+    """What SQLite holds beside the file belongs to it; nothing beside it comes or goes."""
+    path = tmp_path / "trace.db"
+    with closing(sqlite3.connect(path, isolation_level=None)) as writer:
+        writer.execute(f"PRAGMA journal_mode = {mode}")
+        writer.execute(
+            "CREATE TABLE messages (ts REAL, arbitration_id INTEGER, extended INTEGER,"
+            " remote INTEGER, error INTEGER, dlc INTEGER, data BLOB)"
+        )
+        row = (1.0, 0x752, 0, 0, 0, 2, b"ab")
+        writer.execute("INSERT INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)", row)
+        if mode == "delete":
+            writer.execute("PRAGMA cache_size = 1")
+            writer.execute("BEGIN")  # as of a program that was killed here
+            writer.executemany("INSERT INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)", [row] * 5000)
+        before = {each.name: each.read_bytes() for each in tmp_path.iterdir()}
+        assert len(before) > 1
+        assert [frame.data for _, frame in read_trace(path)] == [b"ab"]
+        assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == before
+
+
+def test_a_format_whose_package_is_missing_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "trace.mf4"
+    path.write_bytes(b"MDF     4.10")
+    with pytest.raises(UsageError, match="needs a package that is not installed"):
+        list(read_trace(path))
+
+
+def test_a_byte_order_mark_of_a_text_does_no_harm(tmp_path: Path) -> None:
+    path = tmp_path / "trace.log"
+    path.write_bytes(b"\xef\xbb\xbf(1.0) can0 752#00\r\n")
+    assert [frame.data for _, frame in read_trace(path)] == [b"\0"]
