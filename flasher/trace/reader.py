@@ -66,8 +66,8 @@ def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
                 check_unpacked(iter(partial(source.read, _PIECE_SIZE), b""), size)
                 source.seek(0)
             for at_s, frame in _frames(suffix, source, size, Path(path), bounds):
-                bounds.frames += 1
                 _check(at_s, frame)
+                bounds.frames += 1
                 yield at_s, frame
         except NotImplementedError as error:
             raise UsageError(

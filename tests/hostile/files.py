@@ -429,7 +429,12 @@ TRACES = tuple(
         ("random.trc", content(bytes(range(255, 0, -1)) * 100), USAGE, "not a trace"),
         # Times.
         ("infinite.log", content(several("(inf) can0 752#00", FRAME)), USAGE, "the time inf"),
-        ("minus.log", content(several(FRAME, "(-inf) can0 752#00")), 0, "the time -inf"),
+        (
+            "minus.log",
+            content(several(FRAME, "(-inf) can0 752#00")),
+            0,
+            "behind frame 1; a frame has the time -inf",
+        ),
         ("nan.log", content(several("(nan) can0 752#00", FRAME)), USAGE, "the time nan"),
         ("year.log", content(several("(1e17) can0 752#00")), USAGE, "the time 1e+17"),
         ("back.log", content(several("(1e10) can0 752#00", FRAME)), 0, "2 frames"),
@@ -552,4 +557,10 @@ TRACES = tuple(
     )
 )
 
-ROWS = (*IMAGES, *SETTINGS, *SCANS, *REPORTS, *TRACES)
+MONITOR = (
+    Row("pipe.log", os.mkfifo, "monitor FILE", USAGE, "no regular file"),
+    Row("inf.log", content(several(FRAME, "(inf) can0 1#00")), "monitor FILE", USAGE, "time inf"),
+    Row("far.log", content(several(FRAME, "(1e10) can0 1#00")), "monitor FILE", 0, "2 frames"),
+)
+
+ROWS = (*MONITOR, *IMAGES, *SETTINGS, *SCANS, *REPORTS, *TRACES)
