@@ -26,9 +26,8 @@ _DEPTH_MAX: Final = 32
 _NUMBER_BITS_MAX: Final = 64
 _DOTS_MAX: Final = 128
 """In a line of TOML. The time that tomllib takes grows with the square of the parts of a key."""
-_OPEN_FLAGS: Final = (
-    os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
-)  # a pipe that took the place of the file in this moment must not hold us up
+_OPEN_FLAGS: Final = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+"""Not to wait for a pipe that took the place of the file in this moment; no line end translated."""
 
 
 @contextmanager
@@ -77,8 +76,8 @@ def opened(
             after = os.fstat(descriptor)
     except OSError as problem:
         raise _unreadable(subject, problem, error) from problem
-    is_shorter = after.st_size < before.st_size
-    if is_shorter or (after.st_mtime_ns != before.st_mtime_ns and not may_grow):
+    is_changed = (after.st_size, after.st_mtime_ns) != (before.st_size, before.st_mtime_ns)
+    if is_changed and not (may_grow and after.st_size >= before.st_size):
         raise error(
             f"{subject} cannot be read: it changed meanwhile.",
             cause="another program writes it",
@@ -125,7 +124,7 @@ def parse_toml(raw: bytes) -> dict[str, Any]:
     ValueError saying why it is none, or has whole numbers of more than 64 bits.
     """
     text = raw.decode("utf-8-sig")  # some editors write a BOM, which is no part of TOML
-    for number, line in enumerate(text.splitlines(), 1):
+    for number, line in enumerate(text.split("\n"), 1):
         if line.count(".") > _DOTS_MAX and not line.lstrip().startswith("#"):
             raise ValueError(f"more than {_DOTS_MAX} dots (at line {number})")
     try:

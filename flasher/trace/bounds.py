@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -59,19 +60,25 @@ class Bounds:
 
 
 class Lines:
-    """The lines of a file as python-can's readers of text take them from an open file."""
+    """The lines of a file as python-can's readers of text take them from an open file.
 
-    def __init__(self, source: BufferedIOBase, bounds: Bounds) -> None:
+    It ends with the line in which byte number `size` stands, whatever another program adds after
+    it; None reads to the end.
+    """
+
+    def __init__(self, source: BufferedIOBase, size: int | None, bounds: Bounds) -> None:
         self._source = source
+        self._left = math.inf if size is None else size
         self._bounds = bounds
 
     def __iter__(self) -> Self:
         return self
 
     def __next__(self) -> str:
-        raw = self._source.readline(_LINE_MAX)
+        raw = self._source.readline(_LINE_MAX) if self._left > 0 else b""
         if not raw:
             raise StopIteration
+        self._left -= len(raw)
         self._bounds.entry()
         if len(raw) == _LINE_MAX:
             raise UnfitError(f"a line is longer than {_LINE_MAX:,} bytes")

@@ -103,7 +103,11 @@ def _frames(
             raise UnfitError(f"it has more than {_WHOLE_MAX_SIZE:,} bytes")
         reader = can.MF4Reader(BytesIO(whole))
     else:
-        reader = _LINE_READERS[suffix](cast("TextIO", Lines(source, bounds)))
+        reader = _LINE_READERS[suffix](
+            cast(
+                "TextIO", Lines(source, None if isinstance(source, gzip.GzipFile) else size, bounds)
+            )
+        )
     for message in reader:
         # Not every format marks CAN FD; no other frame has as many bytes.
         if not message.is_fd and len(message.data) <= _DATA_MAX:

@@ -257,6 +257,7 @@ TOML = (
     ("deep", content(b"attempts = " + b"[" * 100_000), "no TOML file"),
     ("deep_tables", content(b"attempts = " + b"{a=" * 300 + b"1" + b"}" * 300), "no TOML file"),
     ("deep_key", content(b"a." * 100_000 + b"a = 1\n"), "no TOML file"),
+    ("deep_texts", content(('"\u2028".' * 20_000 + "a = 1\n").encode()), "no TOML file"),
     (
         "deep_keys",
         content(b"".join(b"[k%d%s]\n" % (n, b".a" * 125) for n in range(900))),

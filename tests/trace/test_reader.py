@@ -166,3 +166,14 @@ def test_a_byte_order_mark_of_a_text_does_no_harm(tmp_path: Path) -> None:
     path = tmp_path / "trace.log"
     path.write_bytes(b"\xef\xbb\xbf(1.0) can0 752#00\r\n")
     assert [frame.data for _, frame in read_trace(path)] == [b"\0"]
+
+
+def test_a_recording_that_grows_faster_than_it_is_read_has_an_end(tmp_path: Path) -> None:
+    path = tmp_path / "trace.log"
+    path.write_bytes(b"(1.0) can0 752#00\n" * 2000)
+    count = 0
+    for _ in read_trace(path):
+        count += 1
+        with path.open("ab") as file:
+            file.write(b"(2.0) can0 752#00\n" * 2)
+    assert count == 2000
