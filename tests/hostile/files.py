@@ -295,11 +295,11 @@ def bundle(
 
 SETTINGS = (
     *settings("profile check FILE", USAGE),
-    *settings(f"flash {SAMPLES}/bms.bin -t bms --mock --dry-run --profile FILE", USAGE, some=3),
-    *settings(f"manifest check {SAMPLES}/bms.bin -t bms --manifest FILE", IMAGE, some=3),
-    *settings("conformance -t bms --mock --case RS-01 --profile FILE", USAGE, some=3),
+    *settings(f"flash {SAMPLES}/bms.bin -t bms --mock --dry-run --profile FILE", USAGE, some=4),
+    *settings(f"manifest check {SAMPLES}/bms.bin -t bms --manifest FILE", IMAGE, some=4),
+    *settings("conformance -t bms --mock --case RS-01 --profile FILE", USAGE, some=4),
     *settings("station check FILE", USAGE),
-    *settings(f"station check {SAMPLES}/station/recipe.toml --sockets FILE", USAGE, some=3),
+    *settings(f"station check {SAMPLES}/station/recipe.toml --sockets FILE", USAGE, some=4),
 )
 SCANS = tuple(
     Row(
@@ -540,7 +540,7 @@ TRACES = tuple(
         ),
         (
             "ids.log",
-            content(several(*(f"(1.0) can0 {n:08X}#" for n in range(120_000)))),
+            content(several(*(f"(1.0) can0 {n:08X}#" for n in range(40_000)))),
             0,
             "ids more",
         ),
