@@ -14,6 +14,7 @@ import pytest
 
 from flasher.errors import ExitCode, ImageError, UsageError
 from flasher.image import load as load_module
+from flasher.image import records
 from flasher.image.image import Image, Span
 from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, load
 from flasher.protocol.spec import IMAGE_MAX_SIZE
@@ -468,3 +469,15 @@ def test_a_hex_file_of_one_mebibyte_is_planned_in_little_memory(tmp_path: Path) 
     assert not said
     assert seconds < 4
     assert megabytes < 150
+
+
+def test_a_file_has_so_many_lines_and_no_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = (SAMPLES / "wmc.hex").read_bytes()
+    path = write(tmp_path, "app.hex", text)
+    monkeypatch.setattr(records, "LINES_MAX", text.count(b"\n"))
+    assert load(path).size_bytes
+    monkeypatch.setattr(records, "LINES_MAX", text.count(b"\n") - 1)
+    with pytest.raises(ImageError, match="it has more than"):
+        load(path)
