@@ -35,6 +35,7 @@ from flasher.protocol.spec import (
     Dialect,
     Mode,
     Node,
+    can_id,
 )
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message
@@ -42,9 +43,15 @@ from flasher.protocol.wire import Message
 FAULT_PERIOD_S: Final = 0.2
 """Faults are told at this interval while any is set (5.1)."""
 IDLE_SHUTDOWN_S: Final = 30 * 60.0
-"""A bus that was idle for this long, at a small current, switches the battery off (5.1)."""
+"""A bus idle for this long, at a small pack current throughout, switches the battery off (5.1)."""
 IDLE_CURRENT_MA: Final = {WELLING: 50, MOTINOVA: 20}
 """What is a small current (section 6)."""
+CURRENT_PERIOD_S: Final = 1.0
+"""How often the pack current is looked at meanwhile."""
+_FEEDBACK_IDS: Final = {
+    can_id(node, Node.BMS): can_id(Node.BMS, node) for node in Node if node is not Node.BMS
+}
+"""Where a write is confirmed, by the id that it came on: 2.2.1(2) goes by the sender."""
 _WRITE: Final = "write "
 _CELL_MODEL: Final = "21700A"
 _ID_FILLER: Final = b"\x01"
@@ -69,8 +76,11 @@ class BmsApplication(Application):
         self._firmware = ""
         self._shutdown: Shutdown | None = None
         self._fault_due: float | None = None
-        self._heard_at: float | None = None
+        self._idle_since: float | None = None
+        """Since when there was no frame, and the current was small; None before the first tick."""
+        self._current_due = float("-inf")
         self._faults_item = _sent_item(contents.Faults, self.dialect)
+        self._feedback_item = _sent_item(contents.GeneralFeedback, self.dialect)
         self._readers: dict[type[Content], Callable[[float], Content]] = {
             contents.RunningInformation: self._running_information,
             contents.CellVoltages: self._cell_voltages,
@@ -89,7 +99,7 @@ class BmsApplication(Application):
     def start(self, firmware: str, now: float) -> None:
         self._firmware = firmware
         self._shutdown = None
-        self._heard_at = None
+        self._idle_since = None
         self._fault_due = now if self.faults else None
 
     def stop(self) -> None:
@@ -97,7 +107,7 @@ class BmsApplication(Application):
         self._fault_due = None
 
     def heard(self, now: float) -> None:
-        self._heard_at = now
+        self._idle_since = now
 
     def deadline(self) -> float | None:
         shutdown_due = None if self._shutdown is None else self._shutdown.due
@@ -108,10 +118,11 @@ class BmsApplication(Application):
         if self._fault_due is not None and self._fault_due <= now:
             if self.port.is_idle:
                 self.port.send(encode(self._faults_item, contents.Faults(self.faults)))
+            self._idle_since = now  # its own frames keep the bus busy too
             self._fault_due = due_again(self._fault_due, FAULT_PERIOD_S, now)
         idle_due = self._idle_due()
         if idle_due is not None and idle_due <= now:
-            self._idle_over(now)
+            self._look_at_current(now)
         if self._shutdown is not None:
             self._shutdown.tick(now)
 
@@ -138,14 +149,16 @@ class BmsApplication(Application):
         if self.profile.idle_shutdown == "off" or self._shutdown is not None:
             return None
         # Without a frame so far, the time counts from the first tick.
-        return float("-inf") if self._heard_at is None else self._heard_at + IDLE_SHUTDOWN_S
+        since = self._idle_since
+        return float("-inf") if since is None else min(self._current_due, since + IDLE_SHUTDOWN_S)
 
-    def _idle_over(self, now: float) -> None:
-        current_ma = abs(self.battery.at(now).current_ma)
-        if self._heard_at is not None and current_ma < IDLE_CURRENT_MA[self.dialect]:
+    def _look_at_current(self, now: float) -> None:
+        self._current_due = now + CURRENT_PERIOD_S
+        is_small = abs(self.battery.at(now).current_ma) < IDLE_CURRENT_MA[self.dialect]
+        if self._idle_since is None or not is_small:
+            self._idle_since = now
+        elif now - self._idle_since >= IDLE_SHUTDOWN_S:
             self._announce_shutdown("bus idle", now)
-        else:
-            self._heard_at = now
 
     # -- messages ---------------------------------------------------------------------------------
 
@@ -153,6 +166,7 @@ class BmsApplication(Application):
         """Answer a query or a write; anything else of no concern is passed over."""
         decoded = decode(message, self.dialect)
         if decoded is None:
+            self._confirm_unknown(message)
             return
         item, content = decoded.item, decoded.content
         if isinstance(content, contents.Ready):
@@ -170,6 +184,17 @@ class BmsApplication(Application):
         if reply is not None:
             self.port.send(encode(answer, reply))
 
+    def _confirm_unknown(self, message: Message) -> None:
+        """A write that is no row of the dialect is confirmed too, and changes nothing: 2.2.1(2) has
+        general feedback follow every write, to its sender.
+        """
+        answer_id = _FEEDBACK_IDS.get(message.can_id)
+        if answer_id is None or message.mode != Mode.WRITE:
+            return
+        if not self.profile.is_silent_to(message.can_id, message.command):
+            feedback = encode(self._feedback_item, contents.GeneralFeedback())
+            self.port.send(feedback._replace(can_id=answer_id))
+
     def _knows(self, item: Item, answer: Item) -> bool:
         if self.profile.older_battery == "yes" and (item.sender, answer.content) in _NEWER_QUERIES:
             return False
@@ -177,6 +202,8 @@ class BmsApplication(Application):
 
     def _write(self, item: Item, content: Content) -> None:
         name = item.title.removeprefix(_WRITE)
+        if name not in self.kept:  # a reset with another text
+            return
         before, self.kept[name] = self.kept[name], content
         self.port.emit(DeviceWritten(name, _shown(before), _shown(content)))
 

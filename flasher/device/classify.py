@@ -86,6 +86,10 @@ def classify(row: object, situation: Situation) -> Event:
             return _classify_packet(row, situation)
         case messages.EndOfTransfer():
             return _classify_end(situation)
+        case messages.Malformed() if state is State.APPLICATION:
+            return _classify_malformed(row)
+        case messages.UpdateCommand() if state is State.APPLICATION:
+            return Event.UPGRADE_IN_APPLICATION
         case messages.Malformed() if row.message.command == Command.PACKET:
             return Event.PACKET_BAD if state is State.TRANSFER else Event.OUT_OF_TURN
     return Event.NO_CONCERN
@@ -100,6 +104,13 @@ def named_number(received: bytes) -> int | None:
     """The packet number in the bytes of a packet, damaged or not; None when they end before it."""
     raw = received[_NUMBER_AT:_NUMBER_END]
     return int.from_bytes(raw, "little") if len(raw) == _NUMBER_END - _NUMBER_AT else None
+
+
+def _classify_malformed(row: messages.Malformed) -> Event:
+    """To an application it is a write like others, which may be confirmed (2.2.1(2), R17)."""
+    is_write = row.message.mode == Mode.WRITE
+    is_upgrade = row.message.command in (Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER)
+    return Event.UPGRADE_IN_APPLICATION if is_write and is_upgrade else Event.QUERY
 
 
 def _classify_reset(situation: Situation) -> Event:

@@ -14,6 +14,7 @@ from flasher.device.machine import Machine, Unit
 from flasher.device.model import Device
 from flasher.device.profile import DeviceProfile, set_option
 from flasher.device.talkers import Talker
+from flasher.protocol.echoes import Echoes
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, TARGETS, WELLING, Dialect, Node, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
@@ -71,6 +72,8 @@ class System:
         self._battery = self.members[Node.BMS]
         self._turns = list(self.members.values())
         self._sending: Machine | None = None
+        self._echoes = Echoes()
+        """The members have heard each other's frames when an adapter gives them back."""
 
     # -- the bicycle ------------------------------------------------------------------------------
 
@@ -107,7 +110,9 @@ class System:
         return all(member.done for member in self._turns)
 
     def receive(self, frame: Frame, now: float) -> None:
-        """A frame arrived from outside."""
+        """A frame arrived from outside, or is the adapter's echo of one of its own."""
+        if self._echoes.take(frame, now):
+            return
         for member in self._turns:
             member.receive(frame, now)
 
@@ -143,6 +148,7 @@ class System:
         if sender is None or frame is None:
             return
         sender.frame_sent(now)
+        self._echoes.sent(frame, now)
         self._turns.remove(sender)
         for member in self._turns:
             member.receive(frame, now)

@@ -25,6 +25,7 @@ def battery(target: Target = BMS, **options: Any) -> Talk:
 
 
 # Typed from the tables of chapter 3; a battery at rest, with 85 % of 9,800 mAh.
+FEEDBACK_IDS = {0x712: 0x721, 0x732: 0x723, 0x742: 0x724, 0x752: 0x725}
 CELLS_MV = (4012, 4021, 4021, 4013, 4016, 4020, 4009, 4018, 4010, 4013)
 RUNNING = struct.pack("<HhHHBBBBI", sum(CELLS_MV), -8, 8330, 9800, 22 + 40, 85, 0, 98, 0)
 CELLS = struct.pack("<16H", *CELLS_MV, 0, 0, 0, 0, 0, 0)
@@ -112,7 +113,9 @@ def test_the_handshake_is_answered_to_the_wmc_alone(dialect: str) -> None:
 def test_a_query_in_the_wrong_mode_is_not_answered(
     query: tuple[int, int, int, int, bytes], mode: int
 ) -> None:
-    assert battery().ask(query[0], mode, query[1]) == []
+    """By 2.2.1(2) a write is confirmed to its sender, whatever it says."""
+    feedback = FEEDBACK._replace(can_id=FEEDBACK_IDS[query[0]])
+    assert battery().ask(query[0], mode, query[1]) == ([feedback] if mode == WRITE else [])
 
 
 @pytest.mark.parametrize("can_id", [0x751, 0x753, 0x710, 0x720, 0x725, 0x713, 0x731])
@@ -240,17 +243,29 @@ def test_broken_texts_are_kept_as_they_are_and_reported_harmlessly(data: bytes) 
     assert event.after.isprintable()
 
 
-def test_a_write_of_the_wrong_size_changes_nothing() -> None:
+@pytest.mark.parametrize(
+    ("command", "data"),
+    [(0x4108, b"W2605999"), (0x7701, b"?"), (0x4205, b"RESEt"), (0x4204, b"RESE"), (0xA401, b"?")],
+)
+def test_a_write_that_is_no_row_of_the_document_is_confirmed_and_changes_nothing(
+    command: int, data: bytes
+) -> None:
+    """2.2.1(2)."""
     talk = battery()
-    assert talk.ask(0x752, WRITE, 0x4108, b"W2605999") == []
+    assert talk.ask(0x752, WRITE, command, data) == [FEEDBACK]
+    talk.run(1.0)
+    assert talk.take() == []
     assert talk.data_of(0x3300) == VERSION
 
 
-@pytest.mark.parametrize("can_id", [0x712, 0x732, 0x742, 0x751, 0x753])
+@pytest.mark.parametrize("can_id", [0x712, 0x732, 0x742, 0x751, 0x753, 0x710])
 def test_only_the_tool_may_write(can_id: int) -> None:
+    """Others get general feedback on the battery's id to them, as 2.2.1(2) says."""
     talk = battery(dialect="motinova")
+    at = FEEDBACK_IDS.get(can_id)
     for command, data, _, _ in WRITES.values():
-        assert talk.ask(can_id, WRITE, command, data) == []
+        confirmed = [] if at is None else [FEEDBACK._replace(can_id=at)]
+        assert talk.ask(can_id, WRITE, command, data) == confirmed
     assert talk.data_of(0x3300) == VERSION
     assert talk.data_of(0x3900) == NO_STRING
 

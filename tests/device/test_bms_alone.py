@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from flasher.device.battery import Battery
 from flasher.device.bms import BmsApplication
 from flasher.device.model import Device
 from flasher.device.profile import DeviceProfile
@@ -281,6 +282,28 @@ def test_a_battery_that_is_ridden_or_charged_stays_on() -> None:
     talk = battery(idle_shutdown="on", battery_use="riding")
     talk.run(6 * 3600.0)
     assert device_of(talk).state is State.APPLICATION
+
+
+def test_the_current_has_to_be_small_for_the_whole_half_hour() -> None:
+    """5.1: it is large for a moment in the middle, and small when the half hour is over."""
+    talk = battery(idle_shutdown="on")
+    rests, rides = application_of(talk).battery, Battery("riding")
+    talk.run(900.0)
+    application_of(talk).battery = rides
+    talk.run(2.0)
+    application_of(talk).battery = rests
+    large_until_s = talk.now
+    talk.run(1795.0)
+    assert not talk.times_of(*SHUTDOWN)
+    talk.run(10.0)
+    first_s = START_S + talk.times_of(*SHUTDOWN)[0]
+    assert first_s - large_until_s == pytest.approx(1800.0, abs=1.5)
+
+
+def test_a_battery_that_tells_its_faults_keeps_the_bus_busy() -> None:
+    talk = battery(idle_shutdown="on", faults=1)
+    talk.run(2000.0)
+    assert not talk.times_of(*SHUTDOWN)
 
 
 def test_by_default_an_idle_bus_changes_nothing() -> None:

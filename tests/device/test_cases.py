@@ -126,7 +126,9 @@ def test_a_reset_that_is_none_is_ignored(can_id: int, mode: Mode, data: bytes) -
     bench = Bench()
     bench.put_wire(encode(Message(can_id, mode, Command.RESET, data)), can_id)
     bench.run(1.0)
-    assert bench.take() == []
+    # 2.2.1(2): an application confirms every write.
+    is_write = (can_id, mode) == (0x752, Mode.WRITE)
+    assert bench.take() == ([messages.GeneralFeedback()] if is_write else [])
     assert bench.device.state is State.APPLICATION
 
 

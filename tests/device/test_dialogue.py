@@ -222,10 +222,11 @@ def test_the_application_answers_upgrade_messages_with_feedback_or_not_and_erase
     assert (bench.device.erase_count, bench.device.program_count) == (0, 0)
 
 
-def test_the_update_text_of_another_target_means_nothing_to_the_application() -> None:
+def test_the_update_text_of_another_target_is_a_write_like_others_to_the_application() -> None:
     bench = Bench()
     bench.send(messages.UpdateCommand("OBC_UPD", 300))
-    assert bench.take() == []
+    assert bench.take() == [messages.GeneralFeedback()]
+    assert bench.device.state is State.APPLICATION
 
 
 # -- what is not for the device -------------------------------------------------------------------

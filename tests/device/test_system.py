@@ -192,11 +192,32 @@ def test_only_the_target_s_events_are_told() -> None:
 def test_the_profile_is_the_batterys_too_and_the_dialect_is_the_systems() -> None:
     profile = DeviceProfile(serial_number="W1", silent_queries="3800")
     talk = Talk(System(MOTINOVA, WMC, profile=profile))
-    talk.run(0.05)
+    talk.run(2.0)  # the bicycle's own questions of its start are no echoes any more
     assert talk.ask(0x752, READ, 0x3800) == []
     (answer,) = talk.ask(0x742, READ, 0x5000)
     assert answer.data[16:32] == b"W1.             "
     assert talk.ask(0x752, READ, 0x3700)[0].can_id == 0x725
+
+
+class _Echoed(System):
+    """On an adapter that gives back what it was given to send."""
+
+    def frame_sent(self, now: float) -> None:
+        frame = self.next_frame(now)
+        super().frame_sent(now)
+        if frame is not None:
+            self.receive(frame, now)
+
+
+@pytest.mark.parametrize("dialect", DIALECTS)
+def test_a_bus_that_gives_own_frames_back_is_answered_once(dialect: Dialect) -> None:
+    said = []
+    for build_system in (System, _Echoed):
+        talk = Talk(build_system(dialect))
+        talk.run(10.0)
+        said.append(Counter((heard.can_id, heard.command) for heard in talk.take()))
+    assert said[0] == said[1]
+    assert said[0][0x720, 0x1010] > 5
 
 
 def test_a_device_without_an_application_announces_itself_while_the_others_talk() -> None:
