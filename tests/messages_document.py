@@ -166,7 +166,8 @@ def _on_the_wire(codec: Codec) -> str:
 
 
 def _bits(name: str, codec: Flags) -> Iterator[str]:
-    yield from (f"Bits of {name}; the others are reserved:", "")
+    others = "are reserved" if "reserved" in codec.names.unnamed(0) else "are not in the document"
+    yield from (f"Bits of {name}; the others {others}:", "")
     yield from _table("bit", "mask", "meaning")
     for flag in codec.names:
         (meaning,) = flag_names(codec.names, flag)

@@ -149,6 +149,8 @@ class HeardDocument(TypedDict):
     damaged: int
     """How often bytes came that made no message."""
     boot_version: str | None
+    not_in_dialect: list[str]
+    """Kinds of message that the document of --dialect does not have."""
 
 
 # -- events ----------------------------------------------------------------------------------------

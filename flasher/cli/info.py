@@ -14,6 +14,7 @@ from flasher.cli.recording import add_recording, recorded_connection
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.survey_text import heard_document, heard_lines
 from flasher.errors import ExitCode, NoAnswerError
+from flasher.protocol.spec import WELLING, Dialect
 from flasher.service import DeviceInfo, Reading
 
 _DESCRIPTION = """\
@@ -108,12 +109,15 @@ def _lines(found: DeviceInfo) -> list[str]:
     lines = [f"{node}, {found.dialect.name} dialect"]
     if not found.readings:
         lines.append("The documents give no question to ask it; this is what it sent by itself:")
-        return lines + heard_lines(found.survey.heard[found.target.node], contents=True)
+        lines += heard_lines(found.survey.heard[found.target.node], contents=True)
+        if found.survey.faults:
+            lines += ["", "faults of the battery", *content_lines(found.survey.faults)]
+        return lines
     for reading in found.readings:
         if reading.answer is not None:
             lines += ["", _title(reading), *content_lines(reading.answer)]
     faults = found.survey.faults
-    lines += ["", "faults", *(content_lines(faults) if faults else [_no_faults()])]
+    lines += ["", "faults", *(content_lines(faults) if faults else [_no_faults(found.dialect)])]
     missing = [reading for reading in found.readings if reading.answer is None]
     if missing:
         lines += ["", "not answered"]
@@ -130,8 +134,11 @@ def _title(reading: Reading) -> str:
     return reading.name.replace("-", " ")
 
 
-def _no_faults() -> str:
-    return row_line("faults", "none reported")
+def _no_faults(dialect: Dialect) -> str:
+    """A fault is heard, not asked for: how long to wait for one only one document says."""
+    is_periodic = dialect is WELLING
+    proviso = "" if is_periodic else "; how often they are sent is not documented: see monitor"
+    return row_line("faults", f"none heard{proviso}")
 
 
 def _why(reading: Reading) -> str:

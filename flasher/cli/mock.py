@@ -264,7 +264,7 @@ class _Watcher:
                     "written", f"{name}: {after or 'empty'} (before: {before or 'empty'})", event
                 )
             case events.ShutdownAnnounced(why):
-                self._say("power", f"shutdown announced: {why}", event)
+                self._say("power", f"SHUTDOWN sent: {why}", event)
             case events.ShutdownEnded(ready, silent):
                 others = f"; no answer from {', '.join(silent)}" if silent else ""
                 self._say("power", f"off; ready: {', '.join(ready) or 'nobody'}{others}", event)

@@ -8,6 +8,7 @@ import sys
 from contextlib import ExitStack
 from typing import Final, TypedDict
 
+from flasher.api import as_dialect
 from flasher.cli import arguments
 from flasher.cli.monitor_views import FrameLine, Lines, SeenLine, Table, View
 from flasher.cli.output import Output, counted
@@ -126,6 +127,7 @@ def run(options: argparse.Namespace, output: Output) -> int:
         count=options.count,
         duration_s=options.duration,
         pulse_s=REFRESH_S if view.is_live else None,
+        dialect=as_dialect(options.dialect),
     )
     with ExitStack() as stack:
         if options.trace is None:

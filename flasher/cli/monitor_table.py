@@ -6,10 +6,11 @@ bus says enters as `Text`, which is never read as markup.
 
 from __future__ import annotations
 
+from textwrap import wrap
 from typing import Final
 
 from rich.box import SIMPLE_HEAD
-from rich.console import Console, ConsoleDimensions, RenderableType
+from rich.console import Console, ConsoleDimensions, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
@@ -39,12 +40,20 @@ class BoardView:
     def draw(self, board: Board, now: float, title: str) -> RenderableType:
         """The board at `now`."""
         size = self._console.size
-        wide = size.width >= WIDE
         lines = list(board.lines())
-        room = max(size.height - _FRAME_LINES, 1)
+        faults = _fault_lines(lines, size.width, size.height - _FRAME_LINES - 1)
+        if size.height <= _FRAME_LINES + 1 and faults:
+            title, faults = faults[0], []
+        table = self._table(lines, now, title, size.height - len(faults))
+        return Group(*(Text(line, style=_TROUBLE, no_wrap=True) for line in faults), table)
+
+    def _table(self, lines: list[Line], now: float, title: str, height: int) -> Table:
+        size = self._console.size
+        wide = size.width >= WIDE
+        room = max(height - _FRAME_LINES, 1)
         if size != self._too_long_for and len(lines) <= room:
             view = _by_field(lines, now, title, wide=wide)
-            if len(self._console.render_lines(view, pad=False)) < size.height:
+            if len(self._console.render_lines(view, pad=False)) < height:
                 return view
         self._too_long_for = size
         view = _by_message(lines[:room], now, title, wide=wide)
@@ -52,6 +61,25 @@ class BoardView:
             more = f"{len(lines) - room} more: make the window higher, or use --node or --message"
             view.caption = Text(more, style="dim", no_wrap=True, overflow="ellipsis")
         return view
+
+
+def _fault_lines(lines: list[Line], width: int, room: int) -> list[str]:
+    """All faults that are set, over the whole width, since the columns of a table cut them. Those
+    that have no room are counted.
+    """
+    wrapped = [
+        part
+        for line in lines
+        for shown in line.seen.fields
+        if line.seen.is_alarm and shown.name == "faults"
+        for part in wrap(f"FAULTS of the {line.seen.sender}: {shown.text}", width)
+    ]
+    if len(wrapped) <= room:
+        return wrapped
+    shown_lines = wrapped[: max(room - 1, 0)]
+    left = " ".join(wrapped[len(shown_lines) :]).count(",") + 1
+    more = "more " if shown_lines else ""
+    return [*shown_lines, f"{left} {more}FAULTS: make the window higher"[:width]]
 
 
 def _longest(text: str) -> str:
@@ -126,7 +154,7 @@ def _column(
 def _head(line: Line, *, wide: bool) -> list[Text]:
     seen = line.seen
     style = _TROUBLE if seen.is_trouble else ""
-    cells = [Text(f"{seen.can_id:03X}"), Text(seen.title, style=style)]
+    cells = [Text(f"{seen.can_id:03X}"), Text(seen.marked_title, style=style)]
     if wide:
         cells.insert(1, Text(route(seen)))
     return cells

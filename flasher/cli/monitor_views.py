@@ -38,6 +38,8 @@ class SeenLine(_Route):
     fields: dict[str, FieldValue]
     changed: list[str]
     """Fields that differ from the same message before."""
+    in_dialect: bool
+    """False for a message that the document of --dialect does not have."""
 
 
 class FrameLine(TypedDict):
@@ -184,9 +186,10 @@ class Table(View):
 
 def _line(seen: Seen, at_s: float, changed: frozenset[str], *, cut: bool) -> str:
     """Time, id, sender to receiver, title, fields with units."""
+    cut = cut and not seen.is_alarm  # no fault is left out
     said = ", ".join(_field_text(shown, shown.name in changed, cut=cut) for shown in seen.fields)
     mark = "! " if seen.is_trouble else ""
-    text = f"{at_s:10.3f}  {seen.can_id:03X}  {route(seen):<9}  {mark}{seen.title}"
+    text = f"{at_s:10.3f}  {seen.can_id:03X}  {route(seen):<9}  {mark}{seen.marked_title}"
     return f"{text}: {said}" if said else text
 
 
@@ -210,6 +213,7 @@ def _document(seen: Seen, at_s: float, changed: frozenset[str]) -> SeenLine:
         "trouble": seen.is_trouble,
         "fields": {shown.name: shown.value for shown in seen.fields},
         "changed": sorted(changed),
+        "in_dialect": seen.in_dialect,
     }
 
 

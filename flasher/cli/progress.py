@@ -133,7 +133,7 @@ def _warning(event: object) -> str:
     """What nobody should miss, in words; empty for any other event."""
     match event:
         case events.ShutdownHeard(sender):
-            return f"the {sender} announces SHUTDOWN: it switches off"
+            return f"the {sender} sent the command SHUTDOWN: it switches off"
         case events.AdapterLost(reason, wait_s):
             return f"{reason} Waiting {wait_s:g} s for the adapter ..."
         case events.CheckMade(_, "warned" | "waived", text):

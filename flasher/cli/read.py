@@ -10,7 +10,7 @@ from typing import Any, Final, Literal, NotRequired, Self, TypedDict
 
 from flasher import api, service
 from flasher.cli import arguments
-from flasher.cli.content_text import content_document, content_lines, row_line
+from flasher.cli.content_text import content_document, content_lines
 from flasher.cli.documents import FieldValue
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.output import Output, byte_count
@@ -123,13 +123,10 @@ def _read_item(
             cancelled=stopped,
         )
     document = content_document(answer)
+    for line in content_lines(answer, entry.field):
+        output.result(line)
     if entry.field:
-        codec = dict(answer.LAYOUT)[entry.field]
-        output.result(row_line(label(entry.field, codec), codec.show(getattr(answer, entry.field))))
         document = {entry.field: document[entry.field]}
-    else:
-        for line in content_lines(answer):
-            output.result(line)
     output.document(ItemDocument(target=target.name, item=entry.name, fields=document))
     return ExitCode.OK
 

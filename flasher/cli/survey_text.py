@@ -8,6 +8,7 @@ from flasher.cli.content_text import content_document, content_rows, row_line
 from flasher.cli.documents import HeardDocument
 from flasher.cli.output import counted
 from flasher.host.survey import Heard
+from flasher.trace.decoder import NOT_IN_DIALECT
 
 _SHOWN_AT_MOST: Final = 40
 """Kinds of message listed: a babbling node must not fill the screen."""
@@ -19,7 +20,8 @@ def heard_lines(heard: Heard, *, contents: bool = False) -> list[str]:
     if heard.boot_version:
         lines.append(row_line("bootloader", heard.boot_version))
     for title, times in sorted(heard.messages.items())[:_SHOWN_AT_MOST]:
-        lines.append(row_line(title, f"{times} times" if times > 1 else "once"))
+        mark = f" {NOT_IN_DIALECT}" if title in heard.not_in_dialect else ""
+        lines.append(row_line(title, (f"{times} times" if times > 1 else "once") + mark))
         if contents and title in heard.last:
             lines += ["  " + row_line(*row) for row in content_rows(heard.last[title])]
     left_out = len(heard.messages) - _SHOWN_AT_MOST
@@ -38,4 +40,5 @@ def heard_document(heard: Heard) -> HeardDocument:
         "last": {title: content_document(content) for title, content in heard.last.items()},
         "damaged": heard.damaged,
         "boot_version": heard.boot_version or None,
+        "not_in_dialect": sorted(heard.not_in_dialect),
     }

@@ -45,7 +45,7 @@ class UpgradeDocument(TypedDict):
     outcome: OutcomeDocument
     verification: VerificationDocument
     shutdown_heard: bool
-    """The battery announced meanwhile that it switches off."""
+    """The battery sent SHUTDOWN meanwhile."""
     link: NotRequired[Annotated[dict[str, object], LinkReport]]
     """Times on the line; missing when no packet was answered."""
 

@@ -27,7 +27,7 @@ class Result:
     outcome: Outcome
     verification: Verification = NOT_ASKED
     shutdown_heard: bool = False
-    """The battery announced that it switches off while the session ran."""
+    """The battery sent SHUTDOWN while the session ran."""
 
     @property
     def ok(self) -> bool:
@@ -51,5 +51,5 @@ class Result:
         """The error that stands for it; None when it is good, or there was nothing to do."""
         error = self.outcome.error() or self.verification.error(self.outcome.target)
         if self.shutdown_heard and isinstance(error, _BY_LOST_POWER):
-            error.cause = f"the battery announced SHUTDOWN and switched off; else {error.cause}"
+            error.cause = f"the battery sent SHUTDOWN and switched off; else {error.cause}"
         return error

@@ -14,7 +14,7 @@ from typing import Final
 
 from flasher.host.query import Queries, Query, Request
 from flasher.protocol import catalogue, messages
-from flasher.protocol.contents import Faults
+from flasher.protocol.contents import Fault, Faults
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import MOTINOVA, WELLING, Command, Dialect, Node, can_id
@@ -43,6 +43,8 @@ class Heard:
     """Stretches of bytes that made no message."""
     boot_version: str = ""
     """What its bootloader announced, escaped; empty when it did not."""
+    not_in_dialect: set[str] = field(default_factory=set)
+    """Titles of messages that the dialect which was asked for does not have."""
 
 
 class Survey:
@@ -61,6 +63,7 @@ class Survey:
         timings: Timings = DEFAULT_TIMINGS,
     ) -> None:
         self.heard: dict[Node, Heard] = {}
+        self._faults: Faults | None = None
         self.foreign_frames = 0
         """Frames under ids that the documents do not give."""
         self.cancelled = False
@@ -87,10 +90,10 @@ class Survey:
 
     @property
     def faults(self) -> Faults | None:
-        """The last faults that the BMS reported; None when it reported none."""
-        bms = self.heard.get(Node.BMS)
-        found = [c for c in bms.last.values() if isinstance(c, Faults)] if bms else []
-        return found[-1] if found else None
+        """All faults that the BMS reported, also those that it did not report last; None when it
+        reported none.
+        """
+        return self._faults
 
     def guess_dialect(self) -> tuple[Dialect | None, str]:
         """The dialect that the traffic speaks, and why; None when nothing tells."""
@@ -205,6 +208,9 @@ class Survey:
         if decoded is not None:
             title = _title(decoded.item)
             heard.last[title] = decoded.content
+            if isinstance(decoded.content, Faults) and heard.node is Node.BMS:
+                before = Fault(0) if self._faults is None else self._faults.faults
+                self._faults = Faults(before | decoded.content.faults)
         elif found.command in _UPGRADE:
             row = messages.decode(found)
             if isinstance(row, messages.BootVersion):
@@ -213,6 +219,8 @@ class Survey:
         else:
             title = f"{found.can_id:03X} {found.command:04X} (not in the documents)"
         heard.messages[title] += 1
+        if not catalogue.has_message(self._dialect, found):
+            heard.not_in_dialect.add(title)
 
 
 def _title(item: catalogue.Item) -> str:

@@ -72,7 +72,7 @@ ITEMS: Final = (
     Item(_BMS, None, _P, 0x1010, contents.RunningInformation, "running information"),
     Item(_BMS, None, _P, 0x1120, contents.CellVoltages, "cell voltages"),
     Item(_BMS, None, _P, 0x1204, contents.Faults, "faults"),
-    Item(_BMS, None, _P, 0x1308, contents.Shutdown, "shutdown announced"),
+    Item(_BMS, None, _P, 0x1308, contents.Shutdown, "SHUTDOWN"),
     Item(_BMS, None, _P, 0x1410, contents.DesignInformation, "design information"),
     Item(_BMS, None, _P, _VERSION, contents.VersionInformation, "version information"),
     Item(_BMS, None, _P, 0x160C, contents.PhysicalId, "physical id"),
@@ -87,7 +87,7 @@ ITEMS: Final = (
     Item(_BMS, _CDL, _P, 0x5688, contents.Memory, "memory"),
     # 5.2, sent by the others.
     Item(_WMC, None, _P, 0x1305, contents.Ready, "ready for shutdown"),
-    Item(_WMC, None, _P, 0x1808, contents.Shutdown, "shutdown announced", dialects=_OLD),
+    Item(_WMC, None, _P, 0x1808, contents.Shutdown, "SHUTDOWN", dialects=_OLD),
     Item(_WMC, _BMS, _R, 0x3009, contents.Handshake, "handshake", 0x3005),
     Item(_WMC, _BMS, _R, 0x3100, contents.Empty, "read physical id", 0x160C),
     Item(_WMC, _BMS, _R, 0x3200, contents.Empty, "read check code", 0x170C),
@@ -132,6 +132,7 @@ ITEMS: Final = (
     Item(_CDL, _BMS, _R, 0x4308, contents.ReadMemory, "read memory", 0x5688),
 )  # fmt: skip
 
+_UPGRADE: Final = frozenset(Command) - {item.command for item in ITEMS}
 BY_KEY: Final = {item.key: item for item in ITEMS}
 
 
@@ -166,6 +167,16 @@ def decode(message: Message, dialect: Dialect | None = None) -> Decoded | None:
     if len(message.data) != data_size(item.command):
         return None
     return Decoded(item, item.content.from_data(message.data))
+
+
+def has_message(dialect: Dialect, message: Message) -> bool:
+    """False for a message of the documents that is not in this dialect's: another dialect's row, or
+    the upgrade where it was cancelled.
+    """
+    item = BY_KEY.get((message.can_id, message.command))
+    if item is not None:
+        return dialect in item.dialects
+    return dialect.has_upgrade or message.command not in _UPGRADE
 
 
 def encode(item: Item, content: Content) -> Message:

@@ -5,11 +5,11 @@ which command stands in `catalogue`.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntFlag
 from typing import Any, Final
 
 from flasher.protocol.fields import (
     Address,
+    Bits,
     Bytes,
     Content,
     DateField,
@@ -34,14 +34,16 @@ def _temperature() -> Any:
     return number(1, "°C", offset=TEMPERATURE_OFFSET_C)
 
 
-class Status(IntFlag):
-    """Status bits of the running information; 0 means asleep, the other bits are reserved."""
+class Status(Bits):
+    """Status bits of the running information; 0 may mean asleep, or awake without charger (R21)."""
 
     CHARGER_CONNECTED = 0x01
 
 
-class Fault(IntFlag):
-    """Faults: warnings in the upper half, protections and defects in the lower (5.1)."""
+class Fault(Bits):
+    """Faults: warnings in the upper half, protections and defects in the lower (5.1). The document
+    has nothing on the other bits, and does not reserve them (R24).
+    """
 
     SECOND_LEVEL_DISCHARGE_OVER_CURRENT_PROTECTION = 1 << 0
     CHARGE_OVER_CURRENT_PROTECTION = 1 << 1
@@ -68,6 +70,10 @@ class Fault(IntFlag):
     DISCHARGE_OVER_TEMPERATURE_WARNING = 1 << 22
     DISCHARGE_UNDER_TEMPERATURE_WARNING = 1 << 23
     MOS_OVER_TEMPERATURE_WARNING = 1 << 24
+
+    @classmethod
+    def unnamed(cls, bit: int) -> str:
+        return f"bit {bit} (not in the document)"
 
 
 @dataclass(frozen=True)
@@ -121,9 +127,9 @@ class RunningInformation(Content):
     full_capacity_mah: int = number(2, "mAh")
     cell_temperature_c: int = _temperature()
     state_of_charge_percent: int = number(1, "%")
-    status: Status = field(Flags(1, Status, none="asleep"))
+    status: Status = field(Flags(1, Status, none="no flag (00)"))
     state_of_health_percent: int = number(1, "%")
-    """0 from older devices, which do not know it (section 6)."""
+    """0 may be an older device's, which does not know it (R22)."""
     reserved: bytes = reserved(4)
 
 

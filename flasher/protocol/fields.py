@@ -9,6 +9,7 @@ range of their meaning, broken texts and reserved bytes are kept as they came.
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import IntFlag
@@ -103,30 +104,45 @@ class Numbers:
         return " ".join(map(str, value[:used])) or "none"
 
 
+class Bits(IntFlag):
+    """Named bits; the document reserves the others."""
+
+    @classmethod
+    def unnamed(cls, bit: int) -> str:
+        """What a bit without a name is called."""
+        return f"reserved bit {bit}"
+
+
+_ABBREVIATIONS: Final = re.compile(r"\b(?:afe|mcu|mos)\b")
+
+
 @dataclass(frozen=True)
 class Flags:
     """A set of named bits, little-endian; unknown bits are kept."""
 
     size_bytes: int
-    names: type[IntFlag]
+    names: type[Bits]
     none: str = "none"
     unit: str = ""
 
     def encode(self, value: int) -> bytes:
         return _integer(int(value), int(value), self.size_bytes)
 
-    def decode(self, raw: bytes) -> IntFlag:
+    def decode(self, raw: bytes) -> Bits:
         return self.names(int.from_bytes(raw, "little"))
 
     def show(self, value: int) -> str:
-        return ", ".join(flag_names(self.names, value)) or self.none
+        words = ", ".join(flag_names(self.names, value)) or self.none
+        return _ABBREVIATIONS.sub(lambda found: found[0].upper(), words)
 
 
-def flag_names(names: type[IntFlag], value: int) -> list[str]:
-    """The names of the bits that are set, in order; an unnamed bit as its number."""
+def flag_names(names: type[Bits], value: int) -> list[str]:
+    """The names of the bits that are set, in order, as JSON has them; an unnamed bit as its
+    number.
+    """
     named = {int(flag): (flag.name or "").lower().replace("_", " ") for flag in names}
     bits = (1 << bit for bit in range(int(value).bit_length()) if value >> bit & 1)
-    return [named.get(bit, f"reserved bit {bit.bit_length() - 1}") for bit in bits]
+    return [named.get(bit) or names.unnamed(bit.bit_length() - 1) for bit in bits]
 
 
 @dataclass(frozen=True)
@@ -315,6 +331,16 @@ _UNIT_SUFFIXES: Final = {"mV": "_mv", "V": "_v", "mA": "_ma", "mAh": "_mah", "°
                          "%": "_percent", "h": "_h", "min": "_min"}  # fmt: skip
 
 
+_OWN_LABELS: Final = {
+    "full_capacity": "full-charge capacity",
+    "latest_charge_interval": "most recent charge interval",
+}
+
+
 def label(name: str, codec: Codec) -> str:
     """A field's name for people: without the unit that follows the value."""
-    return name.removesuffix(_UNIT_SUFFIXES.get(codec.unit, "")).replace("_", " ")
+    bare = name.removesuffix(_UNIT_SUFFIXES.get(codec.unit, ""))
+    if bare.endswith("_count"):  # of the history; warnings have the same names (chapter 3)
+        bare = f"{bare.removesuffix('count')}protection_count"
+        bare = re.sub("(over|under|short)_", r"\1-", bare)
+    return _OWN_LABELS.get(bare, bare.replace("_", " "))

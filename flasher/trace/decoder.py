@@ -10,14 +10,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
-from enum import Enum, IntFlag
+from enum import Enum
 from typing import Any, Final, NamedTuple
 
 from flasher.protocol import catalogue, messages
 from flasher.protocol.contents import Faults
-from flasher.protocol.fields import Content, Reserved, Text, flag_names, label
+from flasher.protocol.fields import Bits, Content, Reserved, Text, flag_names, label
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import TARGETS, Mode, Node, can_id
+from flasher.protocol.spec import TARGETS, Dialect, Mode, Node, can_id
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Damage, Message, Reassembler
@@ -63,6 +63,13 @@ class Seen:
     fields: tuple[Field, ...] = ()
     is_alarm: bool = False
     """An intact message that tells of trouble: a NAK, or faults that are set."""
+    in_dialect: bool = True
+    """False for a message that the dialect which was asked for does not have."""
+
+    @property
+    def marked_title(self) -> str:
+        """The title, marked where the dialect does not have the message."""
+        return self.title if self.in_dialect else f"{self.title} {NOT_IN_DIALECT}"
 
     @property
     def is_trouble(self) -> bool:
@@ -71,7 +78,9 @@ class Seen:
 
 
 BROADCAST: Final = "all"
+NOT_IN_DIALECT: Final = "(not in this dialect)"
 _HEALTH: Final = "state_of_health_percent"
+_OLDER: Final = "or an older device, which does not know it"
 _ROUTES: Final = {
     can_id(sender, receiver): (sender.name, BROADCAST if receiver is None else receiver.name)
     for sender in Node
@@ -108,11 +117,16 @@ def message_titles() -> tuple[str, ...]:
 
 
 class Decoder:
-    """Tells what the frames of a bus say. Give it every frame, and `tick` at `deadline`."""
+    """Tells what the frames of a bus say, in either dialect; with a `dialect`, what that one does
+    not have is marked. Give it every frame, and `tick` at `deadline`.
+    """
 
     def __init__(
-        self, inter_frame_timeout_s: float = DEFAULT_TIMINGS.inter_frame_timeout_s
+        self,
+        inter_frame_timeout_s: float = DEFAULT_TIMINGS.inter_frame_timeout_s,
+        dialect: Dialect | None = None,
     ) -> None:
+        self._dialect = dialect
         self._streams = {key: Reassembler(key, inter_frame_timeout_s) for key in _ROUTES}
         self._holding: dict[int, Reassembler] = {}
         """The streams that hold the beginning of something: seldom more than two or three."""
@@ -127,7 +141,7 @@ class Decoder:
             yield _foreign(frame, now)
             return
         for found in stream.feed(frame.data, now):
-            yield _describe(found, now)
+            yield self._describe(found, now)
         if stream.held_size:
             self._holding[frame.can_id] = stream
         else:
@@ -142,19 +156,21 @@ class Decoder:
         """What was cut short: the rest of a message that did not come in time (R12)."""
         for key, stream in list(self._holding.items()):
             for found in stream.tick(now):
-                yield _describe(found, now)
+                yield self._describe(found, now)
             if not stream.held_size:
                 del self._holding[key]
 
-
-def _describe(found: Message | Damage, now: float) -> Seen:
-    sender, receiver = _ROUTES[found.can_id]
-    if isinstance(found, Damage):
-        fields = (_plain("reason", found.reason.value), _raw("bytes", found.data))
-        title = Kind.DAMAGED.value
-        return Seen(now, Kind.DAMAGED, found.can_id, title, sender, receiver, fields=fields)
-    kind, title, shown, alarm = _judge(found)
-    return Seen(now, kind, found.can_id, title, sender, receiver, found.command, shown, alarm)
+    def _describe(self, found: Message | Damage, now: float) -> Seen:
+        sender, receiver = _ROUTES[found.can_id]
+        if isinstance(found, Damage):
+            fields = (_plain("reason", found.reason.value), _raw("bytes", found.data))
+            title = Kind.DAMAGED.value
+            return Seen(now, Kind.DAMAGED, found.can_id, title, sender, receiver, fields=fields)
+        kind, title, shown, alarm = _judge(found)
+        return Seen(
+            now, kind, found.can_id, title, sender, receiver, found.command, shown, alarm,
+            in_dialect=self._dialect is None or catalogue.has_message(self._dialect, found),
+        )  # fmt: skip
 
 
 def _judge(message: Message) -> tuple[Kind, str, tuple[Field, ...], bool]:
@@ -187,19 +203,27 @@ def _goes_this_way(row: messages.Row, of_id: int) -> bool:
 
 
 def content_fields(content: Content) -> tuple[Field, ...]:
-    """The fields of a message of chapter 3; reserved bytes only if they are not zero. State of
-    health 0 is an older device's, which does not know it (section 6): None.
-    """
+    """The fields of a message of chapter 3; reserved bytes only if they are not zero."""
     fields = []
     for name, codec in content.LAYOUT:
         value = getattr(content, name)
         if not isinstance(codec, Reserved) or any(value):
             shown = Field(name, _plain_value(value), label(name, codec), codec.show(value))
-            if name == _HEALTH and value == 0:
-                fields.append(shown._replace(value=None, text="not given"))
+            remark = _remark(name, codec.unit, value)
+            if remark:
+                fields.append(shown._replace(text=f"{shown.text} {codec.unit} ({remark})"))
             else:
                 fields.append(shown._replace(unit=codec.unit))
     return tuple(fields)
+
+
+def _remark(name: str, unit: str, value: object) -> str:
+    """What has to be said beside a percentage that is shown as it came (R22)."""
+    if unit != "%" or not isinstance(value, int):
+        return ""
+    if value > 100:
+        return "more than the document allows"
+    return _OLDER if name == _HEALTH and value == 0 else ""
 
 
 def _row_fields(row: messages.Row) -> tuple[Field, ...]:
@@ -252,7 +276,7 @@ def _raw(name: str, data: bytes) -> Field:
 def _plain_value(value: object) -> Any:
     """A value as JSON holds it: numbers, texts, lists of them; bytes in hexadecimal."""
     match value:
-        case IntFlag():
+        case Bits():
             return flag_names(type(value), value)
         case Text():
             return str(value)

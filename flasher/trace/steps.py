@@ -109,7 +109,8 @@ class StepList:
 def step_of(seen: Seen, at_s: float) -> Step:
     """A thing seen as a line."""
     kind = StepKind.DAMAGED if seen.kind is Kind.DAMAGED else StepKind.MESSAGE
-    said = ", ".join(_field_text(shown) for shown in seen.fields if _says_something(shown))
+    width = None if seen.is_alarm else _VALUE_WIDTH  # no fault is left out
+    said = ", ".join(_field_text(shown, width) for shown in seen.fields if _says_something(shown))
     return Step(
         at_s,
         kind,
@@ -127,8 +128,8 @@ def _says_something(shown: Field) -> bool:
     return shown.name not in ("payload", "text")
 
 
-def _field_text(shown: Field) -> str:
+def _field_text(shown: Field, width: int | None) -> str:
     text = shown.text
-    if len(text) > _VALUE_WIDTH:
-        text = f"{text[:_VALUE_WIDTH].rstrip()} ..."
+    if width is not None and len(text) > width:
+        text = f"{text[:width].rstrip()} ..."
     return f"{shown.label} {text} {shown.unit}".rstrip()

@@ -56,7 +56,7 @@ class Cause(Enum):
     PACKET_DAMAGED = "damaged frames in the transfer"
     DEVICE_RESTARTED = "the device restarted in the middle"
     SECOND_TOOL = "two tools speak on the bus"
-    SHUTDOWN = "the battery announced that it switches off"
+    SHUTDOWN = "the battery sent SHUTDOWN: it switches off"
     BUS_TROUBLE = "error frames on the bus"
     TOOL_STOPPED = "the tool fell silent in the middle"
     TOOL_ENDED = "the tool gave up in the middle"
@@ -215,7 +215,7 @@ class UpgradeStory:
     """None when no packet was sent."""
     remarks: tuple[str, ...]
     """What else was remarkable, whatever the verdict: restarts that were recovered from, error
-    frames, queries in the middle, an announced shutdown."""
+    frames, queries in the middle, SHUTDOWN."""
     verdict: Verdict
 
 

@@ -124,7 +124,7 @@ def _spoiled(upgrade: Facts, *, is_alone: bool) -> _Found | None:
         return _Found(Cause.COMPLETE_TOO_EARLY, text)
     if upgrade.shutdown_at_s is not None:
         after_s = upgrade.shutdown_at_s - upgrade.begin_s
-        text = f"The battery announced SHUTDOWN {after_s:.2f} s after the begin of the upgrade, "
+        text = f"The battery sent SHUTDOWN {after_s:.2f} s after the begin of the upgrade, "
         text += "which was not completed."
         return _Found(Cause.SHUTDOWN, text)
     if upgrade.errors_now >= _ERRORS:
@@ -260,7 +260,7 @@ def remarks(upgrade: Facts, cause: Cause) -> tuple[str, ...]:
     if names and upgrade.target.boot_name not in names and cause is not Cause.WRONG_DEVICE:
         found.append(f"boot name is {', '.join(sorted(names))}, not {upgrade.target.boot_name}")
     if upgrade.shutdown_at_s is not None and cause is not Cause.SHUTDOWN:
-        found.append("the battery announced SHUTDOWN in the meantime")
+        found.append("the battery sent SHUTDOWN in the meantime")
     if upgrade.intrusions and cause is not Cause.SECOND_TOOL:
         found.append(f"not explained by this upgrade: {'; '.join(upgrade.intrusions)}")
     if upgrade.errors and cause not in {Cause.BUS_TROUBLE, Cause.NOBODY_ACKNOWLEDGES}:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from flasher.protocol.frame import Frame
+from flasher.protocol.spec import Dialect
 from flasher.trace.decoder import Decoder, Kind, Seen
 
 RATE_WINDOW_S: Final = 5.0
@@ -81,8 +82,9 @@ class Watcher:
         count: int | None = None,
         duration_s: float | None = None,
         pulse_s: float | None = None,
+        dialect: Dialect | None = None,
     ) -> None:
-        self._decoder = Decoder()
+        self._decoder = Decoder(dialect=dialect)
         self._filter = shown
         self._raw = raw
         self._left = count

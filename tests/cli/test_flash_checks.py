@@ -236,9 +236,9 @@ def test_a_battery_that_switches_off_is_named_as_the_cause(
         stage.at_packet[at_packet] = switch_off
     run = bench.flash(stage, "--attempts", "1", "--json")
     assert run.document["shutdown_heard"] is True
-    assert "warning: the BMS announces SHUTDOWN" in run.err
+    assert "warning: the BMS sent the command SHUTDOWN" in run.err
     if run.code != ExitCode.OK:
-        assert "the battery announced SHUTDOWN" in run.document["error"]["cause"]
+        assert "the battery sent SHUTDOWN" in run.document["error"]["cause"]
     assert (run.code == ExitCode.OK) is (at_packet is None)
 
 

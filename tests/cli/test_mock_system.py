@@ -178,7 +178,7 @@ def test_faults_and_an_idle_shutdown_can_be_set(flasher: Flasher, serve: Serve) 
     tool = Tool()
     serve(tool, 2000.0)
     run = flasher("mock", "-t", "bms", "--set", "idle_shutdown=on", "--set", "battery_use=resting")
-    assert "power:   shutdown announced: bus idle\n" in run.out
+    assert "power:   SHUTDOWN sent: bus idle\n" in run.out
     assert "power:   off; ready: nobody; no answer from WMC, OBC\n" in run.out
     assert "state:   off\n" in run.out
     tool = Tool()

@@ -65,7 +65,7 @@ def test_a_trace_is_one_line_a_message_with_units_and_changes(
     assert len(lines) == 6
     assert lines[0] == (
         "     0.000  720  BMS > all  running information: voltage 36000 mV, mean current -1000 mA, "
-        "remaining capacity 9000 mAh, full capacity 10400 mAh, cell temperature 25 °C, "
+        "remaining capacity 9000 mAh, full-charge capacity 10400 mAh, cell temperature 25 °C, "
         "state of charge 80 %, status charger connected, state of health 98 %"
     )
     assert lines[1].startswith(
@@ -259,12 +259,12 @@ def drawn(board: Board, *, width: int, height: int) -> list[str]:
 
 def test_a_high_window_has_a_row_a_field_with_values_and_units_to_the_right() -> None:
     lines = drawn(board_of(traffic.running(), traffic.running(OTHER)), width=120, height=40)
-    labels = ("voltage", "full capacity", "state of charge")
+    labels = ("voltage", "full-charge capacity", "state of charge")
     by_label = {label: line for line in lines for label in labels if label in line}
     ends = {label: line.rstrip() for label, line in by_label.items()}
-    assert ends["full capacity"].endswith("10400    mAh")
+    assert ends["full-charge capacity"].endswith("10400    mAh")
     assert ends["state of charge"].endswith("80      %")
-    assert len(ends["full capacity"]) == len(ends["state of charge"])
+    assert len(ends["full-charge capacity"]) == len(ends["state of charge"])
     assert "*35999     mV" in by_label["voltage"]
     assert "BMS > all" in by_label["voltage"]
 
@@ -281,6 +281,46 @@ def test_a_low_window_has_a_row_a_message() -> None:
     (row,) = [line for line in lines if "running information" in line]
     assert "voltage 36000 mV, mean current" in row
     assert len(lines) < 12
+
+
+@pytest.mark.parametrize("width", [80, 120])
+def test_no_fault_is_cut_off(flasher: Flasher, tmp_path: Path, width: int) -> None:
+    faults = b"\xff" * 4
+    board = board_of(
+        *(traffic.frames(0x752, 0x11, command << 8, b"") for command in range(0x30, 0x3A)),
+        traffic.faults(faults),
+    )
+    shown = " ".join(line.strip() for line in drawn(board, width=width, height=24))
+    assert "bit 31 (not in the document)" in shown
+    for name in ("AFE fault", "MCU fault", "MOS over temperature warning"):
+        assert name in shown
+    with Recorder(tmp_path / "t.asc") as record:
+        for frame in traffic.faults(faults):
+            record(frame, sent=False, now=0.0)
+    for command in ("monitor", "explain"):
+        assert "bit 31 (not in the document)" in flasher(command, tmp_path / "t.asc").out
+
+
+def test_faults_that_have_no_room_are_counted() -> None:
+    lines = drawn(board_of(traffic.faults(b"\xff" * 4)), width=80, height=9)
+    assert lines[0].strip() == "32 FAULTS: make the window higher"
+    assert len(lines) <= 9
+
+
+def test_what_the_dialect_does_not_have_is_marked(flasher: Flasher, tmp_path: Path) -> None:
+    path = tmp_path / "t.asc"
+    hmi = traffic.frames(0x742, 0x11, 0x5000, b"")
+    goodbye = traffic.frames(0x710, REPORT, 0x1808, b"SHUTDOWN")
+    with Recorder(path) as record:
+        for frame in (*hmi, *goodbye, *traffic.nak(), *traffic.running()):
+            record(frame, sent=False, now=0.0)
+    marked = {"welling": ["742 5000"], "motinova": ["710 1808", "725 C302"]}
+    for dialect, wanted in marked.items():
+        lines = documents(flasher("monitor", path, "--dialect", dialect, "--json").out)[:-1]
+        found = [f"{line['can_id']:03X} {line['command']:04X}" for line in lines]
+        assert [f for f, line in zip(found, lines, strict=True) if not line["in_dialect"]] == wanted
+        shown = flasher("monitor", path, "--dialect", dialect).out.splitlines()
+        assert sum("(not in this dialect)" in line for line in shown) == len(wanted)
 
 
 def test_what_has_no_room_is_counted() -> None:

@@ -326,7 +326,7 @@ UPPER_HALF: Final = (
     (0x0020, "charge under temperature warning"),
     (0x0040, "discharge over temperature warning"),
     (0x0080, "discharge under temperature warning"),
-    (0x0100, "mos over temperature warning"),
+    (0x0100, "MOS over temperature warning"),
 )
 LOWER_HALF: Final = (
     (0x0001, "second level discharge over current protection"),
@@ -338,13 +338,13 @@ LOWER_HALF: Final = (
     (0x0040, "discharge over temperature protection"),
     (0x0080, "charge under temperature protection"),
     (0x0100, "charge over temperature protection"),
-    (0x0200, "discharge mos fault"),
-    (0x0400, "charge mos fault"),
+    (0x0200, "discharge MOS fault"),
+    (0x0400, "charge MOS fault"),
     (0x0800, "temperature sensor fault"),
     (0x1000, "first level over current warning"),
     (0x2000, "first level over current protection"),
-    (0x4000, "afe fault"),
-    (0x8000, "mcu fault"),
+    (0x4000, "AFE fault"),
+    (0x8000, "MCU fault"),
 )
 
 
@@ -381,13 +381,13 @@ def test_no_other_bit_has_a_name() -> None:
 def test_an_unnamed_fault_is_kept_and_shown_by_its_number(bit: int) -> None:
     data = b"\x00\x00\x00" + bytes([1 << (bit - 24)])
     assert contents.Faults.from_data(data).data() == data
-    assert shown_faults(data) == f"reserved bit {bit}"
+    assert shown_faults(data) == f"bit {bit} (not in the document)"
 
 
 def test_several_faults_are_shown_in_the_order_of_their_bits() -> None:
     assert shown_faults(bytes.fromhex("04 80 01 03")) == (
-        "short circuit protection, mcu fault, charge over voltage warning, "
-        "mos over temperature warning, reserved bit 25"
+        "short circuit protection, MCU fault, charge over voltage warning, "
+        "MOS over temperature warning, bit 25 (not in the document)"
     )
 
 
@@ -398,7 +398,7 @@ def test_no_fault_is_shown_as_none() -> None:
 @pytest.mark.parametrize(
     ("status", "shown"),
     [
-        (0x00, "asleep"),
+        (0x00, "no flag (00)"),
         (0x01, "charger connected"),
         (0x02, "reserved bit 1"),
         (0x81, "charger connected, reserved bit 7"),
@@ -421,7 +421,7 @@ def test_the_status_is_shown_by_its_bits(status: int, shown: str) -> None:
                 ("voltage", "36000", "mV"),
                 ("mean current", "-20000", "mA"),
                 ("remaining capacity", "5000", "mAh"),
-                ("full capacity", "10000", "mAh"),
+                ("full-charge capacity", "10000", "mAh"),
                 ("cell temperature", "-5", "°C"),
                 ("state of charge", "50", "%"),
                 ("status", "charger connected", ""),
@@ -462,17 +462,17 @@ def test_the_status_is_shown_by_its_bits(status: int, shown: str) -> None:
                 ("greatest discharge current", "35000", "mA"),
                 ("greatest charge current", "8000", "mA"),
                 ("cycles", "321", ""),
-                ("latest charge interval", "24", "h"),
+                ("most recent charge interval", "24", "h"),
                 ("longest charge interval", "1500", "h"),
-                ("charge over current count", "10", ""),
-                ("discharge over current count", "20", ""),
-                ("over charge count", "30", ""),
-                ("over discharge count", "40", ""),
-                ("short circuit count", "50", ""),
-                ("charge under temperature count", "60", ""),
-                ("charge over temperature count", "70", ""),
-                ("discharge under temperature count", "80", ""),
-                ("discharge over temperature count", "90", ""),
+                ("charge over-current protection count", "10", ""),
+                ("discharge over-current protection count", "20", ""),
+                ("over-charge protection count", "30", ""),
+                ("over-discharge protection count", "40", ""),
+                ("short-circuit protection count", "50", ""),
+                ("charge under-temperature protection count", "60", ""),
+                ("charge over-temperature protection count", "70", ""),
+                ("discharge under-temperature protection count", "80", ""),
+                ("discharge over-temperature protection count", "90", ""),
                 ("running time", "123456", "min"),
                 ("state of health", "88", "%"),
             ],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from enum import IntFlag
 from typing import Any
 
 import pytest
@@ -12,6 +11,7 @@ import pytest
 from flasher.protocol import fields
 from flasher.protocol.fields import (
     Address,
+    Bits,
     Bytes,
     Codec,
     Constant,
@@ -28,7 +28,7 @@ from flasher.protocol.fields import (
 )
 
 
-class Lamp(IntFlag):
+class Lamp(Bits):
     """Two bits with names, one without."""
 
     FRONT = 1
@@ -171,12 +171,12 @@ def test_text_reads_up_to_its_terminator_and_keeps_its_bytes() -> None:
         ("voltage_mv", "mV", "voltage"),
         ("design_voltage_v", "V", "design voltage"),
         ("mean_current_ma", "mA", "mean current"),
-        ("full_capacity_mah", "mAh", "full capacity"),
+        ("full_capacity_mah", "mAh", "full-charge capacity"),
         ("cell_temperature_c", "°C", "cell temperature"),
         ("state_of_charge_percent", "%", "state of charge"),
         ("charge_interval_h", "h", "charge interval"),
         ("running_time_min", "min", "running time"),
-        ("short_circuit_count", "", "short circuit count"),
+        ("short_circuit_count", "", "short-circuit protection count"),
         ("ends_in_min", "", "ends in min"),
     ],
 )

@@ -37,7 +37,7 @@ def test_running_information_has_its_route_fields_and_units() -> None:
         "voltage": "36000 mV",
         "mean current": "-1000 mA",
         "remaining capacity": "9000 mAh",
-        "full capacity": "10400 mAh",
+        "full-charge capacity": "10400 mAh",
         "cell temperature": "25 °C",
         "state of charge": "80 %",
         "status": "charger connected",
@@ -54,10 +54,22 @@ def test_values_are_typed_and_their_names_carry_the_units() -> None:
     assert json.loads(json.dumps(values)) == values
 
 
-def test_an_older_device_does_not_give_its_state_of_health() -> None:
-    data = traffic.RUNNING_DATA[:11] + bytes(5)
+@pytest.mark.parametrize(
+    ("raw", "text"),
+    [
+        (0, "0 % (or an older device, which does not know it)"),
+        (1, "1"),
+        (100, "100"),
+        (101, "101 % (more than the document allows)"),
+        (255, "255 % (more than the document allows)"),
+    ],
+)
+def test_a_state_of_health_is_shown_as_received_and_remarked_on(raw: int, text: str) -> None:
+    """R22."""
+    data = traffic.RUNNING_DATA[:11] + bytes([raw, 0, 0, 0, 0])
     health = only(traffic.running(data)).fields[-1]
-    assert (health.value, health.text, health.unit) == (None, "not given", "")
+    assert (health.value, health.text) == (raw, text)
+    assert health.unit == ("" if "%" in text else "%")
 
 
 def test_reserved_bytes_are_shown_only_when_they_are_not_zero() -> None:
@@ -113,7 +125,7 @@ def test_a_nak_and_faults_that_are_set_are_trouble() -> None:
     assert only(traffic.nak()).is_trouble
     set_faults = only(traffic.faults(bytes.fromhex("00400200")))
     assert set_faults.is_trouble
-    assert texts(set_faults)["faults"] == "afe fault, discharge under voltage warning"
+    assert texts(set_faults)["faults"] == "AFE fault, discharge under voltage warning"
     assert not only(traffic.faults(bytes(4))).is_trouble
 
 
