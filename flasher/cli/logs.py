@@ -62,7 +62,7 @@ class Logs:
         if self._file is not None:
             self._file.close()
             if self._file.failure:
-                self._output.write_stderr(f"warning: {self._file.failure}")
+                self._output.say(f"warning: {self._file.failure}")
 
     def open(self, verbosity: int, log_file: str | None, others: Iterable[object] = ()) -> None:
         """Begin. Raises UsageError when the log file cannot be written, or is one of the `others`:
@@ -107,7 +107,7 @@ class _Screen(logging.Handler):
         try:
             name = record.name.removeprefix(f"{ROOT}.")
             text = " | ".join(_lines(record))
-            self._output.write_stderr(f"{record.levelname.lower()}: {name}: {text}")
+            self._output.say(f"{record.levelname.lower()}: {name}: {text}")
         except Exception:  # noqa: BLE001, S110  a record of a foreign library never ends the command
             pass
 

@@ -22,7 +22,8 @@ from typing import Any, Final, NoReturn
 
 from flasher.cli import logs, manual
 from flasher.cli.lists import gather_lists
-from flasher.cli.output import Output, open_missing_streams
+from flasher.cli.output import Output
+from flasher.cli.terminal import prepare_streams
 from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, UsageError
 from flasher.protocol.text import printable
 
@@ -77,7 +78,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if "_ARGCOMPLETE" in os.environ:
         return _complete()
     arguments = gather_lists(sys.argv[1:] if argv is None else argv)
-    open_missing_streams()
+    prepare_streams()
     output = Output(json_wanted="--json" in arguments)
     with logs.Logs(output) as log:
         try:
@@ -125,6 +126,8 @@ def _parse(parser: argparse.ArgumentParser, arguments: Sequence[str]) -> argpars
     try:
         with contextlib.redirect_stdout(said):
             options = parser.parse_args(arguments)
+            if options.command is None and options.json:
+                raise UsageError("No command was named.", remedy="`flasher --help` lists them.")
             if options.command is None:
                 parser.print_help()
                 parser.exit(ExitCode.USAGE)

@@ -5,13 +5,18 @@ commands belong together. Facts about one command stand with that command.
 from __future__ import annotations
 
 import argparse
+import itertools
+import re
 import shutil
+import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
+from flasher.cli.terminal import wrap_line
 from flasher.errors import ExitCode
 
+_EXAMPLE: Final = re.compile(r"(\s+flasher .*?\S) {3,}(\S.*)")
 WIDTH: Final = 100
 """Columns that help takes at the most."""
 _OK: Final = ExitCode.OK
@@ -107,18 +112,38 @@ _BUS_OPTIONS: Final[Mapping[str, tuple[str, str]]] = {
 
 
 class Formatter(argparse.RawDescriptionHelpFormatter):
-    """Help no wider than `WIDTH`. Lines of a text stay as they are; too long ones are filled."""
+    """Help no wider than `WIDTH` and the window. Lines of a text stay as they are; where one is too
+    long, its paragraph is filled, and what is said of an example goes below it.
+    """
 
     def __init__(self, prog: str) -> None:
-        columns = shutil.get_terminal_size().columns - 2
-        super().__init__(prog, max_help_position=30, width=max(40, min(columns, WIDTH)))
+        super().__init__(prog, max_help_position=30, width=columns())
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        lines = (
-            textwrap.wrap(line, width) if len(line) > WIDTH - len(indent) else [line]
-            for line in text.splitlines()
-        )
-        return "\n".join(indent + line for wrapped in lines for line in wrapped)
+        width = width if sys.stdout.isatty() else WIDTH - len(indent)
+        lines: list[str] = []
+        for is_prose, group in itertools.groupby(
+            text.splitlines(), lambda line: line[:1].isalpha()
+        ):
+            part = list(group)
+            if is_prose and max(map(len, part)) > width:
+                lines += textwrap.wrap(" ".join(part), width)
+            else:
+                lines += (each for line in part for each in _narrowed(line, width))
+        return "\n".join(indent + line for line in lines)
+
+
+def columns() -> int:
+    """Columns that help takes."""
+    return max(40, min(shutil.get_terminal_size().columns - 2, WIDTH))
+
+
+def _narrowed(line: str, width: int) -> list[str]:
+    """An indented line that fits: an example's remark below it, else wrapped."""
+    example = _EXAMPLE.match(line)
+    if len(line) > width and example:
+        return [example[1], f"      {example[2]}"]
+    return wrap_line(line, width)
 
 
 def reword_bus_options(actions: Iterable[argparse.Action]) -> None:
@@ -148,7 +173,8 @@ def exit_codes(command: str | None = None) -> str:
     # No space inside, so that a meaning is not parted from its code.
     told = [f"{int(code)} {_MEANINGS.get(code, code.name.lower())}" for code in sorted(codes)]
     words = "   ".join(each.replace(" ", "\xa0") for each in told)
-    lines = textwrap.wrap(words, WIDTH - 4, initial_indent="  ", subsequent_indent="  ")
+    width = min(columns(), WIDTH - 4) if sys.stdout.isatty() else WIDTH - 4
+    lines = textwrap.wrap(words, width, initial_indent="  ", subsequent_indent="  ")
     return "exit codes:\n" + "\n".join(lines).replace("\xa0", " ")
 
 

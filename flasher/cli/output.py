@@ -14,10 +14,10 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, Final, TextIO
 
 from flasher.cli.documents import SCHEMA_VERSION, ErrorDocument, to_json
+from flasher.cli.terminal import takes_colour, wrapped
 from flasher.errors import ExitCode, FlasherError, UsageError
 
 _LOG: Final = logging.getLogger("flasher.cli")
@@ -40,6 +40,10 @@ class Output:
         self.write_stderr: Callable[[str], None] = _plain_stderr
         """Replaced while a progress bar is on the screen."""
 
+    def say(self, text: str) -> None:
+        """Write to stderr, wrapped at the window."""
+        self.write_stderr(wrapped(text, sys.stderr))
+
     def restore_stderr(self) -> None:
         """Write to stderr directly again."""
         self.write_stderr = _plain_stderr
@@ -47,13 +51,13 @@ class Output:
     @property
     def colour(self) -> bool:
         """True where stderr takes colours (NO_COLOR is honoured)."""
-        return sys.stderr.isatty() and not os.environ.get("NO_COLOR")
+        return takes_colour(sys.stderr)
 
     def result(self, text: str) -> None:
         """A line of the result; silent when JSON is wanted."""
         if not self.json_wanted:
             _LOG.info("%s", text, extra=_SAID)
-            _print_stdout(text)
+            _print_stdout(wrapped(text, sys.stdout))
 
     def document(
         self, document: Mapping[str, object], *, exit_code: ExitCode = ExitCode.OK
@@ -88,18 +92,18 @@ class Output:
         """A line on how it goes."""
         _LOG.log(logging.INFO if level < 2 else logging.DEBUG, "%s", text, extra=_SAID)
         if self.verbosity >= level:
-            self.write_stderr(text)
+            self.say(text)
 
     def error_line(self, text: str) -> None:
         """A line that is never silenced."""
         _LOG.error("%s", text, extra=_SAID)
-        self.write_stderr(text)
+        self.say(text)
 
     def failure(self, error: FlasherError, **more: Any) -> None:
         """An error as a person reads it, and as the JSON document of the command."""
         _LOG.error("error: %s", error, extra=_SAID)
         head = "\x1b[1;31merror:\x1b[0m" if self.colour else "error:"
-        self.write_stderr(f"{head} {error}")
+        self.say(f"{head} {error}")
         said = ErrorDocument(
             kind=type(error).__name__,
             what=error.what,
@@ -108,18 +112,6 @@ class Output:
             remedy=error.remedy,
         )
         self.document({**more, "error": said}, exit_code=error.exit_code)
-
-
-def open_missing_streams() -> None:
-    """Give a process without stdin, stdout or stderr (a service, pythonw) somewhere to write to and
-    nothing to read: print() would else take one for the other.
-    """
-    if sys.stdin is None:
-        sys.stdin = Path(os.devnull).open(encoding="utf-8")  # noqa: SIM115
-    if sys.stdout is None:
-        sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
-    if sys.stderr is None:
-        sys.stderr = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
 
 
 def _plain_stderr(text: str) -> None:

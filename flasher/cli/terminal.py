@@ -1,0 +1,84 @@
+"""What a terminal or a pipe takes: its encoding, its width, its colours."""
+
+from __future__ import annotations
+
+import codecs
+import io
+import os
+import re
+import sys
+import textwrap
+from pathlib import Path
+from typing import Final, TextIO
+
+_SUBSTITUTES: Final = {"°": "deg", "…": "~"}
+"""What stands for a character that the encoding of a stream does not have."""
+_SUBSTITUTED: Final = "flasher-substitutes"
+_REPLACED_ERRORS: Final = frozenset({"strict", "backslashreplace", "surrogateescape"})
+_COMMAND: Final = re.compile(r"\s*flasher ")
+"""A command line is never wrapped: it has to be copied as it is."""
+_LABEL: Final = re.compile(r"\s*(?:\S+(?: \S+)*?\s{2,}|[A-Za-z][\w /-]{0,17}: +)?")
+"""What a line begins with, and what its continuations stand behind."""
+
+
+def prepare_streams() -> None:
+    """Give a process without stdin, stdout or stderr (a service, pythonw) somewhere to write to and
+    nothing to read: print() would else take one for the other. What the encoding of a stream does
+    not have is replaced, whoever writes it.
+    """
+    if sys.stdin is None:
+        sys.stdin = Path(os.devnull).open(encoding="utf-8")  # noqa: SIM115
+    if sys.stdout is None:
+        sys.stdout = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
+    if sys.stderr is None:
+        sys.stderr = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115
+    codecs.register_error(_SUBSTITUTED, _substitute)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper) and stream.errors in _REPLACED_ERRORS:
+            stream.reconfigure(errors=_SUBSTITUTED)
+
+
+def _substitute(error: UnicodeError) -> tuple[str, int]:
+    """The error handler for encoding: similar characters, else escapes."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    bad = error.object[error.start : error.end]
+    escaped = (_SUBSTITUTES.get(each) or ascii(each)[1:-1] for each in bad)
+    return "".join(escaped), error.end
+
+
+def takes_colour(stream: TextIO) -> bool:
+    """True for a terminal, unless NO_COLOR is set."""
+    return stream.isatty() and not os.environ.get("NO_COLOR")
+
+
+def wrapped(text: str, stream: TextIO) -> str:
+    """Text for a terminal wrapped at its width, never inside a word; elsewhere as it is."""
+    if not stream.isatty():
+        return text
+    try:
+        width = os.get_terminal_size(stream.fileno()).columns
+    except OSError:
+        return text
+    return "\n".join(part for line in text.split("\n") for part in wrap_line(line, width))
+
+
+def wrap_line(line: str, width: int) -> list[str]:
+    """A line in parts of `width` columns at the most (a longer word stays whole), the later ones
+    indented to where the text of the first begins.
+    """
+    if len(line) <= width or width <= 0 or _COMMAND.match(line):
+        return [line]
+    label = _LABEL.match(line)
+    indent = label.end() if label else 0
+    if indent > width // 2:
+        indent = len(line) - len(line.lstrip()) + 2
+    return textwrap.wrap(
+        line,
+        width,
+        subsequent_indent=" " * indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+        replace_whitespace=False,
+        drop_whitespace=True,
+    )
