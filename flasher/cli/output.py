@@ -14,7 +14,7 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Mapping
-from typing import Any, Final, TextIO
+from typing import Any, Final, Literal, NamedTuple, TextIO
 
 from flasher.cli.documents import SCHEMA_VERSION, ErrorDocument, to_json
 from flasher.cli.terminal import takes_colour, wrapped
@@ -23,6 +23,17 @@ from flasher.errors import ExitCode, FlasherError, UsageError
 _LOG: Final = logging.getLogger("flasher.cli")
 _SAID: Final = {"said": True}
 """Marks log records of what was printed, so that -v does not print it twice."""
+
+
+_COLOURS: Final = {"green": 32, "yellow": 33, "red": 31}
+
+
+class Verdict(NamedTuple):
+    """The end of a command in one line; it says in words what its colour says."""
+
+    word: str
+    text: str
+    colour: Literal["green", "yellow", "red"]
 
 
 class Output:
@@ -37,6 +48,8 @@ class Output:
         """Name of the command that runs; None before it is known."""
         self.shown_events: frozenset[type] = frozenset()
         """Events that the command prints itself while it runs: -v does not log them once more."""
+        self.ending: Callable[[FlasherError], Verdict] | None = None
+        """What the last line says of an error, for a command that ends with a verdict."""
         self.write_stderr: Callable[[str], None] = _plain_stderr
         """Replaced while a progress bar is on the screen."""
 
@@ -99,11 +112,25 @@ class Output:
         _LOG.error("%s", text, extra=_SAID)
         self.say(text)
 
+    def verdict(self, verdict: Verdict) -> None:
+        """The last line of a command, in its colour: a result, or a line of stderr when it failed
+        (also when JSON is wanted).
+        """
+        is_good = verdict.colour != "red"
+        stream = sys.stdout if is_good else sys.stderr
+        word = verdict.word
+        if takes_colour(stream):
+            word = f"\x1b[1;{_COLOURS[verdict.colour]}m{word}\x1b[0m"
+        say = self.result if is_good else self.error_line
+        say(f"{word}  {verdict.text}")
+
     def failure(self, error: FlasherError, **more: Any) -> None:
         """An error as a person reads it, and as the JSON document of the command."""
         _LOG.error("error: %s", error, extra=_SAID)
         head = "\x1b[1;31merror:\x1b[0m" if self.colour else "error:"
         self.say(f"{head} {error}")
+        if self.ending is not None:
+            self.verdict(self.ending(error))
         said = ErrorDocument(
             kind=type(error).__name__,
             what=error.what,

@@ -9,6 +9,7 @@ from typing import Any, Final, Self
 
 from flasher import events
 from flasher.cli.output import Output
+from flasher.host.table import Event
 from flasher.image.plan import Plan
 from flasher.protocol.spec import PACKET_DATA_SIZE
 
@@ -29,6 +30,26 @@ SHOWN: Final = frozenset(
     }
 )
 """The events that have lines or a bar of their own here: the log on stderr leaves them out."""
+
+
+_BECAUSE: Final = {
+    Event.PACKET_REFUSED.value: "the device refused {what}",
+    Event.PACKET_UNANSWERED.value: "the device did not answer {what} in time",
+    Event.PACKET_GIVEN_UP.value: "the device did not take a packet, however often it was sent",
+    Event.REQUEST_AGAIN.value: "the device requested the transfer once more",
+    Event.REQUEST_LATE.value: "the device requested the transfer anew in the middle of it",
+    Event.BOOT_RESTARTED.value: "the device restarted",
+    Event.BOOT_GIVEN_UP.value: "the device did not announce its bootloader",
+    Event.END_NAK.value: "the device refused the {what}",
+    Event.END_UNANSWERED.value: "the device did not answer the {what} in time",
+    Event.LINK_BACK.value: "the adapter was lost and is back",
+}
+"""Why something is sent again, for people, by the engine's name for it."""
+
+
+def because(reason: str, what: str = "") -> str:
+    """The sentence for a reason of `MessageRepeated` and `AttemptStarted`."""
+    return _BECAUSE.get(reason, reason).format(what=what)
 
 
 class Progress:
@@ -73,12 +94,13 @@ class Progress:
                 output.progress(f"{phase.value} ...")
             case events.AttemptStarted(attempt, reason):
                 self._close_bar()
-                output.progress(f"attempt {attempt}: {reason}")
+                output.progress(f"{because(reason)}: beginning again, attempt {attempt}")
             case events.PowerCycleAwaited(limit_s):
                 self._prompt(limit_s)
             case events.MessageRepeated(what, reason, tries):
                 self._repetitions += 1
-                output.progress(f"{what} again (try {tries}): {reason}", level=1)
+                text = f"{because(reason, what)}: sending {what} again, try {tries}"
+                output.progress(text, level=1)
             case _ if warning := _warning(event):
                 self._close_bar()
                 output.error_line(f"warning: {warning}")
@@ -148,7 +170,7 @@ def _note(event: object) -> tuple[str, int] | None:
         case events.BootVersionSeen(name, version):
             return f"boot version: {name} {version}", 0
         case events.CheckMade(_, verdict, text):
-            return f"check: {verdict}: {text}", 0
+            return f"check: {verdict}: {text}", 1 if verdict == "passed" else 0
         case events.AdapterBack():
             return "the adapter is back", 0
         case events.Reported(what):

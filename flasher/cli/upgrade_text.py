@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Annotated, NotRequired, TypedDict
+from typing import Annotated, Final, NotRequired, TypedDict
 
 from flasher.cli.documents import (
     ImageDocument,
@@ -12,13 +12,16 @@ from flasher.cli.documents import (
     PlanDocument,
     VerificationDocument,
 )
-from flasher.cli.output import byte_count, counted, duration
+from flasher.cli.output import Verdict, byte_count, counted, duration
 from flasher.cli.plan_text import image_document, plan_document
+from flasher.errors import FlasherError, InterruptedByUserError
 from flasher.events import CheckMade
 from flasher.host.identity import Verdict as Judgement
-from flasher.host.outcome import Outcome
+from flasher.host.outcome import DeviceLeft, Outcome
 from flasher.host.session import Result
-from flasher.host.verify import Level, Verdict, Verification, possible_levels
+from flasher.host.table import Ending
+from flasher.host.verify import Level, Verification, possible_levels
+from flasher.host.verify import Verdict as Verified
 from flasher.image.cortexm import vector_table
 from flasher.image.plan import Plan
 from flasher.trace.figures import Distribution, LinkReport
@@ -44,6 +47,8 @@ class UpgradeDocument(TypedDict):
     checks: list[CheckDocument]
     outcome: OutcomeDocument
     verification: VerificationDocument
+    previous_version: str | None
+    """What ran before; null where it could not be asked."""
     shutdown_heard: bool
     """The battery sent SHUTDOWN meanwhile."""
     link: NotRequired[Annotated[dict[str, object], LinkReport]]
@@ -65,6 +70,53 @@ class DryRunDocument(TypedDict):
 def check_line(check: CheckMade) -> str:
     """A check that was made, in one line."""
     return f"check: {check.verdict}: {check.text}"
+
+
+_LEFT: Final = {
+    DeviceLeft.UNTOUCHED: "nothing was erased",
+    DeviceLeft.PERHAPS_ERASED: "its application is perhaps erased",
+    DeviceLeft.NO_APPLICATION: "it has no application now",
+    DeviceLeft.UNKNOWN: "it has every byte, what it runs is not known",
+    DeviceLeft.NEW: "it has the new image",
+}
+
+
+def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Verdict:
+    """The last line of an upgrade that was carried out, or was not needed."""
+    outcome, node = result.outcome, result.outcome.target.node.name
+    took = f"  {took_s:.1f} s"
+    error = result.error()
+    if error is not None:
+        return failed(error, f"; {_LEFT[result.device_left]}{took}")
+    if not result.ok:
+        return Verdict("NOTHING TO DO", f"{node}: {outcome.detail}{took}", "green")
+    was = f", was {result.previous_version}" if result.previous_version else ""
+    verification = result.verification
+    remark = f"{verification.level.value} read back"
+    if verification.verdict is Verified.NOT_ASKED:
+        remark = _not_asked(result)
+    elif verification.verdict is Verified.VERSION_UNJUDGED:
+        remark = "the image names no version to compare with"
+    if outcome.ending is Ending.CONFIRMED_BY_VERSION:
+        remark += ", but it did not say complete"
+    warnings = sum(check.verdict in ("warned", "waived") for check in checks)
+    remark += f"; {counted(warnings, 'warning')}" if warnings else ""
+    if result.running_version is None:
+        text = f"{node} confirmed the complete image{was}; what runs now is not known ({remark})"
+    else:
+        text = f"{node} runs {result.running_version}{was} ({remark})"
+    is_sure = verification.verdict in (Verified.VERSION_RIGHT, Verified.MEMORY_RIGHT)
+    is_sure &= outcome.ending is Ending.COMPLETED and not warnings and not result.shutdown_heard
+    return Verdict("OK", text + took, "green" if is_sure else "yellow")
+
+
+def failed(error: FlasherError, more: str = "") -> Verdict:
+    """The last line of an upgrade that was not. The error itself is told in full above it."""
+    word = "STOPPED" if isinstance(error, InterruptedByUserError) else "FAILED"
+    what = error.what.partition(" (")[0].partition(". ")[0].removesuffix(".")
+    if error.needs_rescue and not more:
+        more = "; it has no application now, or perhaps none"
+    return Verdict(word, what + more, "red")
 
 
 def summary_lines(result: Result, plan: Plan) -> list[str]:
@@ -104,10 +156,14 @@ def _figures(of: Distribution) -> str:
 def _running(result: Result) -> str:
     """What is known of the application that runs now, and how."""
     verification = result.verification
-    if verification.verdict is Verdict.NOT_ASKED:
-        reason = "" if possible_levels(result.outcome.target) != (Level.NONE,) else _NO_QUERY
-        return result.running_version or f"not asked{reason}"
+    if verification.verdict is Verified.NOT_ASKED:
+        return result.running_version or _not_asked(result)
     return f"{result.running_version or 'unknown'} ({verification.verdict.value})"
+
+
+def _not_asked(result: Result) -> str:
+    has_query = possible_levels(result.outcome.target) != (Level.NONE,)
+    return "not asked" if has_query else f"not asked{_NO_QUERY}"
 
 
 def _rate(plan: Plan, transfer_s: float) -> str:
@@ -134,6 +190,7 @@ def upgrade_document(
         checks=check_documents(checks),
         outcome=_outcome_document(result.outcome),
         verification=_verification_document(result.verification, result.running_version),
+        previous_version=result.previous_version,
         shutdown_heard=result.shutdown_heard,
     )
     if link is not None:

@@ -16,11 +16,15 @@ from flasher.cli.repair import repair_command
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.upgrade_options import chosen_level, chosen_options, waived_checks
 from flasher.cli.upgrade_text import (
+    UpgradeDocument,
+    check_documents,
     check_line,
     dry_run_document,
+    failed,
     link_lines,
     summary_lines,
     upgrade_document,
+    verdict_of,
 )
 from flasher.errors import ExitCode, FlasherError
 from flasher.events import CheckMade
@@ -31,6 +35,7 @@ from flasher.image.cortexm import vector_table
 from flasher.image.plan import Plan
 from flasher.image.release import Release
 from flasher.profile.model import Profile
+from flasher.trace.figures import LinkReport
 
 
 def run_upgrade(
@@ -42,6 +47,7 @@ def run_upgrade(
     skip_same_version: bool = False,
 ) -> int:
     """Run `flash` or `rescue`; returns the exit code."""
+    output.ending = failed
     profile = profile_of(options)
     release = api.find_release(options.image, options.manifest)
     plan = _make_plan(options, profile, release)
@@ -101,6 +107,7 @@ class _Upgrading:
         self._level = level
         self._identity = identity
         self._checks: list[CheckMade] = []
+        self._took_s = 0.0
 
     def run(self) -> int:
         """Returns the exit code."""
@@ -109,10 +116,18 @@ class _Upgrading:
             record.facts["image_sha256"] = self._plan.image.sha256
             try:
                 result = self._upgrade(record)
-            except FlasherError as error:
-                self._add_repair(error)
+            except FlasherError as failure:
+                self._add_repair(failure)
                 raise
-            return self._tell(result, record)
+            link, error = record.link_report(), result.error()
+            document = upgrade_document(self._plan, result, self._checks, link)
+            record.facts["outcome"] = document["outcome"]
+            record.facts["verification"] = document["verification"]
+            if error is not None:
+                self._add_repair(error)
+                record.failed(error)
+        # The bundle is told of before the error, so that the verdict stands at the end.
+        return self._tell(result, error, document, link)
 
     def _upgrade(self, record: Recording) -> Result:
         options, output = self._options, self._output
@@ -130,10 +145,12 @@ class _Upgrading:
             def on_event(event: object) -> None:
                 if isinstance(event, CheckMade):
                     self._checks.append(event)
+                    record.facts["checks"] = check_documents(self._checks)
                 output.event(event)
                 progress(event)
 
-            return api.upgrade(
+            began_at = connection.clock.now()
+            result = api.upgrade(
                 self._plan,
                 connection,
                 options=self._chosen,
@@ -143,31 +160,32 @@ class _Upgrading:
                 on_event=on_event,
                 cancelled=cancelled,
             )
+            self._took_s = connection.clock.now() - began_at
+            return result
 
-    def _tell(self, result: Result, record: Recording) -> int:
-        output, link = self._output, record.link_report()
-        document = upgrade_document(self._plan, result, self._checks, link)
-        record.facts["outcome"] = document["outcome"]
-        record.facts["verification"] = document["verification"]
-        error = result.error()
-        if error is None and not result.ok:
-            output.result(f"nothing to do: {result.outcome.detail}")
-            output.document(document, exit_code=result.exit_code)
-            return result.exit_code
+    def _tell(
+        self,
+        result: Result,
+        error: FlasherError | None,
+        document: UpgradeDocument,
+        link: LinkReport | None,
+    ) -> int:
+        output = self._output
         show = output.result if error is None else output.progress
         if result.outcome.ok:
             for line in summary_lines(result, self._plan):
                 show(line)
         if link is not None:
             for line in link_lines(link):
-                show(line) if result.outcome.ok else output.progress(line, level=1)
+                output.progress(line, level=1)
+        verdict = verdict_of(result, self._checks, self._took_s)
         if error is None:
-            output.document(document)
-            return ExitCode.OK
-        self._add_repair(error)
-        record.failed(error)
-        output.failure(error, **document)
-        return error.exit_code
+            output.verdict(verdict)
+            output.document(document, exit_code=result.exit_code)
+        else:
+            output.ending = lambda _error: verdict
+            output.failure(error, **document)
+        return result.exit_code
 
     def _add_repair(self, error: FlasherError) -> None:
         """The exact command that repairs a device that was left without an application."""

@@ -10,7 +10,7 @@ from flasher.host.outcome import Statistics
 from flasher.host.situation import Situation
 from flasher.host.table import Event
 from flasher.protocol.fields import Content
-from flasher.protocol.messages import BootVersion, Malformed, Nak, Row, Unknown
+from flasher.protocol.messages import Ack, BootVersion, Malformed, Nak, Row, Unknown
 from flasher.protocol.text import printable
 from flasher.protocol.wire import Damage
 
@@ -117,5 +117,7 @@ def _describe(event: Event, row: Received) -> str:
             return f"unknown message {message.command:04X} from {message.can_id:03X} ignored"
         case BootVersion(name, version):
             return f"{event.value}: {printable(name)} {printable(version)}"
+        case Ack(number) | Nak(number):
+            return f"{event.value}: {type(row).__name__.upper()} {number}"
         case _:
-            return f"{event.value}: {row}"
+            return event.value

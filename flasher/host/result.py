@@ -13,7 +13,7 @@ from flasher.errors import (
     UnconfirmedError,
     VerificationError,
 )
-from flasher.host.outcome import Outcome
+from flasher.host.outcome import DeviceLeft, Outcome
 from flasher.host.verify import NOT_ASKED, Verification
 
 _BY_LOST_POWER: Final = (NoAnswerError, TransferError, UnconfirmedError, VerificationError)
@@ -28,6 +28,9 @@ class Result:
     verification: Verification = NOT_ASKED
     shutdown_heard: bool = False
     """The battery sent SHUTDOWN while the session ran."""
+    previous_version: str | None = None
+    """What the application answered before the upgrade, escaped; None when it was not asked or did
+    not answer."""
 
     @property
     def ok(self) -> bool:
@@ -41,6 +44,11 @@ class Result:
             return ExitCode.NOTHING_TO_DO
         error = self.error()
         return ExitCode.OK if error is None else error.exit_code
+
+    @property
+    def device_left(self) -> DeviceLeft:
+        """The state in which the device was left."""
+        return self.outcome.device_left
 
     @property
     def running_version(self) -> str | None:

@@ -57,6 +57,7 @@ class Session:
         self._began_at: float | None = None
         self._deadline_at: float | None = None
         self._losses = 0
+        self._previous_version: str | None = None
         self._handed: Frame | None = None
         self._upgrade = Upgrade(plan, self._options)
         asked = Identify(plan, self._options)
@@ -216,6 +217,7 @@ class Session:
             versions = " and ".join(firmware_version(each) for each in asked.answers)
             self._end_early(Ending.TWO_DEVICES, f"they answer {versions}", now)
             return
+        self._previous_version = asked.seen.firmware_version
         if self._identity is not None:
             self._judge_seen(self._identity, asked.seen, now)
         if not self.done:
@@ -288,4 +290,5 @@ class Session:
         self._end(before_the_start(self._plan, ending, detail, duration_s=duration_s))
 
     def _end(self, outcome: Outcome, verification: Verification = NOT_ASKED) -> None:
-        self._result = Result(outcome, verification, self._guard.shutdown_heard)
+        heard = self._guard.shutdown_heard
+        self._result = Result(outcome, verification, heard, self._previous_version)
