@@ -42,7 +42,7 @@ _BECAUSE: Final = {
     Event.BOOT_GIVEN_UP.value: "the device did not announce its bootloader",
     Event.END_NAK.value: "the device refused the {what}",
     Event.END_UNANSWERED.value: "the device did not answer the {what} in time",
-    Event.LINK_BACK.value: "the adapter was lost and is back",
+    Event.LINK_BACK.value: "the adapter was away for a while",
 }
 """Why something is sent again, for people, by the engine's name for it."""
 

@@ -186,7 +186,8 @@ def test_an_error_without_a_place_or_remedy_is_one_line(
     monkeypatch.setattr("sys.stderr", stream := io.StringIO())
     run = flasher("flash", OBC_BIN, "-t", "obc", "--mock", "--trace-file", "no-folder/a.asc")
     assert run.code == ExitCode.USAGE
-    assert stream.getvalue().splitlines()[-1].startswith("error: no-folder/a.asc cannot be written")
+    what = "no-folder/a.asc cannot be written: its folder does not exist"
+    assert stream.getvalue().splitlines()[-2:] == [f"error: {what}.", f"FAILED  {what}"]
 
 
 def test_a_process_without_streams_works_and_exits_with_its_code(

@@ -16,9 +16,10 @@ import pytest
 from flasher import events
 from flasher.api import make_plan
 from flasher.cli.output import Output
-from flasher.cli.progress import Progress
+from flasher.cli.progress import Progress, because
 from flasher.errors import BusError, ExitCode
 from flasher.events import Phase
+from flasher.host.table import TABLE, Action, Event
 from flasher.image.image import Image
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.processes import FLASHER, clean_environment
@@ -194,7 +195,7 @@ def test_lines_that_come_while_the_bar_is_on_stand_above_it(
     lines = screen(terminal.read())
     assert lines[:4] == [
         "transferring ...",
-        "packet 3 again (try 2): not answered",
+        "not answered: sending packet 3 again, try 2",
         "note: a second tool is on the bus",
         "bytes on 0x725 ignored: bad tail: 55 aa 13",
     ]
@@ -214,8 +215,8 @@ def test_a_new_attempt_begins_a_new_bar(
         *acknowledged(1),
     )
     lines = screen(terminal.read())
-    assert [line[:8] for line in lines] == ["BMS:  38", "attempt ", "waiting ", "BMS:  13", ""]
-    assert lines[1] == "attempt 2: the device restarted"
+    assert [line[:8] for line in lines] == ["BMS:  38", "the devi", "waiting ", "BMS:  13", ""]
+    assert lines[1] == "the device restarted: beginning again, attempt 2"
 
 
 def test_a_terminal_that_goes_away_does_not_end_the_upgrade(
@@ -259,8 +260,15 @@ def test_away_from_a_terminal_there_is_one_line_a_phase_and_no_carriage_return(
     [
         (-1, []),
         (0, []),
-        (1, ["packet 3 again (try 2): NAK", "note: odd"]),
-        (2, ["packet 3 again (try 2): NAK", "note: odd", "bytes on 0x725 ignored: bad CRC: 01"]),
+        (1, ["the device refused packet 3: sending packet 3 again, try 2", "note: odd"]),
+        (
+            2,
+            [
+                "the device refused packet 3: sending packet 3 again, try 2",
+                "note: odd",
+                "bytes on 0x725 ignored: bad CRC: 01",
+            ],
+        ),
     ],
 )
 def test_verbosity_decides_how_much_is_said(
@@ -269,7 +277,7 @@ def test_verbosity_decides_how_much_is_said(
     show(
         Output(verbosity=verbosity),
         *acknowledged(1, 2),
-        events.MessageRepeated("packet 3", "NAK", 2),
+        events.MessageRepeated("packet 3", Event.PACKET_REFUSED.value, 2),
         events.Reported("odd"),
         events.BytesDamaged(0x725, "bad CRC", b"\x01"),
         object(),
@@ -277,6 +285,18 @@ def test_verbosity_decides_how_much_is_said(
     captured = capsys.readouterr()
     assert captured.err.splitlines() == shown
     assert captured.out == ""
+
+
+def test_everything_that_is_sent_again_has_a_sentence() -> None:
+    again = {Action.START_OVER, Action.BEGIN_AGAIN, Action.REPEAT_PACKET, Action.REPEAT_END}
+    reasons = {
+        event.value
+        for row in TABLE.values()
+        for event, transition in row.items()
+        if transition.action in again
+    }
+    assert len(reasons) >= 9
+    assert {reason for reason in reasons if because(reason, "packet 3") == reason} == set()
 
 
 def test_tqdm_is_loaded_only_for_a_bar(tmp_path: Path) -> None:

@@ -1,0 +1,92 @@
+"""The last line of `flash`: what it came to, in one line and in its colour."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from .conftest import SAMPLES, Flasher
+
+BMS, OBC = SAMPLES / "bms.hex", SAMPLES / "obc.bin"
+MOCK = ("--mock", "--mock-speed", "0")
+GREEN, YELLOW, RED = "\x1b[1;32m", "\x1b[1;33m", "\x1b[1;31m"
+RUNS = "BMS runs V1r0r4_20220512, was V1r0r0_20220512"
+HAS, UNKNOWN = "confirmed the complete image", "what runs now is not known"
+NO_QUERY = "not asked: the document gives this target no query for it"
+
+
+@pytest.fixture
+def colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terminal, as far as colours go."""
+    monkeypatch.setattr("flasher.cli.output.takes_colour", lambda _stream: True)
+
+
+@pytest.mark.usefixtures("colours")
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ((BMS, "-t", "bms"), f"{GREEN}OK\x1b[0m  {RUNS} (version read back)"),
+        (
+            (BMS, "-t", "bms", "--verify", "none"),
+            f"{YELLOW}OK\x1b[0m  BMS {HAS}, was V1r0r0_20220512; {UNKNOWN} (not asked)",
+        ),
+        (
+            (OBC, "-t", "obc"),
+            f"{YELLOW}OK\x1b[0m  OBC {HAS}; {UNKNOWN} ({NO_QUERY})",
+        ),
+        (
+            (BMS, "-t", "wmc", "--allow-other-target"),
+            f"{YELLOW}OK\x1b[0m  WMC {HAS}; {UNKNOWN} ({NO_QUERY}; 1 warning)",
+        ),
+    ],
+    ids=["good", "not asked", "no query", "waived"],
+)
+def test_a_good_end_says_what_runs_and_is_green_only_where_nothing_is_unknown(
+    flasher: Flasher, words: tuple[str, ...], line: str
+) -> None:
+    run = flasher("flash", *words, *MOCK)
+    last = run.out.splitlines()[-1]
+    assert re.fullmatch(re.escape(line) + r"  \d+\.\d s", last), last
+    assert "device took" not in run.out + run.err
+    assert "check: passed" not in run.err
+
+
+@pytest.mark.usefixtures("colours")
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        ((BMS, "-t", "bms"), f"{RED}FAILED\x1b[0m  No adapter is configured"),
+        ((SAMPLES / "missing.hex", "-t", "bms"), f"{RED}FAILED\x1b[0m  there is no file '"),
+        (
+            (BMS, "-t", "wmc", *MOCK),
+            f"{RED}FAILED\x1b[0m  WMC: the image is not meant for this device",
+        ),
+        (
+            (BMS, "-t", "bms", "--timeout", "2", *MOCK),
+            f"{RED}FAILED\x1b[0m  BMS: the overall deadline passed; it has no application now  2.0",
+        ),
+    ],
+    ids=["no adapter", "no file", "wrong device", "broken off"],
+)
+@pytest.mark.parametrize("form", [(), ("--json",)], ids=["text", "json"])
+def test_a_bad_end_is_red_and_the_last_line_whatever_came_before(
+    flasher: Flasher, words: tuple[str, ...], line: str, form: tuple[str, ...]
+) -> None:
+    run = flasher("flash", *words, *form)
+    assert run.code
+    assert run.err.splitlines()[-1].startswith(line)
+    assert run.err.count("FAILED") == 1
+    assert bool(run.out) == bool(form)
+
+
+def test_figures_of_the_line_and_passed_checks_are_told_with_v_and_in_json(
+    flasher: Flasher,
+) -> None:
+    loud = flasher("flash", BMS, "-t", "bms", "-v", *MOCK)
+    assert "device took:" in loud.err
+    assert "check: passed: by a name inside" in loud.err
+    document = flasher("flash", BMS, "-t", "bms", "--json", *MOCK).document
+    assert document["link"]["device_answer"]["median_s"] > 0
+    assert "passed" in {check["verdict"] for check in document["checks"]}
+    assert document["previous_version"] == "V1r0r0_20220512"
