@@ -11,7 +11,8 @@ from flasher.cli.documents import plain_value
 from flasher.cli.explain_text import story_lines
 from flasher.cli.files import check_not_read, check_writable, write_whole
 from flasher.cli.output import Output
-from flasher.errors import ExitCode
+from flasher.cli.recording import bundle_folder
+from flasher.errors import ExitCode, UsageError
 from flasher.protocol.text import printable
 from flasher.trace.story import Story
 
@@ -24,6 +25,7 @@ class ExplainDocument(TypedDict):
 
 DOCUMENTS: Final = (ExplainDocument,)
 _HTML: Final = "--html"
+_LAST: Final = "--last"
 _DESCRIPTION = """\
 Read a recorded trace, or the bundle that a failed command has left, and tell what happened: the
 verdict and its likely cause, phases and messages with their times, how quickly both ends answered,
@@ -32,7 +34,7 @@ how full the bus was, who else was on it. No bus is opened. Goes by CAN ids, who
 _EPILOG = """\
 examples:
   flasher explain upgrade.asc
-  flasher explain flasher-bms-20260517-101502            a bundle
+  flasher explain --last                                 what the latest failure has left
   flasher explain upgrade.blf --html story.html          one page with diagrams
   flasher explain upgrade.log --json | jq .story.verdict
   flasher explain upgrade.log --all --packets            every message, every packet
@@ -48,8 +50,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "trace",
         metavar="TRACE",
+        nargs="?",
         type=Path,
         help="a recorded trace (.asc .blf .log ...), or the folder of a bundle",
+    )
+    parser.add_argument(
+        _LAST, action="store_true", help="the bundle that the latest failed command has left"
     )
     parser.add_argument(
         "-b",
@@ -72,16 +78,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace, output: Output) -> int:
     """Run the command; returns the exit code."""
-    from flasher.trace.bundle import REPORT, TRACE  # noqa: PLC0415  loads python-can
+    from flasher.trace.bundle import OLDER_TRACE, REPORT, TRACE  # noqa: PLC0415  loads python-can
     from flasher.trace.source import explain_path  # noqa: PLC0415  loads python-can
 
+    trace = _source(options)
     if options.html is not None:
         check_writable(options.html, _HTML)
-        read = [options.trace]
-        if options.trace.is_dir():
-            read += [options.trace / name for name in (TRACE, REPORT)]
+        read = [trace]
+        if trace.is_dir():
+            read += [trace / name for name in (TRACE, OLDER_TRACE, REPORT)]
         check_not_read(options.html, _HTML, read)
-    story = explain_path(options.trace, bitrate_bps=options.bitrate, everything=options.all)
+    story = explain_path(trace, bitrate_bps=options.bitrate, everything=options.all)
     for line in story_lines(story, packets=options.packets):
         output.result(line)
     if options.html is not None:
@@ -91,3 +98,25 @@ def run(options: argparse.Namespace, output: Output) -> int:
         output.progress(f"page: {printable(str(options.html))}")
     output.document(ExplainDocument(story=plain_value(story)))
     return ExitCode.OK
+
+
+def _source(options: argparse.Namespace) -> Path:
+    """The trace or bundle to read. Raises UsageError where none is named, or both ways are."""
+    from flasher.trace.bundle import bundles  # noqa: PLC0415  loads python-can
+
+    if options.last == (options.trace is not None):
+        raise UsageError(
+            "flasher explain: name one trace or bundle.", remedy=f"Write either TRACE or {_LAST}."
+        )
+    if options.trace is not None:
+        named: Path = options.trace
+        return named
+    folder = bundle_folder()
+    found = bundles(folder)
+    if not found:
+        raise UsageError(
+            f"There is no bundle in {printable(str(folder))}.",
+            cause="no command has failed on the bus yet, or bundles go to another folder",
+            remedy="Name the folder that the failed command has printed.",
+        )
+    return found[-1]

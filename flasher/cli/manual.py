@@ -88,6 +88,7 @@ _READS: Final[Mapping[str, tuple[tuple[str, str], ...]]] = {
         ("", "working directory, else of the user's configuration"),
     ),
     "--bundle-dir": (("FLASHER_BUNDLE_DIR", "where bundles go, where --bundle-dir is not given"),),
+    "--last": (("FLASHER_BUNDLE_DIR", "where bundles are looked for"),),
 }
 """Environment variables and files, by the option of the command that stands for them."""
 _READS_ALWAYS: Final = (("NO_COLOR", "set to anything: no colours"),)

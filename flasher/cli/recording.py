@@ -21,12 +21,14 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, Final
 
+from platformdirs import user_state_path
+
 from flasher.api import Connection, as_dialect
 from flasher.cli.arguments import bus_config, open_connection
 from flasher.cli.files import check_not_read
 from flasher.cli.output import Output
 from flasher.driver import Tap
-from flasher.errors import ExitCode, FlasherError
+from flasher.errors import ExitCode, FlasherError, InterruptedByUserError
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.trace.figures import LinkReport
@@ -46,10 +48,13 @@ _WITH_BUNDLE: Final = frozenset(
         ExitCode.REFUSED,
         ExitCode.UNCONFIRMED,
         ExitCode.VERIFICATION,
+        ExitCode.INTERRUPTED,
     }
 )
-"""Failures on the bus or of flasher itself; wrong usage and the user's own Ctrl-C explain
-themselves."""
+"""Failures on the bus or of flasher itself, and what was interrupted; wrong usage explains
+itself."""
+_BUNDLES_KEPT: Final = 50
+"""In the folder that nobody chose."""
 
 
 def add_recording(parser: argparse.ArgumentParser) -> None:
@@ -63,9 +68,16 @@ def add_recording(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         type=Path,
         help="where a failure leaves its bundle: last frames, transcript, report "
-        f"(default: ${BUNDLE_FOLDER}, else the current folder)",
+        f"(default: ${BUNDLE_FOLDER}, else the user's own state folder, the last {_BUNDLES_KEPT}; "
+        "flasher explain --last reads the latest)",
     )
     group.add_argument("--no-bundle", action="store_true", help="leave none")
+
+
+def bundle_folder(chosen: Path | None = None) -> Path:
+    """Where bundles go: the folder of the option, of the environment, or the user's own."""
+    named = chosen or os.environ.get(BUNDLE_FOLDER)
+    return Path(named) if named else user_state_path("flasher", appauthor=False) / "bundles"
 
 
 class Recording:
@@ -110,6 +122,9 @@ def recording(
         with ExitStack() as stack:
             stack.enter_context(_trace_file(options, record, output))
             yield record
+    except KeyboardInterrupt:
+        record.failed(InterruptedByUserError("Interrupted at once."))
+        raise
     except Exception as error:
         record.failed(error)
         raise
@@ -159,13 +174,20 @@ def _leave_bundle(
 ) -> None:
     if isinstance(error, FlasherError) and error.exit_code not in _WITH_BUNDLE:
         return
-    from flasher.trace.bundle import write_bundle  # noqa: PLC0415  loads python-can
+    if not record.flight.frames:
+        return
+    from flasher.trace.bundle import keep_last, write_bundle  # noqa: PLC0415  loads python-can
 
-    folder = options.bundle_dir or Path(os.environ.get(BUNDLE_FOLDER) or ".")
+    folder = bundle_folder(options.bundle_dir)
     link = record.link_report()
     facts = {**record.facts, "error": _error(error), "link": link and dataclasses.asdict(link)}
+    is_own = folder == bundle_folder() and not os.environ.get(BUNDLE_FOLDER)
     try:
+        if is_own:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         path = write_bundle(folder, record.flight, facts)
+        if is_own:
+            keep_last(folder, _BUNDLES_KEPT)
     except Exception as problem:  # noqa: BLE001  the command's own failure is what matters
         reason = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
         output.error_line(printable(f"warning: no bundle in {folder}: {reason}"))

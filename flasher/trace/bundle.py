@@ -1,15 +1,18 @@
 """Bundles: what a failed command leaves behind for whoever has to find out why.
 
-A folder of three files: `trace.log`, the last frames; `transcript.txt`, what they say; and
-`report.json`, the circumstances. It appears whole, under its final name, or not at all.
+A folder of three files: `trace.blf`, the last frames; `transcript.txt`, what they say; and
+`report.json`, the circumstances. It appears whole, under its final name, or not at all. Only its
+owner may look into it: a command line may hold what is nobody else's business.
 
-The trace is in candump form: unlike the .asc of python-can it keeps wall times to the microsecond
-without a date in the computer's language, and it keeps directions, remote and error frames too.
+The trace is a .blf: Wireshark, CANalyzer and python-can read it alike, with directions, remote and
+error frames. What python-can writes as .log Wireshark reads wrongly, because of the letters for the
+direction behind each frame.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import platform
 import shutil
 import time
@@ -28,9 +31,13 @@ from flasher.trace.recorder import message_of
 from flasher.trace.ring import Entry, FlightRecorder
 from flasher.trace.steps import step_of
 
-TRACE: Final = "trace.log"
+TRACE: Final = "trace.blf"
+OLDER_TRACE: Final = "trace.log"
+"""What bundles held before."""
 TRANSCRIPT: Final = "transcript.txt"
 REPORT: Final = "report.json"
+PREFIX: Final = "flasher-"
+"""What the name of each bundle begins with."""
 FORMAT: Final = 1
 """Version of report.json: counts up when a key changes its meaning."""
 _PACKAGES: Final = {"flasher": "welling-flasher", "python_can": "python-can"}
@@ -51,7 +58,7 @@ def write_bundle(
     now = wall_clock()
     folder.mkdir(parents=True, exist_ok=True)
     stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(now))
-    path, part = _names(folder, f"flasher-{facts.get('target') or 'bus'}-{stamp}")
+    path, part = _names(folder, f"{PREFIX}{facts.get('target') or 'bus'}-{stamp}")
     try:
         _write_trace(part / TRACE, recorder)
         with (part / TRANSCRIPT).open("w", encoding="utf-8") as file:
@@ -66,6 +73,20 @@ def write_bundle(
     return path
 
 
+def bundles(folder: Path) -> list[Path]:
+    """The bundles in a folder, the latest last; none where there is no such folder."""
+    if not folder.is_dir():
+        return []
+    found = (path for path in folder.iterdir() if path.name.startswith(PREFIX) and path.is_dir())
+    return sorted(found, key=lambda path: (path.stat().st_mtime_ns, path.name))
+
+
+def keep_last(folder: Path, count: int) -> None:
+    """Remove all bundles in a folder but the latest `count`."""
+    for path in bundles(folder)[:-count]:
+        shutil.rmtree(path, ignore_errors=True)
+
+
 def _names(folder: Path, base: str) -> tuple[Path, Path]:
     """A name that is free, and the folder beside it to write into, which is made."""
     for number in count(1):
@@ -74,7 +95,7 @@ def _names(folder: Path, base: str) -> tuple[Path, Path]:
         if (folder / name).exists():
             continue
         try:
-            part.mkdir()
+            part.mkdir(mode=0o700)
         except FileExistsError:
             continue
         return folder / name, part
@@ -83,7 +104,10 @@ def _names(folder: Path, base: str) -> tuple[Path, Path]:
 
 def _write_trace(path: Path, recorder: FlightRecorder) -> None:
     offset_s = recorder.wall_offset_s or 0.0
-    writer = can.CanutilsLogWriter(path)
+    writer = can.BLFWriter(path)
+    # The head of the file holds milliseconds: what counts from them is exact.
+    first_at_s = next((entry.at_s for entry in recorder), 0.0) + offset_s
+    writer.start_timestamp = math.floor(first_at_s * 1000) / 1000
     try:
         for entry in recorder:
             at_s = entry.at_s + offset_s

@@ -12,7 +12,7 @@ from flasher.errors import FlasherError, UsageError
 from flasher.files import JSON_MAX_SIZE, parse_json, read
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
-from flasher.trace.bundle import REPORT, TRACE
+from flasher.trace.bundle import OLDER_TRACE, REPORT, TRACE
 from flasher.trace.explain import explain
 from flasher.trace.explanations import EXPLANATIONS
 from flasher.trace.reader import read_trace
@@ -34,7 +34,9 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
             everything=everything,
         )
         return replace(story, damage=" ".join(damage))
-    trace = path / TRACE
+    trace = next(
+        (at for name in (TRACE, OLDER_TRACE) if (at := path / name).is_file()), path / TRACE
+    )
     if not trace.is_file():
         raise UsageError(
             f"{printable(str(path))} is a folder, but no bundle: there is no {TRACE} in it.",

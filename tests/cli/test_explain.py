@@ -141,7 +141,7 @@ def test_where_the_trace_of_a_bundle_breaks_off_the_tool_gave_up_and_not_the_rec
     assert "Here the tool ended: OBC: the overall deadline passed." in told
     assert "the recording was stopped" not in told
     assert "what to do: Allow more time with --timeout" in page.read_text()
-    for name in ("trace.log", "report.json"):
+    for name in ("trace.blf", "report.json"):
         refused = flasher("explain", bundle, "--html", bundle / name)
         assert refused.code == ExitCode.USAGE
     assert flasher("explain", bundle).out == told

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import can
 import pytest
 
 from flasher import service
 from flasher.cli.output import Output
-from flasher.cli.recording import add_recording, recording
+from flasher.cli.recording import BUNDLE_FOLDER, add_recording, recording
+from flasher.driver import Tap
 from flasher.errors import (
     BusError,
     ExitCode,
@@ -23,6 +26,7 @@ from flasher.errors import (
 )
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS
+from flasher.trace.reader import read_trace
 from tests.trace.tape import Tape
 
 from .conftest import SAMPLES, Flasher
@@ -83,14 +87,68 @@ def test_a_failure_on_the_bus_leaves_a_bundle_and_says_where(
     [
         UsageError("x"),
         ImageError("x"),
-        InterruptedByUserError("x"),
-        KeyboardInterrupt(),
     ],
     ids=lambda error: type(error).__name__,
 )
 def test_what_explains_itself_leaves_none(error: BaseException, bundle_folder: Path) -> None:
     run_into(error)
     assert bundles(bundle_folder) == []
+
+
+@pytest.mark.parametrize("error", [InterruptedByUserError("Stopped."), KeyboardInterrupt()])
+def test_what_was_interrupted_leaves_one_too(error: BaseException, bundle_folder: Path) -> None:
+    run_into(error)
+    (bundle,) = bundles(bundle_folder)
+    assert report_of(bundle)["error"]["exit_code"] == ExitCode.INTERRUPTED
+    assert bundle.stat().st_mode & 0o777 == 0o700
+
+
+def test_what_fails_before_a_frame_was_sent_or_heard_leaves_nothing(
+    flasher: Flasher, bundle_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    image = str(SAMPLES / "bms.hex")
+    for words in (("flash", image, "-t", "bms"), ("info", "-t", "bms"), ("scan",)):
+        run = flasher(*words)
+        assert run.code == ExitCode.BUS
+        assert "bundle" not in run.err
+    assert bundles(bundle_folder) == bundles(tmp_path) == []
+
+
+def test_the_users_own_folder_keeps_the_last_fifty_and_explain_finds_the_latest(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state, work = tmp_path / "state", tmp_path / "work"
+    work.mkdir()
+    monkeypatch.chdir(work)
+    monkeypatch.delenv(BUNDLE_FOLDER)
+    monkeypatch.setenv("XDG_STATE_HOME", str(state))
+    none_yet = flasher("explain", "--last")
+    assert none_yet.code == ExitCode.USAGE
+    assert "There is no bundle in" in none_yet.err
+    for number in range(53):
+        run_into(BusError(f"failure {number}"))
+    folder = state / "flasher" / "bundles"
+    assert len(bundles(folder)) == 50
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert "failure 52" in flasher("explain", "--last").out
+    assert bundles(work) == []
+    run_into(BusError("elsewhere"), "--bundle-dir", work)
+    assert len(bundles(work)) == 1
+    both = flasher("explain", "--last", work)
+    assert (both.code, flasher("explain").code) == (ExitCode.USAGE, ExitCode.USAGE)
+
+
+def test_a_bundle_of_before_is_still_explained(flasher: Flasher, bundle_folder: Path) -> None:
+    run_into(BusError("x"))
+    (bundle,) = bundles(bundle_folder)
+    with can.Logger(bundle / "trace.log") as log, can.LogReader(bundle / "trace.blf") as messages:
+        for message in messages:
+            log(message)
+    told = flasher("explain", bundle).out.splitlines()
+    (bundle / "trace.blf").unlink()
+    assert flasher("explain", bundle).out.splitlines()[:8] == told[:8]
+    assert "reported then: exit code 4" in told
 
 
 def test_a_bug_leaves_a_bundle_with_its_traceback(bundle_folder: Path) -> None:
@@ -102,6 +160,7 @@ def test_a_bug_leaves_a_bundle_with_its_traceback(bundle_folder: Path) -> None:
 
 def test_a_failure_that_is_returned_can_be_handed_in(bundle_folder: Path) -> None:
     with recording(options(), Output()) as record:
+        record.flight(Frame(0x752, b""), sent=True, now=1.0)
         record.facts["outcome"] = {"ending": "refused"}
         record.failed(FlasherError("x"))
     (bundle,) = bundles(bundle_folder)
@@ -165,7 +224,7 @@ def test_the_echoes_of_an_adapter_are_in_neither_trace_nor_bundle_nor_figures(
     assert link.device_answer is not None
     (bundle,) = bundles(bundle_folder)
     assert len(path.read_text().splitlines()) == len(tape.frames)
-    assert len((bundle / "trace.log").read_text().splitlines()) == len(tape.frames)
+    assert len(list(read_trace(bundle / "trace.blf"))) == len(tape.frames)
 
 
 def test_a_trace_file_that_cannot_be_written_is_wrong_usage(bundle_folder: Path) -> None:
@@ -214,7 +273,9 @@ def test_commands_record_what_they_ask(
 def test_a_silent_device_leaves_a_bundle_that_is_explained(
     flasher: Flasher, bundle_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def silent(*_: object, **__: object) -> None:
+    def silent(*_: object, taps: Sequence[Tap], **__: object) -> None:
+        for tap in taps:
+            tap(Frame(0x752, b""), sent=True, now=1.0)
         raise NoAnswerError("The BMS did not answer.", remedy="Wake it.")
 
     monkeypatch.setattr(service, "read", silent)

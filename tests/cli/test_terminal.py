@@ -80,7 +80,7 @@ def test_no_encoding_of_a_stream_ends_a_command(
         monkeypatch.setattr(sys, "stdout", streams[0])
         monkeypatch.setattr(sys, "stderr", streams[1])
         code = main([str(trace) if word == "TRACE" else word for word in words])
-        raw = [bytes(stream.buffer.getvalue()) for stream in streams]  # type: ignore[attr-defined]
+        raw = [bytes(stream.buffer.getvalue()) for stream in streams]
         assert code != ExitCode.INTERNAL, (name, raw)
         assert b"Traceback" not in raw[1], (name, raw)
         said[name] = raw[0].decode(encoding)

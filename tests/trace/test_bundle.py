@@ -48,16 +48,16 @@ def test_the_ring_keeps_the_last_frames_and_counts_all() -> None:
 
 
 def test_frames_directions_and_times_survive_the_way_through_the_file(tmp_path: Path) -> None:
-    recorder = FlightRecorder(wall_clock=lambda: START_S)
+    recorder = FlightRecorder(wall_clock=lambda: START_S + 0.000456)
     for number, (frame, sent) in enumerate(MIXED):
         recorder(frame, sent=sent, now=7.0 + number * 0.000123)
     path = write_bundle(tmp_path, recorder, {})
-    read = list(read_trace(path / "trace.log"))
+    read = list(read_trace(path / "trace.blf"))
     assert [frame for _, frame in read] == [frame for frame, _ in MIXED]
     assert [at for at, _ in read] == pytest.approx(
-        [START_S + number * 0.000123 for number in range(len(MIXED))], abs=1e-6
+        [START_S + 0.000456 + number * 0.000123 for number in range(len(MIXED))], abs=1e-6
     )
-    with can.LogReader(path / "trace.log") as messages:
+    with can.LogReader(path / "trace.blf") as messages:
         assert [not message.is_rx for message in messages] == [sent for _, sent in MIXED]
 
 
@@ -67,7 +67,7 @@ def test_a_bundle_holds_trace_transcript_and_report(tmp_path: Path) -> None:
     path = write_bundle(tmp_path / "new", recorded(tape), facts, wall_clock=lambda: START_S + 9)
     assert re.fullmatch(r"flasher-bms-\d{8}-\d{6}", path.name)
     assert sorted(file.name for file in path.iterdir()) == [
-        "report.json", "trace.log", "transcript.txt",
+        "report.json", "trace.blf", "transcript.txt",
     ]  # fmt: skip
     lines = (path / "transcript.txt").read_text().splitlines()
     assert lines[0] == "  0.000500  out  752  CDL > BMS  reset"
