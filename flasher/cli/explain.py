@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import Annotated, Any, Final, TypedDict
 
@@ -12,6 +13,7 @@ from flasher.cli.explain_text import story_lines
 from flasher.cli.files import check_not_read, check_writable, write_whole
 from flasher.cli.output import Output
 from flasher.cli.recording import bundle_folder
+from flasher.cli.terminal import painted, takes_colour
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.text import printable
 from flasher.trace.story import Story
@@ -89,8 +91,9 @@ def run(options: argparse.Namespace, output: Output) -> int:
             read += [trace / name for name in (TRACE, OLDER_TRACE, REPORT)]
         check_not_read(options.html, _HTML, read)
     story = explain_path(trace, bitrate_bps=options.bitrate, everything=options.all)
+    paint = _painted if takes_colour(sys.stdout) else str
     for line in story_lines(story, packets=options.packets):
-        output.result(line)
+        output.result(paint(line))
     if options.html is not None:
         from flasher.report.explain_page import render  # noqa: PLC0415  loads jinja2
 
@@ -98,6 +101,12 @@ def run(options: argparse.Namespace, output: Output) -> int:
         output.progress(f"page: {printable(str(options.html))}")
     output.document(ExplainDocument(story=plain_value(story)))
     return ExitCode.OK
+
+
+def _painted(line: str) -> str:
+    """A line for a terminal: what went wrong is red."""
+    is_bad = "  ! " in line or line.endswith("  none")
+    return painted(line, "red") if is_bad else line
 
 
 def _source(options: argparse.Namespace) -> Path:

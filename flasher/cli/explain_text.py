@@ -138,7 +138,7 @@ def _link_lines(link: LinkReport) -> Iterator[str]:
     faults = f"{link.repetitions} repeated, {counted(link.naks, 'NAK')}"
     yield f"    packets:     {link.acknowledged:,} of {link.packets:,} acknowledged, {faults}"
     share = link.share_of_line_rate
-    rate = "" if share is None else f", {share:.0%} of the line rate"
+    rate = "" if share is None else f", {_share(share, 0)} of the line rate"
     line = f"{duration(link.line_s)} at line rate{rate}"
     yield f"    time:        {duration(link.transfer_s)}, {line}"
     yield _times("device", link.device_answer)
@@ -163,8 +163,8 @@ def _bus_lines(bus: BusFigures, bitrate_bps: int) -> Iterator[str]:
     if not bus.frames and not bus.error_frames:
         yield "bus load: none, there is no frame"
         return
-    load = "unknown" if bus.load is None else f"{bus.load:.1%}"
-    peak = "" if bus.peak_load is None else f", {bus.peak_load:.1%} in the busiest second"
+    load = "unknown" if bus.load is None else _share(bus.load, 1)
+    peak = "" if bus.peak_load is None else f", {_share(bus.peak_load, 1)} in the busiest second"
     yield f"bus load: {load} of {bitrate_bps / 1000:g} kbit/s{peak}"
     gap = f"{bus.longest_gap_s:.3f} s at {bus.longest_gap_at_s:.3f} s"
     yield f"  longest silence: {gap}"
@@ -172,6 +172,11 @@ def _bus_lines(bus: BusFigures, bitrate_bps: int) -> Iterator[str]:
         f"  error frames: {bus.error_frames:,}, damaged pieces: {bus.damaged:,}, "
         f"malformed or unknown messages: {bus.malformed:,}"
     )
+
+
+def _share(share: float, digits: int) -> str:
+    """A share of what the line carries. More than all of it means that it was no such line."""
+    return f"{share:.{digits}%}" if share <= 1 else "more than all"
 
 
 def _talker_lines(talkers: tuple[Talker, ...], left_out: int) -> Iterator[str]:

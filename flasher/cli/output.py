@@ -17,15 +17,12 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, Literal, NamedTuple, TextIO
 
 from flasher.cli.documents import SCHEMA_VERSION, ErrorDocument, to_json
-from flasher.cli.terminal import takes_colour, wrapped
+from flasher.cli.terminal import painted, takes_colour, wrapped
 from flasher.errors import ExitCode, FlasherError, UsageError
 
 _LOG: Final = logging.getLogger("flasher.cli")
 _SAID: Final = {"said": True}
 """Marks log records of what was printed, so that -v does not print it twice."""
-
-
-_COLOURS: Final = {"green": 32, "yellow": 33, "red": 31}
 
 
 class Verdict(NamedTuple):
@@ -118,16 +115,14 @@ class Output:
         """
         is_good = verdict.colour != "red"
         stream = sys.stdout if is_good else sys.stderr
-        word = verdict.word
-        if takes_colour(stream):
-            word = f"\x1b[1;{_COLOURS[verdict.colour]}m{word}\x1b[0m"
+        word = painted(verdict.word, verdict.colour) if takes_colour(stream) else verdict.word
         say = self.result if is_good else self.error_line
         say(f"{word}  {verdict.text}")
 
     def failure(self, error: FlasherError, **more: Any) -> None:
         """An error as a person reads it, and as the JSON document of the command."""
         _LOG.error("error: %s", error, extra=_SAID)
-        head = "\x1b[1;31merror:\x1b[0m" if self.colour else "error:"
+        head = painted("error:", "red") if self.colour else "error:"
         self.say(f"{head} {error}")
         if self.ending is not None:
             self.verdict(self.ending(error))

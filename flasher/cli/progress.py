@@ -9,6 +9,7 @@ from typing import Any, Final, Self
 
 from flasher import events
 from flasher.cli.output import Output
+from flasher.cli.terminal import painted
 from flasher.host.table import Event
 from flasher.image.plan import Plan
 from flasher.protocol.spec import PACKET_DATA_SIZE
@@ -111,7 +112,7 @@ class Progress:
     def _prompt(self, limit_s: float) -> None:
         """What the user has to do now, so that it is seen."""
         text = f"power-cycle the device now (waiting {limit_s:g} s)"
-        bold = f"\x1b[1;33m{text}\x1b[0m" if self._output.colour else text
+        bold = painted(text, "yellow") if self._output.colour else text
         self._output.error_line(f">>> {bold}")
 
     def _move(self, number: int, total: int) -> None:

@@ -11,6 +11,7 @@ import textwrap
 from pathlib import Path
 from typing import Final, TextIO
 
+COLOURS: Final = {"green": 32, "yellow": 33, "red": 31}
 _SUBSTITUTES: Final = {"°": "deg", "…": "~"}
 """What stands for a character that the encoding of a stream does not have."""
 _SUBSTITUTED: Final = "flasher-substitutes"
@@ -50,6 +51,11 @@ def _substitute(error: UnicodeError) -> tuple[str, int]:
 def takes_colour(stream: TextIO) -> bool:
     """True for a terminal, unless NO_COLOR is set."""
     return stream.isatty() and not os.environ.get("NO_COLOR")
+
+
+def painted(text: str, colour: str) -> str:
+    """Text in a colour of `COLOURS`, bold."""
+    return f"\x1b[1;{COLOURS[colour]}m{text}\x1b[0m"
 
 
 def wrapped(text: str, stream: TextIO) -> str:

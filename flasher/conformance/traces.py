@@ -11,7 +11,7 @@ import can
 
 from flasher.conformance.model import CaseResult, Status, TraceEntry
 from flasher.protocol.frame import Frame
-from flasher.trace.recorder import message_of
+from flasher.trace.recorder import ONE_TOOL_CHANNEL, message_of
 
 SUFFIX = ".log"
 TRACED = frozenset({Status.FAIL, Status.ERROR, Status.INCONCLUSIVE, Status.DEVIATION})
@@ -37,9 +37,12 @@ def candump(result: CaseResult) -> bytes:
 def candump_of(trace: Iterable[TraceEntry]) -> bytes:
     """Frames as a log; times count from the beginning of the case, what the suite sent is `T`."""
     text = io.StringIO()
-    writer = can.CanutilsLogWriter(text, channel="can0")
+    # By its channel `flasher explain` knows it again: one tool, whatever it sends.
+    writer = can.CanutilsLogWriter(text, channel=ONE_TOOL_CHANNEL)
     for entry in trace:
         writer.on_message_received(
-            message_of(Frame(*entry.frame), sent=entry.sent, at_s=entry.at_s)
+            message_of(
+                Frame(*entry.frame), sent=entry.sent, at_s=entry.at_s, channel=ONE_TOOL_CHANNEL
+            )
         )
     return text.getvalue().encode("ascii")

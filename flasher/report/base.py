@@ -54,7 +54,9 @@ def counted(number: int) -> str:
 
 
 def percent(share: float) -> str:
-    """A share of 1 in percent: 87 %, 0.4 %, 0 %."""
+    """A share of 1 in percent: 87 %, 0.4 %, 0 %; more than all of a line is no figure."""
+    if share > 1:
+        return "more than the line carries"
     value = share * 100
     return f"{value:.1f} %" if 0.05 <= value < 9.95 else f"{value:.0f} %"
 

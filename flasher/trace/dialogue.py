@@ -28,6 +28,8 @@ _GAP_S: Final = 1.0
 """Silence that is worth a line."""
 _AT_ONCE_S: Final = 0.3
 """A tool that gives up waits longer than this for an answer, before it starts over."""
+_IN_VAIN_S: Final = 2 * DEFAULT_TIMINGS.command_timeout_s
+"""A tool that is silent for so long before the transfer has waited for an answer."""
 _LATE_BOOT_S: Final = 0.25
 """Boot versions up to here after an update command may have been on their way."""
 _VERSION_SIZE: Final = 32
@@ -47,8 +49,9 @@ class Dialogue(Facts):
         *,
         steps: StepList,
         max_packets: int,
+        is_one_tool: bool = False,
     ) -> None:
-        super().__init__(target, begin_s, begin_s, begin_s)
+        super().__init__(target, begin_s, begin_s, begin_s, is_one_tool=is_one_tool)
         self.steps = steps
         self.link = Transfer(bitrate_bps)
         self._bitrate_bps = bitrate_bps
@@ -149,8 +152,11 @@ class Dialogue(Facts):
                 self.enter(Phase.CONFIRM, piece.begin_s)
 
     def _reset(self, piece: Piece) -> None:
+        is_early = self.phase in (None, Phase.RESET, Phase.BOOT)
+        if is_early and self._gave_up(piece.begin_s):
+            self._next_attempt(piece.begin_s)
         self.resets += 1
-        if self.phase in (None, Phase.RESET, Phase.BOOT):
+        if is_early:
             if self.phase is None:
                 self.enter(Phase.RESET, piece.begin_s)
         elif self._is_undisturbed(piece.begin_s):
@@ -163,7 +169,8 @@ class Dialogue(Facts):
         if self._is_undisturbed(piece.begin_s):
             self._intrude("update command")
             return
-        if self.phase in (Phase.TRANSFER, Phase.END, Phase.CONFIRM):
+        in_silence = not self.is_announced and self._gave_up(piece.begin_s)
+        if self.phase in (Phase.TRANSFER, Phase.END, Phase.CONFIRM) or in_silence:
             self._next_attempt(piece.begin_s)
         self.updates += 1
         self.image_size_bytes = size_bytes
@@ -172,8 +179,16 @@ class Dialogue(Facts):
             self._update_at_s = piece.end_s
         self.enter(Phase.UPDATE, piece.begin_s)
 
+    def _gave_up(self, now: float) -> bool:
+        """True when a tool that has told the device to update before waited for it in vain: what it
+        sends now is its next attempt.
+        """
+        return self.updates > 0 and now - self.tool_at_s >= _IN_VAIN_S
+
     def _is_undisturbed(self, now: float) -> bool:
         """True while all goes well, so that no tool has a reason to start over."""
+        if self.is_one_tool:
+            return False
         packet = self.current
         running = self.phase is Phase.TRANSFER and packet is not None and packet.is_clean
         return running and now - self.last_at_s < _AT_ONCE_S and not self.is_restarted

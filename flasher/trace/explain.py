@@ -28,7 +28,7 @@ from flasher.trace.decoder import Kind
 from flasher.trace.dialogue import Dialogue
 from flasher.trace.explanations import EXPLANATIONS
 from flasher.trace.pieces import Piece, Pieces, bits_of
-from flasher.trace.steps import MAX_STEPS, StepList, step_of
+from flasher.trace.steps import MAX_STEPS, StepList, mark_unanswered, step_of
 from flasher.trace.story import (
     Cause,
     Recorded,
@@ -45,6 +45,8 @@ EVERYTHING_LIMIT: Final = 200_000
 """Lines of a list when every message is wanted."""
 _WALL_TIME_FROM: Final = 1e8
 """Stamps from here on (1973) are wall time, smaller ones count from some start."""
+_MAY_BE_ANSWERED: Final = frozenset({Cause.RECORDING_ENDS, Cause.TOOL_STOPPED})
+"""Ends of a trace behind which the latest message may have been answered."""
 _BEGINNERS: Final = (Command.RESET, Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER)
 """Messages of the tool that make an upgrade."""
 _OF_BOOTLOADERS: Final = frozenset(Command) - {Command.READ_VERSION, Command.VERSION_INFORMATION}
@@ -71,14 +73,16 @@ def explain(
     until: float | None = None,
     everything: bool = False,
     recorded: Recorded | None = None,
+    is_one_tool: bool = False,
 ) -> Story:
     """The story of a trace: `frames` with their times in seconds, in the order of the file.
 
     `suffix` names the format. `bitrate_bps` None finds the dialect's own rate. `until` is the time,
     on the same clock, up to which the bus was listened to, where that is known. `everything` keeps
-    every message as a line of its own. Raises what `frames` raises.
+    every message as a line of its own. `is_one_tool` says that whatever is sent comes from one
+    tool, which may break the protocol on purpose. Raises what `frames` raises.
     """
-    reading = _Reading(bitrate_bps, everything=everything)
+    reading = _Reading(bitrate_bps, everything=everything, is_one_tool=is_one_tool)
     now = float("-inf")
     for at, frame in frames:
         now = max(now, at)
@@ -89,10 +93,11 @@ def explain(
 class _Reading:
     """What has been read so far."""
 
-    def __init__(self, bitrate_bps: int | None, *, everything: bool) -> None:
+    def __init__(self, bitrate_bps: int | None, *, everything: bool, is_one_tool: bool) -> None:
         self._given_bps = bitrate_bps
         self._bitrate_bps = bitrate_bps or WELLING.bitrate_bps
         self._everything = everything
+        self._is_one_tool = is_one_tool
         self._bus = BusCounter()
         self._pieces = Pieces()
         self._open: dict[Target, Dialogue] = {}
@@ -166,6 +171,7 @@ class _Reading:
             self._bitrate_bps,
             steps=self._new_steps(),
             max_packets=self._packets_left,
+            is_one_tool=self._is_one_tool,
         )
         for said in heard:
             dialogue.device(said)
@@ -239,7 +245,9 @@ class _Reading:
             attempts=dialogue.attempt,
             phases=tuple(dialogue.spans),
             packets=tuple(record.story() for record in dialogue.packets),
-            steps=dialogue.steps.lines(),
+            steps=mark_unanswered(
+                dialogue.steps, target.node.name, is_over=verdict.cause not in _MAY_BE_ANSWERED
+            ),
             steps_left_out=dialogue.steps.left_out,
             link=dialogue.link.report(),
             remarks=remarks(dialogue, verdict.cause),

@@ -30,6 +30,9 @@ class Facts:
     is_answered: bool = False
     """The target said something intact."""
 
+    is_one_tool: bool = False
+    """All that is sent on the tool's id is known to come from one tool."""
+
     # Before the transfer.
     resets: int = 0
     feedbacks: int = 0

@@ -6,7 +6,7 @@ import os
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 import can
 
@@ -14,8 +14,11 @@ from flasher.errors import UsageError
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
 
+ONE_TOOL_CHANNEL: Final = "conformance"
+"""Channel of a log in which one tool breaks the protocol on purpose."""
 
-def message_of(frame: Frame, *, sent: bool, at_s: float) -> can.Message:
+
+def message_of(frame: Frame, *, sent: bool, at_s: float, channel: int | str = 0) -> can.Message:
     """A frame as python-can's writers take it, at wall time `at_s`."""
     return can.Message(
         timestamp=at_s,
@@ -25,7 +28,7 @@ def message_of(frame: Frame, *, sent: bool, at_s: float) -> can.Message:
         is_remote_frame=frame.is_remote,
         is_error_frame=frame.is_error,
         is_rx=not sent,
-        channel=0,
+        channel=channel,
     )
 
 

@@ -16,6 +16,7 @@ from flasher.trace.bundle import OLDER_TRACE, REPORT, TRACE
 from flasher.trace.explain import explain
 from flasher.trace.explanations import EXPLANATIONS
 from flasher.trace.reader import read_trace
+from flasher.trace.recorder import ONE_TOOL_CHANNEL
 from flasher.trace.story import Cause, Recorded, Story, Verdict
 
 
@@ -32,6 +33,7 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
             suffix=_suffix(path),
             bitrate_bps=bitrate_bps,
             everything=everything,
+            is_one_tool=_is_of_conformance(path),
         )
         return replace(story, damage=" ".join(damage))
     trace = next(
@@ -94,6 +96,14 @@ def _until_damage(path: Path, damage: list[str]) -> Iterator[tuple[float, Frame]
         if not count:
             raise
         damage.append(f"{error.where or error.what}: {error.cause}")
+
+
+def _is_of_conformance(path: Path) -> bool:
+    """True for a log of the conformance suite: its channel says so."""
+    if path.suffix.lower() != ".log" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return f" {ONE_TOOL_CHANNEL} ".encode() in file.read(_HEAD_SIZE)
 
 
 def _suffix(path: Path) -> str:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import Final
 
+from flasher.protocol.spec import Node
 from flasher.trace.decoder import Field, Kind, Seen
 from flasher.trace.story import Line, PacketRun, Step, StepKind
 
@@ -104,6 +106,29 @@ class StepList:
                 text += f" within {end_s - begin_s:.3f} s"
             self._errors = 0
             self._keep(Step(begin_s, StepKind.ERROR_FRAMES, "", "", _ERRORS, text, is_trouble=True))
+
+
+def mark_unanswered(steps: StepList, device: str, *, is_over: bool) -> tuple[Line, ...]:
+    """The lines of an upgrade, in which what the tool said and the `device` left unanswered is
+    trouble. `is_over`: nothing more came after the last one.
+    """
+    lines = list(steps.lines())
+    gap = len(lines) // 2 - 1 if steps.left_out else None
+    is_answered = not is_over
+    for index in reversed(range(len(lines))):
+        line = lines[index]
+        if index == gap:
+            is_answered = True
+        if isinstance(line, PacketRun):
+            is_answered = False
+        elif line.sender == device:
+            is_answered = True
+        elif line.sender == Node.CDL.name and line.kind is StepKind.MESSAGE:
+            if not is_answered:
+                text = f"{line.text}, not answered".removeprefix(", ")
+                lines[index] = replace(line, text=text, is_trouble=True)
+            is_answered = False
+    return tuple(lines)
 
 
 def step_of(seen: Seen, at_s: float) -> Step:

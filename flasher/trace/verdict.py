@@ -100,11 +100,12 @@ def _other_version(upgrade: Facts) -> _Found:
 
 def _spoiled(upgrade: Facts, *, is_alone: bool) -> _Found | None:
     node = upgrade.target.node.name
-    if upgrade.intrusions:
+    if upgrade.intrusions and not upgrade.is_one_tool:
         said = "; ".join(upgrade.intrusions[:3])
         text = f"On the tool's own CAN id there came what this upgrade does not explain: {said}."
         return _Found(Cause.SECOND_TOOL, text)
-    if upgrade.interleaving.found and upgrade.damage_from_tool:
+    is_cut_in = upgrade.interleaving.found and upgrade.damage_from_tool
+    if is_cut_in and not upgrade.is_one_tool:
         begun = "began inside another one"
         text = f"On the tool's own CAN id a message {begun}, {upgrade.interleaving.found} time(s)."
         return _Found(Cause.SECOND_TOOL, text)

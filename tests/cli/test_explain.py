@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -145,3 +146,54 @@ def test_where_the_trace_of_a_bundle_breaks_off_the_tool_gave_up_and_not_the_rec
         refused = flasher("explain", bundle, "--html", bundle / name)
         assert refused.code == ExitCode.USAGE
     assert flasher("explain", bundle).out == told
+
+
+def test_what_was_not_answered_is_marked_and_red(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tape = Tape().reset(2).feedback().boot().update().request()
+    tape.packets(1, 4).packet(5).wait(0.5).packet(5).ack(5).packet(6).wait(3.0)
+    tape.message(0x710, 0x0C, 0x1305, b"READY")
+    path = tape.save(tmp_path / "t.log")
+    told = flasher("explain", path, "--html", tmp_path / "t.html").out.splitlines()
+    marked = [line.split("  ! ")[1] for line in told if "  ! " in line]
+    assert marked == [
+        "reset: not answered",
+        "packet: number 5, total 10, not answered",
+        "packet: number 6, total 10, not answered",
+    ]
+    page = (tmp_path / "t.html").read_text("utf-8")
+    assert page.count("not answered") >= 3
+    monkeypatch.setattr("flasher.cli.explain.takes_colour", lambda _stream: True)
+    red = [line for line in flasher("explain", path).out.splitlines() if "\x1b[1;31m" in line]
+    assert len(red) == len(marked)
+
+
+def test_no_share_of_a_line_is_more_than_all_of_it(flasher: Flasher, tmp_path: Path) -> None:
+    path = Tape().to_end().complete().save(tmp_path / "t.log")
+    for words in ((), ("--html", tmp_path / "t.html")):
+        told = flasher("explain", path, "-b", "20000", *words).out
+        assert "more than all of 20 kbit/s" in told
+        shares = re.findall(r"([\d.]+) ?%", told)
+        assert all(float(share) <= 100 for share in shares), told
+    page = (tmp_path / "t.html").read_text("utf-8")
+    assert "more than the line carries" in page
+
+
+def test_a_trace_of_the_conformance_suite_is_no_second_tool(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    """It breaks the protocol on purpose: a reset and a query in the midst of a transfer."""
+    tape = Tape().to_packet(4).ack(4).tool(0x3300, b"", mode=0x11).packet(5).ack(5).reset()
+    plain = tape.feedback().boot().save(tmp_path / "plain.log")
+    assert "verdict: two tools speak on the bus" in flasher("explain", plain).out
+    ran = flasher(
+        "conformance", "-t", "bms", "--mock", "--trace-dir", tmp_path, "--case", "TX-13",
+        "--variant", "reset-in-transfer-hangs",
+    )  # fmt: skip
+    assert ran.code == ExitCode.PARTIAL, ran.out
+    told = flasher("explain", tmp_path / "TX-13.log").out
+    assert "two tools" not in told
+    suite = tmp_path / "suite.log"
+    suite.write_text(plain.read_text().replace(" can0 ", " conformance "))
+    assert "two tools" not in flasher("explain", suite).out

@@ -67,6 +67,7 @@ def test_the_verdict_is_the_hosts_outcome(
     assert outcome.ending is ending
     (told,) = tapped.story().upgrades
     assert told.verdict.cause is cause, told.verdict.text
+    assert told.attempts == outcome.statistics.attempts
     if outcome.packet is not None:
         assert told.verdict.packet == outcome.packet
 
