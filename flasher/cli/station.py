@@ -238,7 +238,7 @@ def run(options: argparse.Namespace, output: Output) -> int:
     if missing:
         raise UsageError(
             f"The station needs packages that are not installed: {', '.join(missing)}.",
-            remedy="pip install 'welling-flasher[station]'",
+            remedy="In the checkout: pip install -c .ci/constraints.txt '.[station]'",
         )
     module: Any = importlib.import_module(f"flasher.cli.{_MODULES[options.action]}")
     code: int = module.run(options, output)

