@@ -193,6 +193,8 @@ def _leave_bundle(
         output.error_line(printable(f"warning: no bundle in {folder}: {reason}"))
     else:
         output.error_line(f"bundle: {printable(str(path))}")
+        if is_own:
+            output.error_line("        flasher explain --last tells what happened")
 
 
 def _circumstances(options: argparse.Namespace, target: Target | None) -> dict[str, Any]:

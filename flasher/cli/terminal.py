@@ -16,6 +16,8 @@ _SUBSTITUTES: Final = {"°": "deg", "…": "~"}
 """What stands for a character that the encoding of a stream does not have."""
 _SUBSTITUTED: Final = "flasher-substitutes"
 _REPLACED_ERRORS: Final = frozenset({"strict", "backslashreplace", "surrogateescape"})
+_PAINTED: Final = re.compile(r"(\x1b\[[\d;]+m)(.*?)(\x1b\[0m)(.*)")
+"""A line whose first words, or all, are coloured."""
 _COMMAND: Final = re.compile(r"\s*flasher ")
 """A command line is never wrapped: it has to be copied as it is."""
 _LABEL: Final = re.compile(r"\s*(?:\S+(?: \S+)*?\s{2,}|[A-Za-z][\w /-]{0,17}: +)?")
@@ -75,6 +77,12 @@ def wrap_line(line: str, width: int) -> list[str]:
     """
     if len(line) <= width or width <= 0 or _COMMAND.match(line):
         return [line]
+    if paint := _PAINTED.fullmatch(line):
+        begin, word, end, rest = paint.groups()
+        first, *others = wrap_line(word + rest, width)
+        if rest:
+            return [f"{begin}{word}{end}{first[len(word) :]}", *others]
+        return [f"{begin}{part}{end}" for part in (first, *others)]
     label = _LABEL.match(line)
     indent = label.end() if label else 0
     if indent > width // 2:

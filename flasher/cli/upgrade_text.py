@@ -94,7 +94,7 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Ve
     verification = result.verification
     remark = f"{verification.level.value} read back"
     if verification.verdict is Verified.NOT_ASKED:
-        remark = _not_asked(result)
+        remark = "not asked" if _has_query(result) else "no version query"
     elif verification.verdict is Verified.VERSION_UNJUDGED:
         remark = "the image names no version to compare with"
     if outcome.ending is Ending.CONFIRMED_BY_VERSION:
@@ -102,7 +102,7 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Ve
     warnings = sum(check.verdict in ("warned", "waived") for check in checks)
     remark += f"; {counted(warnings, 'warning')}" if warnings else ""
     if result.running_version is None:
-        text = f"{node} confirmed the complete image{was}; what runs now is not known ({remark})"
+        text = f"{node} confirmed the image{was}; what runs is not known ({remark})"
     else:
         text = f"{node} runs {result.running_version}{was} ({remark})"
     is_sure = verification.verdict in (Verified.VERSION_RIGHT, Verified.MEMORY_RIGHT)
@@ -157,13 +157,13 @@ def _running(result: Result) -> str:
     """What is known of the application that runs now, and how."""
     verification = result.verification
     if verification.verdict is Verified.NOT_ASKED:
-        return result.running_version or _not_asked(result)
+        no_query = "" if _has_query(result) else _NO_QUERY
+        return result.running_version or f"not asked{no_query}"
     return f"{result.running_version or 'unknown'} ({verification.verdict.value})"
 
 
-def _not_asked(result: Result) -> str:
-    has_query = possible_levels(result.outcome.target) != (Level.NONE,)
-    return "not asked" if has_query else f"not asked{_NO_QUERY}"
+def _has_query(result: Result) -> bool:
+    return possible_levels(result.outcome.target) != (Level.NONE,)
 
 
 def _rate(plan: Plan, transfer_s: float) -> str:

@@ -9,7 +9,7 @@ import sys
 import pytest
 
 from flasher.cli.main import main
-from flasher.cli.terminal import wrap_line
+from flasher.cli.terminal import painted, wrap_line
 from flasher.errors import ExitCode
 from tests.trace import traffic
 
@@ -42,6 +42,14 @@ def test_text_is_wrapped_between_words_and_hangs_behind_its_label(width: int) ->
 )  # fmt: skip
 def test_what_is_short_or_a_command_stays_as_it_is(line: str, wrapped: list[str]) -> None:
     assert wrap_line(line, 20) == wrapped
+
+
+def test_colours_take_no_room() -> None:
+    line = painted("OK", "green") + "  BMS runs V1r0r4_20220512"
+    assert wrap_line(line, 28) == [line]
+    assert wrap_line(line, 27) == [painted("OK", "green") + "  BMS runs", "    V1r0r4_20220512"]
+    whole = painted("  ! one two three", "red")
+    assert wrap_line(whole, 13) == [painted("  ! one two", "red"), painted("  three", "red")]
 
 
 COMMANDS = {

@@ -12,8 +12,8 @@ BMS, OBC = SAMPLES / "bms.hex", SAMPLES / "obc.bin"
 MOCK = ("--mock", "--mock-speed", "0")
 GREEN, YELLOW, RED = "\x1b[1;32m", "\x1b[1;33m", "\x1b[1;31m"
 RUNS = "BMS runs V1r0r4_20220512, was V1r0r0_20220512"
-HAS, UNKNOWN = "confirmed the complete image", "what runs now is not known"
-NO_QUERY = "not asked: the document gives this target no query for it"
+HAS, UNKNOWN = "confirmed the image", "what runs is not known"
+NO_QUERY = "no version query"
 
 
 @pytest.fixture
