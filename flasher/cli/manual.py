@@ -121,7 +121,7 @@ class Formatter(argparse.RawDescriptionHelpFormatter):
         super().__init__(prog, max_help_position=30, width=columns())
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
-        width = width if sys.stdout.isatty() else WIDTH - len(indent)
+        width = width if _is_for_terminal() else WIDTH - len(indent)
         lines: list[str] = []
         for is_prose, group in itertools.groupby(
             text.splitlines(), lambda line: line[:1].isalpha()
@@ -137,6 +137,11 @@ class Formatter(argparse.RawDescriptionHelpFormatter):
 def columns() -> int:
     """Columns that help takes."""
     return max(40, min(shutil.get_terminal_size().columns - 2, WIDTH))
+
+
+def _is_for_terminal() -> bool:
+    """Of the process: while it is parsed, stdout itself is held back."""
+    return sys.__stdout__ is not None and sys.__stdout__.isatty()
 
 
 def _narrowed(line: str, width: int) -> list[str]:
@@ -174,7 +179,7 @@ def exit_codes(command: str | None = None) -> str:
     # No space inside, so that a meaning is not parted from its code.
     told = [f"{int(code)} {_MEANINGS.get(code, code.name.lower())}" for code in sorted(codes)]
     words = "   ".join(each.replace(" ", "\xa0") for each in told)
-    width = min(columns(), WIDTH - 4) if sys.stdout.isatty() else WIDTH - 4
+    width = min(columns(), WIDTH - 4) if _is_for_terminal() else WIDTH - 4
     lines = textwrap.wrap(words, width, initial_indent="  ", subsequent_indent="  ")
     return "exit codes:\n" + "\n".join(lines).replace("\xa0", " ")
 

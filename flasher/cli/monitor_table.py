@@ -15,7 +15,7 @@ from rich.table import Table
 from rich.text import Text
 
 from flasher.cli.monitor_views import route
-from flasher.trace.decoder import Field
+from flasher.trace.decoder import NOT_IN_DIALECT, Field
 from flasher.trace.watcher import Board, Line
 
 WIDE: Final = 116
@@ -96,6 +96,8 @@ def _by_field(lines: list[Line], now: float, title: str, *, wide: bool) -> Table
     for line in lines:
         changed = line.changed(now)
         head, tail = _head(line, wide=wide), _tail(line, now, wide=wide)
+        if not line.seen.in_dialect:
+            head[-1] = Text(line.seen.marked_title, no_wrap=False, overflow="fold")
         for shown in line.seen.fields or (None,):
             cells = [Text(), Text(), Text()] if shown is None else _cells(shown, changed)
             table.add_row(*head, *cells, *tail)
@@ -109,7 +111,10 @@ def _by_message(lines: list[Line], now: float, title: str, *, wide: bool) -> Tab
     _figures(table, wide=wide)
     for line in lines:
         changed = line.changed(now)
-        fields = Text(", ").join(_in_words(shown, changed) for shown in line.seen.fields)
+        words = [_in_words(shown, changed) for shown in line.seen.fields]
+        if not line.seen.in_dialect:  # first: what stands behind may be cut
+            words.insert(0, Text(NOT_IN_DIALECT))
+        fields = Text(", ").join(words)
         table.add_row(*_head(line, wide=wide), fields, *_tail(line, now, wide=wide))
     return table
 
@@ -154,7 +159,7 @@ def _column(
 def _head(line: Line, *, wide: bool) -> list[Text]:
     seen = line.seen
     style = _TROUBLE if seen.is_trouble else ""
-    cells = [Text(f"{seen.can_id:03X}"), Text(seen.marked_title, style=style)]
+    cells = [Text(f"{seen.can_id:03X}"), Text(seen.title, style=style)]
     if wide:
         cells.insert(1, Text(route(seen)))
     return cells
