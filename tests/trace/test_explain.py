@@ -329,6 +329,18 @@ def test_the_last_upgrade_of_each_target_makes_the_verdict() -> None:
     assert told(tape).verdict.cause is Cause.NO_BOOT_VERSION
 
 
+def test_an_update_command_into_silence_is_an_attempt_as_flash_counts_it() -> None:
+    """R26; resets and update commands that repeat each other within an attempt are none."""
+    tape = Tape().to_packet(5).packet(5).wait(0.6).packet(5).wait(0.6)
+    tape.reset(5).wait(5.2).reset(5).wait(10.0)
+    tape.update().request().packets(1, 10).end().complete()
+    (upgrade,) = told(tape).upgrades
+    assert upgrade.attempts == 4
+    tape = Tape().reset(5).feedback().boot().update().wait(0.05).boot().update().request()
+    (upgrade,) = told(tape.packets(1, 10).end().complete()).upgrades
+    assert upgrade.attempts == 1
+
+
 def test_a_restart_that_was_overcome_is_a_remark_and_an_attempt() -> None:
     tape = Tape().to_packet(7).packet(7).wait(0.1).boot().update().wait(0.02).request()
     (upgrade,) = told(tape.packets(1, 10).end().complete()).upgrades
