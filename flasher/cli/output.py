@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final, Literal, NamedTuple, TextIO
 
 from flasher.cli.documents import SCHEMA_VERSION, ErrorDocument, to_json
-from flasher.cli.terminal import painted, takes_colour, wrapped
+from flasher.cli.terminal import painted, takes_colour, unpainted, wrapped
 from flasher.errors import ExitCode, FlasherError, UsageError
 
 _LOG: Final = logging.getLogger("flasher.cli")
@@ -66,7 +66,7 @@ class Output:
     def result(self, text: str) -> None:
         """A line of the result; silent when JSON is wanted."""
         if not self.json_wanted:
-            _LOG.info("%s", text, extra=_SAID)
+            _LOG.info("%s", unpainted(text), extra=_SAID)
             _print_stdout(wrapped(text, sys.stdout))
 
     def document(
@@ -106,7 +106,7 @@ class Output:
 
     def error_line(self, text: str) -> None:
         """A line that is never silenced."""
-        _LOG.error("%s", text, extra=_SAID)
+        _LOG.error("%s", unpainted(text), extra=_SAID)
         self.say(text)
 
     def verdict(self, verdict: Verdict) -> None:

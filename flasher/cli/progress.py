@@ -50,7 +50,7 @@ _BECAUSE: Final = {
 
 def because(reason: str, what: str = "") -> str:
     """The sentence for a reason of `MessageRepeated` and `AttemptStarted`."""
-    return _BECAUSE.get(reason, reason).format(what=what)
+    return _BECAUSE.get(reason, "{reason}").format(what=what, reason=reason)
 
 
 class Progress:

@@ -181,7 +181,7 @@ def _leave_bundle(
     folder = bundle_folder(options.bundle_dir)
     link = record.link_report()
     facts = {**record.facts, "error": _error(error), "link": link and dataclasses.asdict(link)}
-    is_own = folder == bundle_folder() and not os.environ.get(BUNDLE_FOLDER)
+    is_own = options.bundle_dir is None and not os.environ.get(BUNDLE_FOLDER)
     try:
         if is_own:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -16,6 +16,7 @@ _SUBSTITUTES: Final = {"°": "deg", "…": "~"}
 """What stands for a character that the encoding of a stream does not have."""
 _SUBSTITUTED: Final = "flasher-substitutes"
 _REPLACED_ERRORS: Final = frozenset({"strict", "backslashreplace", "surrogateescape"})
+_COLOUR: Final = re.compile(r"\x1b\[[\d;]+m")
 _PAINTED: Final = re.compile(r"(\x1b\[[\d;]+m)(.*?)(\x1b\[0m)(.*)")
 """A line whose first words, or all, are coloured."""
 _COMMAND: Final = re.compile(r"\s*flasher ")
@@ -58,6 +59,11 @@ def takes_colour(stream: TextIO) -> bool:
 def painted(text: str, colour: str) -> str:
     """Text in a colour of `COLOURS`, bold."""
     return f"\x1b[1;{COLOURS[colour]}m{text}\x1b[0m"
+
+
+def unpainted(text: str) -> str:
+    """Text without its colours, for a log."""
+    return _COLOUR.sub("", text)
 
 
 def wrapped(text: str, stream: TextIO) -> str:

@@ -87,13 +87,14 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Ve
     took = f"  {took_s:.1f} s"
     error = result.error()
     if error is not None:
-        return failed(error, f"; {_LEFT[result.device_left]}{took}")
+        left = "" if outcome.ok else f"; {_LEFT[outcome.device_left]}"
+        return failed(error, left + took)
     if not result.ok:
         return Verdict("NOTHING TO DO", f"{node}: {outcome.detail}{took}", "green")
     was = f", was {result.previous_version}" if result.previous_version else ""
     verification = result.verification
-    remark = f"{verification.level.value} read back"
-    if verification.verdict is Verified.NOT_ASKED:
+    remark = "memory read back" if verification.level is Level.MEMORY else "version read back"
+    if verification.verdict is Verified.NOT_ASKED and result.running_version is None:
         remark = "not asked" if _has_query(result) else "no version query"
     elif verification.verdict is Verified.VERSION_UNJUDGED:
         remark = "the image names no version to compare with"
@@ -113,7 +114,7 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Ve
 def failed(error: FlasherError, more: str = "") -> Verdict:
     """The last line of an upgrade that was not. The error itself is told in full above it."""
     word = "STOPPED" if isinstance(error, InterruptedByUserError) else "FAILED"
-    what = error.what.partition(" (")[0].partition(". ")[0].removesuffix(".")
+    what = error.what.partition(" (" if more else ". ")[0].removesuffix(".")
     if error.needs_rescue and not more:
         more = "; it has no application now, or perhaps none"
     return Verdict(word, what + more, "red")

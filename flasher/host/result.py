@@ -13,7 +13,7 @@ from flasher.errors import (
     UnconfirmedError,
     VerificationError,
 )
-from flasher.host.outcome import DeviceLeft, Outcome
+from flasher.host.outcome import Outcome
 from flasher.host.verify import NOT_ASKED, Verification
 
 _BY_LOST_POWER: Final = (NoAnswerError, TransferError, UnconfirmedError, VerificationError)
@@ -44,11 +44,6 @@ class Result:
             return ExitCode.NOTHING_TO_DO
         error = self.error()
         return ExitCode.OK if error is None else error.exit_code
-
-    @property
-    def device_left(self) -> DeviceLeft:
-        """The state in which the device was left."""
-        return self.outcome.device_left
 
     @property
     def running_version(self) -> str | None:

@@ -119,7 +119,7 @@ def test_without_the_extra_the_command_for_it_is_named(
     run = flasher("station", "verify")
     assert run.code == ExitCode.USAGE
     assert "sqlalchemy" in run.err
-    assert "pip install 'welling-flasher[station]'" in run.err
+    assert "pip install -c .ci/constraints.txt '.[station]'" in run.err
     assert flasher("station", "--help").code == ExitCode.OK
 
 

@@ -3,8 +3,18 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pytest
+
+from flasher.cli.upgrade_text import verdict_of
+from flasher.events import Phase
+from flasher.host.outcome import DeviceLeft, Outcome, Statistics
+from flasher.host.session import Result
+from flasher.host.table import Ending
+from flasher.host.verify import Level, Verification
+from flasher.host.verify import Verdict as Verified
+from flasher.protocol.spec import TARGETS
 
 from .conftest import SAMPLES, Flasher
 
@@ -90,3 +100,26 @@ def test_figures_of_the_line_and_passed_checks_are_told_with_v_and_in_json(
     assert document["link"]["device_answer"]["median_s"] > 0
     assert "passed" in {check["verdict"] for check in document["checks"]}
     assert document["previous_version"] == "V1r0r0_20220512"
+
+
+@pytest.mark.usefixtures("colours")
+def test_a_log_has_no_colours(flasher: Flasher, tmp_path: Path) -> None:
+    flasher("flash", BMS, "-t", "bms", *MOCK, "--log-file", tmp_path / "log")
+    flasher("flash", BMS, "-t", "bms", "--log-file", tmp_path / "log")
+    log = (tmp_path / "log").read_text()
+    assert f"OK  {RUNS}" in log
+    assert "FAILED  No adapter" in log
+    assert "\x1b" not in log
+
+
+def test_an_upgrade_that_is_completed_and_runs_something_else_has_failed() -> None:
+    outcome = Outcome(
+        Ending.COMPLETED, Phase.END, DeviceLeft.NEW, TARGETS["bms"], 10, None, None, None,
+        Statistics(),
+    )  # fmt: skip
+    other = Verification(Level.VERSION, Verified.VERSION_OTHER, "V1", "V1 instead of V2")
+    line = verdict_of(Result(outcome, other), [], 2.0)
+    assert (line.word, line.colour) == ("FAILED", "red")
+    assert line.text == (
+        "BMS: completed, but the application runs another version than the image names  2.0 s"
+    )
