@@ -139,7 +139,7 @@ def _nodes(heard: Listened) -> Iterator[Finding]:
         )
     for node, said in sorted(survey.heard.items(), key=lambda pair: pair[0].value):
         if any(isinstance(content, contents.Shutdown) for content in said.last.values()):
-            what = f"the {node.name} announces that the system switches off"
+            what = f"the {node.name} sent the command SHUTDOWN: the system switches off"
             yield Finding(Severity.WARNING, "traffic", what, ("press the key of the system",))
         if said.boot_version:
             what = f"the {node.name} is in its bootloader ({said.boot_version})"

@@ -120,8 +120,18 @@ def test_a_second_tool_is_a_problem(flasher: Flasher, monkeypatch: pytest.Monkey
 @pytest.mark.parametrize(
     ("said", "words", "severity", "fix"),
     [
-        ((0x720, 0x1308, b"SHUTDOWN"), "the BMS announces", "warning", "press the key"),
-        ((0x710, 0x1808, b"SHUTDOWN"), "the WMC announces", "warning", "press the key"),
+        (
+            (0x720, 0x1308, b"SHUTDOWN"),
+            "the BMS sent the command SHUTDOWN",
+            "warning",
+            "press the key",
+        ),
+        (
+            (0x710, 0x1808, b"SHUTDOWN"),
+            "the WMC sent the command SHUTDOWN",
+            "warning",
+            "press the key",
+        ),
         ((0x725, 0xC109, b"BMSV1.2.3"), "in its bootloader (BMS V1.2.3)", "note", "flasher flash"),
         ((0x740, 0x1305, b"READY"), "speaks motinova, not welling", "warning", "motinova"),
         ((0x123, 0x6603, b"abc"), "from no node of the system; ", "warning", None),

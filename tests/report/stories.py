@@ -156,7 +156,7 @@ def troubled_upgrade() -> UpgradeStory:
             311,
             1,
             "The BMS announced SHUTDOWN and stopped answering at packet 311 of 613.",
-            "the battery switched itself off: the key was held, or the bus current was low",
+            "the battery switched itself off: the key was held, or the pack current was low",
             "Wake the battery, keep it awake, and run the same command again.",
         ),
     )
