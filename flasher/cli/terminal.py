@@ -21,6 +21,7 @@ _PAINTED: Final = re.compile(r"(\x1b\[[\d;]+m)(.*?)(\x1b\[0m)(.*)")
 """A line whose first words, or all, are coloured."""
 _COMMAND: Final = re.compile(r"\s*flasher ")
 """A command line is never wrapped: it has to be copied as it is."""
+_ENDS_WITH_COMMAND: Final = re.compile(r"(.*[:|]) (flasher [a-z-]+ .*)")
 _LABEL: Final = re.compile(r"\s*(?:\S+(?: \S+)*?\s{2,}|[A-Za-z][\w /-]{0,17}: +)?")
 """What a line begins with, and what its continuations stand behind."""
 
@@ -83,6 +84,8 @@ def wrap_line(line: str, width: int) -> list[str]:
     """
     if len(line) <= width or width <= 0 or _COMMAND.match(line):
         return [line]
+    if ends := _ENDS_WITH_COMMAND.fullmatch(line):
+        return [*wrap_line(ends[1], width), f"    {ends[2]}"]
     if paint := _PAINTED.fullmatch(line):
         begin, word, end, rest = paint.groups()
         first, *others = wrap_line(word + rest, width)

@@ -110,7 +110,8 @@ class DeviceProfile:
     battery_seed: int = _option(1, "decides how the cells differ")
     faults: int = _option(0, "faults that are set from the start, as the 32 bits of 720 1204")
     idle_shutdown: Literal["off", "on"] = _option(
-        "off", "switches off when the bus was idle for 30 min and the pack current small throughout (5.1)"
+        "off",
+        "switches off when the bus was idle for 30 min and the pack current small throughout (5.1)",
     )
 
     # Memory.

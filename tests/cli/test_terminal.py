@@ -37,6 +37,14 @@ def test_text_is_wrapped_between_words_and_hangs_behind_its_label(width: int) ->
         ("", [""]),
         ("  flasher rescue bms.hex -t bms", ["  flasher rescue bms.hex -t bms"]),
         ("OK  BMS runs V1r0r4_20220512 now", ["OK  BMS runs", "    V1r0r4_20220512", "    now"]),
+        (
+            "RS-01 failed badly here | replay: flasher conformance -t bms --case RS-01",
+            [
+                "RS-01 failed badly",
+                "here | replay:",
+                "    flasher conformance -t bms --case RS-01",
+            ],
+        ),
         ("error: no such thing was found", ["error: no such thing", "       was found"]),
     ],
 )  # fmt: skip
