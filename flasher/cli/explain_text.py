@@ -175,8 +175,10 @@ def _bus_lines(bus: BusFigures, bitrate_bps: int) -> Iterator[str]:
 
 
 def _share(share: float, digits: int) -> str:
-    """A share of what the line carries. More than all of it means that it was no such line."""
-    return f"{share:.{digits}%}" if share <= 1 else "more than all"
+    """A share of what the line carries. Much more than all of it means that it was no such line;
+    a little more is what time stamps are wrong by.
+    """
+    return f"{min(share, 1):.{digits}%}" if share <= 1.02 else "more than all"
 
 
 def _talker_lines(talkers: tuple[Talker, ...], left_out: int) -> Iterator[str]:

@@ -174,7 +174,7 @@ def _rate(plan: Plan, transfer_s: float) -> str:
     share = plan.transfer_wire_s / transfer_s
     line = f"{plan.bitrate_bps / 1000:g} kbit/s line"
     # A bus in memory or on a network has no bit rate to keep to.
-    closeness = f"{share:.0%} of a {line}" if share <= 1.02 else f"faster than a {line}"
+    closeness = f"{min(share, 1):.0%} of a {line}" if share <= 1.02 else f"faster than a {line}"
     return f" ({plan.image.size_bytes / transfer_s / 1000:.1f} kB/s, {closeness})"
 
 
