@@ -46,7 +46,7 @@ def colours(monkeypatch: pytest.MonkeyPatch) -> None:
             f"{YELLOW}OK\x1b[0m  OBC {HAS}; {UNKNOWN} ({NO_QUERY})",
         ),
         (
-            (BMS, "-t", "wmc", "--allow-other-target"),
+            (OBC, "-t", "wmc", "--allow-other-target"),
             f"{YELLOW}OK\x1b[0m  WMC {HAS}; {UNKNOWN} ({NO_QUERY}; 1 warning)",
         ),
     ],
@@ -93,7 +93,7 @@ def test_a_bad_end_is_red_and_the_last_line_whatever_came_before(
 def test_figures_of_the_line_and_passed_checks_are_told_with_v_and_in_json(
     flasher: Flasher,
 ) -> None:
-    loud = flasher("flash", BMS, "-t", "bms", "-v", *MOCK)
+    loud = flasher("flash", OBC, "-t", "obc", "-v", *MOCK)
     assert "device took:" in loud.err
     assert "check: passed: by a name inside" in loud.err
     document = flasher("flash", BMS, "-t", "bms", "--json", *MOCK).document
@@ -104,10 +104,10 @@ def test_figures_of_the_line_and_passed_checks_are_told_with_v_and_in_json(
 
 @pytest.mark.usefixtures("colours")
 def test_a_log_has_no_colours(flasher: Flasher, tmp_path: Path) -> None:
-    flasher("flash", BMS, "-t", "bms", *MOCK, "--log-file", tmp_path / "log")
+    flasher("flash", OBC, "-t", "obc", *MOCK, "--log-file", tmp_path / "log")
     flasher("flash", BMS, "-t", "bms", "--log-file", tmp_path / "log")
     log = (tmp_path / "log").read_text()
-    assert f"OK  {RUNS}" in log
+    assert f"OK  OBC {HAS}" in log
     assert "FAILED  No adapter" in log
     assert "\x1b" not in log
 
