@@ -6,10 +6,10 @@ import shlex
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 from flasher.errors import FlasherError, UsageError
-from flasher.files import JSON_MAX_SIZE, parse_json, read
+from flasher.files import JSON_MAX_SIZE, opened, parse_json, read
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
 from flasher.trace.bundle import OLDER_TRACE, REPORT, TRACE
@@ -18,6 +18,8 @@ from flasher.trace.explanations import EXPLANATIONS
 from flasher.trace.reader import read_trace
 from flasher.trace.recorder import ONE_TOOL_CHANNEL
 from flasher.trace.story import Cause, Recorded, Story, Verdict
+
+_HEAD_SIZE: Final = 100
 
 
 def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool = False) -> Story:
@@ -102,7 +104,7 @@ def _is_of_conformance(path: Path) -> bool:
     """True for a log of the conformance suite: its channel says so."""
     if path.suffix.lower() != ".log" or not path.is_file():
         return False
-    with path.open("rb") as file:
+    with opened(path, None, may_grow=True) as (file, _):
         return f" {ONE_TOOL_CHANNEL} ".encode() in file.read(_HEAD_SIZE)
 
 
