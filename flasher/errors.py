@@ -8,9 +8,16 @@ exits: that is the command line's business.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable, Iterable
 from enum import IntEnum
-from typing import ClassVar
+from typing import ClassVar, Final
+
+_PASSWORD: Final = re.compile(r"(:/+[^\s:@]*):[^@\n]*@(?:[^\s@]*@)*")
+"""Between the user and the last @ of a URL: a password may hold an @ of its own."""
+_NO_PORT: Final = re.compile(r"(:/+[^\s:/@]*):(?!\d+\b|\*+@)[^\s/@]+")
+"""In the place of a port there is no number: the host was forgotten."""
+_PASSWORD_KEY: Final = re.compile(r"(?i)([?&][^\s=&]*password=)[^\s&]*")
 
 
 class ExitCode(IntEnum):
@@ -42,6 +49,12 @@ def did_you_mean(
     return f"Did you mean {spelled(close[0])}? " if close else ""
 
 
+def hide_passwords(text: str) -> str:
+    """A text that may hold the URL of a database, without the password in it."""
+    text = _NO_PORT.sub(r"\1:***", _PASSWORD.sub(r"\1:***@", text))
+    return _PASSWORD_KEY.sub(r"\1***", text)
+
+
 def printable(text: str) -> str:
     """`text` with everything but printable ASCII escaped."""
     return "".join(
@@ -53,17 +66,17 @@ def printable(text: str) -> str:
 class FlasherError(Exception):
     """Base of all errors that flasher raises on purpose.
 
-    `what` is one sentence; `where`, `cause` and `remedy` complete it and may be empty.
+    `what` is one sentence; `where`, `cause` and `remedy` complete it and may be empty. No password
+    of a URL is in them.
     """
 
     exit_code: ClassVar[ExitCode] = ExitCode.INTERNAL
 
     def __init__(self, what: str, *, where: str = "", cause: str = "", remedy: str = "") -> None:
-        super().__init__(what)
-        self.what = what
-        self.where = where
-        self.cause = cause
-        self.remedy = remedy
+        self.what, self.where, self.cause, self.remedy = map(
+            hide_passwords, (what, where, cause, remedy)
+        )
+        super().__init__(self.what)
         self.needs_rescue = False
         """True when a device was left that has no application, or perhaps none."""
 

@@ -15,7 +15,7 @@ from typing import Final, Self
 
 from flasher.cli.files import check_not_read, check_writable
 from flasher.cli.output import Output
-from flasher.errors import UsageError
+from flasher.errors import UsageError, hide_passwords
 from flasher.log import ROOT
 from flasher.protocol.text import printable
 
@@ -161,8 +161,8 @@ class _Forward(logging.Handler):
 
 def _lines(record: logging.LogRecord) -> list[str]:
     """The text of a record. What the command has printed was escaped where it came from."""
-    text = record.getMessage()
+    text = hide_passwords(record.getMessage())
     if record.exc_info:
-        text += "\n" + logging.Formatter().formatException(record.exc_info)
+        text += "\n" + hide_passwords(logging.Formatter().formatException(record.exc_info))
     lines = text.splitlines() or [""]
     return lines if getattr(record, "said", False) else [printable(line) for line in lines]

@@ -24,7 +24,13 @@ from flasher.cli import logs, manual
 from flasher.cli.lists import gather_lists
 from flasher.cli.output import Output
 from flasher.cli.terminal import prepare_streams
-from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, UsageError
+from flasher.errors import (
+    ExitCode,
+    FlasherError,
+    InterruptedByUserError,
+    UsageError,
+    hide_passwords,
+)
 from flasher.protocol.text import printable
 
 COMMANDS: Final = {
@@ -92,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parse_and_run(arguments: Sequence[str], output: Output, log: logs.Logs) -> int:
     name = output.command = _command_of(arguments)
     options = _parse(build_parser([name] if name else []), arguments)
-    options.command_line = arguments
+    options.command_line = [hide_passwords(word) for word in arguments]
     output.json_wanted = options.json
     output.events_wanted = options.events
     output.verbosity = options.verbose - options.quiet
@@ -100,7 +106,7 @@ def _parse_and_run(arguments: Sequence[str], output: Output, log: logs.Logs) -> 
         raise UsageError("--events needs --json.", remedy="Events are lines of JSON: add --json.")
     others = [value for name, value in vars(options).items() if name != "log_file"]
     log.open(output.verbosity, options.log_file, others)
-    told = printable(shlex.join(["flasher", *arguments]))
+    told = printable(shlex.join(["flasher", *options.command_line]))
     _LOG.info("flasher %s: %s", _version(), told, extra=_FOR_THE_FILE)
     return int(options.run(options, output))
 
@@ -157,7 +163,7 @@ def _guarded(run: Callable[[], int], output: Output) -> int:
         )
         # Into the log file too: error_line goes there.
         lines = traceback.format_exc().rstrip().splitlines()
-        output.error_line("\n".join(map(printable, lines)))
+        output.error_line("\n".join(printable(hide_passwords(line)) for line in lines))
         return ExitCode.INTERNAL
 
 
