@@ -88,7 +88,7 @@ def _verify(output: Output, store: Store) -> int:
     found = store.examine()
     for each in found.problems:
         output.result(f"{printable(each.where)}: {printable(each.what)}")
-    for line in (*store.limits, *found.remarks):
+    for line in found.remarks:
         output.progress(f"note: {printable(line)}")
     if found.problems:
         output.result(counted(len(found.problems), "problem"))

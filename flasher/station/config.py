@@ -113,7 +113,7 @@ class StationConfig(Part):
 
     name: Words = "station"
     records: str = "records.sqlite"
-    """A file beside this one, or an SQLAlchemy URL."""
+    """A file beside this one, or the URL of a PostgreSQL server."""
     files: str = ""
     """The folder of the attachments; empty: beside the file of the records."""
     keys: str = ""

@@ -6,20 +6,22 @@ connection is used. A setting that does not hold (a network disk without WAL) is
 
 from __future__ import annotations
 
+import importlib
 import os
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, Final
 from uuid import uuid4
 
 from sqlalchemy import Connection, Engine, create_engine, event, inspect, select, text
 from sqlalchemy.engine import URL, make_url
-from sqlalchemy.exc import ArgumentError, NoSuchModuleError
+from sqlalchemy.exc import ArgumentError
 from sqlalchemy.pool import StaticPool
 
 from flasher.errors import UsageError
@@ -32,14 +34,21 @@ from flasher.station.records.errors import (
     mapped,
 )
 from flasher.station.records.files import sync_folder
+from flasher.station.records.lock import StationLock
 from flasher.station.records.model import utc_text
 from flasher.station.records.schema import SCHEMA_VERSION, metadata, schema_info
 from flasher.station.records.triggers import trigger_statements
+
+if TYPE_CHECKING:
+    from flasher.station.records.server import ServerLock
 
 DEFAULT_LOCK_TIMEOUT_S: Final = 5.0
 """How long a write waits for another program that holds the database."""
 _SYNCHRONOUS_FULL: Final = 2
 _IMMEDIATE: Final = "flasher_immediate"
+_POSTGRESQL: Final = "postgresql+psycopg"
+_WRITER_LOCK: Final = 7052
+"""Of the server's advisory locks; a table's lock would need rights that a station has not."""
 _OPENED: Final = "flasher_file"
 """Which file a connection has open."""
 
@@ -69,14 +78,15 @@ def locate(url: str, folder: Path | None = None) -> Location:
     """
     try:
         parsed = make_url(url) if "://" in url else URL.create("sqlite", database=url)
-        backend = parsed.get_backend_name()
-        parsed.get_dialect()
-    except (ArgumentError, NoSuchModuleError, ValueError) as error:
-        raise UsageError(
-            f"{printable(url)!a:.100} names no database.",
-            remedy="Name a file, or an SQLAlchemy URL as postgresql+psycopg://user@host/name.",
-        ) from error
-    shown = printable(parsed.render_as_string(hide_password=True))
+    except (ArgumentError, ValueError) as error:
+        raise _no_database(url) from error
+    backend = parsed.get_backend_name()
+    if parsed.drivername == "postgresql":
+        parsed = parsed.set(drivername=_POSTGRESQL)
+    # An @ or a / of a password that is not written as %40 or %2F lands in host or name.
+    if parsed.drivername not in ("sqlite", _POSTGRESQL) or "@" in f"{parsed.host}{parsed.database}":
+        raise _no_database(url)
+    shown = printable(parsed.set(query={}).render_as_string(hide_password=True))
     if backend == "sqlite" and parsed.query:
         raise UsageError(
             f"The database {shown} has options in its name, which records cannot be trusted with.",
@@ -93,6 +103,16 @@ def locate(url: str, folder: Path | None = None) -> Location:
     return Location(parsed, folder, shown)
 
 
+def _no_database(url: str) -> UsageError:
+    """Nobody knows which part of the text would have been a password: only its begin is shown."""
+    begin, scheme, _ = url.partition("://")
+    return UsageError(
+        f"{printable(begin + scheme)[:40]}... names no place for records.",
+        remedy="Name an SQLite file, or postgresql+psycopg://user@host/name; in a password, @ is "
+        "written %40 and / is written %2F.",
+    )
+
+
 class Database:
     """A database that holds what is committed. Open it with `open_database`."""
 
@@ -101,6 +121,7 @@ class Database:
         self._read_only = read_only
         self._lock_timeout_ms = max(1, round(lock_timeout_s * 1000))
         self.engine = self._engine()
+        self._check_station: Callable[[], None] = lambda: None
 
     @property
     def backend(self) -> str:
@@ -114,6 +135,7 @@ class Database:
 
         Raises RecordError; nothing of the block was saved then.
         """
+        self._check_station()
         with mapped(self.location.shown, writes=True), self.engine.connect() as bare:
             connection = bare.execution_options(**{_IMMEDIATE: True})
             self._check_place(bare)
@@ -133,9 +155,13 @@ class Database:
         with (
             mapped(self.location.shown, writes=False),
             self.engine.connect() as connection,
-            connection.begin(),
         ):
-            yield connection
+            if self.backend == "postgresql":
+                connection.execution_options(
+                    isolation_level="REPEATABLE READ", postgresql_readonly=True
+                )
+            with connection.begin():
+                yield connection
 
     def _check_place(self, connection: Connection, *, has_log: bool = False) -> None:
         """An open file can be moved or deleted: SQLite writes on, and nobody finds it again.
@@ -155,17 +181,24 @@ class Database:
                 remedy="Put it back with the files beside it; else start the station again.",
             )
 
+    def station_lock(self, station: str) -> StationLock | ServerLock:
+        """The lock by which one process is this station: on this computer for a file, on all
+        computers for a server.
+        """
+        if self.backend == "postgresql":
+            lock: ServerLock = _server().ServerLock(self.engine, station, self.location.shown)
+            self._check_station = lock.check
+            return lock
+        return StationLock.of(station, self.location.folder)
+
     def close(self) -> None:
         """Close all connections."""
         self.engine.dispose()
 
     def _engine(self) -> Engine:
         if self.location.url.get_backend_name() != "sqlite":
-            return create_engine(
-                self.location.url,
-                isolation_level="READ COMMITTED",
-                execution_options={"postgresql_readonly": self._read_only},
-            )
+            made: Engine = _server().make_engine(self.location.url, self._lock_timeout_ms / 1000)
+            return made
         options: dict[str, Any] = {"connect_args": {"timeout": self._lock_timeout_ms / 1000}}
         if self.location.file is None:
             options = {
@@ -207,6 +240,18 @@ class Database:
                     cause="it lies on a network disk, or on a disk that cannot be written",
                     remedy="Keep the records on a disk of this computer.",
                 )
+
+
+def _server() -> ModuleType:
+    """What needs the driver. Raises UsageError where it is not installed."""
+    try:
+        return importlib.import_module("flasher.station.records.server")
+    except ImportError as error:
+        raise UsageError(
+            "Records in PostgreSQL need a driver that is not installed.",
+            cause=printable(str(error)),
+            remedy="In the checkout: pip install -c .ci/constraints.txt '.[station,postgres]'",
+        ) from error
 
 
 def read_only_sqlite(file: Path) -> sqlite3.Connection:
@@ -294,7 +339,14 @@ def _create(database: Database, now: datetime) -> None:
         connection = bare.execution_options(**{_IMMEDIATE: True})
         with connection.begin():
             if database.backend == "postgresql":
-                connection.execute(text("SELECT pg_advisory_xact_lock(7052)"))
+                connection.execute(text(f"SELECT pg_advisory_xact_lock({_WRITER_LOCK})"))
+                # Of the functions of the triggers: temporary tables stand behind the records.
+                connection.execute(
+                    text(
+                        "SELECT set_config('search_path',"
+                        " quote_ident(current_schema()) || ', pg_temp', true)"
+                    )
+                )
             if inspect(connection).has_table(schema_info.name):
                 return
             metadata.create_all(connection)

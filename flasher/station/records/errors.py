@@ -105,7 +105,19 @@ class ClaimRefusedError(FlasherError):
         self.refusal = refusal
 
 
-_KINDS: Final[dict[int, tuple[type[RecordError], str, str]]] = {
+_Kind = tuple[type[RecordError], str, str]
+"""The error, why, and what to do."""
+_UNKNOWN: Final[_Kind] = (
+    RecordError,
+    "the database does not work",
+    "Check it, then start the station again.",
+)
+_RULE: Final[_Kind] = (
+    RuleBrokenError,
+    "the database refuses it",
+    "This is a fault of the station: keep its log, and report it.",
+)
+_KINDS: Final[dict[int, _Kind]] = {
     sqlite3.SQLITE_FULL: (DiskFullError, "the disk is full", "Make room on the disk, then retry."),
     sqlite3.SQLITE_BUSY: (
         RecordsLockedError,
@@ -142,12 +154,50 @@ _KINDS: Final[dict[int, tuple[type[RecordError], str, str]]] = {
         "the disk does not read or write",
         "Check the disk; do not go on before it works.",
     ),
-    sqlite3.SQLITE_CONSTRAINT: (
-        RuleBrokenError,
-        "the database refuses it",
-        "This is a fault of the station: keep its log, and report it.",
+    sqlite3.SQLITE_CONSTRAINT: _RULE,
+}
+
+LOCK_NOT_AVAILABLE: Final = "55P03"
+_NO_SERVER: Final[_Kind] = (
+    RecordError,
+    "the database server cannot be reached, or ended the connection",
+    "Check the server, the network, and in the URL host, port, user, password and database.",
+)
+_TOO_SLOW: Final[_Kind] = (
+    RecordsLockedError,
+    "the database server did not finish in time",
+    "Find what holds it up (pg_stat_activity shows it), then retry.",
+)
+_SQLSTATES: Final[dict[str, _Kind]] = {
+    "08": _NO_SERVER,
+    "23": _RULE,
+    "25006": (
+        RecordsReadOnlyError,
+        "the database is read-only",
+        "Name the server that may be written, not its copy.",
+    ),
+    "40": _TOO_SLOW,
+    "42501": (
+        RecordsReadOnlyError,
+        "this user of the database may not do it",
+        "The owner of the database grants it with `flasher station roles`.",
+    ),
+    "53": (DiskFullError, "the database server has no room", "Make room on it, then retry."),
+    LOCK_NOT_AVAILABLE: (
+        RecordsLockedError,
+        "another program holds the database",
+        "End the program that holds it (pg_stat_activity shows it), then retry.",
+    ),
+    "57": _NO_SERVER,
+    "57014": _TOO_SLOW,
+    "58": (DiskFullError, "the database server cannot write", "Check its disk, then retry."),
+    "XX": (
+        RecordsDamagedError,
+        "the database is damaged",
+        "Stop. Keep the database, and go on with the last backup.",
     ),
 }
+"""What a PostgreSQL server answers."""
 
 
 @contextmanager
@@ -164,14 +214,22 @@ def mapped(where: str, *, writes: bool) -> Iterator[None]:
 def record_error(error: Exception, where: str, *, writes: bool) -> RecordError:
     """The error that stands for one of SQLAlchemy or a driver."""
     original = getattr(error, "orig", None) or error
-    code = getattr(original, "sqlite_errorcode", None)
-    if code is None and isinstance(error, exc.IntegrityError):
-        code = sqlite3.SQLITE_CONSTRAINT
-    kind, why, remedy = _KINDS.get(
-        (code or 0) & 0xFF,
-        (RecordError, "the database does not work", "Check it, then start the station again."),
-    )
-    return kind(f"{_begin(writes=writes)}: {why}.", where=where, cause=str(original), remedy=remedy)
+    state = getattr(original, "sqlstate", None)
+    if isinstance(error, exc.DBAPIError) and not isinstance(original, sqlite3.Error):
+        kind, why, remedy = _of_server(state)
+    else:
+        code = getattr(original, "sqlite_errorcode", None) or 0
+        kind, why, remedy = _KINDS.get(code & 0xFF, _UNKNOWN)
+    said = getattr(getattr(original, "diag", None), "message_primary", None) or str(original)
+    cause = " ".join(said.split())
+    return kind(f"{_begin(writes=writes)}: {why}.", where=where, cause=cause, remedy=remedy)
+
+
+def _of_server(state: str | None) -> _Kind:
+    """By SQLSTATE: the whole of it, else its class; None: there was no answer."""
+    if state is None:
+        return _NO_SERVER
+    return _SQLSTATES.get(state) or _SQLSTATES.get(state[:2]) or _UNKNOWN
 
 
 def file_error(error: OSError, where: str, *, writes: bool) -> RecordError:

@@ -49,7 +49,6 @@ from flasher.station.records.endings import (
 )
 from flasher.station.records.errors import RuleBrokenError
 from flasher.station.records.files import FileStore
-from flasher.station.records.lock import StationLock
 from flasher.station.records.model import (
     OUTCOMES,
     AttachmentFile,
@@ -69,7 +68,6 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.rows import insert
 from flasher.station.records.signing import Keeping, Signer
-from flasher.station.records.triggers import limits_of
 
 _USUAL: Final = Keeping()
 _ONLY_FINITE = "a number that is no number cannot be recorded"
@@ -99,7 +97,7 @@ class Store:
         self.signer = Signer(database, station, clock.utc, keeping)
         self.read = queries.Records(database)
         self._clock = clock
-        self._lock = StationLock.of(station, database.location.folder)
+        self._lock = database.station_lock(station)
 
     @classmethod
     def open(
@@ -133,8 +131,8 @@ class Store:
 
     def close(self) -> None:
         """Close the database and let another process be the station."""
-        self.database.close()
         self._lock.release()
+        self.database.close()
 
     def __enter__(self) -> Self:
         return self
@@ -146,11 +144,6 @@ class Store:
         traceback: TracebackType | None,
     ) -> None:
         self.close()
-
-    @property
-    def limits(self) -> tuple[str, ...]:
-        """What this back end does not hold by itself, in words; empty for SQLite and PostgreSQL."""
-        return limits_of(self.database.backend)
 
     # -- beginning --------------------------------------------------------------------------------
 

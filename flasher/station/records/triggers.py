@@ -2,13 +2,15 @@
 """Rules over several rows, as triggers of the database, so that no program can get around them.
 
 The conditions are written once, in SQL that SQLite and PostgreSQL share; only the frame around them
-differs. Other back ends have none of it: `limits_of` says so.
+differs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Final, NamedTuple
+
+from flasher.station.records.schema import metadata
 
 _RUN_IS_OVER: Final = "(SELECT state FROM run WHERE id = {row}.run_id) <> 'RUNNING'"
 _STEP_IS_OVER: Final = (
@@ -258,8 +260,9 @@ RULES: Final = (
 
 
 def trigger_statements(dialect: str) -> list[str]:
-    """The SQL that makes the triggers; empty for a back end that has none here."""
-    return _statements(dialect, RULES)
+    """The SQL that makes the triggers."""
+    more = _no_truncating() if dialect == "postgresql" else ()
+    return [*_statements(dialect, RULES), *more]
 
 
 def final_table(dialect: str, table: str) -> list[str]:
@@ -277,30 +280,32 @@ def _statements(dialect: str, rules: Iterable[Rule]) -> list[str]:
             f" BEGIN SELECT RAISE(ABORT, '{rule.text}'); END"
             for rule in rules
         ]
-    if dialect == "postgresql":
-        return [statement for rule in rules for statement in _postgresql(rule)]
-    return []
+    return [statement for rule in rules for statement in _postgresql(rule)]
+
+
+def _no_truncating() -> Iterator[str]:
+    """TRUNCATE deletes all rows, and no trigger of a row sees it; SQLite has no such command."""
+    yield _function("truncate_is_refused", "RAISE EXCEPTION 'records are not deleted'")
+    for table in metadata.tables:
+        yield (
+            f"CREATE TRIGGER {table}_truncate BEFORE TRUNCATE ON {table}"
+            " FOR EACH STATEMENT EXECUTE FUNCTION truncate_is_refused()"
+        )
 
 
 def _postgresql(rule: Rule) -> tuple[str, str]:
     result = "OLD" if rule.event.endswith("DELETE") else "NEW"
-    function = (
-        f"CREATE FUNCTION {rule.name}() RETURNS trigger LANGUAGE plpgsql AS $$ BEGIN"
-        f" IF {rule.when} THEN RAISE EXCEPTION '{rule.text}' USING ERRCODE = 'check_violation';"
-        f" END IF; RETURN {result}; END $$"
-    )
+    refuse = f"RAISE EXCEPTION '{rule.text}' USING ERRCODE = 'check_violation'"
     trigger = (
         f"CREATE TRIGGER {rule.name} {rule.event} ON {rule.table}"
         f" FOR EACH ROW EXECUTE FUNCTION {rule.name}()"
     )
-    return function, trigger
+    return _function(rule.name, f"IF {rule.when} THEN {refuse}; END IF; RETURN {result}"), trigger
 
 
-def limits_of(dialect: str) -> tuple[str, ...]:
-    """What the database does not hold by itself on this back end; empty where it holds all."""
-    if dialect in ("sqlite", "postgresql"):
-        return ()
+def _function(name: str, body: str) -> str:
+    # The path of who makes it: tables of a session's own must not stand before the records.
     return (
-        f"{dialect}: finished runs are not protected against changes by other programs",
-        f"{dialect}: one running run per unit and socket is held by the station alone",
+        f"CREATE FUNCTION {name}() RETURNS trigger LANGUAGE plpgsql SET search_path FROM CURRENT"
+        f" AS $$ BEGIN {body}; END $$"
     )
