@@ -21,6 +21,7 @@ _MODULES: Final = {
     "check": "station_check",
     "report": "station_records",
     "unit": "station_records",
+    "roles": "station_roles",
     **dict.fromkeys(("backup", "verify", "key", "accept", "migrate"), "station_care"),
 }
 DEFAULT_RECORDS: Final = "records.sqlite"
@@ -39,6 +40,7 @@ examples:
   flasher station backup /mnt/plant/records.sqlite
   flasher station verify --heads /mnt/plant/heads
   flasher station key
+  flasher station roles --database postgresql://flasher_owner@plant-db/flasher
 """
 _RUN_EPILOG = """\
 A scan is the label of a unit, or a command: SOCKET A, CANCEL, ABORT A, FREE A, LOT 4711,
@@ -76,6 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     backup = actions.add_parser("backup", help="copy the records while the station runs")
     backup.add_argument("file", type=Path, metavar="FILE", help="where the copy goes")
     _add_records(backup)
+    _add_roles(actions.add_parser("roles", help="users of a PostgreSQL server, with few rights"))
     _add_records(actions.add_parser("verify", help="tell whether the records were changed"))
     _add_key(actions.add_parser("key", help="the key that signs the records"))
     accept = actions.add_parser("accept", help="let the station go on, and note who said so")
@@ -98,8 +101,8 @@ def _add_records(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--database",
         metavar="FILE|URL",
-        help=f"the records: an SQLite file or an SQLAlchemy URL (default: of --sockets, else "
-        f"{DEFAULT_RECORDS} here)",
+        help="the records: an SQLite file or postgresql://USER@HOST/NAME (default: of --sockets, "
+        f"else {DEFAULT_RECORDS} here)",
     )
     group.add_argument(
         "--files", type=Path, metavar="DIR", help="the folder of traces (default: beside the file)"
@@ -118,6 +121,22 @@ def _add_records(parser: argparse.ArgumentParser) -> None:
         "trails are kept, best on another computer (default: of --sockets, else beside the key)",
     )
     group.add_argument("--sockets", type=Path, metavar="FILE", help="the station's file (TOML)")
+
+
+def _add_roles(parser: argparse.ArgumentParser) -> None:
+    parser.description = (
+        "Give two users of a PostgreSQL server their rights, by the owner of the database: one for "
+        "stations, which adds records, and one which reads them. Neither can delete records, or "
+        "change tables and triggers. Users and records that are not there yet are made."
+    )
+    for who in ("station", "reader"):
+        parser.add_argument(
+            f"--{who}-role",
+            metavar="NAME",
+            default=f"flasher_{who}",
+            help="(default: %(default)s)",
+        )
+    _add_records(parser)
 
 
 def _add_who(parser: argparse.ArgumentParser, *, needs_reason: bool = True) -> None:

@@ -182,6 +182,23 @@ class ProblemDocument(TypedDict):
     what: str
 
 
+class RoleDocument(TypedDict):
+    """A user of the database server."""
+
+    name: str
+    may: str
+    """"add" records, or only "read" them."""
+    is_new: bool
+    """It was made now, and has no password yet."""
+
+
+class StationRolesDocument(TypedDict):
+    """Users that were given their rights."""
+
+    records: str
+    roles: list[RoleDocument]
+
+
 class KeptHeadsDocument(TypedDict):
     """What the audit trail of a station was held against."""
 
@@ -245,6 +262,7 @@ DOCUMENTS: Final = (
     UnitDocument,
     BackupDocument,
     VerifiedRecordsDocument,
+    StationRolesDocument,
     SigningKeyDocument,
     AcceptedDocument,
     MigratedDocument,

@@ -1,0 +1,103 @@
+# ruff: noqa: S608  names are quoted by the dialect, all else is written here
+"""Who may do what to records on a PostgreSQL server. A station adds records and ends its runs, a
+reader reads; neither can delete, or change a table, a trigger or a right. The owner of the tables
+can, so no station is to be the owner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Final
+
+from sqlalchemy import Connection, text
+
+from flasher.errors import UsageError
+from flasher.protocol.text import printable
+from flasher.station.records.database import Database, Location
+from flasher.station.records.schema import (
+    device_write,
+    metadata,
+    run,
+    run_target,
+    schema_info,
+)
+
+_ENDED_LATER: Final = (run, run_target, device_write)
+"""Their rows are completed while a run goes on; triggers hold what may change in them."""
+_FORBIDDEN: Final = ("DELETE", "TRUNCATE", "TRIGGER")
+
+
+def check_roles(location: Location, station: str, reader: str) -> None:
+    """Raises UsageError for records in a file, or one role for both."""
+    if location.url.get_backend_name() != "postgresql":
+        raise UsageError(
+            "Roles are for records on a PostgreSQL server.",
+            where=location.shown,
+            remedy="Who may read or write a file is a matter of its folder's rights.",
+        )
+    if station == reader:
+        raise UsageError(
+            "A station and a reader need roles of their own.", remedy="Name two different ones."
+        )
+
+
+def grant_roles(database: Database, station: str, reader: str) -> tuple[str, ...]:
+    """Make the two roles where they are not there, and give each exactly its rights; the names of
+    those that were made, which have no password yet.
+
+    Raises UsageError for a role that could get around the rights; RecordError where the user of the
+    URL may not do it.
+    """
+    with database.writing() as connection:
+        made = tuple(name for name in (station, reader) if _make(connection, name))
+        quoted = connection.dialect.identifier_preparer.quote
+        schema = quoted(connection.execute(text("SELECT current_schema()")).scalar_one())
+        name = quoted(connection.execute(text("SELECT current_database()")).scalar_one())
+        both = f"{quoted(station)}, {quoted(reader)}"
+        adds = _names(set(metadata.sorted_tables) - {schema_info})
+        for statement in (
+            f"REVOKE CREATE ON SCHEMA {schema} FROM PUBLIC, {both}",
+            f"REVOKE TEMPORARY ON DATABASE {name} FROM PUBLIC, {both}",
+            f"REVOKE ALL ON ALL TABLES IN SCHEMA {schema} FROM PUBLIC, {both}",
+            f"REVOKE ALL ON ALL SEQUENCES IN SCHEMA {schema} FROM PUBLIC, {both}",
+            f"GRANT CONNECT ON DATABASE {name} TO {both}",
+            f"GRANT USAGE ON SCHEMA {schema} TO {both}",
+            f"GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {both}",
+            f"GRANT INSERT ON {adds} TO {quoted(station)}",
+            f"GRANT UPDATE ON {_names(_ENDED_LATER)} TO {quoted(station)}",
+            f"GRANT USAGE ON ALL SEQUENCES IN SCHEMA {schema} TO {quoted(station)}",
+        ):
+            connection.exec_driver_sql(statement)
+        for role in (station, reader):
+            _check(connection, role)
+    return made
+
+
+def _names(tables: Iterable[object]) -> str:
+    return ", ".join(sorted(str(table) for table in tables))
+
+
+def _make(connection: Connection, role: str) -> bool:
+    """Make a role that may log in; False when it is there already."""
+    known = text("SELECT 1 FROM pg_roles WHERE rolname = :role")
+    if connection.execute(known, {"role": role}).first() is not None:
+        return False
+    quoted = connection.dialect.identifier_preparer.quote(role)
+    connection.exec_driver_sql(f"CREATE ROLE {quoted} LOGIN")
+    return True
+
+
+def _check(connection: Connection, role: str) -> None:
+    """A right may come by another way: a superuser, an owner, a role that it is a member of."""
+    rights = " OR ".join(f"has_table_privilege(:role, oid, '{right}')" for right in _FORBIDDEN)
+    query = text(
+        f"SELECT has_schema_privilege(:role, current_schema(), 'CREATE') OR EXISTS (SELECT 1"
+        f" FROM pg_class WHERE relnamespace = current_schema()::regnamespace AND relkind = 'r'"
+        f" AND (pg_has_role(:role, relowner, 'MEMBER') OR {rights}))"
+    )
+    if connection.execute(query, {"role": role}).scalar_one():
+        raise UsageError(
+            f"The role {printable(role)} could change or delete records, whatever it is granted.",
+            cause="it owns them, is a superuser, or a member of a role that may",
+            remedy="Name another role; the owner of the records is for this command alone.",
+        )
