@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 
 import pytest
 
 from flasher.cli.recording import BUNDLE_FOLDER
+from tests.station.postgres import Server, find_programs, running_server
+
+POSTGRES_REQUIRED = "FLASHER_TEST_POSTGRES"
+"""With this variable a missing server is an error, not a reason to skip."""
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -22,3 +27,16 @@ def pytest_xdist_auto_num_workers() -> int:
     for buses at real pace a third of their time.
     """
     return (os.cpu_count() or 1) + 1
+
+
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[Server]:
+    """A PostgreSQL server; each process of the tests has its own."""
+    programs = find_programs()
+    if programs is None:
+        why = "PostgreSQL is not installed (Debian: apt-get install postgresql)"
+        if os.environ.get(POSTGRES_REQUIRED):
+            pytest.fail(f"{why}, and {POSTGRES_REQUIRED} wants it")
+        pytest.skip(why)
+    with running_server(programs) as server:
+        yield server

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import sqlite3
 import tempfile
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, date, datetime, timedelta
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+import psycopg
 from sqlalchemy import event
 
 from flasher.image.image import Image
@@ -104,6 +108,8 @@ class Bench:
     folder: Path
     clock: FakeClock = field(default_factory=FakeClock)
     lock_timeout_s: float = 0.02
+    url: str | None = None
+    """Records on a server that are ready; None: in a file."""
     heads: Path | None = None
     _traces: int = 0
 
@@ -111,22 +117,39 @@ class Bench:
         self.recipe = make_recipe(self.folder)
         self.path = self.folder / "records.sqlite"
         self.trace = self.traced(SERIAL)
-        self.path.write_bytes(_empty_records())
+        if self.url is not None:
+            self.lock_timeout_s = 5.0  # a server takes a moment to let go what a session held
+        else:
+            self.path.write_bytes(_empty_records())
         self.store = self.opened()
         self.store.recover()
 
-    def opened(self, station: str = "line-2") -> Store:
+    def opened(self, station: str = "line-2", lock_timeout_s: float | None = None) -> Store:
         store = Store.open(
-            str(self.path),
+            self.url or str(self.path),
             station=station,
             clock=self.clock,
+            folder=None if self.url is None else self.folder / "files",
             keeping=Keeping(self.keys, self.heads),
-            lock_timeout_s=self.lock_timeout_s,
+            lock_timeout_s=lock_timeout_s or self.lock_timeout_s,
         )
-        # These tests pull no plug, and share the disk with each other.
-        event.listen(store.database.engine, "connect", _do_not_wait_for_the_disk)
-        store.database.close()
+        if self.url is None:
+            # These tests pull no plug, and share the disk with each other.
+            event.listen(store.database.engine, "connect", _do_not_wait_for_the_disk)
+            store.database.close()
         return store
+
+    @contextmanager
+    def outsider(self) -> Iterator[Any]:
+        """A connection of a program that knows nothing of the station, of the plain driver."""
+        if self.url is None:
+            with closing(sqlite3.connect(self.path)) as connection:
+                connection.execute("PRAGMA foreign_keys = ON")
+                connection.execute("PRAGMA synchronous = OFF")
+                yield connection
+        else:
+            with closing(psycopg.connect(self.url.replace("+psycopg", ""))) as server:
+                yield server
 
     @property
     def keys(self) -> Path:

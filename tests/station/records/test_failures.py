@@ -195,7 +195,6 @@ def test_records_in_memory_need_a_folder_for_their_files(tmp_path: Path) -> None
     ) as store:
         assert store.recover() == ()
         assert not store.verify()
-        assert not store.limits
 
 
 def test_a_trace_that_cannot_be_stored_is_an_error_and_leaves_no_part(

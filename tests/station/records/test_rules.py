@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
-import contextlib
 import sqlite3
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
+import psycopg
 import pytest
 
 from flasher.station.records import (
@@ -17,35 +19,43 @@ from flasher.station.records import (
     StepState,
 )
 from flasher.station.records.schema import metadata
-from flasher.station.records.triggers import RULES, limits_of, trigger_statements
+from flasher.station.records.triggers import RULES
 from flasher.station.steps import Verified
 from tests.station.factory import BMS_VERSION, Bench
+from tests.station.postgres import Server
+from tests.station.records.conftest import BACK_ENDS
 
 SHA = "a" * 64
 
 
-@contextlib.contextmanager
-def another_program(bench: Bench) -> Iterator[sqlite3.Connection]:
-    """A connection of a program that knows nothing of the station's settings."""
-    with contextlib.closing(sqlite3.connect(bench.path)) as connection:
-        connection.execute("PRAGMA foreign_keys = ON")
-        connection.execute("PRAGMA synchronous = OFF")
-        yield connection
+REFUSALS = (sqlite3.IntegrityError, psycopg.errors.IntegrityError, psycopg.errors.RaiseException)
 
 
-@pytest.fixture(scope="module")
-def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+def make_bench(request: pytest.FixtureRequest, folder: Path) -> Bench:
+    url = None
+    if request.param == "postgresql":
+        server: Server = request.getfixturevalue("postgres")
+        url = server.own_records()
+    return Bench(folder, url=url)
+
+
+@pytest.fixture(scope="module", params=BACK_ENDS)
+def running(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Bench]:
     """Records with one run that goes on; what is refused leaves them as they are."""
-    made = Bench(tmp_path_factory.mktemp("running"))
+    made = make_bench(request, tmp_path_factory.mktemp("running"))
     made.claim()
     yield made
     made.store.close()
 
 
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+@pytest.fixture(scope="module", params=BACK_ENDS)
+def finished(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Bench]:
     """Records with one run that passed, with a row in every table."""
-    made = Bench(tmp_path_factory.mktemp("finished"))
+    made = make_bench(request, tmp_path_factory.mktemp("finished"))
     run_id = made.claim().run_id
     made.work(run_id)
     measured = [Measurement("u", 36.5, "V", 30.0, 42.0)]
@@ -55,10 +65,12 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     made.store.close()
 
 
-def refused(connection: sqlite3.Connection, statement: str) -> str:
-    """What the database says when it refuses a statement."""
-    with pytest.raises(sqlite3.IntegrityError) as caught:
+def refused(connection: Any, *statements: str) -> str:
+    """What the database says when it refuses the last of some statements."""
+    for statement in statements[:-1]:
         connection.execute(statement)
+    with pytest.raises(REFUSALS) as caught:
+        connection.execute(statements[-1])
     connection.rollback()
     return str(caught.value)
 
@@ -71,16 +83,16 @@ INSERT_RUN = (
 
 
 def test_two_runs_of_one_unit_or_socket_cannot_run_at_once(running: Bench) -> None:
-    with another_program(running) as other:
-        other.execute("BEGIN")
-        other.execute("INSERT INTO unit VALUES (99, 'BAT-36', 'W2600099')")
-        other.execute("INSERT INTO socket VALUES (99, 1, 'Z')")
-        same_unit = INSERT_RUN.format(unit="unit_id", socket="99", state="RUNNING", required=1)
-        same_socket = INSERT_RUN.format(unit="99", socket="socket_id", state="RUNNING", required=1)
-        for statement, column in ((same_unit, "run.unit_id"), (same_socket, "run.socket_id")):
-            with pytest.raises(sqlite3.IntegrityError, match=column):
-                other.execute(statement)
-        other.rollback()
+    others = (
+        "INSERT INTO unit VALUES (99, 'BAT-36', 'W2600099')",
+        "INSERT INTO socket VALUES (99, 1, 'Z')",
+    )
+    same_unit = INSERT_RUN.format(unit="unit_id", socket="99", state="RUNNING", required=1)
+    same_socket = INSERT_RUN.format(unit="99", socket="socket_id", state="RUNNING", required=1)
+    for statement, what in ((same_unit, "unit"), (same_socket, "socket")):
+        with running.outsider() as other:
+            said = refused(other, *others, statement)
+        assert f"run.{what}_id" in said or f"one_running_run_per_{what}" in said
 
 
 @pytest.mark.parametrize(
@@ -92,7 +104,7 @@ def test_a_run_is_not_born_finished_nor_with_an_easier_verification(
     statement = INSERT_RUN.format(
         unit="unit_id", socket="socket_id", state=state, required=required
     )
-    with another_program(finished) as other:
+    with finished.outsider() as other:
         assert why in refused(other, statement)
 
 
@@ -111,7 +123,7 @@ ENDED = (
         (ENDED.format(reached="0", log=f"'{SHA}'"), "PASS needs|pass_is_verified"),
         (ENDED.format(reached="1", log=f"'{SHA}'"), "PASS needs"),
         ("UPDATE run SET state = 'PASS'", "PASS needs|finished_has"),
-        ("UPDATE run SET state = 'FAIL', code = 'X'", "finished_has_an_end"),
+        ("UPDATE run SET state = 'FAIL', code = 'X'", "finished_has"),
         ("UPDATE run SET state = 'GREEN'", "state_is_known|finished_has"),
         ("UPDATE run SET verification_required = 0", "claimed with is final"),
         ("UPDATE run SET unit_id = 2", "claimed with is final"),
@@ -122,7 +134,7 @@ ENDED = (
 def test_a_running_run_cannot_be_made_what_it_is_not(
     running: Bench, statement: str, why: str
 ) -> None:
-    with another_program(running) as other:
+    with running.outsider() as other:
         said = refused(other, statement)
     assert any(each in said for each in why.split("|")), said
 
@@ -140,10 +152,11 @@ def test_a_running_run_cannot_be_made_what_it_is_not(
 def test_the_rules_of_one_row_hold_without_triggers(
     running: Bench, reached: str, log: str, why: str
 ) -> None:
-    with another_program(running) as other:
+    with running.outsider() as other:
         other.execute("BEGIN")
         for rule in RULES:
-            other.execute(f"DROP TRIGGER {rule.name}")
+            table = f" ON {rule.table}" if running.url else ""
+            other.execute(f"DROP TRIGGER {rule.name}{table}")
         assert why in refused(other, ENDED.format(reached=reached, log=log))
 
 
@@ -165,41 +178,41 @@ def ending_with(bench: Bench, **changes: object) -> Ending:
     ],
 )
 def test_a_false_pass_is_not_saved(
-    bench: Bench, spoil: Callable[[Bench], Ending], why: str
+    any_bench: Bench, spoil: Callable[[Bench], Ending], why: str
 ) -> None:
-    run_id = bench.claim().run_id
-    bench.work(run_id)
+    run_id = any_bench.claim().run_id
+    any_bench.work(run_id)
     with pytest.raises(RuleBrokenError, match="RECORD NOT SAVED") as caught:
-        bench.store.finish(run_id, spoil(bench))
+        any_bench.store.finish(run_id, spoil(any_bench))
     assert why in caught.value.cause
-    details = bench.store.read.run(run_id)
+    details = any_bench.store.read.run(run_id)
     assert details.run.state is RunState.RUNNING
     assert not details.attachments  # nothing of the transaction was kept
-    bench.store.finish(run_id, bench.ending())  # and it can still be ended truly
+    any_bench.store.finish(run_id, any_bench.ending())  # and it can still be ended truly
 
 
-def test_a_pass_needs_the_last_try_of_every_step_and_every_write(bench: Bench) -> None:
-    run_id = bench.claim().run_id
-    bench.work(run_id)
-    bench.store.step(run_id, "verify", StepState.FAIL, duration_s=1.0)
+def test_a_pass_needs_the_last_try_of_every_step_and_every_write(any_bench: Bench) -> None:
+    run_id = any_bench.claim().run_id
+    any_bench.work(run_id)
+    any_bench.store.step(run_id, "verify", StepState.FAIL, duration_s=1.0)
     with pytest.raises(RuleBrokenError) as caught:
-        bench.store.finish(run_id, bench.ending())
+        any_bench.store.finish(run_id, any_bench.ending())
     assert "last try" in caught.value.cause
-    bench.store.step(run_id, "verify", StepState.PASS, duration_s=1.0)
-    write = bench.store.intent(run_id, "bms", "model", "X")
+    any_bench.store.step(run_id, "verify", StepState.PASS, duration_s=1.0)
+    write = any_bench.store.intent(run_id, "bms", "model", "X")
     with pytest.raises(RuleBrokenError) as caught:
-        bench.store.finish(run_id, bench.ending())
+        any_bench.store.finish(run_id, any_bench.ending())
     assert "every write" in caught.value.cause
-    again = bench.store.intent(run_id, "bms", "model", "X")
-    bench.store.verified(again, "X")
-    bench.store.finish(run_id, bench.ending())
+    again = any_bench.store.intent(run_id, "bms", "model", "X")
+    any_bench.store.verified(again, "X")
+    any_bench.store.finish(run_id, any_bench.ending())
     assert write != again
 
 
-def test_a_pass_without_any_step_is_none(bench: Bench) -> None:
-    run_id = bench.claim().run_id
+def test_a_pass_without_any_step_is_none(any_bench: Bench) -> None:
+    run_id = any_bench.claim().run_id
     with pytest.raises(RuleBrokenError):
-        bench.store.finish(run_id, bench.ending())
+        any_bench.store.finish(run_id, any_bench.ending())
 
 
 @pytest.mark.parametrize(
@@ -265,58 +278,64 @@ def test_a_step_does_not_pass_with_a_measurement_out_of_limits(
         "UPDATE operator SET name = 'X'",
         "UPDATE socket SET name = 'X'",
         "UPDATE station SET name = 'X'",
-        # Another program does not ask for the triggers of what REPLACE deletes.
-        "INSERT OR REPLACE INTO unit VALUES (1, 'BAT-36', 'X')",
-        "INSERT OR REPLACE INTO operator VALUES (1, 'X')",
-        INSERT_RUN.replace("INSERT", "INSERT OR REPLACE")
-        .replace("99", "id")
-        .format(unit="unit_id", socket="socket_id", state="RUNNING", required=1),
     ],
 )
 def test_what_is_finished_stays_as_it_is(finished: Bench, statement: str) -> None:
-    with another_program(finished) as other:
+    with finished.outsider() as other:
         refused(other, statement)
 
 
+@pytest.mark.parametrize(
+    "statement",
+    [
+        # Another program does not ask for the triggers of what REPLACE deletes.
+        "INSERT INTO unit VALUES (1, 'BAT-36', 'X')",
+        "INSERT INTO operator VALUES (1, 'X')",
+        INSERT_RUN.replace("99", "id").format(
+            unit="unit_id", socket="socket_id", state="RUNNING", required=1
+        ),
+    ],
+)
+def test_nothing_is_replaced(finished: Bench, statement: str) -> None:
+    with finished.outsider() as other:
+        if finished.url:
+            refused(other, f"{statement} ON CONFLICT (id) DO UPDATE SET id = EXCLUDED.id")
+        else:
+            refused(other, statement.replace("INSERT", "INSERT OR REPLACE"))
+
+
 def test_a_unit_is_real_or_virtual_and_its_nature_is_final(finished: Bench) -> None:
-    virtual = INSERT_RUN.replace("is_virtual", "1").format(
+    virtual = INSERT_RUN.replace("is_virtual", "TRUE").format(
         unit="unit_id", socket="socket_id", state="RUNNING", required=1
     )
-    with another_program(finished) as other:
+    with finished.outsider() as other:
         assert "never both" in refused(other, virtual)
-        refused(other, "UPDATE run SET is_virtual = 1")
+        refused(other, "UPDATE run SET is_virtual = TRUE")
 
 
-def test_replacing_a_row_is_deleting_it(finished: Bench) -> None:
-    with pytest.raises(RuleBrokenError), finished.store.database.writing() as connection:
+def test_replacing_a_row_is_deleting_it(bench: Bench) -> None:
+    bench.make()
+    with pytest.raises(RuleBrokenError), bench.store.database.writing() as connection:
         connection.exec_driver_sql("INSERT OR REPLACE INTO unit VALUES (1, 'BAT-36', 'X')")
 
 
-def test_an_intent_is_verified_once_and_only_while_its_run_goes_on(bench: Bench) -> None:
-    run_id = bench.claim().run_id
-    write = bench.store.intent(run_id, "bms", "flash", BMS_VERSION)
-    bench.store.verified(write, BMS_VERSION)
+def test_an_intent_is_verified_once_and_only_while_its_run_goes_on(any_bench: Bench) -> None:
+    run_id = any_bench.claim().run_id
+    write = any_bench.store.intent(run_id, "bms", "flash", BMS_VERSION)
+    any_bench.store.verified(write, BMS_VERSION)
     with pytest.raises(RuleBrokenError):
-        bench.store.verified(write, "another")
-    open_write = bench.store.intent(run_id, "bms", "model", "X")
-    bench.store.finish(run_id, bench.ending(RunState.FAIL, "X"))
+        any_bench.store.verified(write, "another")
+    open_write = any_bench.store.intent(run_id, "bms", "model", "X")
+    any_bench.store.finish(run_id, any_bench.ending(RunState.FAIL, "X"))
     with pytest.raises(RuleBrokenError):
-        bench.store.verified(open_write, "X")
+        any_bench.store.verified(open_write, "X")
     with pytest.raises(RuleBrokenError):
-        bench.store.intent(run_id, "bms", "model", "X")
+        any_bench.store.intent(run_id, "bms", "model", "X")
     with pytest.raises(RuleBrokenError):
-        bench.store.step(run_id, "late", StepState.PASS, duration_s=0.0)
+        any_bench.store.step(run_id, "late", StepState.PASS, duration_s=0.0)
 
 
 def test_the_rules_have_names_of_their_own_and_stand_on_tables() -> None:
     names = [rule.name for rule in RULES]
     assert len(set(names)) == len(names)
     assert {rule.table for rule in RULES} <= set(metadata.tables)
-    assert len(trigger_statements("postgresql")) == 2 * len(RULES)
-
-
-def test_a_back_end_without_the_rules_says_so() -> None:
-    assert not limits_of("sqlite")
-    assert not limits_of("postgresql")
-    assert len(limits_of("mysql")) == 2
-    assert not trigger_statements("mysql")

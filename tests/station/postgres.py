@@ -1,0 +1,143 @@
+# ruff: noqa: S608  all of this SQL is written here
+"""A PostgreSQL server of the tests' own: an ordinary user, a temporary folder, loopback."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import psycopg
+from sqlalchemy import Connection, NullPool, Table, create_engine
+
+from flasher.station.records import Store
+from flasher.station.records.schema import metadata
+from tests.station.factory import FakeClock
+
+OWNER = "postgres"
+_INSTALLED = Path("/usr/lib/postgresql")
+_RULES = f"""\
+host all {OWNER} 127.0.0.1/32 trust
+host all all 127.0.0.1/32 scram-sha-256
+"""
+_FAST = "-c fsync=off -c synchronous_commit=off -c full_page_writes=off -c max_connections=60"
+
+
+@dataclass
+class Server:
+    """A running server. Its databases are gone with it."""
+
+    programs: Path
+    folder: Path
+    port: int
+    _made: int = 0
+    _shared: str = ""
+    _first_rows: dict[Table, list[dict[str, Any]]] = field(default_factory=dict)
+
+    def url(self, database: str, user: str = OWNER) -> str:
+        return f"postgresql+psycopg://{user}@127.0.0.1:{self.port}/{database}"
+
+    def connect(self, database: str = OWNER, user: str = OWNER) -> psycopg.Connection:
+        """A connection of a program that knows nothing of the station."""
+        host = "127.0.0.1"
+        return psycopg.connect(host=host, port=self.port, dbname=database, user=user)
+
+    def records(self) -> str:
+        """The URL of records with nothing in them; always the same ones, for one test at a time."""
+        if not self._shared:
+            self._shared = self.own_records()
+            with self._without_rules(self._shared) as connection:
+                self._first_rows = {
+                    table: [dict(row) for row in connection.execute(table.select()).mappings()]
+                    for table in metadata.sorted_tables
+                }
+        with self._without_rules(self._shared) as connection:
+            for table, rows in self._first_rows.items():
+                connection.execute(table.delete())
+                if rows:
+                    connection.execute(table.insert(), rows)
+                if "id" in table.c:
+                    sequence = f"pg_get_serial_sequence('{table.name}', 'id')"
+                    next_id = f"(SELECT coalesce(max(id), 0) + 1 FROM {table.name})"
+                    connection.exec_driver_sql(f"SELECT setval({sequence}, {next_id}, false)")
+        return self._shared
+
+    def own_records(self) -> str:
+        """The URL of new records; a new database takes half a second."""
+        url = self.url(self.database())
+        Store.open(url, station="line-2", folder=self.folder, clock=FakeClock()).close()
+        return url
+
+    def database(self) -> str:
+        """The name of a new database."""
+        self._made += 1
+        name = f"test_{self._made}"
+        with self.connect() as connection:
+            connection.autocommit = True
+            connection.execute(f"CREATE DATABASE {name}".encode())
+        return name
+
+    @staticmethod
+    @contextmanager
+    def _without_rules(url: str) -> Iterator[Connection]:
+        engine = create_engine(url, poolclass=NullPool)
+        with engine.begin() as connection:
+            connection.exec_driver_sql("SET session_replication_role = replica")
+            yield connection
+
+    def start(self) -> None:
+        data = self.folder / "data"
+        self._run("initdb", "-D", str(data), "-U", OWNER, "-A", "trust", "-N", "-E", "UTF8")
+        (data / "pg_hba.conf").write_text(_RULES, encoding="ascii")
+        where = f"-p {self.port} -c listen_addresses=127.0.0.1 -k {self.folder}"
+        log = str(self.folder / "log")
+        self._run("pg_ctl", "-D", str(data), "-w", "-l", log, "-o", f"{where} {_FAST}", "start")
+
+    def stop(self) -> None:
+        self._run("pg_ctl", "-D", str(self.folder / "data"), "-m", "immediate", "stop")
+
+    def _run(self, program: str, *words: str) -> None:
+        # The server refuses to be run by root.
+        user = OWNER if os.geteuid() == 0 else None
+        subprocess.run(
+            [self.programs / program, *words],
+            user=user,
+            check=True,
+            cwd=self.folder,
+            stdout=subprocess.DEVNULL,
+        )
+
+
+def find_programs() -> Path | None:
+    """The folder of the server's programs; None where it is not installed."""
+    found = shutil.which("pg_ctl")
+    if found:
+        return Path(found).resolve().parent
+    installed = _INSTALLED.glob("*/bin/pg_ctl")
+    newest = max(installed, key=lambda path: int(path.parts[-3]), default=None)
+    return newest and newest.parent
+
+
+@contextmanager
+def running_server(programs: Path) -> Iterator[Server]:
+    """A server from start to end."""
+    # A short path, since the server's socket lies in it.
+    folder = Path(tempfile.mkdtemp(prefix="flasher-pg-"))
+    try:
+        if os.geteuid() == 0:
+            shutil.chown(folder, OWNER)
+        with socket.create_server(("127.0.0.1", 0)) as probe:
+            port = probe.getsockname()[1]
+        server = Server(programs, folder, port)
+        server.start()
+        yield server
+        server.stop()
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
