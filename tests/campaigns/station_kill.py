@@ -1,226 +1,246 @@
-"""Kills the real station process, after every commit and at random moments, and looks each time
-whether the records are true: `python -m tests.campaigns.station_kill --times 200`.
+"""Kills the real station, and the processes of its sockets, while an operator works at it; and
+looks each time whether what was shown is true:
 
-After each kill: every run that was shown is in the records with what was shown, every PASS in the
-records is true of the unit itself, nothing in the records is damaged. After three kills at the most
-a unit is left in peace, and has to pass then.
+    python -m tests.campaigns.station_kill --times 60 [--postgres]
+
+Nothing of the station is looked into: it is the command `flasher station run`, its event stream and
+its scanner. The units are in a process of their own, which knows nothing of flasher. After each
+kill: every PASS that was shown is one of the records and of the unit itself (its serial number, its
+image); no unit bears the number of another one's label; the processes of the sockets ended with
+their station. After a few kills the operator is left in peace, and every unit has to get through.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import random
-import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Final
 
-from flasher.station.records import Store
-from flasher.station.records.model import RunState
-from tests.campaigns.station_bench import (
-    TROUBLES,
-    UnitOnBus,
-    free_port,
-    station_main,
-    write_files,
+from flasher.image.image import Image
+from flasher.image.manifest import release_of, to_toml
+from flasher.protocol.spec import BMS
+from tests.campaigns.scripted_units import NEW_VERSION, Units, bus_of, free_port
+from tests.campaigns.station_operator import Operator, Place, Station, is_running
+from tests.station.postgres import find_programs, running_server
+
+KILLS_IN_A_ROW: Final = 3
+PEACE_LIMIT_S: Final = 120.0
+_KILL_LIMIT_S: Final = 20.0
+_MOMENTS_MAX: Final = 24
+_WORKERS_END_S: Final = 15.0
+IMAGE: Final = Image.from_bytes(
+    b"BMS\0" + NEW_VERSION.encode() + bytes(at % 251 for at in range(6000))
 )
+RECIPE: Final = f"""\
+name = "Campaign"
+part = "BAT-36"
+revision = "1"
+duplicate = "verify-only"
 
-KILLS_A_UNIT = 3
-RUN_LIMIT_S = 60.0
-FIRST_KILL_S = 0.3
-LAST_KILL_S = 4.2
+[serial_number]
+pattern = 'W[0-9]{{7}}'
+example = "W2605002"
+
+[[target]]
+target = "bms"
+image = "bms.bin"
+sha256 = "{IMAGE.sha256}"
+
+[[write]]
+target = "bms"
+item = "serial-number"
+values = ["{{serial}}"]
+manufacturer = true
+
+[[unchanged]]
+target = "bms"
+item = "physical-id"
+"""
+
+
+def write_files(folder: Path, ports: list[int], records: str) -> list[str]:
+    """Recipe, image, manifest and the station's file; the options that name them."""
+    (folder / "bms.bin").write_bytes(IMAGE.data)
+    manifest = to_toml(release_of(IMAGE, BMS))
+    (folder / "bms.bin.toml").write_text(manifest, encoding="utf-8")
+    (folder / "recipe.toml").write_text(RECIPE, encoding="utf-8")
+    lines = ['name = "line"', f'records = "{records}"', 'files = "files"']
+    for number, port in enumerate(ports, 1):
+        bus = bus_of(port)
+        lines += ["", "[[socket]]", f'name = "{number}"']
+        lines += [f'{key} = "{bus[key]}"' for key in ("interface", "channel")]
+        lines.append(f"bus = {{ port = {port}, hop_limit = {bus['hop_limit']} }}")
+    (folder / "sockets.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    sockets = ["--sockets", str(folder / "sockets.toml")]
+    return ["--recipe", str(folder / "recipe.toml"), *sockets, "--operator", "jo"]
 
 
 class Campaign:
-    """Two sockets, and one station process after the other."""
+    """One station process after the other, one operator, and units that outlive them all."""
 
-    def __init__(self, folder: Path, seed: int, sockets: int = 2) -> None:
-        self.folder = folder
-        self.random = random.Random(seed)
-        self.counts: Counter[str] = Counter()
-        self.problems: list[str] = []
-        self._number = 0
-        self._proven: set[str] = set()
-        write_files(folder)
-        ports = [free_port() for _ in range(sockets)]
-        (folder / "ports").write_text(" ".join(map(str, ports)), encoding="ascii")
-        self.units = {str(at): UnitOnBus(port) for at, port in enumerate(ports, 1)}
-        for unit in self.units.values():
-            self._next(unit)
+    def __init__(self, folder: Path, units: Units, ports: list[int], seed: int, words: list[str]):
+        self._folder = folder
+        self._words = words
+        self._random = random.Random(seed)
+        places = {str(at): Place(str(at), port) for at, port in enumerate(ports, 1)}
+        self.operator = Operator(units, places, IMAGE.data, self._random)
+        self.counts = self.operator.counts
+        self.problems = self.operator.problems
+        self._station: Station | None = None
+        self._orphans: list[int] = []
 
-    def close(self) -> None:
-        for unit in self.units.values():
-            unit.close()
+    @property
+    def kills(self) -> int:
+        """Of stations and of workers."""
+        return self.counts["kills of the station"] + self.counts["kills of a worker"]
 
-    def _next(self, unit: UnitOnBus) -> None:
-        self._number += 1
-        unit.put(f"W{self._number:07d}")
-
-    def kill_after(self, commit: int) -> bool:
-        """Kill after a commit; False when there were fewer."""
-        code = self._run(commit=commit)
-        self._check()
-        return code == -signal.SIGKILL
-
-    def trouble_after(self, commit: int, trouble: str) -> None:
-        """Let the records be out of reach for a while after a commit."""
-        if self._run(commit=commit, trouble=trouble):
-            self.problems.append(f"{trouble} after commit {commit} ended the station")
-        self._check()
-
-    def kill_at_random(self) -> None:
-        self._run(at_s=self.random.uniform(FIRST_KILL_S, LAST_KILL_S))
-        self._check()
+    def kill_once(self, *, worker: bool) -> None:
+        """Work up to a moment that chance chooses, and kill."""
+        station = self._open()
+        operator = self.operator
+        moment = operator.moments + self._random.randint(1, _MOMENTS_MAX)
+        latest = time.monotonic() + _KILL_LIMIT_S
+        operator.work(lambda: operator.moments >= moment or time.monotonic() >= latest)
+        pause_until = time.monotonic() + self._random.choice((0.0, 0.01, 0.05, 0.3))
+        operator.work(lambda: time.monotonic() >= pause_until)
+        if not worker:
+            self._orphans = station.kill()
+            self._left("kills of the station")
+            self._check()
+            return
+        workers = station.workers
+        if workers:
+            subprocess.run(["kill", "-9", str(self._random.choice(workers))], check=False)
+            self.counts["kills of a worker"] += 1
 
     def in_peace(self) -> None:
-        """Every unit can be finished."""
-        code = self._run()
-        self._check()
-        if code:
+        """Every unit that is in a socket gets through; then the station ends."""
+        station = self._open()
+        operator = self.operator
+        latest = time.monotonic() + PEACE_LIMIT_S
+        operator.work(lambda: operator.is_done or time.monotonic() >= latest, bring_units=False)
+        self.problems += operator.stuck()
+        code = station.stop()
+        if code not in (0, 12):  # 12: a run that a kill ended is no PASS
             self.problems.append(f"a station in peace ended with {code}")
-        for unit in self.units.values():
-            if unit.serial not in self._proven:
-                self.problems.append(f"{unit.serial} is stuck: {self._last(unit.serial)}")
-            self._next(unit)
+        self._left("ended by Ctrl-C")
+        self._check()
 
-    # -- one process ------------------------------------------------------------------------------
+    def _open(self) -> Station:
+        if self._station is not None and self._station.process.poll() is not None:
+            self.problems.append(f"a station ended by itself: {self._station.process.returncode}")
+            self._left("ended by itself")
+        if self._station is None:
+            self._station = Station(self._folder, *self._words)
+            self.operator.begin(self._station)
+        return self._station
 
-    def _run(
-        self, commit: int | None = None, at_s: float | None = None, trouble: str | None = None
-    ) -> int:
-        orders = [f"{name}={unit.serial}" for name, unit in self.units.items() if self._open(unit)]
-        if not orders:
-            for unit in self.units.values():
-                self._next(unit)
-            orders = [f"{name}={unit.serial}" for name, unit in self.units.items()]
-        words = [sys.executable, "-m", __spec__.name if __spec__ else __name__, "--station"]
-        words += [str(self.folder), *orders]
-        if commit is not None:
-            words += ["--commit", str(commit)]
-        if trouble is not None:
-            words += ["--trouble", trouble]
-        log = (self.folder / "stderr").open("ab")
-        with log, subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=log) as process:
-            try:
-                code = process.wait(RUN_LIMIT_S if at_s is None else at_s)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                code = process.wait()
-                if at_s is None:
-                    self.problems.append("a station did not end: " + " ".join(orders))
-        self.counts["killed" if code == -signal.SIGKILL else "ended by itself"] += 1
-        return code
-
-    def _open(self, unit: UnitOnBus) -> bool:
-        return unit.serial not in self._proven
+    def _left(self, how: str) -> None:
+        self.counts[how] += 1
+        self.operator.leave()
+        self._station = None
 
     # -- what has to hold -------------------------------------------------------------------------
 
     def _check(self) -> None:
-        path = self.folder / "records.sqlite"
-        if not path.exists():
-            return
-        with Store.open(str(path), station="looks", create=False, lock_timeout_s=5.0) as store:
-            runs = {run.run_id: run for run in store.read.runs()}
-            self.problems += [f"{p.where}: {p.what}" for p in store.verify()]
-        for row in self._shown():
-            number = row.get("began", row.get("ended"))
-            run = next((run for run_id, run in runs.items() if run_id == number), None)
-            if run is None or run.serial != row["serial"]:
-                self.problems.append(f"lost: {row}")
-            elif "ended" in row and (run.state, run.code) != (row["outcome"], row["code"]):
-                self.problems.append(f"shown {row}, saved {run.state} {run.code}")
-        passed = {run.serial for run in runs.values() if run.state is RunState.PASS}
-        for unit in self.units.values():
-            if unit.serial in passed and unit.serial not in self._proven:
-                self._proven.add(unit.serial)
-                if not unit.is_made:
-                    self.problems.append(f"false PASS of {unit.serial}")
-        if passed - self._proven:
-            self.problems.append(f"PASS of a unit that was not there: {passed - self._proven}")
-        self.counts["PASS proven"] = len(self._proven)
-        self.counts["runs"] = len(runs)
-        for state in RunState:
-            del self.counts[f"runs {state}"]
-        states = Counter(run.state for run in runs.values())
-        for state, count in states.items():
-            self.counts[f"runs {state}"] = count
+        give_up_at = time.monotonic() + _WORKERS_END_S
+        while any(map(is_running, self._orphans)) and time.monotonic() < give_up_at:
+            time.sleep(0.05)
+        left = [pid for pid in self._orphans if is_running(pid)]
+        self.problems += [f"process {pid} of a socket outlives its station" for pid in left]
+        self._orphans = []
+        self.problems += self.operator.strange_units()
+        self._check_records()
 
-    def _shown(self) -> list[dict[str, object]]:
-        path = self.folder / "shown.jsonl"
-        lines = path.read_text(encoding="ascii").splitlines() if path.exists() else []
-        return [json.loads(line) for line in lines]
+    def _check_records(self) -> None:
+        """What was shown is in the records, and the records hold together."""
+        document = self._say("verify")
+        self.problems += [f"{each['where']}: {each['what']}" for each in document["problems"]]
+        runs = {run["run_id"]: run for run in self._say("report")["runs"]}
+        for event in self.operator.shown:
+            run = runs.get(event["run_id"])
+            if run is None or run["serial"] != event["serial"]:
+                self.problems.append(f"lost: {event}")
+            elif event["event"] == "RunEnded" and (run["state"], run["code"]) != (
+                event["outcome"],
+                event["code"],
+            ):
+                self.problems.append(f"shown {event}, saved {run['state']} {run['code']}")
+        for what in [each for each in self.counts if each.startswith("saved ")]:
+            del self.counts[what]
+        states = [run["state"] for run in runs.values()]
+        for state in set(states):
+            self.counts[f"saved {state}"] = states.count(state)
 
-    def _last(self, serial: str) -> str:
-        with Store.open(str(self.folder / "records.sqlite"), station="looks") as store:
-            last = store.read.unit(serial).last
-        return "no run" if last is None else f"{last.run.state} {last.run.code} {last.run.text}"
+    def _say(self, action: str) -> dict[str, list[dict[str, str]]]:
+        words = [sys.executable, "-m", "flasher", "station", action, "--json", *self._words[2:4]]
+        said = subprocess.run(words, capture_output=True, text=True, check=False).stdout
+        document: dict[str, list[dict[str, str]]] = json.loads(said.splitlines()[-1])
+        if "error" in document:
+            self.problems.append(f"station {action}: {document['error']}")
+        return {"problems": [], "runs": [], **document}
 
 
+@contextmanager
 def campaign(
-    folder: Path, times: int, seed: int, *, every_commit: bool = True, trouble: str | None = None
-) -> Campaign:
-    """Kill the station that often; `every_commit` begins with one kill after each commit. With
-    `trouble` it is not killed, but the records cannot be written for a while after a commit.
-    """
-    made = Campaign(folder, seed)
-    try:
-        for commit in range(1, times + 1) if trouble else ():
-            made.trouble_after(commit, str(trouble))
-            if commit % KILLS_A_UNIT == 0:
-                made.in_peace()
-        if trouble:
-            return made
-        kills, commit, since = 0, 1, 0
-        while kills < times:
-            if every_commit:
-                every_commit = made.kill_after(commit)
-                commit += 1
-            else:
-                made.kill_at_random()
-            kills = made.counts["killed"]
-            since += 1
-            if since >= KILLS_A_UNIT:
-                made.in_peace()
-                since = 0
-        made.in_peace()
-        made.counts["commits of a run with two units"] = commit - 1
-    finally:
-        made.close()
-    return made
+    folder: Path, seed: int, *, sockets: int = 2, records: str = "records.sqlite"
+) -> Iterator[Campaign]:
+    """A campaign that is ready to begin."""
+    ports = [free_port() for _ in range(sockets)]
+    words = write_files(folder, ports, records)
+    with Units(ports, folder / "stderr") as units:
+        made = Campaign(folder, units, ports, seed, words)
+        try:
+            yield made
+        finally:
+            if made._station is not None:
+                made._station.kill()
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--times", type=int, default=200, help="kills in all")
+    parser.add_argument("--times", type=int, default=60, help="kills in all")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument(
-        "--trouble",
-        choices=TROUBLES,
-        help="in place of kills: the records cannot be written for 3 s, from each commit on",
-    )
-    parser.add_argument("--station", nargs="+", help=argparse.SUPPRESS)
-    parser.add_argument("--commit", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--sockets", type=int, default=2)
+    parser.add_argument("--postgres", action="store_true", help="records on a server of its own")
     options = parser.parse_args()
-    if options.station:
-        folder = Path(options.station[0])
-        orders = dict(order.split("=") for order in options.station[1:])
-        trouble = options.trouble or ""
-        return station_main(folder, folder / "shown.jsonl", orders, options.commit, trouble)
     began = time.monotonic()
-    with tempfile.TemporaryDirectory() as name:
-        made = campaign(Path(name), options.times, options.seed, trouble=options.trouble)
-        for what, count in made.counts.items():
-            print(f"{what:<34} {count}")  # noqa: T201
-        errors = (Path(name) / "stderr").read_text(errors="replace").strip()
-    for problem in made.problems:
-        print(f"PROBLEM {problem}")  # noqa: T201
-    if errors:
-        print(errors[-2000:])  # noqa: T201
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        os.environ["XDG_DATA_HOME"] = str(folder / "data")  # what a station keeps of its own
+        records = "records.sqlite"
+        if options.postgres:
+            programs = find_programs()
+            if programs is None:
+                parser.error("PostgreSQL is not installed")
+            server = stack.enter_context(running_server(programs))
+            records = server.url(server.database())
+        made = stack.enter_context(
+            campaign(folder, options.seed, sockets=options.sockets, records=records)
+        )
+        chance = random.Random(options.seed)
+        while made.kills < options.times:
+            for _ in range(min(KILLS_IN_A_ROW, options.times - made.kills)):
+                made.kill_once(worker=chance.random() < 0.4)
+            made.in_peace()
+            at_s = time.monotonic() - began
+            print(f"{at_s:5.0f} s: {made.kills} kills, {len(made.problems)} problems", flush=True)  # noqa: T201
+        for what, count in sorted(made.counts.items()):
+            print(f"{what:<40} {count}")  # noqa: T201
+        print(f"{'PASS shown, each proven by its unit':<40} {len(made.operator.passed)}")  # noqa: T201
+        for problem in made.problems:
+            print(f"PROBLEM {problem}")  # noqa: T201
+        errors = (folder / "stderr").read_text(errors="replace").strip()
+        print("\n".join(dict.fromkeys(errors.splitlines()))[-2000:])  # noqa: T201
     print(f"{len(made.problems)} problems, {time.monotonic() - began:.0f} s")  # noqa: T201
     return 1 if made.problems else 0
 

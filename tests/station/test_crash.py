@@ -1,6 +1,7 @@
-"""The station process is killed for real, twice: the records are true each time.
+"""The station, and the process of a socket, are killed for real while an operator works: what was
+shown is true of the units, and every unit gets through.
 
-The whole campaign is a command: `python -m tests.campaigns.station_kill --times 200`.
+The whole campaign is a command: `python -m tests.campaigns.station_kill --times 60 [--postgres]`.
 """
 
 from __future__ import annotations
@@ -10,11 +11,14 @@ from pathlib import Path
 import can
 import pytest
 
-from tests.campaigns.station_bench import bus_of, free_port
-from tests.campaigns.station_kill import Campaign
+from tests.campaigns.scripted_units import bus_of, free_port
+from tests.campaigns.station_kill import campaign
+from tests.station.postgres import Server
 
 
-def test_after_a_kill_the_records_are_true_and_the_unit_can_be_finished(tmp_path: Path) -> None:
+@pytest.fixture(autouse=True)
+def multicast() -> None:
+    """A bus that other processes hear."""
     try:
         with can.Bus(**bus_of(free_port()), ignore_config=True) as probe:
             probe.send(can.Message(arbitration_id=1, is_extended_id=False))
@@ -22,14 +26,22 @@ def test_after_a_kill_the_records_are_true_and_the_unit_can_be_finished(tmp_path
                 pytest.skip("multicast does not come back on this machine")
     except (can.CanError, OSError) as error:
         pytest.skip(f"no multicast bus here: {error}")
-    campaign = Campaign(tmp_path, seed=1, sockets=1)
-    try:
-        for commit in (6, 8):  # told that the flash may begin, flashed
-            assert campaign.kill_after(commit)
-        campaign.in_peace()
-    finally:
-        campaign.close()
-    assert campaign.problems == []
-    assert campaign.counts["killed"] == 2
-    assert campaign.counts["runs INTERRUPTED"] == 2
-    assert campaign.counts["runs PASS"] == 1
+
+
+@pytest.mark.timeout(240)
+@pytest.mark.parametrize("back_end", ["sqlite", "postgresql"])
+def test_after_kills_all_that_was_shown_is_true_and_every_unit_gets_through(
+    tmp_path: Path, request: pytest.FixtureRequest, back_end: str
+) -> None:
+    records = "records.sqlite"
+    if back_end == "postgresql":
+        server: Server = request.getfixturevalue("postgres")
+        records = server.url(server.database())
+    with campaign(tmp_path, seed=1, records=records) as made:
+        if back_end == "sqlite":
+            made.kill_once(worker=True)
+        made.kill_once(worker=False)
+        made.in_peace()
+    assert made.problems == []
+    assert made.counts["kills of the station"] == 1
+    assert made.operator.passed

@@ -1,0 +1,403 @@
+"""An operator at a station's screen: connects units, scans cards and labels, and does what the
+station says. Of the station it knows the event stream alone, which is what the screen is made of.
+
+Each unit bears a label; what the operator does with a unit, and which unit is in which socket, is
+known here for certain. So every word of the station can be held against the units.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import queue
+import random
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from tests.campaigns.scripted_units import Units
+
+_IDLE_S: Final = 0.6
+"""A socket in which nothing happens for so long waits for the operator."""
+_ATTEMPT_S: Final = 25.0
+"""A label that was scanned has begun its run after so long, or was in vain."""
+_ANSWER_S: Final = 10.0
+_TURN_S: Final = 0.02
+_AT_WORK: Final = ("running", "saving")
+_LEFT_S: Final = 8.0
+"""A socket that shows a unit for so long which is not in it has to be told."""
+_NAMED: Final = re.compile(r"\binto socket ([0-9]+)\b")
+_CARD: Final = re.compile(r"\bscan (the card|SOCKET)\b", re.IGNORECASE)
+_CYCLE: Final = re.compile(r"off.*on again")
+
+
+class Station:
+    """The process of `flasher station run`, its events, and its scanner."""
+
+    def __init__(self, folder: Path, *words: str) -> None:
+        command = [sys.executable, "-m", "flasher", "station", "run", *words]
+        with (folder / "stderr").open("ab") as errors:
+            self.process = subprocess.Popen(
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+                bufsize=1,
+            )
+        self.events: queue.SimpleQueue[dict[str, Any]] = queue.SimpleQueue()
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stdout is not None
+        for line in self.process.stdout:
+            if line.endswith("\n"):  # a line that a kill cut off was not shown
+                self.events.put(json.loads(line))
+
+    def scan(self, text: str) -> None:
+        assert self.process.stdin is not None
+        with contextlib.suppress(OSError):  # it was killed
+            self.process.stdin.write(text + "\n")
+            self.process.stdin.flush()
+
+    @property
+    def workers(self) -> list[int]:
+        """The processes of its sockets."""
+        pid = self.process.pid
+        try:
+            children = Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()
+            return [int(each) for each in children if "spawn_main" in _command_line(int(each))]
+        except OSError:
+            return []
+
+    def kill(self) -> list[int]:
+        """Kill it; its workers, which have to end by themselves."""
+        workers = self.workers
+        self.process.kill()
+        self._end()
+        return workers
+
+    def stop(self) -> int:
+        """Ctrl-C; its exit code."""
+        self.process.send_signal(signal.SIGINT)
+        try:
+            self.process.wait(30.0)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+        self._end()
+        return self.process.returncode
+
+    def _end(self) -> None:
+        self.process.wait()
+        self._reader.join(5.0)
+        for stream in (self.process.stdin, self.process.stdout):
+            assert stream is not None
+            with contextlib.suppress(OSError):
+                stream.close()
+
+
+def _command_line(pid: int) -> str:
+    return Path(f"/proc/{pid}/cmdline").read_bytes().decode(errors="replace")
+
+
+def is_running(pid: int) -> bool:
+    """True while a process that we started is there, and no zombie."""
+    try:
+        os.kill(pid, 0)
+        return ") Z " not in Path(f"/proc/{pid}/stat").read_text(encoding="ascii")
+    except OSError:
+        return False
+
+
+@dataclass
+class Place:
+    """A socket: what the station shows of it, and what is in it."""
+
+    name: str
+    port: int
+    state: str = "starting"
+    serial: str = ""
+    text: str = ""
+    unit: str = ""
+    """The label on the unit that is in it."""
+    changed_at: float = 0.0
+    tries: int = 0
+    """Of this unit, since the last kill."""
+
+
+@dataclass
+class Operator:
+    """Works at one station after the other; units stay where they are meanwhile."""
+
+    units: Units
+    places: dict[str, Place]
+    image: bytes
+    random: random.Random
+    counts: Counter[str] = field(default_factory=Counter)
+    problems: list[str] = field(default_factory=list)
+    shown: list[dict[str, Any]] = field(default_factory=list)
+    """Every RunStarted and RunEnded."""
+    station: Station | None = None
+    moments: int = 0
+    """Happenings of the running station at which a kill is of interest."""
+    _number: int = 0
+    _own: dict[str, str] = field(default_factory=dict)
+    """Of every unit: the serial number that it came with."""
+    _passed: set[str] = field(default_factory=set)
+    _said: list[str] = field(default_factory=list)
+    """What the station answered to the last scan."""
+    _answer: str = ""
+    _is_open: bool = False
+    _stopped: bool = False
+    _resume_at: float = 0.0
+
+    # -- at a station -----------------------------------------------------------------------------
+
+    def begin(self, station: Station) -> None:
+        """Sit down at a station that was just started."""
+        self.station, self.moments = station, 0
+        self._is_open = self._stopped = False
+        for place in self.places.values():
+            place.state, place.serial, place.text, place.tries = "starting", "", "", 0
+            place.changed_at = time.monotonic()
+
+    def work(self, over: Callable[[], bool], *, bring_units: bool = True) -> None:
+        """Work until `over` says so, or the station is gone."""
+        while not over() and self._is_there():
+            self._read(_TURN_S)
+            for place in self.places.values():
+                self._look_after(place, over, bring_units=bring_units)
+                if over():
+                    return
+
+    def leave(self) -> None:
+        """Read what the station showed last."""
+        while self.station is not None and not self.station.events.empty():
+            self._take(self.station.events.get())
+        self.station = None
+
+    def _is_there(self) -> bool:
+        return self.station is not None and self.station.process.poll() is None
+
+    @property
+    def is_done(self) -> bool:
+        """True when no unit is in a socket of a station that works."""
+        return self._is_open and not any(place.unit for place in self.places.values())
+
+    # -- reading ----------------------------------------------------------------------------------
+
+    def _read(self, limit_s: float) -> None:
+        assert self.station is not None
+        try:
+            event = self.station.events.get(timeout=limit_s)
+            while True:
+                self._take(event)
+                event = self.station.events.get_nowait()
+        except queue.Empty:
+            return
+
+    def _take(self, event: dict[str, Any]) -> None:
+        name = event.get("event", "")
+        if name in ("RunStarted", "StepStarted", "StepEnded", "RunEnded") or (
+            name == "SocketChanged" and event["state"] == "saving"
+        ):
+            self.moments += 1
+        match name:
+            case "StationStarted":
+                self._is_open = True
+            case "ScanAccepted":
+                self._answer = "accepted"
+            case "ScanRefused":
+                self._answer = "refused"
+                self._said.append(f"{event['reason']} {event['remedy']}")
+                self.counts[f"refused {event['code']}"] += 1
+            case "OperatorPrompted" if not _CYCLE.search(event["text"]):
+                self._said.append(event["text"])
+            case "LineStopped":
+                self._stopped, self._resume_at = True, time.monotonic() + 1.0
+                self.counts["line stopped"] += 1
+            case "LineResumed":
+                self._stopped = False
+            case _ if event.get("socket") in self.places:
+                self._take_of(self.places[event["socket"]], event)
+
+    def _take_of(self, place: Place, event: dict[str, Any]) -> None:
+        """What is said of one socket."""
+        match event["event"]:
+            case "SocketChanged":
+                place.state, place.serial = event["state"], event["serial"]
+                place.text, place.changed_at = event["text"], time.monotonic()
+            case "RunStarted":
+                self.shown.append(event)
+                if place.unit != event["serial"]:
+                    self.problems.append(
+                        f"the label {event['serial']} runs in socket {place.name}, where "
+                        f"{place.unit or 'nothing'} is"
+                    )
+            case "RunEnded":
+                self.shown.append(event)
+                self.counts[f"shown {event['outcome']} {event['code']}"] += 1
+                if event["outcome"] == "pass":
+                    self._hold(event["serial"], place)
+            case "OperatorPrompted" if place.unit:
+                self.counts["power cycles"] += 1
+                self.units.out(place.unit)
+                self.units.put(place.unit, place.port)
+            case "WorkerFailed":
+                self.counts["worker failed"] += 1
+
+    def _hold(self, serial: str, place: Place) -> None:
+        """A PASS is shown: the unit with this label has to be what it says."""
+        self._passed.add(serial)
+        found = self.units.look(serial) if serial in self._own else {}
+        if place.unit != serial:
+            self.problems.append(f"PASS of {serial} in socket {place.name}, where {place.unit} is")
+        if found.get("serial") != serial or found.get("image") != self.image.hex():
+            self.problems.append(f"false PASS of {serial}: its own number is {found.get('serial')}")
+
+    # -- doing ------------------------------------------------------------------------------------
+
+    def _look_after(self, place: Place, over: Callable[[], bool], *, bring_units: bool) -> None:
+        now = time.monotonic()
+        if self._stopped:
+            if now >= self._resume_at:
+                self._resume_at = now + 1.0
+                self._scan("RESUME")
+            return
+        quiet_s = now - place.changed_at
+        if place.state in ("starting", "error", *_AT_WORK) or quiet_s < _IDLE_S:
+            return
+        if place.unit and place.unit in self._passed:
+            self._take_out(place)
+        elif place.unit:
+            place.tries += 1
+            self._scan_unit(place, over)
+        elif place.state in ("empty", "silent"):
+            if bring_units:
+                self._bring(place, over)
+        elif quiet_s > _LEFT_S:
+            self._scan(f"FREE {place.name}")
+            place.changed_at = now
+
+    def _take_out(self, place: Place) -> None:
+        self.units.out(place.unit)
+        self.counts["units passed"] += 1
+        place.unit, place.changed_at = "", time.monotonic()
+
+    def _bring(self, place: Place, over: Callable[[], bool]) -> None:
+        """A new unit: into the socket first, or its label first."""
+        self._number += 1
+        label = f"W{self._number:07d}"
+        # Some come with their number, the others have none yet.
+        self._own[label] = self.random.choice(("", label))
+        if self.random.random() < 0.6:
+            self._put(label, place)
+            return
+        self.counts["bare label, unit in the hand"] += 1
+        if self._scan(label):
+            place = self._named(place)
+        self._put(label, place)
+        if self._answer == "accepted":
+            if self._wants_card():
+                self._scan(f"SOCKET {place.name}")
+            self._see_run(label, place, over)
+
+    def _named(self, place: Place) -> Place:
+        """The socket that the station names, when nothing is in it; else the one meant."""
+        named = _NAMED.search(" ".join(self._said))
+        chosen = self.places[named[1]] if named else place
+        return place if chosen.unit else chosen
+
+    def _wants_card(self) -> bool:
+        return bool(_CARD.search(" ".join(self._said)))
+
+    def _put(self, label: str, place: Place) -> None:
+        place.unit, place.changed_at, place.tries = label, time.monotonic(), 0
+        self.units.put(label, place.port, self._own[label])
+
+    def _scan_unit(self, place: Place, over: Callable[[], bool]) -> None:
+        """Scan a unit that waits in a socket: the card and the label, or the label alone; after a
+        label alone, what the station asks for.
+        """
+        way = self.random.choice(("card, label", "label, card", "bare label"))
+        if place.tries > 2:
+            way = "card, label"  # what is on the wall for those who do not get further
+            if place.tries % 4 == 0:
+                self._scan("CANCEL")
+        self.counts[way] += 1
+        if way == "card, label":
+            if self._scan(f"SOCKET {place.name}"):
+                self._scan(place.unit)
+        elif self._scan(place.unit):
+            if way == "label, card" or self._wants_card():
+                self._scan(f"SOCKET {place.name}")
+            elif self._named(place) is not place:
+                label, place.unit = place.unit, ""
+                self.units.out(label)
+                place = self._named(place)
+                self._put(label, place)
+                self.counts["unit moved, as the station said"] += 1
+        if self._answer == "accepted":
+            self._see_run(place.unit, place, over)
+        place.changed_at = time.monotonic()
+
+    def _see_run(self, label: str, place: Place, over: Callable[[], bool]) -> None:
+        """Wait until the run has begun, while the other sockets go on by themselves."""
+        give_up_at = time.monotonic() + _ATTEMPT_S
+        refusals = len(self._said)
+        while time.monotonic() < give_up_at and self._is_there() and not over():
+            self._read(_TURN_S)
+            if len(self._said) > refusals or label in self._passed or self._stopped:
+                return
+            if any(
+                each["event"] == "RunStarted" and each["serial"] == label
+                for each in self.shown[-4:]
+            ) and place.state in (*_AT_WORK, "pass", "fail", "recheck"):
+                return
+
+    def _scan(self, text: str) -> bool:
+        """Scan, and read the answer; False when it is refused, or there is none."""
+        if not self._is_there():
+            return False
+        assert self.station is not None
+        self._said.clear()
+        self._answer = ""
+        self.station.scan(text)
+        give_up_at = time.monotonic() + _ANSWER_S
+        while not self._answer and time.monotonic() < give_up_at and self._is_there():
+            self._read(_TURN_S)
+        return self._answer == "accepted"
+
+    # -- at the end -------------------------------------------------------------------------------
+
+    def stuck(self) -> list[str]:
+        """The units that did not get through."""
+        return [
+            f"{place.unit} is stuck in socket {place.name}: {place.state} {place.text}"
+            for place in self.places.values()
+            if place.unit
+        ]
+
+    def strange_units(self) -> list[str]:
+        """Units that bear a number which is neither their label's nor their own."""
+        found = {label: self.units.look(label)["serial"] for label in self._own}
+        return [
+            f"unit {label} has the number {serial}"
+            for label, serial in found.items()
+            if serial not in (label, self._own[label])
+        ]
+
+    @property
+    def passed(self) -> set[str]:
+        """Serial numbers of which a PASS was shown."""
+        return set(self._passed)
