@@ -41,7 +41,6 @@ def test_the_mock_passes_as_obc() -> None:
     assert failed(target="obc", only=("RS-01", "RS-04", "UP-06")) == []
 
 
-@pytest.mark.no_cover
 @pytest.mark.parametrize(
     "choices",
     [

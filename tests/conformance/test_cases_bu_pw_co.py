@@ -122,7 +122,6 @@ def test_every_frame_of_every_message_is_disturbed() -> None:
         assert frame == 18 or f"frame {frame} sent is swapped" in steps
 
 
-@pytest.mark.no_cover
 def test_power_is_cut_at_every_frame_of_an_upgrade_and_in_every_flash_operation() -> None:
     result = result_of("PW-01")
     assert result.status is Status.PASS

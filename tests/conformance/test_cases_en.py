@@ -29,7 +29,6 @@ def test_a_target_without_a_version_query_passes_all_but_the_version() -> None:
     assert set(found.values()) == {Status.PASS}
 
 
-@pytest.mark.no_cover
 @pytest.mark.parametrize(
     "choices",
     [

@@ -132,13 +132,11 @@ def judged(kind: type[ScriptedDevice], cases: Sequence[str], **given: Value) -> 
     }
 
 
-@pytest.mark.no_cover
 def test_a_right_device_of_others_passes() -> None:
     cases = [case_id for case_id in CASES if case_id not in _LONGEST]
     assert judged(ScriptedDevice, cases) == {}
 
 
-@pytest.mark.no_cover
 @pytest.mark.parametrize(
     ("kind", "cases", "choices"),
     [

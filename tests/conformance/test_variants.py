@@ -36,7 +36,6 @@ def test_a_variant_fails_nothing_but_its_clause_and_what_it_says_that_it_touches
         assert passed or not variant.upgrade_works, name
 
 
-@pytest.mark.no_cover
 @pytest.mark.parametrize("name", VARIANTS)
 def test_the_suite_says_what_the_table_says_of_the_case_of_the_clause(name: str) -> None:
     clause = VARIANTS[name].clause
