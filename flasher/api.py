@@ -80,16 +80,19 @@ class Connection:
 
 
 @contextmanager
-def connect(dialect: str | Dialect = "welling", **bus: Any) -> Iterator[Connection]:
+def connect(
+    dialect: str | Dialect = "welling", *, holder: str | None = "a program", **bus: Any
+) -> Iterator[Connection]:
     """Open an adapter through python-can and close it at the end.
 
     `bus` are python-can's own keywords (`interface`, `channel`, `bitrate`, ...); its configuration
-    files and CAN_* variables hold too. The bit rate defaults to the dialect's. Raises UsageError
-    or BusError.
+    files and CAN_* variables hold too. The bit rate defaults to the dialect's. Meanwhile no other
+    program of this user may speak as the tool on this adapter: `holder` is what it is told; None is
+    for who never does so (a device model, a monitor). Raises UsageError or BusError.
     """
     from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can
 
-    link = open_adapter(as_dialect(dialect).bitrate_bps, **bus)
+    link = open_adapter(as_dialect(dialect).bitrate_bps, holder=holder, **bus)
     try:
         yield Connection(link, MonotonicClock(), str(link))
     finally:

@@ -15,6 +15,7 @@ from enum import Enum
 class Phase(Enum):
     """Where an upgrade stands, in the words of the protocol."""
 
+    LISTEN = "listening for another tool"
     IDENTIFY = "asking the device who it is"
     RESET = "resetting the application"
     BOOT = "waiting for the boot version"
@@ -64,6 +65,15 @@ class ShutdownHeard:
     """The battery announces that it switches off (0x1308)."""
 
     sender: str
+
+
+@dataclass(frozen=True)
+class ForeignQuery:
+    """Another tool asks the device that is upgraded for something; `title` names it. It writes
+    nothing, so the upgrade goes on. Reported once for each question.
+    """
+
+    title: str
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from flasher.errors import (
     TransmitBlockedError,
 )
 from flasher.host.session import Result, Session
+from flasher.protocol.frame import Frame
 
 _WAS_OFF: Final = frozenset({TroubleKind.BUS_OFF, TroubleKind.RESTARTED})
 _REOPEN_PAUSE_S: Final = 0.1
@@ -50,7 +51,8 @@ def run_session(
     try:
         while True:
             try:
-                drive(session, link, clock, taps=taps, on_event=on_event, cancelled=cancelled)
+                watched = (*taps, _end_when_off(link))
+                drive(session, link, clock, taps=watched, on_event=on_event, cancelled=cancelled)
                 break
             except BusError as error:
                 if not _came_back(error, session, link, clock, adapter_return_s, tell, cancelled):
@@ -74,6 +76,18 @@ def run_session(
     if isinstance(silence, NoAnswerError):
         _check_bus(link, silence.where, session, before)
     return result
+
+
+def _end_when_off(link: Link) -> Tap:
+    """A tap that raises BusError as soon as the adapter reports bus-off: what the device says until
+    it is back is lost, and there is no use in waiting for it.
+    """
+
+    def look(frame: Frame, *, sent: bool, now: float) -> None:  # noqa: ARG001  of a tap
+        if frame.is_error and link.is_off:
+            raise bus_off_error(str(link))
+
+    return look
 
 
 def _check_bus(link: Link, where: str, session: Session, before: LinkHealth) -> None:

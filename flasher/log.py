@@ -41,6 +41,7 @@ _WARNING: Final = frozenset(
         events.AttemptStarted,
         events.QueryUnanswered,
         events.ShutdownHeard,
+        events.ForeignQuery,
         events.AdapterLost,
         events.BytesDamaged,
         events.DeviceReported,

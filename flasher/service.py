@@ -14,6 +14,7 @@ from typing import Final, Protocol, TypedDict, Unpack
 from flasher.bus.link import Clock, Link
 from flasher.driver import Tap, drive
 from flasher.errors import BusError, InterruptedByUserError, NoAnswerError
+from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.items import Readable, find, readable
 from flasher.host.query import Query, Request
 from flasher.host.read import MemoryRead
@@ -53,6 +54,28 @@ class Manner(TypedDict, total=False):
     taps: Sequence[Tap]
     on_event: Callable[[object], None] | None
     cancelled: Callable[[], bool] | None
+    has_listened: bool
+    """The caller has just listened for another tool itself."""
+
+
+def listen_first(
+    connection: Opened, *, dialect: Dialect = WELLING, **manner: Unpack[Manner]
+) -> None:
+    """Listen for `LISTEN_FIRST_S`, as everybody does who asks: a question in the middle of another
+    tool's packet spoils it. Raises BusError when another tool speaks.
+    """
+    if not manner.get("has_listened"):
+        _check_alone(_survey(connection, (), LISTEN_FIRST_S, dialect, manner))
+
+
+def _check_alone(survey: Survey) -> None:
+    if survey.other_tool_heard:
+        raise BusError(
+            "Another tool speaks on this bus; nothing is asked or written now.",
+            where="while listening first",
+            cause="an upgrade or a test is under way",
+            remedy="Wait until it has ended. flasher monitor listens without asking.",
+        )
 
 
 # -- asking ---------------------------------------------------------------------------------------
@@ -62,6 +85,7 @@ def query(
     connection: Opened, request: Request, *, dialect: Dialect = WELLING, **manner: Unpack[Manner]
 ) -> Content:
     """Ask one question; returns the content of the answer. Raises NoAnswerError."""
+    listen_first(connection, dialect=dialect, **manner)
     asked = Query(request, bitrate_bps=dialect.bitrate_bps, timings=_timings(manner))
     _drive(asked, connection, manner)
     _check_cancelled(asked.cancelled and asked.answer is None)
@@ -97,6 +121,7 @@ def read_memory(
     """The bytes from `start` up to `end` (exclusive, R5) of the BMS. Raises UsageError for an
     impossible range, NoAnswerError when a piece is not answered.
     """
+    listen_first(connection, dialect=dialect, **manner)
     reading = MemoryRead(start, end, bitrate_bps=dialect.bitrate_bps, timings=_timings(manner))
     _drive(reading, connection, manner)
     _check_cancelled(not reading.complete and reading.cancelled)
@@ -146,9 +171,11 @@ def carry_out(
 ) -> Written:
     """Write, wait for general feedback, read back. What went wrong stands in the result.
 
-    `cancelled` is not asked any more: a write that was begun is looked after, it takes seconds.
+    Raises BusError, before anything is written, when another tool speaks. `cancelled` is not asked
+    any more: a write that was begun is looked after, it takes seconds.
     """
     manner["cancelled"] = None
+    listen_first(connection, dialect=plan.dialect, **manner)
     request = Request(plan.writable.item, plan.content)
     is_confirmed = _ask(connection, request, plan.dialect, manner) is not None
     written = Written(plan, old, is_confirmed, None)
@@ -233,13 +260,8 @@ def info(
     requests = [Request(entry.item) for entry in asked]
     listen_s = INFO_LISTEN_S if asked else INFO_LISTEN_ONLY_S
     survey = _survey(connection, requests, listen_s, dialect, manner)
-    if requests and survey.other_tool_heard:
-        raise BusError(
-            "Another tool speaks on this bus; nothing was asked.",
-            where="while listening, before the first question",
-            cause="an upgrade or a test is under way",
-            remedy="Wait until it has ended. flasher monitor listens without asking.",
-        )
+    if requests:
+        _check_alone(survey)
     done = dict(zip((entry.name for entry in asked), survey.queries, strict=False))
     readings = tuple(_reading(entry, done.get(entry.name)) for entry in asked)
     return DeviceInfo(target, dialect, readings, survey)

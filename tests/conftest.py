@@ -15,11 +15,13 @@ POSTGRES_REQUIRED = "FLASHER_TEST_POSTGRES"
 
 
 @pytest.fixture(autouse=True, scope="session")
-def bundles_elsewhere(tmp_path_factory: pytest.TempPathFactory) -> None:
+def files_elsewhere(tmp_path_factory: pytest.TempPathFactory) -> None:
     """For processes that a test starts too."""
     os.environ[BUNDLE_FOLDER] = str(tmp_path_factory.mktemp("bundles"))
     # Signing keys of stations.
     os.environ["XDG_DATA_HOME"] = str(tmp_path_factory.mktemp("data"))
+    # Locks of adapters.
+    os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
 
 
 def pytest_xdist_auto_num_workers() -> int:

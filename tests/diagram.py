@@ -26,7 +26,7 @@ _MARKED: Final = re.compile(
 
 _QUIET: Final = {"NOTHING", "REPORT", "IMPOSSIBLE"}
 _EVERYWHERE: Final = {"CANCEL", "OUT_OF_TIME", "POWER_CUT", "SECOND_TOOL", "UNEXPECTED"}
-_NOT_IN_THE_OVERVIEW: Final = {"LINK_BACK"}
+_NOT_IN_THE_OVERVIEW: Final = {"LINK_BACK", "LINK_BACK_UPDATING"}
 _GOOD: Final = {Ending.COMPLETED, Ending.CONFIRMED_BY_VERSION}
 
 _INTRODUCTION: Final = """\
@@ -35,7 +35,8 @@ _INTRODUCTION: Final = """\
 Drawn from the tables in the code by `python -m tests.diagram`; a test keeps them so. Each arrow is
 *event / action*. Left out are events that are ignored or only reported, and those that are possible
 in every state: for the host the overall deadline, the user's cancellation and a second tool (all
-end the upgrade), for the device a power cut.
+end the upgrade; a mere query of it is reported, and no event of the table), for the device a power
+cut.
 """
 
 _Table = Mapping[Any, Mapping[Any, Any]]

@@ -28,6 +28,7 @@ from flasher.bus.health import (
 )
 from flasher.bus.inspect_interface import Interface, read_interface
 from flasher.bus.link import SEND_LIMIT_S
+from flasher.bus.lock import hold
 from flasher.bus.opening import bus_config, open_bus, words_of
 from flasher.errors import BusError, TransmitBlockedError
 from flasher.protocol.frame import Frame
@@ -59,18 +60,29 @@ _PCAN_PASSIVE: Final = 0x40000
 _PCAN_WARNING: Final = 0x00004 | 0x00008
 
 
-def open_adapter(default_bitrate_bps: int, *, listen_only: bool = False, **config: Any) -> CanLink:
+def open_adapter(
+    default_bitrate_bps: int,
+    *,
+    holder: str | None = None,
+    listen_only: bool = False,
+    **config: Any,
+) -> CanLink:
     """Open the adapter that `config` (python-can's keywords), its files and variables describe.
 
-    `default_bitrate_bps` holds where none of them names a bit rate. `listen_only` keeps the adapter
-    from acknowledging, where its back end can be told (`opening.can_listen_only`). Raises
-    UsageError for an interface that python-can does not know, BusError when the adapter cannot be
-    opened.
+    `default_bitrate_bps` holds where none of them names a bit rate. As `holder` it is locked until
+    it is closed (`lock.hold`). `listen_only` keeps the adapter from acknowledging, where its back
+    end can be told (`opening.can_listen_only`). Raises UsageError for an interface that python-can
+    does not know, BusError when the adapter cannot be opened or somebody else holds it.
     """
     merged = bus_config(default_bitrate_bps, config, listen_only=listen_only)
     interface = str(merged["interface"])
     channel = str(merged.get("channel") or "")
-    return CanLink(open_bus(merged), interface, channel, lambda: open_bus(merged))
+    give_back = hold(merged, holder)
+    try:
+        return CanLink(open_bus(merged), interface, channel, lambda: open_bus(merged), give_back)
+    except BaseException:
+        give_back()
+        raise
 
 
 class CanLink:
@@ -82,7 +94,9 @@ class CanLink:
         interface: str,
         channel: str = "",
         open_again: Callable[[], can.BusABC] | None = None,
+        give_back: Callable[[], None] = lambda: None,
     ) -> None:
+        self._give_back = give_back
         self._interface = interface
         self._channel = channel
         self._name = f"{interface} {channel}".strip()
@@ -125,7 +139,7 @@ class CanLink:
         all the same, and lose them.
         """
         give_up_at: float | None = None
-        if self._health.state is ControllerState.BUS_OFF:
+        if self.is_off:
             raise bus_off_error(str(self), "The adapter failed while sending: it is bus-off.")
         while True:
             # A back end may alter a message: never the same object twice.
@@ -170,6 +184,10 @@ class CanLink:
 
     def close(self) -> None:
         """Shut the adapter down; a failure to do so is of no interest any more."""
+        self._shut_down()
+        self._give_back()
+
+    def _shut_down(self) -> None:
         if self._bus is not None:
             with contextlib.suppress(*_FAILURES):
                 self._bus.shutdown()
@@ -181,11 +199,16 @@ class CanLink:
         """
         if self._open_again is None:
             raise BusError("This adapter cannot be opened again.", where=str(self))
-        self.close()
+        self._shut_down()
         self._use(None)
         self._waiting.clear()
         self._use(self._open_again())
         self._health.reset()
+
+    @property
+    def is_off(self) -> bool:
+        """True while the adapter is bus-off by its own report."""
+        return self._health.state is ControllerState.BUS_OFF
 
     def health(self) -> LinkHealth:
         """What is known of the adapter and its bus. Sends nothing; takes up to 2 s on SocketCAN."""

@@ -60,6 +60,11 @@ class Link(Protocol):
         """
         ...
 
+    @property
+    def is_off(self) -> bool:
+        """True while the adapter is bus-off by its own report. Asks nobody."""
+        ...
+
     def health(self) -> LinkHealth:
         """What is known of the adapter and its bus. Sends nothing, never raises."""
         ...

@@ -294,6 +294,11 @@ class SimulatedLink:
         self._host.outbox.clear()
         self._health.reset()
 
+    @property
+    def is_off(self) -> bool:
+        """True while the adapter is bus-off by its own report."""
+        return self._health.state is ControllerState.BUS_OFF
+
     def health(self) -> LinkHealth:
         """As an adapter on Linux tells it: error-active unless something befell it."""
         faults = self._bus.faults
@@ -307,7 +312,7 @@ class SimulatedLink:
 
     def _check(self, doing: str) -> None:
         self._check_plugged(doing)
-        if self._health.state is ControllerState.BUS_OFF:
+        if self.is_off:
             raise bus_off_error(str(self), f"The adapter failed while {doing}: it is bus-off.")
 
     def _check_plugged(self, doing: str) -> None:

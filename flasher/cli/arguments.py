@@ -173,15 +173,23 @@ def add_mock(parser: argparse.ArgumentParser) -> None:
 
 
 def open_connection(
-    options: argparse.Namespace, target: Target
+    options: argparse.Namespace, target: Target, *, asks: bool = True
 ) -> contextlib.AbstractContextManager[Connection]:
-    """The bus that the options name: an adapter, or a whole bicycle with the model of `target`."""
+    """The bus that the options name: an adapter, or a whole bicycle with the model of `target`.
+    With `asks` False nothing will be sent.
+    """
     if options.mock:
         riding = DeviceProfile(battery_use="riding")  # so that there is something to see
         return connect_mock(
             target, options.dialect, speed=options.mock_speed, system=True, profile=riding
         )
-    return connect(options.dialect, **bus_config(options))
+    holder = holder_of(options) if asks else None
+    return connect(options.dialect, holder=holder, **bus_config(options))
+
+
+def holder_of(options: argparse.Namespace) -> str:
+    """What other programs are told of this command while it has the adapter."""
+    return f"flasher {options.command}"
 
 
 def take_values_anywhere(parser: argparse.ArgumentParser, dest: str) -> None:

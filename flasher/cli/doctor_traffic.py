@@ -135,7 +135,7 @@ def _nodes(heard: Listened) -> Iterator[Finding]:
             Severity.PROBLEM,
             "traffic",
             "another tool speaks as CDL on this bus: two at once spoil an upgrade",
-            ("close the other tool, or disconnect it",),
+            ("wait if it upgrades a device; else close the other tool, or disconnect it",),
         )
     for node, said in sorted(survey.heard.items(), key=lambda pair: pair[0].value):
         if any(isinstance(content, contents.Shutdown) for content in said.last.values()):

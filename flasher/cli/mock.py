@@ -143,7 +143,7 @@ def run(options: argparse.Namespace, output: Output) -> int:
     output.shown_events = SHOWN
     tool = _Tool(options.target)
     with (
-        api.connect(dialect, **arguments.bus_config(options)) as connection,
+        api.connect(dialect, holder=None, **arguments.bus_config(options)) as connection,
         stop_on_signal() as stopped,
     ):
         if not dialect.has_upgrade:

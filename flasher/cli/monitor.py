@@ -132,7 +132,7 @@ def run(options: argparse.Namespace, output: Output) -> int:
     with ExitStack() as stack:
         if options.trace is None:
             connection = stack.enter_context(
-                arguments.open_connection(options, options.target or BMS)
+                arguments.open_connection(options, options.target or BMS, asks=False)
             )
             view.name = printable(connection.name)
             cancelled = stack.enter_context(stop_on_signal())

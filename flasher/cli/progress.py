@@ -25,6 +25,7 @@ SHOWN: Final = frozenset(
         events.CheckMade,
         events.PowerCycleAwaited,
         events.ShutdownHeard,
+        events.ForeignQuery,
         events.AdapterLost,
         events.AdapterBack,
         events.BytesDamaged,
@@ -41,6 +42,8 @@ _BECAUSE: Final = {
     Event.REQUEST_LATE.value: "the device requested the transfer anew in the middle of it",
     Event.BOOT_RESTARTED.value: "the device restarted",
     Event.BOOT_GIVEN_UP.value: "the device did not announce its bootloader",
+    Event.BOOT_SILENT.value: "the device neither answered the reset nor announced its bootloader",
+    Event.REQUEST_GIVEN_UP.value: "the device did not request the transfer in time",
     Event.END_NAK.value: "the device refused the {what}",
     Event.END_UNANSWERED.value: "the device did not answer the {what} in time",
     Event.LINK_BACK.value: "the adapter was away for a while",
@@ -157,6 +160,8 @@ def _warning(event: object) -> str:
     match event:
         case events.ShutdownHeard(sender):
             return f"the {sender} sent the command SHUTDOWN: it switches off"
+        case events.ForeignQuery(title):
+            return f"another tool asks the device ({title}); the upgrade goes on. End that tool."
         case events.AdapterLost(reason, wait_s):
             return f"{reason} Waiting {wait_s:g} s for the adapter ..."
         case events.CheckMade(_, "warned" | "waived", text):

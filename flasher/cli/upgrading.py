@@ -205,4 +205,5 @@ def _connection(
             speed=options.mock_speed,
             has_application=not at_power_up,
         )
-    return api.connect(options.dialect, **arguments.bus_config(options))
+    holder = arguments.holder_of(options)
+    return api.connect(options.dialect, holder=holder, **arguments.bus_config(options))

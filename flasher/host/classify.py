@@ -59,6 +59,7 @@ class Classifier:
             case Complete():
                 return self._complete(at)
             case GeneralFeedback():
+                at.feedback_came = True
                 return Event.FEEDBACK
             case Content():
                 return self._version(row, at)
@@ -74,9 +75,9 @@ class Classifier:
                 given_up = in_state_s >= timings.command_timeout_s
                 return Event.RESET_UNANSWERED if given_up else Event.RESET_DUE
             case State.AWAITING_BOOT:
-                return self._no_boot(at)
+                return self._no_boot(at, now)
             case State.AWAITING_REQUEST:
-                return Event.REQUEST_MISSING
+                return self._no_request(at)
             case State.TRANSFERRING:
                 return self._packet_lost(at) if self._last_try(at) else Event.PACKET_UNANSWERED
             case State.SETTLING:
@@ -147,13 +148,29 @@ class Classifier:
             return self._boot_again(boot, at, now)
         return Event.BOOT_TOO_OLD if self._is_too_old(boot) else Event.BOOT_VERSION
 
-    def _no_boot(self, at: Situation) -> Event:
-        """No boot version came. A device that was told to update is not left alone at once."""
+    def link_back(self, at: Situation) -> Event:
+        """The event that the return of a lost adapter is."""
+        is_updating = at.state is State.AWAITING_REQUEST and at.first_update_left_at is not None
+        return Event.LINK_BACK_UPDATING if is_updating else Event.LINK_BACK
+
+    def _no_boot(self, at: Situation, now: float) -> Event:
+        """No boot version came; a device that was told to update is not left alone (R26)."""
         if at.update_left and not self._last_attempt(at):
-            return Event.BOOT_GIVEN_UP
+            if at.feedback_came or at.silence_was_answered:
+                return Event.BOOT_GIVEN_UP
+            if now < at.silent_since + self._timings.request_transfer_timeout_s:
+                return Event.BOOT_AWAITED
+            at.silence_was_answered = True
+            return Event.BOOT_SILENT
         if at.failed_packet is not None:
             return Event.BOOT_LOST
         return Event.POWER_UP_MISSING if self._options.at_power_up else Event.BOOT_MISSING
+
+    def _no_request(self, at: Situation) -> Event:
+        if not self._last_attempt(at):
+            return Event.REQUEST_GIVEN_UP
+        was_lost = at.failed_packet is not None and at.boot is None
+        return Event.BOOT_LOST if was_lost else Event.REQUEST_MISSING
 
     def _boot_again(self, boot: BootVersion, at: Situation, now: float) -> Event:
         """After an update command was sent, before request transfer (R2)."""

@@ -26,7 +26,7 @@ def conclude(
     ending: Ending, detail: str, plan: Plan, at: Situation, statistics: Statistics
 ) -> Outcome:
     """The outcome of an upgrade that ended so where `at` stands."""
-    phase, packet = at.phase, at.packet
+    phase, packet, boot = at.phase, at.packet, at.last_boot
     if ending is Ending.PACKET_FAILED and packet is None:
         # It failed in an earlier attempt, and the device did not come back for this one.
         phase, packet = Phase.TRANSFER, at.failed_packet
@@ -37,7 +37,7 @@ def conclude(
         target=plan.target,
         total_packets=plan.total_packets,
         packet=packet,
-        boot_version=printable(f"{at.boot.name} {at.boot.version}") if at.boot else None,
+        boot_version=printable(f"{boot.name} {boot.version}") if boot else None,
         running_version=at.running_version,
         statistics=statistics,
         detail=detail,

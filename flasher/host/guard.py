@@ -1,26 +1,49 @@
 """Watches the whole bus while a session runs, for what no single dialogue would notice; pure.
 
 A second tool: a frame with the id on which only the tool speaks, and that is no echo of what was
-sent. Echoes come soon; an adapter that gives none, not all, or some of them twice is fine.
+sent. Echoes come soon; an adapter that gives none, not all, or some of them twice is fine. A query
+(mode 11) is told from all other messages: it writes nothing.
 The battery's SHUTDOWN: whatever the target is, its power goes with it.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from typing import Final
+from typing import Final, NamedTuple
 
 from flasher import events
 from flasher.protocol import catalogue
 from flasher.protocol.contents import Shutdown
 from flasher.protocol.echoes import ECHO_FRAMES, Echoes
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import Node, Target, can_id
+from flasher.protocol.spec import (
+    COMMAND_SIZE,
+    FRAME_DATA_SIZE,
+    HEADER,
+    PREFIX_SIZE,
+    Mode,
+    Node,
+    Target,
+    can_id,
+)
 from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Message, Reassembler
 
 DOUBLE_LIMIT_S: Final = 0.1
 """A second copy of an echo (a network with two ways, a driver's own) comes right behind it."""
+
+
+class Foreign(NamedTuple):
+    """A frame of a second tool: what was seen; whether a transfer may go on beside it; the command
+    that it asks for, None where it is not the beginning of a query.
+
+    Only the first frame of a message tells what it is, and is judged. One that is no beginning is
+    harmless, since its beginning is judged or was not heard.
+    """
+
+    seen: str
+    is_harmless: bool
+    query: int | None = None
 
 
 class Guard:
@@ -41,8 +64,12 @@ class Guard:
         if frame[0] == self._own_id:
             self._echoes.sent(frame, now)
 
-    def see(self, frame: Frame, now: float) -> str | None:
-        """A frame was received; returns what it shows when a second tool has sent it."""
+    def link_back(self, now: float) -> None:
+        """The adapter was lost and works again: what it held may leave, and come back, only now."""
+        self._echoes.held_up(now)
+
+    def see(self, frame: Frame, now: float) -> Foreign | None:
+        """A frame was received; returns what it is when a second tool has sent it."""
         frame_id = frame[0]
         if frame_id == self._own_id:
             return self._judge_own(frame, now)
@@ -57,7 +84,7 @@ class Guard:
         taken, self._events = self._events, []
         return taken
 
-    def _judge_own(self, frame: Frame, now: float) -> str | None:
+    def _judge_own(self, frame: Frame, now: float) -> Foreign | None:
         if not frame.is_payload:
             return None
         if self._echoes.take(frame, now):
@@ -65,7 +92,14 @@ class Guard:
             return None
         if any(own == frame and now - at <= DOUBLE_LIMIT_S for at, own in self._echoed):
             return None
-        return f"frame {frame.data.hex(' ')} with id 0x{frame.can_id:03X}, not sent by this tool"
+        data = frame.data
+        seen = f"frame {data.hex(' ')} with id 0x{frame.can_id:03X}, not sent by this tool"
+        if len(data) < FRAME_DATA_SIZE or not data.startswith(HEADER):
+            return Foreign(seen, is_harmless=True)
+        if data[len(HEADER)] != Mode.READ:
+            return Foreign(seen, is_harmless=False)
+        command = int.from_bytes(data[PREFIX_SIZE : PREFIX_SIZE + COMMAND_SIZE], "big")
+        return Foreign(seen, is_harmless=True, query=command)
 
     def _note(self, message: Message) -> None:
         decoded = catalogue.decode(message)

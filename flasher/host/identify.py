@@ -3,7 +3,8 @@
 Asked are the version information (where the target has a query for it) and, of the battery, the
 running information. A device that sits in its bootloader announces itself instead of answering:
 that is heard, and ends the asking at once, so that the announcement can be answered in its window.
-After the version was told it listens a moment longer: another device may tell another one.
+Before the first question it listens for a moment, for another tool may be at work (`guard` hears
+it); after the version was told it listens a moment longer, for another device may tell another one.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
+from flasher.events import Phase, PhaseEntered
 from flasher.host.identity import Seen
 from flasher.host.options import UpgradeOptions
 from flasher.host.query import Queries, Request
@@ -23,16 +25,23 @@ from flasher.protocol.messages import BootVersion, decode
 from flasher.protocol.spec import Node, Target
 from flasher.protocol.wire import Message, Reassembler
 
+LISTEN_FIRST_S: Final = 0.1
+"""How long every command that asks listens before it does. A tool that flashes sends more often,
+unless it waits for the device."""
 LISTENS_ON_S: Final = 0.1
 """How much later than the first device a second one is still heard."""
 
 
 class Identify:
-    """Asks until it knows what can be known; an engine."""
+    """Listens, then asks until it knows what can be known; an engine. With `asks` False it listens
+    only.
+    """
 
-    def __init__(self, plan: Plan, options: UpgradeOptions) -> None:
+    def __init__(self, plan: Plan, options: UpgradeOptions, *, asks: bool = True) -> None:
         timings = options.timings
-        requests = _requests(plan.target, options)
+        requests = _requests(plan.target, options) if asks else []
+        self.asks = bool(requests)
+        """False where nothing is asked: other targets than the battery have no query (5.2)."""
         self._queries = Queries(
             requests, bitrate_bps=plan.bitrate_bps, timings=timings, stop_at_silence=True
         )
@@ -46,7 +55,20 @@ class Identify:
         self.answers: list[Content] = []
         """Every version answer that came, each different one once: two are two devices."""
         self.cancelled = False
+        self._events: list[object] = []
+        self._begun = False
+        self._listens_first_until: float | None = None
         self._listens_until: float | None = None
+
+    @property
+    def has_listened(self) -> bool:
+        """True once it may ask."""
+        return self._begun and self._listens_first_until is None
+
+    @property
+    def phase(self) -> Phase:
+        """Where it stands."""
+        return Phase.IDENTIFY if self.has_listened else Phase.LISTEN
 
     @property
     def seen(self) -> Seen:
@@ -61,7 +83,7 @@ class Identify:
     @property
     def done(self) -> bool:
         """True when nothing more is asked, nor listened for."""
-        return self._queries.done and self._listens_until is None
+        return self.has_listened and self._queries.done and self._listens_until is None
 
     def receive(self, frame: Frame, now: float) -> None:
         """A CAN frame arrived."""
@@ -91,20 +113,31 @@ class Identify:
 
     def tick(self, now: float) -> None:
         """The time that `deadline` asked for has come."""
+        if not self._begun:
+            self._begun = True
+            self._listens_first_until = now + LISTEN_FIRST_S
+            self._events.append(PhaseEntered(Phase.LISTEN, 1))
+        if self._listens_first_until is not None and now >= self._listens_first_until:
+            self._listens_first_until = None
+            if self.asks and not self._queries.done:
+                self._events.append(PhaseEntered(Phase.IDENTIFY, 1))
         if self._listens_until is not None and now >= self._listens_until:
             self._listens_until = None
-        self._queries.tick(now)
+        if self.has_listened:
+            self._queries.tick(now)
 
     def deadline(self) -> float | None:
-        """When it next wants `tick`."""
+        """When it next wants `tick`; at once before the beginning."""
+        if not self.has_listened:
+            return self._listens_first_until if self._begun else 0.0
         wanted = self._queries.deadline()
         if self._listens_until is None or wanted is None:
             return self._listens_until if wanted is None else wanted
         return min(wanted, self._listens_until)
 
     def next_frame(self, now: float) -> Frame | None:
-        """The next frame to send."""
-        return self._queries.next_frame(now)
+        """The next frame to send; nothing while it listens first."""
+        return self._queries.next_frame(now) if self.has_listened else None
 
     def frame_sent(self, now: float) -> None:
         """The adapter has accepted it."""
@@ -112,13 +145,14 @@ class Identify:
 
     def cancel(self, now: float) -> None:
         """End at the next message boundary."""
-        self.cancelled = True
-        self._listens_until = None
+        self.cancelled = self._begun = True
+        self._listens_first_until = self._listens_until = None
         self._queries.cancel(now)
 
     def take_events(self) -> Sequence[object]:
         """What happened since the last call."""
-        return self._queries.take_events()
+        taken, self._events = [*self._events, *self._queries.take_events()], []
+        return taken
 
 
 def _requests(target: Target, options: UpgradeOptions) -> list[Request]:

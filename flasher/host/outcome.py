@@ -128,11 +128,13 @@ class Outcome:
         return error
 
 
-def before_the_start(plan: Plan, ending: Ending, detail: str, *, duration_s: float) -> Outcome:
+def before_the_start(
+    plan: Plan, ending: Ending, detail: str, phase: Phase = Phase.IDENTIFY, *, duration_s: float
+) -> Outcome:
     """The outcome of a session that ends before its upgrade has begun."""
     return Outcome(
         ending=ending,
-        phase=Phase.IDENTIFY,
+        phase=phase,
         device_left=DeviceLeft.UNTOUCHED,
         target=plan.target,
         total_packets=plan.total_packets,
@@ -255,7 +257,7 @@ def _late(phase: Phase, left: DeviceLeft) -> _Explanation:
     """The explanation of a passed deadline, by what had been reached."""
     remedy = f"Allow more time with --timeout, or find what is slow. {_AGAIN}"
     match phase:
-        case Phase.IDENTIFY | Phase.RESET | Phase.BOOT | Phase.UPDATE:
+        case Phase.LISTEN | Phase.IDENTIFY | Phase.RESET | Phase.BOOT | Phase.UPDATE:
             cause = "the device is not there, or not ready in the time allowed"
             return _Explanation(NoAnswerError, cause, remedy)
         case Phase.END if left is not DeviceLeft.UNKNOWN:

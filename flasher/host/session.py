@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 
 from flasher import events
 from flasher.events import Phase
-from flasher.host.guard import Guard
+from flasher.host.guard import Foreign, Guard
 from flasher.host.identify import Identify
 from flasher.host.identity import Finding, Identity, Seen, judge_device, judge_image
 from flasher.host.options import UpgradeOptions, firmware_version, overall_timeout_s
@@ -28,6 +28,7 @@ from flasher.host.verify import (
     VersionCheck,
 )
 from flasher.image.plan import Plan
+from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.frame import Frame
 
 __all__ = ["Result", "Session"]
@@ -38,8 +39,9 @@ _Stage = Identify | Upgrade | Check
 class Session:
     """One session; an engine. Begins with the first `tick`.
 
-    With `identity` the device is asked who it is, and the image is held against the answer, before
-    anything is written; a device that is waited for at power-up cannot be asked.
+    It listens for a second tool before it sends anything. With `identity` the device is then asked
+    who it is, and the image is held against the answer, before anything is written; a device that
+    is waited for at power-up cannot be asked.
     """
 
     def __init__(
@@ -54,16 +56,16 @@ class Session:
         self._level = level
         self._identity = identity
         self._guard = Guard(plan.target, self._options.timings)
+        self._foreign_queries: set[int] = set()
+        """The commands of those that were reported."""
         self._began_at: float | None = None
         self._deadline_at: float | None = None
         self._losses = 0
         self._previous_version: str | None = None
         self._handed: Frame | None = None
         self._upgrade = Upgrade(plan, self._options)
-        asked = Identify(plan, self._options)
-        # At power-up no application runs; other targets than the battery cannot be asked (5.2).
-        self._asks = identity is not None and not self._options.at_power_up and not asked.done
-        self._stage: _Stage = asked if self._asks else self._upgrade
+        # At power-up no application runs, and nothing is sent before the device's announcement.
+        self._stage: _Stage = self._upgrade if self._options.at_power_up else self._identify()
         self._events: list[object] = []
         self._result: Result | None = None
 
@@ -90,8 +92,8 @@ class Session:
         match self._stage:
             case Upgrade() as upgrade:
                 return upgrade.standing
-            case Identify():
-                return Phase.IDENTIFY.value
+            case Identify() as asked:
+                return asked.phase.value
             case Check() as check:
                 return f"verifying by {check.level.value}"
 
@@ -110,9 +112,9 @@ class Session:
 
     def receive(self, frame: Frame, now: float) -> None:
         """A CAN frame arrived."""
-        seen = self._guard.see(frame, now)
-        if seen is not None:
-            self._second_tool(seen, now)
+        foreign = self._guard.see(frame, now)
+        if foreign is not None:
+            self._second_tool(foreign, now)
         elif not self.done:
             self._stage.receive(frame, now)
             self._go_on(now)
@@ -163,9 +165,10 @@ class Session:
     def link_back(self, now: float) -> None:
         """The adapter was lost and works again."""
         self._losses += 1
+        self._guard.link_back(now)
         if isinstance(self._stage, Identify):
             # Queries are short and harmless: they are begun anew.
-            self._stage = Identify(self._plan, self._options)
+            self._stage = self._identify()
         elif isinstance(self._stage, Upgrade):
             self._stage.link_back(now)
         self._go_on(now)
@@ -185,10 +188,12 @@ class Session:
         self._upgrade.deadline_at = self._deadline_at
         if self._identity is not None:
             self._judge(judge_image(self._plan.image, self._plan.target, self._identity), now)
-        if self._asks and not self.done:
-            self._events.append(events.PhaseEntered(Phase.IDENTIFY, 1))
-        elif self._identity is not None and not self.done:
+        if self._identity is not None and self._options.at_power_up and not self.done:
             self._judge_seen(self._identity, Seen(), now)
+
+    def _identify(self) -> Identify:
+        """What listens and, to hold the answers against the image, asks."""
+        return Identify(self._plan, self._options, asks=self._identity is not None)
 
     def _is_late(self, now: float) -> bool:
         """The deadline passed in a stage that does not know it; the upgrade does."""
@@ -271,10 +276,16 @@ class Session:
 
     # -- the end ---------------------------------------------------------------------------------
 
-    def _second_tool(self, seen: str, now: float) -> None:
+    def _second_tool(self, foreign: Foreign, now: float) -> None:
+        seen = foreign.seen
         match self._stage:
             case _ if self.done:
                 return
+            case Upgrade(is_told_to_update=True) | Check() if foreign.is_harmless:
+                # It writes nothing, CRC and repetition protect the data: to end here would leave a
+                # device without an application.
+                if foreign.query is not None:
+                    self._report_query(foreign.query)
             case Upgrade() as upgrade:
                 upgrade.second_tool(seen, now)
                 self._go_on(now)
@@ -285,9 +296,18 @@ class Session:
                 verification = Verification(self._stage.level, Verdict.SECOND_TOOL, None, seen)
                 self._end(self._upgrade.outcome, verification)
 
+    def _report_query(self, command: int) -> None:
+        if command in self._foreign_queries:
+            return
+        self._foreign_queries.add(command)
+        item = BY_KEY.get((self._plan.target.request_id, command))
+        title = f"query {command:04X}" if item is None else item.title
+        self._events.append(events.ForeignQuery(title))
+
     def _end_early(self, ending: Ending, detail: str, now: float) -> None:
         duration_s = now - (now if self._began_at is None else self._began_at)
-        self._end(before_the_start(self._plan, ending, detail, duration_s=duration_s))
+        phase = self._stage.phase if isinstance(self._stage, Identify) else Phase.IDENTIFY
+        self._end(before_the_start(self._plan, ending, detail, phase, duration_s=duration_s))
 
     def _end(self, outcome: Outcome, verification: Verification = NOT_ASKED) -> None:
         heard = self._guard.shutdown_heard

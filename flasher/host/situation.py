@@ -39,8 +39,16 @@ class Situation:
     phase: Phase = Phase.RESET
     attempt: int = 1
 
+    heard_at: float = _NEVER
+    """When the device was heard last, or could not be heard as the adapter was away."""
+    feedback_came: bool = False
+    """The reset was answered: an application runs."""
+    silence_was_answered: bool = False
+    """An update command was sent into the silence of a device, in any attempt (R26)."""
     boot: BootVersion | None = None
     """The first boot version of the attempt."""
+    last_boot: BootVersion | None = None
+    """The same, of this or an earlier attempt."""
     update_left_at: float = _NEVER
     """When the last update command left, of this or an earlier attempt."""
     first_update_left_at: float | None = None
@@ -77,6 +85,11 @@ class Situation:
     def update_left(self) -> bool:
         """True when an update command was sent: the device may have erased its application."""
         return self.update_left_at > _NEVER
+
+    @property
+    def silent_since(self) -> float:
+        """Since when the device has been silent, and not been told to update again."""
+        return max(self.heard_at, self.update_left_at)
 
     @property
     def packet(self) -> int | None:
@@ -127,6 +140,9 @@ class Situation:
             state_since=self.state_since,
             phase=self.phase,
             attempt=self.attempt + 1,
+            heard_at=self.heard_at,
+            silence_was_answered=self.silence_was_answered,
+            last_boot=self.last_boot,
             update_left_at=self.update_left_at,
             erased=self.erased,
             failed_packet=failed_packet or self.failed_packet,

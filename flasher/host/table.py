@@ -71,9 +71,13 @@ class Event(Enum):
     BOOT_MISSING = "no boot version in time"
     POWER_UP_MISSING = "no boot version in time, waited for at power-up"
     BOOT_GIVEN_UP = "no boot version of a device that was told to update, an attempt left"
+    BOOT_AWAITED = "no boot version, the device may still be erasing"
+    BOOT_SILENT = "no boot version and no answer to the reset for the erase limit, an attempt left"
     BOOT_LOST = "no boot version after a lost packet, no attempt left"
-    REQUEST_MISSING = "no request transfer in time"
+    REQUEST_MISSING = "no request transfer in time, no attempt left"
+    REQUEST_GIVEN_UP = "no request transfer in time, an attempt left"
     LINK_BACK = "the adapter was lost and is back"
+    LINK_BACK_UPDATING = "the adapter was lost and is back, the device was told to update"
     SECOND_TOOL = "somebody else speaks as the tool"
     UNEXPECTED = "message that has no place here"
     OUT_OF_TIME = "overall deadline"
@@ -88,6 +92,8 @@ class Action(Enum):
     IMPOSSIBLE = "cannot happen"
     SEND_RESET = "send reset"
     AWAIT_BOOT = "wait for the boot version"
+    AWAIT_ERASE = "wait for the end of the erase limit"
+    AWAIT_REQUEST = "wait for request transfer"
     SEND_UPDATE = "send update command"
     START_OVER = "start over: send update command"
     BEGIN_AGAIN = "begin again: send reset"
@@ -150,8 +156,8 @@ def _row(
 ) -> _Row:
     """A complete row: the moves, what is ignored or reported where it stands, the rest impossible.
 
-    Every state but the last two ends on the deadline, on the user's word and on a second tool, and
-    begins again when a lost adapter is back.
+    Every state but the last two ends on the deadline, on the user's word and on a second tool.
+    Where a lost adapter that is back has no row of its own, the upgrade begins again.
     """
     row = {event: Transition(Action.IMPOSSIBLE, state) for event in Event}
     row.update({event: Transition(Action.NOTHING, state) for event in ignored})
@@ -189,6 +195,10 @@ TABLE: Final[Mapping[State, _Row]] = {
             Event.BOOT_MISSING: (Ending.NO_BOOT_VERSION, State.STOPPING),
             Event.POWER_UP_MISSING: (Ending.NO_ANNOUNCEMENT, State.STOPPING),
             Event.BOOT_GIVEN_UP: (Action.BEGIN_AGAIN, State.RESETTING),
+            Event.BOOT_AWAITED: (Action.AWAIT_ERASE, State.AWAITING_BOOT),
+            # It may sit in a session that never ends and knows no reset: once, and only here, an
+            # update command goes into silence (R26).
+            Event.BOOT_SILENT: (Action.START_OVER, State.AWAITING_REQUEST),
             Event.BOOT_LOST: (Ending.PACKET_FAILED, State.STOPPING),
         },
         ignored=(Event.FEEDBACK,),
@@ -202,7 +212,10 @@ TABLE: Final[Mapping[State, _Row]] = {
             Event.BOOT_UNHEARING: (Ending.UNHEARING, State.STOPPING),
             Event.REQUEST: (Action.SEND_FIRST_PACKET, State.TRANSFERRING),
             # Silence is not answered (R2): the device may be erasing.
+            Event.LINK_BACK_UPDATING: (Action.AWAIT_REQUEST, State.AWAITING_REQUEST),
+            Event.REQUEST_GIVEN_UP: (Action.BEGIN_AGAIN, State.RESETTING),
             Event.REQUEST_MISSING: (Ending.NO_REQUEST, State.STOPPING),
+            Event.BOOT_LOST: (Ending.PACKET_FAILED, State.STOPPING),
         },
         ignored=(Event.BOOT_TOO_SOON, Event.FEEDBACK),
     ),
@@ -215,6 +228,8 @@ TABLE: Final[Mapping[State, _Row]] = {
             Event.PACKET_UNANSWERED: (Action.REPEAT_PACKET, State.TRANSFERRING),
             Event.PACKET_GIVEN_UP: (Action.BEGIN_AGAIN, State.RESETTING),
             Event.PACKET_LOST: (Ending.PACKET_FAILED, State.STOPPING),
+            # A device that has stored the packet answers it all the same (R10).
+            Event.LINK_BACK: (Action.REPEAT_PACKET, State.TRANSFERRING),
             Event.COPY_OUTSTANDING: (Action.AWAIT_QUIET, State.SETTLING),
             Event.REQUEST_AGAIN: (Action.REPEAT_PACKET, State.TRANSFERRING),
             Event.REQUEST_LATE: (Action.START_OVER, State.AWAITING_REQUEST),
@@ -236,6 +251,7 @@ TABLE: Final[Mapping[State, _Row]] = {
             Event.PACKET_REFUSED: (Action.REPEAT_PACKET, State.TRANSFERRING),
             Event.PACKET_GIVEN_UP: (Action.BEGIN_AGAIN, State.RESETTING),
             Event.PACKET_LOST: (Ending.PACKET_FAILED, State.STOPPING),
+            Event.LINK_BACK: (Action.AWAIT_QUIET, State.SETTLING),
             Event.COPY_OUTSTANDING: (Action.AWAIT_QUIET, State.SETTLING),
             Event.REQUEST_AGAIN: (Action.AWAIT_QUIET, State.SETTLING),
             Event.REQUEST_LATE: (Action.START_OVER, State.AWAITING_REQUEST),

@@ -35,6 +35,8 @@ _WELL_BEYOND: Final = 1.5
 """Silence after a message that was cut short, as a multiple of the time after which its receiver
 drops it (R12)."""
 _NEW_ATTEMPTS: Final = frozenset({Action.START_OVER, Action.BEGIN_AGAIN})
+_RESUMED: Final = frozenset({State.TRANSFERRING, State.SETTLING, State.ENDING, State.CONFIRMING})
+"""States that go on where they stood when a lost adapter is back."""
 
 
 class Upgrade:
@@ -84,12 +86,18 @@ class Upgrade:
 
     @property
     def may_begin_again(self) -> bool:
-        """True when an attempt is left, or none is needed since only the end is missing."""
+        """True when an attempt is left, or none is needed to go on after the adapter was lost."""
         return (
             self._at.attempt < self._options.attempts
             or self._ending is not None
-            or self._at.state in (State.ENDING, State.CONFIRMING)
+            or self._at.state in _RESUMED
+            or self._classifier.link_back(self._at) is Event.LINK_BACK_UPDATING
         )
+
+    @property
+    def is_told_to_update(self) -> bool:
+        """True once an update command was sent: the device may have erased its application."""
+        return self._at.update_left
 
     @property
     def device_left(self) -> DeviceLeft:
@@ -162,12 +170,13 @@ class Upgrade:
         if self._began_at is None:
             return
         self._tx.abandon(now + self._timings.inter_frame_timeout_s * _WELL_BEYOND)
+        self._at.heard_at = now  # nobody knows what it said meanwhile
         if self._ending is not None:
             self._finish(now)
         elif self._waits_for_power_up:
             self._await_boot(now, Event.LINK_BACK, None)
         else:
-            self._dispatch(Event.LINK_BACK, now)
+            self._dispatch(self._classifier.link_back(self._at), now)
 
     @property
     def _waits_for_power_up(self) -> bool:
@@ -202,6 +211,7 @@ class Upgrade:
             self._journal.damaged(found)
             return
         row = self._incoming.decode(found)
+        self._at.heard_at = now
         self._journal.received(row)
         self._dispatch(self._classifier.message(row, self._at, now), now, row)
 
@@ -212,7 +222,7 @@ class Upgrade:
             self._at = self._at.next_attempt(failed)
             self._journal.attempt(self._at.attempt, event)
         if isinstance(row, BootVersion) and action in _BEGINNINGS and self._at.boot is None:
-            self._at.boot = row
+            self._at.boot = self._at.last_boot = row
             self._journal.boot_seen(row, self._options.minimum_boot_version)
         if event in _ACKNOWLEDGED:
             self._journal.packet_done(self._at, self._plan.total_packets, now)
@@ -272,6 +282,12 @@ class Upgrade:
         self._timer_at = max(now, self._tx.left_at) + self._options.boot_timeout_s
         if self._options.at_power_up and self.heard is None:
             self._journal.power_cycle(self._options.boot_timeout_s)
+
+    def _await_erase(self, now: float, event: Event, row: Received) -> None:
+        self._timer_at = self._at.silent_since + self._timings.request_transfer_timeout_s
+
+    def _await_request(self, now: float, event: Event, row: Received) -> None:
+        self._timer_at = self._at.update_left_at + self._timings.request_transfer_timeout_s
 
     def _send_update(self, now: float, event: Event, row: Received) -> None:
         self._tx.drop_unstarted()
@@ -350,6 +366,8 @@ class Upgrade:
         Action.REPORT: _report,
         Action.SEND_RESET: _send_reset,
         Action.AWAIT_BOOT: _await_boot,
+        Action.AWAIT_ERASE: _await_erase,
+        Action.AWAIT_REQUEST: _await_request,
         Action.SEND_UPDATE: _send_update,
         Action.START_OVER: _send_update,
         Action.BEGIN_AGAIN: _send_reset,

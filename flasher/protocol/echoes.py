@@ -25,6 +25,10 @@ class Echoes:
         self._sent.append((now, frame))
         self._ids.add(frame[0])
 
+    def held_up(self, now: float) -> None:
+        """The adapter was off the bus: what waited in its queue leaves only from `now` on."""
+        self._sent = deque(((now, frame) for _, frame in self._sent), maxlen=ECHO_FRAMES)
+
     def take(self, frame: Frame, now: float) -> bool:
         """True when a received frame is the echo of a sent one, which is forgotten then."""
         if frame[0] not in self._ids:

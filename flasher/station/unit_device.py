@@ -150,6 +150,7 @@ class UnitDevice:
             timings=self.loaded.profile.timings,
             taps=self.taps,
             cancelled=self.cancelled,
+            has_listened=True,  # nobody else has this adapter, and each flash listens itself
         )
         self.check_cancelled()
         return answer

@@ -216,7 +216,9 @@ def open_socket(
         virtual = VirtualSocket(recipe, setup.virtual)
         yield virtual.connection, virtual
         return
-    with connect(recipe.targets[0].profile.dialect, **setup.bus) as connection:
+    holder = f"flasher station, socket {setup.socket}"
+    dialect = recipe.targets[0].profile.dialect
+    with connect(dialect, holder=holder, **setup.bus) as connection:
         yield connection, None
 
 

@@ -78,6 +78,7 @@ def test_events_arrive_in_order_while_it_runs() -> None:
     seen: list[object] = []
     flasher.flash(IMAGE, "bms", mock=True, on_event=seen.append)
     assert [event.phase for event in seen if isinstance(event, events.PhaseEntered)] == [
+        events.Phase.LISTEN,
         events.Phase.IDENTIFY,
         events.Phase.RESET,
         events.Phase.BOOT,
@@ -277,6 +278,8 @@ class FakeLink:
 
     def reopen(self) -> None:
         raise BusError("the adapter is not back")
+
+    is_off = False
 
     def health(self) -> LinkHealth:
         return HealthKeeper().health()

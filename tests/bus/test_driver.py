@@ -50,6 +50,8 @@ class FakeLink:
     def reopen(self) -> None:
         pass
 
+    is_off = False
+
     def health(self) -> LinkHealth:
         return HealthKeeper().health()
 

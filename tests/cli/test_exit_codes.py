@@ -17,7 +17,7 @@ from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.stage import IMAGE, SMALL, Speaker, Stage
 
 Words = Sequence[str]
-OTHER_TOOL = Frame(0x752, bytes.fromhex("55AA110234007A11"))
+OTHER_TOOL = Frame(0x752, bytes.fromhex("55AA16123A107A11"))
 COMPLETE = bytes.fromhex("55AA0C04C5020000")
 ON_THE_BUS = ("-i", "virtual", "-c", "stage")
 

@@ -183,8 +183,7 @@ HOST_ROWS: Final[dict[str, tuple[str, ...]]] = {
     ),
     "BU-02": (
         _ODD + "test_a_device_that_goes_bus_off_at_any_frame_is_upgraded_or_the_end_is_explicit",
-        _RESCUE
-        + "test_an_adapter_that_restarts_after_a_bus_off_in_any_phase_is_overcome_or_exit_4",
+        _RESCUE + "test_an_adapter_that_restarts_after_a_bus_off_in_any_phase_is_overcome",
         _ADAPTER + "test_once_bus_off_is_reported_nothing_more_is_sent_into_the_void",
     ),
     "BU-03": (
@@ -253,6 +252,7 @@ HOST_ROWS: Final[dict[str, tuple[str, ...]]] = {
     "CO-03": (
         _STAGES
         + "test_a_second_tool_ends_the_session_in_every_stage_and_not_one_frame_more_is_sent",
+        _STAGES + "test_a_query_of_a_second_tool_is_reported_once_and_the_upgrade_goes_on",
         _GUARD + "test_a_frame_that_was_not_sent_is_somebody_else_and_is_told_in_hex",
     ),
 }

@@ -182,9 +182,8 @@ def test_an_adapter_that_fails_at_any_packet_is_exit_4_or_overcome(number: int) 
             stage.at_packet[number] = lambda: stage.bus.unplug(0.4)
             assert stage.flash(LONG).exit_code == ExitCode.OK
             assert len(stage.seen(events.AdapterLost)) == len(stage.seen(events.AdapterBack)) == 1
-            assert [started.attempt for started in stage.seen(events.AttemptStarted)] == [2]
+            assert not stage.seen(events.AttemptStarted)
         case 2:
-            # Over before the next frame is sent: a repeated packet is enough.
             stage.at_packet[number] = lambda: stage.bus.bus_off(0.4)
             assert stage.flash(LONG).exit_code == ExitCode.OK
     assert stage.has == LONG.data
@@ -224,7 +223,7 @@ def test_with_one_attempt_a_lost_adapter_is_the_end() -> None:
     assert not stage.seen(events.AdapterLost)
 
 
-PHASES = [Phase.IDENTIFY, Phase.RESET, Phase.BOOT, Phase.UPDATE, Phase.TRANSFER, Phase.END]
+PHASES = list(Phase)[:-1]
 
 
 def when(stage: Stage, phase: Phase, happens: object) -> None:
@@ -247,8 +246,8 @@ def test_an_adapter_that_is_lost_for_good_in_any_phase_is_exit_4(phase: Phase) -
         stage.flash()
     assert phase.value in caught.value.where
     assert "State of the device: " in caught.value.remedy
-    assert caught.value.needs_rescue is (phase in PHASES[3:])
-    assert stage.has in (None, IMAGE.data) or phase in PHASES[:4]
+    assert caught.value.needs_rescue is (phase in PHASES[4:])
+    assert stage.has in (None, IMAGE.data) or phase in PHASES[:5]
 
 
 @pytest.mark.parametrize("phase", PHASES)
@@ -261,16 +260,9 @@ def test_an_adapter_that_comes_back_in_any_phase_is_no_failure(phase: Phase) -> 
 
 
 @pytest.mark.parametrize("phase", PHASES)
-def test_an_adapter_that_restarts_after_a_bus_off_in_any_phase_is_overcome_or_exit_4(
-    phase: Phase,
-) -> None:
-    """What the device says once only may be lost, and nobody else is to blame then."""
+def test_an_adapter_that_restarts_after_a_bus_off_in_any_phase_is_overcome(phase: Phase) -> None:
     stage = Stage()
     when(stage, phase, lambda: stage.bus.bus_off(0.5))
-    if phase in (Phase.BOOT, Phase.UPDATE):
-        with pytest.raises(BusError, match="off the bus for a while"):
-            stage.flash()
-        stage.wait(10.0)
     assert stage.flash().exit_code == ExitCode.OK
     assert stage.has == IMAGE.data
 

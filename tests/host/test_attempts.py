@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from flasher import events
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
@@ -91,27 +89,66 @@ def test_a_device_that_does_not_come_back_is_given_each_attempt_before_it_is_giv
     assert bench.outcome.statistics.attempts == 4
 
 
-def states() -> list[tuple[str, bool]]:
-    """How far it came, and whether a new attempt (with a reset) follows."""
-    return [("to_boot", True), ("to_request", True), ("to_transfer", True), ("to_end", False)]
-
-
-@pytest.mark.parametrize(("come_to", "begins_again"), states())
-def test_an_adapter_that_is_back_begins_again_unless_only_the_end_is_missing(
-    come_to: str, *, begins_again: bool
-) -> None:
+def test_an_adapter_that_is_back_before_the_update_command_begins_again() -> None:
     bench = Bench(options=options(3))
-    getattr(bench, come_to)()
+    bench.to_boot()
     bench.engine.link_back(bench.now)
-    if begins_again:
-        bench.expect(Reset)
-        bench.say(GeneralFeedback(), BOOT)
-        bench.expect(UpdateCommand)
-    else:
-        bench.expect(EndOfTransfer)
-        bench.say(Complete())
-        assert bench.outcome.ending is Ending.COMPLETED
-        assert bench.outcome.statistics.attempts == 1
+    bench.expect(Reset)
+    bench.say(GeneralFeedback(), BOOT)
+    bench.expect(UpdateCommand)
+    assert bench.seen(events.AttemptStarted)
+
+
+def test_an_adapter_that_is_back_in_the_erase_waits_on_for_request_transfer() -> None:
+    bench = Bench(options=options(1))
+    bench.to_request()
+    bench.wait(9.0)
+    bench.engine.link_back(bench.now)
+    bench.wait(0.9)
+    assert bench.unread == []
+    bench.say(RequestTransfer())
+    assert bench.expect(Packet).number == 1
+
+
+def test_an_adapter_that_is_back_in_the_transfer_sends_the_packet_in_flight_again() -> None:
+    """R10: a device that has stored it answers it all the same. No attempt is used."""
+    bench = Bench(options=options(1))
+    bench.to_packet(2)
+    bench.engine.link_back(bench.now)
+    assert bench.expect(Packet).number == 2
+    bench.say(Ack(2))
+    assert bench.expect(Packet).number == 3
+    assert not bench.seen(events.AttemptStarted)
+
+
+def test_a_packet_in_flight_that_is_not_answered_after_all_begins_again() -> None:
+    bench = Bench(options=options(2))
+    bench.to_packet(2)
+    bench.engine.link_back(bench.now)
+    bench.expect(Packet)
+    bench.expect(Reset)
+    assert bench.seen(events.AttemptStarted)
+
+
+def test_an_adapter_that_is_back_while_copies_are_waited_for_waits_for_quiet_again() -> None:
+    bench = Bench(options=UpgradeOptions(attempts=1))
+    bench.to_packet(2)
+    bench.wait(0.51)
+    bench.expect(Packet)
+    bench.say(Ack(2))
+    assert bench.engine.state is State.SETTLING
+    bench.engine.link_back(bench.now)
+    assert bench.expect(Packet).number == 3
+
+
+def test_an_adapter_that_is_back_at_the_end_says_the_end_again() -> None:
+    bench = Bench(options=options(1))
+    bench.to_end()
+    bench.engine.link_back(bench.now)
+    bench.expect(EndOfTransfer)
+    bench.say(Complete())
+    assert bench.outcome.ending is Ending.COMPLETED
+    assert bench.outcome.statistics.attempts == 1
 
 
 def test_a_message_that_was_cut_short_is_followed_by_more_silence_than_its_receiver_waits() -> None:
@@ -129,7 +166,7 @@ def test_a_message_that_was_cut_short_is_followed_by_more_silence_than_its_recei
     bench.engine.link_back(bench.now)
     bench.expect(Packet)  # the bench lets a message out that it had begun
     at = bench.now
-    bench.expect(Reset)
+    bench.expect(Packet)
     assert bench.now - at > Timings().inter_frame_timeout_s
     assert began
 
@@ -151,14 +188,78 @@ def test_a_restart_counts_as_an_attempt_too() -> None:
     assert bench.outcome.ending is Ending.RESTARTED
 
 
-def test_an_attempt_more_never_follows_a_device_that_may_be_erasing() -> None:
-    """R2: into silence after an update command nothing is sent."""
+def test_nothing_is_sent_to_a_device_that_may_be_erasing() -> None:
+    """R2: not before the erase limit has passed."""
     bench = Bench(options=options(9))
     bench.to_request()
-    sent = len(bench.sent)
-    bench.wait(60.0)
-    assert bench.outcome.ending is Ending.NO_REQUEST
-    assert len(bench.sent) == sent
+    bench.wait(9.99)
+    assert bench.unread == []
+
+
+def test_no_request_transfer_begins_again_while_an_attempt_is_left() -> None:
+    bench = Bench(options=options(2))
+    bench.to_request()
+    bench.wait(10.01)
+    bench.to_boot()
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
+    bench.say(RequestTransfer())
+    assert bench.expect(Packet).number == 1
+
+
+def lose_request(bench: Bench) -> None:
+    """Up to the silence after an attempt that got no request transfer."""
+    bench.to_request()
+    bench.wait(10.01)
+    while bench.engine.state is State.RESETTING:
+        bench.expect(Reset)
+        bench.wait(0.2)
+
+
+def test_a_silent_device_gets_one_update_command_when_the_erase_limit_has_passed() -> None:
+    """R26: it may sit in a session that knows no reset. Not two, however many attempts are left."""
+    bench = Bench(options=options(9))
+    lose_request(bench)
+    bench.expect(UpdateCommand, within_s=5.1)
+    assert bench.engine.state is State.AWAITING_REQUEST
+    assert [each.attempt for each in bench.seen(events.AttemptStarted)] == [2, 3]  # type: ignore[attr-defined]
+    bench.wait(120.0)
+    assert bench.outcome.ending is Ending.NO_BOOT_VERSION
+    assert not any(isinstance(row, UpdateCommand) for row in bench.unread)
+
+
+def test_a_session_that_was_left_over_is_found_by_the_update_command_into_the_silence() -> None:
+    bench = Bench(options=options(3))
+    lose_request(bench)
+    bench.expect(UpdateCommand)
+    bench.say(RequestTransfer())
+    bench.on_to_packet(3, first=1)
+    bench.say(Ack(3))
+    bench.expect(EndOfTransfer)
+    outcome = bench.complete()
+    assert outcome.ok
+    assert outcome.boot_version == "BMS V1.2.3"
+    assert outcome.statistics.attempts == 3
+
+
+def test_the_silence_is_counted_from_the_last_word_of_the_device() -> None:
+    """R26: the erase limit has to pass in silence."""
+    bench = Bench(options=options(3))
+    lose_request(bench)
+    bench.wait(4.0)
+    bench.say(RequestTransfer())  # too late: it has been told to restart
+    bench.wait(9.9)
+    assert bench.unread == []
+    bench.expect(UpdateCommand, within_s=0.2)
+
+
+def test_a_device_that_answers_the_reset_is_reset_again_and_not_told_to_update() -> None:
+    """Its application runs: R26 is for devices that do not even answer the reset."""
+    bench = Bench(options=options(3))
+    bench.to_request()
+    bench.wait(10.01)
+    bench.to_boot()
+    bench.expect(Reset)
 
 
 def test_the_deadline_counts_all_attempts_together() -> None:

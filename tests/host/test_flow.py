@@ -186,7 +186,7 @@ def test_a_boot_version_within_30_ms_of_the_update_command_is_not_answered(
 
 def test_the_update_command_is_never_repeated_into_silence() -> None:
     """The device may be erasing: UP-07."""
-    bench = Bench()
+    bench = Bench(options=UpgradeOptions(attempts=1))
     bench.to_request()
     bench.wait(30.0)
     assert sum(isinstance(row, UpdateCommand) for _, row in bench.sent) == 1
@@ -203,7 +203,7 @@ def test_request_transfer_may_come_up_to_ten_seconds_after_the_update_command(
     *, late_s: float, in_time: bool
 ) -> None:
     """TM-01, UP-07."""
-    bench = Bench()
+    bench = Bench(options=UpgradeOptions(attempts=1))
     bench.to_request()
     bench.wait(bench.sent[-1][0] + 10.0 + late_s - bench.now)
     bench.say(RequestTransfer())

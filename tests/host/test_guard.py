@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flasher import events
-from flasher.host.guard import DOUBLE_LIMIT_S, Guard
+from flasher.host.guard import DOUBLE_LIMIT_S, Foreign, Guard
 from flasher.protocol.echoes import ECHO_LIMIT_S
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, Target
@@ -13,7 +13,7 @@ from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Message, encode, split
 
 OWN = [Frame(0x752, bytes([number] * 8)) for number in range(18)]
-OTHER = Frame(0x752, b"\x55\xaa\x16\x07")
+OTHER = Frame(0x752, bytes.fromhex("55AA160742055245"))
 
 
 def guard(target: Target = BMS) -> Guard:
@@ -56,10 +56,11 @@ def test_the_same_frame_sent_again_has_its_own_echo() -> None:
 
 
 def test_a_frame_that_was_not_sent_is_somebody_else_and_is_told_in_hex() -> None:
-    seen = sent(OWN).see(OTHER, 1.01)
-    assert seen is not None
-    assert "55 aa 16 07" in seen
-    assert "0x752" in seen
+    found = sent(OWN).see(OTHER, 1.01)
+    assert found is not None
+    assert "55 aa 16 07" in found.seen
+    assert "0x752" in found.seen
+    assert found.query is None
 
 
 def test_nothing_sent_at_all_and_somebody_speaks() -> None:
@@ -73,12 +74,56 @@ def test_what_was_sent_long_ago_is_no_echo_any_more(late_s: float) -> None:
     assert made.see(OWN[0], 1.0 + late_s) is not None
 
 
+def test_what_an_adapter_held_while_it_was_off_the_bus_is_an_echo_when_it_is_back() -> None:
+    """A kernel's queue keeps the frames, and sends them when the controller has restarted."""
+    made = sent(OWN)
+    made.link_back(3.0)
+    assert all(made.see(frame, 3.1) is None for frame in OWN)
+    assert made.see(OWN[0], 3.3) is not None
+
+
 def test_a_second_copy_counts_as_an_echo_for_a_moment_only() -> None:
     made = guard()
     made.sent(OWN[0], 1.0)
     assert made.see(OWN[0], 1.001) is None
     assert made.see(OWN[0], 1.001 + DOUBLE_LIMIT_S / 2) is None
     assert made.see(OWN[0], 1.002 + DOUBLE_LIMIT_S) is not None
+
+
+READ_MEMORY = split(0x752, encode(Message(0x752, 0x11, 0x4308, bytes(8))))
+WRITE = split(0x752, encode(Message(0x752, 0x16, 0x3A10, bytes(16))))
+PACKET = split(0x752, encode(Message(0x752, 0x16, 0xA385, bytes(133))))
+TAILS = [
+    *READ_MEMORY[1:],
+    Frame(0x752, READ_MEMORY[-1].data.ljust(8, b"\xff")),
+    Frame(0x752, b"\x55\xaa\xf0"),  # its CRC ends as a header begins
+    *WRITE[1:],
+]
+
+
+def test_a_foreign_query_is_harmless_and_named() -> None:
+    assert guard().see(READ_MEMORY[0], 1.0) == Foreign(
+        SEEN % "55 aa 11 0a 43 08 00 00", True, 0x4308
+    )
+
+
+SEEN = "frame %s with id 0x752, not sent by this tool"
+
+
+@pytest.mark.parametrize("frame", [WRITE[0], PACKET[0], Frame(0x752, b"\x55\xaa\x0c" + bytes(5))])
+def test_every_other_foreign_message_is_not_harmless(frame: Frame) -> None:
+    found = guard().see(frame, 1.0)
+    assert found is not None
+    assert not found.is_harmless
+
+
+@pytest.mark.parametrize("frame", TAILS, ids=str)
+def test_a_frame_that_begins_no_message_is_not_judged_by_itself(frame: Frame) -> None:
+    """Its beginning was, or got lost, as when the adapter was away for a moment."""
+    found = guard().see(frame, 1.0)
+    assert found is not None
+    assert found.is_harmless
+    assert found.query is None
 
 
 def test_an_adapter_without_echoes_hides_no_second_tool() -> None:

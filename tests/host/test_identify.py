@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from flasher.host.identify import LISTENS_ON_S, Identify
+from flasher.host.identify import LISTEN_FIRST_S, LISTENS_ON_S, Identify
 from flasher.host.options import UpgradeOptions
 from flasher.host.query import Request
 from flasher.image.plan import plan
@@ -34,9 +34,11 @@ class Asked:
     def __init__(self, target: Target = BMS, options: UpgradeOptions | None = None) -> None:
         planned = plan(image_of(300), target, WELLING.bitrate_bps)
         self.engine = Identify(planned, options or UpgradeOptions())
-        self.now = 10.0
+        self.now = 10.0 - LISTEN_FIRST_S
         self.commands: list[int] = []
         self._wire = Reassembler(target.request_id, 1.0)
+        self.run(9.999)
+        assert self.commands == [], "it listens first"
 
     def run(self, until: float) -> None:
         """Let it send what it wants to until then."""
@@ -91,6 +93,8 @@ def test_a_battery_is_asked_for_its_version_and_its_state_and_no_more() -> None:
 @pytest.mark.parametrize("target", [WMC, OBC])
 def test_who_has_no_query_is_not_asked(target: Target) -> None:
     asked = Asked(target)
+    assert asked.engine.deadline() is not None, "it listens all the same"
+    asked.run(10.0)
     assert asked.engine.done
     assert asked.engine.next_frame(10.0) is None
     assert asked.engine.seen.version is None
@@ -100,7 +104,7 @@ def test_a_products_own_query_is_asked_too() -> None:
     """Here with the battery's own rows, sent to another target."""
     own = Request(catalogue.BY_KEY[(0x752, 0x3300)])
     asked = Asked(WMC, UpgradeOptions(version_request=own))
-    assert not asked.engine.done
+    assert asked.engine.asks
 
 
 def test_silence_ends_it_after_a_second_and_the_rest_is_not_asked() -> None:
@@ -122,8 +126,19 @@ def test_an_announcement_ends_it_at_once() -> None:
     assert asked.engine.next_frame(asked.now) is None
 
 
+def test_an_announcement_while_it_listens_first_is_kept_until_it_has_listened() -> None:
+    asked = Asked()
+    asked.hear(answer_frames(BootVersion("BMS", "V1.2.3")))
+    assert asked.engine.deadline() is not None
+    asked.run(10.0)
+    assert asked.engine.done
+    assert asked.engine.heard is not None
+    assert asked.commands == []
+
+
 def test_an_announcement_in_the_middle_of_a_question_lets_it_go_to_its_end_only() -> None:
     asked = Asked()
+    asked.now = 10.0
     asked.engine.tick(asked.now)
     first = asked.engine.next_frame(asked.now)
     assert first is not None
@@ -164,6 +179,7 @@ def test_other_frames_on_its_ids_are_nothing() -> None:
 
 def test_it_ends_at_the_end_of_the_message_when_it_is_cancelled() -> None:
     asked = Asked()
+    asked.now = 10.0
     asked.engine.tick(asked.now)
     asked.engine.next_frame(asked.now)
     asked.engine.frame_sent(asked.now)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from flasher import events
+from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.query import Queries, Query, Request
@@ -99,11 +100,14 @@ def test_a_session_says_where_it_stands_in_the_upgrade_and_in_the_check() -> Non
     bench.sent.clear()
     bench._step()
     stands = [(session.standing, session.device_left)]
+    bench.wait(LISTEN_FIRST_S)
+    stands.append((session.standing, session.device_left))
     bench.to_end()
     stands.append((session.standing, session.device_left))
     bench.say(Complete())
     stands.append((session.standing, session.device_left))
     assert stands == [
+        ("listening for another tool", DeviceLeft.UNTOUCHED),
         ("resetting the application", DeviceLeft.UNTOUCHED),
         ("waiting for the final answer", DeviceLeft.UNKNOWN),
         ("verifying by version", DeviceLeft.NEW),

@@ -8,6 +8,7 @@ import pytest
 
 from flasher.errors import ExitCode
 from flasher.host.guard import Guard
+from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.identity import Check, Identity, Seen, Verdict, judge_device
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import before_the_start
@@ -87,8 +88,10 @@ def test_a_session_that_has_ended_hears_and_sends_nothing_any_more() -> None:
 def test_a_session_without_identity_asks_nobody_and_checks_nothing() -> None:
     session = Session(PLAN)
     session.tick(0.0)
+    assert session.next_frame(0.0) is None
+    session.tick(LISTEN_FIRST_S)
     assert session.standing.startswith("resetting")
-    frame = session.next_frame(0.0)
+    frame = session.next_frame(LISTEN_FIRST_S)
     assert frame is not None
     assert frame.data.startswith(bytes.fromhex("55AA16074205"))
 

@@ -25,17 +25,21 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import WELLING
 from flasher.protocol.text import encode_text
 from flasher.protocol.timing import Timings
-from flasher.protocol.wire import encode, split
-from tests.end_to_end.stage import IMAGE, NEW, SMALL, Speaker, Stage
+from flasher.protocol.wire import Message, encode, split
+from tests.end_to_end.stage import IMAGE, NEW, SMALL, Speaker, Stage, image_of
 
-OTHER_TOOL = Frame(0x752, bytes.fromhex("55AA110239005A5A"))
+OTHER_TOOL = Frame(0x752, bytes.fromhex("55AA16123A105A5A"))
+"""Begins to write user string 1."""
+QUERY = split(0x752, encode(Message(0x752, 0x11, 0x3900, b"")))
+"""Asks for user string 1."""
 UPDATE = bytes.fromhex("55AA160DA10B")
 COMPLETE = bytes.fromhex("55AA0C04C5020000")
 READ_VERSION = bytes.fromhex("55AA11023300")
 TWIN = replace(SMALL, serial_number="W2605077")
 NEVER = 1e9
+LONG = image_of(40)
 VERIFICATION = "verification"
-BEFORE_ERASE = (Phase.IDENTIFY, Phase.RESET, Phase.BOOT)
+BEFORE_ERASE = (Phase.LISTEN, Phase.IDENTIFY, Phase.RESET, Phase.BOOT)
 
 
 def once(stage: Stage, phase: Phase | str, happens: Callable[[], None]) -> None:
@@ -69,12 +73,16 @@ class Witness:
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         if sent and self.has_heard:
             self.sent_after.append(frame)
-        self.has_heard = self.has_heard or (not sent and frame == OTHER_TOOL)
+        self.has_heard = self.has_heard or (not sent and frame in (OTHER_TOOL, QUERY[0]))
 
 
-@pytest.mark.parametrize("phase", [*Phase, VERIFICATION])
+@pytest.mark.parametrize(
+    ("phase", "frame"),
+    [(phase, OTHER_TOOL) for phase in (*Phase, VERIFICATION)]
+    + [(phase, QUERY[0]) for phase in BEFORE_ERASE],
+)
 def test_a_second_tool_ends_the_session_in_every_stage_and_not_one_frame_more_is_sent(
-    phase: Phase | str,
+    phase: Phase | str, frame: Frame
 ) -> None:
     stage, witness = Stage(), Witness()
     if phase is Phase.CONFIRM:
@@ -82,7 +90,7 @@ def test_a_second_tool_ends_the_session_in_every_stage_and_not_one_frame_more_is
 
     def speak() -> None:
         now = stage.clock.now()
-        stage.bus.attach(Speaker(OTHER_TOOL, every_s=60.0, begins_at=now + 0.0011))
+        stage.bus.attach(Speaker(frame, every_s=60.0, begins_at=now + 0.0011))
 
     once(stage, phase, speak)
     result = stage.flash(taps=[witness])
@@ -91,7 +99,7 @@ def test_a_second_tool_ends_the_session_in_every_stage_and_not_one_frame_more_is
     assert result.exit_code == ExitCode.BUS
     error = result.error()
     assert error is not None
-    assert "55 aa 11 02 39" in str(error)
+    assert frame.data.hex(" ") in str(error)
     assert "End the other tool" in error.remedy
     if phase in BEFORE_ERASE:
         assert result.outcome.device_left is DeviceLeft.UNTOUCHED
@@ -114,6 +122,38 @@ def test_a_second_tool_cuts_a_message_short_that_was_finished_for_a_clean_end() 
     result = stage.flash(options=UpgradeOptions(frame_gap_s=0.002), taps=[witness])
     assert result.exit_code in (ExitCode.INTERRUPTED, ExitCode.BUS)
     assert witness.sent_after == []
+
+
+@pytest.mark.parametrize("target", ["bms", "obc"])
+def test_a_tool_that_flashes_is_heard_before_anything_is_sent(target: str) -> None:
+    """The OBC cannot be asked: before its reset nothing else would have told."""
+    stage = Stage(target)
+    packet = Frame(stage.target.request_id, bytes.fromhex("0102030405060708"))
+    stage.bus.attach(Speaker(packet, every_s=0.09, begins_at=0.08))
+    result = stage.flash()
+    assert stage.heard == [packet], "the other tool's frame, and none of ours"
+    error = result.error()
+    assert error is not None
+    assert error.exit_code == ExitCode.BUS
+    assert error.where == "listening for another tool"
+    assert result.outcome.device_left is DeviceLeft.UNTOUCHED
+
+
+@pytest.mark.parametrize("phase", [Phase.UPDATE, Phase.TRANSFER, Phase.END, VERIFICATION])
+def test_a_query_of_a_second_tool_is_reported_once_and_the_upgrade_goes_on(
+    phase: Phase | str,
+) -> None:
+    stage = Stage(profile=replace(SMALL, erase_time_s=0.1))
+    asked = Speaker(*QUERY, every_s=0.0373, begins_at=NEVER)
+    stage.bus.attach(asked)
+    once(stage, phase, lambda: setattr(asked, "_next", stage.clock.now() + 0.0011))
+    result = stage.flash(LONG, verify=Level.VERSION)
+    assert result.exit_code == ExitCode.OK, result.error()
+    assert stage.has == LONG.data
+    assert stage.seen(events.ForeignQuery) == [events.ForeignQuery("read user string 1")]
+    if phase is Phase.TRANSFER:
+        assert result.outcome.statistics.repetitions, "a query in a packet destroys the packet"
+        assert result.outcome.statistics.attempts == 1
 
 
 # -- echoes ---------------------------------------------------------------------------------------
@@ -151,6 +191,10 @@ class Echoing:
 
     def reopen(self) -> None:
         self._link.reopen()
+
+    @property
+    def is_off(self) -> bool:
+        return self._link.is_off
 
     def health(self) -> LinkHealth:
         return self._link.health()

@@ -72,9 +72,14 @@ def test_after_end_of_transfer_only_a_device_beyond_its_burst_gets_an_update_com
         assert sends == {Event.BOOT_RESTARTED}
 
 
-def test_an_update_command_always_answers_something_the_device_said() -> None:
-    """R2: never into silence."""
+def test_an_update_command_answers_something_the_device_said_or_one_long_silence() -> None:
+    """R2, R26."""
     for row in TABLE.values():
         for event, move in row.items():
             if move.action in {Action.SEND_UPDATE, Action.START_OVER}:
-                assert event in {Event.BOOT_VERSION, Event.BOOT_RESTARTED, Event.REQUEST_LATE}
+                assert event in {
+                    Event.BOOT_VERSION,
+                    Event.BOOT_RESTARTED,
+                    Event.REQUEST_LATE,
+                    Event.BOOT_SILENT,
+                }

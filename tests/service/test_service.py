@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 
 from flasher import service
@@ -12,6 +15,7 @@ from flasher.errors import (
     UsageError,
     VerificationError,
 )
+from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.write import plan_write
 from flasher.protocol import contents
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC, Dialect, Node, Target
@@ -42,7 +46,7 @@ def test_a_silent_device_is_no_answer_with_what_was_asked() -> None:
     with pytest.raises(NoAnswerError) as caught:
         service.read(wire, "history")
     assert "752 3800, sent 5 times" in caught.value.where
-    assert 1.0 <= wire.clock.now() < 1.1
+    assert 1.0 + LISTEN_FIRST_S <= wire.clock.now() < 1.2
 
 
 def test_an_answer_in_another_form_is_named_as_the_cause() -> None:
@@ -232,6 +236,27 @@ def test_info_does_not_ask_into_the_dialogue_of_another_tool() -> None:
     with pytest.raises(BusError, match="Another tool speaks on this bus"):
         service.info(wire_to(battery, tool))
     assert battery.received == []
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda wire: service.read(wire, "history"),
+        lambda wire: service.read_memory(wire, 0x0800_0000, 0x0800_0080),
+        lambda wire: service.write(wire, "user-string-1", "rack 7"),
+        lambda wire: service.carry_out(wire, plan_write("user-string-1", ["rack 7"], BMS), None),
+    ],
+    ids=["read", "read memory", "write", "write what was agreed to"],
+)
+def test_nobody_asks_or_writes_before_having_listened_for_another_tool(
+    ask: Callable[[Any], object],
+) -> None:
+    battery, tool = Battery(), Battery(silent=SILENT, repeats=((0x751, 0xA401, b"\x04"),))
+    wire = wire_to(battery, tool)
+    with pytest.raises(BusError, match="nothing is asked or written now"):
+        ask(wire)
+    assert battery.received == []
+    assert wire.clock.now() >= LISTEN_FIRST_S
 
 
 def test_scan_shows_another_tool_and_asks_nothing_then() -> None:
