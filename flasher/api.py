@@ -13,13 +13,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from flasher import service
+from flasher.bus.bit_rate import BitRate
 from flasher.bus.link import Clock, Link, MonotonicClock, PacedClock, VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.device.model import Device
 from flasher.device.profile import DeviceProfile, set_option
 from flasher.device.system import System
 from flasher.driver import Tap
-from flasher.errors import UsageError
+from flasher.errors import FlasherError, UsageError
 from flasher.flashing import run_session
 from flasher.host.identity import Check, Finding, Identity, judge_image
 from flasher.host.options import UpgradeOptions
@@ -77,6 +78,8 @@ class Connection:
     link: Link
     clock: Clock
     name: str
+    bit_rate: BitRate | None = None
+    """What the bus runs at, and where that comes from; None where nobody told."""
 
 
 @contextmanager
@@ -86,15 +89,16 @@ def connect(
     """Open an adapter through python-can and close it at the end.
 
     `bus` are python-can's own keywords (`interface`, `channel`, `bitrate`, ...); its configuration
-    files and CAN_* variables hold too. The bit rate defaults to the dialect's. Meanwhile no other
-    program of this user may speak as the tool on this adapter: `holder` is what it is told; None is
-    for who never does so (a device model, a monitor). Raises UsageError or BusError.
+    files and CAN_* variables hold too. The bit rate is the dialect's unless `bus` itself names
+    another one. Meanwhile no other program of this user may speak as the tool on this adapter:
+    `holder` is what it is told; None is for who never does so (a device model, a monitor). Raises
+    UsageError or BusError.
     """
     from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can
 
     link = open_adapter(as_dialect(dialect).bitrate_bps, holder=holder, **bus)
     try:
-        yield Connection(link, MonotonicClock(), str(link))
+        yield Connection(link, MonotonicClock(), str(link), link.bit_rate)
     finally:
         link.close()
 
@@ -127,10 +131,27 @@ def connect_mock(
     else:
         device = Device(node, bitrate_bps=bitrate_bps, profile=own, has_application=has_application)
         bus.attach(device, on_event)
-    yield Connection(bus.link(), clock, "the built-in mock")
+    rate = BitRate(bitrate_bps, "the dialect's")
+    yield Connection(bus.link(), clock, "the built-in mock", rate)
 
 
-def upgrade(
+def bit_rate(dialect: str | Dialect = "welling", **bus: Any) -> BitRate:
+    """The bit rate that `connect` would open with; `bus` are its keywords. Opens nothing.
+
+    Raises UsageError and BusError as `connect` does for a bit rate; where no adapter is configured,
+    the one that `bus` or else the dialect names.
+    """
+    from flasher.bus import bit_rate as settling  # noqa: PLC0415  loads python-can
+    from flasher.bus.opening import bus_config  # noqa: PLC0415
+
+    try:
+        merged = bus_config(bus)
+    except FlasherError:  # none is named, or none that there is: who opens it says so
+        merged = bus
+    return settling.bit_rate(as_dialect(dialect).bitrate_bps, bus, merged)
+
+
+def upgrade(  # noqa: PLR0913  one argument for each thing that a caller may want
     plan: Plan,
     connection: Connection,
     *,
@@ -140,18 +161,25 @@ def upgrade(
     taps: Sequence[Tap] = (),
     on_event: EventHandler | None = None,
     cancelled: Callable[[], bool] | None = None,
+    hung_up: Callable[[], bool] | None = None,
 ) -> Result:
     """Run one upgrade to its end, good or bad, and verify a good one.
 
     `verify` None stands for `default_level`. `identity` says what the image may be flashed to; the
     device is asked who it is and held against it before anything is written. `cancelled` is asked
-    while it runs. Raises UsageError when the target or the image cannot be verified so, BusError
-    when the adapter fails, saying how far the upgrade had come and in what state the device is
-    left; every other end is a `Result`.
+    while it runs, and ends it; `hung_up` ends it only before the update command. Raises UsageError
+    when the target or the image cannot be verified so, BusError when the adapter fails, saying how
+    far the upgrade had come and in what state the device is left; every other end is a `Result`.
     """
     chosen = options or UpgradeOptions()
     level = default_level(plan.target, chosen) if verify is None else verify
     check_level(plan, level, chosen)
+    rate = connection.bit_rate
+    if rate is not None and rate.bps != plan.bitrate_bps:
+        raise UsageError(
+            f"The plan is for {plan.bitrate_bps / 1000:g} kbit/s, the bus runs at {rate}.",
+            remedy="Make the plan with bitrate_bps of the connection.",
+        )
     return run_session(
         Session(plan, chosen, level, identity or Identity()),
         connection.link,
@@ -160,6 +188,7 @@ def upgrade(
         taps=taps,
         on_event=_logged(on_event),
         cancelled=cancelled,
+        hung_up=hung_up,
     )
 
 
@@ -218,7 +247,9 @@ def flash(
     loaded = image if isinstance(image, Image) else load(image)
     if identity is None:
         identity = Identity(None if isinstance(image, Image) else find_release(image))
-    planned = make_plan(release_checked(loaded, identity.release), target, dialect)
+    rate = None if mock else bit_rate(dialect, **bus).bps
+    checked = release_checked(loaded, identity.release)
+    planned = make_plan(checked, target, dialect, bitrate_bps=rate)
     check_image(planned, identity)
     level = None if verify is None else as_level(verify)
     opened = connect_mock(target, dialect) if mock else connect(dialect, **bus)
@@ -259,16 +290,25 @@ def release_options(options: UpgradeOptions | None, release: Release | None) -> 
 def check_image(plan: Plan, identity: Identity) -> list[Finding]:
     """What an image and its manifest say of the target by themselves, without a device.
 
-    Raises WrongDeviceError when they speak against it.
+    Raises ImageError when it is hardly a program for the device, WrongDeviceError when they speak
+    against the target.
     """
     findings = list(judge_image(plan.image, plan.target, identity))
     for found in findings:
-        if found.ending is not None:
-            refused = before_the_start(plan, found.ending, found.detail, duration_s=0.0).error()
-            if refused is not None:
-                refused.where = "before anything was sent"
-                raise refused
+        error = refusal(plan, found)
+        if error is not None:
+            raise error
     return findings
+
+
+def refusal(plan: Plan, found: Finding) -> FlasherError | None:
+    """The error for a finding that speaks against an upgrade; None for any other."""
+    if found.ending is None:
+        return None
+    refused = before_the_start(plan, found.ending, found.detail, duration_s=0.0).error()
+    if refused is not None:
+        refused.where = "before anything was sent"
+    return refused
 
 
 def as_level(level: Level | str) -> Level:
@@ -348,7 +388,8 @@ def make_plan(
             f"The {chosen.name.upper()} dialect has no upgrade: its document cancelled it.",
             remedy="Use --dialect welling if the device speaks it; a profile can enable it.",
         )
-    return plan(image, as_target(target), bitrate_bps or chosen.bitrate_bps)
+    rate = chosen.bitrate_bps if bitrate_bps is None else bitrate_bps
+    return plan(image, as_target(target), rate)
 
 
 def as_target(target: str | Target) -> Target:

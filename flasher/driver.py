@@ -14,8 +14,9 @@ from flasher.bus.link import Clock, Link
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 
-MAX_WAIT_S: Final = 0.2
-"""Longest blocking receive: the time after which a cancellation is seen at the latest."""
+MAX_WAIT_S: Final = 0.1
+"""Longest blocking receive, in real seconds: the time after which a cancellation is seen at the
+latest."""
 _AT_ONCE: Final = float("-inf")
 """A deadline in the past: only what is there already."""
 _CATCH_UP_FRAMES: Final = 10_000
@@ -62,7 +63,7 @@ def drive(
         if engine.done:
             return
         wanted = engine.deadline()
-        latest = clock.now() + MAX_WAIT_S
+        latest = clock.now() + MAX_WAIT_S * clock.speed
         frame = link.receive(latest if wanted is None else min(wanted, latest))
         _receive_on(frame, engine, link, clock, taps)
 

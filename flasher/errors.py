@@ -77,6 +77,8 @@ class FlasherError(Exception):
             hide_passwords, (what, where, cause, remedy)
         )
         super().__init__(self.what)
+        self.command = ""
+        """The command that repairs what was left, to be copied as it stands; "" where none does."""
         self.needs_rescue = False
         """True when a device was left that has no application, or perhaps none."""
 
@@ -89,6 +91,8 @@ class FlasherError(Exception):
             lines.append(f"  likely cause: {self.cause}")
         if self.remedy:
             lines.append(f"  what to do: {self.remedy}")
+        if self.command:
+            lines += ["  to repair it:", f"    {self.command}"]
         return "\n".join(lines)
 
 

@@ -20,6 +20,7 @@ from flasher.errors import (
     NoAnswerError,
     TransmitBlockedError,
 )
+from flasher.host.outcome import AGAIN
 from flasher.host.session import Result, Session
 from flasher.protocol.frame import Frame
 
@@ -37,8 +38,10 @@ def run_session(
     taps: Sequence[Tap] = (),
     on_event: Callable[[object], None] | None = None,
     cancelled: Callable[[], bool] | None = None,
+    hung_up: Callable[[], bool] | None = None,
 ) -> Result:
-    """Run a session to its end, good or bad.
+    """Run a session to its end, good or bad. `cancelled` ends it, `hung_up` only as long as the
+    device was not told to erase its application: then nobody has to be there.
 
     A lost adapter is opened again for `adapter_return_s` while the session has an attempt left.
     Raises BusError, saying how far it had come and in what state the device is left, when the
@@ -46,6 +49,8 @@ def run_session(
     interrupts a second time.
     """
     tell = on_event or (lambda _event: None)
+    if hung_up is not None:
+        cancelled = _unless_begun(session, cancelled or (lambda: False), hung_up)
     before = link.health()
     _check_bus(link, "before anything was sent", session, before)
     try:
@@ -67,7 +72,7 @@ def run_session(
             "Interrupted at once.",
             where=session.standing,
             cause="it may have ended in the middle of a message",
-            remedy="Run the same command again.",
+            remedy=AGAIN,
         )
         _say_what_is_left(interrupted, session)
         raise interrupted from interrupt
@@ -88,6 +93,12 @@ def _end_when_off(link: Link) -> Tap:
             raise bus_off_error(str(link))
 
     return look
+
+
+def _unless_begun(
+    session: Session, cancelled: Callable[[], bool], hung_up: Callable[[], bool]
+) -> Callable[[], bool]:
+    return lambda: cancelled() or (hung_up() and not session.has_begun_to_erase)
 
 
 def _check_bus(link: Link, where: str, session: Session, before: LinkHealth) -> None:

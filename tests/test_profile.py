@@ -248,7 +248,7 @@ def test_a_wrong_type_or_range_is_refused_with_its_key(tmp_path: Path, text: str
     ("text", "said"),
     [
         ('reset_data = "RST"\n', "reset_data has 3 bytes, but reset_command 0x4205 carries 5"),
-        ("frame_gap_s = 0.1\n", "are no message any more"),
+        ("frame_gap_s = 0.1\n", "0.1 s between frames is more than 0.08 s"),
         ("[application_area]\nstart = 0xFFFFFFFF\nsize_bytes = 2\n", "beyond 32 bits"),
         ("[application_area]\nstart = 0\n", "has no size_bytes"),
         ("[wmc.version_query]\ncommand = 0x3300\n", "has no answer_id and no answer_command"),

@@ -18,6 +18,7 @@ from typing import Any, Final, NoReturn
 
 import can
 
+from flasher.bus.bit_rate import BitRate, bit_rate
 from flasher.bus.health import (
     LAYOUTS,
     ControllerState,
@@ -69,20 +70,31 @@ def open_adapter(
 ) -> CanLink:
     """Open the adapter that `config` (python-can's keywords), its files and variables describe.
 
-    `default_bitrate_bps` holds where none of them names a bit rate. As `holder` it is locked until
-    it is closed (`lock.hold`). `listen_only` keeps the adapter from acknowledging, where its back
-    end can be told (`opening.can_listen_only`). Raises UsageError for an interface that python-can
-    does not know, BusError when the adapter cannot be opened or somebody else holds it.
+    `default_bitrate_bps` is the dialect's, and what holds unless `config` itself names another bit
+    rate. As `holder` it is locked until it is closed (`lock.hold`). `listen_only` keeps the adapter
+    from acknowledging, where its back end can be told (`opening.can_listen_only`). Raises UsageError
+    for an interface that python-can does not know or a value that is no bit rate, BusError when the
+    bit rate is another one, the adapter cannot be opened, or somebody else holds it.
     """
-    merged = bus_config(default_bitrate_bps, config, listen_only=listen_only)
+    merged = bus_config(config, listen_only=listen_only)
+    rate = bit_rate(default_bitrate_bps, config, merged)
+    settled = merged if "timing" in merged else {**merged, "bitrate": rate.bps}
+
+    def open_again() -> can.BusABC:
+        # An interface that is back may have been set up anew, and otherwise.
+        bit_rate(default_bitrate_bps, config, merged)
+        return open_bus(settled)
+
     interface = str(merged["interface"])
     channel = str(merged.get("channel") or "")
     give_back = hold(merged, holder)
     try:
-        return CanLink(open_bus(merged), interface, channel, lambda: open_bus(merged), give_back)
+        link = CanLink(open_bus(settled), interface, channel, open_again, give_back)
     except BaseException:
         give_back()
         raise
+    link.bit_rate = rate
+    return link
 
 
 class CanLink:
@@ -101,6 +113,8 @@ class CanLink:
         self._channel = channel
         self._name = f"{interface} {channel}".strip()
         self._open_again = open_again
+        self.bit_rate: BitRate | None = None
+        """What the bus was opened with; None where nobody told."""
         self._waiting: deque[tuple[Frame, float | None]] = deque()
         is_stamped = interface in _KERNEL_STAMPS and platform.system() == "Linux"
         self.stamp_source = "kernel" if is_stamped else ""

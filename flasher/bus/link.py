@@ -27,6 +27,11 @@ class Clock(Protocol):
         """Return when `moment` has come; at once when it has passed."""
         ...
 
+    @property
+    def speed(self) -> float:
+        """Its seconds in one second of a person who waits."""
+        ...
+
 
 class Link(Protocol):
     """Sends and receives single CAN frames. Methods raise BusError when the adapter fails."""
@@ -90,6 +95,8 @@ class StampingLink(Link, Protocol):
 class MonotonicClock:
     """The computer's monotonic clock: jumps of the wall clock do not touch it."""
 
+    speed: Final = 1.0
+
     def now(self) -> float:
         """Seconds since some moment in the past."""
         return time.monotonic()
@@ -105,22 +112,24 @@ class PacedClock:
     """Real time, but `speed` times as fast: what makes a demonstration look like the real thing."""
 
     def __init__(self, speed: float = 1.0) -> None:
-        self._speed = speed
+        self.speed = speed
         self._origin = time.monotonic()
 
     def now(self) -> float:
         """Simulated seconds since the clock was made."""
-        return (time.monotonic() - self._origin) * self._speed
+        return (time.monotonic() - self._origin) * self.speed
 
     def wait_until(self, moment: float) -> None:
         """Sleep until the simulated `moment`."""
-        remaining_s = (moment - self.now()) / self._speed
+        remaining_s = (moment - self.now()) / self.speed
         if remaining_s > 0:
             time.sleep(remaining_s)
 
 
 class VirtualClock:
     """Time that passes only when somebody waits for it."""
+
+    speed: Final = 1.0
 
     def __init__(self) -> None:
         self._now = 0.0

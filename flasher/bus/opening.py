@@ -55,10 +55,9 @@ def can_listen_only(interface: str) -> bool:
     return interface in _LISTEN_ONLY
 
 
-def bus_config(
-    default_bitrate_bps: int, given: Mapping[str, Any], *, listen_only: bool = False
-) -> dict[str, Any]:
-    """All keywords for `can.Bus`, from what was given, variables and files.
+def bus_config(given: Mapping[str, Any], *, listen_only: bool = False) -> dict[str, Any]:
+    """All keywords for `can.Bus`, from what was given, variables and files, but for a bit rate that
+    none of them names (`flasher.bus.bit_rate`).
 
     `listen_only` adds what keeps the adapter silent, where its back end can be told. Raises
     UsageError for a configuration that makes no sense, BusError when there is none.
@@ -72,8 +71,10 @@ def bus_config(
             f"The adapter's configuration makes no sense: {printable(words_of(error))}.",
             remedy="Check the bus arguments, python-can's configuration file and CAN_* variables.",
         ) from error
-    if "timing" not in merged:
-        merged.setdefault("bitrate", default_bitrate_bps)
+    if "timing" in given:
+        merged.pop("bitrate", None)
+    elif "bitrate" in given:
+        merged.pop("timing", None)
     if listen_only:
         merged.update(_LISTEN_ONLY.get(str(merged["interface"]), {}))
     return merged

@@ -8,15 +8,21 @@ import re
 from collections.abc import Sequence
 from typing import Any, Final
 
-from flasher.api import Connection, as_target, connect, connect_mock
+from flasher.api import Connection, as_dialect, as_target, connect, connect_mock
+from flasher.api import bit_rate as settle_bit_rate
+from flasher.bus.bit_rate import BitRate
 from flasher.device.profile import DeviceProfile
 from flasher.errors import UsageError
+from flasher.host.options import FRAME_GAP_SHARE, PACKET_GAP_MAX_S
 from flasher.image.image import Image
 from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, FORMATS, load
 from flasher.protocol.spec import DIALECTS, TARGET_ALIASES, TARGETS, WELLING, Target
+from flasher.protocol.timing import DEFAULT_TIMINGS
 
+IMPLAUSIBLE: Final = "bytes that do not look like a program for the device"
+"""What --allow-implausible lets through."""
 SLOWEST: Final = 0.1
-"""Of the mock's speeds. Waits are cut by simulated time: Ctrl-C takes longer the slower it is."""
+"""Of the mock's speeds."""
 _NUMBER: Final = re.compile(r"(0[xX][0-9a-fA-F_]+|[0-9][0-9_]*)([kKmM]?)")
 _SUFFIXES: Final = {"": 1, "k": 1024, "m": 1024 * 1024}
 _BUS_KEYWORDS: Final = (
@@ -111,6 +117,32 @@ def add_image(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_implausible(parser: argparse._ActionsContainer) -> None:
+    """--allow-implausible, for a command that has no other --allow-... for a device."""
+    parser.add_argument(
+        "--allow-implausible", action="store_true", help=f"let through {IMPLAUSIBLE}"
+    )
+
+
+def add_gaps(parser: argparse._ActionsContainer) -> None:
+    """--frame-gap and --packet-gap."""
+    parser.add_argument(
+        "--frame-gap",
+        type=seconds,
+        metavar="S",
+        help="seconds of silence between the frames of a message, for slow receivers; at most "
+        f"{FRAME_GAP_SHARE * DEFAULT_TIMINGS.inter_frame_timeout_s:g}, or as a profile's "
+        "inter_frame_timeout_s allows",
+    )
+    parser.add_argument(
+        "--packet-gap",
+        type=seconds,
+        metavar="S",
+        help="seconds of silence before each packet, for slow receivers; at most "
+        f"{PACKET_GAP_MAX_S:g}",
+    )
+
+
 def load_image(options: argparse.Namespace) -> Image:
     """The image that the options describe. Raises ImageError or UsageError."""
     return load(
@@ -157,6 +189,21 @@ def bus_config(options: argparse.Namespace) -> dict[str, Any]:
     """The keywords for python-can that were given on the command line."""
     config = {name: getattr(options, name) for name in _BUS_KEYWORDS if hasattr(options, name)}
     return config | getattr(options, "bus_kwargs", {})
+
+
+def bit_rate(options: argparse.Namespace) -> BitRate:
+    """The bit rate of the bus that the options name, asked once: what is planned, said and
+    recorded. Raises UsageError or BusError.
+    """
+    if not hasattr(options, "settled_bit_rate"):
+        dialect = as_dialect(options.dialect)
+        options.settled_bit_rate = (
+            BitRate(dialect.bitrate_bps, "the dialect's")
+            if options.mock
+            else settle_bit_rate(dialect, **bus_config(options))
+        )
+    rate: BitRate = options.settled_bit_rate
+    return rate
 
 
 def add_mock(parser: argparse.ArgumentParser) -> None:

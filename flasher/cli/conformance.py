@@ -90,6 +90,7 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--second-image", metavar="IMAGE", help="another one, smaller, of another version"
     )
+    arguments.add_implausible(group)
     group.add_argument(
         "--power-cmd",
         metavar="COMMAND",

@@ -31,7 +31,7 @@ _DROPPED: Final = {
 }
 """Options that are about the selection or the reports, with how many values they take; None: all
 words up to the next option. The rest of a command line is about the bench."""
-_KEPT: Final = ("--second-image", "--set", "--strict")
+_KEPT: Final = ("--allow-implausible", "--second-image", "--set", "--strict")
 """Options that an abbreviation of a dropped one could be taken for."""
 
 

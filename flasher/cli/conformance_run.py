@@ -98,6 +98,7 @@ def _bench(options: argparse.Namespace) -> BenchOptions:
         profile=options.profile,
         good_image=options.good_image,
         second_image=options.second_image,
+        allow_implausible=options.allow_implausible,
         bus=arguments.bus_config(options),
         power=None if options.power_cmd is None else PowerCommand(options.power_cmd),
         readback=None if options.readback_cmd is None else ReadbackCommand(options.readback_cmd),

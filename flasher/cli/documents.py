@@ -56,6 +56,8 @@ class ErrorDocument(TypedDict):
     where: str
     cause: str
     remedy: str
+    command: str
+    """The command that repairs what was left."""
 
 
 # -- images and plans ------------------------------------------------------------------------------
@@ -108,6 +110,8 @@ class PlanDocument(TypedDict):
     frames: int
     bytes_on_wire: int
     wire_s: float
+    gaps_s: float
+    """Silence between frames and before packets, on top of `wire_s`."""
 
 
 # -- upgrades --------------------------------------------------------------------------------------

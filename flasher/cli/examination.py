@@ -70,7 +70,7 @@ class Examination:
         given = arguments.bus_config(self._options)
         config: dict[str, Any] | None = None
         try:
-            config = bus_config(self.dialect.bitrate_bps, given)
+            config = bus_config(given)
         except BusError:  # none is named: no other failure is one of the bus
             config = None
         asked = can.VALID_INTERFACES - (_SLOW if config else set()) | _named(config)
@@ -89,6 +89,7 @@ class Examination:
         self, config: dict[str, Any], given: dict[str, Any], stopped: Callable[[], bool]
     ) -> None:
         from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can
+        from flasher.bus.bit_rate import named_bit_rate  # noqa: PLC0415
         from flasher.bus.inspect_interface import Interface, read_interface  # noqa: PLC0415
         from flasher.bus.opening import can_listen_only  # noqa: PLC0415
         from flasher.cli.doctor_setup import (  # noqa: PLC0415
@@ -97,17 +98,23 @@ class Examination:
         )
 
         interface, channel = str(config["interface"]), str(config.get("channel") or "")
-        self.bitrate_bps = int(config.get("bitrate") or config["timing"].bitrate)
+        named = named_bit_rate(given, config)
+        if named is not None:
+            self.bitrate_bps = named.bps
         self._note(*package_findings(interface))
-        self._note(*bit_rate_findings(self.bitrate_bps, self.dialect))
+        if "bitrate" in given or "timing" in given:  # any other source is refused at the opening
+            self._note(*bit_rate_findings(self.bitrate_bps, self.dialect))
         if interface == "socketcan" and not channel:
             self._note(nameless_finding())
             return
         if interface == "socketcan":
             seen = read_interface(channel)
             self._note(*interface_findings(seen, channel, self.bitrate_bps))
-            if isinstance(seen, Interface) and not (seen.is_up and seen.is_can):
-                return  # it would open, and carry nothing
+            if isinstance(seen, Interface) and (
+                not (seen.is_up and seen.is_can)  # it would open, and carry nothing
+                or seen.bitrate_bps not in (None, self.bitrate_bps)  # it would not be opened
+            ):
+                return
         try:
             link = open_adapter(self.dialect.bitrate_bps, listen_only=True, **given)
         except BusError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 from typing import Final, TypedDict
 
 from flasher import api
@@ -17,8 +18,12 @@ from flasher.cli.plan_text import (
     plan_lines,
     vector_lines,
 )
-from flasher.errors import ExitCode
+from flasher.cli.profile import add_option as add_profile
+from flasher.cli.upgrade_text import check_line
+from flasher.errors import ExitCode, FlasherError
+from flasher.host.identity import Check, judge_bytes
 from flasher.image.cortexm import vector_table
+from flasher.profile import load_profile
 from flasher.protocol.spec import BMS
 
 _EPILOG = """\
@@ -45,12 +50,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Arguments of the command."""
     parser.description = (
         "Show what is in an image file and what an upgrade would send. Opens no adapter. A file "
-        "that no device should get is refused as flasher flash refuses it."
+        "that no device should get is shown as far as it can be read, and refused as flasher flash "
+        "refuses it."
     )
     parser.epilog = _EPILOG
     arguments.add_image(parser)
+    arguments.add_implausible(parser)
     arguments.add_target(parser, required=False)
     arguments.add_dialect(parser)
+    add_profile(parser)
+    arguments.add_gaps(parser)
 
 
 def run(options: argparse.Namespace, output: Output) -> int:
@@ -58,16 +67,27 @@ def run(options: argparse.Namespace, output: Output) -> int:
     image = arguments.load_image(options)
     table = vector_table(image)
     # The time differs by stuff bits only between targets: any one serves for the figure.
-    plan = api.make_plan(image, options.target or BMS, options.dialect)
+    target = options.target or BMS
+    profile = load_profile(options.profile, target, api.as_dialect(options.dialect))
+    plan = api.make_plan(image, target, profile.dialect, has_upgrade=profile.has_upgrade)
+    chosen = profile.upgrade_options(frame_gap_s=options.frame_gap, packet_gap_s=options.packet_gap)
     beside = manifest_beside(options.image, image, options.target)
-    for line in (*image_lines(image), *vector_lines(table)):
+    lines = [*image_lines(image), *vector_lines(table), beside_line(beside)]
+    for line in (*lines, *plan_lines(plan, chosen)):
         output.result(line)
-    output.result(beside_line(beside))
-    for line in plan_lines(plan):
-        output.result(line)
-    output.document(
-        ImageInfoDocument(
-            image=image_document(image, table), manifest=beside, plan=plan_document(plan)
-        )
+    document = ImageInfoDocument(
+        image=image_document(image, table), manifest=beside, plan=plan_document(plan, chosen)
     )
+    release = None
+    with contextlib.suppress(FlasherError):  # told in `beside`
+        release = api.find_release(options.image)
+    waived = frozenset({Check.PLAUSIBLE} if options.allow_implausible else ())
+    identity = profile.identity(release=release, waived=waived)
+    for found in judge_bytes(image, identity):
+        error = api.refusal(plan, found)
+        if error is not None:
+            output.failure(error, **document)
+            return error.exit_code
+        output.result(check_line(found.event))
+    output.document(document)
     return ExitCode.OK

@@ -22,6 +22,7 @@ from flasher.errors import ExitCode, FlasherError, ImageError, UsageError
 from flasher.image.image import Image
 from flasher.image.manifest import find_release, manifest_path, to_toml
 from flasher.image.manifest_keys import KEYS, read_value
+from flasher.image.plausible import check_plausible
 from flasher.image.release import check_target, names_of, release_of
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
@@ -83,6 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     for action in (create, check):
         arguments.add_image(action)
         arguments.add_target(action, required=action is create)
+    arguments.add_implausible(create)
     _add_statements(create)
     check.add_argument("--manifest", metavar="FILE", help="(default: beside IMAGE, IMAGE.toml)")
 
@@ -160,6 +162,8 @@ def run(options: argparse.Namespace, output: Output) -> int:
 def _create(options: argparse.Namespace, image: Image, output: Output) -> int:
     path = Path(options.output) if options.output else manifest_path(options.image)
     _check_destination(path, options)
+    if not options.allow_implausible:
+        check_plausible(image)
     release = release_of(
         image,
         options.target,

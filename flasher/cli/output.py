@@ -9,6 +9,7 @@ left out, and the exit code tells.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
 import logging
 import os
@@ -49,6 +50,14 @@ class Output:
         """What the last line says of an error, for a command that ends with a verdict."""
         self.write_stderr: Callable[[str], None] = _plain_stderr
         """Replaced while a progress bar is on the screen."""
+        # A terminal that is gone does not say any more that it is one.
+        self._terminals = [each for each in (sys.stdout, sys.stderr) if each.isatty()]
+
+    def leave_terminal(self, why: str) -> None:
+        """Say nothing more where a terminal was; files and pipes still get everything."""
+        _LOG.warning("%s", why, extra=_SAID)
+        for stream in self._terminals:
+            _give_up(stream)
 
     def say(self, text: str) -> None:
         """Write to stderr, wrapped at the window."""
@@ -132,6 +141,7 @@ class Output:
             where=error.where,
             cause=error.cause,
             remedy=error.remedy,
+            command=error.command,
         )
         self.document({**more, "error": said}, exit_code=error.exit_code)
 
@@ -150,6 +160,8 @@ def _print_stdout(text: str) -> None:
         _give_up(sys.stdout)
     except OSError as error:
         _give_up(sys.stdout)
+        if error.errno == errno.EIO:  # the terminal is gone
+            return
         raise UsageError(
             f"Standard output cannot be written: {error.strerror}.",
             cause="the disk that it is redirected to is full",

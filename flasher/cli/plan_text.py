@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from flasher.cli.documents import ImageDocument, PlanDocument
 from flasher.cli.output import byte_count, counted, duration
+from flasher.host.options import UpgradeOptions, gaps_s
 from flasher.image.cortexm import VectorTable
 from flasher.image.image import Image
 from flasher.image.plan import Plan
@@ -34,24 +35,28 @@ def vector_lines(table: VectorTable | None) -> list[str]:
     if table is None:
         return ["  start:   too short for a vector table"]
     words = f"stack pointer 0x{table.stack_pointer:08X}, reset vector 0x{table.reset_vector:08X}"
-    verdict = "plausible for a Cortex-M" if not table.problems else "not plausible for a Cortex-M"
+    verdict = "plausible for a Cortex-M" if table.plausible else "not plausible for a Cortex-M"
     lines = [f"  start:   {words}: {verdict}"]
     lines += [f"           {problem}" for problem in table.problems]
     lines += [f"           {note}" for note in table.notes]
     return lines
 
 
-def plan_lines(plan: Plan) -> list[str]:
-    """What would be sent to whom, and how long it takes on the bus."""
+def plan_lines(plan: Plan, options: UpgradeOptions) -> list[str]:
+    """What would be sent to whom, and how long it takes on the bus, gaps included."""
     target = plan.target
     ids = f"CAN ids 0x{target.request_id:03X}, 0x{target.answer_id:03X}"
     document_bps = {dialect.bitrate_bps for dialect in DIALECTS.values() if dialect.has_upgrade}
     foreign = "" if plan.bitrate_bps in document_bps else " (not the document's bit rate)"
     sent = f"{counted(plan.total_packets, 'packet')}, {counted(plan.frames, 'frame')}"
+    silence_s = gaps_s(plan, options)
+    time = f"{duration(plan.wire_s)} on the wire"
+    if silence_s:
+        time = f"{duration(plan.wire_s + silence_s)}: {time}, {duration(silence_s)} of gaps"
     return [
         f"  to:      {target.node.name} ({ids}) at {plan.bitrate_bps / 1000:g} kbit/s{foreign}",
         f"  plan:    {sent}, {byte_count(plan.bytes_on_wire)} of frame data",
-        f"  time:    {duration(plan.wire_s)} on the wire, erasing and the device's own time extra",
+        f"  time:    {time}, erasing and the device's own time extra",
     ]
 
 
@@ -72,14 +77,14 @@ def image_document(image: Image, table: VectorTable | None) -> ImageDocument:
         else {
             "stack_pointer": table.stack_pointer,
             "reset_vector": table.reset_vector,
-            "plausible": not table.problems,
+            "plausible": table.plausible,
             "problems": list(table.problems),
             "notes": list(table.notes),
         },
     }
 
 
-def plan_document(plan: Plan) -> PlanDocument:
+def plan_document(plan: Plan, options: UpgradeOptions) -> PlanDocument:
     """The plan as JSON."""
     return {
         "target": plan.target.name,
@@ -90,4 +95,5 @@ def plan_document(plan: Plan) -> PlanDocument:
         "frames": plan.frames,
         "bytes_on_wire": plan.bytes_on_wire,
         "wire_s": round(plan.wire_s, 6),
+        "gaps_s": round(gaps_s(plan, options), 6),
     }

@@ -11,6 +11,7 @@ from flasher import api
 from flasher.cli import arguments
 from flasher.cli.output import Output
 from flasher.errors import ExitCode
+from flasher.image.plausible import Cpu
 from flasher.profile import FILE_NAME, Profile, check_profile, load_profile
 from flasher.protocol.text import printable
 
@@ -140,6 +141,8 @@ def _shown(name: str, value: object) -> str:
             return "not set"
         case bool():
             return str(value).lower()
+        case Cpu():
+            return f'"{value.value}"'
         case bytes() if value.isascii() and value.decode().isprintable():
             return f'"{value.decode()}"'
         case bytes():
@@ -156,6 +159,8 @@ def _plain(value: object) -> ProfileValue:
     match value:
         case bytes():
             return list(value)
+        case Cpu():
+            return value.value
         case None | bool() | int() | float() | str():
             return value
         case _:

@@ -23,8 +23,8 @@ from typing import Any, Final
 
 from platformdirs import user_state_path
 
-from flasher.api import Connection, as_dialect
-from flasher.cli.arguments import bus_config, open_connection
+from flasher.api import Connection
+from flasher.cli.arguments import bit_rate, bus_config, open_connection
 from flasher.cli.files import check_not_read
 from flasher.cli.output import Output
 from flasher.driver import Tap
@@ -94,6 +94,8 @@ class Recording:
         self.taps: tuple[Tap, ...] = (Unechoed(lambda: self.recorders),)
         """For the driver."""
         self.failure: BaseException | None = None
+        self.is_alone = False
+        """The terminal is gone: the verdict is left in a bundle, a good one too."""
 
     def opened(self, connection: Connection) -> None:
         """The bus is open."""
@@ -129,7 +131,7 @@ def recording(
         record.failed(error)
         raise
     finally:
-        if record.failure is not None and not options.no_bundle:
+        if (record.is_alone or record.failure is not None) and not options.no_bundle:
             _leave_bundle(options, output, record, record.failure)
 
 
@@ -170,9 +172,10 @@ def _other_texts(options: argparse.Namespace, but: str) -> list[object]:
 
 
 def _leave_bundle(
-    options: argparse.Namespace, output: Output, record: Recording, error: BaseException
+    options: argparse.Namespace, output: Output, record: Recording, error: BaseException | None
 ) -> None:
-    if isinstance(error, FlasherError) and error.exit_code not in _WITH_BUNDLE:
+    own = isinstance(error, FlasherError) and error.exit_code not in _WITH_BUNDLE
+    if own and not record.is_alone:
         return
     if not record.flight.frames:
         return
@@ -180,7 +183,11 @@ def _leave_bundle(
 
     folder = bundle_folder(options.bundle_dir)
     link = record.link_report()
-    facts = {**record.facts, "error": _error(error), "link": link and dataclasses.asdict(link)}
+    facts = {
+        **record.facts,
+        "error": error and _error(error),
+        "link": link and dataclasses.asdict(link),
+    }
     is_own = options.bundle_dir is None and not os.environ.get(BUNDLE_FOLDER)
     try:
         if is_own:
@@ -198,13 +205,15 @@ def _leave_bundle(
 
 
 def _circumstances(options: argparse.Namespace, target: Target | None) -> dict[str, Any]:
+    rate = bit_rate(options)
     words = getattr(options, "command_line", None) or sys.argv[1:]
     return {
         "command_line": ["flasher", *map(printable, words)],
         "target": None if target is None else target.name,
         "dialect": options.dialect,
         "bus": {} if options.mock else bus_config(options),
-        "bitrate_bps": getattr(options, "bitrate", None) or as_dialect(options.dialect).bitrate_bps,
+        "bitrate_bps": rate.bps,
+        "bitrate_source": rate.source,
     }
 
 
@@ -217,6 +226,7 @@ def _error(error: BaseException) -> dict[str, Any]:
             "where": error.where,
             "cause": error.cause,
             "remedy": error.remedy,
+            "command": error.command,
         }
     lines = traceback.format_exception(error)
     return {

@@ -6,6 +6,7 @@ import argparse
 from typing import Final, Literal, TypedDict
 
 from flasher import api, service
+from flasher.bus.bit_rate import BitRate
 from flasher.cli import arguments
 from flasher.cli.documents import HeardDocument
 from flasher.cli.output import Output, counted
@@ -35,8 +36,10 @@ class ScanDocument(TypedDict):
     """Who is on the bus."""
 
     bitrate_bps: int
+    bitrate_source: str
+    """Where it comes from."""
     bitrate_is_assumed: Literal[True]
-    """Frames do not tell it: it is the one of the options."""
+    """Frames do not tell it."""
     dialect: str | None
     dialect_because: str
     nodes: dict[str, HeardDocument]
@@ -61,7 +64,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace, output: Output) -> int:
     """Run the command; returns the exit code."""
     dialect = api.as_dialect(options.dialect)
-    bitrate_bps = getattr(options, "bitrate", None) or dialect.bitrate_bps
+    rate = arguments.bit_rate(options)
+    bitrate_bps = rate.bps
     with (
         recorded_connection(options, output, options.target or BMS) as (connection, record),
         stop_on_signal() as stopped,
@@ -71,12 +75,12 @@ def run(options: argparse.Namespace, output: Output) -> int:
         if not survey.heard:
             record.failed(_silent(survey, bitrate_bps))
     guessed, why = judge_dialect(survey, bitrate_bps)
-    bus = _bus_document(survey, bitrate_bps, guessed, why)
+    bus = _bus_document(survey, rate, guessed, why)
     if not survey.heard:
         error = _silent(survey, bitrate_bps)
         output.failure(error, **bus)
         return error.exit_code
-    for line in _lines(survey, bitrate_bps, dialect, guessed, why):
+    for line in _lines(survey, rate, dialect, guessed, why):
         output.result(line)
     output.document(bus)
     return ExitCode.OK
@@ -106,10 +110,10 @@ def _silent(survey: Survey, bitrate_bps: int) -> NoAnswerError:
 
 
 def _lines(
-    survey: Survey, bitrate_bps: int, asked: Dialect, guessed: Dialect | None, why: str
+    survey: Survey, rate: BitRate, asked: Dialect, guessed: Dialect | None, why: str
 ) -> list[str]:
     lines = [
-        f"bit rate: {bitrate_bps / 1000:g} kbit/s assumed from the options, frames do not tell it",
+        f"bit rate: {rate}; frames do not tell it",
         f"dialect:  {guessed.name if guessed else 'unknown'} ({why})",
     ]
     if guessed is not None and guessed is not asked:
@@ -123,11 +127,10 @@ def _lines(
     return lines
 
 
-def _bus_document(
-    survey: Survey, bitrate_bps: int, guessed: Dialect | None, why: str
-) -> ScanDocument:
+def _bus_document(survey: Survey, rate: BitRate, guessed: Dialect | None, why: str) -> ScanDocument:
     return {
-        "bitrate_bps": bitrate_bps,
+        "bitrate_bps": rate.bps,
+        "bitrate_source": rate.source,
         "bitrate_is_assumed": True,
         "dialect": guessed.name if guessed else None,
         "dialect_because": why,

@@ -1,4 +1,8 @@
-"""Ctrl-C and SIGTERM: the first one asks for a clean end, a second one ends at once."""
+"""Ctrl-C, SIGTERM and SIGHUP: the first one asks for a clean end, a second Ctrl-C ends at once.
+
+SIGHUP, from a terminal that was closed or a connection that was lost, is asked for apart: what must
+not be left half done goes on without anybody who listens. Under `nohup` it stays ignored.
+"""
 
 from __future__ import annotations
 
@@ -7,40 +11,62 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 
+_HANGUP: signal.Signals | None = getattr(signal, "SIGHUP", None)  # not on Windows
+
+
+class Stop:
+    """What the user, or the loss of the terminal, asks for; `stop()` is True for either."""
+
+    def __init__(self, on_first: Callable[[], None] | None) -> None:
+        self._on_first = on_first
+        self._told = False
+        self.is_asked = False
+        """Ctrl-C or SIGTERM came."""
+        self.has_hung_up = False
+        """SIGHUP came."""
+
+    def __call__(self) -> bool:
+        return self.asked() or self.has_hung_up
+
+    def asked(self) -> bool:
+        """True since Ctrl-C or SIGTERM; the first time that it says so, it calls `on_first`."""
+        # Not in the handler, which may have come in the middle of a print: printing there fails.
+        if self.is_asked and not self._told:
+            self._told = True
+            if self._on_first is not None:
+                self._on_first()
+        return self.is_asked
+
 
 @contextmanager
 def stop_on_signal(
     on_first: Callable[[], None] | None = None, on_second: Callable[[], None] | None = None
-) -> Iterator[Callable[[], bool]]:
-    """Gives a function that tells whether the user wants to stop; the first time that it says so,
-    it calls `on_first`. With `on_second` the second signal calls it, in the handler, and only a
-    third one ends at once.
+) -> Iterator[Stop]:
+    """Gives what tells whether to stop. `on_first` is called when it first says that the user wants
+    to. With `on_second` the second signal calls it, in the handler, and only a third one ends at
+    once.
     """
-    asked = told = False
+    stop = Stop(on_first)
     second = on_second
 
-    def handle(_number: int, _frame: FrameType | None) -> None:
-        nonlocal asked, second
-        if not asked:
-            asked = True
+    def handle(number: int, _frame: FrameType | None) -> None:
+        nonlocal second
+        if number == _HANGUP:
+            stop.has_hung_up = True
+        elif not stop.is_asked:
+            stop.is_asked = True
         elif second is not None:
             call, second = second, None
             call()
         else:
             raise KeyboardInterrupt
 
-    def stopped() -> bool:
-        # Not in the handler, which may have come in the middle of a print: printing there fails.
-        nonlocal told
-        if asked and not told:
-            told = True
-            if on_first is not None:
-                on_first()
-        return asked
-
-    before = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if _HANGUP is not None and signal.getsignal(_HANGUP) is not signal.SIG_IGN:
+        numbers.append(_HANGUP)
+    before = {number: signal.signal(number, handle) for number in numbers}
     try:
-        yield stopped
+        yield stop
     finally:
         for number, handler in before.items():
             # None: it was not set from Python, which cannot set it again.

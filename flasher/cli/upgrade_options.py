@@ -21,6 +21,7 @@ from flasher.profile.model import Profile
 from flasher.protocol.timing import DEFAULT_TIMINGS
 
 _WAIVERS: Final = {
+    "implausible": arguments.IMPLAUSIBLE,
     "other-target": "an image that its manifest, or a name inside, gives to another target",
     "hardware": "a hardware version that the manifest does not list",
     "downgrade": "an image that is older than what runs",
@@ -101,18 +102,7 @@ def _add_how(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_special_bootloaders(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
-        "--frame-gap",
-        type=arguments.seconds,
-        metavar="S",
-        help="seconds of silence between frames, for slow receivers",
-    )
-    group.add_argument(
-        "--packet-gap",
-        type=arguments.seconds,
-        metavar="S",
-        help="seconds of silence before each packet, for slow receivers",
-    )
+    arguments.add_gaps(group)
     group.add_argument(
         "--nak-next-is-ack",
         action="store_true",

@@ -17,6 +17,7 @@ from flasher.cli.plan_text import image_document, plan_document
 from flasher.errors import FlasherError, InterruptedByUserError
 from flasher.events import CheckMade
 from flasher.host.identity import Verdict as Judgement
+from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft, Outcome
 from flasher.host.session import Result
 from flasher.host.table import Ending
@@ -182,12 +183,16 @@ def _rate(plan: Plan, transfer_s: float) -> str:
 
 
 def upgrade_document(
-    plan: Plan, result: Result, checks: Iterable[CheckMade], link: LinkReport | None
+    plan: Plan,
+    options: UpgradeOptions,
+    result: Result,
+    checks: Iterable[CheckMade],
+    link: LinkReport | None,
 ) -> UpgradeDocument:
     """The document of an upgrade, good or bad."""
     document = UpgradeDocument(
         image=image_document(plan.image, vector_table(plan.image)),
-        plan=plan_document(plan),
+        plan=plan_document(plan, options),
         checks=check_documents(checks),
         outcome=_outcome_document(result.outcome),
         verification=_verification_document(result.verification, result.running_version),
@@ -199,12 +204,14 @@ def upgrade_document(
     return document
 
 
-def dry_run_document(plan: Plan, checks: Iterable[CheckMade]) -> DryRunDocument:
+def dry_run_document(
+    plan: Plan, options: UpgradeOptions, checks: Iterable[CheckMade]
+) -> DryRunDocument:
     """The document of a plan that is not carried out."""
     return DryRunDocument(
         dry_run=True,
         image=image_document(plan.image, vector_table(plan.image)),
-        plan=plan_document(plan),
+        plan=plan_document(plan, options),
         checks=check_documents(checks),
     )
 

@@ -29,6 +29,7 @@ from flasher.cli.upgrade_text import (
 from flasher.errors import ExitCode, FlasherError
 from flasher.events import CheckMade
 from flasher.host.options import UpgradeOptions
+from flasher.host.outcome import AGAIN
 from flasher.host.session import Result
 from flasher.host.verify import Level
 from flasher.image.cortexm import vector_table
@@ -51,20 +52,6 @@ def run_upgrade(
     profile = profile_of(options)
     release = api.find_release(options.image, options.manifest)
     plan = _make_plan(options, profile, release)
-    image = plan.image
-    show = output.result if options.dry_run else output.progress
-    for line in (*image_lines(image), *vector_lines(vector_table(image)), *plan_lines(plan)):
-        show(line)
-    identity = profile.identity(
-        release=release, waived=waived_checks(options), skip_same_version=skip_same_version
-    )
-    checks = [found.event for found in api.check_image(plan, identity)]
-    if options.dry_run:
-        for check in checks:
-            output.result(check_line(check))
-        output.result("dry run: nothing was sent")
-        output.document(dry_run_document(plan, checks))
-        return ExitCode.OK
     chosen = chosen_options(
         options,
         profile,
@@ -72,6 +59,27 @@ def run_upgrade(
         at_power_up=at_power_up,
         power_up_timeout_s=power_up_timeout_s,
     )
+    image = plan.image
+    show = output.result if options.dry_run else output.progress
+    for line in (
+        *image_lines(image),
+        *vector_lines(vector_table(image)),
+        *plan_lines(plan, chosen),
+    ):
+        show(line)
+    identity = profile.identity(
+        release=release,
+        waived=waived_checks(options),
+        skip_same_version=skip_same_version,
+        goes_on_unchecked=at_power_up,
+    )
+    checks = [found.event for found in api.check_image(plan, identity)]
+    if options.dry_run:
+        for check in checks:
+            output.result(check_line(check))
+        output.result("dry run: nothing was sent")
+        output.document(dry_run_document(plan, chosen, checks))
+        return ExitCode.OK
     level = chosen_level(options, plan, chosen)
     return _Upgrading(options, output, plan, chosen, level, identity).run()
 
@@ -83,7 +91,7 @@ def _make_plan(options: argparse.Namespace, profile: Profile, release: Release |
         image,
         options.target,
         options.dialect,
-        bitrate_bps=getattr(options, "bitrate", None),
+        bitrate_bps=arguments.bit_rate(options).bps,
         has_upgrade=profile.has_upgrade,
     )
 
@@ -112,7 +120,7 @@ class _Upgrading:
     def run(self) -> int:
         """Returns the exit code."""
         with recording(self._options, self._output, target=self._plan.target) as record:
-            record.facts["plan"] = plan_document(self._plan)
+            record.facts["plan"] = plan_document(self._plan, self._chosen)
             record.facts["image_sha256"] = self._plan.image.sha256
             try:
                 result = self._upgrade(record)
@@ -120,7 +128,7 @@ class _Upgrading:
                 self._add_repair(failure)
                 raise
             link, error = record.link_report(), result.error()
-            document = upgrade_document(self._plan, result, self._checks, link)
+            document = upgrade_document(self._plan, self._chosen, result, self._checks, link)
             record.facts["outcome"] = document["outcome"]
             record.facts["verification"] = document["verification"]
             if error is not None:
@@ -136,11 +144,17 @@ class _Upgrading:
                 _connection(options, at_power_up=self._chosen.at_power_up)
             )
             record.opened(connection)
-            output.progress(f"on {connection.name}")
+            output.progress(f"on {connection.name} at {connection.bit_rate}")
             progress = stack.enter_context(Progress(self._plan, output))
-            cancelled = stack.enter_context(
+            stop = stack.enter_context(
                 stop_on_signal(lambda: output.error_line("stopping at the end of the message ..."))
             )
+
+            def hung_up() -> bool:
+                if stop.has_hung_up and not record.is_alone:
+                    record.is_alone = True
+                    output.leave_terminal("the terminal is gone")
+                return stop.has_hung_up
 
             def on_event(event: object) -> None:
                 if isinstance(event, CheckMade):
@@ -158,7 +172,8 @@ class _Upgrading:
                 identity=self._identity,
                 taps=record.taps,
                 on_event=on_event,
-                cancelled=cancelled,
+                cancelled=stop.asked,
+                hung_up=hung_up,
             )
             self._took_s = connection.clock.now() - began_at
             return result
@@ -191,8 +206,11 @@ class _Upgrading:
         """The exact command that repairs a device that was left without an application."""
         if not error.needs_rescue or self._options.mock:
             return
-        command = repair_command(self._options.command_line, self._options.command)
-        error.remedy = f"{error.remedy} To repair it: {command}"
+        options = self._options
+        # An image that the device has refused repairs nothing.
+        refused = options.image if error.exit_code is ExitCode.REFUSED else None
+        error.command = repair_command(options.command_line, options.command, refused)
+        error.remedy = error.remedy.replace(f"{AGAIN} ", "")
 
 
 def _connection(

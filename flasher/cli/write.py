@@ -11,7 +11,7 @@ from flasher.cli import arguments
 from flasher.cli.output import Output
 from flasher.cli.recording import add_recording, recorded_connection
 from flasher.cli.stop import stop_on_signal
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ExitCode, InterruptedByUserError, UsageError
 from flasher.host.items import writable
 from flasher.host.write import FieldChange, WritePlan, Written, field_changes, plan_write
 from flasher.protocol.fields import Content, label
@@ -165,7 +165,15 @@ def _is_terminal() -> bool:
 def _agrees(plan: WritePlan) -> bool:
     sys.stderr.write(f"Write {plan.writable.name} to the {plan.target.node.name}? [y/N] ")
     sys.stderr.flush()
-    return sys.stdin.readline().strip().lower() in {"y", "yes"}
+    try:
+        answer = sys.stdin.readline()
+    except KeyboardInterrupt as interrupt:
+        sys.stderr.write("\n")
+        raise InterruptedByUserError(
+            f"Interrupted at the question: nothing was written to the {plan.target.node.name}, and "
+            "nothing was sent to it but the question for the old value.",
+        ) from interrupt
+    return answer.strip().lower() in {"y", "yes"}
 
 
 def _list(target: Target, dialect: Dialect, output: Output) -> int:

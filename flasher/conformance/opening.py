@@ -22,6 +22,7 @@ from flasher.conformance.subject import Subject
 from flasher.device.profile import DeviceProfile, set_option
 from flasher.errors import UsageError
 from flasher.image.load import load
+from flasher.image.plausible import check_plausible
 from flasher.protocol.spec import WELLING
 from flasher.protocol.text import printable
 
@@ -46,6 +47,7 @@ class BenchOptions:
     profile: str | None = None
     good_image: str | None = None
     second_image: str | None = None
+    allow_implausible: bool = False
     bus: Mapping[str, Any] = field(default_factory=dict)
     power: PowerControl | None = None
     readback: Readback | None = None
@@ -57,8 +59,8 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
     """The device under test and its profile. Raises UsageError, ImageError and BusError."""
     check_bench(options)
     profile = None if options.profile is None else load_profile(options.profile)
-    good = None if options.good_image is None else load(options.good_image).data
-    second = None if options.second_image is None else load(options.second_image).data
+    good = _image(options.good_image, options)
+    second = _image(options.second_image, options)
     if second is not None and good is not None and len(second) >= len(good):
         raise UsageError(
             f"The second image is not smaller than the good one: {len(second):,} bytes, "
@@ -81,7 +83,7 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
         port = RealPort(
             connection.link,
             connection.clock,
-            int(options.bus.get("bitrate") or WELLING.bitrate_bps),
+            connection.bit_rate.bps if connection.bit_rate else WELLING.bitrate_bps,
             echoes=echoes,
             uncertainty_s=options.uncertainty_s,
         )
@@ -97,6 +99,16 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
             ),
             profile,
         )
+
+
+def _image(path: str | None, options: BenchOptions) -> bytes | None:
+    """The bytes of an image file, which a real device has to run."""
+    if path is None:
+        return None
+    image = load(path)
+    if not options.allow_implausible:
+        check_plausible(image)
+    return image.data
 
 
 def check_bench(options: BenchOptions) -> None:

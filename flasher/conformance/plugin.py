@@ -45,6 +45,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     add("--btl-profile", metavar="FILE", help="the product's choices and limits (TOML)")
     add("--btl-good-image", metavar="IMAGE", help="an image that runs on the device")
     add("--btl-second-image", metavar="IMAGE", help="another one, smaller, of another version")
+    add("--btl-allow-implausible", action="store_true", help="whatever these images look like")
     add("--btl-power-cmd", metavar="COMMAND", help="switches the device, as 'relay 3 {on|off}'")
     add("--btl-readback-cmd", metavar="COMMAND", help="dumps the flash, as 'dump {file}'")
     add("--btl-uncertainty", metavar="SECONDS", type=float, help="how far times may be off")

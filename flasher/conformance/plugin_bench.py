@@ -183,6 +183,7 @@ def _options(
         profile=given("profile"),
         good_image=given("good_image"),
         second_image=given("second_image"),
+        allow_implausible=given("allow_implausible"),
         bus=bus,
         power=power,
         readback=readback,

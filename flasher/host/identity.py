@@ -17,6 +17,7 @@ from flasher.events import CheckMade
 from flasher.host.options import firmware_version
 from flasher.host.table import Ending
 from flasher.image.image import Image
+from flasher.image.plausible import Cpu, doubt
 from flasher.image.release import Release, target_problem
 from flasher.protocol.contents import RunningInformation
 from flasher.protocol.fields import Content
@@ -31,6 +32,7 @@ DEFAULT_IN_USE_MA: Final = 1000
 class Check(Enum):
     """What is checked; the value names it, and the option that waives it."""
 
+    PLAUSIBLE = "implausible"
     TARGET = "other-target"
     HARDWARE = "hardware"
     DOWNGRADE = "downgrade"
@@ -46,6 +48,7 @@ class Check(Enum):
 
 
 WAIVABLE: Final = (
+    Check.PLAUSIBLE,
     Check.TARGET,
     Check.HARDWARE,
     Check.DOWNGRADE,
@@ -54,6 +57,7 @@ WAIVABLE: Final = (
 )
 """Checks that refuse; the others report."""
 _ENDINGS: Final[Mapping[Check, Ending]] = {
+    Check.PLAUSIBLE: Ending.IMPLAUSIBLE,
     Check.IN_USE: Ending.IN_USE,
     Check.SAME_VERSION: Ending.UP_TO_DATE,
 }
@@ -79,6 +83,10 @@ class Finding(NamedTuple):
     check: Check
     verdict: Verdict
     text: str
+    other_ways: str = ""
+    """What waives it beside its option; continues the sentence that names that."""
+    is_unchecked: bool = False
+    """True when nothing speaks against the image, but a rule could not be checked."""
 
     @property
     def event(self) -> CheckMade:
@@ -90,13 +98,16 @@ class Finding(NamedTuple):
         """How it ends the session; None when it does not."""
         if self.verdict not in (Verdict.REFUSED, Verdict.SKIPPED):
             return None
+        if self.is_unchecked:
+            return Ending.UNCHECKED
         return _ENDINGS.get(self.check, Ending.NOT_FOR_DEVICE)
 
     @property
     def detail(self) -> str:
         """What is wrong, and the option that waives it."""
-        waiver = f"; {self.check.option} waives this" if self.check in WAIVABLE else ""
-        return f"{self.text}{waiver}"
+        if self.check not in WAIVABLE:
+            return self.text
+        return f"{self.text}; {self.check.option} waives this{self.other_ways}"
 
 
 @dataclass(frozen=True)
@@ -111,10 +122,30 @@ class Identity:
     """Below this state of charge there is a warning."""
     in_use_ma: int = DEFAULT_IN_USE_MA
     """A discharge beyond this means that the vehicle is in use."""
+    goes_on_unchecked: bool = False
+    """Rules of the manifest that the device cannot be asked for do not refuse, but are told: for a
+    rescue, whose device runs no application."""
+    cpu: Cpu = Cpu.CORTEX_M
+    """What kind of processor the device has; an image is expected to look like a program for it."""
 
-    def refusal(self, check: Check, text: str) -> Finding:
+    def vouches_for(self, image: Image) -> bool:
+        """True when there is a manifest of these very bytes."""
+        return self.release is not None and self.release.sha256 == image.sha256
+
+    def refusal(self, check: Check, text: str, other_ways: str = "") -> Finding:
         """A finding against the upgrade, or that it is waived."""
-        return Finding(check, Verdict.WAIVED if check in self.waived else Verdict.REFUSED, text)
+        verdict = Verdict.WAIVED if check in self.waived else Verdict.REFUSED
+        return Finding(check, verdict, text, other_ways)
+
+    def uncheckable(self, check: Check, text: str) -> Finding:
+        """A rule of the manifest that the device does not let be checked: as one that fails, but
+        that --allow-hardware waives it.
+        """
+        if self.goes_on_unchecked:
+            return Finding(Check.HARDWARE, Verdict.UNKNOWN, f"{text}: goes on unchecked")
+        if check in self.waived:
+            return Finding(check, Verdict.WAIVED, text)
+        return self.refusal(Check.HARDWARE, text)._replace(is_unchecked=True)
 
 
 @dataclass(frozen=True)
@@ -145,7 +176,8 @@ def new_version(image: Image, release: Release | None) -> str | None:
 
 
 def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Finding]:
-    """What the image and its manifest say of the target."""
+    """What the image and its manifest say of the target, and whether it can be a program."""
+    yield from judge_bytes(image, identity)
     problem = target_problem(image, identity.release, target)
     wanted = target.node.name
     if problem is not None:
@@ -158,19 +190,48 @@ def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Fi
         yield Finding(Check.TARGET, Verdict.UNKNOWN, text + wanted)
 
 
+def judge_bytes(image: Image, identity: Identity) -> Iterator[Finding]:
+    """Whether the bytes can be a program for the device; nothing where they look like one."""
+    found = doubt(image)
+    if found is None:
+        return
+    text = f"the image {found.text}"
+    if not found.is_certain and identity.cpu is not Cpu.CORTEX_M:
+        text += ": the profile says that the processor is another"
+        yield Finding(Check.PLAUSIBLE, Verdict.UNKNOWN, text)
+    elif not found.is_certain and identity.vouches_for(image):
+        text += ": the manifest was made for these very bytes"
+        yield Finding(Check.PLAUSIBLE, Verdict.UNKNOWN, text)
+    else:
+        yield identity.refusal(Check.PLAUSIBLE, text, found.ways)
+
+
 # -- the device -------------------------------------------------------------------------------
 
 
 def judge_device(image: Image, target: Target, identity: Identity, seen: Seen) -> Iterator[Finding]:
     """What the running application says of the image. `seen` is empty where it did not answer."""
     if seen.version is None:
-        text = f"the {target.node.name}'s application does not tell its versions: neither hardware"
-        yield Finding(Check.HARDWARE, Verdict.UNKNOWN, text + " nor downgrade can be checked")
+        yield _untold(identity, target)
     else:
         yield _hardware(identity, seen.hardware_version)
         yield from _versions(image, identity, seen.firmware_version or "")
     if seen.running is not None:
         yield from _state(identity, seen.running)
+
+
+def _untold(identity: Identity, target: Target) -> Finding:
+    """The application does not answer, or there is no question for its versions."""
+    text = f"the {target.node.name}'s application does not tell its versions: "
+    release = identity.release
+    hardware = release is not None and bool(release.hardware_versions)
+    previous = release is not None and release.rules_previous
+    if not hardware and not previous:
+        text += "neither hardware nor downgrade can be checked"
+        return Finding(Check.HARDWARE, Verdict.UNKNOWN, text)
+    rules = " and ".join(["hardware"] * hardware + ["the version that is replaced"] * previous)
+    text += f"the manifest's rule on {rules} cannot be checked"
+    return identity.uncheckable(Check.HARDWARE if hardware else Check.PREVIOUS, text)
 
 
 def _hardware(identity: Identity, hardware: str | None) -> Finding:
@@ -181,7 +242,7 @@ def _hardware(identity: Identity, hardware: str | None) -> Finding:
     fits = ", ".join(printable(each) for each in release.hardware_versions)
     if hardware is None:
         text = f"the device does not tell its hardware; the manifest lists {fits}"
-        return Finding(Check.HARDWARE, Verdict.UNKNOWN, text)
+        return identity.uncheckable(Check.HARDWARE, text)
     if release.fits_hardware(hardware):
         return Finding(Check.HARDWARE, Verdict.PASSED, f"the manifest lists hardware {hardware}")
     text = f"the device's hardware {hardware} is not in the manifest, which lists {fits}"
@@ -215,7 +276,7 @@ def _versions(image: Image, identity: Identity, running: str) -> Iterator[Findin
 
 def _previous(release: Release, identity: Identity, running: str) -> Iterator[Finding]:
     """The manifest's rule on the version that is replaced, where it has one."""
-    if release.previous_from is None and not release.previous_except:
+    if not release.rules_previous:
         return
     if release.fits_previous(running):
         text = f"the manifest lets {running} be replaced"

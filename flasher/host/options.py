@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
+from flasher.errors import UsageError
 from flasher.host.query import Request
 from flasher.image.plan import Plan
 from flasher.protocol.catalogue import BY_KEY
@@ -17,11 +18,19 @@ DEFAULT_POWER_UP_TIMEOUT_S: Final = 60.0
 """Long enough to walk to the bicycle and unplug its battery."""
 DEFAULT_ADAPTER_RETURN_S: Final = 0.8
 """A bus-off recovers and an interface comes up again within this; a pulled plug ends within 1 s."""
+FRAME_GAP_SHARE: Final = 0.8
+"""The largest gap between two frames, as a share of the time after which their receiver drops the
+message (R12): the rest is for a computer that wakes up late."""
+PACKET_GAP_MAX_S: Final = 10.0
+"""A device that waits for longer is as likely to have given up."""
 
 
 @dataclass(frozen=True)
 class UpgradeOptions:
-    """What a user or a product may set for an upgrade; the defaults are the document's readings."""
+    """What a user or a product may set for an upgrade; the defaults are the document's readings.
+
+    Raises UsageError for gaps that no upgrade survives.
+    """
 
     timings: Timings = DEFAULT_TIMINGS
     attempts: int = DEFAULT_ATTEMPTS
@@ -32,7 +41,7 @@ class UpgradeOptions:
     frame_gap_s: float = 0.0
     """Silence between the frames of one message, for slow receivers."""
     packet_gap_s: float = 0.0
-    """Silence between an answer and the next packet, for slow receivers."""
+    """Silence before each packet and before end of transfer, for slow receivers."""
     nak_next_is_ack: bool = False
     """Take NAK n+1 for ACK n when n was sent more than once (R10)."""
     reset_command: int = Command.RESET
@@ -51,6 +60,24 @@ class UpgradeOptions:
     """How long such an announcement is waited for."""
     adapter_return_s: float = DEFAULT_ADAPTER_RETURN_S
     """How long a lost adapter is tried to be opened again."""
+
+    def __post_init__(self) -> None:
+        limit_s = FRAME_GAP_SHARE * self.timings.inter_frame_timeout_s
+        if not 0 <= self.frame_gap_s <= limit_s:
+            raise UsageError(
+                f"A gap of {self.frame_gap_s:g} s between frames is more than {limit_s:g} s.",
+                cause="the device drops a message whose frames are "
+                f"{self.timings.inter_frame_timeout_s:g} s apart",
+                remedy="Choose a shorter --frame-gap (frame_gap_s in a profile); a device that is "
+                "slow between packets needs --packet-gap.",
+            )
+        if not 0 <= self.packet_gap_s <= PACKET_GAP_MAX_S:
+            raise UsageError(
+                f"A gap of {self.packet_gap_s:g} s before each packet is more than "
+                f"{PACKET_GAP_MAX_S:g} s.",
+                cause="the device takes the silence for the end of the transfer",
+                remedy="Choose a shorter --packet-gap (packet_gap_s in a profile).",
+            )
 
     @property
     def boot_timeout_s(self) -> float:
@@ -75,16 +102,21 @@ def overall_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
     return default_timeout_s(plan, options) if options.timeout_s is None else options.timeout_s
 
 
+def gaps_s(plan: Plan, options: UpgradeOptions) -> float:
+    """The silence that the options ask for in a faultless upgrade, all gaps together."""
+    between_frames = plan.host_frames - plan.host_messages
+    return options.frame_gap_s * between_frames + options.packet_gap_s * (plan.total_packets + 1)
+
+
 def default_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
     """The overall deadline for a plan: every attempt with every wait at its limit, so that it cuts
     off no device that answers in time, only one that needs repetition after repetition.
     """
     timings = options.timings
-    gaps_s = options.packet_gap_s * plan.total_packets + options.frame_gap_s * plan.frames
     answers_s = timings.ack_timeout_s * plan.total_packets
     begin_s = timings.command_timeout_s + options.boot_timeout_s
     begin_s += timings.request_transfer_timeout_s
-    transfer_s = plan.wire_s + gaps_s + answers_s
+    transfer_s = plan.wire_s + gaps_s(plan, options) + answers_s
     end_s = timings.complete_timeout_s * timings.end_tries + timings.application_start_timeout_s
     away_s = (options.attempts - 1) * options.adapter_return_s
     return options.attempts * (begin_s + transfer_s) + away_s + end_s

@@ -13,6 +13,7 @@ from typing import Final, NamedTuple, assert_never
 from flasher.errors import (
     BusError,
     FlasherError,
+    ImageError,
     InterruptedByUserError,
     NoAnswerError,
     RefusedError,
@@ -24,6 +25,7 @@ from flasher.errors import (
 from flasher.events import Phase
 from flasher.host.table import Ending
 from flasher.image.plan import Plan
+from flasher.image.plausible import UNLIKELY
 from flasher.protocol.spec import Target
 
 
@@ -154,7 +156,7 @@ class _Explanation(NamedTuple):
     remedy: str
 
 
-_AGAIN: Final = "Run the same command again."
+AGAIN: Final = "Run the same command again."
 
 _EXPLANATIONS: Final = {
     Ending.NO_BOOT_VERSION: _Explanation(
@@ -168,13 +170,13 @@ _EXPLANATIONS: Final = {
         NoAnswerError,
         "nobody switched it off and on, it has no power, it is not on this bus, or the bit rate "
         "differs",
-        f"{_AGAIN} Take the device's supply away for some seconds when you are asked to (a battery "
+        f"{AGAIN} Take the device's supply away for some seconds when you are asked to (a battery "
         "wakes by its key or charger); --wait allows more time.",
     ),
     Ending.NO_REQUEST: _Explanation(
         NoAnswerError,
         "erasing takes longer than allowed, or the device refuses this size or target",
-        f"Power-cycle the device. {_AGAIN}",
+        f"Power-cycle the device. {AGAIN}",
     ),
     Ending.UNHEARING: _Explanation(
         NoAnswerError,
@@ -196,6 +198,16 @@ _EXPLANATIONS: Final = {
         "another file was meant, another device is connected, or the manifest is not up to date",
         "Compare the image (flasher image-info) with the device (flasher info).",
     ),
+    Ending.IMPLAUSIBLE: _Explanation(
+        ImageError,
+        UNLIKELY,
+        "Name the firmware file itself; flasher image-info shows what is in a file.",
+    ),
+    Ending.UNCHECKED: _Explanation(
+        WrongDeviceError,
+        "no application runs on the device, or it has no query for what the manifest rules",
+        "Look at the device's label, then waive the check; flasher rescue goes on without it.",
+    ),
     Ending.IN_USE: _Explanation(
         WrongDeviceError,
         "somebody rides it, or a load draws current",
@@ -204,30 +216,30 @@ _EXPLANATIONS: Final = {
     Ending.SECOND_TOOL: _Explanation(
         BusError,
         "another program or dongle speaks as the CAN dongle (CDL) on this bus",
-        f"End the other tool and disconnect it. {_AGAIN}",
+        f"End the other tool and disconnect it. {AGAIN}",
     ),
     Ending.TWO_DEVICES: _Explanation(
         WrongDeviceError,
         "two devices of the same kind are on the bus",
-        f"Disconnect one of them. {_AGAIN}",
+        f"Disconnect one of them. {AGAIN}",
     ),
     Ending.PACKET_FAILED: _Explanation(
         TransferError,
         "the device lost power or contact, the line is disturbed, or the device cannot store this "
         "packet",
-        f"Check supply and wiring. {_AGAIN} A device that stays silent needs flasher rescue and a "
+        f"Check supply and wiring. {AGAIN} A device that stays silent needs flasher rescue and a "
         "power cycle.",
     ),
     Ending.RESTARTED: _Explanation(
         TransferError,
         "its supply drops, its watchdog bites, it does not accept what it is sent, or two devices "
         "of the same kind answer",
-        f"Check the supply, and that there is one {{node}} only. {_AGAIN}",
+        f"Check the supply, and that there is one {{node}} only. {AGAIN}",
     ),
     Ending.BROKEN_PROTOCOL: _Explanation(
         TransferError,
         "its bootloader does not follow the protocol",
-        f"Report the boot version to its maker. {_AGAIN}",
+        f"Report the boot version to its maker. {AGAIN}",
     ),
     Ending.REFUSED: _Explanation(
         RefusedError,
@@ -247,7 +259,7 @@ _EXPLANATIONS: Final = {
     Ending.CANCELLED: _Explanation(
         InterruptedByUserError,
         "",
-        f"{_AGAIN} Give a bootloader that was receiving some seconds to time out first, or "
+        f"{AGAIN} Give a bootloader that was receiving some seconds to time out first, or "
         "power-cycle the device if it does not.",
     ),
 }
@@ -255,7 +267,7 @@ _EXPLANATIONS: Final = {
 
 def _late(phase: Phase, left: DeviceLeft) -> _Explanation:
     """The explanation of a passed deadline, by what had been reached."""
-    remedy = f"Allow more time with --timeout, or find what is slow. {_AGAIN}"
+    remedy = f"Allow more time with --timeout, or find what is slow. {AGAIN}"
     match phase:
         case Phase.LISTEN | Phase.IDENTIFY | Phase.RESET | Phase.BOOT | Phase.UPDATE:
             cause = "the device is not there, or not ready in the time allowed"

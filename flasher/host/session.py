@@ -103,6 +103,13 @@ class Session:
         return DeviceLeft.NEW if isinstance(self._stage, Check) else self._upgrade.device_left
 
     @property
+    def has_begun_to_erase(self) -> bool:
+        """True once an update command is sent, or being sent: to end then leaves the device
+        without an application.
+        """
+        return self._upgrade.has_begun_to_erase
+
+    @property
     def may_begin_again(self) -> bool:
         """True when a lost adapter may be opened again: an attempt is left for it."""
         has_left = not isinstance(self._stage, Upgrade) or self._stage.may_begin_again

@@ -123,6 +123,8 @@ class Ending(Enum):
     BOOT_TOO_OLD = "its bootloader is older than the image needs"
     TWO_DEVICES = "two devices answer on the same id"
     NOT_FOR_DEVICE = "the image is not meant for this device"
+    IMPLAUSIBLE = "not plausible as firmware"
+    UNCHECKED = "it cannot be checked whether the image is meant for this device"
     IN_USE = "the vehicle is in use"
     UP_TO_DATE = "the device already runs this version"
     SECOND_TOOL = "a second tool speaks on the bus"
@@ -133,7 +135,15 @@ class Ending(Enum):
     CANCELLED = "cancelled by the user"
 
 
-BEFORE_THE_START: Final = frozenset({Ending.NOT_FOR_DEVICE, Ending.IN_USE, Ending.UP_TO_DATE})
+BEFORE_THE_START: Final = frozenset(
+    {
+        Ending.IMPLAUSIBLE,
+        Ending.NOT_FOR_DEVICE,
+        Ending.UNCHECKED,
+        Ending.IN_USE,
+        Ending.UP_TO_DATE,
+    }
+)
 """Endings of a session whose upgrade is never begun: the table does not hold them."""
 
 

@@ -95,9 +95,11 @@ class Upgrade:
         )
 
     @property
-    def is_told_to_update(self) -> bool:
-        """True once an update command was sent: the device may have erased its application."""
-        return self._at.update_left
+    def has_begun_to_erase(self) -> bool:
+        """True once an update command is sent, or being sent."""
+        at = self._at
+        is_leaving = at.state is State.AWAITING_REQUEST and self._tx.begun
+        return at.update_left or is_leaving
 
     @property
     def device_left(self) -> DeviceLeft:
@@ -349,6 +351,7 @@ class Upgrade:
         self._ending = (ending, detail)
         self._timer_at = None
         self._tx.drop_unstarted()
+        self._tx.hurry()
         if self._tx.idle:
             self._finish(now)
 

@@ -1,9 +1,10 @@
 """Whether an image looks like a program for a Cortex-M, and whether it starts inside itself.
 
 The first word of such a program is its initial stack pointer, the second its reset vector: an
-address with bit 0 set, for Thumb. Nothing in the protocol says that a device has such a processor,
-so what does not look like one is told, not refused. What does look like one and starts somewhere
-else is refused (R8): a part of a program, or the wrong part of a merged file.
+address with bit 0 set, for Thumb. Nothing in the protocol says that a device has such a processor:
+`flasher.image.plausible` refuses what does not look like one, and can be told otherwise. What does
+look like one and starts somewhere else is refused here (R8): a part of a program, or the wrong part
+of a merged file.
 """
 
 from __future__ import annotations
@@ -22,12 +23,15 @@ _RAM_AREAS: Final = ((0x1000_0000, 0x2000_0000), (0x2000_0000, 0x4000_0000))
 """RAM in the code region (core-coupled, or of some makers) and the SRAM region. A stack pointer
 starts at the end of a RAM and grows down, so the start of an area is outside, its end inside."""
 _THUMB: Final = 1
+_MEMORY_SIZE: Final = 1 << 24
+"""More than the program memory of any device; the handlers of one program lie closer together."""
+_ERASED: Final = 0xFFFF_FFFF
+_EMPTY: Final = (0, _ERASED)
 _BASE_ALIGNMENT: Final = 128
 """The least alignment of a vector table."""
 _INNER_ALIGNMENT: Final = 512
 """Alignment at which a second vector table is looked for: applications start at a flash page."""
 _INNER_NAMED_MAX: Final = 4
-_HINT: Final = "an encrypted image, a header in front, or another kind of processor"
 
 
 @dataclass(frozen=True)
@@ -37,7 +41,8 @@ class VectorTable:
     stack_pointer: int
     reset_vector: int
     plausible: bool
-    """Both words look like a Cortex-M's. Whether they fit this place is in `problems` too."""
+    """It looks like a Cortex-M's, and fits its place. Only whether it starts inside the image is a
+    rule of its own (`check_starts_inside`)."""
     problems: tuple[str, ...]
     notes: tuple[str, ...] = ()
     """What could not be judged, and why."""
@@ -60,42 +65,50 @@ def vector_table(image: Image) -> VectorTable | None:
     stack_pointer, reset, *others = _VECTORS.unpack(head.ljust(_VECTORS.size, b"\0"))
     problems = []
     if not _is_stack_pointer(stack_pointer):
-        problems.append(
-            f"the first word, 0x{stack_pointer:08X}, is no stack pointer of a Cortex-M ({_HINT})"
-        )
+        problems.append(f"the first word, 0x{stack_pointer:08X}, is no stack pointer of a Cortex-M")
     if not reset & _THUMB:
         problems.append(f"the reset vector, 0x{reset:08X}, has no Thumb bit")
-    elif reset in (_THUMB, 0xFFFF_FFFF):
+    elif reset in (_THUMB, _ERASED):
         problems.append(f"the reset vector, 0x{reset:08X}, is empty")
-    plausible = not problems
+    if any(not vector & _THUMB and vector for vector in others):
+        problems.append("its NMI or hard fault vector has no Thumb bit")
+    looks_right = not problems
+    if looks_right:
+        problems += _too_far_apart([reset, *(each for each in others if each not in _EMPTY)], image)
     notes = []
     inner = _inner_tables(image)
-    if plausible and inner:
+    if looks_right and inner:
         notes.append(
             f"another vector table stands at {', '.join(f'0x{address:08X}' for address in inner)}: "
             "if that is the application, the file holds more than it (--range START:END)"
         )
     entry = reset & ~_THUMB
+    outside = []
     if image.base is not None:
         if not image.base <= entry < image.base + image.size_bytes:
-            problems.append(
+            outside.append(
                 f"the reset vector, 0x{reset:08X}, points outside of the image, "
                 f"0x{image.base:08X}..0x{image.base + image.size_bytes - 1:08X}"
             )
-        if plausible and image.base % _BASE_ALIGNMENT:
+        if looks_right and image.base % _BASE_ALIGNMENT:
             problems.append(f"a vector table cannot stand at 0x{image.base:08X}")
-    elif plausible:
+    elif looks_right:
         notes.append(
             "a raw binary has no address: whether its reset vector points into it "
             "can be judged with --base only"
         )
-        vectors = [reset, *(vector for vector in others if vector & _THUMB)]
-        if max(vectors) - min(vectors) >= image.size_bytes:
-            problems.append(
-                "its reset, NMI and hard fault vectors lie further apart than the image is long: "
-                "it is a part of a program"
-            )
-    return VectorTable(stack_pointer, reset, plausible, tuple(problems), tuple(notes))
+    return VectorTable(stack_pointer, reset, not problems, (*problems, *outside), tuple(notes))
+
+
+def _too_far_apart(vectors: list[int], image: Image) -> list[str]:
+    """What is wrong with the places that vectors point to, as one list or none."""
+    reach = image.size_bytes if image.base is None else max(image.size_bytes, _MEMORY_SIZE)
+    if max(vectors) - min(vectors) < reach:
+        return []
+    return [
+        "its reset, NMI and hard fault vectors lie further apart than the "
+        + ("image is long: it is a part of a program" if image.base is None else "memory reaches")
+    ]
 
 
 def check_starts_inside(image: Image) -> None:

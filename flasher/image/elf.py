@@ -17,10 +17,29 @@ from flasher.image.segments import SparseBytes
 
 FORMAT: Final = "ELF"
 MAGIC: Final = b"\x7fELF"
+EM_ARM: Final = 40
+_MACHINES: Final = {
+    2: "SPARC",
+    3: "x86",
+    8: "MIPS",
+    20: "PowerPC",
+    36: "V850",
+    42: "SuperH",
+    62: "x86-64",
+    83: "AVR",
+    87: "V850",
+    94: "Xtensa",
+    105: "MSP430",
+    173: "RX",
+    183: "AArch64",
+    197: "RL78",
+    243: "RISC-V",
+}
 
 _CLASS_AT, _CLASS_32 = 4, 1
 _BYTE_ORDER_AT: Final = 5
 _BYTE_ORDERS: Final = {1: "<", 2: ">"}
+_MACHINE_AT, _MACHINE_END = 18, 20
 _HEADER: Final = "16s2H5I6H"
 _PROGRAM_HEADER: Final = "8I"
 _LOADABLE: Final = 1
@@ -77,6 +96,19 @@ def read(file: BinaryIO, source: str, into: SparseBytes) -> None:
             fresh = max(start, done)  # sections may overlap: they are the same bytes
             into.add(load.address + fresh - load.offset, data[fresh:end], load.place)
             done = max(done, end)
+
+
+def machine_of(head: bytes) -> int | None:
+    """The kind of processor that an ELF file which starts with `head` is for (e_machine); None for
+    a header that is cut off.
+    """
+    order = _BYTE_ORDERS.get(head[_BYTE_ORDER_AT]) if len(head) >= _MACHINE_END else None
+    return None if order is None else int(Struct(f"{order}H").unpack_from(head, _MACHINE_AT)[0])
+
+
+def machine_name(machine: int | None) -> str:
+    """A kind of processor in words."""
+    return _MACHINES.get(machine or 0, f"ELF machine {machine}")
 
 
 def _header(data: bytes, source: str) -> tuple[str, tuple[int, ...]]:

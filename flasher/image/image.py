@@ -49,6 +49,8 @@ class Image:
     """How many bytes of `data` are filler and not from the file."""
     version: str | None = None
     """The firmware version `Vxrxrx_YYYYMMDD` inside; None when there is none, or several."""
+    elf_machine: int | None = field(default=None, compare=False)
+    """The kind of processor that an ELF file names; None for the other formats."""
 
     @classmethod
     def from_bytes(cls, data: bytes, *, base: int | None = None, source: str = "(memory)") -> Self:

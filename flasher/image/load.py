@@ -66,6 +66,9 @@ def load(
                 )
             _READERS[form](file, source, sparse)
             image = _joined(sparse, form, fill_gaps_up_to)
+        if form is Format.ELF:
+            file.seek(0)
+            image = replace(image, elf_machine=elf.machine_of(file.read(HEAD_SIZE)))
     if not allow_outside_vector:
         check_starts_inside(image)
     return image

@@ -58,6 +58,8 @@ class Plan:
     device_frames: int
     """CAN frames of the device: general feedback, one boot version, request transfer, an ACK for
     each packet, complete."""
+    host_messages: int
+    """The messages that the tool's frames make."""
     bytes_on_wire: int
     """Data bytes in all those frames."""
     wire_s: float
@@ -135,6 +137,7 @@ def plan(image: Image, target: Target, bitrate_bps: int) -> Plan:
         total_packets=total,
         host_frames=host.frames + packet_frames,
         device_frames=device.frames + acks.frames,
+        host_messages=host.messages + total,
         bytes_on_wire=packet_bytes + host.size_bytes + device.size_bytes + acks.size_bytes,
         wire_s=(transfer_bits + host.bits + device.bits) / bitrate_bps,
         transfer_wire_s=transfer_bits / bitrate_bps,
@@ -146,6 +149,7 @@ class _Traffic:
     """Sums over messages."""
 
     def __init__(self) -> None:
+        self.messages = 0
         self.frames = 0
         self.size_bytes = 0
         self.bits = 0
@@ -154,6 +158,7 @@ class _Traffic:
         for message in messages:
             wire = encode(message)
             frames = split(message.can_id, wire)
+            self.messages += 1
             self.frames += len(frames)
             self.size_bytes += len(wire)
             self.bits += message_bits(frames)

@@ -53,6 +53,11 @@ class Release:
     """Running versions from which it must not be installed."""
     notes: str = ""
 
+    @property
+    def rules_previous(self) -> bool:
+        """True when it states which running versions it may replace."""
+        return self.previous_from is not None or bool(self.previous_except)
+
     def fits_hardware(self, text: str) -> bool:
         """True when a device with this hardware version is listed, or none are stated."""
         return not self.hardware_versions or any(

@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any, Final
 
 from flasher.errors import UsageError, did_you_mean
+from flasher.host.options import PACKET_GAP_MAX_S
+from flasher.image.plausible import Cpu
 from flasher.protocol.spec import COMMAND_SIZE, IMAGE_MAX_SIZE, LENGTH_MAX, TARGETS
 from flasher.protocol.timing import Timings
 
@@ -27,8 +30,8 @@ _DATA_MAX: Final = LENGTH_MAX - COMMAND_SIZE
 
 @dataclass(frozen=True)
 class Key:
-    """One key: `kind` is bool, int, float or bytes; numbers lie in `low` to `high`, both included,
-    `low` excluded with `above`.
+    """One key: `kind` is bool, int, float, bytes or an enumeration of words; numbers lie in
+    `low` to `high`, both included, `low` excluded with `above`.
     """
 
     kind: type
@@ -44,6 +47,8 @@ class Key:
             return "true or false"
         if self.kind is bytes:
             return f"a text in ASCII, or a list of bytes, of {_DATA_MAX} bytes at most"
+        if issubclass(self.kind, Enum):
+            return " or ".join(f'"{each.value}"' for each in self.kind)
         what = "a whole number" if self.kind is int else "a number"
         start = f"above {self.low:g}" if self.above else f"from {_number(self.low)}"
         return f"{what} {start} to {_number(self.high)}"
@@ -68,10 +73,11 @@ KEYS: Final[dict[str, Key]] = {
     "timeout_s": Key(float, "overall deadline", 0, 24 * _TIME_LIMIT_S, above=True),
     "power_up_timeout_s": Key(float, "wait for a power cycle", 0, 24 * _TIME_LIMIT_S, above=True),
     "adapter_return_s": Key(float, "wait for a lost adapter", 0, _TIME_LIMIT_S),
+    "cpu": Key(Cpu, "the device's processor; other: no vector table is looked for in images"),
     "low_charge_percent": Key(int, "warn below this state of charge", 0, 100),
     "in_use_ma": Key(int, "a discharge beyond this is a vehicle in use", 0, 0x7FFF),
     "frame_gap_s": Key(float, "silence between the frames of a message", 0, 1.0),
-    "packet_gap_s": Key(float, "silence before each packet", 0, 60.0),
+    "packet_gap_s": Key(float, "silence before each packet", 0, PACKET_GAP_MAX_S),
     "nak_next_is_ack": Key(bool, "NAK n+1 after a repeated packet n is ACK n (R10)"),
     "reset_command": Key(int, "restarts into the bootloader (R3)", 0, 0xFFFF),
     "reset_data": Key(bytes, "the data of reset_command"),
@@ -104,6 +110,8 @@ def _convert(known: Key, value: object) -> object:
     """Raises ValueError or TypeError."""
     if known.kind is bytes:
         return _bytes(value)
+    if issubclass(known.kind, Enum):
+        return known.kind(value)
     if known.kind is bool or isinstance(value, bool):
         if known.kind is not bool or not isinstance(value, bool):
             raise TypeError

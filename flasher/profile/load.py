@@ -227,12 +227,11 @@ def _check_together(profile: Profile, file: str) -> None:
             f"0x{profile.reset_command:04X} carries {wanted}: its second byte says so.",
             where=file,
         )
-    if profile.frame_gap_s >= profile.timings.inter_frame_timeout_s:
-        raise UsageError(
-            f"frame_gap_s is {profile.frame_gap_s:g}, but frames of one message that are "
-            f"{profile.timings.inter_frame_timeout_s:g} s apart are no message any more (R12).",
-            where=file,
-        )
+    try:
+        profile.upgrade_options()
+    except UsageError as error:
+        error.where = file
+        raise
     area = profile.application_area
     if area is not None and area.start + area.size_bytes > 1 << 32:
         raise UsageError("application_area goes beyond 32 bits of address.", where=file)

@@ -11,6 +11,7 @@ from flasher.host.identity import Identity
 from flasher.host.options import UpgradeOptions
 from flasher.host.query import Request
 from flasher.image.image import Image
+from flasher.image.plausible import Cpu
 from flasher.profile.keys import GROUPS
 from flasher.protocol.catalogue import Item
 from flasher.protocol.contents import Empty
@@ -102,6 +103,8 @@ class Profile:
     """Overall deadline; None computes one from the plan."""
     power_up_timeout_s: float = UpgradeOptions.power_up_timeout_s
     adapter_return_s: float = UpgradeOptions.adapter_return_s
+    cpu: Cpu = Identity.cpu
+    """What kind of program its images are expected to look like."""
     low_charge_percent: int = Identity.low_charge_percent
     """Below this state of charge there is a warning before an upgrade."""
     in_use_ma: int = Identity.in_use_ma
@@ -163,7 +166,10 @@ class Profile:
         other fields of `Identity`.
         """
         return Identity(
-            low_charge_percent=self.low_charge_percent, in_use_ma=self.in_use_ma, **overrides
+            low_charge_percent=self.low_charge_percent,
+            in_use_ma=self.in_use_ma,
+            cpu=self.cpu,
+            **overrides,
         )
 
     def values(self) -> Iterator[tuple[str, object]]:

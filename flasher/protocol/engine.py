@@ -116,6 +116,12 @@ class Transmitter:
         if started is not None:
             self._queue.append(started)
 
+    def hurry(self) -> None:
+        """Send the rest of a message that is half sent without gaps: nothing comes after it."""
+        self._frame_gap_s = 0.0
+        if self._sent_frames:
+            self._not_before = 0.0
+
     def abandon(self, quiet_until: float) -> None:
         """Forget everything, a message that is half sent included; what is queued from now on waits
         until `quiet_until`, so that the receiver drops the half (R12).

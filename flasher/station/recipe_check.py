@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from flasher.errors import FlasherError, UsageError
+from flasher.host.identity import judge_bytes
 from flasher.host.items import Readable, find, meaningful_fields, readable
 from flasher.host.read import READ_MEMORY
 from flasher.image.plan import plan
@@ -79,6 +80,10 @@ def _check_target(loaded: LoadedRecipe, target: LoadedTarget) -> Iterator[Findin
     try:
         target.release.check_bytes(target.image)
         check_target(target.image, target.release, target.target)
+        identity = target.profile.identity(release=target.release)
+        for found in judge_bytes(target.image, identity):
+            if found.ending is not None:
+                yield Finding(where, f"{found.text}.", "Name the firmware file itself.")
         target.profile.check_fits(target.image)
         plan(target.image, target.target, target.profile.dialect.bitrate_bps)
     except FlasherError as error:

@@ -14,7 +14,7 @@ from flasher.api import Connection, make_plan, release_checked, release_options
 from flasher.driver import Tap, drive
 from flasher.errors import NoAnswerError
 from flasher.host.identify import Identify
-from flasher.host.identity import Seen
+from flasher.host.identity import Identity, Seen
 from flasher.host.items import Readable, meaningful_fields
 from flasher.host.options import UpgradeOptions, firmware_version
 from flasher.host.query import Request
@@ -66,9 +66,20 @@ class UnitDevice:
         self.taps: tuple[Tap, ...] = (*taps, self.watcher)
         self.cancelled = cancelled
         self.image = release_checked(loaded.image, loaded.release)
+        rate = connection.bit_rate
         self.plan = make_plan(
-            self.image, loaded.target, profile.dialect, has_upgrade=profile.has_upgrade
+            self.image,
+            loaded.target,
+            profile.dialect,
+            bitrate_bps=None if rate is None else rate.bps,
+            has_upgrade=profile.has_upgrade,
         )
+
+    @property
+    def identity(self) -> Identity:
+        """What is checked before an upgrade. A unit without an application is rescued here."""
+        loaded = self.loaded
+        return loaded.profile.identity(release=loaded.release, goes_on_unchecked=True)
 
     @property
     def name(self) -> str:

@@ -90,7 +90,6 @@ class Flashing:
 
     def _upgrade(self, device: UnitDevice, *, at_power_up: bool) -> Result:
         """One upgrade to a good end. Raises StepFailedError."""
-        loaded = device.loaded
         limit_s = self._recipe.recipe.rule(StepName.FLASH).time_limit_s
         options = device.options(timeout_s=limit_s)
         options = replace(options, at_power_up=at_power_up)
@@ -100,7 +99,7 @@ class Flashing:
             device.connection,
             options=options,
             verify=Level.VERSION if asks else Level.NONE,
-            identity=loaded.profile.identity(release=loaded.release),
+            identity=device.identity,
             taps=device.taps,
             on_event=lambda event: self._hear(event, device),
             cancelled=device.cancelled,

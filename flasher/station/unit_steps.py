@@ -162,8 +162,9 @@ class UnitSteps:
     ) -> list[Finding]:
         """The manifest's rules and the recipe's. Raises StepFailedError."""
         firmware = device.loaded.firmware
-        identity = device.loaded.profile.identity(release=device.loaded.release)
-        findings = list(judge_device(device.image, device.loaded.target, identity, found.seen))
+        findings = list(
+            judge_device(device.image, device.loaded.target, device.identity, found.seen)
+        )
         for finding in findings:
             measured.append(
                 Measurement(f"{device.name} {finding.check.value}", text=finding.verdict.value)

@@ -232,8 +232,10 @@ def load_same(setup: WorkerSetup) -> LoadedRecipe:
 
 def worker_main(channel: Channel, setup: WorkerSetup) -> None:
     """The whole life of the process."""
-    # Ctrl-C is the station's business: it tells its processes what to do.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ctrl-C and a closed terminal are the station's business: it tells its processes what to do.
+    for name in ("SIGINT", "SIGHUP"):  # Windows has no SIGHUP
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     pipe = StationPipe(channel, time.monotonic)
     with suppress(StationGoneError):
         try:

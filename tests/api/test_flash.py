@@ -29,8 +29,9 @@ from flasher.protocol import contents
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC
 from flasher.protocol.timing import Timings
+from tests.firmware import VECTORS
 
-DATA = random.Random(31).randbytes(300)
+DATA = VECTORS + random.Random(31).randbytes(284)
 IMAGE = flasher.Image.from_bytes(DATA)
 Connect = Callable[..., AbstractContextManager[api.Connection]]
 
@@ -217,7 +218,7 @@ def test_the_version_decides_when_the_final_answer_is_lost(
     claimed: str, ending: flasher.Ending
 ) -> None:
     connection, device = simulated(lose_complete, repeated_end="silence")
-    image = flasher.Image.from_bytes(b"V2r0r0_20260101\x00" + DATA)
+    image = flasher.Image.from_bytes(DATA[:16] + b"V2r0r0_20260101\x00" + DATA)
     plan = flasher.make_plan(dataclasses.replace(image, version=claimed), "bms")
     outcome = flasher.upgrade(plan, connection).outcome
     error = outcome.error()
@@ -258,6 +259,8 @@ def test_a_cancelled_upgrade_is_an_outcome_that_says_what_is_left() -> None:
 
 class FakeLink:
     """An adapter that counts how often it is closed, and may fail."""
+
+    bit_rate = None
 
     def __init__(self, failure: Exception | None = None) -> None:
         self.closed = 0

@@ -72,6 +72,8 @@ def test_what_other_back_ends_put_into_that_field_is_not_used(bus: FakeBus) -> N
 
 def port_on(bus: FakeBus, interface: str, now: Callable[[], float]) -> RealPort:
     class Clock:
+        speed = 1.0
+
         def now(self) -> float:
             return now()
 

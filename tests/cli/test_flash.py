@@ -147,6 +147,33 @@ def test_another_bit_rate_is_planned_with_and_pointed_out(flasher: Flasher) -> N
     assert "at 500 kbit/s (not the document's bit rate)" in run.out
 
 
+def test_another_bit_rate_that_no_option_names_is_refused_and_nothing_is_opened(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("can.util.load_environment_config", lambda *_: {"bitrate": "500000"})
+    monkeypatch.delattr("can.Bus")
+    for command in (("flash", OBC, "-t", "obc"), ("info", "-t", "bms"), ("scan",), ("monitor",)):
+        run = flasher(*command, "-i", "virtual", "-c", "a")
+        assert run.code == ExitCode.BUS, run.err
+        assert "500 kbit/s (CAN_BITRATE), not 250 kbit/s (the dialect's)" in run.err
+
+
+@pytest.mark.parametrize("rate", ["0", "-1", "10", "3000000", "fast", "250k"])
+def test_what_is_no_bit_rate_is_wrong_usage(flasher: Flasher, rate: str) -> None:
+    run = flasher("flash", OBC, "-t", "obc", "-i", "virtual", f"--bitrate={rate}")
+    assert run.code == ExitCode.USAGE
+    assert rate in run.err
+
+
+@pytest.mark.parametrize("gap", [("--frame-gap", "0.081"), ("--packet-gap", "10.1")], ids=" ".join)
+def test_a_gap_that_no_upgrade_survives_is_wrong_usage(
+    flasher: Flasher, gap: tuple[str, str]
+) -> None:
+    run = flasher("flash", OBC, "-t", "obc", "--mock", *gap)
+    assert run.code == ExitCode.USAGE
+    assert f"Choose a shorter {gap[0]}" in run.err
+
+
 @pytest.mark.parametrize("words", [("flash", "--json"), ("--json", "flash", "--nonsense")])
 def test_wrong_usage_is_a_json_document_too(flasher: Flasher, words: tuple[str, ...]) -> None:
     run = flasher(*words)

@@ -14,6 +14,7 @@ from flasher.image.image import Image
 from flasher.protocol.wire import Message, encode, split
 from tests.cli.conftest import Flasher, Run
 from tests.end_to_end.stage import IMAGE, NEW, OLD, SMALL, Speaker, Stage, image_of
+from tests.firmware import VECTORS
 
 UPDATE = bytes.fromhex("55AA160DA10B")
 OLDER, BETWEEN = "V0r9r0_20200101", "V1r0r1_20230101"
@@ -66,13 +67,14 @@ class Workbench:
         *words: str,
         image: Image = IMAGE,
         manifest: dict[str, Any] | None = None,
+        command: str = "flash",
     ) -> Run:
         path = self._folder / "image.bin"
         path.write_bytes(image.data)
         self._write_manifest(image, manifest)
         stage.heard.clear()
         self._patch.setattr("flasher.api.connect", stage.connect)
-        return self._flasher("flash", path, "-t", stage.target.name, "-i", "virtual", *words)
+        return self._flasher(command, path, "-t", stage.target.name, "-i", "virtual", *words)
 
     def _write_manifest(self, image: Image, keys: dict[str, Any] | None) -> None:
         if keys is None:
@@ -142,6 +144,34 @@ def test_a_right_manifest_lets_every_check_pass_and_says_so(bench: Workbench) ->
     assert "check: unknown" not in run.err
 
 
+@pytest.mark.parametrize(
+    "rule",
+    [{"hardware_versions": ["V1r2r0_*"]}, {"previous_from": OLD}],
+    ids=str,
+)
+def test_a_rule_that_cannot_be_checked_refuses_as_one_that_fails(
+    bench: Workbench, rule: dict[str, Any]
+) -> None:
+    """The device sits in its bootloader: nobody can ask it."""
+    stage = Stage(has_application=False)
+    run = bench.flash(stage, manifest=rule)
+    assert run.code == ExitCode.WRONG_DEVICE
+    assert "does not tell its versions: the manifest's rule on" in run.err
+    assert "cannot be checked; --allow-hardware waives this" in run.err
+    assert "flasher rescue goes on without it" in run.err
+    assert not wrote(stage)
+    run = bench.flash(stage, "--allow-hardware", manifest=rule)
+    assert run.code == ExitCode.OK, run.err
+    assert "warning: the BMS's application does not tell its versions" in run.err
+
+
+def test_a_rescue_says_that_it_goes_on_unchecked(bench: Workbench) -> None:
+    stage = Stage(has_application=False)
+    run = bench.flash(stage, manifest={"hardware_versions": ["V9*"]}, command="rescue")
+    assert run.code == ExitCode.OK, run.err
+    assert "the manifest's rule on hardware cannot be checked: goes on unchecked" in run.err
+
+
 def test_where_there_is_nothing_to_check_against_a_line_says_so(bench: Workbench) -> None:
     run = bench.flash(Stage("obc"))
     assert run.code == ExitCode.OK
@@ -154,7 +184,7 @@ def test_where_there_is_nothing_to_check_against_a_line_says_so(bench: Workbench
 def test_the_manifests_version_stands_in_for_one_that_the_image_does_not_name(
     bench: Workbench,
 ) -> None:
-    nameless = Image.from_bytes(bytes(300))
+    nameless = Image.from_bytes(VECTORS + bytes(300))
     stage = Stage()
     run = bench.flash(stage, image=nameless, manifest={"firmware_version": OLDER})
     assert run.code == ExitCode.WRONG_DEVICE

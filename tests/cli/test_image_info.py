@@ -37,14 +37,31 @@ def test_a_binary_says_that_its_address_is_unknown(flasher: Flasher) -> None:
     assert "0x08002000..0x08002F9F" in with_base.out
 
 
-def test_what_is_no_program_is_told_not_refused(flasher: Flasher, tmp_path: Path) -> None:
+def test_what_is_no_program_is_shown_and_refused_as_flash_refuses_it(
+    flasher: Flasher, tmp_path: Path
+) -> None:
     path = tmp_path / "data.bin"
     path.write_bytes(bytes(range(1, 200)))
     run = flasher("image-info", path)
-    assert run.code == ExitCode.OK
+    assert run.code == ExitCode.IMAGE
     assert "not plausible for a Cortex-M" in run.out
-    path.write_bytes(b"abc")
+    assert "begins with no Cortex-M vector table" in run.err
+    document = flasher("image-info", path, "--json").document
+    assert document["image"]["vector_table"]["plausible"] is False
+    run = flasher("image-info", path, "--allow-implausible")
+    assert run.code == ExitCode.OK
+    assert "check: waived: the image begins with no" in run.out
+    path.write_bytes(b"\1\2\3")
     assert "too short for a vector table" in flasher("image-info", path).out
+
+
+def test_gaps_count_in_the_planned_time(flasher: Flasher) -> None:
+    """613 packets and 3 other messages: 17 gaps in a packet, 1 + 2 + 1 in the others (2.2.3)."""
+    gaps = ("--frame-gap", "0.01", "--packet-gap", "0.1")
+    plan = flasher("image-info", SAMPLES / "bms.bin", *gaps, "--json").document["plan"]
+    assert plan["gaps_s"] == pytest.approx(0.01 * (613 * 17 + 1 + 2 + 1) + 0.1 * 614)
+    said = flasher("image-info", SAMPLES / "bms.bin", *gaps).out
+    assert "on the wire, 2 min 45 s of gaps" in said
 
 
 def test_an_outside_vector_is_refused_until_waived(flasher: Flasher) -> None:

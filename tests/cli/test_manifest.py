@@ -11,6 +11,7 @@ from flasher.errors import ExitCode
 from flasher.image.manifest import read_release
 from flasher.protocol.spec import BMS
 from tests.cli.conftest import SAMPLES, Flasher
+from tests.firmware import VECTORS
 
 BMS_SHA256 = "5084b23b11e875b6041d23a7ba3918f28bf537aa30c136f03db8b9550481a823"
 
@@ -99,7 +100,7 @@ def test_create_warns_when_the_image_names_another_target_too(
     flasher: Flasher, tmp_path: Path
 ) -> None:
     both = tmp_path / "both.bin"
-    both.write_bytes(b"\x20BMS_UPD\0WMC_UPD\0\xf0\xf1" * 9)
+    both.write_bytes(VECTORS + b"\x20BMS_UPD\0WMC_UPD\0\xf0\xf1" * 9)
     document = flasher(
         "manifest", "create", both, "-t", "wmc", "--format", "bin", "--json"
     ).document
@@ -158,7 +159,7 @@ def test_check_says_what_there_was_nothing_to_check_against(
     flasher: Flasher, tmp_path: Path
 ) -> None:
     silent = tmp_path / "silent.bin"
-    silent.write_bytes(bytes(range(256)))
+    silent.write_bytes(VECTORS + bytes(range(240)))
     flasher(
         "manifest", "create", silent, "-t", "obc", "--firmware-version", "V1r0r4_20220512",
         "--hardware-version", "V1*", "--previous-except", "TEST",

@@ -25,8 +25,9 @@ from flasher.errors import ExitCode
 from flasher.host.outcome import Outcome
 from flasher.protocol.wire import Message, encode
 from tests.cli.conftest import Flasher, Run
+from tests.firmware import VECTORS
 
-IMAGE = bytes(range(256)) + b"and three bytes more than two packets"[:3]
+IMAGE = VECTORS + bytes(range(240)) + b"and three bytes more than two packets"[:3]
 QUICK = (
     "--set", "reset_delay_s=0.001", "--set", "erase_time_s=0", "--set", "program_time_s=0",
     "--set", "start_delay_s=0",
@@ -176,7 +177,9 @@ def test_the_last_upgrade_can_be_verified_before_it_ends(serve: Serve, host: Hos
     results: list[api.Result] = []
 
     def upgrade() -> None:
-        plan = api.make_plan(api.Image.from_bytes(b"V2r0r0_20260101".ljust(200, b"-")), "bms")
+        plan = api.make_plan(
+            api.Image.from_bytes(VECTORS + b"V2r0r0_20260101".ljust(200, b"-")), "bms"
+        )
         with api.connect(interface="virtual", channel=host.channel) as connection:
             results.append(api.upgrade(plan, connection, verify=api.Level.VERSION))
 
@@ -189,7 +192,7 @@ def test_the_last_upgrade_can_be_verified_before_it_ends(serve: Serve, host: Hos
 
 def test_it_ends_after_n_upgrades(serve: Serve, host: Host, tmp_path: Path) -> None:
     """EN-07: also to a smaller image."""
-    images = [IMAGE * 2, IMAGE, b"x"]
+    images = [IMAGE * 2, IMAGE, VECTORS[:8]]
 
     def upgrade_all() -> None:
         for image in images:
@@ -201,7 +204,7 @@ def test_it_ends_after_n_upgrades(serve: Serve, host: Host, tmp_path: Path) -> N
     assert run.out.count("image:") == 3
     host.join()
     assert [outcome.ending for outcome in host.outcomes] == [api.Ending.COMPLETED] * 3
-    assert (tmp_path / "out.bin").read_bytes() == b"x"
+    assert (tmp_path / "out.bin").read_bytes() == VECTORS[:8]
 
 
 def test_ctrl_c_ends_it_with_exit_code_0(serve: Serve, host: Host) -> None:

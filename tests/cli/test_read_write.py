@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from intelhex import IntelHex
@@ -210,6 +211,21 @@ def test_on_a_terminal_it_asks_and_writes_on_yes(
     assert run.code == ExitCode.OK
     assert "Write user-string-1 to the BMS? [y/N]" in run.err
     assert (0x3A10, b"RACK 7.         ") in battery.received
+
+
+@pytest.mark.usefixtures("terminal")
+def test_ctrl_c_at_the_question_says_that_nothing_was_written(
+    flasher: Flasher, battery: Battery, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def press(*_: object) -> str:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(sys, "stdin", SimpleNamespace(readline=press))
+    run = flasher("write", "user-string-1", "RACK 7", *MOCK, "--json")
+    assert run.code == run.document["exit_code"] == ExitCode.INTERRUPTED
+    assert "nothing was written to the BMS" in run.document["error"]["what"]
+    assert "not known" not in run.err
+    assert [command for command, _ in battery.received] == [0x3900]
 
 
 @pytest.mark.parametrize("answer", ["n\n", "\n", "", "yess\n"])

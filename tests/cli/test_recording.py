@@ -74,10 +74,11 @@ def test_a_failure_on_the_bus_leaves_a_bundle_and_says_where(
     report = report_of(bundle)
     assert report["error"] == {
         "kind": "NoAnswerError", "exit_code": 5, "what": "Nobody.", "where": "packet 3",
-        "cause": "no power", "remedy": "Switch on.",
+        "cause": "no power", "remedy": "Switch on.", "command": "",
     }  # fmt: skip
     assert report["command_line"] == ["flasher", "flash", "a b", r"\x1b"]
     assert (report["target"], report["bitrate_bps"]) == ("bms", 250_000)
+    assert report["bitrate_source"] == "the dialect's"
     assert report["link"]["packets"] == 3
     assert "packet: number 3" in (bundle / "transcript.txt").read_text()
 

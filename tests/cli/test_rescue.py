@@ -5,7 +5,9 @@ from __future__ import annotations
 import shlex
 import signal
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from zlib import crc32
 
 import pytest
 
@@ -14,13 +16,13 @@ from flasher.cli.repair import repair_command
 from flasher.errors import ExitCode
 from flasher.events import Phase
 from tests.cli.conftest import SAMPLES, Flasher
-from tests.end_to_end.stage import IMAGE, Stage
+from tests.end_to_end.stage import IMAGE, SMALL, Stage
 
 
 def repair_named_in(said: str) -> list[str]:
-    """The words of the command behind "To repair it:", as a shell parts them."""
-    line = next(line for line in said.splitlines() if "To repair it: " in line)
-    words = shlex.split(line.partition("To repair it: ")[2])
+    """The words of the command on the line behind "to repair it:", as a shell parts them."""
+    lines = said.splitlines()
+    words = shlex.split(lines[lines.index("  to repair it:") + 1])
     assert words[:1] == ["flasher"]
     return words[1:]
 
@@ -108,6 +110,48 @@ def test_the_repair_is_what_was_typed_without_what_does_not_fit(typed: str, repa
     assert repair_command(words, command) == f"flasher {repair}"
 
 
+@pytest.mark.parametrize(
+    ("typed", "repair"),
+    [
+        ("flash a.hex -t bms", "rescue OTHER_IMAGE -t bms"),
+        ("flash -t bms bms", "rescue -t bms OTHER_IMAGE"),
+        ("flash bms -t bms", "rescue OTHER_IMAGE -t bms"),
+        ("flash -t bms -- a.hex", "rescue -t bms -- OTHER_IMAGE"),
+        (
+            "flash a.hex -t bms --base 0 --range=0:9 --man m.toml -f --allow-hardware -b 250000",
+            "rescue OTHER_IMAGE -t bms -b 250000",
+        ),
+    ],
+)
+def test_a_refused_image_is_not_named_again_nor_what_was_said_about_it(
+    typed: str, repair: str
+) -> None:
+    words = shlex.split(typed)
+    image = "bms" if "a.hex" not in words else "a.hex"
+    assert repair_command(words, "flash", image) == f"flasher {repair}"
+
+
+def test_after_a_refusal_the_one_command_can_be_right_and_spares_the_evidence(
+    flasher: Flasher, stage: Stage, tmp_path: Path
+) -> None:
+    stage.device.profile = replace(SMALL, image_checksum="crc32")
+    image, trace = tmp_path / "bad.bin", tmp_path / "evidence.asc"
+    image.write_bytes(IMAGE.data)
+    words = ("flash", image, "-t", "bms", "-i", "virtual", "--trace-file", trace)
+    failed = flasher(*words)
+    assert failed.code == ExitCode.REFUSED
+    kept = trace.read_bytes()
+    command = repair_named_in(failed.err)
+    assert command == ["rescue", "OTHER_IMAGE", "-t", "bms", "-i", "virtual"]
+    assert failed.err.count("flasher rescue") == 1
+    good = tmp_path / "good.bin"
+    checked = IMAGE.data + crc32(IMAGE.data).to_bytes(4, "little")
+    good.write_bytes(checked)
+    repaired = flasher(*(str(good) if word == "OTHER_IMAGE" else word for word in command))
+    assert repaired.code == ExitCode.OK, repaired.err
+    assert trace.read_bytes() == kept
+
+
 # -- Ctrl-C ---------------------------------------------------------------------------------------
 
 STAGES = [
@@ -156,11 +200,11 @@ def test_ctrl_c_in_every_phase_says_what_the_device_has_and_how_to_repair_it(
         assert phase.value in error["where"]
     if times == 1:
         assert f"State of the device: {state}" in error["remedy"]
-        assert ("To repair it: " in error["remedy"]) is needs_repair
+        assert error["command"].startswith("flasher rescue ") is needs_repair
     else:
         assert "State of the device: " in error["remedy"]
         assert "Interrupted at once" in error["what"]
-    if "To repair it: " in error["remedy"]:
+    if error["command"]:
         stage.wait(10.0)
         assert flasher("flash", image, "-t", "bms", "-i", "virtual").code == ExitCode.OK
         assert stage.has == IMAGE.data
@@ -222,4 +266,4 @@ def test_ctrl_c_while_the_adapter_is_awaited_is_heard_at_once(
     error = run.document["error"]
     assert "packet 2 of 4" in error["where"]
     assert "no such device" in error["cause"]
-    assert "To repair it: " in error["remedy"]
+    assert error["command"].startswith("flasher rescue ")

@@ -27,7 +27,7 @@ def test_a_bit_rate_is_called_an_assumption(
     run = flasher("scan", "--dialect", dialect, *MOCK)
     assert run.code == ExitCode.OK
     lines = run.out.splitlines()
-    assert lines[0].startswith(f"bit rate: {bitrate} assumed")
+    assert lines[0].startswith(f"bit rate: {bitrate} (the dialect's)")
     assert lines[1].startswith(f"dialect:  {dialect} (by the bit rate alone")
     assert "assumption" in lines[1]
     assert "BMS" in lines

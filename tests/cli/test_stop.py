@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
+import os
+import pty
 import signal
 import subprocess
 import sys
@@ -77,7 +80,30 @@ def test_a_handler_that_python_did_not_set_is_replaced_by_the_default(
     monkeypatch.setattr(signal, "signal", lambda number, handler: calls.append((number, handler)))
     with stop_on_signal():
         pass
-    assert calls[2:] == [(number, signal.SIG_DFL) for number in SIGNALS]
+    numbers = [*SIGNALS, signal.SIGHUP]
+    assert calls[len(numbers) :] == [(number, signal.SIG_DFL) for number in numbers]
+
+
+@signals_reach_processes
+def test_a_hangup_is_told_apart_and_interrupts_nothing_however_often_it_comes() -> None:
+    with stop_on_signal() as stop:
+        for _ in range(3):
+            signal.raise_signal(signal.SIGHUP)
+        assert stop.has_hung_up
+        assert stop()
+        assert not stop.asked()
+
+
+@signals_reach_processes
+def test_nohup_is_respected() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stop_on_signal() as stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert not stop()
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 # -- in this process ------------------------------------------------------------------------------
@@ -151,16 +177,45 @@ def test_a_signal_in_the_transfer_ends_it_cleanly_and_says_what_to_do(
 
 
 @signals_reach_processes
-def test_a_second_ctrl_c_ends_at_once(tmp_path: Path) -> None:
-    """With half a minute between two frames the end of the message is far away."""
-    with flashing(tmp_path, "--frame-gap", "30") as process:
-        told(process)("resetting the application ...")
+@pytest.mark.parametrize(
+    "options", [("--frame-gap", "0.08"), ("--packet-gap", "10"), ("--mock-speed", "0.1")]
+)
+def test_ctrl_c_ends_in_no_time_at_any_setting(tmp_path: Path, options: tuple[str, ...]) -> None:
+    """The end of a message is 1.4 s away at the slowest gap."""
+    with flashing(tmp_path, *options) as process:
+        told(process)("transferring ...")
         process.send_signal(signal.SIGINT)
-        told(process)("stopping at the end of the message ...")
-        process.send_signal(signal.SIGINT)
-        took_s, said = seconds_until_the_end(process)
-    assert process.returncode == ExitCode.INTERRUPTED
-    assert took_s < 2.0
-    assert "Interrupted at once" in said
-    assert "Run the same command again" in said
-    assert "Traceback" not in said
+        began = time.monotonic()
+        told(process)("cancelled by the user")
+        took_s = time.monotonic() - began
+    assert took_s < 0.6  # 0.3 s, and room for a busy computer
+
+
+@signals_reach_processes
+@pytest.mark.parametrize(
+    ("phase", "ending", "code"),
+    [
+        ("waiting for the boot version ...", "cancelled", ExitCode.INTERRUPTED),
+        ("transferring ...", "completed", ExitCode.OK),
+    ],
+)
+def test_a_closed_terminal_ends_before_the_update_command_and_finishes_after_it(
+    tmp_path: Path, phase: str, ending: str, code: ExitCode
+) -> None:
+    """Its terminal is closed: SIGHUP comes, and nothing can be written to it any more."""
+    log, bundles = tmp_path / "log.txt", tmp_path / "bundles"
+    image = str(SAMPLES / "wmc.hex")
+    words = ("-t", "wmc", "--mock", "--log-file", str(log), "--bundle-dir", str(bundles))
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execve(FLASHER[0], [*FLASHER, "flash", image, *words], clean_environment())  # noqa: S606
+    said = b""
+    while phase.encode() not in said:
+        said += os.read(terminal, 4096)
+    os.close(terminal)
+    _, status = os.waitpid(pid, 0)
+    assert os.waitstatus_to_exitcode(status) == code
+    [bundle] = bundles.iterdir()
+    report = json.loads((bundle / "report.json").read_text())
+    assert report["outcome"]["ending"] == ending
+    assert f"exit code {int(code)}" in log.read_text()

@@ -28,6 +28,7 @@ from flasher.image.image import Image
 from flasher.image.plan import Plan, plan
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import TARGETS, WELLING
+from tests.firmware import VECTORS
 
 SMALL = DeviceProfile(application_area_bytes=16 * 1024)
 """Many devices are made; a large flash takes time to make."""
@@ -37,7 +38,7 @@ OLD, NEW, NEWER = "V1r0r0_20220512", "V2r0r1_20260102", "V3r0r0_20260301"
 
 def image_of(packets: int = 4, version: str = NEW, seed: int = 5) -> Image:
     """An image that names its version, its last packet not full."""
-    head = b"\x00\x50\x00\x20" + version.encode() + b"\0"
+    head = VECTORS + version.encode() + b"\0"
     body = random.Random(seed).randbytes(packets * 128 - 5 - len(head))
     return replace(Image.from_bytes(head + body), version=version)
 

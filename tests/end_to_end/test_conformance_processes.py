@@ -7,9 +7,10 @@ from pathlib import Path
 
 from tests.end_to_end.processes import MockProcess, run_flasher
 from tests.end_to_end.test_processes import bus
+from tests.firmware import VECTORS
 
 __all__ = ["bus"]
-IMAGE = b"V2r0r1_20240131" + bytes(range(256)) * 2
+IMAGE = VECTORS + b"V2r0r1_20240131" + bytes(range(256)) * 2
 
 
 def test_a_mock_in_another_process_gets_the_verdicts_that_the_built_in_one_gets(

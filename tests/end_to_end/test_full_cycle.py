@@ -20,6 +20,7 @@ from flasher.errors import ExitCode
 from flasher.protocol.spec import BMS, WELLING
 from tests.cli import conftest
 from tests.cli.conftest import SAMPLES, Flasher, Run
+from tests.firmware import VECTORS
 
 flasher = conftest.flasher
 """The fixture, for the tests here too."""
@@ -124,7 +125,7 @@ def test_an_image_that_was_linked_for_another_address_is_found_by_reading_it_bac
 ) -> None:
     """The update command names no address: the battery stores and confirms it all the same."""
     image = tmp_path / "image.bin"
-    image.write_bytes(bytes(range(1, 201)))
+    image.write_bytes(VECTORS + bytes(range(1, 185)))
     run = flasher(
         "flash", image, "--base", "0x08009000", "--allow-outside-vector", "-t", "bms",
         *battery.bus, "--verify", "memory", "--json",

@@ -11,11 +11,12 @@ import pytest
 
 from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment, run_flasher
 from tests.end_to_end.test_processes import GROUP, bus, free_port
+from tests.firmware import VECTORS
 
 __all__ = ["GROUP", "bus", "free_port"]  # `bus` is a fixture
 
 PACKETS = 40
-IMAGE = random.Random(40).randbytes(PACKETS * 128 - 5)
+IMAGE = VECTORS + random.Random(40).randbytes(PACKETS * 128 - 21)
 SLOW = ("--packet-gap", "0.02")
 """So that the kill hits while packets go."""
 PAUSE_S = "transfer_timeout_s=0.3"

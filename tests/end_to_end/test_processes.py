@@ -11,6 +11,7 @@ import can
 import pytest
 
 from tests.end_to_end.processes import MockProcess, transfer
+from tests.firmware import VECTORS
 
 GROUP = "239.74.163.2"
 
@@ -48,12 +49,12 @@ def bus() -> tuple[str, ...]:
 def test_images_of_every_edge_size_arrive_byte_for_byte_at_one_mock(
     bus: tuple[str, ...], tmp_path: Path
 ) -> None:
-    sizes = (128, 1, 129, 127)
+    sizes = (128, 16, 129, 127)
     data = random.Random(11)
     serving = ("-t", "bms", "--save-image", "out.bin", "--upgrades", str(len(sizes)), *bus)
     with MockProcess(*serving, folder=tmp_path) as mock:
         for size_bytes in sizes:
-            done = transfer(mock, tmp_path, data.randbytes(size_bytes), *bus)
+            done = transfer(mock, tmp_path, VECTORS + data.randbytes(size_bytes - 16), *bus)
             assert "completed:    the device confirmed" in done.stdout
         assert mock.end() == 0
 
@@ -61,7 +62,7 @@ def test_images_of_every_edge_size_arrive_byte_for_byte_at_one_mock(
 def test_300_kib_arrive_byte_for_byte(bus: tuple[str, ...], tmp_path: Path) -> None:
     """The mock's flash takes no time here: a packet would last 1 ms longer."""
     fast = ("--set", "program_time_s=0", "--set", "erase_time_s=0")
-    image = random.Random(12).randbytes(300 * 1024)
+    image = VECTORS + random.Random(12).randbytes(300 * 1024 - 16)
     serving = ("-t", "bms", "--save-image", "out.bin", "--upgrades", "1", *fast, *bus)
     with MockProcess(*serving, folder=tmp_path) as mock:
         done = transfer(mock, tmp_path, image, *bus)

@@ -34,6 +34,7 @@ from tests.end_to_end.processes import (
     run_flasher,
     transfer,
 )
+from tests.firmware import VECTORS
 
 QUEUE_FRAMES = 64
 """Longer than any transmit queue that counts as short here."""
@@ -62,12 +63,12 @@ def on(channel: str) -> tuple[str, ...]:
 
 @needs_vcan
 def test_images_of_every_edge_size_arrive_over_vcan(tmp_path: Path) -> None:
-    sizes = (1, 127, 128, 129)
+    sizes = (16, 127, 128, 129)
     data = random.Random(21)
     serving = ("-t", "bms", "--save-image", "out.bin", "--upgrades", str(len(sizes)))
     with MockProcess(*serving, *on("vcan0"), folder=tmp_path) as mock:
         for size_bytes in sizes:
-            transfer(mock, tmp_path, data.randbytes(size_bytes), *on("vcan0"))
+            transfer(mock, tmp_path, VECTORS + data.randbytes(size_bytes - 16), *on("vcan0"))
         assert mock.end() == 0
 
 
@@ -81,7 +82,7 @@ def test_nobody_on_vcan_is_exit_code_5(tmp_path: Path) -> None:
 
 @needs_pair
 def test_an_upgrade_over_a_line_with_a_short_transmit_queue(tmp_path: Path) -> None:
-    image = random.Random(22).randbytes(20_000)
+    image = VECTORS + random.Random(22).randbytes(19_984)
     serving = ("-t", "bms", "--save-image", "out.bin", "--upgrades", "1", *on("vx1"))
     with MockProcess(*serving, folder=tmp_path) as mock:
         done = transfer(mock, tmp_path, image, *on("vx0"))
@@ -141,7 +142,7 @@ def taken_down(channel: str) -> Iterator[None]:
 @needs_pair
 def test_an_interface_that_goes_down_ends_the_upgrade_and_says_what_is_left(tmp_path: Path) -> None:
     """BU-05."""
-    (tmp_path / "image.bin").write_bytes(random.Random(23).randbytes(60_000))
+    (tmp_path / "image.bin").write_bytes(VECTORS + random.Random(23).randbytes(59_984))
     with (
         MockProcess("-t", "bms", *on("vx1"), folder=tmp_path) as mock,
         subprocess.Popen(
@@ -170,7 +171,7 @@ def test_an_interface_that_goes_down_ends_the_upgrade_and_says_what_is_left(tmp_
 def test_ctrl_c_on_a_real_line_ends_cleanly_and_the_device_can_be_flashed_again(
     tmp_path: Path,
 ) -> None:
-    image = random.Random(24).randbytes(6_000)
+    image = VECTORS + random.Random(24).randbytes(5_984)
     (tmp_path / "image.bin").write_bytes(image)
     # A device that waits in its transfer for ever would need a power cycle first.
     impatient = ("--set", "pause_in_transfer=announces", "--set", "transfer_timeout_s=0.5")

@@ -34,6 +34,7 @@ from flasher.protocol.messages import (
 )
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.protocol.wire import Message, Reassembler, encode, split
+from tests.firmware import VECTORS
 
 BOOT = BootVersion("BMS", "V1.2.3")
 SentRow = TypeVar("SentRow", bound=Row | Message)
@@ -41,8 +42,9 @@ SentRow = TypeVar("SentRow", bound=Row | Message)
 
 
 def image_of(size_bytes: int, seed: int = 1) -> Image:
-    """An image of random bytes without a version inside."""
-    return Image.from_bytes(random.Random(seed).randbytes(size_bytes))
+    """An image of random bytes behind a vector table, without a version inside."""
+    data = VECTORS + random.Random(seed).randbytes(size_bytes)
+    return Image.from_bytes(data[:size_bytes])
 
 
 def answer_frames(row: Row, target: Target = BMS) -> list[Frame]:

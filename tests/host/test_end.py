@@ -381,6 +381,21 @@ def test_cancelling_tells_what_state_the_device_is_left_in(reach: str, left: Dev
     assert len(bench.sent) == sent
 
 
+def test_cancelling_lets_the_rest_of_a_message_out_without_gaps() -> None:
+    bench = Bench(options=UpgradeOptions(frame_gap_s=0.08))
+    bench.to_packet(1)
+    bench.say(Ack(1))
+    bench.wait(0.2)
+    cancelled_at = bench.now
+    bench.engine.cancel(bench.now)
+    bench.wait(10.0)
+    assert bench.outcome.ending is Ending.CANCELLED
+    sent_at, packet = bench.sent[-1]
+    assert isinstance(packet, Packet)
+    assert packet.number == 2
+    assert sent_at - cancelled_at < 0.02
+
+
 def test_cancelling_in_the_middle_of_a_message_finishes_the_message() -> None:
     bench = Bench(300)
     bench.to_request()

@@ -24,10 +24,11 @@ from flasher.protocol.contents import RunningInformation, Status, VersionInforma
 from flasher.protocol.fields import Text
 from flasher.protocol.spec import BMS, OBC, WMC
 from flasher.protocol.text import encode_text
+from tests.firmware import VECTORS
 
 NEW, OLD = "V2r0r1_20260102", "V1r0r0_20220512"
-IMAGE = replace(Image.from_bytes(bytes(64) + NEW.encode()), version=NEW)
-NAMELESS = Image.from_bytes(bytes(64))
+IMAGE = replace(Image.from_bytes(VECTORS + bytes(64) + NEW.encode()), version=NEW)
+NAMELESS = Image.from_bytes(VECTORS + bytes(64))
 BATTERY = RunningInformation(40_000, -8, 8000, 9800, 22, 85, Status(0), 98, bytes(4))
 
 
@@ -50,10 +51,10 @@ def verdicts(findings: Iterable[Finding]) -> list[tuple[Check, Verdict]]:
         (NAMELESS, None, Verdict.UNKNOWN),
         (IMAGE, {}, Verdict.PASSED),
         (IMAGE, {"target": WMC}, Verdict.REFUSED),
-        (Image.from_bytes(b"\0BMS_UPD\0"), None, Verdict.PASSED),
-        (Image.from_bytes(b"\0OBC_UPD\0"), None, Verdict.REFUSED),
-        (Image.from_bytes(b"\0OBC_UPD\0"), {}, Verdict.REFUSED),
-        (Image.from_bytes(b"\0OBC_UPD\0BMS_UPD\0"), None, Verdict.PASSED),
+        (Image.from_bytes(VECTORS + b"\0BMS_UPD\0"), None, Verdict.PASSED),
+        (Image.from_bytes(VECTORS + b"\0OBC_UPD\0"), None, Verdict.REFUSED),
+        (Image.from_bytes(VECTORS + b"\0OBC_UPD\0"), {}, Verdict.REFUSED),
+        (Image.from_bytes(VECTORS + b"\0OBC_UPD\0BMS_UPD\0"), None, Verdict.PASSED),
     ],
 )
 def test_the_target_of_an_image(

@@ -50,7 +50,7 @@ def test_an_answer_before_the_packet_has_left_is_none() -> None:
 
 
 def test_a_deadline_in_the_middle_of_a_message_lets_it_end() -> None:
-    bench = Bench(options=UpgradeOptions(timeout_s=2.0, frame_gap_s=0.2))
+    bench = Bench(options=UpgradeOptions(timeout_s=2.0, frame_gap_s=0.08))
     bench.wait(60.0)
     assert bench.outcome.device_left is DeviceLeft.UNTOUCHED
     assert bench.engine.state is State.DONE

@@ -116,14 +116,14 @@ class OnlyFirmware(Content):
     firmware_version: Text = field(TextField(16))  # noqa: RUF009  as in contents
 
 
-def test_a_device_that_does_not_tell_its_hardware_is_not_held_against_the_manifest() -> None:
+def test_a_device_that_does_not_tell_its_hardware_is_refused_as_one_that_does_not_fit() -> None:
     release = release_of(IMAGE, BMS, hardware_versions=["V1r2r0_*"])
     told = Seen(OnlyFirmware(Text(encode_text("V1r0r0_20220512", 16))))
     findings = list(judge_device(IMAGE, BMS, Identity(release), told))
     hardware = next(found for found in findings if found.check is Check.HARDWARE)
-    assert hardware.verdict is Verdict.UNKNOWN
+    assert hardware.verdict is Verdict.REFUSED
     assert "does not tell its hardware" in hardware.text
-    assert hardware.ending is None
+    assert hardware.ending is Ending.UNCHECKED
 
 
 def test_an_up_to_date_device_is_no_error_and_has_an_exit_code_of_its_own() -> None:

@@ -127,7 +127,7 @@ def test_without_a_base_vectors_further_apart_than_the_image_is_long_are_told() 
 def test_a_vector_table_at_an_odd_place_is_told() -> None:
     table = vector_table(image(STACK, BASE + 0x101, base=BASE + 0x10))
     assert table is not None
-    assert table.plausible
+    assert not table.plausible
     assert "cannot stand at 0x08004010" in table.problems[0]
 
 

@@ -17,6 +17,7 @@ from flasher.image import load as load_module
 from flasher.image import records
 from flasher.image.image import Image, Span
 from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, load
+from flasher.image.plausible import check_plausible
 from flasher.protocol.spec import IMAGE_MAX_SIZE
 from flasher.protocol.text import find_firmware_version
 
@@ -36,7 +37,7 @@ FILL = {"fill_gaps_up_to": 1 << 24}
 ENDLESS = {"fill_gaps_up_to": 1 << 32}
 REFUSALS: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
     ("empty.bin", {}, ("is empty",)),
-    ("text.bin", {}, ("is a text", "--format bin")),
+    ("text.bin", {}, ("is a text", "--allow-implausible")),
     ("zip.bin", {}, ("a zip archive",)),
     ("utf_16.bin", {}, ("a text in UTF-16",)),
     ("hex_inside.bin", {}, ("damaged Intel HEX", "check sum is EC, computed EB", "line 2")),
@@ -99,7 +100,7 @@ def test_each_bad_file_is_refused_in_the_words_for_it(
     name: str, options: dict[str, Any], words: tuple[str, ...]
 ) -> None:
     with pytest.raises(ImageError) as caught:
-        load(BAD / name, **options)
+        check_plausible(load(BAD / name, **options))
     assert caught.value.exit_code is ExitCode.IMAGE
     message = str(caught.value)
     assert name in message

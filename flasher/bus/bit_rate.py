@@ -1,0 +1,126 @@
+"""The one bit rate of a bus: what is said, recorded and opened, and where it comes from.
+
+A wrong bit rate disturbs a live bus. So the dialect's holds, unless an option names another one;
+what a variable, a configuration file or the kernel says besides is compared, and refused where it
+differs.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from flasher.bus.inspect_interface import Interface, read_interface
+from flasher.errors import BusError, UsageError
+from flasher.protocol.text import printable
+
+LOWEST_BPS: Final = 5_000
+HIGHEST_BPS: Final = 1_000_000
+"""Of classic CAN."""
+_TOLERANCE: Final = 0.005
+"""A kernel that reaches a bit rate with its own clock tells the one that it reaches."""
+_NAMES: Final = ("timing", "bitrate", "nom_tseg1", "tseg1")
+"""What decides the bit rate in a configuration; python-can makes a timing of the last two."""
+_BY_OPTION: Final = {"bitrate": "-b", "timing": "--timing"}
+
+
+@dataclass(frozen=True)
+class BitRate:
+    """A bit rate in bit/s, and where it comes from, in words."""
+
+    bps: int
+    source: str
+
+    def __str__(self) -> str:
+        return f"{self.bps / 1000:g} kbit/s ({self.source})"
+
+
+def bit_rate(dialect_bps: int, given: Mapping[str, Any], merged: Mapping[str, Any]) -> BitRate:
+    """The bit rate that a bus has, or is opened with.
+
+    `given` are the options, `merged` what they come to with python-can's variables and files.
+    Raises UsageError for a value that is no bit rate, BusError when the bit rate is not the
+    dialect's and no option says so, or when the kernel has set a SocketCAN interface otherwise.
+    """
+    named = named_bit_rate(given, merged)
+    wanted = BitRate(dialect_bps, "the dialect's") if named is None else named
+    is_chosen = any(name in given for name in _NAMES)
+    kernel = _of_kernel(merged)
+    if named is not None and not is_chosen:
+        _refuse_other(named, BitRate(dialect_bps, "the dialect's"), merged)
+    if kernel is not None:
+        _refuse_other(kernel, wanted, merged)
+        return kernel
+    return wanted
+
+
+def named_bit_rate(given: Mapping[str, Any], merged: Mapping[str, Any]) -> BitRate | None:
+    """The bit rate that an option, a variable or a file names; None where none does. Raises
+    UsageError for a value that is no bit rate.
+    """
+    name = next((each for each in ("timing", "bitrate") if each in merged), None)
+    if name is None:
+        return None
+    value = merged[name]
+    source = _BY_OPTION[name] if name in given else _configured_by()
+    if name == "timing":
+        value = getattr(value, "nom_bitrate", None) or value.bitrate
+    if isinstance(value, str) and value.isdigit():
+        value = int(value)
+    if type(value) is not int or not LOWEST_BPS <= value <= HIGHEST_BPS:
+        raise UsageError(
+            f"{printable(str(value))} is no bit rate in bit/s.",
+            where=source,
+            remedy=f"Give one from {LOWEST_BPS} to {HIGHEST_BPS}, as 250000; without one the "
+            "dialect's holds.",
+        )
+    return BitRate(value, source)
+
+
+def _configured_by() -> str:
+    """The variable or file that names a bit rate where no option does."""
+    import can.util  # noqa: PLC0415  slow, and not needed for a mock
+
+    variables = can.util.load_environment_config()
+    if any(name in variables for name in _NAMES):
+        as_json = json.loads(os.environ.get("CAN_CONFIG") or "{}")
+        return "CAN_CONFIG" if any(name in as_json for name in _NAMES) else "CAN_BITRATE"
+    for name in reversed(can.util.CONFIG_FILES):
+        path = Path(name).expanduser()
+        if path.is_file() and any(each in can.util.load_file_config(path) for each in _NAMES):
+            return printable(str(path))
+    return "python-can's configuration"
+
+
+def _of_kernel(merged: Mapping[str, Any]) -> BitRate | None:
+    """The bit rate that the kernel has set a SocketCAN interface to; None where it has, or tells,
+    none.
+    """
+    channel = merged.get("channel")
+    if merged.get("interface") != "socketcan" or not channel:
+        return None
+    seen = read_interface(str(channel))
+    if not isinstance(seen, Interface) or seen.bitrate_bps is None:
+        return None
+    return BitRate(seen.bitrate_bps, f"the kernel's setting of {printable(str(channel))}")
+
+
+def _refuse_other(found: BitRate, wanted: BitRate, merged: Mapping[str, Any]) -> None:
+    if abs(found.bps - wanted.bps) <= wanted.bps * _TOLERANCE:
+        return
+    if found.source.startswith("the kernel"):
+        link = f"ip link set {merged['channel']}"
+        change = f"`{link} down; {link} type can bitrate {wanted.bps}; {link} up` (as root) sets it"
+    else:
+        change = f"take it out of {found.source}"
+    raise BusError(
+        f"The bit rate would be {found}, not {wanted}: nothing was opened.",
+        where=f"interface {merged.get('interface')}, channel {merged.get('channel')}",
+        cause="another bit rate than that of the bus disturbs everybody on it",
+        remedy=f"If the bus runs at {wanted.bps} bit/s: {change}. If it runs at {found.bps}: "
+        f"-b {found.bps}.",
+    )

@@ -1,0 +1,157 @@
+"""Whether the bytes of an image can be a program for the device, before anybody sends them.
+
+Two degrees of doubt: what is certainly something else (another kind of file, a text, one byte again
+and again, a program for another processor), and what has no plausible Cortex-M vector table. The
+second may still be right: the documents name no processor, and an image may be encrypted.
+"""
+
+from __future__ import annotations
+
+import codecs
+import re
+from enum import Enum
+from typing import Final, NamedTuple
+
+from flasher.errors import ImageError
+from flasher.image.cortexm import vector_table
+from flasher.image.elf import EM_ARM, machine_name
+from flasher.image.image import Image
+
+_MAGICS: Final = {
+    b"PK\x03\x04": "a zip archive",
+    b"PK\x05\x06": "a zip archive",
+    b"\x1f\x8b\x08": "a gzip file",
+    b"BZh": "a bzip2 file",
+    b"\xfd7zXZ\0": "an xz file",
+    b"\x28\xb5\x2f\xfd": "a zstd file",
+    b"7z\xbc\xaf\x27\x1c": "a 7-Zip archive",
+    b"Rar!\x1a\x07": "a RAR archive",
+    b"!<arch>\n": "a library of object files",
+    b"\x89PNG\r\n\x1a\n": "a PNG picture",
+    b"\xff\xd8\xff": "a JPEG picture",
+    b"GIF8": "a GIF picture",
+    b"%PDF": "a PDF document",
+    b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1": "an Office document",
+    b"SQLite format 3\0": "an SQLite database",
+    b"UF2\n": "a UF2 file",
+    b"DfuSe": "a DfuSe file",
+    b"\x7fELF": "an ELF file read as a raw binary",
+    b"\xca\xfe\xba\xbe": "a Java class or a Mach-O program",
+    b"\xcf\xfa\xed\xfe": "a Mach-O program",
+    b"\xce\xfa\xed\xfe": "a Mach-O program",
+    b"LOGG": "a BLF trace",
+    b"MDF     ": "an MDF trace",
+}
+_TAR: Final = (257, b"ustar")
+_PE_HEADER_AT: Final = 0x3C
+_HTML: Final = re.compile(rb"\s*(<!--|<!doctype|<html|<head|<body)", re.IGNORECASE)
+_XML: Final = re.compile(rb"\s*<\?xml")
+_UTF_16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_UTF_16_JUDGED: Final = 64
+_CONTROLS: Final = bytes(byte for byte in range(0x20) if byte not in b"\t\n\v\f\r\x1b") + b"\x7f"
+_OTHER_ENCODING_SIZE: Final = 256
+"""So many bytes without one control character are a text in some encoding; of random bytes one in
+10^13 such runs has none."""
+UNLIKELY: Final = "the wrong file, an encrypted image, a header in front, or another processor"
+"""What an image without a vector table may be."""
+_OTHER_WAYS: Final = (
+    ", as does a manifest of these very bytes (flasher manifest create --allow-implausible), or "
+    'cpu = "other" in the target\'s profile'
+)
+
+
+class Cpu(Enum):
+    """The kinds of processor that a profile can name; the value is its word there."""
+
+    CORTEX_M = "cortex-m"
+    OTHER = "other"
+
+
+class Doubt(NamedTuple):
+    """Why an image is hardly a program for the device: `text` completes "the image ...".
+
+    `is_certain`: it is something else by its own marks, and no profile or manifest makes it a
+    program; `ways` are what lets it through beside the option --allow-implausible.
+    """
+
+    text: str
+    is_certain: bool
+
+    @property
+    def ways(self) -> str:
+        return "" if self.is_certain else _OTHER_WAYS
+
+
+def doubt(image: Image) -> Doubt | None:
+    """What speaks against an image being a program for the device; None when nothing does."""
+    foreign = _foreign(image)
+    if foreign is not None:
+        return Doubt(f"is {foreign}", is_certain=True)
+    table = vector_table(image)
+    if table is None:
+        return Doubt("is too short to begin with a vector table", is_certain=False)
+    if table.plausible:
+        return None
+    problems = "; ".join(table.problems)
+    return Doubt(f"begins with no Cortex-M vector table: {problems}", is_certain=False)
+
+
+def check_plausible(image: Image) -> None:
+    """Raise ImageError when there is a doubt, for commands that know no manifest or profile."""
+    found = doubt(image)
+    if found is not None:
+        raise ImageError(
+            f"{image.source} {found.text}: not plausible as firmware.",
+            cause="the wrong file" if found.is_certain else UNLIKELY,
+            remedy="Name the firmware file itself; if these really are the bytes to send, say so "
+            "with --allow-implausible.",
+        )
+
+
+def _foreign(image: Image) -> str | None:
+    """What an image certainly is instead of a program for the device."""
+    data = image.data
+    if image.elf_machine not in (None, EM_ARM):
+        return f"a program for another processor ({machine_name(image.elf_machine)})"
+    if len(data) > 1 and data.count(data[:1]) == len(data):
+        return f"one byte again and again (0x{data[0]:02X})"
+    for magic, name in _MAGICS.items():
+        if data.startswith(magic):
+            return name
+    at, mark = _TAR
+    if data[at : at + len(mark)] == mark:
+        return "a tar archive"
+    if data.startswith(b"MZ") and _is_pe(data):
+        return "a Windows program"
+    return _text(data)
+
+
+def _is_pe(data: bytes) -> bool:
+    at = int.from_bytes(data[_PE_HEADER_AT : _PE_HEADER_AT + 4], "little")
+    return data[at : at + 4] == b"PE\0\0"
+
+
+def _text(data: bytes) -> str | None:
+    if _HTML.match(data):
+        return "an HTML page"
+    if _XML.match(data):
+        return "an XML document"
+    if data.startswith(_UTF_16):
+        if data[:_UTF_16_JUDGED].decode("utf-16", "ignore").isascii():
+            return "a text in UTF-16"
+        return None
+    # Texts are found in flash memories too, and a flash memory is filled up with FF or 00.
+    body = data.rstrip(b"\0\xff")
+    if not body or body.translate(None, _CONTROLS) != body:
+        return None
+    if _is_utf_8(body):
+        return "a text"
+    return "a text" if len(body) >= _OTHER_ENCODING_SIZE and b"\n" in body else None
+
+
+def _is_utf_8(data: bytes) -> bool:
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return True
