@@ -72,8 +72,9 @@ def open_adapter(
 
     `default_bitrate_bps` is the dialect's, and what holds unless `config` itself names another bit
     rate. As `holder` it is locked until it is closed (`lock.hold`). `listen_only` keeps the adapter
-    from acknowledging, where its back end can be told (`opening.can_listen_only`). Raises UsageError
-    for an interface that python-can does not know or a value that is no bit rate, BusError when the
+    from acknowledging, where its back end can be told (`opening.can_listen_only`).
+
+    Raises UsageError for an interface that python-can does not know or a value that is no bit rate, BusError when the
     bit rate is another one, the adapter cannot be opened, or somebody else holds it.
     """
     merged = bus_config(config, listen_only=listen_only)

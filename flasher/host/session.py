@@ -288,7 +288,7 @@ class Session:
         match self._stage:
             case _ if self.done:
                 return
-            case Upgrade(is_told_to_update=True) | Check() if foreign.is_harmless:
+            case Upgrade(has_begun_to_erase=True) | Check() if foreign.is_harmless:
                 # It writes nothing, CRC and repetition protect the data: to end here would leave a
                 # device without an application.
                 if foreign.query is not None:
