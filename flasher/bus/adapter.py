@@ -74,8 +74,8 @@ def open_adapter(
     rate. As `holder` it is locked until it is closed (`lock.hold`). `listen_only` keeps the adapter
     from acknowledging, where its back end can be told (`opening.can_listen_only`).
 
-    Raises UsageError for an interface that python-can does not know or a value that is no bit rate, BusError when the
-    bit rate is another one, the adapter cannot be opened, or somebody else holds it.
+    Raises UsageError for an interface that python-can does not know or a value that is no bit rate,
+    BusError when the bit rate is another one, the adapter cannot be opened, or somebody holds it.
     """
     merged = bus_config(config, listen_only=listen_only)
     rate = bit_rate(default_bitrate_bps, config, merged)
