@@ -24,6 +24,7 @@ from flasher.errors import ExitCode
 from flasher.protocol.frame import Frame
 from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment, run_flasher
 from tests.end_to_end.stage import SMALL, Speaker, Stage, image_of
+from tests.firmware import VECTORS
 from tests.end_to_end.stranger import QUERY, Stranger
 from tests.end_to_end.test_processes import GROUP, free_port
 
@@ -42,7 +43,7 @@ ASKS_EVERY_S: Final = 0.2
 
 def beside_processes(folder: Path, seed: int, counts: Counter[str]) -> str:
     """One flash among processes; returns what went wrong, or nothing."""
-    image = random.Random(seed).randbytes(SIZE_BYTES)
+    image = VECTORS + random.Random(seed).randbytes(SIZE_BYTES - len(VECTORS))
     (folder / "image.bin").write_bytes(image)
     options = ("--bus-kwargs", "hop_limit=0", f"port={free_port()}")
     bus = ("-i", "udp_multicast", "-c", GROUP, *options)

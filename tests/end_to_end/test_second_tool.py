@@ -12,13 +12,14 @@ from tests.cli.conftest import Flasher
 from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment
 from tests.end_to_end.stranger import Stranger
 from tests.end_to_end.test_processes import GROUP, bus, free_port
+from tests.firmware import VECTORS
 
 __all__ = ["GROUP", "bus", "free_port"]  # `bus` is a fixture
 
 flasher = conftest.flasher
 """The fixture, for the tests here too."""
 
-IMAGE = random.Random(41).randbytes(120 * 128 - 5)
+IMAGE = VECTORS + random.Random(41).randbytes(120 * 128 - 21)
 SLOW = ("--packet-gap", "0.02")
 """So that the others have their time."""
 

@@ -184,7 +184,7 @@ IMAGES = (
         content(
             elf([(0, 0x0800_0000, IMAGE_MAX)], [(n, IMAGE_MAX - n) for n in range(4096)], IMAGE_MAX)
         ),
-        "image-info FILE",
+        "image-info --allow-implausible FILE",
         0,
         "8,388,480",
     ),
