@@ -24,9 +24,9 @@ from flasher.errors import ExitCode
 from flasher.protocol.frame import Frame
 from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment, run_flasher
 from tests.end_to_end.stage import SMALL, Speaker, Stage, image_of
-from tests.firmware import VECTORS
 from tests.end_to_end.stranger import QUERY, Stranger
 from tests.end_to_end.test_processes import GROUP, free_port
+from tests.firmware import VECTORS
 
 SIZE_BYTES: Final = 400 * 1024
 COMMANDS: Final = {
