@@ -158,6 +158,7 @@ class Socket:
             self.own, self.is_own_known = what.serial, is_serial
         is_new = self._is_new(before) or bool(what.label)
         if is_new:
+            self._forget_note()
             self.borne = what.label
         return is_new
 
@@ -177,12 +178,18 @@ class Socket:
         self.last = replace(last, has_talked=True)
         return False
 
+    def _forget_note(self) -> None:
+        """What was wrong with its label was said of the unit that was there."""
+        if self.phase is Phase.REST:
+            self.note = ""
+
     def fall_silent(self, *, is_certain: bool) -> bool:
         """Nothing is heard any more, or nothing is in it for certain. True when a unit was."""
         before = self.seen
         is_out = is_certain or self.is_own_known or before is Seen.EMPTY
         self.seen = Seen.EMPTY if is_out else Seen.SILENT
         self.own, self.is_own_known, self.borne = None, False, ""
+        self._forget_note()
         if is_certain:
             self.last = None
         return before is Seen.THERE

@@ -171,11 +171,13 @@ class Operator:
             place.state, place.serial, place.text, place.tries = "starting", "", "", 0
             place.changed_at = time.monotonic()
 
-    def work(self, over: Callable[[], bool], *, bring_units: bool = True) -> None:
-        """Work until `over` says so, or the station is gone."""
+    def work(
+        self, over: Callable[[], bool], *, bring_units: bool = True, scans: bool = True
+    ) -> None:
+        """Work until `over` says so, or the station is gone; without `scans` only look on."""
         while not over() and self._is_there():
             self._read(_TURN_S)
-            for place in self.places.values():
+            for place in self.places.values() if scans else ():
                 self._look_after(place, over, bring_units=bring_units)
                 if over():
                     return

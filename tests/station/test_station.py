@@ -436,6 +436,10 @@ def test_a_unit_that_passed_before_is_refused_by_the_records(line: LineBench) ->
     refused = line.last(ScanRefused)
     assert (refused.code, refused.socket) == ("DUPLICATE", "A")
     assert line.state("A") is SocketState.SCAN
+    assert line.text("A") == f"{refused.reason} {refused.remedy}"
+    line.fall_silent("A")
+    line.arrive("A")
+    assert line.text("A") == "Scan the label of the unit and SOCKET A.", "it was said of another"
     line.scan("SOCKET A")
     line.scan(OTHER)
     assert line.state("A") is SocketState.RUNNING
