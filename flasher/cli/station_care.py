@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from typing import Final
 
@@ -21,7 +22,7 @@ from flasher.cli.station_records import open_to_read, records_of
 from flasher.cli.station_setup import operator_of
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.text import printable
-from flasher.station.records import Examination, Store
+from flasher.station.records import Examination, Problem, Store
 from flasher.station.records.keys import fingerprint
 from flasher.station.records.migration import migrate
 
@@ -86,8 +87,8 @@ def _backup(options: argparse.Namespace, output: Output, store: Store) -> int:
 
 def _verify(output: Output, store: Store) -> int:
     found = store.examine()
-    for each in found.problems:
-        output.result(f"{printable(each.where)}: {printable(each.what)}")
+    for line in _problem_lines(found.problems):
+        output.result(printable(line))
     for line in found.remarks:
         output.progress(f"note: {printable(line)}")
     if found.problems:
@@ -110,6 +111,23 @@ def _verify(output: Output, store: Store) -> int:
     )
     output.document(document, exit_code=code)
     return code
+
+
+def _problem_lines(problems: Sequence[Problem]) -> Iterator[str]:
+    """A line for each problem; many of the schema with one cause share one, and come first, so
+    that they hide nothing.
+    """
+    schema, others = "schema, ", []
+    alike: dict[str, list[str]] = {}
+    for each in problems:
+        if each.where.startswith(schema):
+            alike.setdefault(each.what, []).append(each.where.removeprefix(schema))
+        else:
+            others.append(f"{each.where}: {each.what}")
+    for what, names in alike.items():
+        shown = f"{names[0]}, {names[1]} and {len(names) - 2} more" if len(names) > 3 else None
+        yield f"schema, {shown or ', '.join(names)}: {what}"
+    yield from others
 
 
 def _say_what_was_checked(found: Examination, output: Output) -> None:

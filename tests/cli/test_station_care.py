@@ -147,3 +147,19 @@ def test_records_of_version_1_are_read_after_migration(
     assert Path(done.document["backup"]).is_file()
     assert "PASS" in flasher("station", "unit", SERIAL, *place).out
     assert flasher("station", "migrate", *place).code == ExitCode.USAGE
+
+
+def test_rules_that_were_taken_away_hide_nothing_else(
+    flasher: Flasher, bench: Bench, place: tuple[str, ...]
+) -> None:
+    with closing(sqlite3.connect(bench.path)) as db:
+        rules = db.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall()
+        for (name,) in rules:
+            db.execute(f"DROP TRIGGER {name}")
+        db.execute("UPDATE operator SET name = 'somebody'")
+        db.commit()
+    run = flasher("station", "verify", *place)
+    schema, operator, count = run.out.splitlines()
+    assert schema.endswith(f"and {len(rules) - 2} more: it was taken away")
+    assert operator == "operator of run 1, 2: changed after it was recorded: the operator's name"
+    assert count == f"{len(rules) + 1} problems"
