@@ -112,10 +112,16 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Ve
     return Verdict("OK", text + took, "green" if is_sure else "yellow")
 
 
+_LINE_MAX: Final = 120
+"""Of what failed: a remark in brackets stands in the error alone where it makes more of it."""
+
+
 def failed(error: FlasherError, more: str = "") -> Verdict:
     """The last line of an upgrade that was not. The error itself is told in full above it."""
     word = "STOPPED" if isinstance(error, InterruptedByUserError) else "FAILED"
     what = error.what.partition(" (" if more else ". ")[0].removesuffix(".")
+    if len(what) > _LINE_MAX:
+        what = what.partition(" (")[0]
     if error.needs_rescue and not more:
         more = "; it has no application now, or perhaps none"
     return Verdict(word, what + more, "red")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import re
 from pathlib import Path
 
@@ -88,6 +89,15 @@ def test_a_bad_end_is_red_and_the_last_line_whatever_came_before(
     assert run.err.splitlines()[-1].startswith(line)
     assert run.err.count("FAILED") == 1
     assert bool(run.out) == bool(form)
+
+
+def test_what_makes_the_last_line_long_stands_in_the_error_alone(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    (tmp_path / "noise.bin").write_bytes(random.Random(1).randbytes(3000))
+    run = flasher("flash", tmp_path / "noise.bin", "-t", "bms", *MOCK)
+    assert run.err.splitlines()[-1] == "FAILED  BMS: not plausible as firmware"
+    assert "--allow-implausible" in run.err
 
 
 def test_figures_of_the_line_and_passed_checks_are_told_with_v_and_in_json(
