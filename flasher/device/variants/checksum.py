@@ -118,6 +118,6 @@ VARIANTS: Final = (
         "CR-04",
         "sends general feedback with a little-endian CRC",
         FeedbackCrcMirrored,
-        also=("RS-01", "UP-03"),
+        also=("RS-01", "RS-04", "UP-03"),
     ),
 )
