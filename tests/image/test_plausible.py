@@ -62,6 +62,12 @@ def test_an_elf_of_another_machine_is_no_firmware_whatever_it_begins_with(tmp_pa
     assert found.is_certain
 
 
+def test_two_bytes_as_a_mark_of_utf_16_make_no_text() -> None:
+    found = doubt(Image.from_bytes(b"\xff\xfe" + random.Random(2).randbytes(500)))
+    assert found is not None
+    assert not found.is_certain, "an encrypted image may begin with any two bytes"
+
+
 def test_no_random_bytes_begin_like_a_program() -> None:
     """One word alone would let one in fifty pass."""
     for seed in range(2000):
