@@ -314,7 +314,8 @@ class Station:
                         self.supervisor.send(socket, Abort())
                     case line.Resume(sockets):
                         saved = [self._save(socket) for socket in sockets]  # every one is tried
-                        self.line.resumed(self._now, all_saved=all(saved))
+                        all_saved = self._end_unknown() and all(saved)
+                        self.line.resumed(self._now, all_saved=all_saved)
                     case line.Audit(what, data):
                         self._audit(what, data)
 
@@ -355,6 +356,16 @@ class Station:
             socket = self.line.sockets.get(run.socket)
             if socket is not None:
                 socket.interrupted = run.serial
+
+    def _end_unknown(self) -> bool:
+        """End runs whose claim was saved although it seemed lost; False when that is not saved."""
+        known = {run.claim.run_id for run in self._runs.values()}
+        try:
+            self._find_interrupted(self.store.end_unknown(known))
+        except RecordError as error:
+            self._not_saved("", "", None, error)
+            return False
+        return True
 
     def _audit(self, what: AuditEvent, data: Mapping[str, str]) -> None:
         try:

@@ -563,6 +563,31 @@ def test_a_claim_that_cannot_be_saved_begins_nothing(line: LineBench, bench: Ben
     assert line.state("A") is SocketState.STOPPED
 
 
+def test_a_claim_that_was_saved_although_it_seemed_lost_keeps_no_unit_from_being_run(
+    line: LineBench, bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server that ends the connection in the very commit."""
+    real = bench.store.claim
+
+    def claim(*args: Any, **kwargs: Any) -> None:
+        real(*args, **kwargs)
+        raise RecordsLockedError("RECORD NOT SAVED: the server is gone.", remedy="Wait for it.")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(bench.store, "claim", claim)
+        line.scan(SERIAL)
+        line.arrive("A")
+    assert line.of(RunStarted) == []
+    assert line.station.is_line_stopped
+    line.scan("RESUME")
+    line.scan(SERIAL)
+    line.scan("SOCKET A")
+    assert line.order("A").order.kind is RunKind.RECHECK
+    line.work("A")
+    line.end("A")
+    assert line.last(RunEnded).outcome is RunState.PASS
+
+
 def test_a_trace_that_is_not_what_was_written_is_no_pass(line: LineBench) -> None:
     line.scan(SERIAL)
     line.arrive("A")

@@ -163,8 +163,15 @@ class Store:
         Raises StationBusyError; KeyMissingError, RecordsCutError; another RecordError.
         """
         self.become_station()
+        self.files.sweep(self._clock.utc())
+        return self.end_unknown(())
+
+    def end_unknown(self, known: Collection[RunId]) -> tuple[RunId, ...]:
+        """End runs of this station that go on in the records and are none of the `known` ones: a
+        dead station left them, or their claim was saved although it seemed lost. They become
+        INTERRUPTED. Raises RecordError.
+        """
         now = self._clock.utc()
-        self.files.sweep(now)
         with self.signer.writing() as trail:
             left = trail.connection.execute(
                 select(schema.run.c.id)
@@ -176,7 +183,7 @@ class Store:
                 )
                 .order_by(schema.run.c.id)
             ).scalars()
-            found = tuple(RunId(run_id) for run_id in left)
+            found = tuple(RunId(run_id) for run_id in left if run_id not in known)
             for run_id in found:
                 add_attachments(trail.connection, run_id, self.files.add_spooled(run_id))
                 end_run(
