@@ -208,11 +208,6 @@ class Line:
         self._reasons: dict[str, str] = {}
         """Of labels: sockets that begin in between must not take each other's."""
 
-    @property
-    def waiting_label(self) -> str:
-        """The label that waits for the card of its socket; empty where none does."""
-        return self._label
-
     def take(self) -> list[Effect]:
         """What is to be done now; asked again after each effect that was answered."""
         effects, self._effects = self._effects, []

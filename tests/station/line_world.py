@@ -345,7 +345,7 @@ class Operator:
         """What the screen still wants is not what comes next."""
         world = self.world
         wants = any("in this socket" in shown.text for shown in world.shown.values())
-        if world.line.waiting_label or wants:
+        if world.line._label or wants:
             world.scan("CANCEL")
 
     def runs(self, unit: Unit) -> bool:

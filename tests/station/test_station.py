@@ -563,6 +563,24 @@ def test_a_claim_that_cannot_be_saved_begins_nothing(line: LineBench, bench: Ben
     assert line.state("A") is SocketState.STOPPED
 
 
+def test_what_cannot_be_audited_stops_the_line_once_and_resume_says_the_truth(
+    line: LineBench, bench: Bench
+) -> None:
+    other = hold(bench)
+    line.scan("HELLO")
+    assert line.of(RecordNotSaved)
+    assert len(line.of(LineStopped)) == 1
+    line.scan("RESUME")
+    assert line.last(ScanRefused).code == "STILL_NOT_SAVED"
+    assert line.of(LineResumed) == []
+    other.close()
+    line.scan("RESUME")
+    assert len(line.of(LineResumed)) == 1
+    line.scan(SERIAL)
+    line.arrive("A")
+    assert line.state("A") is SocketState.RUNNING
+
+
 def test_a_claim_that_was_saved_although_it_seemed_lost_keeps_no_unit_from_being_run(
     line: LineBench, bench: Bench, monkeypatch: pytest.MonkeyPatch
 ) -> None:
