@@ -11,10 +11,15 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Final
 
+from flasher.files import opened, parse_json
 from flasher.protocol.text import printable
-from flasher.station.records.errors import mapped
+from flasher.station.records.errors import RecordError, mapped
 from flasher.station.records.files import sync_folder
+
+MAX_SIZE: Final = 256 * 1024 * 1024
+"""In bytes: some 200,000 units."""
 
 
 @dataclass(frozen=True)
@@ -60,19 +65,20 @@ class HeadsFile:
 
     def read(self) -> tuple[Head | int, ...]:
         """The heads in the order in which they were kept; in place of a line that is no head its
-        number, from 1. Empty without a file. Raises RecordError.
+        number, from 1. Empty without a file. Raises RecordError, UsageError for what is no file.
         """
         if not self.path.exists():
             return ()
-        with mapped(printable(str(self.path)), writes=False):
-            lines = self.path.read_bytes().splitlines()
+        # A station may add to it meanwhile.
+        with opened(self.path, MAX_SIZE, error=RecordError, may_grow=True) as (file, size):
+            lines = file.read(size).splitlines()
         return tuple(_heads(lines))
 
 
 def _heads(lines: list[bytes]) -> Iterator[Head | int]:
     for number, line in enumerate(lines, 1):
         try:
-            head = Head(**json.loads(line))
+            head = Head(**parse_json(line))
         except (ValueError, TypeError):
             yield number
         else:

@@ -22,10 +22,13 @@ from cryptography.hazmat.primitives.serialization import (
 )
 from platformdirs import user_data_path
 
+from flasher.files import read
 from flasher.protocol.text import printable
-from flasher.station.records.errors import KeyMissingError, mapped
+from flasher.station.records.errors import KeyMissingError, RecordError, mapped
 from flasher.station.records.files import sync_folder
 
+MAX_SIZE: Final = 64 * 1024
+"""In bytes."""
 _MODE: Final = 0o600
 _CONTEXT: Final = b"flasher station audit row "
 """What is signed says what it is, so that no signature can stand for something else."""
@@ -84,7 +87,8 @@ class SigningKey:
     @classmethod
     def load(cls, path: Path) -> SigningKey | None:
         """The key in a file; None when there is no file. Raises KeyMissingError for a file that is
-        no key or that others may read, RecordError for one that cannot be read.
+        no key or that others may read, RecordError for one that cannot be read, UsageError for what
+        is no file.
         """
         shown = printable(str(path))
         if not path.exists():
@@ -97,7 +101,7 @@ class SigningKey:
                         where=shown,
                         remedy=f"chmod 600 {shown}",
                     )
-                data = path.read_bytes()
+            data = read(path, MAX_SIZE, error=RecordError)
             key = load_pem_private_key(data, password=None)
         except (ValueError, TypeError, UnsupportedAlgorithm) as error:
             raise _no_key(shown) from error

@@ -24,6 +24,7 @@ from flasher.station.records import (
     SchemaVersionError,
     Store,
 )
+from flasher.station.records.heads import HeadsFile
 from flasher.station.records.keys import SigningKey
 from flasher.station.records.migration import migrate
 from flasher.station.records.model import TORN_TRACE, TRACE
@@ -323,3 +324,16 @@ def test_what_was_wrong_with_records_of_version_1_is_said_and_stays_said(old: Pa
     with Store.open(str(old), station="x", read_only=True, keeping=keeping) as store:
         assert any(problem in each.what for each in store.verify())
         assert store.read.units("W2605003")[0].runs[0].run.state is RunState.FAIL
+
+
+def test_what_is_no_file_in_place_of_key_or_heads_is_never_waited_for(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe", 0o600)
+    with pytest.raises(UsageError, match="no regular file"):
+        HeadsFile(tmp_path / "pipe").read()
+    with pytest.raises(UsageError, match="no regular file"):
+        SigningKey.load(tmp_path / "pipe")
+
+
+def test_a_line_without_end_in_the_heads_is_told_by_its_number(tmp_path: Path) -> None:
+    (tmp_path / "heads").write_bytes(b"[" * 100_000 + b"\n{}\n")
+    assert HeadsFile(tmp_path / "heads").read() == (1, 2)
