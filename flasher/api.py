@@ -16,9 +16,6 @@ from flasher import service
 from flasher.bus.bit_rate import BitRate
 from flasher.bus.link import Clock, Link, MonotonicClock, PacedClock, VirtualClock
 from flasher.bus.simulated import SimulatedBus
-from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile, set_option
-from flasher.device.system import System
 from flasher.driver import Tap
 from flasher.errors import FlasherError, UsageError
 from flasher.flashing import run_session
@@ -34,6 +31,9 @@ from flasher.image.load import load
 from flasher.image.manifest import Release, find_release
 from flasher.image.plan import Plan, plan
 from flasher.log import log_event
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile, set_option
+from flasher.mock.system import System
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import DIALECTS, TARGETS, Dialect, Target, find_target
 
@@ -129,7 +129,9 @@ def connect_mock(
     if system:
         bus.attach(System(chosen, node, profile=own, has_application=has_application), on_event)
     else:
-        device = Device(node, bitrate_bps=bitrate_bps, profile=own, has_application=has_application)
+        device = MockDevice(
+            node, bitrate_bps=bitrate_bps, profile=own, has_application=has_application
+        )
         bus.attach(device, on_event)
     rate = BitRate(bitrate_bps, "the dialect's")
     yield Connection(bus.link(), clock, "the built-in mock", rate)

@@ -17,7 +17,7 @@ from flasher.protocol.text import printable
 
 ROOT: Final = "flasher"
 _HOST: Final = logging.getLogger("flasher.host")
-_DEVICE: Final = logging.getLogger("flasher.device")
+_DEVICE: Final = logging.getLogger("flasher.mock")
 _INFO: Final = frozenset(
     {
         events.PhaseEntered,

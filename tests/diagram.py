@@ -13,9 +13,9 @@ from enum import Enum
 from pathlib import Path
 from typing import Any, Final
 
-from flasher.device import table as device
 from flasher.host import table as host
 from flasher.host.table import Ending
+from flasher.mock import table as device
 
 _ROOT: Final = Path(__file__).parents[1]
 UPGRADE: Final = _ROOT / "docs" / "upgrade.md"
@@ -73,7 +73,7 @@ def states_document() -> str:
             _INTRODUCTION,
             "## The host: `flasher/host/table.py`\n",
             diagram(host.TABLE, host.State.RESETTING),
-            "## The device model: `flasher/device/table.py`\n",
+            "## The device model: `flasher/mock/table.py`\n",
             diagram(device.TABLE, device.State.APPLICATION),
         ]
     )

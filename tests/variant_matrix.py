@@ -23,7 +23,7 @@ from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock,
 from flasher.conformance.model import CASES, Status
 from flasher.conformance.runner import run
 from flasher.conformance.selection import Selection, in_order
-from flasher.device.variants import VARIANTS, Variant
+from flasher.mock.variants import VARIANTS, Variant
 
 PATH: Final = Path(__file__).parents[1] / "docs" / "variants.md"
 TARGET: Final = "bms"

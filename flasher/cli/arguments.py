@@ -11,11 +11,11 @@ from typing import Any, Final
 from flasher.api import Connection, as_dialect, as_target, connect, connect_mock
 from flasher.api import bit_rate as settle_bit_rate
 from flasher.bus.bit_rate import BitRate
-from flasher.device.profile import DeviceProfile
 from flasher.errors import UsageError
 from flasher.host.options import FRAME_GAP_SHARE, PACKET_GAP_MAX_S
 from flasher.image.image import Image
 from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, FORMATS, load
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import DIALECTS, TARGET_ALIASES, TARGETS, WELLING, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
 

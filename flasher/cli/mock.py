@@ -13,13 +13,13 @@ from flasher.cli.documents import to_json
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.output import Output, byte_count
 from flasher.cli.stop import stop_on_signal
-from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile, describe_options, set_option
-from flasher.device.system import System
-from flasher.device.variants import VARIANTS, find, make
 from flasher.driver import drive
 from flasher.errors import ExitCode, UsageError
 from flasher.log import BY_DEVICE, log_event
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile, describe_options, set_option
+from flasher.mock.system import System
+from flasher.mock.variants import VARIANTS, find, make
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import Dialect, Target
@@ -173,7 +173,7 @@ def run(options: argparse.Namespace, output: Output) -> int:
 
 def _served(
     options: argparse.Namespace, dialect: Dialect, profile: DeviceProfile
-) -> tuple[Engine, Device]:
+) -> tuple[Engine, MockDevice]:
     """What is put on the bus, and the device of it that is watched."""
     has_application = not options.no_app
     if options.system:
@@ -184,7 +184,7 @@ def _served(
             )
         system = System(dialect, options.target, profile=profile, has_application=has_application)
         return system, system.device
-    build = Device if options.variant is None else partial(make, options.variant)
+    build = MockDevice if options.variant is None else partial(make, options.variant)
     device = build(
         options.target,
         bitrate_bps=dialect.bitrate_bps,
@@ -240,7 +240,7 @@ class _Tool:
 class _Watcher:
     """Prints what the device model sees, and saves what it received."""
 
-    def __init__(self, device: Device, save_to: str | None, output: Output) -> None:
+    def __init__(self, device: MockDevice, save_to: str | None, output: Output) -> None:
         self._device = device
         self._save_to = save_to
         self._output = output

@@ -18,11 +18,11 @@ from flasher.conformance.model import DeviceCrashed, Unsupported
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.subject import Arrival
 from flasher.conformance.wire import RawFrame
-from flasher.device.faults import FaultInjector, InOperation, PowerCut
-from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile
-from flasher.device.variants import find, make
 from flasher.errors import BusError, FlasherError
+from flasher.mock.faults import FaultInjector, InOperation, PowerCut
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
+from flasher.mock.variants import find, make
 from flasher.protocol.bittime import frame_bits
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
@@ -168,7 +168,7 @@ class MockSubject:
         target: str = "bms",
         *,
         profile: DeviceProfile = MOCK_PROFILE,
-        make_device: Callable[[str, DeviceProfile], Device] | None = None,
+        make_device: Callable[[str, DeviceProfile], MockDevice] | None = None,
         others: Sequence[Engine] = (),
         name: str = "the built-in mock",
         good_image: bytes = GOOD_IMAGE,
@@ -212,18 +212,18 @@ class MockSubject:
         self.device.bus_off(self.port.now(), for_s)
 
 
-def plain_device(target: str, profile: DeviceProfile) -> Device:
+def plain_device(target: str, profile: DeviceProfile) -> MockDevice:
     """The device model as it is. Raises Unsupported for a target that does not exist."""
     if target not in TARGETS:
         raise Unsupported(f"there is no target {target}")
-    return Device(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
+    return MockDevice(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
 
 
-def variant_maker(name: str) -> Callable[[str, DeviceProfile], Device]:
+def variant_maker(name: str) -> Callable[[str, DeviceProfile], MockDevice]:
     """What makes a deliberately wrong device. Raises UsageError for a name that is none."""
     variant = find(name)
 
-    def make_variant(target: str, profile: DeviceProfile) -> Device:
+    def make_variant(target: str, profile: DeviceProfile) -> MockDevice:
         return make(variant, TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
 
     return make_variant

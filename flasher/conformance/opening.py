@@ -19,10 +19,10 @@ from flasher.conformance.real import (
     RealSubject,
 )
 from flasher.conformance.subject import Subject
-from flasher.device.profile import DeviceProfile, set_option
 from flasher.errors import UsageError
 from flasher.image.load import load
 from flasher.image.plausible import check_plausible
+from flasher.mock.profile import DeviceProfile, set_option
 from flasher.protocol.spec import WELLING
 from flasher.protocol.text import printable
 

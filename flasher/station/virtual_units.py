@@ -16,10 +16,10 @@ from typing import Final
 from flasher.api import Connection
 from flasher.bus.link import Clock, PacedClock, VirtualClock
 from flasher.bus.simulated import SimulatedBus
-from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile
 from flasher.errors import UsageError
 from flasher.image.release import Release
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import IMAGE_MAX_SIZE, VERSION_FIELD_SIZE, Dialect, Target
 from flasher.protocol.text import encode_text
@@ -93,11 +93,11 @@ class Place:
     """Where one target of a unit sits: an engine, which is a device or nothing."""
 
     def __init__(self) -> None:
-        self.device: Device | None = None
+        self.device: MockDevice | None = None
         self._power_at: float | None = None
         """When the power comes back."""
 
-    def put(self, device: Device, now: float) -> None:
+    def put(self, device: MockDevice, now: float) -> None:
         """Put a device in. Its power comes with the socket: it passes through its bootloader."""
         self.device = device
         device.power_cut(now)
@@ -245,7 +245,7 @@ class VirtualSocket:
 
 def make_device(
     target: Target, dialect: Dialect, health: Health, release: Release, serial_number: str
-) -> Device:
+) -> MockDevice:
     """A device as it comes to the end of the line, with an older application."""
     profile = DeviceProfile(
         dialect=dialect.name,  # type: ignore[arg-type]
@@ -258,7 +258,7 @@ def make_device(
     if health is Health.REFUSES:
         # Its product wants a checksum in the image, which this image does not have.
         profile = replace(profile, image_checksum="crc32")
-    return Device(target, bitrate_bps=dialect.bitrate_bps, profile=profile)
+    return MockDevice(target, bitrate_bps=dialect.bitrate_bps, profile=profile)
 
 
 def _hardware(release: Release, health: Health) -> str:

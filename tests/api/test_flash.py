@@ -21,10 +21,10 @@ from flasher import api, errors, events
 from flasher.bus.health import HealthKeeper, LinkHealth
 from flasher.bus.link import MonotonicClock, VirtualClock
 from flasher.bus.simulated import Disturbance, SimulatedBus
-from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile
 from flasher.errors import BusError, ExitCode, FlasherError, UsageError
 from flasher.host.options import UpgradeOptions
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol import contents
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC
@@ -183,11 +183,11 @@ def test_each_bad_ending_is_raised_as_its_own_error_with_its_exit_code(
 
 def simulated(
     disturbance: Disturbance | None = None, **choices: Any
-) -> tuple[api.Connection, Device]:
+) -> tuple[api.Connection, MockDevice]:
     """A connection to a device on a bus that disturbs."""
     clock = VirtualClock()
     bus = SimulatedBus(WELLING.bitrate_bps, clock, disturbance)
-    device = Device(BMS, bitrate_bps=WELLING.bitrate_bps, profile=DeviceProfile(**choices))
+    device = MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=DeviceProfile(**choices))
     bus.attach(device)
     return api.Connection(bus.link(), clock, "simulated"), device
 

@@ -21,12 +21,12 @@ import can
 from flasher import events
 from flasher.bus.adapter import CanLink, open_adapter
 from flasher.bus.link import MonotonicClock
-from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile
 from flasher.driver import drive
 from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, PACKET_DATA_SIZE, WELLING
 
@@ -65,7 +65,7 @@ def upgrade(packets: int) -> tuple[Stopwatch, float]:
     ]
     size = packets * PACKET_DATA_SIZE
     profile = DeviceProfile(erase_time_s=0.0, program_time_s=0.0)
-    device = Device(BMS, bitrate_bps=WELLING.bitrate_bps, profile=profile)
+    device = MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=profile)
     image = Image.from_bytes(random.Random(1).randbytes(size))
     engine = Upgrade(plan(image, BMS, WELLING.bitrate_bps))
     finished = threading.Event()
@@ -90,7 +90,7 @@ def upgrade(packets: int) -> tuple[Stopwatch, float]:
     return stopwatch, (len(times) - 1) / (times[-1] - times[0])
 
 
-def _serve(device: Device, link: CanLink, finished: threading.Event) -> None:
+def _serve(device: MockDevice, link: CanLink, finished: threading.Event) -> None:
     drive(device, link, MonotonicClock(), cancelled=finished.is_set)
 
 

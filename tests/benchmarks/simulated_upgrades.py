@@ -15,12 +15,12 @@ import time
 
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
-from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile
 from flasher.driver import drive
 from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, WELLING
 
 IMAGE_BYTES = 2 * 1024
@@ -30,7 +30,7 @@ def upgrade(image: Image) -> None:
     """One upgrade from the beginning to the end."""
     clock = VirtualClock()
     bus = SimulatedBus(WELLING.bitrate_bps, clock)
-    device = Device(BMS, bitrate_bps=WELLING.bitrate_bps, profile=DeviceProfile())
+    device = MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=DeviceProfile())
     bus.attach(device)
     engine = Upgrade(plan(image, BMS, WELLING.bitrate_bps))
     drive(engine, bus.link(), clock)

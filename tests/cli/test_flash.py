@@ -14,8 +14,8 @@ import pytest
 
 from flasher.api import connect_mock
 from flasher.bus.simulated import SimulatedLink
-from flasher.device.profile import DeviceProfile, set_option
 from flasher.errors import BusError, ExitCode
+from flasher.mock.profile import DeviceProfile, set_option
 from flasher.protocol.frame import Frame
 from tests.cli.conftest import SAMPLES, Flasher
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from flasher.device.profile import DeviceProfile
 from flasher.errors import ExitCode
 from flasher.image.image import Image
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.wire import Message, encode, split
 from tests.cli.conftest import Flasher, Run
 from tests.end_to_end.stage import IMAGE, NEW, OLD, SMALL, Speaker, Stage, image_of

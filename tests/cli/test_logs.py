@@ -280,7 +280,7 @@ def test_the_device_models_events_have_a_logger_of_their_own(
     caplog.set_level(logging.DEBUG, "flasher")
     log_event(events.PacketStored(1, 2))
     log_event(events.PacketAcknowledged(1, 2, 1))
-    assert [record.name for record in caplog.records] == ["flasher.device", "flasher.host"]
+    assert [record.name for record in caplog.records] == ["flasher.mock", "flasher.host"]
 
 
 def test_trouble_of_every_kind_is_at_least_a_warning() -> None:

@@ -18,11 +18,11 @@ import pytest
 
 from flasher import api
 from flasher.cli import mock as mock_command
-from flasher.device.profile import describe_options
-from flasher.device.variants import VARIANTS
 from flasher.driver import drive
 from flasher.errors import ExitCode
 from flasher.host.outcome import Outcome
+from flasher.mock.profile import describe_options
+from flasher.mock.variants import VARIANTS
 from flasher.protocol.wire import Message, encode
 from tests.cli.conftest import Flasher, Run
 from tests.firmware import VECTORS

@@ -12,15 +12,15 @@ from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.report import Report
 from flasher.conformance.runner import RunOptions, run
 from flasher.conformance.selection import Selection
-from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import TARGETS, WELLING
 
 PROFILE = profile_of_mock()
 
 
-class DeafDevice(Device):
+class DeafDevice(MockDevice):
     """Hears nothing once it is told to hang; `hangs_for_good` survives a power cycle."""
 
     hangs = False
@@ -41,7 +41,7 @@ class DeafDevice(Device):
         super().power_cut(now)
 
 
-class RestlessDevice(Device):
+class RestlessDevice(MockDevice):
     """Loses its power for a moment after every 60th frame that it hears."""
 
     heard = 0
@@ -85,17 +85,17 @@ class Babbler:
         return ()
 
 
-def maker(kind: type[Device]) -> Callable[[str, DeviceProfile], Device]:
+def maker(kind: type[MockDevice]) -> Callable[[str, DeviceProfile], MockDevice]:
     """Makes devices of that class."""
 
-    def make_device(target: str, profile: DeviceProfile) -> Device:
+    def make_device(target: str, profile: DeviceProfile) -> MockDevice:
         return kind(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
 
     return make_device
 
 
 def subject(
-    kind: type[Device] = Device, profile: DeviceProfile = MOCK_PROFILE, target: str = "bms"
+    kind: type[MockDevice] = MockDevice, profile: DeviceProfile = MOCK_PROFILE, target: str = "bms"
 ) -> MockSubject:
     return MockSubject(target, profile=profile, make_device=maker(kind))
 

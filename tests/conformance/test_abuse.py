@@ -17,8 +17,8 @@ from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.report import Report
 from flasher.conformance.runner import Silent, run
 from flasher.conformance.selection import Selection
-from flasher.device.model import Device
 from flasher.errors import ExitCode
+from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
 
 from .bench import PROFILE, Babbler, DeafDevice, maker
@@ -46,7 +46,7 @@ IMPATIENT = ConformanceProfile(
 """A babbling node is simulated frame by frame: short limits keep that cheap."""
 
 
-class MoodyDevice(Device):
+class MoodyDevice(MockDevice):
     """Loses its power for a moment now and then: by chance, with a fixed seed."""
 
     def __init__(self, *arguments: object, **options: object) -> None:
@@ -118,7 +118,7 @@ def test_behind_a_node_that_takes_the_whole_bus_nothing_can_be_judged() -> None:
     assert exit_code(report, was_stopped=False) in (ExitCode.NO_ANSWER, ExitCode.BUS)
 
 
-class BabblingDevice(Device):
+class BabblingDevice(MockDevice):
     """Sends boot versions all the time on its own id, whatever it is asked."""
 
     def next_frame(self, now: float) -> Frame | None:

@@ -12,7 +12,7 @@ from flasher.conformance.model import CASES, Status
 from flasher.conformance.profile_keys import BY_PATH
 from flasher.conformance.runner import run
 from flasher.conformance.selection import GROUPS, Selection
-from flasher.device.variants import VARIANTS
+from flasher.mock.variants import VARIANTS
 
 MINE = ("RS", "UP")
 WRONG = {name: one for name, one in VARIANTS.items() if one.clause.partition("-")[0] in MINE}

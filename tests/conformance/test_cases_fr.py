@@ -19,7 +19,7 @@ from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.report import Report
 from flasher.conformance.runner import run
 from flasher.conformance.selection import Selection
-from flasher.device.variants import VARIANTS
+from flasher.mock.variants import VARIANTS
 
 MINE = ("FR", "CR", "TM")
 LONGEST = ("CR-01", "CR-02")

@@ -14,8 +14,8 @@ from flasher.conformance.profile import (
     load_profile,
 )
 from flasher.conformance.profile_keys import KEYS
-from flasher.device.profile import DeviceProfile
 from flasher.errors import UsageError
+from flasher.mock.profile import DeviceProfile
 
 
 def write(tmp_path: Path, text: str) -> Path:

@@ -15,18 +15,18 @@ from flasher.conformance.real import PowerCommand, ReadbackCommand, RealPort, Re
 from flasher.conformance.runner import run
 from flasher.conformance.selection import Selection
 from flasher.conformance.wire import RawFrame
-from flasher.device.model import Device
 from flasher.errors import BusError, UsageError
+from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING
 
 SCRIPT = "import sys; open(sys.argv[1], 'w').write(sys.argv[2])"
 
 
-def bench(*, has_power: bool) -> tuple[RealSubject, Device]:
+def bench(*, has_power: bool) -> tuple[RealSubject, MockDevice]:
     clock = VirtualClock()
     bus = SimulatedBus(WELLING.bitrate_bps, clock)
-    device = Device(BMS, bitrate_bps=WELLING.bitrate_bps, profile=MOCK_PROFILE)
+    device = MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=MOCK_PROFILE)
     bus.attach(device)
 
     def power(on: bool) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import pytest
 
 from flasher.conformance.model import CASES
-from flasher.device.variants import VARIANTS
+from flasher.mock.variants import VARIANTS
 from tests.variant_matrix import Row, groups_passed, listed_rows, row_of
 
 LISTED = listed_rows()

@@ -13,7 +13,7 @@ from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock,
 from flasher.conformance.model import CASES, Case, Status
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.selection import what_is_missing
-from flasher.device.variants import VARIANTS
+from flasher.mock.variants import VARIANTS
 
 SMALL_AREA = {"application_area_bytes": 34 * 1024}
 """272 packets: enough for all but images beyond 64 KiB, and quickly filled."""

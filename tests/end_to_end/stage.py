@@ -18,14 +18,14 @@ from typing import Any
 from flasher import api, events
 from flasher.bus.link import Link, VirtualClock
 from flasher.bus.simulated import DEFAULT_QUEUE_FRAMES, Disturbance, SimulatedBus, SimulatedLink
-from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile
 from flasher.host.identity import Identity
 from flasher.host.options import UpgradeOptions
 from flasher.host.session import Result
 from flasher.host.verify import Level
 from flasher.image.image import Image
 from flasher.image.plan import Plan, plan
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import TARGETS, WELLING
 from tests.firmware import VECTORS
@@ -72,7 +72,7 @@ class Stage:
         self.target = TARGETS[target]
         self.clock = WatchedClock()
         self.bus = SimulatedBus(WELLING.bitrate_bps, self.clock, self._carry)
-        self.device = Device(
+        self.device = MockDevice(
             self.target,
             bitrate_bps=WELLING.bitrate_bps,
             profile=profile,

@@ -9,8 +9,6 @@ import pytest
 
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
-from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile
 from flasher.driver import drive
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft, Outcome
@@ -18,6 +16,8 @@ from flasher.host.table import Ending
 from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC
 from tests.end_to_end.world import Traffic, upgrade
@@ -29,8 +29,8 @@ SMALL = DeviceProfile(application_area_bytes=16 * 1024)
 VERSIONED = b"\x00\x50\x00\x20" + b"BMS\0V2r0r1_20260102\0" + random.Random(4).randbytes(200)
 
 
-def device_model(target: str = "bms") -> Device:
-    return Device(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=SMALL)
+def device_model(target: str = "bms") -> MockDevice:
+    return MockDevice(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=SMALL)
 
 
 def frames_of_an_upgrade() -> int:
@@ -58,7 +58,7 @@ def at(index: int, fate: Callable[[Frame], list[Frame]]) -> Callable[[Frame, flo
     return disturb
 
 
-def judge(outcome: Outcome, device: Device) -> None:
+def judge(outcome: Outcome, device: MockDevice) -> None:
     """Right bytes, or an explicit end: what is never said twice by the device may be missed."""
     if outcome.ending is Ending.NO_REQUEST:
         # Request transfer was damaged; the update command is never sent into silence (R2).
@@ -177,7 +177,7 @@ def test_other_traffic_at_high_load_changes_nothing_but_the_time(can_id: int) ->
 @pytest.mark.parametrize("target", ["wmc", "bms", "obc"])
 def test_a_device_without_application_announces_on_and_is_upgraded(target: str) -> None:
     """R14."""
-    device = Device(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, has_application=False)
+    device = MockDevice(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, has_application=False)
     outcome = upgrade(device, target, IMAGE)
     assert outcome.ok
     assert device.stored_image == IMAGE

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from flasher import api, events
-from flasher.device.model import Device
 from flasher.driver import Tap
 from flasher.errors import ExitCode
 from flasher.host.upgrade import Upgrade
 from flasher.image.plan import plan
+from flasher.mock.model import MockDevice
 from flasher.protocol.bittime import frame_bits
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
@@ -130,7 +130,7 @@ def test_two_other_pairs_are_upgraded_at_the_same_time_and_nobody_notices_the_ot
     stage = Stage("bms")
     pairs = []
     for target, version in ((WMC, "V5r0r0_20260101"), (OBC, "V6r0r0_20260101")):
-        device = Device(target, bitrate_bps=WELLING.bitrate_bps, profile=SMALL)
+        device = MockDevice(target, bitrate_bps=WELLING.bitrate_bps, profile=SMALL)
         image = image_of(3, version, seed=target.request_id)
         pairs.append((device, Upgrade(plan(image, target, WELLING.bitrate_bps)), image))
     flash(stage, *(engine for device, host, _ in pairs for engine in (device, host)))

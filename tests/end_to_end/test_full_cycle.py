@@ -14,9 +14,9 @@ import pytest
 from intelhex import IntelHex
 
 from flasher import api
-from flasher.device.model import Device
 from flasher.driver import drive
 from flasher.errors import ExitCode
+from flasher.mock.model import MockDevice
 from flasher.protocol.spec import BMS, WELLING
 from tests.cli import conftest
 from tests.cli.conftest import SAMPLES, Flasher, Run
@@ -34,7 +34,7 @@ class ServedBattery:
     """The device model on python-can's `virtual` bus, in a thread of its own."""
 
     def __init__(self) -> None:
-        self.device = Device(BMS, bitrate_bps=WELLING.bitrate_bps)
+        self.device = MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps)
         self.bus = ("-i", "virtual", "-c", f"cycle-{uuid.uuid4()}")
         self.failure: BaseException | None = None
         self._is_listening = threading.Event()

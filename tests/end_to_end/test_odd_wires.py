@@ -10,8 +10,6 @@ import pytest
 
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
-from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile
 from flasher.driver import drive
 from flasher.errors import BusError
 from flasher.host.outcome import Outcome
@@ -19,6 +17,8 @@ from flasher.host.table import Ending
 from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING
 from tests.end_to_end.world import upgrade
@@ -63,11 +63,11 @@ class Sender:
         return []
 
 
-def device_model(profile: DeviceProfile = SMALL) -> Device:
-    return Device(BMS, bitrate_bps=WELLING.bitrate_bps, profile=profile)
+def device_model(profile: DeviceProfile = SMALL) -> MockDevice:
+    return MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=profile)
 
 
-def judge(outcome: Outcome, device: Device) -> None:
+def judge(outcome: Outcome, device: MockDevice) -> None:
     """The right image in any case; only the device's last word may be missed."""
     assert device.stored_image == IMAGE
     assert outcome.ok or outcome.ending is Ending.UNCONFIRMED

@@ -8,10 +8,10 @@ import random
 import pytest
 
 from flasher.api import as_target
-from flasher.device.model import Device
 from flasher.errors import ExitCode
 from flasher.host.options import UpgradeOptions
 from flasher.host.table import Ending
+from flasher.mock.model import MockDevice
 from tests.end_to_end.world import IMAGE, Traffic, upgrade
 from tests.peers.dialogue import strays
 from tests.peers.scripted_device import DeviceScript, ScriptedDevice
@@ -178,7 +178,7 @@ def test_a_lost_final_answer_never_leads_to_a_second_erase() -> None:
 @pytest.mark.parametrize("target", ["wmc", "bms", "obc"])
 def test_a_host_of_literal_frames_upgrades_the_device_model(target: str, size_bytes: int) -> None:
     image = random.Random(size_bytes).randbytes(size_bytes)
-    device = Device(as_target(target), bitrate_bps=250_000)
+    device = MockDevice(as_target(target), bitrate_bps=250_000)
     host = ScriptedHost(target, image)
     run(host, device, linger_s=1.0)
     assert host.outcome == "complete"
@@ -211,7 +211,7 @@ def test_a_host_of_literal_frames_upgrades_the_device_model(target: str, size_by
     ids=strays,
 )
 def test_the_device_model_copes_with_a_host_that_strays(script: HostScript) -> None:
-    device = Device(as_target("bms"), bitrate_bps=250_000)
+    device = MockDevice(as_target("bms"), bitrate_bps=250_000)
     host = ScriptedHost("bms", IMAGE, script)
     run(host, device, linger_s=1.0)
     assert host.outcome == "complete"

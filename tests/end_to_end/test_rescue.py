@@ -12,12 +12,12 @@ from dataclasses import replace
 import pytest
 
 from flasher import api, events
-from flasher.device.profile import DeviceProfile
 from flasher.errors import BusError, ExitCode
 from flasher.events import Phase
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BOOT_VERSION_BURST
 from tests.end_to_end.stage import IMAGE, NEW, SMALL, Stage, image_of

@@ -10,7 +10,6 @@ import pytest
 from flasher import events
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import Disturbance, SimulatedBus
-from flasher.device.model import Device
 from flasher.driver import drive
 from flasher.errors import ExitCode
 from flasher.host.options import UpgradeOptions
@@ -24,6 +23,7 @@ from flasher.host.verify import (
 )
 from flasher.image.image import Image
 from flasher.image.plan import Plan, plan
+from flasher.mock.model import MockDevice
 from flasher.protocol import catalogue
 from flasher.protocol.contents import Memory, ReadMemory, VersionInformation
 from flasher.protocol.fields import Content, Text
@@ -51,7 +51,7 @@ def run(
     """A session with the device model."""
     clock = VirtualClock()
     bus = SimulatedBus(WELLING.bitrate_bps, clock, disturbance)
-    bus.attach(Device(TARGETS[target], bitrate_bps=WELLING.bitrate_bps))
+    bus.attach(MockDevice(TARGETS[target], bitrate_bps=WELLING.bitrate_bps))
     session = Session(plan(image, TARGETS[target], WELLING.bitrate_bps), level=level)
     seen: list[object] = []
     drive(session, bus.link(), clock, on_event=seen.append)

@@ -11,13 +11,13 @@ import pytest
 from flasher import events
 from flasher.bus.health import LinkHealth
 from flasher.bus.simulated import SimulatedLink
-from flasher.device.model import Device
 from flasher.errors import BusError, ExitCode
 from flasher.events import Phase
 from flasher.host.options import UpgradeOptions, default_timeout_s
 from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending
 from flasher.host.verify import Level, Verdict
+from flasher.mock.model import MockDevice
 from flasher.protocol import catalogue
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.fields import Text
@@ -230,9 +230,9 @@ def test_a_second_tool_is_heard_among_echoes() -> None:
 # -- two devices ----------------------------------------------------------------------------------
 
 
-def with_another(stage: Stage, **differs: str) -> Device:
+def with_another(stage: Stage, **differs: str) -> MockDevice:
     profile = replace(SMALL, **differs)  # type: ignore[arg-type]
-    other = Device(stage.target, bitrate_bps=WELLING.bitrate_bps, profile=profile)
+    other = MockDevice(stage.target, bitrate_bps=WELLING.bitrate_bps, profile=profile)
     stage.bus.attach(other)
     return other
 

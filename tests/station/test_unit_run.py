@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from flasher.device.bms import BmsApplication
 from flasher.image.manifest import release_of, to_toml
+from flasher.mock.bms import BmsApplication
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WMC
 from flasher.station.codes import CODES, OF_ENDING

@@ -9,9 +9,9 @@ from pathlib import Path
 from flasher.api import Connection
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
-from flasher.device.model import Device
-from flasher.device.profile import DeviceProfile
 from flasher.driver import Tap
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.station.records.model import RunId, RunKind, StepState, WriteId
 from flasher.station.run_model import (
@@ -86,7 +86,7 @@ class UnitBench:
         self.places = {target: Place() for target in targets}
         for target, place in self.places.items():
             self.bus.attach(place)
-            place.device = Device(target, bitrate_bps=WELLING.bitrate_bps, profile=profile)
+            place.device = MockDevice(target, bitrate_bps=WELLING.bitrate_bps, profile=profile)
         self.connection = Connection(self.bus.link(), self.clock, "a simulated bus")
         self.journal = Notes()
         self.notes: list[RunNote] = []
@@ -95,7 +95,7 @@ class UnitBench:
         self.taps: Sequence[Tap] = ()
 
     @property
-    def device(self) -> Device:
+    def device(self) -> MockDevice:
         """The only unit, or the first."""
         device = next(iter(self.places.values())).device
         assert device is not None

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from flasher.device.model import Device
 from flasher.host.options import UpgradeOptions
 from flasher.host.table import Ending
+from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import TARGETS, WELLING
 from flasher.trace.explain import explain
@@ -90,7 +90,7 @@ def test_live_and_recorded_figures_are_the_same() -> None:
 
 def test_a_transfer_without_waiting_reaches_the_line_rate() -> None:
     tapped = Tapped()
-    upgrade(Device(TARGETS["bms"], bitrate_bps=WELLING.bitrate_bps), traffic=tapped)
+    upgrade(MockDevice(TARGETS["bms"], bitrate_bps=WELLING.bitrate_bps), traffic=tapped)
     report = tapped.meter.report()
     assert report is not None
     assert report.share_of_line_rate is not None
@@ -105,7 +105,7 @@ def test_a_transfer_without_waiting_reaches_the_line_rate() -> None:
 def test_a_host_that_leaves_gaps_shows_as_turnaround() -> None:
     tapped = Tapped()
     upgrade(
-        Device(TARGETS["bms"], bitrate_bps=WELLING.bitrate_bps),
+        MockDevice(TARGETS["bms"], bitrate_bps=WELLING.bitrate_bps),
         traffic=tapped,
         options=UpgradeOptions(packet_gap_s=0.01),
     )

@@ -1,0 +1,326 @@
+"""The application of a BMS: answers every query and write of chapter 3, tells its faults, and runs
+the shutdown handshake.
+
+What a message looks like, and which one answers which, comes from the catalogue. What was written
+is kept through power cuts and upgrades, as in a memory of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+from flasher.events import DeviceReported, DeviceWritten
+from flasher.mock.application import Application, ids_heard_by
+from flasher.mock.battery import (
+    DESIGN_CAPACITY_MAH,
+    DESIGN_VOLTAGE_V,
+    FULL_CAPACITY_MAH,
+    STATE_OF_HEALTH_PERCENT,
+    Battery,
+)
+from flasher.mock.memory_map import MemoryMap
+from flasher.mock.profile import DeviceProfile
+from flasher.mock.shutdown import Shutdown
+from flasher.mock.timer import due_again
+from flasher.protocol import contents
+from flasher.protocol.catalogue import ITEMS, Item, answer_of, decode, encode
+from flasher.protocol.contents import CheckCode, Fault, PhysicalId, ProductionInformation
+from flasher.protocol.fields import Content, Text
+from flasher.protocol.spec import (
+    DIALECTS,
+    MOTINOVA,
+    VERSION_FIELD_SIZE,
+    WELLING,
+    Dialect,
+    Mode,
+    Node,
+    can_id,
+)
+from flasher.protocol.text import encode_text
+from flasher.protocol.wire import Message
+
+FAULT_PERIOD_S: Final = 0.2
+"""Faults are told at this interval while any is set (5.1)."""
+IDLE_SHUTDOWN_S: Final = 30 * 60.0
+"""A bus idle for this long, at a small pack current throughout, switches the battery off (5.1)."""
+IDLE_CURRENT_MA: Final = {WELLING: 50, MOTINOVA: 20}
+"""What is a small current (section 6)."""
+CURRENT_PERIOD_S: Final = 1.0
+"""How often the pack current is looked at meanwhile."""
+_FEEDBACK_IDS: Final = {
+    can_id(node, Node.BMS): can_id(Node.BMS, node) for node in Node if node is not Node.BMS
+}
+"""Where a write is confirmed, by the id that it came on: 2.2.1(2) goes by the sender."""
+_WRITE: Final = "write "
+_CELL_MODEL: Final = "21700A"
+_ID_FILLER: Final = b"\x01"
+"""R13."""
+_NO_STATE_OF_HEALTH: Final = 0
+_NEWER_QUERIES: Final = frozenset(
+    {(Node.OBC, contents.CellVoltages), (Node.HMI, contents.CellVoltages)}
+)
+"""Who may ask an older battery for what in vain (section 6)."""
+
+
+class BmsApplication(Application):
+    """The BMS; `kept` holds what can be written, by the names of the catalogue."""
+
+    def __init__(self, profile: DeviceProfile, memory: MemoryMap) -> None:
+        super().__init__(Node.BMS, DIALECTS[profile.dialect])
+        self.profile = profile
+        self.battery = Battery(profile.battery_use, profile.battery_seed)
+        self.faults = Fault(profile.faults)
+        self.kept = _factory_settings(profile)
+        self._memory = memory
+        self._firmware = ""
+        self._shutdown: Shutdown | None = None
+        self._fault_due: float | None = None
+        self._idle_since: float | None = None
+        """Since when there was no frame, and the current was small; None before the first tick."""
+        self._current_due = float("-inf")
+        self._faults_item = _sent_item(contents.Faults, self.dialect)
+        self._feedback_item = _sent_item(contents.GeneralFeedback, self.dialect)
+        self._readers: dict[type[Content], Callable[[float], Content]] = {
+            contents.RunningInformation: self._running_information,
+            contents.CellVoltages: self._cell_voltages,
+            contents.VersionInformation: self._version_information,
+            contents.History: self._history,
+            contents.Ready: lambda _now: contents.Ready(),
+            contents.GeneralFeedback: lambda _now: contents.GeneralFeedback(),
+        }
+
+    # -- the machine's side -----------------------------------------------------------------------
+
+    @property
+    def hears(self) -> frozenset[int]:
+        return ids_heard_by(self.node, self.dialect)
+
+    def start(self, firmware: str, now: float) -> None:
+        self._firmware = firmware
+        self._shutdown = None
+        self._idle_since = None
+        self._fault_due = now if self.faults else None
+
+    def stop(self) -> None:
+        self._shutdown = None
+        self._fault_due = None
+
+    def heard(self, now: float) -> None:
+        self._idle_since = now
+
+    def deadline(self) -> float | None:
+        shutdown_due = None if self._shutdown is None else self._shutdown.due
+        due = (self._fault_due, self._idle_due(), shutdown_due)
+        return min((moment for moment in due if moment is not None), default=None)
+
+    def tick(self, now: float) -> None:
+        if self._fault_due is not None and self._fault_due <= now:
+            if self.port.is_idle:
+                self.port.send(encode(self._faults_item, contents.Faults(self.faults)))
+            self._idle_since = now  # its own frames keep the bus busy too
+            self._fault_due = due_again(self._fault_due, FAULT_PERIOD_S, now)
+        idle_due = self._idle_due()
+        if idle_due is not None and idle_due <= now:
+            self._look_at_current(now)
+        if self._shutdown is not None:
+            self._shutdown.tick(now)
+
+    # -- what happens to it -----------------------------------------------------------------------
+
+    def set_faults(self, faults: Fault, now: float) -> None:
+        """These faults are set from now on, and no other."""
+        self.faults = faults
+        if not faults:
+            self._fault_due = None
+        elif self._fault_due is None:
+            self._fault_due = now
+
+    def hold_key(self, now: float) -> None:
+        """The key was held for 3 s: announce shutdown, then switch off."""
+        self._announce_shutdown("key held", now)
+
+    def _announce_shutdown(self, why: str, now: float) -> None:
+        if self._shutdown is None:
+            self._shutdown = Shutdown(self.dialect, self.port, why, now)
+            self._shutdown.tick(now)
+
+    def _idle_due(self) -> float | None:
+        if self.profile.idle_shutdown == "off" or self._shutdown is not None:
+            return None
+        # Without a frame so far, the time counts from the first tick.
+        since = self._idle_since
+        return float("-inf") if since is None else min(self._current_due, since + IDLE_SHUTDOWN_S)
+
+    def _look_at_current(self, now: float) -> None:
+        self._current_due = now + CURRENT_PERIOD_S
+        is_small = abs(self.battery.at(now).current_ma) < IDLE_CURRENT_MA[self.dialect]
+        if self._idle_since is None or not is_small:
+            self._idle_since = now
+        elif now - self._idle_since >= IDLE_SHUTDOWN_S:
+            self._announce_shutdown("bus idle", now)
+
+    # -- messages ---------------------------------------------------------------------------------
+
+    def take(self, message: Message, now: float) -> None:
+        """Answer a query or a write; anything else of no concern is passed over."""
+        decoded = decode(message, self.dialect)
+        if decoded is None:
+            self._confirm_unknown(message)
+            return
+        item, content = decoded.item, decoded.content
+        if isinstance(content, contents.Ready):
+            if self._shutdown is not None and content == contents.Ready():
+                self._shutdown.ready(item.sender)
+            return
+        answer = answer_of(item)
+        if answer is None or not self._knows(item, answer):
+            return
+        if isinstance(content, contents.Handshake) and content != contents.Handshake():
+            return
+        if item.mode is Mode.WRITE:
+            self._write(item, content)
+        reply = self._reply(answer, content, now)
+        if reply is not None:
+            self.port.send(encode(answer, reply))
+
+    def _confirm_unknown(self, message: Message) -> None:
+        """A write that is no row of the dialect is confirmed too, and changes nothing: 2.2.1(2) has
+        general feedback follow every write, to its sender.
+        """
+        answer_id = _FEEDBACK_IDS.get(message.can_id)
+        if answer_id is None or message.mode != Mode.WRITE:
+            return
+        if not self.profile.is_silent_to(message.can_id, message.command):
+            feedback = encode(self._feedback_item, contents.GeneralFeedback())
+            self.port.send(feedback._replace(can_id=answer_id))
+
+    def _knows(self, item: Item, answer: Item) -> bool:
+        if self.profile.older_battery == "yes" and (item.sender, answer.content) in _NEWER_QUERIES:
+            return False
+        return not self.profile.is_silent_to(item.can_id, item.command)
+
+    def _write(self, item: Item, content: Content) -> None:
+        name = item.title.removeprefix(_WRITE)
+        if name not in self.kept:  # a reset with another text
+            return
+        before, self.kept[name] = self.kept[name], content
+        self.port.emit(DeviceWritten(name, _shown(before), _shown(content)))
+
+    def _reply(self, answer: Item, content: Content, now: float) -> Content | None:
+        if isinstance(content, contents.ReadMemory):
+            return self._read_memory(content)
+        kept = self.kept.get(answer.title)
+        return self._readers[answer.content](now) if kept is None else kept
+
+    def _read_memory(self, wanted: contents.ReadMemory) -> Content | None:
+        """The memory asked for; nothing where there is none, and for more than fits (R5)."""
+        found = None
+        if 0 < wanted.end - wanted.start <= contents.MEMORY_PIECE_SIZE:
+            found = self._memory.read(wanted.start, wanted.end)
+        if found is None:
+            where = f"0x{wanted.start:08X}..0x{wanted.end:08X}"
+            self.port.emit(DeviceReported(f"memory {where} cannot be read"))
+            return None
+        padded = found.ljust(contents.MEMORY_PIECE_SIZE, b"\xff")
+        return contents.Memory(wanted.start, wanted.end, padded)
+
+    # -- what changes by itself -------------------------------------------------------------------
+
+    def _running_information(self, now: float) -> Content:
+        reading = self.battery.at(now)
+        is_older = self.profile.older_battery == "yes"
+        return contents.RunningInformation(
+            voltage_mv=reading.voltage_mv,
+            mean_current_ma=reading.current_ma,
+            remaining_capacity_mah=reading.remaining_mah,
+            full_capacity_mah=FULL_CAPACITY_MAH,
+            cell_temperature_c=reading.temperature_c,
+            state_of_charge_percent=reading.state_of_charge_percent,
+            status=reading.status,
+            state_of_health_percent=_NO_STATE_OF_HEALTH if is_older else STATE_OF_HEALTH_PERCENT,
+        )
+
+    def _cell_voltages(self, now: float) -> Content:
+        return contents.CellVoltages(self.battery.at(now).cells_mv)
+
+    def _version_information(self, now: float) -> Content:
+        model, serial_number = self.kept["model"], self.kept["serial number"]
+        assert isinstance(model, contents.Model)  # noqa: S101  for the type checker
+        assert isinstance(serial_number, contents.SerialNumber)  # noqa: S101
+        return contents.VersionInformation(
+            model.model,
+            serial_number.serial_number,
+            _version_text(self.profile.hardware_version),
+            _version_text(self._firmware),
+        )
+
+    def _history(self, now: float) -> Content:
+        """An easy life: none of its counters ever counted."""
+        return contents.History(
+            highest_cell_temperature_c=45,
+            lowest_cell_temperature_c=-5,
+            greatest_discharge_current_ma=25_000,
+            greatest_charge_current_ma=4_000,
+            cycles=12,
+            latest_charge_interval_h=30,
+            longest_charge_interval_h=400,
+            charge_over_current_count=0,
+            discharge_over_current_count=0,
+            over_charge_count=0,
+            over_discharge_count=0,
+            short_circuit_count=0,
+            charge_under_temperature_count=0,
+            charge_over_temperature_count=0,
+            discharge_under_temperature_count=0,
+            discharge_over_temperature_count=0,
+            running_time_min=60_000 + int(self.battery.at(now).elapsed_s // 60),
+            state_of_health_percent=STATE_OF_HEALTH_PERCENT,
+        )
+
+
+def _factory_settings(profile: DeviceProfile) -> dict[str, Content]:
+    """What leaves the factory, by the title of the message that reads or, without "write", writes
+    it.
+    """
+    design = contents.DesignInformation(
+        DESIGN_CAPACITY_MAH, DESIGN_VOLTAGE_V, _text(_CELL_MODEL, 8)
+    )
+    identity = profile.serial_number.encode("ascii")[: PhysicalId.SIZE_BYTES]
+    return {
+        "model": contents.Model(_text(profile.model)),
+        "serial number": contents.SerialNumber(_text(profile.serial_number)),
+        "production information": ProductionInformation(
+            _text("WELLING", 8), _text("WUXI", 8), Text(b"20220512")
+        ),
+        "design information": design,
+        "physical id": PhysicalId(identity.ljust(PhysicalId.SIZE_BYTES, _ID_FILLER)),
+        "check code": CheckCode(bytes(CheckCode.SIZE_BYTES)),
+        "user string 1": contents.UserString(_text("")),
+        "user string 2": contents.UserString(_text("")),
+        "user string 3": contents.UserString(_text("")),
+    }
+
+
+def _text(text: str, size_bytes: int = VERSION_FIELD_SIZE) -> Text:
+    return Text(encode_text(text, size_bytes))
+
+
+def _version_text(text: str) -> Text:
+    """A text as a field; one that fills the field has no terminator, a longer one is cut (R20)."""
+    if len(text) < VERSION_FIELD_SIZE:
+        return _text(text)
+    return Text(text.encode("ascii")[:VERSION_FIELD_SIZE])
+
+
+def _sent_item(content: type[Content], dialect: Dialect) -> Item:
+    """The row of a message that the BMS sends on its own."""
+    return next(
+        item
+        for item in ITEMS
+        if item.sender is Node.BMS and item.content is content and dialect in item.dialects
+    )
+
+
+def _shown(content: Content) -> str:
+    return ", ".join(value for _, value, _ in content.shown())

@@ -1,0 +1,283 @@
+"""The device's side of the engine interface: reception, sending, timers. What to make of it is the
+business of the model, and of the application that runs on it.
+
+One timer is enough for a bootloader, as in every state it waits for one thing; the application has
+its own.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Final
+
+from flasher.events import BytesDamaged, DeviceReported
+from flasher.mock.application import Application
+from flasher.mock.timer import due_again
+from flasher.protocol.engine import Transmitter
+from flasher.protocol.frame import Frame
+from flasher.protocol.timing import Timings
+from flasher.protocol.wire import Damage, Message, Reassembler, encode, split
+
+_UNUSED_WIRE_S: Final = 0.0
+"""Nothing here counts from when a message has left the wire, so its time there is not computed."""
+BUS_OFF_S: Final = 0.02
+"""How long a CAN controller stays off the bus unless told otherwise: longer than the 128 times 11
+bits that the standard asks for, as software has to notice first."""
+
+
+class Machine(ABC):
+    """An engine (`flasher.protocol.engine`) that hears the ids of its application and its own
+    `own_ids`; base of `MockDevice` and `Unit`.
+    """
+
+    reassembler_type: ClassVar[type[Reassembler]] = Reassembler
+    """What makes messages of the frames on each id."""
+
+    def __init__(
+        self,
+        application: Application,
+        own_ids: frozenset[int] = frozenset(),
+        *,
+        bitrate_bps: int,
+        timings: Timings,
+    ) -> None:
+        self.application = application
+        self.timings = timings
+        self._bitrate_bps = bitrate_bps
+        self._reassemblers = {
+            can_id: self.reassembler_type(can_id, timings.inter_frame_timeout_s)
+            for can_id in sorted(own_ids | application.hears)
+        }
+        self._half_received: dict[int, Reassembler] = {}
+        """Those of them that may hold a part of a message."""
+        self._transmitter = Transmitter(bitrate_bps)
+        self._events: list[object] = []
+        self._due: float | None = None
+        self._is_deaf = False
+        self._is_cancelled = False
+        self._runs_application = False
+        self._off_bus_until: float | None = None
+        application.attach(self)
+
+    # -- the engine interface ---------------------------------------------------------------------
+
+    @property
+    def done(self) -> bool:
+        """True once it was cancelled and the message under way was sent."""
+        return self._is_cancelled and self._transmitter.idle
+
+    def receive(self, frame: Frame, now: float) -> None:
+        """A CAN frame arrived. Only payload on the ids that concern this device is looked at."""
+        self._rejoin_bus(now)
+        if self._is_cancelled or self._is_deaf or self._off_bus_until is not None:
+            return
+        if self._runs_application:
+            self.application.heard(now)
+        reassembler = self._reassemblers.get(frame.can_id)
+        if reassembler is None or not frame.is_payload:
+            return
+        completed = reassembler.feed(frame.data, now)
+        if reassembler.deadline() is None:
+            self._half_received.pop(frame.can_id, None)
+        else:
+            self._half_received[frame.can_id] = reassembler
+        for found in completed:
+            self._take(found, now)
+
+    def tick(self, now: float) -> None:
+        """Let everything happen that is due by `now`."""
+        if self._is_cancelled:
+            return
+        self._rejoin_bus(now)
+        for reassembler in self._reassemblers.values():
+            for found in reassembler.tick(now):
+                self._take(found, now)
+        self._run_timer(now)
+        if self._runs_application:
+            self.application.tick(now)
+
+    def deadline(self) -> float | None:
+        """When it next wants `tick` or has a frame to send; None while it waits for the bus."""
+        wanted = self._transmitter.deadline()
+        if self._is_cancelled:
+            return wanted
+        others = [reassembler.deadline() for reassembler in self._half_received.values()]
+        others += (self._due, self._off_bus_until)
+        if self._runs_application:
+            others.append(self.application.deadline())
+        for other in others:
+            if other is not None and (wanted is None or other < wanted):
+                wanted = other
+        return wanted
+
+    def next_frame(self, now: float) -> Frame | None:
+        """The next frame to send; the same one until `frame_sent` is called."""
+        return self._transmitter.next_frame(now)
+
+    def frame_sent(self, now: float) -> None:
+        """The adapter has accepted it. What a power cut made void meanwhile is not missed."""
+        if not self._transmitter.idle:
+            self._transmitter.frame_sent(now)
+
+    def cancel(self, now: float) -> None:
+        """Send the message under way to its end, then nothing more."""
+        self._is_cancelled = True
+        self._transmitter.drop_unstarted()
+
+    def take_events(self) -> Sequence[object]:
+        """What happened since the last call."""
+        if not self._events:
+            return ()
+        events, self._events = self._events, []
+        return events
+
+    # -- for the application ----------------------------------------------------------------------
+
+    @property
+    def is_idle(self) -> bool:
+        """True when nothing waits to be sent."""
+        return self._transmitter.idle
+
+    def send(self, message: Message) -> None:
+        """Send a message after those before it. Off the bus, it is lost."""
+        if self._off_bus_until is not None:
+            return
+        frames = split(message.can_id, encode(message))
+        self._transmitter.queue(frames, wire_s=_UNUSED_WIRE_S)
+
+    def emit(self, event: object) -> None:
+        """Tell those who watch."""
+        self._events.append(event)
+
+    def switch_off(self, now: float) -> None:
+        """The application cuts the power."""
+        self.power_cut(now)
+
+    def hold_key(self, now: float) -> None:
+        """Somebody held the key for as long as it takes to switch off; the application knows
+        whether that is its business.
+        """
+        if self._runs_application:
+            self.application.hold_key(now)
+
+    # -- the bus's faults -------------------------------------------------------------------------
+
+    def bus_off(self, now: float, off_s: float = BUS_OFF_S) -> None:
+        """The CAN controller leaves the bus and is back after `off_s` seconds.
+
+        What was to be sent is lost, the rest of a message half sent too, and so is everything that
+        is said meanwhile, by others or by the device.
+        """
+        self._transmitter = Transmitter(self._bitrate_bps)
+        self._off_bus_until = now + off_s
+
+    @property
+    def is_off_bus(self) -> bool:
+        """True from `bus_off` until it is back."""
+        return self._off_bus_until is not None
+
+    def _rejoin_bus(self, now: float) -> None:
+        if self._off_bus_until is not None and now >= self._off_bus_until:
+            self._off_bus_until = None
+
+    # -- for the model ----------------------------------------------------------------------------
+
+    @property
+    @abstractmethod
+    def has_power(self) -> bool:
+        """False after a power cut."""
+
+    @abstractmethod
+    def power_cut(self, now: float) -> None:
+        """The power goes, and with it everything but the flash and what is kept on purpose."""
+
+    @abstractmethod
+    def power_on(self, now: float) -> None:
+        """The power comes back."""
+
+    @abstractmethod
+    def _take_message(self, message: Message, now: float) -> None:
+        """An intact message arrived."""
+
+    @abstractmethod
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        """Bytes arrived that were no message."""
+
+    @abstractmethod
+    def _expire(self, now: float) -> None:
+        """The timer is over: set it anew, or stop it."""
+
+    def _run_timer(self, now: float) -> None:
+        """Let the timer expire as often as it is due; with times of 0 one leads to the next."""
+        while self._due is not None and self._due <= now:
+            self._expire(now)
+
+    def _rearm(self, delay_s: float, now: float) -> None:
+        self._due = due_again(self._due, delay_s, now)
+
+    def _report(self, what: str) -> None:
+        self.emit(DeviceReported(what))
+
+    def _forget_received(self) -> None:
+        """Forget every message of which the end is still to come."""
+        for reassembler in self._reassemblers.values():
+            reassembler.reset()
+
+    def _lose_memory(self) -> None:
+        """Forget everything received, and everything to be sent at once, even half a message."""
+        self._forget_received()
+        self._transmitter = Transmitter(self._bitrate_bps)
+        self._off_bus_until = None
+        self._due = None
+
+    def _take(self, found: Message | Damage, now: float) -> None:
+        # A message before this one may have restarted the device.
+        if self._is_deaf:
+            return
+        due_before = self._due
+        if isinstance(found, Damage):
+            self.emit(BytesDamaged(found.can_id, found.reason.value, found.data))
+            self._take_damage(found, now)
+        else:
+            self._take_message(found, now)
+        # What this message began is over at once with times of 0. A timer that ran before waits for
+        # `tick`: messages that were held up somewhere are taken first.
+        if self._due != due_before:
+            self._run_timer(now)
+
+
+class Unit(Machine):
+    """A node without a bootloader: its application runs while there is power."""
+
+    def __init__(self, application: Application, *, bitrate_bps: int, timings: Timings) -> None:
+        super().__init__(application, bitrate_bps=bitrate_bps, timings=timings)
+        self.power_on(float("-inf"))
+
+    @property
+    def has_power(self) -> bool:
+        """False after a power cut."""
+        return self._runs_application
+
+    def power_cut(self, now: float) -> None:
+        """The power goes."""
+        self._runs_application = False
+        self._is_deaf = True
+        self.application.stop()
+        self._lose_memory()
+
+    def power_on(self, now: float) -> None:
+        """The power comes back."""
+        if not self._runs_application:
+            self._runs_application = True
+            self._is_deaf = False
+            self.application.start("", now)
+
+    def _take_message(self, message: Message, now: float) -> None:
+        self.application.take(message, now)
+
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        pass
+
+    def _expire(self, now: float) -> None:
+        self._due = None

@@ -1,0 +1,102 @@
+"""Where the application lies in the flash, and the record that says that it is whole.
+
+The application area is followed by one page for the record. The record is erased before anything
+else and written after everything else, its magic last, so a power cut at any moment leaves either
+a whole application or none: what boots is never a mixture.
+"""
+
+from __future__ import annotations
+
+import zlib
+from struct import Struct
+from typing import ClassVar, Final
+
+from flasher.mock.memory import ERASED, Flash, Operation
+from flasher.mock.profile import DeviceProfile
+from flasher.protocol.spec import PACKET_DATA_SIZE
+
+AREA_START: Final = 0x0800_8000
+"""Address of the application area. Nothing on the wire depends on it (R8)."""
+_RECORD: Final = Struct("<II8s")
+_MAGIC: Final = b"WHOLEAPP"
+_CHECKSUM: Final = Struct("<I")
+_FACTORY_IMAGE_BYTES: Final = 500
+
+
+def checksum_fits(image: bytes) -> bool:
+    """True when the last four bytes are the CRC-32 of those before, little-endian (R7)."""
+    body = image[: -_CHECKSUM.size]
+    return len(image) > _CHECKSUM.size and _CHECKSUM.pack(zlib.crc32(body)) == image[len(body) :]
+
+
+def factory_image(profile: DeviceProfile) -> bytes:
+    """The application that a device leaves the factory with: its version among filler, and the
+    checksum of R7, so that every profile accepts it.
+    """
+    size_bytes = min(_FACTORY_IMAGE_BYTES, profile.application_area_bytes)
+    body = b"factory application " + profile.factory_version.encode("ascii") + b"\x00"
+    body += bytes(index % 251 for index in range(size_bytes - len(body) - _CHECKSUM.size))
+    return body + _CHECKSUM.pack(zlib.crc32(body))
+
+
+class ApplicationStore:
+    """The application area and its record, on a flash of their own size."""
+
+    flash_type: ClassVar[type[Flash]] = Flash
+
+    def __init__(self, profile: DeviceProfile) -> None:
+        self._area_bytes = profile.application_area_bytes
+        self._erases_all = profile.erased_pages == "all"
+        self._record_address = AREA_START + self._area_bytes
+        self.flash = self.flash_type(
+            AREA_START,
+            self._area_bytes + profile.page_size_bytes,
+            page_size_bytes=profile.page_size_bytes,
+            program_unit_bytes=profile.program_unit_bytes,
+        )
+
+    def image(self) -> bytes | None:
+        """The image that the record vouches for, exactly its size; None unless all of it fits."""
+        size_bytes, crc, magic = _RECORD.unpack(self.flash.read(self._record_address, _RECORD.size))
+        if magic != _MAGIC or not 0 < size_bytes <= self._area_bytes:
+            return None
+        image = self.flash.read(AREA_START, size_bytes)
+        return image if self._is_intact(image, crc) else None
+
+    def _is_intact(self, image: bytes, crc: int) -> bool:
+        return zlib.crc32(image) == crc
+
+    def read(self, size_bytes: int) -> bytes:
+        """The first bytes of the area, whole or not."""
+        return self.flash.read(AREA_START, size_bytes)
+
+    def erasing(self, size_bytes: int) -> list[Operation]:
+        """What makes room for an image: the record first, then the pages."""
+        area_bytes = self._area_bytes if self._erases_all else size_bytes
+        pages = range(AREA_START, AREA_START + area_bytes, self.flash.page_size_bytes)
+        return [Operation(self._record_address), *(Operation(page) for page in pages)]
+
+    def storing(self, number: int, payload: bytes, size_bytes: int) -> Operation:
+        """What stores packet `number` of an image of `size_bytes`.
+
+        Bytes beyond the size are not stored, whatever they are (TX-08).
+        """
+        offset = (number - 1) * PACKET_DATA_SIZE
+        return Operation(AREA_START + offset, self._units(payload[: size_bytes - offset]))
+
+    def recording(self, size_bytes: int) -> Operation:
+        """What declares the first `size_bytes` of the area, as they are, a whole application."""
+        record = _RECORD.pack(size_bytes, zlib.crc32(self.read(size_bytes)), _MAGIC)
+        return Operation(self._record_address, self._units(record))
+
+    def load(self, image: bytes) -> None:
+        """Put an image and its record there as a factory does: no time, no operation counted."""
+        self.flash.program(AREA_START, self._units(image))
+        record = self.recording(len(image))
+        self.flash.program(record.address, record.data or b"")
+        self.flash.program_count = 0
+
+    def _units(self, data: bytes) -> bytes:
+        """`data` filled up to whole program units."""
+        unit = self.flash.program_unit_bytes
+        return data.ljust(-(-len(data) // unit) * unit, bytes((ERASED,)))

@@ -1,0 +1,172 @@
+"""A whole bicycle as one engine: BMS, WMC, OBC and, in the MOTINOVA dialect, HMI talk to each other
+on the bus, and each of the first three can be upgraded meanwhile.
+
+The battery feeds the others: when it switches off, they are off.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from flasher.mock.application import Application
+from flasher.mock.machine import Machine, Unit
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile, set_option
+from flasher.mock.talkers import Talker
+from flasher.protocol.echoes import Echoes
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import BMS, TARGETS, WELLING, Dialect, Node, Target
+from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
+
+_TARGETS: Final = {target.node: target for target in TARGETS.values()}
+_DEFAULT_PROFILE: Final = DeviceProfile()
+
+
+class System:
+    """An engine (`flasher.protocol.engine`) made of several, which hear each other as well.
+
+    `profile` and `has_application` are those of `device`, the one that `target` names; `profile`
+    is the BMS's too. Events are those of `device`. Put it on a simulated bus, or drive it on a
+    link: its members' frames take turns.
+    """
+
+    def __init__(
+        self,
+        dialect: Dialect = WELLING,
+        target: Target = BMS,
+        *,
+        profile: DeviceProfile = _DEFAULT_PROFILE,
+        timings: Timings = DEFAULT_TIMINGS,
+        has_application: bool = True,
+    ) -> None:
+        self.dialect = dialect
+        own_profile = set_option(profile, "dialect", dialect.name)
+        plain_profile = set_option(_DEFAULT_PROFILE, "dialect", dialect.name)
+        self.members: dict[Node, Machine] = {}
+        """Each node's machine."""
+        for node in dialect.nodes:
+            is_target = node is target.node
+            if node is Node.CDL:
+                continue
+            if node in _TARGETS:
+                self.members[node] = MockDevice(
+                    _TARGETS[node],
+                    bitrate_bps=dialect.bitrate_bps,
+                    profile=own_profile if is_target or node is Node.BMS else plain_profile,
+                    timings=timings,
+                    has_application=has_application or not is_target,
+                    application=_talker(node, dialect, timings),
+                )
+            else:
+                self.members[node] = Unit(
+                    Talker(node, dialect, timings),
+                    bitrate_bps=dialect.bitrate_bps,
+                    timings=timings,
+                )
+        device = self.members[target.node]
+        if not isinstance(device, MockDevice):
+            raise TypeError(f"{target.name} is no device that can be upgraded")
+        self.device = device
+        """The one that is to be upgraded."""
+        self._battery = self.members[Node.BMS]
+        self._turns = list(self.members.values())
+        self._sending: Machine | None = None
+        self._echoes = Echoes()
+        """The members have heard each other's frames when an adapter gives them back."""
+
+    # -- the bicycle ------------------------------------------------------------------------------
+
+    @property
+    def has_power(self) -> bool:
+        """False after the battery switched off."""
+        return self._battery.has_power
+
+    def hold_key(self, now: float) -> None:
+        """Hold the battery's key for as long as it takes to switch off."""
+        self._battery.hold_key(now)
+
+    def power_cut(self, now: float) -> None:
+        """The power goes everywhere."""
+        for member in self._turns:
+            if member.has_power:
+                member.power_cut(now)
+
+    def power_on(self, now: float) -> None:
+        """The power comes back everywhere; devices pass through their bootloaders (R19)."""
+        for member in self._turns:
+            if not member.has_power:
+                member.power_on(now)
+
+    def _share_power(self, now: float) -> None:
+        if not self._battery.has_power:
+            self.power_cut(now)
+
+    # -- the engine interface ---------------------------------------------------------------------
+
+    @property
+    def done(self) -> bool:
+        """True when all its members are."""
+        return all(member.done for member in self._turns)
+
+    def receive(self, frame: Frame, now: float) -> None:
+        """A frame arrived from outside, or is the adapter's echo of one of its own."""
+        if self._echoes.take(frame, now):
+            return
+        for member in self._turns:
+            member.receive(frame, now)
+
+    def tick(self, now: float) -> None:
+        """Let everything happen that is due by `now`."""
+        for member in self._turns:
+            member.tick(now)
+        self._share_power(now)
+
+    def deadline(self) -> float | None:
+        """When a member next wants `tick` or has a frame to send."""
+        wanted = [member.deadline() for member in self._turns]
+        return min((moment for moment in wanted if moment is not None), default=None)
+
+    def next_frame(self, now: float) -> Frame | None:
+        """The next frame to send, of one member after the other."""
+        if self._sending is not None:
+            frame = self._sending.next_frame(now)
+            if frame is not None:
+                return frame
+            self._sending = None
+        for member in self._turns:
+            frame = member.next_frame(now)
+            if frame is not None:
+                self._sending = member
+                return frame
+        return None
+
+    def frame_sent(self, now: float) -> None:
+        """The adapter has accepted it: the other members hear it, and it is their turn."""
+        sender, self._sending = self._sending, None
+        frame = sender.next_frame(now) if sender is not None else None
+        if sender is None or frame is None:
+            return
+        sender.frame_sent(now)
+        self._echoes.sent(frame, now)
+        self._turns.remove(sender)
+        for member in self._turns:
+            member.receive(frame, now)
+        self._turns.append(sender)
+
+    def cancel(self, now: float) -> None:
+        """Every member sends the message under way to its end, then nothing more."""
+        for member in self._turns:
+            member.cancel(now)
+
+    def take_events(self) -> Sequence[object]:
+        """What happened to `device` since the last call."""
+        for member in self._turns:
+            if member is not self.device:
+                member.take_events()
+        return self.device.take_events()
+
+
+def _talker(node: Node, dialect: Dialect, timings: Timings) -> Application | None:
+    """What a node asks; a BMS answers, with the application of its own."""
+    return None if node is Node.BMS else Talker(node, dialect, timings)

@@ -1,0 +1,181 @@
+"""The applications of WMC, OBC and HMI: what they ask the BMS, when, and how they shut down.
+
+The documents give the messages, not the rhythm: asking follows the rule of chapter 3 (every 200 ms,
+up to 1 s), and how often a question comes again is made up here. Nobody asks these nodes anything.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from flasher.mock.application import Application, ids_heard_by
+from flasher.mock.timer import due_again, due_until
+from flasher.protocol import contents
+from flasher.protocol.catalogue import ITEMS, Item, answer_of, decode, encode
+from flasher.protocol.spec import Dialect, Node
+from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
+from flasher.protocol.wire import Message
+
+RUNNING_INFORMATION_PERIOD_S: Final = 1.0
+"""How often an OBC asks for running information."""
+CELL_VOLTAGES_PERIOD_S: Final = 5.0
+"""How often an HMI asks for cell voltages."""
+PAUSE_S: Final = 1.0
+"""After a question in vain that has to be answered, before it is asked again."""
+
+
+@dataclass(frozen=True)
+class Habit:
+    """A question that a node asks when it starts: once, every `period_s`, or until answered."""
+
+    title: str
+    period_s: float | None = None
+    insists: bool = False
+
+
+_VERSIONS: Final = (Habit("read version information"), Habit("read design information"))
+HABITS: Final[Mapping[Node, Sequence[Habit]]] = {
+    Node.WMC: (
+        Habit("handshake", insists=True),
+        Habit("read physical id"),
+        Habit("read check code"),
+        Habit("read design information"),
+    ),
+    Node.OBC: (
+        *_VERSIONS,
+        Habit("read cell voltages"),
+        Habit("read running information", RUNNING_INFORMATION_PERIOD_S),
+    ),
+    Node.HMI: (*_VERSIONS, Habit("read cell voltages", CELL_VOLTAGES_PERIOD_S)),
+}
+
+
+class Talker(Application):
+    """A node that asks the BMS what it needs, one question after the other, and gets ready when the
+    BMS announces shutdown. After that it is silent until it starts again.
+    """
+
+    def __init__(self, node: Node, dialect: Dialect, timings: Timings = DEFAULT_TIMINGS) -> None:
+        super().__init__(node, dialect)
+        self._timings = timings
+        rows = {item.title: item for item in ITEMS if _sends(node, item, dialect)}
+        self._questions = [(habit, rows[habit.title]) for habit in HABITS[node]]
+        self._ready = next(item for item in rows.values() if item.content is contents.Ready)
+        self._goodbye = next((i for i in rows.values() if i.content is contents.Shutdown), None)
+        self._waiting: deque[tuple[Habit, Item]] = deque()
+        self._asked: tuple[Habit, Item] | None = None
+        self._due: float | None = None
+        self._give_up_at = 0.0
+        self._periodic: dict[str, float] = {}
+        self._is_asleep = True
+        self._said_goodbye = False
+        self.answers: dict[str, int] = {}
+        """How often each question was answered, by its title."""
+
+    # -- the machine's side -----------------------------------------------------------------------
+
+    @property
+    def hears(self) -> frozenset[int]:
+        return ids_heard_by(self.node, self.dialect)
+
+    def start(self, firmware: str, now: float) -> None:
+        self._is_asleep = self._said_goodbye = False
+        self._waiting = deque(self._questions)
+        self._asked = None
+        self._periodic = {
+            item.title: now + habit.period_s for habit, item in self._questions if habit.period_s
+        }
+        self._due = now
+
+    def stop(self) -> None:
+        self._is_asleep = True
+
+    def deadline(self) -> float | None:
+        if self._is_asleep:
+            return None
+        due = [*self._periodic.values()]
+        if self._due is not None:
+            due.append(self._due)
+        return min(due, default=None)
+
+    def tick(self, now: float) -> None:
+        if self._is_asleep:
+            return
+        self._take_up_again(now)
+        if self._due is None or now < self._due:
+            return
+        if self._asked is not None and now >= self._give_up_at:
+            self._give_up(now)
+        elif self._asked is not None:
+            self._say(self._asked[1])
+            repeat_s = self._timings.command_repeat_s
+            self._due = due_until(self._due, repeat_s, self._give_up_at, now)
+        else:
+            self._ask_next(now)
+
+    # -- questions --------------------------------------------------------------------------------
+
+    def _take_up_again(self, now: float) -> None:
+        """Periodic questions that are due wait their turn, each once."""
+        for question in self._questions:
+            habit, item = question
+            due = self._periodic.get(item.title)
+            if habit.period_s is None or due is None or due > now:
+                continue
+            self._periodic[item.title] = due_again(due, habit.period_s, now)
+            if question not in self._waiting and question != self._asked:
+                self._waiting.append(question)
+                if self._due is None:
+                    self._due = now
+
+    def _ask_next(self, now: float) -> None:
+        self._asked = self._waiting.popleft() if self._waiting else None
+        self._due = None
+        if self._asked is not None:
+            self._say(self._asked[1])
+            self._give_up_at = now + self._timings.command_timeout_s
+            self._due = now + self._timings.command_repeat_s
+
+    def _give_up(self, now: float) -> None:
+        question, self._asked = self._asked, None
+        if question is not None and question[0].insists:
+            self._waiting.appendleft(question)
+            self._due = now + PAUSE_S
+        else:
+            self._ask_next(now)
+
+    def _say(self, item: Item) -> None:
+        # Never more than one copy unsent: a bus that takes nothing would get them all at once.
+        if self.port.is_idle:
+            self.port.send(encode(item, item.content()))
+
+    # -- messages ---------------------------------------------------------------------------------
+
+    def take(self, message: Message, now: float) -> None:
+        """An answer ends its question; a shutdown of the BMS ends them all."""
+        decoded = decode(message, self.dialect)
+        if decoded is None or self._is_asleep:
+            return
+        if decoded.item.sender is Node.BMS and decoded.content == contents.Shutdown():
+            self._get_ready()
+        elif self._asked is not None and answer_of(self._asked[1]) is decoded.item:
+            title = self._asked[1].title
+            self.answers[title] = self.answers.get(title, 0) + 1
+            self._ask_next(now)
+
+    def _get_ready(self) -> None:
+        """Answer every announcement, as each one asks anew; ask nothing more."""
+        self._waiting.clear()
+        self._periodic.clear()
+        self._asked = self._due = None
+        self.port.send(encode(self._ready, contents.Ready()))
+        if self._goodbye is not None and not self._said_goodbye:
+            self._said_goodbye = True
+            self.port.send(encode(self._goodbye, contents.Shutdown()))
+
+
+def _sends(node: Node, item: Item, dialect: Dialect) -> bool:
+    return item.sender is node and dialect in item.dialects

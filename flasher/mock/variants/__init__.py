@@ -1,0 +1,91 @@
+"""Deliberately wrong bootloaders: each violates one clause and is right in everything else.
+
+They show what a conformance suite is worth: every case has one that fails it. `make` builds one as
+`MockDevice` itself is built; `VARIANTS` has them all by name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, Final
+
+from flasher.errors import UsageError, did_you_mean
+from flasher.mock.application import Application
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
+from flasher.mock.variants import (
+    announcing,
+    checksum,
+    ending,
+    framing,
+    more_en,
+    more_tx,
+    surroundings,
+    transfer,
+    update,
+)
+from flasher.mock.variants.base import HangingDevice, Variant
+from flasher.protocol.spec import Target
+from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
+
+__all__ = ["VARIANTS", "HangingDevice", "Variant", "find", "make"]
+
+VARIANTS: Final[Mapping[str, Variant]] = MappingProxyType(
+    {
+        variant.name: variant
+        for module in (
+            framing,
+            checksum,
+            announcing,
+            update,
+            transfer,
+            more_tx,
+            ending,
+            more_en,
+            surroundings,
+        )
+        for variant in module.VARIANTS
+    }
+)
+"""All of them by name, in the order of the catalogue's groups."""
+_DEFAULT_PROFILE: Final = DeviceProfile()
+
+
+def find(name: str) -> Variant:
+    """The variant of that name. Raises UsageError, naming the one probably meant."""
+    if name in VARIANTS:
+        return VARIANTS[name]
+    hint = did_you_mean(name, VARIANTS)
+    raise UsageError(
+        f"There is no variant {name!a} of the device model.",
+        where="--variant",
+        remedy=f"{hint}`flasher mock --list-variants` lists them.",
+    )
+
+
+def make(
+    variant: Variant | str,
+    target: Target,
+    *,
+    bitrate_bps: int,
+    profile: DeviceProfile = _DEFAULT_PROFILE,
+    timings: Timings = DEFAULT_TIMINGS,
+    has_application: bool = True,
+    application: Application | None = None,
+) -> MockDevice:
+    """A wrong device, with the keywords of `MockDevice`. The variant's own choices and timings
+    replace those given. Raises UsageError for an unknown name and as `MockDevice` does.
+    """
+    chosen = find(variant) if isinstance(variant, str) else variant
+    choices: dict[str, Any] = dict(chosen.profile)
+    faults: dict[str, Any] = dict(chosen.timings)
+    return chosen.device_type(
+        target,
+        bitrate_bps=bitrate_bps,
+        profile=dataclasses.replace(profile, **choices),
+        timings=dataclasses.replace(timings, **faults),
+        has_application=has_application,
+        application=application,
+    )

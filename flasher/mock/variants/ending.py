@@ -1,0 +1,244 @@
+"""Wrong bootloaders: end of transfer (EN) and power cuts (PW)."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from flasher.mock.memory import ERASED, Operation
+from flasher.mock.model import MockDevice
+from flasher.mock.store import AREA_START, ApplicationStore
+from flasher.mock.table import Event, State
+from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, Variant
+
+_DARK_BOOTS: Final = 2
+"""Power-ups in a row without an application after which one is spent in the dark."""
+
+
+# -- end of transfer ------------------------------------------------------------------------------
+
+
+class AnnouncesAfterComplete(MockDevice):
+    """Goes on as a device without an application after complete, until its power is cut."""
+
+    _holds_back = False
+
+    def _complete(self, now: float) -> str:
+        self._holds_back = True
+        return super()._complete(now)
+
+    def _elapsed(self) -> Event:
+        if self.state is State.STARTING:
+            return Event.START_BY_RESTART_DUE
+        return super()._elapsed()
+
+    def _boot(self, now: float) -> str:
+        detail = super()._boot(now)
+        self._has_whole_application = self._has_whole_application and not self._holds_back
+        return detail
+
+    def _switch_off(self, now: float) -> str:
+        self._holds_back = False
+        return super()._switch_off(now)
+
+
+class AcceptsEarlyEnd(MockDevice):
+    """Does not count whether all packets came."""
+
+    def _classify(self, row: AnyRow) -> Event:
+        event = super()._classify(row)
+        if event is not Event.END_EARLY:
+            return event
+        return Event.END_WHOLE if self._accepts_image() else Event.END_WRONG
+
+
+class ImageChecksumIgnored(MockDevice):
+    """Does not look at the checksum inside an image."""
+
+    def _accepts_image(self) -> bool:
+        return True
+
+
+class _KeepsLastPage(PlainStore):
+    def erasing(self, size_bytes: int) -> list[Operation]:
+        """All but the page where the new image ends, when the old one reaches beyond it."""
+        old = self.image()
+        operations = super().erasing(size_bytes)
+        if old is None or len(old) <= size_bytes:
+            return operations
+        page = self.flash.page_size_bytes
+        kept = AREA_START + (size_bytes - 1) // page * page
+        return [operation for operation in operations if operation.address != kept]
+
+
+class KeepsLongerRest(MockDevice):
+    """Leaves the page where a smaller image ends as the longer old one had it."""
+
+    store_type = _KeepsLastPage
+
+
+class ReportsOldVersion(MockDevice):
+    """Reads the version of its application at power-up only."""
+
+    _version: str | None = None
+
+    def _firmware(self) -> str:
+        if self._version is None:
+            self._version = super()._firmware()
+        return self._version
+
+    def _switch_off(self, now: float) -> str:
+        self._version = None
+        return super()._switch_off(now)
+
+
+# -- power cuts -----------------------------------------------------------------------------------
+
+
+class StartsTornImage(MockDevice):
+    """Starts whatever stands at the start of the application area."""
+
+    def _boot(self, now: float) -> str:
+        super()._boot(now)
+        first = self.store.read(self.profile.program_unit_bytes)
+        self._has_whole_application = set(first) != {ERASED}
+        return "something" if self._has_whole_application else "no application"
+
+
+class _RecordFirst(ApplicationStore):
+    def erasing(self, size_bytes: int) -> list[Operation]:
+        return [*super().erasing(size_bytes), self.recording(size_bytes)]
+
+    def _is_intact(self, image: bytes, crc: int) -> bool:
+        return True
+
+
+class RecordFirst(MockDevice):
+    """Writes the record that declares the application whole before the first packet."""
+
+    store_type = _RecordFirst
+
+    def _record(self, now: float) -> str:
+        self._due = now
+        return f"{self._transfer.size_bytes} bytes"
+
+
+class AckBeforeWrite(MockDevice):
+    """Acknowledges a packet that is in its buffer, and writes it when the next message comes."""
+
+    _buffered: Operation | None = None
+
+    def _store(self, now: float) -> str:
+        self._flush()
+        transfer = self._transfer
+        self._buffered = self.store.storing(transfer.wanted, self._payload, transfer.size_bytes)
+        self._due = now + self.profile.program_time_s
+        return ""
+
+    def _accepts_image(self) -> bool:
+        self._flush()
+        return super()._accepts_image()
+
+    def _flush(self) -> None:
+        operation, self._buffered = self._buffered, None
+        if operation is not None:
+            self.store.flash.program(operation.address, operation.data or b"")
+
+    def _erase(self, now: float) -> str:
+        self._buffered = None
+        return super()._erase(now)
+
+    def _boot(self, now: float) -> str:
+        self._buffered = None
+        return super()._boot(now)
+
+    def _switch_off(self, now: float) -> str:
+        self._buffered = None
+        return super()._switch_off(now)
+
+
+class DarkAfterSecondCut(HangingDevice):
+    """Hangs at the second power-up in a row that finds no application."""
+
+    _dark_boots = 0
+    _is_power_up = False
+
+    def power_on(self, now: float) -> None:
+        self._is_power_up = not self.has_power
+        super().power_on(now)
+
+    def _boot(self, now: float) -> str:
+        detail = super()._boot(now)
+        if not self._is_power_up:
+            return detail
+        self._is_power_up = False
+        self._dark_boots = 0 if self._has_whole_application else self._dark_boots + 1
+        if self._dark_boots < _DARK_BOOTS:
+            return detail
+        self._dark_boots = 0
+        return self._hang()
+
+    def _complete(self, now: float) -> str:
+        self._dark_boots = 0
+        return super()._complete(now)
+
+
+VARIANTS: Final = (
+    Variant(
+        "announces-after-complete",
+        "EN-01",
+        "does not start the new application until power is cut, announces itself instead",
+        AnnouncesAfterComplete,
+        also=("EN-07", "EN-08"),
+        upgrade_works=False,
+    ),
+    Variant("accepts-early-end", "EN-02", "completes when packets are missing", AcceptsEarlyEnd),
+    Variant(
+        "ignores-image-checksum",
+        "EN-04",
+        "starts an image whose own checksum is wrong",
+        ImageChecksumIgnored,
+        profile={"image_checksum": "crc32"},
+    ),
+    Variant(
+        "keeps-longer-rest",
+        "EN-07",
+        "does not erase the page where a smaller image ends: a mixture with the old one",
+        KeepsLongerRest,
+        also=("UP-01", "UP-08", "EN-01", "EN-08"),
+    ),
+    Variant(
+        "reports-old-version",
+        "EN-08",
+        "reports the version from before the upgrade until power is cut (a BMS)",
+        ReportsOldVersion,
+        also=("EN-01", "EN-07"),
+    ),
+    Variant(
+        "starts-torn-image",
+        "PW-01",
+        "starts what is stored of an image that was broken off",
+        StartsTornImage,
+        also=("RS-03", "TX-12", "EN-04", "PW-02"),
+    ),
+    Variant(
+        "record-first",
+        "PW-01",
+        "declares the new image whole before its first packet",
+        RecordFirst,
+        also=("TX-12", "EN-04", "RS-03", "PW-02"),
+    ),
+    Variant(
+        "ack-before-write",
+        "PW-01",
+        "acknowledges a packet, and writes it when the next message comes",
+        AckBeforeWrite,
+        also=("TX-02", "TX-05"),
+    ),
+    Variant(
+        "dark-after-second-cut",
+        "PW-02",
+        "hangs at the second power-up in a row without an application",
+        DarkAfterSecondCut,
+        also=("PW-01",),
+    ),
+)

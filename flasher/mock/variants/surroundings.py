@@ -1,0 +1,291 @@
+"""Wrong bootloaders: timing (TM), bus (BU), bad input (SE) and other traffic (CO)."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from functools import cached_property
+from itertools import pairwise
+from typing import Final
+
+from flasher.mock.machine import BUS_OFF_S
+from flasher.mock.model import MockDevice
+from flasher.mock.store import AREA_START
+from flasher.mock.table import Event, State
+from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, Variant
+from flasher.protocol import messages
+from flasher.protocol.catalogue import ITEMS
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import FRAME_DATA_SIZE, OVERHEAD_SIZE, PACKET_DATA_SIZE, TARGETS, Mode
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.protocol.wire import Damage, DamageReason, Message, Reassembler
+
+_PACKETS_A_PAGE: Final = 16
+_SLOW_S: Final = DEFAULT_TIMINGS.ack_timeout_s + 0.1
+"""Later than a host waits for an ACK (R12)."""
+_LOG_BYTES: Final = 4096
+_JUNK_BYTES: Final = 64
+_LOAD_WINDOW_S: Final = 0.1
+_LOAD_FRAMES: Final = 140
+"""Frames of others in that time that are too many: 250 kbit/s carries about 200 full ones."""
+_WRONG_MESSAGE: Final = frozenset((DamageReason.BAD_CRC, DamageReason.BAD_TAIL))
+_APPLICATION_COMMANDS: Final = frozenset(item.command for item in ITEMS)
+_USELESS: Final = frozenset((Event.NO_CONCERN, Event.OUT_OF_TURN, Event.RESET_IGNORED))
+
+
+# -- timing ---------------------------------------------------------------------------------------
+
+
+class SlowSixteenth(MockDevice):
+    """Every sixteenth packet takes longer than a host waits."""
+
+    def _store(self, now: float) -> str:
+        detail = super()._store(now)
+        if self._transfer.wanted % _PACKETS_A_PAGE == 0:
+            self._due = now + _SLOW_S
+        return detail
+
+
+# -- bus ------------------------------------------------------------------------------------------
+
+
+class DoubledFrameHangs(HangingDevice):
+    """A frame that comes twice in a message leaves it hanging."""
+
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        size = FRAME_DATA_SIZE
+        frames = [damage.data[at : at + size] for at in range(0, len(damage.data), size)]
+        # Filler repeats itself rightly.
+        doubled = any(one == next_one and len(set(one)) > 1 for one, next_one in pairwise(frames))
+        if doubled and damage.reason in _WRONG_MESSAGE:
+            self._hang()
+        else:
+            super()._take_damage(damage, now)
+
+
+class StaysOffBus(MockDevice):
+    """Does not bring its controller back after bus-off."""
+
+    def bus_off(self, now: float, off_s: float = BUS_OFF_S) -> None:
+        super().bus_off(now, float("inf"))
+
+
+class CollisionHangs(HangingDevice):
+    """A frame of somebody else with the id of its own answers leaves it hanging."""
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if frame.can_id == self.target.answer_id and self.has_power and not self.hangs:
+            self._hang()
+        super().receive(frame, now)
+
+
+# -- bad input ------------------------------------------------------------------------------------
+
+
+class LogsUseless(HangingDevice):
+    """Keeps every message of no use until a useful one comes, in a memory that is soon full."""
+
+    _log_bytes = 0
+
+    def _classify(self, row: AnyRow) -> Event:
+        event = super()._classify(row)
+        if self._message is None or not self._is_useless(event, self._message.command):
+            self._log_bytes = 0
+            return event
+        self._log_bytes += OVERHEAD_SIZE + len(self._message.data)
+        if self._log_bytes > _LOG_BYTES:
+            self._log_bytes = 0
+            self._hang()
+            return Event.NO_CONCERN
+        return event
+
+    def _is_useless(self, event: Event, command: int) -> bool:
+        if event is Event.QUERY:
+            return self.state is not State.APPLICATION or command not in _APPLICATION_COMMANDS
+        return event in _USELESS
+
+
+class NoiseHangs(HangingDevice):
+    """A report sent to it, or more junk than its ring holds, leaves it hanging."""
+
+    def _take_message(self, message: Message, now: float) -> None:
+        is_own = message.can_id == self.target.request_id
+        if is_own and message.mode == Mode.REPORT and self.state is not State.APPLICATION:
+            self._hang()
+        else:
+            super()._take_message(message, now)
+
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        if damage.reason is DamageReason.JUNK and len(damage.data) >= _JUNK_BYTES:
+            self._hang()
+        else:
+            super()._take_damage(damage, now)
+
+
+class WritesAnywhere(MockDevice):
+    """Writes a packet beyond the total to where its number says, whatever lies there."""
+
+    store_type = PlainStore
+    _is_beyond = False
+
+    def _classify(self, row: AnyRow) -> Event:
+        event = super()._classify(row)
+        self._is_beyond = (
+            event is Event.PACKET_BAD
+            and isinstance(row, messages.Packet)
+            and row.total == self._transfer.total < row.number
+        )
+        return event
+
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        self._is_beyond = False
+        super()._take_damage(damage, now)
+
+    def _answer_bad(self, now: float) -> str:
+        if not self._is_beyond or self._number is None:
+            return super()._answer_bad(now)
+        address = AREA_START + (self._number - 1) * PACKET_DATA_SIZE
+        self.store.flash.program(address, self._payload)
+        self._send(messages.Ack(self._number))
+        self._await_host(now)
+        return ""
+
+
+# -- other traffic --------------------------------------------------------------------------------
+
+
+class LoadHangs(HangingDevice):
+    """Is interrupted by every frame on the bus: more than it can serve leave it hanging."""
+
+    @cached_property
+    def _foreign(self) -> deque[float]:
+        """When the last frames of others came."""
+        return deque(maxlen=_LOAD_FRAMES)
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if frame.can_id != self.target.request_id and self.has_power and not self.hangs:
+            self._foreign.append(now)
+            is_full = len(self._foreign) == _LOAD_FRAMES
+            if is_full and now - self._foreign[0] <= _LOAD_WINDOW_S:
+                self._foreign.clear()
+                self._hang()
+        super().receive(frame, now)
+
+
+class HearsOtherTargets(MockDevice):
+    """While it is upgraded, takes packets and ends for other targets too."""
+
+    @cached_property
+    def _others(self) -> dict[int, Reassembler]:
+        return {
+            target.request_id: Reassembler(target.request_id, self.timings.inter_frame_timeout_s)
+            for target in TARGETS.values()
+            if target is not self.target
+        }
+
+    def receive(self, frame: Frame, now: float) -> None:
+        super().receive(frame, now)
+        other = self._others.get(frame.can_id)
+        if other is None or not frame.is_payload or self.state is not State.TRANSFER:
+            return
+        self._take_others(other.feed(frame.data, now), now)
+
+    def _take_others(self, found: Sequence[Message | Damage], now: float) -> None:
+        for one in found:
+            if isinstance(one, Message):
+                row = messages.decode(one)
+                if isinstance(row, messages.Packet | messages.EndOfTransfer):
+                    self._take(one._replace(can_id=self.target.request_id), now)
+
+
+class AnswersInBootloader(MockDevice):
+    """Its bootloader confirms every message of chapter 3, as the application would."""
+
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        in_bootloader = self.state is not State.APPLICATION
+        if in_bootloader and isinstance(row, messages.Unknown):
+            self._confirm(row.message.command)
+        super()._take_row(row, now)
+
+    def _confirm(self, command: int) -> None:
+        if command in _APPLICATION_COMMANDS:
+            self._send(messages.GeneralFeedback())
+
+
+VARIANTS: Final = (
+    Variant(
+        "drops-after-20-ms-gap",
+        "TM-02",
+        "drops a message when 20 ms pass between two of its frames",
+        timings={"inter_frame_timeout_s": 0.02},
+        also=("BU-01",),
+    ),
+    Variant(
+        "slow-sixteenth-packet",
+        "TM-05",
+        "acknowledges packets 16, 32, ... after 0.6 s",
+        SlowSixteenth,
+        also=("TX-07",),
+    ),
+    Variant(
+        "doubled-frame-hangs",
+        "BU-01",
+        "hangs at a message with a doubled frame until power is cut",
+        DoubledFrameHangs,
+        also=("CR-02",),
+    ),
+    Variant(
+        "stays-off-after-bus-off",
+        "BU-02",
+        "does not come back from bus-off until power is cut",
+        StaysOffBus,
+    ),
+    Variant(
+        "collision-hangs",
+        "BU-06",
+        "hangs when somebody else sends with its answer id, until power is cut",
+        CollisionHangs,
+    ),
+    Variant(
+        "logs-useless-messages",
+        "SE-01",
+        "hangs after 4 KiB of messages of no use in a row",
+        LogsUseless,
+        also=("SE-03", "CO-04"),
+    ),
+    Variant(
+        "noise-hangs",
+        "SE-03",
+        "hangs at 64 bytes of junk in a row, or at a report sent to its bootloader",
+        NoiseHangs,
+        also=("SE-01", "FR-10", "FR-02", "TX-01", "BU-01", "CR-01", "CR-02", "FR-06"),
+    ),
+    Variant(
+        "writes-anywhere",
+        "SE-04",
+        "writes and acknowledges a packet beyond the total",
+        WritesAnywhere,
+        also=("TX-03",),
+    ),
+    Variant(
+        "load-hangs",
+        "CO-01",
+        "hangs when 140 frames of others come within 100 ms",
+        LoadHangs,
+        also=("CO-02",),
+    ),
+    Variant(
+        "hears-other-targets",
+        "CO-02",
+        "takes packets for other targets during its own transfer",
+        HearsOtherTargets,
+        also=("CO-04",),
+    ),
+    Variant(
+        "answers-in-bootloader",
+        "CO-04",
+        "its bootloader confirms messages of chapter 3",
+        AnswersInBootloader,
+        also=("FR-10", "SE-01"),
+    ),
+)
