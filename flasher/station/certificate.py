@@ -11,8 +11,7 @@ from typing import Final
 
 from flasher.errors import UsageError
 from flasher.report.base import Status, render_page
-from flasher.station.records.heads import Head
-from flasher.station.records.keys import fingerprint
+from flasher.station.records.keys import Head, fingerprint
 from flasher.station.records.model import (
     Measurement,
     RunDetails,

@@ -9,8 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 
-from flasher.station.records.model import Figures, RunId, RunKind, RunState, StepState
-from flasher.station.steps import StepName, Verified
+from flasher.station.records.model import (
+    Figures,
+    RunId,
+    RunKind,
+    RunState,
+    StepName,
+    StepState,
+    Verified,
+)
 
 
 class SocketState(StrEnum):

@@ -6,7 +6,7 @@
 
 It opens nothing and reads no clock: times are seconds on the station's monotonic clock. The shell
 around it (`flasher.station.station`) carries its effects out and tells it what came of them. The
-rule by which labels get their sockets stands in `flasher.station.placing`.
+rule by which labels get their sockets stands in `flasher.station.scans`.
 """
 
 from __future__ import annotations
@@ -29,8 +29,14 @@ from flasher.station.events import (
     UnitRemoved,
 )
 from flasher.station.messages import PresenceChanged
-from flasher.station.placing import (
+from flasher.station.records.errors import Refusal
+from flasher.station.records.model import AuditEvent, RunState
+from flasher.station.scans import (
+    Command,
+    Label,
+    Nonsense,
     Refused,
+    Word,
     check_first,
     check_fits,
     check_free,
@@ -39,11 +45,9 @@ from flasher.station.placing import (
     check_service,
     place,
     still_there,
+    understand,
     was_in,
 )
-from flasher.station.records.errors import Refusal
-from flasher.station.records.model import AuditEvent, RunState
-from flasher.station.scans import Command, Label, Nonsense, Word, understand
 from flasher.station.socket import LastRun, Phase, Seen, Socket, Why
 
 ARRIVAL_LIMIT_S: Final = 20.0

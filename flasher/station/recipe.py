@@ -31,7 +31,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from flasher.protocol.spec import TARGETS, Target, find_target
 from flasher.station import checkdigit
 from flasher.station.pattern import TEXT_MAX, pattern_of
-from flasher.station.steps import StepName, Verified
+from flasher.station.records.model import StepName, Verified
 
 _TIME_MAX_S: Final = 3600.0
 _TRIES_MAX: Final = 10

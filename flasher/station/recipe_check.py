@@ -24,7 +24,7 @@ from flasher.station.recipe_file import (
     RecipeError,
     load_recipe,
 )
-from flasher.station.steps import Verified
+from flasher.station.records.model import Verified
 from flasher.station.template import Scan
 
 _SAMPLE_LOT: Final = "LOT1"

@@ -29,7 +29,7 @@ from flasher.profile.model import Profile
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.station.recipe import Firmware, Recipe, Verify, Write
-from flasher.station.steps import Verified
+from flasher.station.records.model import Verified
 from flasher.station.template import Scan, fill
 
 Model = TypeVar("Model", bound=BaseModel)

@@ -8,15 +8,31 @@ LOT 4711      the lot of the units that follow
 OPERATOR Jo   who works here now
 REASON text   why units that have passed are done again; holds for the next label
 RESUME        what stopped the line is mended: save what is open, and go on
+
+`place` is the rule by which a label is never given to a unit that reports first. A label that is
+scanned alone belongs to
+
+- the only socket of a station that has one;
+- the socket whose unit says that this is its serial number;
+- the socket that the station names, when the unit comes there afterwards. It names only one of
+  which it knows that nothing is in it.
+
+In all other cases a person says it, by the card of the socket.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from flasher.protocol.text import printable
+from flasher.station import codes
 from flasher.station.pattern import TEXT_MAX
+from flasher.station.records.errors import Refusal
+from flasher.station.records.model import RunState
+from flasher.station.socket import LastRun, Phase, Seen, Socket, Why
 
 _COMMAND_MAX: Final = 200
 
@@ -76,3 +92,163 @@ def understand(text: str) -> Label | Command | Nonsense:
     if len(scanned) > TEXT_MAX:
         return Nonsense(f"It is longer than {TEXT_MAX} characters.")
     return Label(scanned)
+
+
+WAIT: Final = "Wait for its end."
+Sockets = Mapping[str, Socket]
+
+
+class Refused(Exception):  # noqa: N818  a scan that changes nothing
+    """Why a scan is refused: a stable word, a sentence, and what to do."""
+
+    def __init__(self, code: str, reason: str, remedy: str) -> None:
+        super().__init__(reason)
+        self.code = code
+        self.reason = reason
+        self.remedy = remedy
+
+
+def place(sockets: Sockets, serial: str) -> tuple[Socket, Why] | None:
+    """The socket of a label that was scanned alone; None where a person has to say it.
+
+    Raises Refused.
+    """
+    if len(sockets) == 1:
+        (only,) = sockets.values()
+        return only, _why_only(only, serial)
+    found = _where_it_is(sockets, serial)
+    if found is not None:
+        return found, Why.SAID
+    starting = next((each for each in sockets.values() if each.is_starting), None)
+    if starting is not None:
+        raise Refused(
+            "STARTING",
+            f"Socket {starting.name} is still starting: it is not known what is in it.",
+            "Scan the card of the unit's socket, then the label; or wait for it.",
+        )
+    may_be_in = (each.awaits_label and not each.is_of_another(serial) for each in sockets.values())
+    if was_in(sockets, serial) is not None or any(may_be_in):
+        return None
+    empty = (e for e in sockets.values() if e.seen is Seen.EMPTY and e.can_work)
+    named = next((e for e in empty if e.phase is Phase.REST and not e.label), None)
+    return None if named is None else (named, Why.NAMED)
+
+
+def was_in(sockets: Sockets, serial: str) -> Socket | None:
+    """The socket in which the unit was last, as far as it has no PASS."""
+    for each in sockets.values():
+        last = each.verdict
+        if each.interrupted == serial or (last is not None and last.serial == serial):
+            return each
+    return None
+
+
+def _why_only(only: Socket, serial: str) -> Why:
+    check_service(only)
+    check_free(only)
+    if only.label:
+        raise one_at_a_time(only.label, only.wanted)
+    last = only.verdict
+    if last is None or last.serial == serial:
+        return Why.ONLY
+    if only.seen is not Seen.SILENT:
+        return Why.NAMED  # the next one, when this one is out
+    if last.outcome is not RunState.PASS and not last.has_talked and only.sees_units:
+        # It may sit in its bootloader, and announce itself at any time.
+        raise Refused(
+            "TAKE_OUT",
+            f"{printable(last.serial)} may still be in socket {only.name}.",
+            f"Take it out, scan FREE {only.name}, then the label again.",
+        )
+    return Why.ONLY
+
+
+def _where_it_is(sockets: Sockets, serial: str) -> Socket | None:
+    """The socket in which this very unit is heard."""
+    idle = [e for e in sockets.values() if e.can_work and e.phase is Phase.REST]
+    said = [each for each in idle if each.is_there and each.own == serial]
+    return said[0] if len(said) == 1 else None
+
+
+def check_free(socket: Socket) -> None:
+    """Raises Refused while a run of the socket goes on, or is not saved."""
+    if socket.phase is not Phase.REST:
+        reason = f"Socket {socket.name} is busy with {printable(socket.serial)}."
+        raise Refused(Refusal.SOCKET_BUSY.value, reason, WAIT)
+
+
+def check_service(socket: Socket) -> None:
+    """Raises Refused for a socket that cannot work; one that starts will."""
+    if socket.out_of_service:
+        reason = f"Socket {socket.name} is out of service: {socket.out_of_service}"
+        raise Refused("SOCKET_BROKEN", reason, "Use another socket, or mend this one.")
+
+
+def check_known(sockets: Sockets, serial: str) -> None:
+    """Raises Refused for the label of a unit that runs, or has just passed."""
+    for each in sockets.values():
+        if each.phase is not Phase.REST and each.serial == serial:
+            reason = f"It runs in socket {each.name}."
+            raise Refused(Refusal.UNIT_RUNNING.value, reason, WAIT)
+        last = each.verdict
+        if last is not None and last.serial == serial and last.outcome is RunState.PASS:
+            reason = f"It has just passed in socket {each.name}."
+            raise Refused("JUST_PASSED", reason, "Take it out, and scan the next unit.")
+
+
+def check_first(sockets: Sockets, serial: str, waiting: str) -> None:
+    """Raises Refused for a label that was scanned already, or behind one that still waits."""
+    for each in sockets.values():
+        if each.label == serial:
+            again = f"If it is there, scan SOCKET {each.name}, then the label."
+            raise Refused("DOUBLE_SCAN", "It was scanned already.", f"{each.wanted} {again}")
+        if each.label and each.why is Why.NAMED:
+            raise one_at_a_time(each.label, each.wanted)
+    if waiting:
+        remedy = f"Scan the card of the socket that {printable(waiting)} is in."
+        if waiting == serial:
+            raise Refused("DOUBLE_SCAN", "It was scanned already.", remedy)
+        raise one_at_a_time(waiting, remedy)
+
+
+def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
+    """Raises Refused for a label where another unit is known to be in the socket."""
+    last = socket.holds
+    if last is not None and last.serial != serial:
+        raise still_there(socket, last)
+    if socket.is_of_another(serial):
+        raise Refused(
+            codes.WRONG_UNIT.name,
+            f"The unit in socket {socket.name} says that it is {printable(socket.own or '')}.",
+            "Compare label and unit: scan the label of the unit that is in the socket.",
+        )
+    for each in sockets.values():
+        if each is not socket and each.is_there and each.own == serial:
+            raise Refused(
+                codes.WRONG_UNIT.name,
+                f"The unit in socket {each.name} says that it is {printable(serial)}.",
+                f"Compare the labels of the units in the sockets {each.name} and {socket.name}.",
+            )
+
+
+def check_one_socket(sockets: Sockets, socket: Socket, serial: str) -> None:
+    """Raises Refused for a label that a person gave to another socket."""
+    for each in sockets.values():
+        if each is not socket and each.label == serial and each.why is not Why.NAMED:
+            reason = f"It was scanned for socket {each.name}."
+            raise Refused("DOUBLE_SCAN", reason, f"{each.wanted} Or scan CANCEL.")
+
+
+def one_at_a_time(label: str, remedy: str) -> Refused:
+    """For a label that is scanned while another one waits."""
+    reason = f"{printable(label)} was scanned before and waits for its unit."
+    return Refused("LABEL_WAITS", reason, f"{remedy} Or scan CANCEL.")
+
+
+def still_there(socket: Socket, last: LastRun) -> Refused:
+    """For a scan that means another unit than the one that is heard."""
+    return Refused(
+        "TAKE_OUT",
+        f"{printable(last.serial)} is still in socket {socket.name}.",
+        f"Take it out first. If it is out, scan FREE {socket.name}.",
+    )

@@ -38,7 +38,6 @@ from flasher.station.events import (
     StepStarted,
     WorkerFailed,
 )
-from flasher.station.history import before_of
 from flasher.station.line import Line
 from flasher.station.messages import (
     Abort,
@@ -51,8 +50,15 @@ from flasher.station.messages import (
     Intent,
     Note,
     PresenceChanged,
+    Progress,
+    Prompt,
     Ready,
     Reply,
+    RunNote,
+    RunOrder,
+    RunResult,
+    StepBegan,
+    StepReport,
     WorkerSetup,
 )
 from flasher.station.options import StationOptions, check_natures
@@ -68,16 +74,7 @@ from flasher.station.records.model import (
     RunState,
 )
 from flasher.station.records.store import Store, SystemClock
-from flasher.station.run_model import (
-    Progress,
-    Prompt,
-    RunNote,
-    RunOrder,
-    RunResult,
-    StepBegan,
-    StepReport,
-)
-from flasher.station.saving import ActiveRun, save, verified_words
+from flasher.station.runs import ActiveRun, before_of, save, verified_words
 from flasher.station.socket import Phase, Socket
 from flasher.station.supervisor import Launch, ProcessPort, Supervisor, WorkerLost
 

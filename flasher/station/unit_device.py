@@ -26,8 +26,8 @@ from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Command
 from flasher.station.listening import BootWatcher, Listen
+from flasher.station.messages import CancelledError, PowerControl
 from flasher.station.recipe_file import LoadedTarget
-from flasher.station.run_model import CancelledError, PowerControl
 
 BURST_QUIET_S: Final = 0.3
 """No further announcement for so long: the burst (4 of them, 50 ms apart) is over."""

@@ -25,9 +25,7 @@ from flasher.errors import (
 from flasher.station import codes
 from flasher.station.codes import Code
 from flasher.station.listening import Listen
-from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.model import Measurement, RunState, StepState
-from flasher.station.run_model import (
+from flasher.station.messages import (
     CancelledError,
     Journal,
     JournalError,
@@ -40,7 +38,8 @@ from flasher.station.run_model import (
     StepReport,
     Tell,
 )
-from flasher.station.steps import StepName
+from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.records.model import Measurement, RunState, StepName, StepState
 from flasher.station.unit_device import UnitDevice
 from flasher.station.unit_steps import Act, UnitSteps
 

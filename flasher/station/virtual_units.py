@@ -27,7 +27,7 @@ from flasher.station.config import MockUnits
 from flasher.station.messages import PresenceChanged, VirtualUnits
 from flasher.station.recipe import SerialNumber
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.unit_judging import SERIAL_ITEM
+from flasher.station.unit_checks import SERIAL_ITEM
 
 NO_NUMBER: Final = "NONE"
 """What a new unit has for a serial number."""

@@ -26,8 +26,8 @@ from flasher.station.records import (
     StepState,
     Store,
 )
+from flasher.station.records.model import StepName, Verified
 from flasher.station.reports import make_report, unit_document
-from flasher.station.steps import StepName, Verified
 from tests.station.factory import BMS_VERSION, HEAD, Bench, make_recipe, target_table
 
 SERIAL_NUMBER = """

@@ -23,8 +23,8 @@ from flasher.station.messages import VirtualUnits, WorkerSetup
 from flasher.station.options import StationOptions
 from flasher.station.recipe_file import LoadedRecipe, load_recipe
 from flasher.station.records import Keeping, RunState, Store
+from flasher.station.records.model import StepName
 from flasher.station.station import Station
-from flasher.station.steps import StepName
 
 SAMPLE = Path(__file__).parents[2] / "firmware_samples" / "bms.hex"
 RECIPE = """\

@@ -10,8 +10,7 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from flasher.station.messages import FromWorker, ToWorker, WorkerSetup
-from flasher.station.worker import Worker, load_same, open_socket
-from flasher.station.worker_pipe import StationGoneError, StationPipe
+from flasher.station.worker import StationGoneError, StationPipe, Worker, load_same, open_socket
 
 
 class ThreadPort:

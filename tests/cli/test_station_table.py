@@ -39,9 +39,8 @@ from flasher.station.events import (
     UnitArrived,
     WorkerFailed,
 )
-from flasher.station.records.model import Figures, RunId, RunKind, RunState
+from flasher.station.records.model import Figures, RunId, RunKind, RunState, StepName
 from flasher.station.station import SocketView
-from flasher.station.steps import StepName
 from tests.cli.conftest import Flasher
 from tests.cli.station_threads import ThreadPort
 from tests.cli.test_schema import hold

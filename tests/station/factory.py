@@ -21,7 +21,7 @@ from flasher.protocol.spec import BMS, WMC, Target
 from flasher.station.recipe_check import load_checked
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import Claim, Ending, Keeping, RunId, RunState, StepState, Store
-from flasher.station.steps import Verified
+from flasher.station.records.model import Verified
 from tests.station.traces import run_messages, write_trace
 
 DAY = date(2026, 5, 17)

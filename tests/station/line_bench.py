@@ -18,15 +18,15 @@ from flasher.station.messages import (
     PresenceChanged,
     Ready,
     Reply,
+    RunResult,
+    StepReport,
     ToWorker,
     TraceFile,
     WorkerSetup,
 )
 from flasher.station.options import StationOptions
-from flasher.station.records.model import Measurement, RunState, StepState
-from flasher.station.run_model import RunResult, StepReport
+from flasher.station.records.model import Measurement, RunState, StepName, StepState, Verified
 from flasher.station.station import Station
-from flasher.station.steps import StepName, Verified
 from tests.station.factory import Bench
 
 Event = TypeVar("Event")

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from flasher.station import line, placing
+from flasher.station import line, scans
 from flasher.station.events import SocketChanged
 from flasher.station.line import Line
 from flasher.station.messages import PresenceChanged
@@ -95,10 +95,10 @@ def take_silence_for_an_empty_socket(patch: pytest.MonkeyPatch) -> None:
 
 
 def name_a_socket_of_which_nothing_is_known(patch: pytest.MonkeyPatch) -> None:
-    def place(sockets: placing.Sockets, serial: str) -> tuple[Socket, Why] | None:
+    def place(sockets: scans.Sockets, serial: str) -> tuple[Socket, Why] | None:
         try:
-            found = placing.place(sockets, serial)
-        except placing.Refused:
+            found = scans.place(sockets, serial)
+        except scans.Refused:
             found = None
         free = (e for e in sockets.values() if e.can_work and e.phase is Phase.REST)
         unknown = next((e for e in free if e.seen is not Seen.THERE and not e.label), None)

@@ -11,7 +11,7 @@ from flasher.errors import UsageError
 from flasher.protocol.spec import BMS, WMC
 from flasher.station.recipe_check import check_recipe
 from flasher.station.recipe_file import RecipeError, load_recipe
-from flasher.station.steps import StepName, Verified
+from flasher.station.records.model import StepName, Verified
 from tests.station.factory import (
     BMS_VERSION,
     DAY,

@@ -35,19 +35,22 @@ from flasher.station.messages import (
     Intent,
     PresenceChanged,
     Ready,
+    RunResult,
+    StepReport,
     TraceFile,
+    flash_value,
 )
 from flasher.station.records.errors import DiskFullError, RecordsLockedError
 from flasher.station.records.model import (
     Measurement,
     RunKind,
     RunState,
+    StepName,
     StepState,
     UnitState,
+    Verified,
     WriteId,
 )
-from flasher.station.run_model import RunResult, StepReport, flash_value
-from flasher.station.steps import StepName, Verified
 from tests.station.factory import SERIAL, USUAL, Bench
 from tests.station.line_bench import LineBench
 

@@ -12,10 +12,9 @@ from flasher.mock.bms import BmsApplication
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WMC
 from flasher.station.codes import CODES, OF_ENDING
-from flasher.station.records.model import RunKind, RunState, StepState
+from flasher.station.messages import Progress, Prompt
+from flasher.station.records.model import RunKind, RunState, StepName, StepState, Verified
 from flasher.station.records.proof import hear
-from flasher.station.run_model import Progress, Prompt
-from flasher.station.steps import StepName, Verified
 from flasher.trace.reader import read_trace
 from flasher.trace.recorder import Recorder
 from flasher.trace.source import explain_path

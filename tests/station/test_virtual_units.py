@@ -11,9 +11,8 @@ import pytest
 from flasher.errors import UsageError
 from flasher.station.adapters import resolve
 from flasher.station.config import MockUnits, mock_config
-from flasher.station.messages import VirtualUnits
+from flasher.station.messages import RunOrder, RunResult, VirtualUnits
 from flasher.station.records.model import RunId, RunKind
-from flasher.station.run_model import RunOrder, RunResult
 from flasher.station.setups import worker_setups
 from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import Health, VirtualSocket, health_of, serial_numbers

@@ -26,20 +26,20 @@ from flasher.station.messages import (
     Finished,
     FromWorker,
     Intent,
+    JournalError,
     Note,
     PresenceChanged,
     Quit,
     Ready,
     Reply,
+    RunOrder,
     ToWorker,
     VirtualUnits,
     WorkerSetup,
 )
 from flasher.station.records.model import RunId, RunKind, RunState, WriteId
-from flasher.station.run_model import JournalError, RunOrder
 from flasher.station.virtual_units import VirtualSocket
-from flasher.station.worker import Worker, load_same
-from flasher.station.worker_pipe import PipeJournal, StationPipe
+from flasher.station.worker import PipeJournal, StationPipe, Worker, load_same
 from tests.station.factory import DAY, USUAL, make_recipe
 from tests.station.unit_bench import WRITES
 

@@ -13,8 +13,7 @@ from flasher.driver import Tap
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, WELLING, Target
-from flasher.station.records.model import RunId, RunKind, StepState, WriteId
-from flasher.station.run_model import (
+from flasher.station.messages import (
     JournalError,
     PowerControl,
     RunNote,
@@ -23,7 +22,7 @@ from flasher.station.run_model import (
     StepReport,
     Texts,
 )
-from flasher.station.steps import StepName
+from flasher.station.records.model import RunId, RunKind, StepName, StepState, WriteId
 from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import Place
 from tests.station.factory import DAY, SERIAL, USUAL, make_recipe

@@ -12,12 +12,10 @@ from sqlalchemy import Connection, func, select
 
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
-from flasher.station import golden
-from flasher.station.recipe import Duplicate
+from flasher.station.recipe import Duplicate, Golden
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import chain, schema
-from flasher.station.records.chain import Trail
-from flasher.station.records.digests import CLAIMED, digests_of
+from flasher.station.records.chain import CLAIM_PARTS, Trail, digests_of
 from flasher.station.records.errors import ClaimRefusedError, Refusal
 from flasher.station.records.model import (
     Claim,
@@ -123,7 +121,7 @@ def begin_run(trail: Trail, order: Order, now: datetime, monotonic_s: float) -> 
     )
     add_targets(connection, run_id, loaded.targets)
     digests = digests_of(connection, [run_id])[run_id]
-    data = {"serial": order.serial, "digests": {name: digests[name] for name in CLAIMED}}
+    data = {"serial": order.serial, "digests": {name: digests[name] for name in CLAIM_PARTS}}
     trail.append(now, chain.CLAIMED, data, run_id)
     return Claim(RunId(run_id), kind, order.serial, order.part, before, count)
 
@@ -269,9 +267,32 @@ def _check_golden(connection: Connection, order: Order, socket_id: int, now: dat
         )
     )
     last = connection.execute(query).scalar_one()
-    if golden.is_due(rule, utc_moment(last) if last else None, now.astimezone()):
+    if is_due(rule, utc_moment(last) if last else None, now.astimezone()):
         raise ClaimRefusedError(
             Refusal.GOLDEN_DUE,
             f"A golden unit has to pass on socket {order.socket} first.",
             remedy=f"Scan and connect one of: {', '.join(rule.serial_numbers)}.",
         )
+
+
+def is_due(rule: Golden, last_pass: datetime | None, now: datetime) -> bool:
+    """True when a golden unit has to pass first. `last_pass` is when one last did on this socket.
+
+    `now` has the time zone of the clock on the wall, in which the shifts start.
+    """
+    if last_pass is None:
+        return True
+    if rule.every_h is not None and now - last_pass >= timedelta(hours=rule.every_h):
+        return True
+    start = last_shift_start(rule, now)
+    return start is not None and last_pass < start
+
+
+def last_shift_start(rule: Golden, now: datetime) -> datetime | None:
+    """When the shift that runs at `now` began; None where the rule names no shifts."""
+    starts = [
+        datetime.combine(now.date() - timedelta(days=days), start, now.tzinfo)
+        for start in rule.shift_starts
+        for days in (0, 1)
+    ]
+    return max((start for start in starts if start <= now), default=None)

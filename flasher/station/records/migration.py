@@ -20,15 +20,13 @@ from sqlalchemy import Column, Connection, Integer, MetaData, String, Table, ins
 from flasher.errors import UsageError
 from flasher.station.records import chain, schema
 from flasher.station.records.backup import copy_sqlite
-from flasher.station.records.chain import Trail
+from flasher.station.records.chain import CLAIM_PARTS, Trail, batches, digests_of
 from flasher.station.records.database import Database, locate
-from flasher.station.records.digests import CLAIMED, batches, digests_of
 from flasher.station.records.files import whole_file
-from flasher.station.records.fingerprint import fingerprint_of
 from flasher.station.records.keys import SigningKey, file_name
 from flasher.station.records.lock import StationLock
 from flasher.station.records.signing import Keeping, KeptPlace, key_folder
-from flasher.station.records.triggers import final_table, trigger_statements
+from flasher.station.records.triggers import final_table, fingerprint_of, trigger_statements
 
 _OLD: Final = Table(
     "audit_1",
@@ -155,7 +153,7 @@ def _vouch(trail: Trail, records_id: str) -> tuple[tuple[str, ...], int]:
             is_over = states[run_id] != "RUNNING"
             event = chain.MIGRATED_RUN if is_over else chain.CLAIMED
             if not is_over:
-                digests = {name: digests[name] for name in CLAIMED}  # noqa: PLW2901
+                digests = {name: digests[name] for name in CLAIM_PARTS}  # noqa: PLW2901
             trail.append(now, event, {"state": states[run_id], "digests": digests}, run_id)
     return problems, len(states)
 

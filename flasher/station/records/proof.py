@@ -20,8 +20,7 @@ from flasher.protocol.spec import TARGETS, Node, Target, can_id, packet_count
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Message, Reassembler
-from flasher.station.records.model import RunDetails, TargetRecord
-from flasher.station.steps import Verified
+from flasher.station.records.model import RunDetails, TargetRecord, Verified
 
 FLASH: Final = "flash"
 SERIAL: Final = "serial-number"

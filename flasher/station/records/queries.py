@@ -1,8 +1,10 @@
-"""Reading the records: a unit's life, runs, figures, and what is wrong with them."""
+"""Reading the records: units, runs with their parts, tables and figures for reports."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import statistics
+from collections import defaultdict
+from collections.abc import Collection, Iterable
 from typing import Any, Final
 
 from sqlalchemy import Connection, Select, case, select
@@ -10,24 +12,159 @@ from sqlalchemy import Connection, Select, case, select
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.database import Database
-from flasher.station.records.details import details_of
 from flasher.station.records.errors import NotFoundError
-from flasher.station.records.figures import figures_of
-from flasher.station.records.heads import Head
+from flasher.station.records.keys import Head
 from flasher.station.records.model import (
+    AttachmentFile,
     Figures,
+    Measurement,
     RunDetails,
     RunFilter,
     RunId,
     RunKind,
     RunRecord,
     RunState,
+    StepRecord,
+    StepState,
+    TargetRecord,
     UnitLife,
     UnitState,
+    Verified,
+    WriteId,
+    WriteRecord,
     utc_moment,
     utc_text,
 )
-from flasher.station.steps import Verified
+
+_BATCH: Final = 500
+"""Keys in one IN (...): every back end takes so many."""
+
+
+def details_of(connection: Connection, runs: list[RunRecord]) -> Iterable[RunDetails]:
+    """The runs with all that belongs to them, in the same order."""
+    for first in range(0, len(runs), _BATCH):
+        some = runs[first : first + _BATCH]
+        keys = [run.run_id for run in some]
+        targets = _grouped(connection, _target_query(), schema.run_target, keys)
+        steps = _grouped(connection, select(schema.step), schema.step, keys)
+        measured = _measurements(connection, [row.id for rows in steps.values() for row in rows])
+        writes = _grouped(connection, select(schema.device_write), schema.device_write, keys)
+        files = _grouped(connection, select(schema.attachment), schema.attachment, keys)
+        for run in some:
+            yield RunDetails(
+                run=run,
+                targets=tuple(map(_target, targets[run.run_id])),
+                steps=tuple(_step(row, measured[row.id]) for row in steps[run.run_id]),
+                writes=tuple(map(_write, writes[run.run_id])),
+                attachments=tuple(
+                    AttachmentFile(row.kind, row.name, row.sha256, row.size_bytes)
+                    for row in files[run.run_id]
+                ),
+            )
+
+
+def _grouped(
+    connection: Connection, query: Select[Any], table: Any, keys: list[RunId]
+) -> dict[int, list[Any]]:
+    found = defaultdict(list)
+    for row in connection.execute(query.where(table.c.run_id.in_(keys)).order_by(table.c.id)):
+        found[row.run_id].append(row)
+    return found
+
+
+def _measurements(connection: Connection, steps: list[int]) -> dict[int, list[Measurement]]:
+    table = schema.measurement
+    found = defaultdict(list)
+    for first in range(0, len(steps), _BATCH):
+        query = select(table).where(table.c.step_id.in_(steps[first : first + _BATCH]))
+        for row in connection.execute(query.order_by(table.c.id)):
+            found[row.step_id].append(
+                Measurement(
+                    row.name, row.value, row.unit, row.low, row.high, row.text, row.expected
+                )
+            )
+    return found
+
+
+def _target_query() -> Select[Any]:
+    artifact = schema.artifact.c
+    return select(schema.run_target, artifact.name, artifact.sha256, artifact.version).join_from(
+        schema.run_target, schema.artifact
+    )
+
+
+def _target(row: Any) -> TargetRecord:
+    return TargetRecord(
+        target=row.target,
+        image=row.name,
+        image_sha256=row.sha256,
+        version=row.version,
+        required=Verified(row.required),
+        reached=None if row.reached is None else Verified(row.reached),
+    )
+
+
+def _step(row: Any, measured: list[Measurement]) -> StepRecord:
+    return StepRecord(
+        position=row.position,
+        name=row.name,
+        try_number=row.try_number,
+        state=StepState(row.state),
+        begun_at=utc_moment(row.begun_at),
+        duration_s=row.duration_s,
+        code=row.code,
+        text=row.text,
+        measurements=tuple(measured),
+    )
+
+
+def _write(row: Any) -> WriteRecord:
+    return WriteRecord(
+        write_id=WriteId(row.id),
+        target=row.target,
+        what=row.what,
+        value=row.value,
+        intended_at=utc_moment(row.intended_at),
+        verified_at=None if row.verified_at is None else utc_moment(row.verified_at),
+        read_back=row.read_back,
+    )
+
+
+_JUDGED: Final = (RunState.PASS.value, RunState.FAIL.value)
+"""Runs that say something about the unit; the others are about the station."""
+
+
+def figures_of(rows: Iterable[Any]) -> Figures:
+    """The figures of runs in the order in which they began."""
+    first: dict[int, str] = {}
+    last: dict[int, str] = {}
+    by_state: dict[str, int] = defaultdict(int)
+    failures: dict[str, int] = defaultdict(int)
+    durations_s: list[float] = []
+    virtual_runs = 0
+    for unit_id, state, code, duration_s, is_virtual in rows:
+        virtual_runs += bool(is_virtual)
+        by_state[state] += 1
+        if state in _JUDGED:
+            first.setdefault(unit_id, state)
+            last[unit_id] = state
+        if state == RunState.PASS.value:
+            durations_s.append(duration_s)
+        elif state != RunState.RUNNING.value:
+            failures[code] += 1
+    passed = RunState.PASS.value
+    return Figures(
+        runs=sum(by_state.values()),
+        units=len(last),
+        passed=sum(state == passed for state in last.values()),
+        first_passed=sum(state == passed for state in first.values()),
+        by_state=dict(by_state),
+        virtual_runs=virtual_runs,
+        failures=dict(sorted(failures.items(), key=lambda item: (-item[1], item[0]))),
+        duration_median_s=statistics.median(durations_s) if durations_s else None,
+        duration_longest_s=max(durations_s, default=None),
+    )
+
 
 _EVERYTHING: Final = RunFilter()
 

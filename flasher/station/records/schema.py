@@ -26,8 +26,7 @@ from sqlalchemy import (
     text,
 )
 
-from flasher.station.records.model import RunKind, RunState, StepState
-from flasher.station.steps import Verified
+from flasher.station.records.model import RunKind, RunState, StepState, Verified
 
 SCHEMA_VERSION: Final = 2
 

@@ -22,10 +22,16 @@ from flasher.station.records.errors import (
     RecordError,
     RecordsCutError,
 )
-from flasher.station.records.fingerprint import fingerprint_of
-from flasher.station.records.heads import Head, HeadsFile
-from flasher.station.records.keys import SigningKey, default_folder, file_name, fingerprint
+from flasher.station.records.keys import (
+    Head,
+    HeadsFile,
+    SigningKey,
+    default_folder,
+    file_name,
+    fingerprint,
+)
 from flasher.station.records.schema import SCHEMA_VERSION, schema_info
+from flasher.station.records.triggers import fingerprint_of
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,6 @@ from sqlalchemy import select, update
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import chain, queries, schema
 from flasher.station.records.backup import make_backup
-from flasher.station.records.checking import Examiner
 from flasher.station.records.claims import begin_run, make_order
 from flasher.station.records.database import (
     DEFAULT_LOCK_TIMEOUT_S,
@@ -38,16 +37,8 @@ from flasher.station.records.database import (
     locate,
     open_database,
 )
-from flasher.station.records.endings import (
-    add_attachments,
-    add_ending,
-    add_step,
-    end_run,
-    is_saved,
-    one_row,
-    weakest,
-)
 from flasher.station.records.errors import RuleBrokenError
+from flasher.station.records.examination import Examiner
 from flasher.station.records.files import FileStore
 from flasher.station.records.model import (
     OUTCOMES,
@@ -66,7 +57,16 @@ from flasher.station.records.model import (
     WriteId,
     utc_text,
 )
-from flasher.station.records.rows import insert
+from flasher.station.records.rows import (
+    add_attachments,
+    add_ending,
+    add_step,
+    end_run,
+    insert,
+    is_saved,
+    one_row,
+    weakest,
+)
 from flasher.station.records.signing import Keeping, Signer
 
 _USUAL: Final = Keeping()

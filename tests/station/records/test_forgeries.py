@@ -79,7 +79,7 @@ class Forger:
         """Let the audit row of a finished run state what the run is now."""
         from sqlalchemy import create_engine  # noqa: PLC0415
 
-        from flasher.station.records.digests import digests_of  # noqa: PLC0415
+        from flasher.station.records.chain import digests_of  # noqa: PLC0415
 
         self.db.commit()
         engine = create_engine(f"sqlite:///{folder / 'records.sqlite'}")

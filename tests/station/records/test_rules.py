@@ -18,9 +18,9 @@ from flasher.station.records import (
     RunState,
     StepState,
 )
+from flasher.station.records.model import Verified
 from flasher.station.records.schema import metadata
 from flasher.station.records.triggers import RULES
-from flasher.station.steps import Verified
 from tests.station.factory import BMS_VERSION, Bench
 from tests.station.postgres import Server
 from tests.station.records.conftest import BACK_ENDS

@@ -24,8 +24,7 @@ from flasher.station.records import (
     SchemaVersionError,
     Store,
 )
-from flasher.station.records.heads import HeadsFile
-from flasher.station.records.keys import SigningKey
+from flasher.station.records.keys import HeadsFile, SigningKey
 from flasher.station.records.migration import migrate
 from flasher.station.records.model import TORN_TRACE, TRACE
 from tests.station.factory import SERIAL, Bench

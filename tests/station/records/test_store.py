@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from flasher.errors import UsageError
-from flasher.station.golden import is_due, last_shift_start
 from flasher.station.recipe import Golden
 from flasher.station.records import (
     ClaimRefusedError,
@@ -24,7 +23,8 @@ from flasher.station.records import (
     StepState,
     UnitState,
 )
-from flasher.station.steps import Verified
+from flasher.station.records.claims import is_due, last_shift_start
+from flasher.station.records.model import Verified
 from tests.station.factory import BMS_VERSION, SERIAL, USUAL, Bench
 
 GOLDEN = '\n[golden]\nserial_numbers = ["W2600001"]\nevery_h = 8\n'

@@ -1,18 +1,21 @@
-"""The way of an outcome onto the disk: trace, last step, and one transaction that ends the run.
+"""A run on its way from the records and back: what earlier runs of the unit mean for it, and how
+its outcome gets on disk.
 
-It may be tried again after every failure, from any point; nothing is shown before it is through.
+Saving may be tried again after every failure, from any point; nothing is shown before it is done.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Final
 
 from flasher.station import codes
 from flasher.station.codes import CODES, Code
-from flasher.station.messages import Finished
+from flasher.station.messages import Finished, RunOrder, RunResult, Texts, flash_value, write_key
+from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.errors import RuleBrokenError
 from flasher.station.records.model import (
     TORN_TRACE,
@@ -20,12 +23,15 @@ from flasher.station.records.model import (
     AttachmentFile,
     Claim,
     Ending,
+    RunDetails,
     RunState,
+    StepName,
     StepState,
+    UnitLife,
+    WriteRecord,
 )
 from flasher.station.records.store import Store
-from flasher.station.run_model import RunOrder, RunResult
-from flasher.station.steps import StepName
+from flasher.station.unit_checks import BEFORE
 
 
 @dataclass
@@ -128,3 +134,74 @@ def _forget_spooled(run: ActiveRun) -> None:
     for path in paths:
         with suppress(OSError):
             path.unlink(missing_ok=True)
+
+
+_OPEN: Final = frozenset({RunState.INTERRUPTED, RunState.ERROR, RunState.ABORTED})
+FLASH: Final = "flash"
+
+
+@dataclass(frozen=True)
+class Before:
+    """The fields of `RunOrder` of these names."""
+
+    known_before: Texts = field(default_factory=dict)
+    flashed_before: frozenset[str] = frozenset()
+    written_before: Texts = field(default_factory=dict)
+
+
+def before_of(life: UnitLife | None, recipe: LoadedRecipe, *, is_reworked: bool = False) -> Before:
+    """What the next run of a unit has to know. A verdict ends a story: what came before the last
+    PASS or FAIL is not the state in which this run finds the unit. But what must not change is
+    held until a PASS: a run that failed after its first write may be what changed it. Only for a
+    unit that `is_reworked` it is read anew.
+    """
+    if life is None:
+        return Before()
+    runs = list(life.runs)
+    since = next((at for at, run in reversed(list(enumerate(runs))) if not _is_open(run)), -1)
+    still_open = runs[since + 1 :]
+    passed_at = [at for at, run in enumerate(runs) if run.run.state is RunState.PASS]
+    passed = runs[passed_at[-1]] if passed_at else None
+    unfinished = runs[passed_at[-1] + 1 :] if passed_at else runs
+    bound = still_open if is_reworked else unfinished
+    return Before(
+        _known(bound), _flashed(still_open, recipe), {} if passed is None else _written(passed)
+    )
+
+
+def _is_open(run: RunDetails) -> bool:
+    return run.run.state in _OPEN
+
+
+def _known(runs: Sequence[RunDetails]) -> dict[str, str]:
+    """What must not change, as the first of these runs that wrote anything read it."""
+    known: dict[str, str] = {}
+    for run in runs:
+        if not run.writes:
+            continue
+        for step in run.steps:
+            for each in step.measurements:
+                if each.name.startswith(BEFORE) and each.text is not None:
+                    known.setdefault(each.name.removeprefix(BEFORE), each.text)
+    return known
+
+
+def _flashed(runs: Sequence[RunDetails], recipe: LoadedRecipe) -> frozenset[str]:
+    """Targets whose last flash in these runs was of this image, and was read back."""
+    last: dict[str, WriteRecord] = {}
+    for run in runs:
+        last |= {write.target: write for write in run.writes if write.what == FLASH}
+    wanted = {each.name: flash_value(each.version, each.image.sha256) for each in recipe.targets}
+    return frozenset(
+        name
+        for name, write in last.items()
+        if write.value == wanted.get(name) and write.read_back is not None
+    )
+
+
+def _written(run: RunDetails) -> dict[str, str]:
+    return {
+        write_key(write.target, write.what): write.value
+        for write in run.writes
+        if write.what != FLASH
+    }
