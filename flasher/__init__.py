@@ -17,60 +17,67 @@ What would be sent, and how long it takes on the bus:
 In two steps, to look at a failure instead of catching it:
 
     with flasher.connect(interface="pcan", channel="PCAN_USBBUS1") as connection:
-        result = flasher.upgrade(plan, connection)
+        result = connection.device("bms").upgrade(plan)
     print(result.outcome.ending, result.outcome.device_left, result.error())
 
-What the battery says of itself, as dataclasses with units in their names:
+A device on a bus: what it says of itself, typed, with units in the names; its memory; writing:
 
     with flasher.connect(interface="socketcan", channel="can0") as connection:
-        print(flasher.query(connection, "running-information").voltage_mv)
-        flasher.write(connection, "user-string-1", "checked 2026-01")
+        battery = connection.device("bms")
+        print(battery.read(flasher.contents.RunningInformation).voltage_mv)
+        battery.write("user-string-1", "checked 2026-01")
+        battery.flash("firmware.hex", verify="memory", on_event=print)
+
+With an event loop:
+
+    async def main():
+        async with flasher.aconnect(interface="socketcan", channel="can0") as connection:
+            await connection.async_device("bms").flash("firmware.hex")
 
 Every failure is a `FlasherError` with its exit code, its likely cause and what to do; what happens
 meanwhile comes as the dataclasses of `flasher.events`.
 """
 
-from __future__ import annotations
+from flasher import events
+from flasher.api import (
+    AsyncDevice,
+    Connection,
+    Device,
+    DeviceInfo,
+    DeviceLeft,
+    Ending,
+    Identity,
+    Image,
+    Level,
+    Outcome,
+    Plan,
+    Profile,
+    Result,
+    UpgradeOptions,
+    Verification,
+    Written,
+    aconnect,
+    connect,
+    connect_mock,
+    flash,
+    load,
+    make_plan,
+)
+from flasher.errors import ExitCode, FlasherError
+from flasher.protocol import contents
 
-import importlib
-from typing import TYPE_CHECKING, Any
-
-if TYPE_CHECKING:
-    from flasher import events
-    from flasher.api import (
-        Connection,
-        DeviceLeft,
-        Ending,
-        Identity,
-        Image,
-        Level,
-        Outcome,
-        Plan,
-        Result,
-        UpgradeOptions,
-        connect,
-        connect_mock,
-        flash,
-        load,
-        make_plan,
-        query,
-        read,
-        upgrade,
-        write,
-    )
-    from flasher.errors import ExitCode, FlasherError
-
+__version__ = "0.1.0"
 __all__ = [
     "flash",
     "connect",
+    "aconnect",
     "connect_mock",
     "load",
     "make_plan",
-    "query",
-    "read",
-    "upgrade",
-    "write",
+    "AsyncDevice",
     "Connection",
+    "Device",
+    "DeviceInfo",
     "DeviceLeft",
     "Ending",
     "ExitCode",
@@ -80,20 +87,11 @@ __all__ = [
     "Level",
     "Outcome",
     "Plan",
+    "Profile",
     "Result",
     "UpgradeOptions",
+    "Verification",
+    "Written",
+    "contents",
     "events",
 ]
-
-_ELSEWHERE = {"ExitCode": "errors", "FlasherError": "errors"}
-
-
-def __getattr__(name: str) -> Any:
-    """Load what is asked for when it is asked for: pytest imports this package in every project
-    that has flasher installed, for its plugin, and must not wait for the rest.
-    """
-    if name not in __all__:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    if name == "events":
-        return importlib.import_module("flasher.events")
-    return getattr(importlib.import_module(f"flasher.{_ELSEWHERE.get(name, 'api')}"), name)

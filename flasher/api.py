@@ -1,60 +1,63 @@
-"""What a program calls: blocking functions, typed results, an event callback.
+"""What a program calls: a connection, the devices on it, and `flash`, the whole job in one call.
 
-`flash` is the whole job in one call. `connect` and `upgrade` are its two halves, for who wants to
-keep the adapter open or look at the outcome of a failure.
+`Device` blocks; `AsyncDevice` is the same for programs with an event loop. Both run the procedures
+of `flasher.procedures`.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack, overload
 
-from flasher import service
-from flasher.bus.bit_rate import BitRate
-from flasher.bus.link import Clock, Link, MonotonicClock, PacedClock, VirtualClock
-from flasher.bus.simulated import SimulatedBus
-from flasher.driver import Tap
-from flasher.errors import FlasherError, UsageError
-from flasher.flashing import run_session
+from flasher.driver import Tap, adrive, drive
+from flasher.errors import FlasherError
 from flasher.host.identity import Check, Finding, Identity, judge_image
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft, Outcome, before_the_start
-from flasher.host.session import Result, Session
+from flasher.host.query import Request
+from flasher.host.session import Result
+from flasher.host.survey import Survey
 from flasher.host.table import Ending
-from flasher.host.verify import Level, possible_levels
-from flasher.host.write import Written
+from flasher.host.verify import Level, Verification, as_level, check_level, default_level
+from flasher.host.write import WritePlan, Written
 from flasher.image.image import Image
 from flasher.image.load import load
 from flasher.image.manifest import Release, find_release
-from flasher.image.plan import Plan, plan
+from flasher.image.plan import Plan, make_plan
 from flasher.log import log_event
-from flasher.mock.model import MockDevice
-from flasher.mock.profile import DeviceProfile, set_option
-from flasher.mock.system import System
+from flasher.procedures import DeviceInfo, Procedure, Procedures, Run, Step, Tell, WaitUntil
+from flasher.profile.model import Profile
+from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
-from flasher.protocol.spec import DIALECTS, TARGETS, Dialect, Target, find_target
+from flasher.protocol.spec import Dialect, Target, as_dialect, as_target
+
+if TYPE_CHECKING:
+    from flasher.bus.bit_rate import BitRate
+    from flasher.bus.link import Clock, Link
+    from flasher.mock.profile import DeviceProfile
 
 __all__ = [
     "flash",
+    "aconnect",
     "connect",
     "connect_mock",
     "load",
     "make_plan",
-    "query",
-    "read",
-    "upgrade",
-    "write",
-    "check_level",
-    "default_level",
+    "find_release",
     "as_dialect",
     "as_level",
     "as_target",
-    "find_release",
+    "check_level",
+    "default_level",
+    "AsyncDevice",
     "Check",
     "Connection",
+    "Device",
+    "DeviceInfo",
     "DeviceLeft",
     "Ending",
     "EventHandler",
@@ -63,12 +66,33 @@ __all__ = [
     "Level",
     "Outcome",
     "Plan",
+    "Profile",
     "Release",
     "Result",
     "UpgradeOptions",
+    "Verification",
+    "Written",
 ]
 
 EventHandler = Callable[[object], None]
+T = TypeVar("T")
+C = TypeVar("C", bound=Content)
+
+
+class Watch(TypedDict, total=False):
+    """How a call is watched and ended; what is left out is as the device was made."""
+
+    taps: Sequence[Tap]
+    """See every frame in both directions."""
+    on_event: EventHandler | None
+    """Gets what happens, as dataclasses of `flasher.events`."""
+    cancelled: Callable[[], bool] | None
+    """Asked while it runs; ends it at the next message boundary."""
+    hung_up: Callable[[], bool] | None
+    """The same for a terminal that is gone: it does not end an upgrade that has begun to erase."""
+
+
+# -- the bus --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -80,6 +104,56 @@ class Connection:
     name: str
     bit_rate: BitRate | None = None
     """What the bus runs at, and where that comes from; None where nobody told."""
+
+    def device(
+        self,
+        target: str | Target = "bms",
+        *,
+        dialect: str | Dialect = "welling",
+        profile: Profile | None = None,
+        is_alone: bool = False,
+        **watch: Unpack[Watch],
+    ) -> Device:
+        """A device on this bus. Nothing is sent yet.
+
+        `profile` is what holds for the product (its timings, its own reset and version query); it
+        goes before `target` and `dialect`. With `is_alone` no other tool can be on this bus, and
+        none is listened for before a question. Raises UsageError for a name that is none.
+        """
+        chosen = profile or _default_profile(target, dialect)
+        return Device(self, chosen, is_alone=is_alone, watch=watch)
+
+    def async_device(
+        self,
+        target: str | Target = "bms",
+        *,
+        dialect: str | Dialect = "welling",
+        profile: Profile | None = None,
+        is_alone: bool = False,
+        **watch: Unpack[Watch],
+    ) -> AsyncDevice:
+        """The same for a program with an event loop."""
+        chosen = profile or _default_profile(target, dialect)
+        return AsyncDevice(self, chosen, is_alone=is_alone, watch=watch)
+
+    def listen_first(self, dialect: str | Dialect = "welling", **watch: Unpack[Watch]) -> None:
+        """Listen for a moment for another tool, as every question does before it is sent. Raises
+        BusError when there is one.
+        """
+        device = self.device("bms", dialect=dialect)
+        device._run(device._steps.listen_first(), watch)  # noqa: SLF001  of this module
+
+    def scan(self, dialect: str | Dialect = "welling", **watch: Unpack[Watch]) -> Survey:
+        """Listen for a second, then ask the BMS for its version and state: who was heard, with
+        what. Raises BusError, and InterruptedByUserError when it was cancelled.
+        """
+        device = self.device("bms", dialect=dialect)
+        return device._run(device._steps.scan(), watch)  # noqa: SLF001  of this module
+
+
+def _default_profile(target: str | Target, dialect: str | Dialect) -> Profile:
+    chosen = as_dialect(dialect)
+    return Profile(as_target(target), chosen, has_upgrade=chosen.has_upgrade)
 
 
 @contextmanager
@@ -95,12 +169,28 @@ def connect(
     UsageError or BusError.
     """
     from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can
+    from flasher.bus.link import MonotonicClock  # noqa: PLC0415
 
     link = open_adapter(as_dialect(dialect).bitrate_bps, holder=holder, **bus)
     try:
         yield Connection(link, MonotonicClock(), str(link), link.bit_rate)
     finally:
         link.close()
+
+
+@asynccontextmanager
+async def aconnect(
+    dialect: str | Dialect = "welling", *, holder: str | None = "a program", **bus: Any
+) -> AsyncIterator[Connection]:
+    """`connect` without blocking an event loop while the adapter opens and closes."""
+    import asyncio  # noqa: PLC0415  for programs that have it already
+
+    opened = connect(dialect, holder=holder, **bus)
+    connection = await asyncio.to_thread(opened.__enter__)
+    try:
+        yield connection
+    finally:
+        await asyncio.to_thread(opened.__exit__, None, None, None)
 
 
 @contextmanager
@@ -121,6 +211,13 @@ def connect_mock(
     It takes the time that a real bus takes, divided by `speed`; 0 means no time at all. `on_event`
     gets what the device model reports.
     """
+    from flasher.bus.bit_rate import BitRate  # noqa: PLC0415  loads python-can
+    from flasher.bus.link import PacedClock, VirtualClock  # noqa: PLC0415
+    from flasher.bus.simulated import SimulatedBus  # noqa: PLC0415
+    from flasher.mock.model import MockDevice  # noqa: PLC0415
+    from flasher.mock.profile import DeviceProfile, set_option  # noqa: PLC0415
+    from flasher.mock.system import System  # noqa: PLC0415
+
     chosen, node = as_dialect(dialect), as_target(target)
     bitrate_bps = chosen.bitrate_bps
     own = set_option(profile or DeviceProfile(), "dialect", chosen.name)
@@ -153,48 +250,51 @@ def bit_rate(dialect: str | Dialect = "welling", **bus: Any) -> BitRate:
     return settling.bit_rate(as_dialect(dialect).bitrate_bps, bus, merged)
 
 
-def upgrade(  # noqa: PLR0913  one argument for each thing that a caller may want
-    plan: Plan,
-    connection: Connection,
-    *,
-    options: UpgradeOptions | None = None,
-    verify: Level | None = None,
-    identity: Identity | None = None,
-    taps: Sequence[Tap] = (),
-    on_event: EventHandler | None = None,
-    cancelled: Callable[[], bool] | None = None,
-    hung_up: Callable[[], bool] | None = None,
-) -> Result:
-    """Run one upgrade to its end, good or bad, and verify a good one.
+# -- a device -------------------------------------------------------------------------------------
 
-    `verify` None stands for `default_level`. `identity` says what the image may be flashed to; the
-    device is asked who it is and held against it before anything is written. `cancelled` is asked
-    while it runs, and ends it; `hung_up` ends it only before the update command. Raises UsageError
-    when the target or the image cannot be verified so, BusError when the adapter fails, saying how
-    far the upgrade had come and in what state the device is left; every other end is a `Result`.
-    """
-    chosen = options or UpgradeOptions()
-    level = default_level(plan.target, chosen) if verify is None else verify
-    check_level(plan, level, chosen)
-    rate = connection.bit_rate
-    if rate is not None and rate.bps != plan.bitrate_bps:
-        raise UsageError(
-            f"The plan is for {plan.bitrate_bps / 1000:g} kbit/s, the bus runs at {rate}.",
-            remedy="Make the plan with bitrate_bps of the connection.",
+
+class _OnBus:
+    """What `Device` and `AsyncDevice` share: everything but the waiting."""
+
+    def __init__(
+        self, connection: Connection, profile: Profile, *, is_alone: bool, watch: Watch
+    ) -> None:
+        self.connection = connection
+        self.profile = profile
+        self._watch = watch
+        self._steps = Procedures(
+            connection.link, connection.clock, profile, connection.bit_rate, is_alone
         )
-    return run_session(
-        Session(plan, chosen, level, identity or Identity()),
-        connection.link,
-        connection.clock,
-        adapter_return_s=chosen.adapter_return_s,
-        taps=taps,
-        on_event=_logged(on_event),
-        cancelled=cancelled,
-        hung_up=hung_up,
-    )
+
+    @property
+    def target(self) -> Target:
+        """Which device it is."""
+        return self.profile.target
+
+    def plan(self, image: Image | Plan) -> Plan:
+        """What an upgrade with this image would send. Raises ImageError and UsageError."""
+        return self._steps.plan(image)
+
+    def _cancelled(self, step: Run | WaitUntil, watch: Watch) -> Callable[[], bool] | None:
+        """What ends a step before its end."""
+        asked = watch.get("cancelled") or _never
+        hung_up = watch.get("hung_up") or _never
+        may_hang_up = step.hang_up_ends
+        if isinstance(step, Run) and not step.may_cancel:
+            return None
+        if may_hang_up is None:
+            return asked
+        return lambda: asked() or (hung_up() and may_hang_up())
 
 
-def _logged(on_event: EventHandler | None) -> EventHandler:
+def _never() -> bool:
+    return False
+
+
+def _teller(watch: Watch) -> EventHandler:
+    """Logs an event, and tells it who wants to know."""
+    on_event = watch.get("on_event")
+
     def tell(event: object) -> None:
         log_event(event)
         if on_event is not None:
@@ -203,27 +303,344 @@ def _logged(on_event: EventHandler | None) -> EventHandler:
     return tell
 
 
-def default_level(target: Target, options: UpgradeOptions | None = None) -> Level:
-    """How far an upgrade of a target is verified unless somebody says otherwise: by its version
-    where there is a query for it.
+class Device(_OnBus):
+    """A device on a bus, for programs that wait for it; made by `Connection.device`.
+
+    Every method takes the keywords of `Watch`, and raises BusError when the adapter fails or
+    another tool speaks on the bus, InterruptedByUserError when `cancelled` said so.
     """
-    return Level.VERSION if Level.VERSION in possible_levels(target, options) else Level.NONE
+
+    def identify(self, **watch: Unpack[Watch]) -> DeviceInfo:
+        """Ask it everything that the documents let one ask; listen only where they give nothing.
+
+        Silence is no error: see `DeviceInfo.is_there`. Takes 12 s when nothing is answered by a
+        device that is heard, 4 s when it is not heard either.
+        """
+        return self._run(self._steps.identify(), watch)
+
+    def version(self, **watch: Unpack[Watch]) -> Content:
+        """Its version information, or the answer to the product's own version query. Raises
+        NoAnswerError when it does not answer, or nobody knows how to ask it.
+        """
+        return self._run(self._steps.version(), watch)
+
+    @overload
+    def read(self, what: type[C], **watch: Unpack[Watch]) -> C: ...
+    @overload
+    def read(self, what: str, **watch: Unpack[Watch]) -> Content: ...
+    def read(self, what: str | type[Content], **watch: Unpack[Watch]) -> Content:
+        """Read an item: by its name ("running-information"), or by the class of its content
+        (`flasher.protocol.contents.RunningInformation`), where only one item has it. "model" and
+        "serial-number" give the version information, which holds them.
+
+        Raises UsageError for what is not there, NoAnswerError when it does not answer.
+        """
+        return self._run(self._steps.read(what), watch)
+
+    def ask(self, request: Request, **watch: Unpack[Watch]) -> Content:
+        """Ask a question of your own. Raises NoAnswerError."""
+        return self._run(self._steps.ask(request), watch)
+
+    def read_memory(self, start: int, end: int, **watch: Unpack[Watch]) -> bytes:
+        """The bytes from address `start` up to `end`, which is not read any more (R5).
+
+        Raises UsageError for an impossible range and for a target whose memory the documents do not
+        let one read, NoAnswerError when a piece is not answered.
+        """
+        return self._run(self._steps.read_memory(start, end), watch)
+
+    def write(
+        self,
+        name: str,
+        *values: object,
+        manufacturer: bool = False,
+        **watch: Unpack[Watch],
+    ) -> Written:
+        """Write an item by name and read it back where it can be read; old and new value are in the
+        result.
+
+        `manufacturer` allows what the document leaves to the manufacturer. Raises UsageError for a
+        value that does not fit, NoAnswerError when the device is silent before anything was
+        written, VerificationError when the write is not confirmed or reads back differently.
+        """
+        return self._run(self._steps.write(name, values, manufacturer=manufacturer), watch)
+
+    def content_before(self, plan: WritePlan, **watch: Unpack[Watch]) -> Content | None:
+        """The first half of a write: what the device holds now; None when there is no query."""
+        return self._run(self._steps.content_before(plan), watch)
+
+    def carry_out(self, plan: WritePlan, before: Content | None, **watch: Unpack[Watch]) -> Written:
+        """The second half: write and read back. What went wrong stands in the result."""
+        return self._run(self._steps.carry_out(plan, before), watch)
+
+    def flash(
+        self,
+        image: str | os.PathLike[str] | Image,
+        *,
+        options: UpgradeOptions | None = None,
+        verify: Level | str | None = None,
+        identity: Identity | None = None,
+        **watch: Unpack[Watch],
+    ) -> Result:
+        """Upgrade it with an image file (or a loaded `Image`), and verify it.
+
+        `verify` is "none", "version" or "memory"; None chooses (`default_level`). `identity` None
+        takes the manifest beside the file, if there is one, and waives no check. Returns the result
+        of a good session, or of one that found nothing to do; every other one is raised as the
+        FlasherError that stands for it (see flasher.errors).
+        """
+        job = _Job(self, image, options, verify, identity)
+        return job.checked(self._run(job.procedure(), watch))
+
+    def rescue(
+        self,
+        image: str | os.PathLike[str] | Image,
+        *,
+        options: UpgradeOptions | None = None,
+        verify: Level | str | None = None,
+        identity: Identity | None = None,
+        **watch: Unpack[Watch],
+    ) -> Result:
+        """`flash` for a device whose application does not run: waits until it announces its
+        bootloader at power-up, for `power_up_timeout_s` of the options, and upgrades it then.
+        """
+        job = _Job(self, image, options, verify, identity, at_power_up=True)
+        return job.checked(self._run(job.procedure(), watch))
+
+    def upgrade(
+        self,
+        image: Image | Plan,
+        *,
+        options: UpgradeOptions | None = None,
+        verify: Level | None = None,
+        identity: Identity | None = None,
+        **watch: Unpack[Watch],
+    ) -> Result:
+        """The upgrade alone, to look at a failure instead of catching it: every end but that of the
+        adapter is a `Result`.
+
+        `identity` says what the image may be flashed to; the device is asked who it is and held
+        against it before anything is written. Raises UsageError when the target or the image cannot
+        be verified so, BusError when the adapter fails, saying how far the upgrade had come and in
+        what state the device is left.
+        """
+        return self._run(self._steps.upgrade(image, options, verify, identity), watch)
+
+    def verify(
+        self, image: Image | Plan, level: Level | str = Level.VERSION, **watch: Unpack[Watch]
+    ) -> Verification:
+        """Whether it runs this image: by the version that it names, or by its memory too. What
+        speaks against it stands in the result. Raises UsageError for a level that is not possible.
+        """
+        return self._run(self._steps.verify(image, as_level(level)), watch)
+
+    def reset(self, **watch: Unpack[Watch]) -> None:
+        """Restart its application. Raises NoAnswerError when it does not confirm, or when the
+        documents give no reset for it.
+        """
+        self._run(self._steps.reset(), watch)
+
+    def run(self, engine: Engine, **watch: Unpack[Watch]) -> None:
+        """Run an engine of your own on the connection."""
+        self._run(_alone(engine), watch)
+
+    def _run(self, procedure: Procedure[T], of_call: Watch) -> T:
+        watch: Watch = {**self._watch, **of_call}
+        try:
+            step = next(procedure)
+            while True:
+                try:
+                    came = self._do(step, watch)
+                except (FlasherError, KeyboardInterrupt) as error:
+                    step = procedure.throw(error)
+                else:
+                    step = procedure.send(came)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+
+    def _do(self, step: Step, watch: Watch) -> bool:
+        link, clock = self.connection.link, self.connection.clock
+        match step:
+            case Run():
+                drive(
+                    step.engine,
+                    link,
+                    clock,
+                    taps=(*watch.get("taps", ()), *step.taps),
+                    on_event=_teller(watch),
+                    cancelled=self._cancelled(step, watch),
+                )
+            case WaitUntil():
+                clock.wait_until(step.moment)
+                cancelled = self._cancelled(step, watch)
+                return cancelled is not None and cancelled()
+            case Tell():
+                _teller(watch)(step.event)
+        return False
 
 
-def check_level(plan: Plan, level: Level, options: UpgradeOptions | None = None) -> None:
-    """Raise UsageError when an upgrade cannot be verified so."""
-    if level not in possible_levels(plan.target, options):
-        raise UsageError(
-            f"A {plan.target.node.name} cannot be verified by {level.value}.",
-            cause="the document gives no query for it, and no profile names one",
-            remedy="Leave --verify out, or use --verify none.",
+class AsyncDevice(_OnBus):
+    """`Device` for programs with an event loop; made by `Connection.async_device`. Every method is
+    that of `Device`, awaited. A task that is cancelled ends at the next message boundary first.
+    """
+
+    async def identify(self, **watch: Unpack[Watch]) -> DeviceInfo:
+        return await self._run(self._steps.identify(), watch)
+
+    async def version(self, **watch: Unpack[Watch]) -> Content:
+        return await self._run(self._steps.version(), watch)
+
+    @overload
+    async def read(self, what: type[C], **watch: Unpack[Watch]) -> C: ...
+    @overload
+    async def read(self, what: str, **watch: Unpack[Watch]) -> Content: ...
+    async def read(self, what: str | type[Content], **watch: Unpack[Watch]) -> Content:
+        return await self._run(self._steps.read(what), watch)
+
+    async def read_memory(self, start: int, end: int, **watch: Unpack[Watch]) -> bytes:
+        return await self._run(self._steps.read_memory(start, end), watch)
+
+    async def write(
+        self,
+        name: str,
+        *values: object,
+        manufacturer: bool = False,
+        **watch: Unpack[Watch],
+    ) -> Written:
+        return await self._run(self._steps.write(name, values, manufacturer=manufacturer), watch)
+
+    async def flash(
+        self,
+        image: str | os.PathLike[str] | Image,
+        *,
+        options: UpgradeOptions | None = None,
+        verify: Level | str | None = None,
+        identity: Identity | None = None,
+        **watch: Unpack[Watch],
+    ) -> Result:
+        import asyncio  # noqa: PLC0415  for programs that have it already
+
+        job = await asyncio.to_thread(_Job, self, image, options, verify, identity)
+        return job.checked(await self._run(job.procedure(), watch))
+
+    async def rescue(
+        self,
+        image: str | os.PathLike[str] | Image,
+        *,
+        options: UpgradeOptions | None = None,
+        verify: Level | str | None = None,
+        identity: Identity | None = None,
+        **watch: Unpack[Watch],
+    ) -> Result:
+        import asyncio  # noqa: PLC0415  for programs that have it already
+
+        job = await asyncio.to_thread(
+            partial(_Job, self, image, options, verify, identity, at_power_up=True)
         )
-    if level is Level.MEMORY and plan.image.base is None:
-        raise UsageError(
-            "The memory cannot be read back without addresses.",
-            cause=f"{plan.image.source} is a raw binary",
-            remedy="Say with --base where its first byte lies.",
-        )
+        return job.checked(await self._run(job.procedure(), watch))
+
+    async def upgrade(
+        self,
+        image: Image | Plan,
+        *,
+        options: UpgradeOptions | None = None,
+        verify: Level | None = None,
+        identity: Identity | None = None,
+        **watch: Unpack[Watch],
+    ) -> Result:
+        return await self._run(self._steps.upgrade(image, options, verify, identity), watch)
+
+    async def verify(
+        self, image: Image | Plan, level: Level | str = Level.VERSION, **watch: Unpack[Watch]
+    ) -> Verification:
+        return await self._run(self._steps.verify(image, as_level(level)), watch)
+
+    async def reset(self, **watch: Unpack[Watch]) -> None:
+        await self._run(self._steps.reset(), watch)
+
+    async def _run(self, procedure: Procedure[T], of_call: Watch) -> T:
+        import asyncio  # noqa: PLC0415  for programs that have it already
+
+        watch: Watch = {**self._watch, **of_call}
+        try:
+            step = next(procedure)
+            while True:
+                try:
+                    came = await self._do(step, watch)
+                except (FlasherError, asyncio.CancelledError) as error:
+                    step = procedure.throw(error)
+                else:
+                    step = procedure.send(came)
+        except StopIteration as end:
+            result: T = end.value
+            return result
+
+    async def _do(self, step: Step, watch: Watch) -> bool:
+        link, clock = self.connection.link, self.connection.clock
+        match step:
+            case Run():
+                await adrive(
+                    step.engine,
+                    link,
+                    clock,
+                    taps=(*watch.get("taps", ()), *step.taps),
+                    on_event=_teller(watch),
+                    cancelled=self._cancelled(step, watch),
+                )
+            case WaitUntil():
+                import asyncio  # noqa: PLC0415  for programs that have it already
+
+                await asyncio.to_thread(clock.wait_until, step.moment)
+                cancelled = self._cancelled(step, watch)
+                return cancelled is not None and cancelled()
+            case Tell():
+                _teller(watch)(step.event)
+        return False
+
+
+def _alone(engine: Engine) -> Procedure[None]:
+    yield Run(engine)
+
+
+# -- an image for a device ------------------------------------------------------------------------
+
+
+class _Job:
+    """What `flash` and `rescue` do before and behind the upgrade: load, check, judge."""
+
+    def __init__(
+        self,
+        device: _OnBus,
+        image: str | os.PathLike[str] | Image,
+        options: UpgradeOptions | None,
+        verify: Level | str | None,
+        identity: Identity | None,
+        *,
+        at_power_up: bool = False,
+    ) -> None:
+        profile = device.profile
+        loaded = image if isinstance(image, Image) else load(image)
+        if identity is None:
+            release = None if isinstance(image, Image) else find_release(image)
+            identity = profile.identity(release=release, goes_on_unchecked=at_power_up)
+        self._identity = identity
+        self._plan = device.plan(release_checked(loaded, identity.release))
+        check_image(self._plan, identity)
+        chosen = release_options(options or profile.upgrade_options(), identity.release)
+        self._options = replace(chosen, at_power_up=True) if at_power_up else chosen
+        self._level = None if verify is None else as_level(verify)
+        self._steps = device._steps  # noqa: SLF001  of this module
+
+    def procedure(self) -> Procedure[Result]:
+        return self._steps.upgrade(self._plan, self._options, self._level, self._identity)
+
+    def checked(self, result: Result) -> Result:
+        """The result of a good session. Raises the error of every other one."""
+        error = result.error()
+        if error is not None:
+            raise error
+        return result
 
 
 def flash(
@@ -238,36 +655,23 @@ def flash(
     on_event: EventHandler | None = None,
     **bus: Any,
 ) -> Result:
-    """Upgrade a device with an image file (or a loaded `Image`), and verify it.
+    """The whole job in one call: open the bus, `Device.flash`, close it.
 
     `bus` are python-can's keywords, as for `connect`; with `mock` the built-in device model is
-    upgraded instead. `verify` is "none", "version" or "memory"; None chooses (`default_level`).
-    `identity` None takes the manifest beside the file, if there is one, and waives no check.
-    Returns the result of a good session, or of one that found nothing to do; every other one is
-    raised as the FlasherError that stands for it (see flasher.errors).
+    upgraded instead. An image that cannot be flashed is refused before the bus is opened.
     """
     loaded = image if isinstance(image, Image) else load(image)
     if identity is None:
         identity = Identity(None if isinstance(image, Image) else find_release(image))
     rate = None if mock else bit_rate(dialect, **bus).bps
     checked = release_checked(loaded, identity.release)
-    planned = make_plan(checked, target, dialect, bitrate_bps=rate)
-    check_image(planned, identity)
+    check_image(make_plan(checked, target, dialect, bitrate_bps=rate), identity)
     level = None if verify is None else as_level(verify)
     opened = connect_mock(target, dialect) if mock else connect(dialect, **bus)
     with opened as connection:
-        result = upgrade(
-            planned,
-            connection,
-            options=release_options(options, identity.release),
-            verify=level,
-            identity=identity,
-            on_event=on_event,
+        return connection.device(target, dialect=dialect).flash(
+            checked, options=options, verify=level, identity=identity, on_event=on_event
         )
-    error = result.error()
-    if error is not None:
-        raise error
-    return result
 
 
 def release_checked(image: Image, release: Release | None) -> Image:
@@ -311,100 +715,3 @@ def refusal(plan: Plan, found: Finding) -> FlasherError | None:
     if refused is not None:
         refused.where = "before anything was sent"
     return refused
-
-
-def as_level(level: Level | str) -> Level:
-    """A level of verification by its name. Raises UsageError."""
-    try:
-        return Level(level)
-    except ValueError:
-        names = ", ".join(each.value for each in Level)
-        raise UsageError(f"There is no verification {level!r}; there are {names}.") from None
-
-
-def query(
-    connection: Connection,
-    name: str,
-    target: str | Target = "bms",
-    *,
-    dialect: str | Dialect = "welling",
-) -> Content:
-    """What a device answers to the question `name` ("version-information", "running-information",
-    "serial-number", ...), as the typed content of `flasher.protocol.contents`.
-
-    Raises NoAnswerError when it does not answer, UsageError for a name that is none.
-    """
-    return service.read(connection, name, as_target(target), dialect=as_dialect(dialect))
-
-
-def read(
-    connection: Connection, start: int, end: int, *, dialect: str | Dialect = "welling"
-) -> bytes:
-    """The battery's memory from `start` up to `end`, which is not read any more (R5).
-
-    Raises NoAnswerError when some of it is not answered.
-    """
-    return service.read_memory(connection, start, end, dialect=as_dialect(dialect))
-
-
-def write(
-    connection: Connection,
-    name: str,
-    *values: object,
-    target: str | Target = "bms",
-    dialect: str | Dialect = "welling",
-    manufacturer: bool = False,
-) -> Written:
-    """Write an item and read it back where it can be read; old and new value are in the result.
-
-    `manufacturer` allows what the document leaves to the manufacturer. Raises UsageError for a
-    value that does not fit, NoAnswerError when the write is not confirmed, VerificationError when
-    it reads back differently.
-    """
-    return service.write(
-        connection,
-        name,
-        *values,
-        target=as_target(target),
-        dialect=as_dialect(dialect),
-        manufacturer=manufacturer,
-    )
-
-
-def make_plan(
-    image: Image,
-    target: str | Target,
-    dialect: str | Dialect = "welling",
-    *,
-    bitrate_bps: int | None = None,
-    has_upgrade: bool | None = None,
-) -> Plan:
-    """What an upgrade would send; at the dialect's bit rate unless another one is given.
-
-    Raises UsageError for a dialect that has no upgrade, unless `has_upgrade` says that a product
-    has it all the same.
-    """
-    chosen = as_dialect(dialect)
-    if not (chosen.has_upgrade if has_upgrade is None else has_upgrade):
-        raise UsageError(
-            f"The {chosen.name.upper()} dialect has no upgrade: its document cancelled it.",
-            remedy="Use --dialect welling if the device speaks it; a profile can enable it.",
-        )
-    rate = chosen.bitrate_bps if bitrate_bps is None else bitrate_bps
-    return plan(image, as_target(target), rate)
-
-
-def as_target(target: str | Target) -> Target:
-    """A target by its name or one of the documents' other names. Raises UsageError."""
-    found = target if isinstance(target, Target) else find_target(target)
-    if found is None:
-        raise UsageError(f"There is no target {target!r}; targets are {', '.join(TARGETS)}.")
-    return found
-
-
-def as_dialect(dialect: str | Dialect) -> Dialect:
-    """A dialect by its name. Raises UsageError."""
-    found = dialect if isinstance(dialect, Dialect) else DIALECTS.get(dialect.lower())
-    if found is None:
-        raise UsageError(f"There is no dialect {dialect!r}; dialects are {', '.join(DIALECTS)}.")
-    return found

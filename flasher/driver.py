@@ -1,5 +1,7 @@
 """The one loop: runs an engine on a link against a clock until it is done.
 
+`drive` blocks while it waits for a frame; `adrive` awaits it. All else they share.
+
 Its rules: everything that waits is received before `tick`, so that a stall of the computer does not
 become a timeout of the device; frames go out one at a time and the engine is told when each was
 accepted; waiting is a blocking receive with a deadline.
@@ -7,7 +9,7 @@ accepted; waiting is a blocking receive with a deadline.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from typing import Final, Protocol
 
 from flasher.bus.link import Clock, Link
@@ -45,6 +47,75 @@ def drive(
     `on_event` gets every event the engine reports; `cancelled` is asked between frames, and ends
     the engine at its next message boundary. Raises BusError when the link fails.
     """
+    turns = _turns(engine, link, clock, taps, on_event, cancelled)
+    until = next(turns, None)
+    while until is not None:
+        try:
+            until = turns.send(link.receive(until))
+        except StopIteration:
+            return
+
+
+async def adrive(
+    engine: Engine,
+    link: Link,
+    clock: Clock,
+    *,
+    taps: Sequence[Tap] = (),
+    on_event: Callable[[object], None] | None = None,
+    cancelled: Callable[[], bool] | None = None,
+) -> None:
+    """`drive` for programs with an event loop: the link is used in a thread, one turn at a time.
+
+    `on_event` is called in the event loop, `taps` and `cancelled` in the thread. A task that is
+    cancelled meanwhile first ends the engine at its next message boundary.
+    """
+    import asyncio  # noqa: PLC0415  for programs that have it already
+
+    happened: list[object] = []
+    is_given_up = False
+
+    def is_cancelled() -> bool:
+        return is_given_up or (cancelled is not None and cancelled())
+
+    turns = _turns(engine, link, clock, taps, happened.append, is_cancelled)
+
+    def turn(until: float | None) -> float | None:
+        if until is None:
+            return next(turns, None)
+        try:
+            return turns.send(link.receive(until))
+        except StopIteration:
+            return None
+
+    until: float | None = None
+    while True:
+        work = asyncio.ensure_future(asyncio.to_thread(turn, until))
+        while not work.done():
+            try:
+                await asyncio.wait([work])
+            except asyncio.CancelledError:
+                is_given_up = True
+        for event in happened:
+            if on_event is not None:
+                on_event(event)
+        happened.clear()
+        until = work.result()
+        if until is None:
+            break
+    if is_given_up:
+        raise asyncio.CancelledError
+
+
+def _turns(
+    engine: Engine,
+    link: Link,
+    clock: Clock,
+    taps: Sequence[Tap],
+    on_event: Callable[[object], None] | None,
+    cancelled: Callable[[], bool] | None,
+) -> Generator[float, Frame | None]:
+    """The loop without its waiting: yields until when to receive, and is sent what came."""
     link.drain()
     cancel_seen = False
     while True:
@@ -54,9 +125,15 @@ def drive(
             engine.cancel(now)
         wanted = engine.deadline()
         if wanted is not None and now >= wanted:
-            _receive_on(link.receive(_AT_ONCE), engine, link, clock, taps)
+            _hear(link.receive(_AT_ONCE), engine, link, clock, taps)
             engine.tick(clock.now())
-        _send_all(engine, link, clock, taps)
+        now = clock.now()
+        while (frame := engine.next_frame(now)) is not None:
+            link.send(frame)
+            now = clock.now()
+            engine.frame_sent(now)
+            for tap in taps:
+                tap(frame, sent=True, now=now)
         for event in engine.take_events():
             if on_event is not None:
                 on_event(event)
@@ -64,11 +141,11 @@ def drive(
             return
         wanted = engine.deadline()
         latest = clock.now() + MAX_WAIT_S * clock.speed
-        frame = link.receive(latest if wanted is None else min(wanted, latest))
-        _receive_on(frame, engine, link, clock, taps)
+        came = yield latest if wanted is None else min(wanted, latest)
+        _hear(came, engine, link, clock, taps)
 
 
-def _receive_on(
+def _hear(
     frame: Frame | None, engine: Engine, link: Link, clock: Clock, taps: Sequence[Tap]
 ) -> None:
     """Hand on a frame and all that wait behind it: what is sent next must not look like the cause
@@ -82,14 +159,3 @@ def _receive_on(
             tap(frame, sent=False, now=now)
         engine.receive(frame, now)
         frame = link.receive(_AT_ONCE)
-
-
-def _send_all(engine: Engine, link: Link, clock: Clock, taps: Sequence[Tap]) -> None:
-    """Send what the engine has to send now."""
-    now = clock.now()
-    while (frame := engine.next_frame(now)) is not None:
-        link.send(frame)
-        now = clock.now()
-        engine.frame_sent(now)
-        for tap in taps:
-            tap(frame, sent=True, now=now)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Final, TypedDict
 
-from flasher import api, service
+from flasher import api
 from flasher.cli import arguments
 from flasher.cli.content_text import content_document, content_lines, row_line
 from flasher.cli.documents import FieldValue, HeardDocument
@@ -14,8 +14,8 @@ from flasher.cli.recording import add_recording, recorded_connection
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.survey_text import heard_document, heard_lines
 from flasher.errors import ExitCode, NoAnswerError
+from flasher.procedures import INFO_LISTEN_ONLY_S, DeviceInfo, Reading
 from flasher.protocol.spec import WELLING, Dialect
-from flasher.service import DeviceInfo, Reading
 
 _DESCRIPTION = """\
 Ask one device everything that the documents let a tool ask (identity, versions, state, history),
@@ -69,13 +69,8 @@ def run(options: argparse.Namespace, output: Output) -> int:
         stop_on_signal() as stopped,
     ):
         output.progress(f"asking the {options.target.node.name} on {connection.name} ...")
-        found = service.info(
-            connection,
-            options.target,
-            dialect=dialect,
-            taps=record.taps,
-            cancelled=stopped,
-        )
+        device = connection.device(options.target, dialect=dialect)
+        found = device.identify(taps=record.taps, cancelled=stopped)
         if not found.is_there:
             record.failed(_silent(found))
     if not found.is_there:
@@ -97,7 +92,7 @@ def _silent(found: DeviceInfo) -> NoAnswerError:
             remedy="Wake it with its key; see who is on the bus with flasher scan.",
         )
     return NoAnswerError(
-        f"The {node} sent nothing in {service.INFO_LISTEN_ONLY_S:g} s, and the documents give no"
+        f"The {node} sent nothing in {INFO_LISTEN_ONLY_S:g} s, and the documents give no"
         " question to ask it.",
         cause="it is off, or it has nothing to say: it speaks by itself only now and then",
         remedy="Try again while it is switched on; flasher scan shows who else is there.",

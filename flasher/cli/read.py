@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any, Final, Literal, NotRequired, Self, TypedDict
 
-from flasher import api, service
+from flasher import api
 from flasher.cli import arguments
 from flasher.cli.content_text import content_document, content_lines
 from flasher.cli.documents import FieldValue
@@ -114,14 +114,8 @@ def _read_item(
         recorded_connection(options, output, target) as (connection, record),
         stop_on_signal() as stopped,
     ):
-        answer = service.read(
-            connection,
-            entry.name,
-            target,
-            dialect=dialect,
-            taps=record.taps,
-            cancelled=stopped,
-        )
+        device = connection.device(target, dialect=dialect)
+        answer = device.read(entry.name, taps=record.taps, cancelled=stopped)
     document = content_document(answer)
     for line in content_lines(answer, entry.field):
         output.result(line)
@@ -151,14 +145,9 @@ def _read_memory(
         _MemoryProgress(end - start, output) as progress,
     ):
         try:
-            data = service.read_memory(
-                connection,
-                start,
-                end,
-                dialect=dialect,
-                taps=record.taps,
-                on_event=progress,
-                cancelled=stopped,
+            device = connection.device(target, dialect=dialect)
+            data = device.read_memory(
+                start, end, taps=record.taps, on_event=progress, cancelled=stopped
             )
         except NoAnswerError as error:
             error.remedy = f"{error.remedy} No file was written."

@@ -3,7 +3,7 @@
     with recording(options, output, target=target) as record:
         with connect(...) as connection:
             record.opened(connection)
-            service.info(connection, target, taps=record.taps)
+            connection.device(target).identify(taps=record.taps)
 
 An error that leaves the `with` block, or is handed to `failed`, makes a bundle. Nothing that goes
 wrong here changes what the command says or its exit code.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Final, Literal, TypedDict
 
-from flasher import api, service
+from flasher import api
 from flasher.bus.bit_rate import BitRate
 from flasher.cli import arguments
 from flasher.cli.documents import HeardDocument
@@ -15,6 +15,7 @@ from flasher.cli.stop import stop_on_signal
 from flasher.cli.survey_text import heard_document, heard_lines
 from flasher.errors import ExitCode, NoAnswerError
 from flasher.host.survey import Survey
+from flasher.procedures import SCAN_LISTEN_S
 from flasher.protocol.spec import BMS, DIALECTS, Dialect
 
 _DESCRIPTION = """\
@@ -70,8 +71,8 @@ def run(options: argparse.Namespace, output: Output) -> int:
         recorded_connection(options, output, options.target or BMS) as (connection, record),
         stop_on_signal() as stopped,
     ):
-        output.progress(f"listening for {service.SCAN_LISTEN_S:g} s on {connection.name} ...")
-        survey = service.scan(connection, dialect=dialect, taps=record.taps, cancelled=stopped)
+        output.progress(f"listening for {SCAN_LISTEN_S:g} s on {connection.name} ...")
+        survey = connection.scan(dialect, taps=record.taps, cancelled=stopped)
         if not survey.heard:
             record.failed(_silent(survey, bitrate_bps))
     guessed, why = judge_dialect(survey, bitrate_bps)

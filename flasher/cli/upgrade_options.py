@@ -12,11 +12,9 @@ from flasher.cli.profile import add_option as add_profile
 from flasher.cli.recording import add_recording
 from flasher.host.identity import WAIVABLE, Check
 from flasher.host.options import DEFAULT_ATTEMPTS, UpgradeOptions
-from flasher.host.query import Request
 from flasher.host.verify import Level
 from flasher.image.plan import Plan
 from flasher.image.release import Release
-from flasher.profile.load import documented_query
 from flasher.profile.model import Profile
 from flasher.protocol.timing import DEFAULT_TIMINGS
 
@@ -152,7 +150,6 @@ def chosen_options(
             packet_gap_s=options.packet_gap,
             nak_next_is_ack=options.nak_next_is_ack or None,
             allow_boot_name=_is_allowed(options, "boot-name") or None,
-            version_request=_version_request(profile),
         ),
         at_power_up=at_power_up,
         power_up_timeout_s=profile.power_up_timeout_s
@@ -177,13 +174,3 @@ def chosen_level(options: argparse.Namespace, plan: Plan, chosen: UpgradeOptions
 
 def _is_allowed(options: argparse.Namespace, name: str) -> bool:
     return bool(options.force or getattr(options, f"allow_{name.replace('-', '_')}"))
-
-
-def _version_request(profile: Profile) -> Request | None:
-    """The product's own version query. None for the document's: its answer tells the hardware
-    version too.
-    """
-    query = profile.version_query
-    if query is None or query == documented_query(profile.target):
-        return None
-    return query.request(profile.target)

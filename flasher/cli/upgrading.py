@@ -164,9 +164,9 @@ class _Upgrading:
                 progress(event)
 
             began_at = connection.clock.now()
-            result = api.upgrade(
+            device = connection.device(options.target, dialect=options.dialect)
+            result = device.upgrade(
                 self._plan,
-                connection,
                 options=self._chosen,
                 verify=self._level,
                 identity=self._identity,

@@ -6,7 +6,7 @@ import argparse
 import sys
 from typing import Final, Literal, TypedDict
 
-from flasher import api, service
+from flasher import api
 from flasher.cli import arguments
 from flasher.cli.output import Output
 from flasher.cli.recording import add_recording, recorded_connection
@@ -113,15 +113,16 @@ def run(options: argparse.Namespace, output: Output) -> int:
             remedy="Add --yes.",
         )
     with recorded_connection(options, output, target) as (connection, record):
+        device = connection.device(target, dialect=dialect, taps=record.taps)
         with stop_on_signal() as stopped:
-            old = service.old_content(connection, plan, taps=record.taps, cancelled=stopped)
+            old = device.content_before(plan, cancelled=stopped)
         _show(plan, old, output)
         if not options.yes and not _agrees(plan):
             output.progress("nothing was written")
             output.document({"written": False}, exit_code=ExitCode.INTERRUPTED)
             return ExitCode.INTERRUPTED
         with stop_on_signal(lambda: output.error_line("the write ends first ...")):
-            written = service.carry_out(connection, plan, old, taps=record.taps)
+            written = device.carry_out(plan, old)
         if (error := written.error()) is not None:
             record.failed(error)
     return _conclude(written, output)

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any, Final
 
-from flasher import api, service
+from flasher import api
 from flasher.conformance.profile import ConformanceProfile, load_profile
 from flasher.conformance.real import (
     HOST_UNCERTAINTY_S,
@@ -79,7 +79,7 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
     bus = {**(asked or {}), **options.bus}
     echoes = asked is not None and bus.get("receive_own_messages", True) is True
     with api.connect(WELLING, holder="flasher conformance", **bus) as connection:
-        service.listen_first(connection, dialect=WELLING)
+        connection.listen_first(WELLING)
         port = RealPort(
             connection.link,
             connection.clock,

@@ -12,7 +12,13 @@ from enum import Enum
 from typing import Final
 
 from flasher import events
-from flasher.errors import BusError, FlasherError, InterruptedByUserError, VerificationError
+from flasher.errors import (
+    BusError,
+    FlasherError,
+    InterruptedByUserError,
+    UsageError,
+    VerificationError,
+)
 from flasher.host.options import UpgradeOptions, firmware_version
 from flasher.host.outcome import DeviceLeft
 from flasher.host.query import Query, Request
@@ -110,6 +116,38 @@ def possible_levels(target: Target, options: UpgradeOptions | None = None) -> tu
     if READ_MEMORY.receiver is target.node:
         levels.append(Level.MEMORY)
     return tuple(levels)
+
+
+def as_level(level: Level | str) -> Level:
+    """A level of verification by its name. Raises UsageError."""
+    try:
+        return Level(level)
+    except ValueError:
+        names = ", ".join(each.value for each in Level)
+        raise UsageError(f"There is no verification {level!r}; there are {names}.") from None
+
+
+def default_level(target: Target, options: UpgradeOptions | None = None) -> Level:
+    """How far an upgrade of a target is verified unless somebody says otherwise: by its version
+    where there is a query for it.
+    """
+    return Level.VERSION if Level.VERSION in possible_levels(target, options) else Level.NONE
+
+
+def check_level(plan: Plan, level: Level, options: UpgradeOptions | None = None) -> None:
+    """Raise UsageError when an upgrade cannot be verified so."""
+    if level not in possible_levels(plan.target, options):
+        raise UsageError(
+            f"A {plan.target.node.name} cannot be verified by {level.value}.",
+            cause="the document gives no query for it, and no profile names one",
+            remedy="Leave --verify out, or use --verify none.",
+        )
+    if level is Level.MEMORY and plan.image.base is None:
+        raise UsageError(
+            "The memory cannot be read back without addresses.",
+            cause=f"{plan.image.source} is a raw binary",
+            remedy="Say with --base where its first byte lies.",
+        )
 
 
 class Check:

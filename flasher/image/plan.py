@@ -33,7 +33,10 @@ from flasher.protocol.spec import (
     IMAGE_MAX_SIZE,
     PACKET_DATA_SIZE,
     PACKET_FILLER,
+    Dialect,
     Target,
+    as_dialect,
+    as_target,
     packet_count,
 )
 from flasher.protocol.wire import Message, encode, split
@@ -90,6 +93,29 @@ class Plan:
     def _check(self, number: int) -> None:
         if not 1 <= number <= self.total_packets:
             raise IndexError(f"there is no packet {number} of {self.total_packets}")
+
+
+def make_plan(
+    image: Image,
+    target: str | Target,
+    dialect: str | Dialect = "welling",
+    *,
+    bitrate_bps: int | None = None,
+    has_upgrade: bool | None = None,
+) -> Plan:
+    """What an upgrade would send; at the dialect's bit rate unless another one is given.
+
+    Raises UsageError for a dialect that has no upgrade, unless `has_upgrade` says that a product
+    has it all the same; else as `plan`.
+    """
+    chosen = as_dialect(dialect)
+    if not (chosen.has_upgrade if has_upgrade is None else has_upgrade):
+        raise UsageError(
+            f"The {chosen.name.upper()} dialect has no upgrade: its document cancelled it.",
+            remedy="Use --dialect welling if the device speaks it; a profile can enable it.",
+        )
+    rate = chosen.bitrate_bps if bitrate_bps is None else bitrate_bps
+    return plan(image, as_target(target), rate)
 
 
 def plan(image: Image, target: Target, bitrate_bps: int) -> Plan:

@@ -23,9 +23,14 @@ from typing import Any, Final
 from flasher.errors import UsageError
 from flasher.files import read_toml
 from flasher.profile.keys import GROUPS, KEYS, explain_unknown, read_value
-from flasher.profile.model import ApplicationArea, Profile, VersionQuery, sent_ids
-from flasher.protocol.contents import VersionInformation
-from flasher.protocol.spec import TARGETS, WELLING, Command, Dialect, Target, data_size, find_target
+from flasher.profile.model import (
+    ApplicationArea,
+    Profile,
+    VersionQuery,
+    documented_query,
+    sent_ids,
+)
+from flasher.protocol.spec import TARGETS, WELLING, Dialect, Target, data_size, find_target
 from flasher.protocol.text import printable
 
 FILE_NAME: Final = "flasher.toml"
@@ -188,24 +193,6 @@ def _group(name: str, default: Any, given: Mapping[str, Any], file: str) -> Any:
     return kind(**values)
 
 
-def documented_query(target: Target) -> VersionQuery | None:
-    """Version information as chapter 3 has it, for the BMS only."""
-    if not target.has_version_query:
-        return None
-    offset = 0
-    for name, codec in VersionInformation.LAYOUT:
-        if name == "firmware_version":
-            break
-        offset += codec.size_bytes
-    return VersionQuery(
-        Command.READ_VERSION,
-        target.broadcast_id,
-        Command.VERSION_INFORMATION,
-        offset,
-        codec.size_bytes,
-    )
-
-
 def _source(name: str, target: Target) -> str:
     group, _, part = name.rpartition(".")
     documented = (
@@ -228,7 +215,7 @@ def _check_together(profile: Profile, file: str) -> None:
             where=file,
         )
     try:
-        profile.upgrade_options()
+        replace(profile, version_query=None).upgrade_options()  # that is checked below
     except UsageError as error:
         error.where = file
         raise

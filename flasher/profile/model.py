@@ -14,7 +14,7 @@ from flasher.image.image import Image
 from flasher.image.plausible import Cpu
 from flasher.profile.keys import GROUPS
 from flasher.protocol.catalogue import Item
-from flasher.protocol.contents import Empty
+from flasher.protocol.contents import Empty, VersionInformation
 from flasher.protocol.fields import Bytes, Content, Text, TextField
 from flasher.protocol.fields import field as wire_field
 from flasher.protocol.spec import WELLING, Command, Dialect, Mode, Node, Target, can_id, data_size
@@ -87,6 +87,24 @@ def _version_answer(before_bytes: int, text_bytes: int, behind_bytes: int) -> ty
     )
 
 
+def documented_query(target: Target) -> VersionQuery | None:
+    """Version information as chapter 3 has it, for the BMS only."""
+    if not target.has_version_query:
+        return None
+    offset = 0
+    for name, codec in VersionInformation.LAYOUT:
+        if name == "firmware_version":
+            break
+        offset += codec.size_bytes
+    return VersionQuery(
+        Command.READ_VERSION,
+        target.broadcast_id,
+        Command.VERSION_INFORMATION,
+        offset,
+        codec.size_bytes,
+    )
+
+
 @dataclass(frozen=True)
 class Profile:
     """What holds for one target in one dialect. `sources` has "default" (a reading of this
@@ -149,6 +167,9 @@ class Profile:
     def upgrade_options(self, **overrides: Any) -> UpgradeOptions:
         """The options of an upgrade. `overrides` are its fields or those of `Timings`, by name;
         one that is None was not given. Raises TypeError for another name.
+
+        The product's own version query is among them, not the document's: its answer tells the
+        hardware version too.
         """
         given = {name: value for name, value in overrides.items() if value is not None}
         names = {known.name for known in fields(UpgradeOptions)}
@@ -156,7 +177,11 @@ class Profile:
         timings = {
             known.name: given.pop(known.name) for known in fields(Timings) if known.name in given
         }
-        options = {name: value for name, value in shared.items() if name in names} | given
+        options = {name: value for name, value in shared.items() if name in names}
+        query = self.version_query
+        if query is not None and query != documented_query(self.target):
+            options["version_request"] = query.request(self.target)
+        options |= given
         base: Timings = options["timings"]
         options["timings"] = replace(base, **timings)
         return UpgradeOptions(**options)

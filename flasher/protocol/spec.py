@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import Final
 
+from flasher.errors import UsageError
+
 # -- framing (2.2.1) ---------------------------------------------------------------------------
 
 HEADER: Final = b"\x55\xaa"
@@ -164,6 +166,14 @@ def find_target(name: str) -> Target | None:
     return TARGETS.get(lower) or TARGET_ALIASES.get(lower)
 
 
+def as_target(target: str | Target) -> Target:
+    """A target by its name or one of the documents' other names. Raises UsageError."""
+    found = target if isinstance(target, Target) else find_target(target)
+    if found is None:
+        raise UsageError(f"There is no target {target!r}; targets are {', '.join(TARGETS)}.")
+    return found
+
+
 @dataclass(frozen=True)
 class Dialect:
     """One of the two protocol documents, with what it decides differently from the other."""
@@ -190,3 +200,11 @@ MOTINOVA: Final = Dialect(
     has_upgrade=False,
 )
 DIALECTS: Final = {dialect.name: dialect for dialect in (WELLING, MOTINOVA)}
+
+
+def as_dialect(dialect: str | Dialect) -> Dialect:
+    """A dialect by its name. Raises UsageError."""
+    found = dialect if isinstance(dialect, Dialect) else DIALECTS.get(dialect.lower())
+    if found is None:
+        raise UsageError(f"There is no dialect {dialect!r}; dialects are {', '.join(DIALECTS)}.")
+    return found

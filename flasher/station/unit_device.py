@@ -9,7 +9,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from flasher import service
 from flasher.api import Connection, make_plan, release_checked, release_options
 from flasher.driver import Tap, drive
 from flasher.errors import NoAnswerError
@@ -19,7 +18,6 @@ from flasher.host.items import Readable, meaningful_fields
 from flasher.host.options import UpgradeOptions, firmware_version
 from flasher.host.query import Request
 from flasher.host.verify import MemoryCheck, Verification
-from flasher.profile.load import documented_query
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.contents import Reset
 from flasher.protocol.engine import Engine
@@ -94,12 +92,7 @@ class UnitDevice:
     def options(self, **overrides: object) -> UpgradeOptions:
         """The options of an upgrade, those of the product."""
         profile = self.loaded.profile
-        query = profile.version_query
-        own = None
-        if query is not None and query != documented_query(self.loaded.target):
-            own = query.request(self.loaded.target)
-        chosen = profile.upgrade_options(version_request=own, **overrides)
-        return release_options(chosen, self.loaded.release)
+        return release_options(profile.upgrade_options(**overrides), self.loaded.release)
 
     # -- asking -----------------------------------------------------------------------------------
 
@@ -154,15 +147,9 @@ class UnitDevice:
 
     def query(self, request: Request) -> Content:
         """Ask one question. Raises NoAnswerError."""
-        answer = service.query(
-            self.connection,
-            request,
-            dialect=self.loaded.profile.dialect,
-            timings=self.loaded.profile.timings,
-            taps=self.taps,
-            cancelled=self.cancelled,
-            has_listened=True,  # nobody else has this adapter, and each flash listens itself
-        )
+        # Nobody else has this adapter, and each flash listens itself.
+        device = self.connection.device(profile=self.loaded.profile, is_alone=True)
+        answer = device.ask(request, taps=self.taps, cancelled=self.cancelled)
         self.check_cancelled()
         return answer
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Final
 
-from flasher import api, events, service
+from flasher import events
 from flasher.errors import NoAnswerError, VerificationError
 from flasher.host.identity import Finding, judge_device
 from flasher.host.options import firmware_version
@@ -112,9 +112,8 @@ class Flashing:
         options = device.options(timeout_s=limit_s)
         options = replace(options, at_power_up=at_power_up)
         asks = device.version_request is not None
-        result = api.upgrade(
+        result = device.connection.device(profile=device.loaded.profile).upgrade(
             device.plan,
-            device.connection,
             options=options,
             verify=Level.VERSION if asks else Level.NONE,
             identity=device.identity,
@@ -318,15 +317,13 @@ class UnitSteps:
         return f"{len(self._plans)} written"
 
     def _write_one(self, device: UnitDevice, plan: WritePlan) -> None:
-        manner: service.Manner = {
-            "taps": device.taps,
-            "cancelled": device.cancelled,
-            "timings": device.loaded.profile.timings,
-        }
+        writing = device.connection.device(
+            profile=device.loaded.profile, taps=device.taps, cancelled=device.cancelled
+        )
         device.check_cancelled()
-        old = service.old_content(device.connection, plan, **manner)
+        old = writing.content_before(plan)
         write = self._journal.intent(plan.target.name, plan.writable.name, wanted_text(plan))
-        written = service.carry_out(device.connection, plan, old, **manner)
+        written = writing.carry_out(plan, old)
         error = written.error()
         if isinstance(error, VerificationError):
             code = codes.WRITE_DIFFERS if written.differences else codes.WRITE_FAILED

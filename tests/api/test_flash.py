@@ -104,14 +104,14 @@ def test_the_mock_takes_the_time_of_a_real_bus_unless_told_otherwise() -> None:
 def test_what_the_device_model_reports_can_be_watched() -> None:
     seen: list[object] = []
     with flasher.connect_mock("bms", speed=0, on_event=seen.append) as connection:
-        assert flasher.upgrade(flasher.make_plan(IMAGE, "bms"), connection).ok
+        assert connection.device().upgrade(flasher.make_plan(IMAGE, "bms")).ok
     assert events.ImageStored(300, IMAGE.sha256) in seen
 
 
 def test_two_upgrades_on_one_connection() -> None:
     plan = flasher.make_plan(IMAGE, "bms")
     with flasher.connect_mock("bms", speed=0) as connection:
-        assert [flasher.upgrade(plan, connection).ok for _ in range(2)] == [True, True]
+        assert [connection.device().upgrade(plan).ok for _ in range(2)] == [True, True]
 
 
 def test_taps_see_the_traffic_of_an_upgrade() -> None:
@@ -123,7 +123,7 @@ def test_taps_see_the_traffic_of_an_upgrade() -> None:
         times.append(now)
 
     with flasher.connect_mock("bms", speed=0) as connection:
-        flasher.upgrade(flasher.make_plan(IMAGE, "bms"), connection, taps=[tap])
+        connection.device().upgrade(flasher.make_plan(IMAGE, "bms"), taps=[tap])
     assert ids == {(0x752, True), (0x725, False), (0x720, False)}
     assert times == sorted(times)
 
@@ -199,7 +199,7 @@ def lose_complete(frame: Frame, _now: float) -> list[Frame]:
 
 def test_a_final_answer_that_never_comes_is_unconfirmed_not_done() -> None:
     connection, device = simulated(lose_complete, repeated_end="silence", start_delay_s=1000.0)
-    outcome = flasher.upgrade(flasher.make_plan(IMAGE, "bms"), connection).outcome
+    outcome = connection.device().upgrade(flasher.make_plan(IMAGE, "bms")).outcome
     error = outcome.error()
     assert isinstance(error, errors.UnconfirmedError)
     assert error.exit_code == ExitCode.UNCONFIRMED
@@ -220,7 +220,7 @@ def test_the_version_decides_when_the_final_answer_is_lost(
     connection, device = simulated(lose_complete, repeated_end="silence")
     image = flasher.Image.from_bytes(DATA[:16] + b"V2r0r0_20260101\x00" + DATA)
     plan = flasher.make_plan(dataclasses.replace(image, version=claimed), "bms")
-    outcome = flasher.upgrade(plan, connection).outcome
+    outcome = connection.device().upgrade(plan).outcome
     error = outcome.error()
     assert outcome.ending is ending
     assert outcome.running_version == "V2r0r0_20260101"
@@ -239,19 +239,15 @@ def test_a_cancelled_upgrade_is_an_outcome_that_says_what_is_left() -> None:
         if isinstance(event, events.PacketAcknowledged):
             acknowledged.append(event)
 
-    connection, device = simulated()
-    outcome = flasher.upgrade(
-        flasher.make_plan(IMAGE, "bms"),
-        connection,
-        on_event=note,
-        cancelled=lambda: bool(acknowledged),
-    ).outcome
+    connection, model = simulated()
+    device = connection.device()
+    outcome = device.upgrade(IMAGE, on_event=note, cancelled=lambda: bool(acknowledged)).outcome
     error = outcome.error()
     assert outcome.ending is flasher.Ending.CANCELLED
     assert isinstance(error, errors.InterruptedByUserError)
     assert error.exit_code == ExitCode.INTERRUPTED
     assert outcome.device_left is flasher.DeviceLeft.NO_APPLICATION
-    assert device.stored_image is None
+    assert model.stored_image is None
 
 
 # -- connections ----------------------------------------------------------------------------------
@@ -359,9 +355,9 @@ def test_a_babbling_bus_keeps_an_upgrade_neither_from_its_deadline_nor_from_bein
     connection = api.Connection(link, MonotonicClock(), "babbling")
     plan = flasher.make_plan(IMAGE, "bms")
     began = time.monotonic()
-    outcome = flasher.upgrade(plan, connection, options=UpgradeOptions(timeout_s=0.1)).outcome
+    outcome = connection.device().upgrade(plan, options=UpgradeOptions(timeout_s=0.1)).outcome
     assert outcome.ending is flasher.Ending.OUT_OF_TIME
-    outcome = flasher.upgrade(plan, connection, cancelled=lambda: True).outcome
+    outcome = connection.device().upgrade(plan, cancelled=lambda: True).outcome
     assert outcome.ending is flasher.Ending.CANCELLED
     assert time.monotonic() - began < 2.0
     assert link.received > 10_000
@@ -435,7 +431,7 @@ def test_the_examples_of_the_tour_run(
     examples = [
         textwrap.dedent(block) for block in re.findall(r"(?:^    .+\n)+", tour, re.MULTILINE)
     ]
-    assert len(examples) == 5
+    assert len(examples) == 6
     opened: list[dict[str, Any]] = []
     real: Connect = api.connect_mock
 
@@ -468,15 +464,15 @@ def test_everything_that_the_tour_exports_is_there() -> None:
 
 def test_a_program_reads_and_writes_what_the_battery_says_of_itself() -> None:
     with flasher.connect_mock("bms", speed=0) as connection:
-        running = flasher.query(connection, "running-information")
+        running = connection.device().read("running-information")
         assert isinstance(running, contents.RunningInformation)
         assert 30_000 < running.voltage_mv < 45_000
-        written = flasher.write(connection, "user-string-1", "checked")
+        written = connection.device().write("user-string-1", "checked")
         assert written.error() is None
-        text = flasher.query(connection, "user-string-1")
+        text = connection.device().read("user-string-1")
         assert isinstance(text, contents.UserString)
         assert str(text.text) == "checked"
-        assert len(flasher.read(connection, 0x0800_8000, 0x0800_8010)) == 16
+        assert len(connection.device().read_memory(0x0800_8000, 0x0800_8010)) == 16
 
 
 def test_what_only_the_manufacturer_writes_needs_a_word() -> None:
@@ -484,4 +480,4 @@ def test_what_only_the_manufacturer_writes_needs_a_word() -> None:
         flasher.connect_mock("bms", speed=0) as connection,
         pytest.raises(errors.UsageError, match="manufacturer"),
     ):
-        flasher.write(connection, "serial-number", "W2605002")
+        connection.device().write("serial-number", "W2605002")

@@ -13,7 +13,9 @@ from typing import Any
 import can
 import pytest
 
+from flasher.api import Connection
 from flasher.bus.inspect_interface import Interface, Unseen
+from flasher.bus.simulated import SimulatedLink
 from flasher.cli import doctor
 from flasher.cli.detect import Detected, Found
 from flasher.cli.doctor_traffic import Traffic
@@ -24,7 +26,7 @@ from flasher.protocol.bittime import fixed_bits
 from flasher.protocol.frame import Frame
 from tests.bus.test_adapter import FakeBus, error_message, message
 from tests.cli.conftest import Flasher, Run
-from tests.service.battery import ANSWERS, Battery, Wire, wire_to
+from tests.service.battery import ANSWERS, Battery, wire_to
 
 MOCK = ("--mock", "--mock-speed", "0")
 SILENT = frozenset(ANSWERS)
@@ -57,16 +59,16 @@ def one(run: Run, words: str) -> tuple[str, list[str]]:
 # -- traffic, on a simulated bus ------------------------------------------------------------------
 
 
-def listen(flasher: Flasher, monkeypatch: pytest.MonkeyPatch, wire: Wire, *more: str) -> Run:
+def listen(flasher: Flasher, monkeypatch: pytest.MonkeyPatch, wire: Connection, *more: str) -> Run:
     @contextmanager
-    def opened(*_arguments: object, **_options: object) -> Iterator[Wire]:
+    def opened(*_arguments: object, **_options: object) -> Iterator[Connection]:
         yield wire
 
     monkeypatch.setattr("flasher.api.connect_mock", opened)
     return flasher("doctor", *MOCK, "--json", *more)
 
 
-def saying(*messages: tuple[int, int, bytes], damages: bool = False) -> Wire:
+def saying(*messages: tuple[int, int, bytes], damages: bool = False) -> Connection:
     return wire_to(*(Battery(silent=SILENT, repeats=(m,), damages=damages) for m in messages))
 
 
@@ -162,6 +164,7 @@ def test_a_controller_that_is_bus_off_is_a_problem(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wire = wire_to()
+    assert isinstance(wire.link, SimulatedLink)
     wire.link._bus.bus_off()
     run = listen(flasher, monkeypatch, wire)
     assert run.code == ExitCode.BUS
@@ -173,6 +176,7 @@ def test_an_adapter_that_fails_meanwhile_is_a_finding(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wire = wire_to()
+    assert isinstance(wire.link, SimulatedLink)
     wire.link._bus.unplug()
     run = listen(flasher, monkeypatch, wire)
     assert run.code == ExitCode.BUS

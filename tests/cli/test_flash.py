@@ -305,7 +305,7 @@ def test_a_bug_is_exit_code_1_and_says_so(
     def broken(*_args: object, **_options: object) -> None:
         raise ZeroDivisionError("injected")
 
-    monkeypatch.setattr("flasher.api.upgrade", broken)
+    monkeypatch.setattr("flasher.api.Device.upgrade", broken)
     run = flasher("flash", OBC, "-t", "obc", "--mock")
     assert run.code == ExitCode.INTERNAL
     assert "a bug in flasher" in run.err

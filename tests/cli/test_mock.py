@@ -74,7 +74,7 @@ class Host:
         """One upgrade from reset to the end."""
         plan = api.make_plan(api.Image.from_bytes(image), target)
         with api.connect(interface="virtual", channel=self.channel) as connection:
-            outcome = api.upgrade(plan, connection).outcome
+            outcome = connection.device(target).upgrade(plan).outcome
         self.outcomes.append(outcome)
         return outcome
 
@@ -82,7 +82,7 @@ class Host:
         """One upgrade after which nothing is asked: for a mock that ends before it could answer."""
         plan = api.make_plan(api.Image.from_bytes(IMAGE), "bms")
         with api.connect(interface="virtual", channel=self.channel) as connection:
-            api.upgrade(plan, connection, verify=api.Level.NONE)
+            connection.device().upgrade(plan, verify=api.Level.NONE)
 
     def hear(self, question: bytes, can_id: int, wanted: bytes) -> bytes:
         """Send the frames of a message, or listen only, until `wanted` was heard on `can_id`."""
@@ -181,7 +181,7 @@ def test_the_last_upgrade_can_be_verified_before_it_ends(serve: Serve, host: Hos
             api.Image.from_bytes(VECTORS + b"V2r0r0_20260101".ljust(200, b"-")), "bms"
         )
         with api.connect(interface="virtual", channel=host.channel) as connection:
-            results.append(api.upgrade(plan, connection, verify=api.Level.VERSION))
+            results.append(connection.device().upgrade(plan, verify=api.Level.VERSION))
 
     host.do(upgrade)
     assert serve("--upgrades", "1", "--set", "after_complete=restarts").code == ExitCode.OK

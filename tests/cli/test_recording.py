@@ -11,7 +11,7 @@ from typing import Any
 import can
 import pytest
 
-from flasher import service
+from flasher.api import Device
 from flasher.cli.output import Output
 from flasher.cli.recording import BUNDLE_FOLDER, add_recording, recording
 from flasher.driver import Tap
@@ -279,7 +279,7 @@ def test_a_silent_device_leaves_a_bundle_that_is_explained(
             tap(Frame(0x752, b""), sent=True, now=1.0)
         raise NoAnswerError("The BMS did not answer.", remedy="Wake it.")
 
-    monkeypatch.setattr(service, "read", silent)
+    monkeypatch.setattr(Device, "read", silent)
     run = flasher("read", "version-information", *MOCK)
     assert run.code == 5
     (bundle,) = bundles(bundle_folder)

@@ -154,15 +154,18 @@ class Stage:
         """One session, as `flasher flash` runs it."""
         self.heard.clear()
         self.events.clear()
-        return api.upgrade(
-            self.plan(image),
-            self.connection(),
-            options=options,
-            verify=verify,
-            identity=identity,
-            taps=taps,
-            on_event=self.note,
-            cancelled=self.cancelled,
+        return (
+            self.connection()
+            .device(self.target)
+            .upgrade(
+                self.plan(image),
+                options=options,
+                verify=verify,
+                identity=identity,
+                taps=taps,
+                on_event=self.note,
+                cancelled=self.cancelled,
+            )
         )
 
     def rescue(self, image: Image = IMAGE, **options: Any) -> Result:

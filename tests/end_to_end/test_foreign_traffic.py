@@ -145,7 +145,7 @@ def test_a_whole_bicycle_talks_while_its_battery_is_flashed() -> None:
     ids = Ids()
     with api.connect_mock("bms", speed=0, system=True, on_event=stored.append) as connection:
         planned = plan(IMAGE, BMS, WELLING.bitrate_bps)
-        result = api.upgrade(planned, connection, taps=[ids])
+        result = connection.device().upgrade(planned, taps=[ids])
     assert result.exit_code == ExitCode.OK
     assert ids.sent == {0x752}
     assert {frame.can_id for frame in ids.received} > {0x720, 0x725}

@@ -274,7 +274,7 @@ def test_a_bus_off_that_is_over_keeps_no_later_upgrade_from_starting() -> None:
     while (seen := link.receive(stage.clock.now() + 1.0)) is not None:
         assert seen.is_error
     connection = api.Connection(link, stage.clock, "the simulated bus")
-    result = api.upgrade(api.make_plan(IMAGE, "bms"), connection)
+    result = connection.device().upgrade(IMAGE)
     assert result.exit_code == ExitCode.OK
     assert stage.has == IMAGE.data
 

@@ -10,8 +10,9 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Final
 
+from flasher.api import Connection
 from flasher.bus.link import VirtualClock
-from flasher.bus.simulated import SimulatedBus, SimulatedLink
+from flasher.bus.simulated import SimulatedBus
 from flasher.protocol.frame import Frame
 from tests.peers.wording import build, payloads
 
@@ -164,25 +165,16 @@ class Battery:
         self._out.sort(key=lambda waiting: waiting[0])
 
 
-@dataclass(frozen=True)
-class Wire:
-    """A connection to a simulated bus."""
-
-    link: SimulatedLink
-    clock: VirtualClock
-    name: str = "a simulated bus"
-
-
-def wire_to(*batteries: Battery) -> Wire:
+def wire_to(*batteries: Battery) -> Connection:
     """A bus with these on it."""
     clock = VirtualClock()
     bus = SimulatedBus(250_000, clock)
     for battery in batteries:
         bus.attach(battery)
-    return Wire(bus.link(), clock)
+    return Connection(bus.link(), clock, "a simulated bus")
 
 
 @contextmanager
-def opened(*batteries: Battery) -> Iterator[Wire]:
+def opened(*batteries: Battery) -> Iterator[Connection]:
     """The same as a context manager, as the command line wants it."""
     yield wire_to(*batteries)

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from flasher import service
 from flasher.errors import (
     BusError,
     InterruptedByUserError,
@@ -27,7 +26,7 @@ SILENT = frozenset(ANSWERS)
 
 @BOTH
 def test_an_item_is_read_by_its_name(dialect: Dialect) -> None:
-    answer = service.read(wire_to(Battery()), "running-information", dialect=dialect)
+    answer = wire_to(Battery()).device(dialect=dialect).read("running-information")
     assert isinstance(answer, contents.RunningInformation)
     assert (answer.voltage_mv, answer.mean_current_ma) == (36_000, -1000)
     assert (answer.cell_temperature_c, answer.status) == (25, contents.Status.CHARGER_CONNECTED)
@@ -35,7 +34,7 @@ def test_an_item_is_read_by_its_name(dialect: Dialect) -> None:
 
 def test_a_sleeping_device_that_misses_the_first_messages_is_read_all_the_same() -> None:
     battery = Battery(deaf_messages=3)
-    answer = service.read(wire_to(battery), "version-information")
+    answer = wire_to(battery).device().read("version-information")
     assert isinstance(answer, contents.VersionInformation)
     assert str(answer.model) == "BM36"
     assert battery.received == [(0x3300, b"")]
@@ -44,7 +43,7 @@ def test_a_sleeping_device_that_misses_the_first_messages_is_read_all_the_same()
 def test_a_silent_device_is_no_answer_with_what_was_asked() -> None:
     wire = wire_to(Battery(silent=SILENT))
     with pytest.raises(NoAnswerError) as caught:
-        service.read(wire, "history")
+        wire.device().read("history")
     assert "752 3800, sent 5 times" in caught.value.where
     assert 1.0 + LISTEN_FIRST_S <= wire.clock.now() < 1.2
 
@@ -53,25 +52,25 @@ def test_an_answer_in_another_form_is_named_as_the_cause() -> None:
     battery = Battery()
     battery.answers[0x3300] = (0x720, 0x1530, bytes(0x30))
     with pytest.raises(NoAnswerError) as caught:
-        service.read(wire_to(battery), "version-information")
+        wire_to(battery).device().read("version-information")
     assert "1530 with 48 bytes, not 1540" in caught.value.cause
 
 
 def test_an_unknown_name_is_refused_with_the_closest_one() -> None:
     with pytest.raises(UsageError, match="serial-nmber") as caught:
-        service.read(wire_to(), "serial-nmber")
+        wire_to().device().read("serial-nmber")
     assert "Did you mean serial-number?" in caught.value.remedy
 
 
 @pytest.mark.parametrize("target", [WMC, OBC], ids=lambda t: t.name)
 def test_devices_without_queries_are_not_asked(target: Target) -> None:
     with pytest.raises(UsageError, match="nothing to read"):
-        service.read(wire_to(), "version-information", target)
+        wire_to().device(target).read("version-information")
 
 
 def test_cancelled_reading_is_an_interruption() -> None:
     with pytest.raises(InterruptedByUserError):
-        service.read(wire_to(Battery(silent=SILENT)), "history", cancelled=lambda: True)
+        wire_to(Battery(silent=SILENT)).device().read("history", cancelled=lambda: True)
 
 
 # -- writing ---------------------------------------------------------------------------------------
@@ -82,8 +81,10 @@ SERIAL = b"W9999999.       "
 @BOTH
 def test_a_write_is_confirmed_and_read_back(dialect: Dialect) -> None:
     battery = Battery()
-    written = service.write(
-        wire_to(battery), "serial-number", "W9999999", dialect=dialect, manufacturer=True
+    written = (
+        wire_to(battery)
+        .device(dialect=dialect)
+        .write("serial-number", "W9999999", manufacturer=True)
     )
     assert battery.received == [(0x3300, b""), (0x4110, SERIAL), (0x3300, b"")]
     (change,) = written.changes
@@ -93,27 +94,27 @@ def test_a_write_is_confirmed_and_read_back(dialect: Dialect) -> None:
 def test_production_data_go_out_as_the_document_has_them() -> None:
     battery = Battery()
     values = ("ACME", "SUZHOU", "20260517")
-    service.write(wire_to(battery), "production-information", *values, manufacturer=True)
+    wire_to(battery).device().write("production-information", *values, manufacturer=True)
     assert battery.received[1] == (0x3F20, b"ACME.   SUZHOU. 20260517" + bytes(8))
 
 
 def test_a_finished_content_may_be_given() -> None:
     battery = Battery()
-    service.write(wire_to(battery), "check-code", contents.CheckCode(b"\x5a" * 12))
+    wire_to(battery).device().write("check-code", contents.CheckCode(b"\x5a" * 12))
     assert battery.received[1] == (0x320C, b"\x5a" * 12)
 
 
 def test_what_the_document_reserves_for_the_manufacturer_needs_his_word() -> None:
     battery = Battery()
     with pytest.raises(UsageError, match="manufacturer"):
-        service.write(wire_to(battery), "model", "BM48")
+        wire_to(battery).device().write("model", "BM48")
     assert battery.received == []
 
 
 def test_nothing_is_written_to_a_device_that_does_not_answer() -> None:
     battery = Battery(silent=SILENT)
     with pytest.raises(NoAnswerError) as caught:
-        service.write(wire_to(battery), "user-string-1", "RACK 7")
+        wire_to(battery).device().write("user-string-1", "RACK 7")
     assert "Nothing was written" in caught.value.remedy
     assert 0x3A10 not in [command for command, _ in battery.received]
 
@@ -122,8 +123,8 @@ def test_an_unconfirmed_write_fails_even_if_it_reads_back() -> None:
     battery = Battery()
     battery.silent = frozenset({0x3A10})
     plan = plan_write("user-string-1", [""])
-    old = service.old_content(wire_to(battery), plan)
-    written = service.carry_out(wire_to(battery), plan, old)
+    old = wire_to(battery).device().content_before(plan)
+    written = wire_to(battery).device().carry_out(plan, old)
     assert not written.is_confirmed
     error = written.error()
     assert isinstance(error, VerificationError)
@@ -132,14 +133,14 @@ def test_an_unconfirmed_write_fails_even_if_it_reads_back() -> None:
 
 def test_a_write_that_reads_back_differently_fails_and_names_both_values() -> None:
     with pytest.raises(VerificationError) as caught:
-        service.write(wire_to(Battery(loses_writes=True)), "user-string-2", "RACK 7")
+        wire_to(Battery(loses_writes=True)).device().write("user-string-2", "RACK 7")
     assert caught.value.what.endswith("reads back text '' instead of 'RACK 7'.")
 
 
 def test_a_write_is_seen_through_once_it_has_begun() -> None:
     battery = Battery()
     plan = plan_write("user-string-1", ["RACK 7"])
-    written = service.carry_out(wire_to(battery), plan, None, cancelled=lambda: True)
+    written = wire_to(battery).device().carry_out(plan, None, cancelled=lambda: True)
     assert written.error() is None
     assert written.is_confirmed
 
@@ -165,7 +166,7 @@ def test_values_that_do_not_fit_are_refused_before_anything_is_sent(
 ) -> None:
     battery = Battery()
     with pytest.raises(UsageError, match=says):
-        service.write(wire_to(battery), name, *values, manufacturer=True)
+        wire_to(battery).device().write(name, *values, manufacturer=True)
     assert battery.received == []
 
 
@@ -174,7 +175,7 @@ def test_values_that_do_not_fit_are_refused_before_anything_is_sent(
 
 def test_memory_is_read_in_pieces_of_128_bytes() -> None:
     battery = Battery()
-    data = service.read_memory(wire_to(battery), 0x1010, 0x1010 + 300)
+    data = wire_to(battery).device().read_memory(0x1010, 0x1010 + 300)
     assert data == battery.memory[0x10 : 0x10 + 300]
     assert [asked.hex(" ") for _, asked in battery.received] == [
         "10 10 00 00 90 10 00 00",
@@ -185,19 +186,19 @@ def test_memory_is_read_in_pieces_of_128_bytes() -> None:
 
 def test_memory_that_is_not_answered_names_the_address() -> None:
     with pytest.raises(NoAnswerError) as caught:
-        service.read_memory(wire_to(Battery()), 0x1380, 0x1480)
+        wire_to(Battery()).device().read_memory(0x1380, 0x1480)
     assert caught.value.where == "memory at 0x00001400"
 
 
 def test_repeated_answers_do_not_shift_the_pieces() -> None:
     battery = Battery(copies=2, deaf_messages=1)
-    assert service.read_memory(wire_to(battery), 0x1000, 0x1400) == battery.memory
+    assert wire_to(battery).device().read_memory(0x1000, 0x1400) == battery.memory
 
 
 @pytest.mark.parametrize(("start", "end"), [(8, 8), (9, 8), (0, 0x1_0000_0000)])
 def test_an_impossible_range_is_refused(start: int, end: int) -> None:
     with pytest.raises(UsageError, match="no range of memory"):
-        service.read_memory(wire_to(), start, end)
+        wire_to().device().read_memory(start, end)
 
 
 # -- info and scan ---------------------------------------------------------------------------------
@@ -207,7 +208,7 @@ FAULTS = (0x720, 0x1204, bytes.fromhex("0400 0100"))
 
 @BOTH
 def test_info_asks_everything_that_the_tool_may_ask(dialect: Dialect) -> None:
-    found = service.info(wire_to(Battery()), dialect=dialect)
+    found = wire_to(Battery()).device(dialect=dialect).identify()
     assert found.is_there
     assert [reading.item.command for reading in found.readings] == list(ANSWERS)
     assert all(reading.answer is not None for reading in found.readings)
@@ -215,7 +216,7 @@ def test_info_asks_everything_that_the_tool_may_ask(dialect: Dialect) -> None:
 
 
 def test_info_hears_faults() -> None:
-    found = service.info(wire_to(Battery(repeats=(FAULTS,))))
+    found = wire_to(Battery(repeats=(FAULTS,))).device().identify()
     assert found.survey.faults is not None
     assert found.survey.faults.faults == (
         contents.Fault.SHORT_CIRCUIT_PROTECTION | contents.Fault.CHARGE_OVER_VOLTAGE_WARNING
@@ -225,7 +226,7 @@ def test_info_hears_faults() -> None:
 def test_info_of_a_device_that_answers_half_is_bounded_and_says_what_is_missing() -> None:
     silent = frozenset(list(ANSWERS)[::2])
     wire = wire_to(Battery(silent=silent, delay_s=0.3))
-    found = service.info(wire)
+    found = wire.device().identify()
     missing = {reading.item.command for reading in found.readings if reading.answer is None}
     assert missing == silent
     assert wire.clock.now() < 0.5 + 11 * 1.1
@@ -234,17 +235,17 @@ def test_info_of_a_device_that_answers_half_is_bounded_and_says_what_is_missing(
 def test_info_does_not_ask_into_the_dialogue_of_another_tool() -> None:
     battery, tool = Battery(), Battery(silent=SILENT, repeats=((0x751, 0xA401, b"\x04"),))
     with pytest.raises(BusError, match="Another tool speaks on this bus"):
-        service.info(wire_to(battery, tool))
+        wire_to(battery, tool).device().identify()
     assert battery.received == []
 
 
 @pytest.mark.parametrize(
     "ask",
     [
-        lambda wire: service.read(wire, "history"),
-        lambda wire: service.read_memory(wire, 0x0800_0000, 0x0800_0080),
-        lambda wire: service.write(wire, "user-string-1", "rack 7"),
-        lambda wire: service.carry_out(wire, plan_write("user-string-1", ["rack 7"], BMS), None),
+        lambda wire: wire.device().read("history"),
+        lambda wire: wire.device().read_memory(0x0800_0000, 0x0800_0080),
+        lambda wire: wire.device().write("user-string-1", "rack 7"),
+        lambda wire: wire.device().carry_out(plan_write("user-string-1", ["rack 7"], BMS), None),
     ],
     ids=["read", "read memory", "write", "write what was agreed to"],
 )
@@ -261,7 +262,7 @@ def test_nobody_asks_or_writes_before_having_listened_for_another_tool(
 
 def test_scan_shows_another_tool_and_asks_nothing_then() -> None:
     battery, tool = Battery(), Battery(silent=SILENT, repeats=((0x751, 0xA401, b"\x04"),))
-    survey = service.scan(wire_to(battery, tool))
+    survey = wire_to(battery, tool).scan()
     assert survey.other_tool_heard
     assert set(survey.heard) == {Node.CDL}
     assert battery.received == []
@@ -269,7 +270,7 @@ def test_scan_shows_another_tool_and_asks_nothing_then() -> None:
 
 def test_info_gives_an_absent_device_up_soon() -> None:
     wire = wire_to()
-    found = service.info(wire)
+    found = wire.device().identify()
     assert not found.is_there
     assert [reading.was_asked for reading in found.readings] == [True] * 3 + [False] * 8
     assert wire.clock.now() < 4.0
@@ -277,7 +278,7 @@ def test_info_gives_an_absent_device_up_soon() -> None:
 
 def test_info_of_a_device_without_queries_listens_only() -> None:
     chatty = Battery(repeats=((0x710, 0x1305, b"READY"),))
-    found = service.info(wire_to(chatty), WMC)
+    found = wire_to(chatty).device(WMC).identify()
     assert found.is_there
     assert found.readings == ()
     assert chatty.received == []
@@ -286,7 +287,7 @@ def test_info_of_a_device_without_queries_listens_only() -> None:
 
 def test_scan_finds_who_talks_and_who_answers() -> None:
     wire = wire_to(Battery(), Battery(silent=SILENT, repeats=((0x730, 0x1405, b"READY"),)))
-    survey = service.scan(wire)
+    survey = wire.scan()
     assert set(survey.heard) == {Node.BMS, Node.OBC}
     assert survey.guess_dialect()[0] is None
 
@@ -303,14 +304,14 @@ def test_scan_finds_who_talks_and_who_answers() -> None:
 def test_traffic_of_one_dialect_only_tells_it(
     report: tuple[int, int, bytes], dialect: Dialect
 ) -> None:
-    survey = service.scan(wire_to(Battery(silent=SILENT, repeats=(report,))))
+    survey = wire_to(Battery(silent=SILENT, repeats=(report,))).scan()
     assert survey.guess_dialect()[0] is dialect
 
 
 def test_a_bootloader_that_announces_itself_is_named() -> None:
-    survey = service.scan(wire_to(Battery(repeats=((0x725, 0xC109, b"BMSV1.2.3"),))))
+    survey = wire_to(Battery(repeats=((0x725, 0xC109, b"BMSV1.2.3"),))).scan()
     assert survey.heard[Node.BMS].boot_version == "BMS V1.2.3"
 
 
 def test_the_default_target_is_the_bms() -> None:
-    assert service.info(wire_to(Battery())).target is BMS
+    assert wire_to(Battery()).device().identify().target is BMS

@@ -1,0 +1,519 @@
+"""What is done with a device, step by step, without the waiting.
+
+A procedure is a generator: it yields what has to happen next (an engine to run, a moment to wait
+for), and returns its result. `flasher.api` runs procedures: `Device` blocks meanwhile,
+`AsyncDevice` awaits. An error of a step is thrown into the procedure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from flasher import events
+from flasher.bus.health import LinkHealth, TroubleKind, bus_off_error
+from flasher.bus.link import Clock, Link
+from flasher.driver import Tap
+from flasher.errors import (
+    BusError,
+    FlasherError,
+    InterruptedByUserError,
+    NoAnswerError,
+    TransmitBlockedError,
+    UsageError,
+)
+from flasher.host.identify import LISTEN_FIRST_S
+from flasher.host.identity import Identity
+from flasher.host.items import Readable, find, readable
+from flasher.host.options import UpgradeOptions
+from flasher.host.outcome import AGAIN
+from flasher.host.query import Query, Request
+from flasher.host.read import READ_MEMORY, MemoryRead
+from flasher.host.session import Result, Session
+from flasher.host.survey import Survey
+from flasher.host.verify import (
+    NOT_ASKED,
+    Level,
+    MemoryCheck,
+    Verdict,
+    Verification,
+    VersionCheck,
+    check_level,
+    default_level,
+)
+from flasher.host.write import WritePlan, Written, plan_write
+from flasher.image.image import Image
+from flasher.image.plan import Plan, make_plan
+from flasher.profile.model import Profile
+from flasher.protocol.catalogue import BY_KEY, Item
+from flasher.protocol.contents import Reset
+from flasher.protocol.engine import Engine
+from flasher.protocol.fields import Content
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import BMS, Command, Dialect, Target
+
+if TYPE_CHECKING:
+    from flasher.bus.bit_rate import BitRate
+
+INFO_LISTEN_S: Final = 0.5
+"""Long enough to hear faults twice, which come every 200 ms while there are any (5.1)."""
+INFO_LISTEN_ONLY_S: Final = 3.0
+"""For devices that cannot be asked: their polls come about once a second."""
+SCAN_LISTEN_S: Final = 1.0
+_WAS_OFF: Final = frozenset({TroubleKind.BUS_OFF, TroubleKind.RESTARTED})
+_REOPEN_PAUSE_S: Final = 0.1
+"""Between two tries to open a lost adapter again."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A step: run this engine until it is done. `taps` see the frames beside those of the caller.
+
+    Without `may_cancel` the user does not end it; a terminal that hangs up ends it only while
+    `hang_up_ends` says so.
+    """
+
+    engine: Engine
+    taps: Sequence[Tap] = ()
+    may_cancel: bool = True
+    hang_up_ends: Callable[[], bool] | None = None
+
+
+@dataclass(frozen=True)
+class WaitUntil:
+    """A step: wait for this moment of the connection's clock. True is sent back when the user has
+    cancelled, or when the terminal hung up and that ends it.
+    """
+
+    moment: float
+    hang_up_ends: Callable[[], bool]
+
+
+@dataclass(frozen=True)
+class Tell:
+    """A step: report this event."""
+
+    event: object
+
+
+Step = Run | WaitUntil | Tell
+T = TypeVar("T")
+Procedure = Generator[Step, bool, T]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """One question of `identify` and its answer, None when none came; `misfit` says in words what
+    came in another form, and `was_asked` is False when the device was given up before.
+    """
+
+    name: str
+    item: Item
+    answer: Content | None
+    misfit: str = ""
+    was_asked: bool = True
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """What a device says about itself, and the traffic heard meanwhile."""
+
+    target: Target
+    dialect: Dialect
+    readings: tuple[Reading, ...]
+    """In the order of the document; empty for devices that have no queries."""
+    survey: Survey
+
+    @property
+    def is_there(self) -> bool:
+        """True when the device answered or sent anything."""
+        return self.target.node in self.survey.heard
+
+
+@dataclass(frozen=True)
+class Procedures:
+    """The procedures for the target of a profile, on a link with its clock."""
+
+    link: Link
+    clock: Clock
+    profile: Profile
+    bit_rate: BitRate | None
+    is_alone: bool
+    """Nobody else can speak as the tool on this bus: it is not listened for before asking."""
+
+    @property
+    def target(self) -> Target:
+        return self.profile.target
+
+    # -- asking ----------------------------------------------------------------------------------
+
+    def listen_first(self) -> Procedure[None]:
+        """Listen for another tool before asking: a question in the middle of its packet spoils it.
+        Raises BusError when there is one.
+        """
+        if not self.is_alone:
+            _check_no_other_tool((yield from self._survey((), LISTEN_FIRST_S)))
+
+    def ask(self, request: Request) -> Procedure[Content]:
+        """Ask one question. Raises NoAnswerError."""
+        yield from self.listen_first()
+        query = self._query(request)
+        yield Run(query)
+        if query.cancelled and query.answer is None:
+            raise _interrupted()
+        if query.answer is None:
+            raise _no_answer(query)
+        return query.answer
+
+    def read(self, what: str | type[Content]) -> Procedure[Content]:
+        """Read an item by its name, or by the type of its content."""
+        return self.ask(Request(self._readable(what).item))
+
+    def _readable(self, what: str | type[Content]) -> Readable:
+        items = readable(self.target, self.profile.dialect)
+        if isinstance(what, str):
+            return find(what, items, self.target, "read")
+        matching = [each for each in items.values() if each.content is what and not each.field]
+        if len(matching) == 1:
+            return matching[0]
+        names = ", ".join(each.name for each in matching)
+        raise UsageError(
+            f"{what.__name__} is the content of {len(matching) or 'no'} items of the "
+            f"{self.target.node.name}.",
+            remedy=f"Read by name: {names or ', '.join(items) or 'there are none'}.",
+        )
+
+    def version(self) -> Procedure[Content]:
+        """The answer to the version request of the document or the product."""
+        request = self.profile.upgrade_options().version_request_for(self.target)
+        if request is None:
+            raise NoAnswerError(f"The {self.target.name} cannot be asked for its version.")
+        return self.ask(request)
+
+    def read_memory(self, start: int, end: int) -> Procedure[bytes]:
+        """The bytes from `start` up to `end`, exclusive (R5)."""
+        if READ_MEMORY.receiver is not self.target.node:
+            node = self.target.node.name
+            raise UsageError(f"The documents give no way to read memory of the {node}.")
+        reading = MemoryRead(
+            start, end, bitrate_bps=self.profile.dialect.bitrate_bps, timings=self.profile.timings
+        )
+        yield from self.listen_first()
+        yield Run(reading)
+        if reading.complete:
+            return reading.data
+        if reading.cancelled:
+            raise _interrupted()
+        error = _no_answer(reading.queries[-1])
+        error.where = f"memory at 0x{start + len(reading.data):08X}"
+        error.cause = "the address is outside of what the device shows, or it went away"
+        raise error
+
+    def reset(self) -> Procedure[None]:
+        """Restart the application, by the reset of the document or the product (R3)."""
+        profile = self.profile
+        reset = BY_KEY.get((self.target.request_id, Command.RESET))
+        documented = (UpgradeOptions.reset_command, UpgradeOptions.reset_data)
+        if reset is None or (profile.reset_command, profile.reset_data) != documented:
+            raise NoAnswerError(f"The documents give no reset for the {self.target.name}.")
+        yield from self.ask(Request(reset, Reset()))
+
+    # -- writing ---------------------------------------------------------------------------------
+
+    def content_before(self, plan: WritePlan) -> Procedure[Content | None]:
+        """What the device holds before a write; None when there is no query for it."""
+        read_back = plan.writable.read_back
+        if read_back is None:
+            return None
+        try:
+            return (yield from self.ask(Request(read_back.item)))
+        except NoAnswerError as error:
+            error.remedy = f"Nothing was written. {error.remedy}"
+            raise
+
+    def carry_out(self, plan: WritePlan, before: Content | None) -> Procedure[Written]:
+        """Write, wait for general feedback, read back. What went wrong stands in the result.
+
+        A write that was begun is looked after: it takes seconds, and is not ended by the user.
+        """
+        for step in self.listen_first():
+            assert isinstance(step, Run)  # noqa: S101  it listens
+            yield replace(step, may_cancel=False)
+        query = self._query(Request(plan.writable.item, plan.content))
+        yield Run(query, may_cancel=False)
+        written = Written(plan, before, query.answer is not None, None)
+        if plan.writable.read_back is None:
+            return written
+        for _ in range(2):
+            # An answer on a broadcast id may be one to somebody who asked before the write.
+            again = self._query(Request(plan.writable.read_back.item))
+            yield Run(again, may_cancel=False)
+            written = replace(written, read_back=again.answer)
+            if not written.differences:
+                break
+        return written
+
+    def write(
+        self, name: str, values: Sequence[object], *, manufacturer: bool
+    ) -> Procedure[Written]:
+        """Write an item by name and read it back."""
+        dialect = self.profile.dialect
+        plan = plan_write(name, values, self.target, dialect=dialect, manufacturer=manufacturer)
+        before = yield from self.content_before(plan)
+        written = yield from self.carry_out(plan, before)
+        error = written.error()
+        if error is not None:
+            raise error
+        return written
+
+    # -- looking ---------------------------------------------------------------------------------
+
+    def identify(self) -> Procedure[DeviceInfo]:
+        """Ask everything that the documents let one ask; listen only where they give nothing."""
+        items = readable(self.target, self.profile.dialect)
+        asked = [entry for entry in items.values() if not entry.field]
+        survey = yield from self._survey(
+            [Request(entry.item) for entry in asked],
+            INFO_LISTEN_S if asked else INFO_LISTEN_ONLY_S,
+        )
+        if asked:
+            _check_no_other_tool(survey)
+        done = dict(zip((entry.name for entry in asked), survey.queries, strict=False))
+        readings = tuple(_reading(entry, done.get(entry.name)) for entry in asked)
+        return DeviceInfo(self.target, self.profile.dialect, readings, survey)
+
+    def scan(self) -> Procedure[Survey]:
+        """Listen for a second, then ask the BMS for its version and state."""
+        items = readable(BMS, self.profile.dialect)
+        names = ("version-information", "running-information")
+        return self._survey([Request(items[name].item) for name in names], SCAN_LISTEN_S)
+
+    def _survey(self, requests: Sequence[Request], listen_s: float) -> Procedure[Survey]:
+        survey = Survey(
+            requests,
+            listen_s=listen_s,
+            bitrate_bps=self.profile.dialect.bitrate_bps,
+            dialect=self.profile.dialect,
+            timings=self.profile.timings,
+        )
+        yield Run(survey)
+        if survey.cancelled:
+            raise _interrupted()
+        return survey
+
+    def _query(self, request: Request) -> Query:
+        bitrate_bps = self.profile.dialect.bitrate_bps
+        return Query(request, bitrate_bps=bitrate_bps, timings=self.profile.timings)
+
+    # -- firmware --------------------------------------------------------------------------------
+
+    def plan(self, image: Image | Plan) -> Plan:
+        """What an upgrade with this image would send."""
+        if isinstance(image, Plan):
+            if image.target is not self.target:
+                planned, own = image.target.node.name, self.target.node.name
+                raise UsageError(f"The plan is for a {planned}, and this device is a {own}.")
+            return image
+        profile = self.profile
+        profile.check_fits(image)
+        rate = None if self.bit_rate is None else self.bit_rate.bps
+        return make_plan(
+            image,
+            profile.target,
+            profile.dialect,
+            bitrate_bps=rate,
+            has_upgrade=profile.has_upgrade,
+        )
+
+    def verify(self, image: Image | Plan, level: Level) -> Procedure[Verification]:
+        """Whether the device runs this image: by its version, then by its memory."""
+        plan, options = self.plan(image), self.profile.upgrade_options()
+        check_level(plan, level, options)
+        if level is Level.NONE:
+            return NOT_ASKED
+        yield from self.listen_first()
+        version = VersionCheck(plan, options)
+        yield Run(version)
+        verification = _known(version)
+        if level is Level.MEMORY and verification.ok:
+            memory = MemoryCheck(plan, options, verification.running_version)
+            yield Run(memory)
+            verification = _known(memory)
+        return verification
+
+    def upgrade(
+        self,
+        image: Image | Plan,
+        options: UpgradeOptions | None,
+        verify: Level | None,
+        identity: Identity | None,
+    ) -> Procedure[Result]:
+        """Run one upgrade to its end, good or bad, and verify a good one.
+
+        A lost adapter is opened again for the time of the options while an attempt is left. Raises
+        BusError, saying how far it had come and in what state the device is left, when the adapter
+        fails for good or nobody on the bus acknowledges; InterruptedByUserError when the user
+        interrupts a second time.
+        """
+        plan = self.plan(image)
+        chosen = options or self.profile.upgrade_options()
+        level = default_level(plan.target, chosen) if verify is None else verify
+        check_level(plan, level, chosen)
+        rate = self.bit_rate
+        if rate is not None and rate.bps != plan.bitrate_bps:
+            raise UsageError(
+                f"The plan is for {plan.bitrate_bps / 1000:g} kbit/s, the bus runs at {rate}.",
+                remedy="Make the plan with bitrate_bps of the connection.",
+            )
+        return self._session(Session(plan, chosen, level, identity or Identity()), chosen)
+
+    def _session(self, session: Session, options: UpgradeOptions) -> Procedure[Result]:
+        run = Run(session, taps=(self._end_when_off,), hang_up_ends=_may_end(session))
+        link = self.link
+        before = link.health()
+        self._check_bus("before anything was sent", session, before)
+        try:
+            while True:
+                try:
+                    yield run
+                    break
+                except BusError as error:
+                    # A bus that takes no frame is no lost adapter.
+                    is_lost = not isinstance(error, TransmitBlockedError)
+                    wait_s = options.adapter_return_s
+                    if not is_lost or not session.may_begin_again or not wait_s:
+                        raise
+                    yield Tell(events.AdapterLost(error.what, wait_s))
+                    if not (yield from self._reopened(session, error, wait_s)):
+                        raise
+                    yield Tell(events.AdapterBack())
+                    session.link_back(self.clock.now())
+        except (BusError, InterruptedByUserError) as error:
+            # The adapter does not know what it was used for.
+            error.where = f"{session.standing}; {error.where}".removesuffix("; ")
+            _say_what_is_left(error, session)
+            raise
+        except KeyboardInterrupt as interrupt:
+            interrupted = InterruptedByUserError(
+                "Interrupted at once.",
+                where=session.standing,
+                cause="it may have ended in the middle of a message",
+                remedy=AGAIN,
+            )
+            _say_what_is_left(interrupted, session)
+            raise interrupted from interrupt
+        result = session.result
+        silence = result.error()
+        if isinstance(silence, NoAnswerError):
+            self._check_bus(silence.where, session, before)
+        return result
+
+    def _end_when_off(self, frame: Frame, *, sent: bool, now: float) -> None:
+        """A tap that raises BusError as soon as the adapter reports bus-off: what the device says
+        until it is back is lost, and there is no use in waiting for it.
+        """
+        if frame[4] and self.link.is_off:
+            raise bus_off_error(str(self.link))
+
+    def _check_bus(self, where: str, session: Session, before: LinkHealth) -> None:
+        """Raise BusError when it is the bus that is silent, not the device, or when the adapter was
+        off the bus since `before` and came back by itself: what was said meanwhile is lost.
+        """
+        health, where = self.link.health(), f"{where}; {self.link}"
+        error, trouble = health.error(where), health.last_trouble
+        is_new = trouble is not before.last_trouble
+        if error is None and is_new and trouble is not None and trouble.kinds & _WAS_OFF:
+            error = bus_off_error(where, "The adapter was off the bus for a while.")
+        if error is not None:
+            _say_what_is_left(error, session)
+            raise error
+
+    def _reopened(self, session: Session, lost: BusError, wait_s: float) -> Procedure[bool]:
+        """Try to open a lost adapter again, within the overall deadline and until the user has
+        enough.
+        """
+        now = self.clock.now()
+        give_up_at = now + wait_s
+        if session.deadline_at is not None:
+            give_up_at = min(give_up_at, session.deadline_at)
+        is_cancelled = yield WaitUntil(now, _may_end(session))
+        while True:
+            if is_cancelled:
+                raise InterruptedByUserError(
+                    "Interrupted while the adapter was away.",
+                    where=lost.where,
+                    cause=lost.what,
+                    remedy="Plug the adapter in, then run the same command again.",
+                ) from lost
+            try:
+                self.link.reopen()
+            except BusError:
+                now = self.clock.now()
+                if now >= give_up_at:
+                    return False
+                until = min(give_up_at, now + _REOPEN_PAUSE_S)
+                is_cancelled = yield WaitUntil(until, _may_end(session))
+            else:
+                return True
+
+
+def _may_end(session: Session) -> Callable[[], bool]:
+    """Whether a terminal that hangs up may end a session: as long as the device has its program."""
+    return lambda: not session.has_begun_to_erase
+
+
+def _known(check: VersionCheck | MemoryCheck) -> Verification:
+    """What a check found. Raises InterruptedByUserError when it did not come to its end."""
+    found = check.verification
+    if found is None or found.verdict is Verdict.INTERRUPTED:
+        raise _interrupted()
+    return found
+
+
+def _say_what_is_left(error: FlasherError, session: Session) -> None:
+    left = session.device_left
+    error.remedy = f"{error.remedy} State of the device: {left.value}.".lstrip()
+    error.needs_rescue = left.needs_rescue
+
+
+def _interrupted() -> InterruptedByUserError:
+    return InterruptedByUserError("Interrupted by the user.")
+
+
+def _check_no_other_tool(survey: Survey) -> None:
+    if survey.other_tool_heard:
+        raise BusError(
+            "Another tool speaks on this bus; nothing is asked or written now.",
+            where="while listening first",
+            cause="an upgrade or a test is under way",
+            remedy="Wait until it has ended. flasher monitor listens without asking.",
+        )
+
+
+def _no_answer(asked: Query) -> NoAnswerError:
+    item = asked.request.item
+    node = item.receiver.name if item.receiver else "bus"
+    misfit = asked.misfit
+    if misfit is None:
+        cause = "it is off, asleep or not connected, it speaks the other dialect, or it is an older"
+        cause += " device that does not know the question"
+    else:
+        cause = f"it answers in another form: {misfit.command:04X} with {len(misfit.data)} bytes"
+        cause += f", not {asked.request.answer_item.command:04X}"
+    return NoAnswerError(
+        f"The {node} did not answer {item.title!r}.",
+        where=f"message {item.name}, sent {asked.tries} times",
+        cause=cause,
+        remedy="See who is on the bus with flasher scan; wake the device with its key.",
+    )
+
+
+def _reading(entry: Readable, asked: Query | None) -> Reading:
+    if asked is None:
+        return Reading(entry.name, entry.item, None, was_asked=False)
+    misfit = ""
+    if asked.answer is None and asked.misfit is not None:
+        came = asked.misfit
+        misfit = f"{came.command:04X} with {len(came.data)} bytes, mode {came.mode:02X}"
+    return Reading(entry.name, entry.item, asked.answer, misfit)
