@@ -26,14 +26,15 @@ from flasher.host.verify import Level, Verification, as_level, check_level, defa
 from flasher.host.write import WritePlan, Written
 from flasher.image.image import Image
 from flasher.image.load import load
-from flasher.image.manifest import Release, find_release
 from flasher.image.plan import Plan, make_plan
+from flasher.image.release import Release
 from flasher.log import log_event
 from flasher.procedures import DeviceInfo, Procedure, Procedures, Run, Step, Tell, WaitUntil
-from flasher.profile.model import Profile
 from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Dialect, Target, as_dialect, as_target
+from flasher.settings.manifest import find_release
+from flasher.settings.profile import Profile
 
 if TYPE_CHECKING:
     from flasher.bus.bit_rate import BitRate

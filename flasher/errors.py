@@ -10,6 +10,7 @@ from __future__ import annotations
 import difflib
 import re
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from enum import IntEnum
 from typing import ClassVar, Final
 
@@ -63,6 +64,26 @@ def printable(text: str) -> str:
     )
 
 
+@dataclass(frozen=True)
+class Fault:
+    """One thing that is wrong with a file: "target[0].base cannot be -1."."""
+
+    place: str
+    """The key, with the tables that it is in; "" is the whole file."""
+    what: str
+    remedy: str = ""
+    alone: str = ""
+    """Says it with its place, where it is the only fault; empty: as `said` does."""
+
+    @property
+    def said(self) -> str:
+        """The fault with its place."""
+        return self.what if self.what.startswith(self.place) else f"{self.place}: {self.what}"
+
+    def __str__(self) -> str:
+        return f"{self.said} {self.remedy}".rstrip()
+
+
 class FlasherError(Exception):
     """Base of all errors that flasher raises on purpose.
 
@@ -81,6 +102,8 @@ class FlasherError(Exception):
         """The command that repairs what was left, to be copied as it stands; "" where none does."""
         self.needs_rescue = False
         """True when a device was left that has no application, or perhaps none."""
+        self.faults: tuple[Fault, ...] = ()
+        """Everything that is wrong with a file, where the error is about one."""
 
     def __str__(self) -> str:
         """The whole message, one part a line, as a person reads it."""

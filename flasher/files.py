@@ -107,6 +107,13 @@ def read_toml(
 ) -> dict[str, Any]:
     """What a TOML file of settings holds. Raises as `opened`, and `error` when it is none."""
     raw = read(path, TOML_MAX_SIZE, what=what, error=error, if_missing=if_missing)
+    return parse_file(raw, path, what=what, error=error)
+
+
+def parse_file(
+    raw: bytes, path: str | os.PathLike[str], *, what: str, error: type[FlasherError] = UsageError
+) -> dict[str, Any]:
+    """What the bytes of the TOML file `path` hold. Raises `error` when they are none."""
     try:
         return parse_toml(raw)
     except ValueError as problem:

@@ -45,13 +45,13 @@ from flasher.host.verify import (
 from flasher.host.write import WritePlan, Written, plan_write
 from flasher.image.image import Image
 from flasher.image.plan import Plan, make_plan
-from flasher.profile.model import Profile
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import Reset
 from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, Command, Dialect, Target
+from flasher.settings.profile import Profile
 
 if TYPE_CHECKING:
     from flasher.bus.bit_rate import BitRate

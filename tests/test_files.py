@@ -14,8 +14,8 @@ import pytest
 
 from flasher.errors import ImageError, UsageError
 from flasher.files import opened, read
-from flasher.profile.load import load_profile
 from flasher.protocol.spec import BMS, IMAGE_MAX_SIZE
+from flasher.settings.profile import load_profile
 
 
 def append(path: Path) -> None:

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from pathlib import Path
 
 import pytest
 
 from flasher.errors import ExitCode, UsageError
 from flasher.host.options import UpgradeOptions
-from flasher.profile import (
+from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC
+from flasher.protocol.timing import Timings
+from flasher.protocol.wire import Message
+from flasher.settings.profile import (
     ApplicationArea,
     Profile,
     VersionAnswer,
@@ -17,12 +21,8 @@ from flasher.profile import (
     check_profile,
     find_profile,
     load_profile,
+    reader,
 )
-from flasher.profile.keys import KEYS
-from flasher.profile.load import user_directory
-from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC
-from flasher.protocol.timing import Timings
-from flasher.protocol.wire import Message
 
 
 def written(directory: Path, text: str) -> Path:
@@ -40,10 +40,16 @@ def refused(directory: Path, text: str) -> UsageError:
     return caught.value
 
 
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The home of a user who has no configuration."""
+    for name in ("HOME", "XDG_CONFIG_HOME", "APPDATA"):
+        monkeypatch.setenv(name, str(tmp_path / "home"))
+    return tmp_path / "home"
+
+
 def without_file(directory: Path) -> Profile:
-    return load_profile(
-        None, BMS, working_directory=directory, environment={"HOME": str(directory)}
-    )
+    return load_profile(None, BMS, working_directory=directory)
 
 
 # -- values and sources ----------------------------------------------------------------------------
@@ -127,7 +133,7 @@ def test_every_key_is_a_value_of_the_profile() -> None:
         application_area=ApplicationArea(0, 1),
         version_query=VersionQuery(0x3300, 0x710, 0x1540, 48, 16),
     )
-    assert {name for name, _ in full.values()} == set(KEYS)
+    assert {name for name, _ in full.values()} == set(reader().keys)
 
 
 # -- options ---------------------------------------------------------------------------------------
@@ -192,11 +198,11 @@ def test_part_of_the_documents_query_may_be_changed(tmp_path: Path) -> None:
     ("text", "key", "meant"),
     [
         ("atempts = 3\n", "atempts", "attempts"),
-        ("[wmc]\nack_timout_s = 1\n", "ack_timout_s", "ack_timeout_s in the table [wmc.timings]"),
-        ("ack_timeout_s = 1\n", "ack_timeout_s", "ack_timeout_s in the table [timings]"),
-        ("[timings]\npacket_trys = 1\n", "packet_trys", "packet_tries in the table [timings]"),
-        ("[timing]\npacket_tries = 1\n", "timing", "the table [timings]"),
-        ("[bms.version_query]\nofset = 1\n", "ofset", "offset in the table [bms.version_query]"),
+        ("[wmc]\nack_timout_s = 1\n", "ack_timout_s", "wmc.timings.ack_timeout_s"),
+        ("ack_timeout_s = 1\n", "ack_timeout_s", "timings.ack_timeout_s"),
+        ("[timings]\npacket_trys = 1\n", "packet_trys", "packet_tries"),
+        ("[timing]\npacket_tries = 1\n", "timing", "timings"),
+        ("[bms.version_query]\nofset = 1\n", "ofset", "offset"),
     ],
 )
 def test_an_unknown_key_is_refused_with_the_one_that_was_meant(
@@ -301,34 +307,47 @@ def test_hostile_names_and_keys_are_shown_harmlessly(tmp_path: Path) -> None:
 # -- where it is found -----------------------------------------------------------------------------
 
 
-def test_the_working_directory_goes_before_the_users(tmp_path: Path) -> None:
-    here, home = tmp_path / "here", tmp_path / "home"
-    environment = {"HOME": str(home), "XDG_CONFIG_HOME": str(home), "APPDATA": str(home)}
-    mine = user_directory(environment)
+def test_the_working_directory_goes_before_the_users(tmp_path: Path, home: Path) -> None:
+    here, mine = tmp_path / "here", home / "flasher"
     for directory in (here, mine):
         directory.mkdir(parents=True)
-    assert find_profile(here, environment) is None
+    assert find_profile(here) is None
     users = written(mine, "attempts = 4\n")
-    assert find_profile(here, environment) == users
+    assert find_profile(here) == users
     local = written(here, "attempts = 5\n")
-    assert find_profile(here, environment) == local
-    found = load_profile(None, BMS, working_directory=here, environment=environment)
-    assert found.attempts == 5
+    assert find_profile(here) == local
+    assert load_profile(None, BMS, working_directory=here).attempts == 5
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have other places")
 @pytest.mark.parametrize(
-    ("system", "environment", "expected"),
-    [
-        ("Linux", {"HOME": "/h", "XDG_CONFIG_HOME": "/x"}, "/x/flasher"),
-        ("Linux", {"HOME": "/h"}, "/h/.config/flasher"),
-        ("Linux", {"HOME": "/h", "XDG_CONFIG_HOME": "relative"}, "/h/.config/flasher"),
-        ("FreeBSD", {"HOME": "/h", "XDG_CONFIG_HOME": ""}, "/h/.config/flasher"),
-        ("Darwin", {"HOME": "/h"}, "/h/Library/Application Support/flasher"),
-        ("Windows", {"USERPROFILE": "/u", "APPDATA": "/a"}, "/a/flasher"),
-        ("Windows", {"USERPROFILE": "/u"}, "/u/AppData/Roaming/flasher"),
-    ],
+    ("configured", "expected"),
+    [("/x", "/x/flasher"), ("relative", "/h/.config/flasher"), ("", "/h/.config/flasher")],
 )
 def test_the_users_directory_is_the_systems_own(
-    system: str, environment: dict[str, str], expected: str
+    monkeypatch: pytest.MonkeyPatch, configured: str, expected: str
 ) -> None:
-    assert user_directory(environment, system) == Path(expected)
+    looked_at: list[Path] = []
+    monkeypatch.setenv("HOME", "/h")
+    monkeypatch.setenv("XDG_CONFIG_HOME", configured)
+    monkeypatch.setattr(Path, "is_file", looked_at.append)
+    find_profile("/here")
+    assert looked_at == [Path("/here/flasher.toml"), Path(expected, "flasher.toml")]
+
+
+def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
+    error = refused(
+        tmp_path,
+        'atempts = 1\nframe_gap_s = -1\n[timings]\npacket_tries = 0\n[wmc]\ncpu = "cortex"\n'
+        "[wmc.timings]\nack_timeout_s = 1979-05-27\n",
+    )
+    path = tmp_path / "flasher.toml"
+    assert error.what == f"The profile {path} has 5 faults."
+    for fault in (
+        "frame_gap_s cannot be -1. It is seconds from 0 to 1: Silence between the frames",
+        "timings.packet_tries cannot be 0. It is a whole number from 1 to 1000: How often",
+        "wmc.cpu cannot be 'cortex'. Did you mean cortex-m? It is cortex-m, other: The device's",
+        "wmc.timings.ack_timeout_s cannot be datetime.date(1979, 5, 27). It is seconds above 0",
+        "atempts: unknown key. Did you mean attempts? Known are: wmc, bms, obc, has_upgrade",
+    ):
+        assert f"{path}: {fault}" in error.where

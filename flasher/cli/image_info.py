@@ -23,8 +23,8 @@ from flasher.cli.upgrade_text import check_line
 from flasher.errors import ExitCode, FlasherError
 from flasher.host.identity import Check, judge_bytes
 from flasher.image.cortexm import vector_table
-from flasher.profile import load_profile
 from flasher.protocol.spec import BMS
+from flasher.settings.profile import load_profile
 
 _EPILOG = """\
 examples:

@@ -20,12 +20,18 @@ from flasher.cli.manifest_text import (
 from flasher.cli.output import Output
 from flasher.errors import ExitCode, FlasherError, ImageError, UsageError
 from flasher.image.image import Image
-from flasher.image.manifest import find_release, manifest_path, to_toml
-from flasher.image.manifest_keys import KEYS, read_value
 from flasher.image.plausible import check_plausible
-from flasher.image.release import check_target, names_of, release_of
+from flasher.image.release import check_target, names_of
 from flasher.protocol.spec import Target
-from flasher.protocol.text import printable
+from flasher.protocol.text import BOOT_VERSION_FORM, FIRMWARE_VERSION_FORM, printable
+from flasher.settings.manifest import (
+    STATEMENTS,
+    check_statement,
+    find_release,
+    manifest_path,
+    release_of,
+    to_toml,
+)
 
 DOCUMENTS: Final = (ManifestCreateDocument, ManifestCheckDocument, ManifestRefusedDocument)
 
@@ -58,7 +64,7 @@ exit codes:
   0 everything that could be checked agrees   3 the image is not the one of the manifest, or there
   is no right manifest   6 the image is for another target
 """
-_LABEL_WIDTH: Final = max(map(len, KEYS)) + 1
+_LABEL_WIDTH: Final = max(map(len, STATEMENTS)) + 1
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -91,18 +97,35 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_statements(create: argparse.ArgumentParser) -> None:
     group = create.add_argument_group("manifest")
-    for option, key, metavar in (
-        ("--firmware-version", "firmware_version", "V"),
-        ("--minimum-boot-version", "minimum_boot_version", "V"),
-        ("--previous-from", "previous_from", "V"),
-        ("--notes", "notes", "TEXT"),
+    for option, key, metavar, text in (
+        (
+            "--firmware-version",
+            "firmware_version",
+            FIRMWARE_VERSION_FORM,
+            "(default: the one inside)",
+        ),
+        (
+            "--minimum-boot-version",
+            "minimum_boot_version",
+            BOOT_VERSION_FORM,
+            "the oldest bootloader that may receive it",
+        ),
+        (
+            "--previous-from",
+            "previous_from",
+            FIRMWARE_VERSION_FORM,
+            "the oldest running version that it may replace",
+        ),
+        ("--notes", "notes", "TEXT", "what a person should know"),
     ):
-        group.add_argument(
-            option, type=_one(key), metavar=metavar, help=f"{KEYS[key].text}: {KEYS[key].allowed}"
-        )
-    for option, key in (
-        ("--hardware-version", "hardware_versions"),
-        ("--previous-except", "previous_except"),
+        group.add_argument(option, type=_one(key), metavar=metavar, help=text)
+    for option, key, text in (
+        (
+            "--hardware-version",
+            "hardware_versions",
+            "hardware that it fits; * stands for any text",
+        ),
+        ("--previous-except", "previous_except", "running versions that it must not replace"),
     ):
         group.add_argument(
             option,
@@ -111,7 +134,7 @@ def _add_statements(create: argparse.ArgumentParser) -> None:
             default=[],
             type=_one_of(key),
             metavar="V",
-            help=f"{KEYS[key].text}; may be given more than once",
+            help=f"{text}; may be given more than once",
         )
     group.add_argument("-o", "--output", metavar="FILE", help="(default: beside IMAGE, IMAGE.toml)")
     # Not "force": that waives checks of the image.
@@ -125,7 +148,7 @@ def _one(key: str) -> Callable[[str], str]:
 
     def read(text: str) -> str:
         try:
-            read_value(key, text)
+            check_statement(key, text)
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from error
         return text
@@ -138,7 +161,7 @@ def _one_of(key: str) -> Callable[[str], str]:
 
     def read(text: str) -> str:
         try:
-            read_value(key, [text])
+            check_statement(key, [text])
         except ValueError as error:
             raise argparse.ArgumentTypeError(str(error)) from error
         return text

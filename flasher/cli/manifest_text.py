@@ -8,11 +8,10 @@ from typing import Any, Final, Literal, TypedDict
 from flasher.cli.documents import ErrorDocument
 from flasher.errors import FlasherError
 from flasher.image.image import Image
-from flasher.image.manifest import find_release, manifest_path
-from flasher.image.manifest_keys import KEYS
 from flasher.image.release import Finding, Release, check_target
 from flasher.protocol.spec import TARGETS, Target
 from flasher.protocol.text import printable
+from flasher.settings.manifest import STATEMENTS, find_release, manifest_path
 
 _FOR_A_DEVICE: Final = ("hardware_versions", "minimum_boot_version", "previous_from")
 """Statements that only a device's answers can be held against."""
@@ -73,7 +72,7 @@ class ManifestRefusedDocument(TypedDict):
 def stated_rows(release: Release) -> dict[str, str]:
     """What a manifest states, in words and safe to show."""
     rows = {}
-    for key in KEYS:
+    for key in STATEMENTS:
         value: Any = getattr(release, key)
         if isinstance(value, Target):
             rows[key] = value.node.name

@@ -12,8 +12,8 @@ from flasher.cli import arguments
 from flasher.cli.output import Output
 from flasher.errors import ExitCode
 from flasher.image.plausible import Cpu
-from flasher.profile import FILE_NAME, Profile, check_profile, load_profile
 from flasher.protocol.text import printable
+from flasher.settings.profile import FILE_NAME, Profile, check_profile, load_profile
 
 _EPILOG = f"""\
 examples:

@@ -15,8 +15,8 @@ from flasher.host.options import DEFAULT_ATTEMPTS, UpgradeOptions
 from flasher.host.verify import Level
 from flasher.image.plan import Plan
 from flasher.image.release import Release
-from flasher.profile.model import Profile
 from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.settings.profile import Profile
 
 _WAIVERS: Final = {
     "implausible": arguments.IMPLAUSIBLE,

@@ -35,7 +35,7 @@ from flasher.host.verify import Level
 from flasher.image.cortexm import vector_table
 from flasher.image.plan import Plan
 from flasher.image.release import Release
-from flasher.profile.model import Profile
+from flasher.settings.profile import Profile
 from flasher.trace.figures import LinkReport
 
 

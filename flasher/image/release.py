@@ -6,15 +6,65 @@ change them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
+from typing import Annotated
+
+from annotated_types import Interval
 
 from flasher.errors import ImageError, WrongDeviceError
+from flasher.form import Form
 from flasher.image.image import Image
-from flasher.image.manifest_keys import read_value
-from flasher.protocol.spec import Target
-from flasher.protocol.text import FirmwareVersion, printable
+from flasher.protocol.spec import IMAGE_MAX_SIZE, TARGETS, Target, find_target
+from flasher.protocol.text import (
+    BOOT_VERSION_FORM,
+    FIRMWARE_VERSION_FORM,
+    FirmwareVersion,
+    boot_version_number,
+    printable,
+)
+
+
+def _text(value: object) -> str:
+    """A text as a device sends them: printable ASCII, not empty."""
+    if not isinstance(value, str):
+        raise TypeError
+    if not (value and value.isascii() and value.isprintable()):
+        raise ValueError
+    return value
+
+
+def _target(value: object) -> Target:
+    found = find_target(_text(value))
+    if found is None:
+        raise ValueError
+    return found
+
+
+def _sha256(value: object) -> str:
+    if not re.fullmatch(r"[0-9a-fA-F]{64}", _text(value)):
+        raise ValueError
+    return _text(value).lower()
+
+
+def _firmware_version(value: object) -> str:
+    if FirmwareVersion.parse(_text(value)) is None:
+        raise ValueError
+    return _text(value)
+
+
+def _boot_version(value: object) -> str:
+    if boot_version_number(_text(value)) is None:
+        raise ValueError
+    return _text(value)
+
+
+DeviceText = Annotated[str, Form("a text of printable ASCII", _text)]
+FirmwareText = Annotated[
+    str, Form(f"a text of the form {FIRMWARE_VERSION_FORM}", _firmware_version)
+]
+BootText = Annotated[str, Form(f"a text of the form {BOOT_VERSION_FORM}", _boot_version)]
 
 
 @dataclass(frozen=True)
@@ -30,28 +80,32 @@ class Finding:
     """None where one of the two is missing: nothing to check, or nothing to check against."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Release:
     """What a manifest states. The rules for a device hold where they are stated: a text that they
     cannot be applied to does not fit, since nobody knows that it would.
     """
 
-    target: Target
-    size_bytes: int
+    target: Annotated[Target, Form(f"one of {', '.join(TARGETS)}", _target)]
+    """The device that the image is for."""
+    firmware_version: FirmwareText | None = None
+    """The version inside the image."""
+    size_bytes: Annotated[int, Interval(ge=1, le=IMAGE_MAX_SIZE)]
     """Bytes to be sent."""
-    sha256: str
+    sha256: Annotated[str, Form("64 hex digits", _sha256)]
     """Of the bytes to be sent, lower-case hex digits."""
+    hardware_versions: tuple[DeviceText, ...] = ()
+    """Hardware that it fits; `*` stands for any text, and none means any."""
+    minimum_boot_version: BootText | None = None
+    """The oldest bootloader that may receive it."""
+    previous_from: FirmwareText | None = None
+    """The oldest running version that it may replace."""
+    previous_except: tuple[DeviceText, ...] = ()
+    """Running versions that it must not replace."""
+    notes: str = ""
+    """What a person should know."""
     source: str
     """File name of the manifest, for messages."""
-    firmware_version: str | None = None
-    hardware_versions: tuple[str, ...] = ()
-    """Texts and patterns with `*` for any text; empty: not stated."""
-    minimum_boot_version: str | None = None
-    previous_from: str | None = None
-    """The oldest running version from which this release may be installed."""
-    previous_except: tuple[str, ...] = ()
-    """Running versions from which it must not be installed."""
-    notes: str = ""
 
     @property
     def rules_previous(self) -> bool:
@@ -140,41 +194,6 @@ def check_target(image: Image, release: Release | None, target: Target) -> None:
 def names_of(targets: frozenset[Target]) -> str:
     """Targets as a person reads them; empty when there are none."""
     return " and ".join(sorted(target.node.name for target in targets))
-
-
-def release_of(  # noqa: PLR0913  one argument for each statement
-    image: Image,
-    target: Target,
-    *,
-    source: str = "",
-    firmware_version: str | None = None,
-    hardware_versions: Sequence[str] = (),
-    minimum_boot_version: str | None = None,
-    previous_from: str | None = None,
-    previous_except: Sequence[str] = (),
-    notes: str = "",
-) -> Release:
-    """The release that an image is; the firmware version is by default the one inside.
-
-    Raises ImageError when the given firmware version is not the one inside, ValueError for a value
-    that a manifest cannot hold.
-    """
-    if firmware_version and image.version and firmware_version != image.version:
-        raise ImageError(
-            f"The image is version {image.version}, not {printable(firmware_version)}.",
-            where=f"the text inside {printable(image.source)}",
-            remedy="Leave the version out: the one inside holds.",
-        )
-    given = {
-        "firmware_version": firmware_version or image.version,
-        "hardware_versions": list(hardware_versions),
-        "minimum_boot_version": minimum_boot_version,
-        "previous_from": previous_from,
-        "previous_except": list(previous_except),
-        "notes": notes,
-    }
-    values = {key: read_value(key, value) for key, value in given.items() if value is not None}
-    return Release(target, image.size_bytes, image.sha256, source, **values)
 
 
 def _only_stars(pattern: str) -> str:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from flasher.profile.model import sent_ids
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import BootVersion, decode
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.protocol.wire import Message, Reassembler
+from flasher.settings.profile import sent_ids
 
 _LOOK_EVERY_S: Final = 0.05
 

@@ -23,11 +23,11 @@ from flasher.files import TOML_MAX_SIZE, opened, parse_toml, read
 from flasher.host.write import WritePlan, plan_write
 from flasher.image.image import Image
 from flasher.image.load import FILE_MAX_SIZE, load
-from flasher.image.manifest import Release, manifest_path, read_release
-from flasher.profile.load import load_profile
-from flasher.profile.model import Profile
+from flasher.image.release import Release
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
+from flasher.settings.manifest import manifest_path, read_release
+from flasher.settings.profile import Profile, load_profile
 from flasher.station.recipe import Firmware, Recipe, Verify, Write
 from flasher.station.records.model import Verified
 from flasher.station.template import Scan, fill

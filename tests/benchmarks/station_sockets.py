@@ -15,8 +15,8 @@ import time
 from pathlib import Path
 
 from flasher.image.load import load
-from flasher.image.manifest import release_of, to_toml
 from flasher.protocol.spec import BMS
+from flasher.settings.manifest import release_of, to_toml
 from flasher.station.config import MockUnits
 from flasher.station.events import RunEnded, RunStarted, StationEvent, StepEnded
 from flasher.station.messages import VirtualUnits, WorkerSetup

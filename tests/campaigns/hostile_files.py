@@ -28,9 +28,9 @@ from flasher.conformance import diff
 from flasher.conformance import profile as conformance_profile
 from flasher.errors import ExitCode, FlasherError
 from flasher.image.load import load
-from flasher.image.manifest import read_release
-from flasher.profile.load import check_profile
 from flasher.report.explain_page import render
+from flasher.settings.manifest import read_release
+from flasher.settings.profile import check_profile
 from flasher.station.config import load_config
 from flasher.station.recipe_file import load_recipe
 from flasher.trace.recorder import Recorder

@@ -26,8 +26,8 @@ from pathlib import Path
 from typing import Final
 
 from flasher.image.image import Image
-from flasher.image.manifest import release_of, to_toml
 from flasher.protocol.spec import BMS
+from flasher.settings.manifest import release_of, to_toml
 from tests.campaigns.scripted_units import NEW_VERSION, Units, bus_of, free_port
 from tests.campaigns.station_operator import Operator, Place, Station, is_running
 from tests.station.postgres import find_programs, running_server

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from flasher.errors import ExitCode
-from flasher.image.manifest import read_release
 from flasher.protocol.spec import BMS
+from flasher.settings.manifest import read_release
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.firmware import VECTORS
 

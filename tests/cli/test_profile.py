@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flasher.errors import ExitCode
-from flasher.profile.keys import KEYS
+from flasher.settings.profile import reader
 from tests.cli.conftest import Flasher
 
 
@@ -33,9 +33,9 @@ def test_every_value_is_shown_with_its_source(flasher: Flasher) -> None:
     run = flasher("profile", "show", "-t", "bms")
     assert run.code == ExitCode.OK
     shown = rows(run.out)
-    assert set(shown) | {"application_area.start", "application_area.size_bytes"} == set(KEYS) | {
-        "application_area"
-    }
+    assert set(shown) | {"application_area.start", "application_area.size_bytes"} == set(
+        reader().keys
+    ) | {"application_area"}
     assert shown["timings.command_timeout_s"] == ("1.0", "document")
     assert shown["timings.ack_timeout_s"] == ("0.5", "default")
     assert shown["reset_command"] == ("0x4205", "document")

@@ -19,11 +19,12 @@ from flasher.host.identity import (
 )
 from flasher.host.table import Ending
 from flasher.image.image import Image
-from flasher.image.release import Release, release_of
+from flasher.image.release import Release
 from flasher.protocol.contents import RunningInformation, Status, VersionInformation
 from flasher.protocol.fields import Text
 from flasher.protocol.spec import BMS, OBC, WMC
 from flasher.protocol.text import encode_text
+from flasher.settings.manifest import release_of
 from tests.firmware import VECTORS
 
 NEW, OLD = "V2r0r1_20260102", "V1r0r0_20220512"

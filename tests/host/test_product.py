@@ -8,10 +8,10 @@ from flasher.host.table import Ending
 from flasher.host.verify import Level, possible_levels
 from flasher.image.image import Image
 from flasher.image.plan import plan
-from flasher.profile.model import VersionQuery
 from flasher.protocol.messages import GeneralFeedback, UpdateCommand
 from flasher.protocol.spec import WMC
 from flasher.protocol.wire import Message
+from flasher.settings.profile import VersionQuery
 from tests.host.bench import Bench
 
 QUERY = VersionQuery(

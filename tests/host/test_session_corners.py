@@ -19,12 +19,12 @@ from flasher.host.table import Ending, State
 from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
 from flasher.image.plan import plan
-from flasher.image.release import release_of
 from flasher.protocol.fields import Content, Text, TextField, field
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, WMC
 from flasher.protocol.text import encode_text
 from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.settings.manifest import release_of
 
 IMAGE = Image.from_bytes(bytes(300))
 PLAN = plan(IMAGE, BMS, WELLING.bitrate_bps)

@@ -13,17 +13,16 @@ from flasher.errors import ImageError, UsageError, WrongDeviceError
 from flasher.files import TOML_MAX_SIZE
 from flasher.image.image import Image
 from flasher.image.load import load
-from flasher.image.manifest import (
-    Release,
-    check_target,
+from flasher.image.release import Release, check_target
+from flasher.protocol.spec import BMS, IMAGE_MAX_SIZE, OBC, WMC
+from flasher.settings.manifest import (
+    STATEMENTS,
     find_release,
     manifest_path,
     read_release,
     release_of,
     to_toml,
 )
-from flasher.image.manifest_keys import KEYS
-from flasher.protocol.spec import BMS, IMAGE_MAX_SIZE, OBC, WMC
 
 VERSION = "V1r0r4_20220512"
 IMAGE = Image.from_bytes(b"BMS\0" + VERSION.encode() + bytes(200), source="firmware.bin")
@@ -68,7 +67,7 @@ def test_what_is_not_stated_is_left_out(tmp_path: Path) -> None:
 
 
 def test_every_statement_of_a_release_has_a_key() -> None:
-    assert {field.name for field in fields(Release)} == {*KEYS, "source"}
+    assert {field.name for field in fields(Release)} == {*STATEMENTS, "source"}
 
 
 def test_other_names_upper_case_and_a_byte_order_mark_are_read(tmp_path: Path) -> None:
@@ -113,8 +112,8 @@ WRONG: list[tuple[str, str, str]] = [
     ('format = 1\nminimum_boot_version = "V1.0"', "minimum_boot_version cannot", "Vx.x.x"),
     ('format = 1\nprevious_from = ""', "previous_from cannot be ''", "Vxrxrx_YYYYMMDD"),
     ('format = 1\nhardware_versions = "V1"', "hardware_versions cannot be 'V1'", "a list of texts"),
-    ("format = 1\nprevious_except = [1]", "previous_except cannot be [1]", "a list of texts"),
-    ('format = 1\nhardware_versions = ["\\u001b[2J"]', "hardware_versions cannot", "\\x1b"),
+    ("format = 1\nprevious_except = [1]", "previous_except[0] cannot be 1", "a text of printable"),
+    ('format = 1\nhardware_versions = ["\\u001b[2J"]', "hardware_versions[0] cannot", "\\x1b"),
     ("format = 1\nnotes = 1979-05-27", "notes cannot be datetime", "a text"),
     ("format = ", "is no TOML file", "quotes"),
     (f"format = {'9' * 5000}", "is no TOML file", "quotes"),

@@ -16,8 +16,8 @@ import psycopg
 from sqlalchemy import event
 
 from flasher.image.image import Image
-from flasher.image.manifest import release_of, to_toml
 from flasher.protocol.spec import BMS, WMC, Target
+from flasher.settings.manifest import release_of, to_toml
 from flasher.station.recipe_check import load_checked
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import Claim, Ending, Keeping, RunId, RunState, StepState, Store

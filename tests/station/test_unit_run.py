@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from flasher.image.manifest import release_of, to_toml
 from flasher.mock.bms import BmsApplication
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WMC
+from flasher.settings.manifest import release_of, to_toml
 from flasher.station.codes import CODES, OF_ENDING
 from flasher.station.messages import Progress, Prompt
 from flasher.station.records.model import RunKind, RunState, StepName, StepState, Verified

@@ -1,0 +1,165 @@
+"""The release manifest: a release as a TOML file beside its image.
+
+`firmware.hex` has `firmware.hex.toml`:
+
+    format = 1
+    target = "bms"
+    firmware_version = "V1r0r4_20220512"
+    size_bytes = 78351
+    sha256 = "5084b23b..."
+    hardware_versions = ["V1r2r0_*"]
+    minimum_boot_version = "V1.0.0"
+    previous_from = "V1r0r0_20220512"
+
+A manifest that cannot be read, or is wrong, is an ImageError: its image is not trustworthy then.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+import tomli_w
+
+from flasher.errors import ImageError
+from flasher.files import read_toml
+from flasher.image.image import Image
+from flasher.image.release import Release
+from flasher.protocol.spec import Target
+from flasher.protocol.text import printable
+
+if TYPE_CHECKING:
+    from flasher.settings.reading import Reader
+
+FORMAT_KEY: Final = "format"
+FORMAT_VERSION: Final = 1
+STATEMENTS: Final = tuple(each.name for each in fields(Release) if each.name != "source")
+"""The keys, in the order in which they are written."""
+SUFFIX: Final = ".toml"
+
+
+def manifest_path(image_path: str | os.PathLike[str]) -> Path:
+    """Where the manifest of an image lies: beside it, with `.toml` behind its whole name."""
+    path = Path(image_path)
+    return path.with_name(path.name + SUFFIX)
+
+
+def find_release(
+    image_path: str | os.PathLike[str], given: str | os.PathLike[str] | None = None
+) -> Release | None:
+    """The release of the manifest `given`, else of the one beside the image; None without any.
+
+    Raises as `read_release`.
+    """
+    if given is not None:
+        return read_release(given)
+    beside = manifest_path(image_path)
+    # A link that leads nowhere is there too: what it should have said is not known.
+    return read_release(beside) if os.path.lexists(beside) else None
+
+
+@cache
+def _reader() -> Reader[Release]:
+    from flasher.settings.reading import Reader  # noqa: PLC0415
+
+    return Reader(
+        Release,
+        "manifest",
+        error=ImageError,
+        remedy="Correct it, or write it anew with `flasher manifest create --force`.",
+        beside=("source",),
+        also=(FORMAT_KEY,),
+    )
+
+
+def read_release(path: str | os.PathLike[str]) -> Release:
+    """The release that a manifest states.
+
+    Raises UsageError when there is no such file or it is no regular one, ImageError when it cannot
+    be read, is no TOML, has another format version, or with everything that is wrong with it.
+    """
+    document = read_toml(
+        path,
+        what="manifest",
+        error=ImageError,
+        if_missing="Correct the name, or write it with `flasher manifest create`.",
+    )
+    _check_format(document, printable(os.fspath(path)))
+    stated = {key: value for key, value in document.items() if key != FORMAT_KEY}
+    return _reader().read(stated, path, source=os.fspath(path))
+
+
+def check_statement(key: str, value: object) -> None:
+    """Raise ValueError saying why a manifest cannot hold this value."""
+    _, faults = _reader().check({key: value}, source="")
+    for fault in faults:
+        if fault.place.startswith(key):
+            raise ValueError(str(fault))
+
+
+def _check_format(document: Mapping[str, Any], shown: str) -> None:
+    version = document.get(FORMAT_KEY)
+    if type(version) is int and version == FORMAT_VERSION:
+        return
+    newer = type(version) is int and version > FORMAT_VERSION
+    said = "does not say its format" if version is None else f"has the format {version!a:.60}"
+    raise ImageError(
+        f"The manifest {said}; this flasher reads {FORMAT_KEY} = {FORMAT_VERSION}.",
+        where=shown,
+        cause="it was written by a newer flasher" if newer else "it is no manifest of flasher",
+        remedy="Use a newer flasher." if newer else "Write it with `flasher manifest create`.",
+    )
+
+
+def release_of(  # noqa: PLR0913  one argument for each statement
+    image: Image,
+    target: Target,
+    *,
+    source: str = "",
+    firmware_version: str | None = None,
+    hardware_versions: Sequence[str] = (),
+    minimum_boot_version: str | None = None,
+    previous_from: str | None = None,
+    previous_except: Sequence[str] = (),
+    notes: str = "",
+) -> Release:
+    """The release that an image is; the firmware version is by default the one inside.
+
+    Raises ImageError when the given firmware version is not the one inside, ValueError for a value
+    that a manifest cannot hold.
+    """
+    if firmware_version and image.version and firmware_version != image.version:
+        raise ImageError(
+            f"The image is version {image.version}, not {printable(firmware_version)}.",
+            where=f"the text inside {printable(image.source)}",
+            remedy="Leave the version out: the one inside holds.",
+        )
+    stated = {
+        "target": target.name,
+        "firmware_version": firmware_version or image.version,
+        "size_bytes": image.size_bytes,
+        "sha256": image.sha256,
+        "hardware_versions": list(hardware_versions),
+        "minimum_boot_version": minimum_boot_version,
+        "previous_from": previous_from,
+        "previous_except": list(previous_except),
+        "notes": notes,
+    }
+    release, faults = _reader().check(stated, source=source)
+    if release is None or faults:
+        raise ValueError("\n".join(map(str, faults)))
+    return release
+
+
+def to_toml(release: Release) -> str:
+    """The text of a manifest; what is not stated is left out."""
+    values: dict[str, Any] = {FORMAT_KEY: FORMAT_VERSION}
+    for key in STATEMENTS:
+        value = getattr(release, key)
+        if value not in (None, (), ""):
+            values[key] = value.name if isinstance(value, Target) else value
+    return tomli_w.dumps(values)

@@ -1,0 +1,471 @@
+"""The target profile: what the documents leave open, or a product does its own way.
+
+A file holds values for every device, and tables for single ones that go before them:
+
+    attempts = 5
+    [timings]
+    ack_timeout_s = 1.0
+    [wmc]
+    frame_gap_s = 0.001
+    [wmc.version_query]
+    command = 0x3300
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+from annotated_types import Interval
+from platformdirs import user_config_path
+
+from flasher.errors import Fault, ImageError, UsageError
+from flasher.files import read_toml
+from flasher.form import Form
+from flasher.host.identity import Identity
+from flasher.host.options import PACKET_GAP_MAX_S, UpgradeOptions
+from flasher.host.query import Request
+from flasher.image.image import Image
+from flasher.image.plausible import Cpu
+from flasher.protocol.catalogue import Item
+from flasher.protocol.contents import Empty, VersionInformation
+from flasher.protocol.fields import Bytes, Content, Text, TextField
+from flasher.protocol.fields import field as wire_field
+from flasher.protocol.spec import (
+    COMMAND_SIZE,
+    DIALECTS,
+    IMAGE_MAX_SIZE,
+    LENGTH_MAX,
+    TARGETS,
+    WELLING,
+    Command,
+    Dialect,
+    Mode,
+    Node,
+    Target,
+    can_id,
+    data_size,
+    find_target,
+)
+from flasher.protocol.text import printable
+from flasher.protocol.timing import DEFAULT_TIMINGS, Timings, Tries
+
+if TYPE_CHECKING:
+    from flasher.settings.reading import Reader
+
+FILE_NAME: Final = "flasher.toml"
+DEFAULT: Final = "default"
+DOCUMENT: Final = "document"
+_DOCUMENTED: Final = frozenset({"command_repeat_s", "command_timeout_s", "boot_version_spacing_s"})
+"""The timings that the documents give; all others are readings (R12)."""
+_BESIDE: Final = ("target", "dialect", "sources")
+"""Fields of `Profile` that do not stand in the file."""
+_TABLES: Final = ("timings", "application_area", "version_query")
+_DATA_MAX: Final = LENGTH_MAX - COMMAND_SIZE
+_DAY_S: Final = 24 * 3600
+
+Time = Annotated[float, Interval(gt=0, le=_DAY_S)]
+Number16 = Annotated[int, Interval(ge=0, le=0xFFFF)]
+Number32 = Annotated[int, Interval(ge=0, le=0xFFFF_FFFF)]
+
+
+def _data(value: object) -> bytes:
+    if isinstance(value, str):
+        data = value.encode("ascii")
+    elif isinstance(value, list) and not any(isinstance(item, bool) for item in value):
+        data = bytes(value)
+    else:
+        raise TypeError
+    if len(data) > _DATA_MAX:
+        raise ValueError
+    return data
+
+
+Data = Annotated[
+    bytes, Form(f"a text in ASCII, or a list of bytes, of {_DATA_MAX} bytes at most", _data)
+]
+
+
+def sent_ids(target: Target) -> dict[int, Node | None]:
+    """The CAN ids that a device sends on, with their receivers; None is all."""
+    receivers = (None, *(node for node in Node if node is not target.node))
+    return {can_id(target.node, receiver): receiver for receiver in receivers}
+
+
+@dataclass(frozen=True)
+class ApplicationArea:
+    """Where a device's application lies; what is outside of it must not be sent (R8)."""
+
+    start: Number32
+    """Address of the application."""
+    size_bytes: Annotated[int, Interval(ge=1, le=0xFFFF_FFFF)]
+    """Size of the application's area."""
+
+    @property
+    def end(self) -> int:
+        """One past the last address."""
+        return self.start + self.size_bytes
+
+
+@dataclass(frozen=True)
+class VersionQuery:
+    """How to ask a device for its firmware version: a query without data, and where the text stands
+    in the data of its answer.
+    """
+
+    command: Number16
+    """Asks for the version."""
+    answer_id: Annotated[int, Interval(ge=0, le=0x7FF)]
+    """CAN id of the answer."""
+    answer_command: Number16
+    """Command of the answer."""
+    offset: Annotated[int, Interval(ge=0, le=_DATA_MAX)]
+    """Where the text begins in the data."""
+    size_bytes: Annotated[int, Interval(ge=1, le=_DATA_MAX)]
+    """Size of the text."""
+
+    def request(self, target: Target) -> Request:
+        """The question for `flasher.host.query`; its answer is a `VersionAnswer`."""
+        rest_bytes = data_size(self.answer_command) - self.offset - self.size_bytes
+        answer = Item(
+            target.node,
+            sent_ids(target)[self.answer_id],
+            Mode.REPORT,
+            self.answer_command,
+            _version_answer(self.offset, self.size_bytes, rest_bytes),
+            "version",
+        )
+        item = Item(Node.CDL, target.node, Mode.READ, self.command, Empty, "read version")
+        return Request(item, answer=answer)
+
+
+class VersionAnswer(Content):
+    """The answer to a version query that a profile describes."""
+
+    firmware_version: Text
+
+
+def _version_answer(before_bytes: int, text_bytes: int, behind_bytes: int) -> type[Content]:
+    """The content of such an answer: what stands around the text is kept, not read."""
+    return make_dataclass(
+        "VersionAnswer",
+        [
+            ("before", bytes, wire_field(Bytes(before_bytes))),
+            ("firmware_version", Text, wire_field(TextField(text_bytes))),
+            ("behind", bytes, wire_field(Bytes(behind_bytes))),
+        ],
+        bases=(VersionAnswer,),
+        frozen=True,
+    )
+
+
+def documented_query(target: Target) -> VersionQuery | None:
+    """Version information as chapter 3 has it, for the BMS only."""
+    if not target.has_version_query:
+        return None
+    offset = 0
+    for name, codec in VersionInformation.LAYOUT:
+        if name == "firmware_version":
+            break
+        offset += codec.size_bytes
+    return VersionQuery(
+        Command.READ_VERSION,
+        target.broadcast_id,
+        Command.VERSION_INFORMATION,
+        offset,
+        codec.size_bytes,
+    )
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What holds for one target in one dialect. `sources` has "default" (a reading of this
+    project), "document", or the path of a file for each name of `values()`.
+    """
+
+    target: Annotated[Target, Form("a target", TARGETS.__getitem__)]
+    dialect: Annotated[Dialect, Form("a dialect", DIALECTS.__getitem__)] = WELLING
+    has_upgrade: bool = WELLING.has_upgrade
+    """Upgrade, even where the document has cancelled it (section 6)."""
+    timings: Timings = DEFAULT_TIMINGS
+    attempts: Tries = UpgradeOptions.attempts
+    """How often the upgrade may begin."""
+    timeout_s: Time | None = None
+    """Overall deadline; without it one is computed from the plan."""
+    power_up_timeout_s: Time = UpgradeOptions.power_up_timeout_s
+    """Wait for a power cycle."""
+    adapter_return_s: Annotated[float, Interval(ge=0, le=3600)] = UpgradeOptions.adapter_return_s
+    """Wait for a lost adapter."""
+    cpu: Cpu = Identity.cpu
+    """The device's processor; other: no vector table is looked for in images."""
+    low_charge_percent: Annotated[int, Interval(ge=0, le=100)] = Identity.low_charge_percent
+    """Warn before an upgrade below this state of charge."""
+    in_use_ma: Annotated[int, Interval(ge=0, le=0x7FFF)] = Identity.in_use_ma
+    """A discharge beyond this is a vehicle in use."""
+    frame_gap_s: Annotated[float, Interval(ge=0, le=1)] = UpgradeOptions.frame_gap_s
+    """Silence between the frames of a message."""
+    packet_gap_s: Annotated[float, Interval(ge=0, le=PACKET_GAP_MAX_S)] = (
+        UpgradeOptions.packet_gap_s
+    )
+    """Silence before each packet."""
+    nak_next_is_ack: bool = UpgradeOptions.nak_next_is_ack
+    """NAK n+1 after a repeated packet n is ACK n (R10)."""
+    reset_command: Number16 = Command.RESET
+    """Restarts the application into the bootloader (R3)."""
+    reset_data: Data = b"RESET"
+    """The data of reset_command."""
+    image_limit_bytes: Annotated[int, Interval(ge=1, le=IMAGE_MAX_SIZE)] | None = None
+    """The largest image that the device takes."""
+    application_area: ApplicationArea | None = None
+    version_query: VersionQuery | None = None
+    sources: Mapping[str, str] = field(default_factory=dict)
+
+    def check_fits(self, image: Image) -> None:
+        """Raise ImageError when the image is too large for the device, or lies outside of its
+        application area (R8). What the profile does not know is not judged.
+        """
+        area = self.application_area
+        limits = (self.image_limit_bytes, area.size_bytes if area else None)
+        limit = min((each for each in limits if each is not None), default=None)
+        if limit is not None and image.size_bytes > limit:
+            raise ImageError(
+                f"{image.source}: {image.size_bytes} bytes are more than the device takes, {limit}",
+                where="the profile's limit",
+                cause="a merged file, or an image for another device",
+                remedy="choose the application with --range START:END",
+            )
+        if area is None or image.base is None:
+            return
+        if not area.start <= image.base <= image.base + image.size_bytes <= area.end:
+            raise ImageError(
+                f"{image.source} lies outside of the device's application area",
+                where=f"0x{image.base:08X}..0x{image.base + image.size_bytes - 1:08X}, the area is "
+                f"0x{area.start:08X}..0x{area.end - 1:08X}",
+                cause="a merged file, or an image for another device",
+                remedy="choose the application with --range START:END",
+            )
+
+    def upgrade_options(self, **overrides: Any) -> UpgradeOptions:
+        """The options of an upgrade. `overrides` are its fields or those of `Timings`, by name;
+        one that is None was not given. Raises TypeError for another name.
+
+        The product's own version query is among them, not the document's: its answer tells the
+        hardware version too.
+        """
+        given = {name: value for name, value in overrides.items() if value is not None}
+        names = {known.name for known in fields(UpgradeOptions)}
+        shared = {known.name: getattr(self, known.name) for known in fields(self)}
+        timings = {
+            known.name: given.pop(known.name) for known in fields(Timings) if known.name in given
+        }
+        options = {name: value for name, value in shared.items() if name in names}
+        query = self.version_query
+        if query is not None and query != documented_query(self.target):
+            options["version_request"] = query.request(self.target)
+        options |= given
+        base: Timings = options["timings"]
+        options["timings"] = replace(base, **timings)
+        return UpgradeOptions(**options)
+
+    def identity(self, **overrides: Any) -> Identity:
+        """What is checked before an upgrade, with the limits of this product. `overrides` are the
+        other fields of `Identity`.
+        """
+        return Identity(
+            low_charge_percent=self.low_charge_percent,
+            in_use_ma=self.in_use_ma,
+            cpu=self.cpu,
+            **overrides,
+        )
+
+    def values(self) -> Iterator[tuple[str, object]]:
+        """Every value with its name; those of a table have the table's name before a point. A table
+        that is not there is one value, None.
+        """
+        for name in (known.name for known in fields(self)):
+            value = getattr(self, name)
+            if name in _TABLES and value is not None:
+                for part in fields(value):
+                    yield f"{name}.{part.name}", getattr(value, part.name)
+            elif name not in _BESIDE:
+                yield name, value
+
+
+# -- finding and reading --------------------------------------------------------------------------
+
+
+def load_profile(
+    path: str | os.PathLike[str] | None,
+    target: Target,
+    dialect: Dialect = WELLING,
+    *,
+    working_directory: str | os.PathLike[str] | None = None,
+) -> Profile:
+    """The profile of a target: of the file `path`, else of the first `flasher.toml` that
+    `find_profile` finds, else the defaults. With os.devnull as `path` no file is looked for.
+
+    Raises UsageError with everything that is wrong with the file.
+    """
+    found = Path(path) if path is not None else find_profile(working_directory)
+    if found is not None and found != Path(os.devnull):
+        return _File(found).profile(target, dialect)
+    profile = Profile(
+        target, dialect, has_upgrade=dialect.has_upgrade, version_query=documented_query(target)
+    )
+    return replace(profile, sources=_sources(profile, {}, ""))
+
+
+def check_profile(path: str | os.PathLike[str]) -> tuple[Target, ...]:
+    """Check a whole file, for every target; returns the targets it has a table for.
+
+    Raises UsageError as `load_profile`.
+    """
+    file = _File(Path(path))
+    for target in TARGETS.values():
+        file.profile(target, WELLING)
+    return tuple(target for target in TARGETS.values() if target.name in file.tables)
+
+
+def find_profile(working_directory: str | os.PathLike[str] | None = None) -> Path | None:
+    """The `flasher.toml` of the working directory, else the one of the user; None without any."""
+    here = Path.cwd() if working_directory is None else Path(working_directory)
+    for directory in (here, user_config_path("flasher", appauthor=False, roaming=True)):
+        path = directory / FILE_NAME
+        if path.is_file():
+            return path
+    return None
+
+
+@cache
+def reader() -> Reader[Profile]:
+    """Reads profiles, and knows every key of one."""
+    from flasher.settings.reading import Reader  # noqa: PLC0415
+
+    return Reader(Profile, "profile", beside=_BESIDE, also=tuple(TARGETS))
+
+
+class _File:
+    """A file whose keys and values are right, each taken by itself. Raises UsageError."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._common: dict[str, Any] = {}
+        self.tables: dict[str, Any] = {}
+        """By the name of the target."""
+        faults: list[Fault] = []
+        for key, value in read_toml(path, what="profile").items():
+            target = find_target(key)
+            if target is None:
+                self._common[key] = value
+            elif not isinstance(value, dict):
+                faults.append(reader().fault((key,), f"is a table, [{key}]."))
+            elif target.name in self.tables:
+                remedy = "Put both into one; mc is another name for wmc, pbu for obc."
+                what = f"is a second table for the {target.node.name}."
+                faults.append(Fault(key, what, remedy, f"[{key}] {what}"))
+            else:
+                self.tables[target.name] = value
+                faults += _check_values(value, (key,))
+        faults += _check_values(self._common, ())
+        if faults:
+            raise reader().refusal(path, faults)
+
+    def profile(self, target: Target, dialect: Dialect) -> Profile:
+        """What the file says of a target, over what holds without it."""
+        given = _over(self._common, self.tables.get(target.name, {}))
+        query = documented_query(target)
+        without = {
+            "has_upgrade": dialect.has_upgrade,
+            "version_query": None if query is None else asdict(query),
+        }
+        names = {"target": target.name, "dialect": dialect.name, "sources": {}}
+        profile = reader().read(_over(without, given), self._path, **names)
+        faults = list(_contradictions(profile))
+        if faults:
+            raise reader().refusal(self._path, faults)
+        try:
+            profile.upgrade_options()
+        except UsageError as error:
+            error.where = printable(str(self._path))
+            raise
+        return replace(profile, sources=_sources(profile, given, str(self._path)))
+
+
+def _check_values(table: Mapping[str, Any], prefix: tuple[str, ...]) -> list[Fault]:
+    """What is wrong with the values that are there; others may stand in another table."""
+    names = {"target": "bms", "dialect": WELLING.name, "sources": {}}
+    whole: dict[str, Any] = {
+        "application_area": {"start": 0, "size_bytes": 1},
+        "version_query": dict.fromkeys(("command", "answer_id", "answer_command", "offset"), 0)
+        | {"size_bytes": 1},
+    }
+    rest = {name: whole[name] for name in whole if isinstance(table.get(name), dict)}
+    return reader().check(_over(rest, table), prefix, **names)[1]
+
+
+def _over(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:
+    """`base` with the values in place of its own, table by table."""
+    tables = {
+        name: {**base[name], **values[name]}
+        for name in values
+        if isinstance(values[name], dict) and isinstance(base.get(name), dict)
+    }
+    return {**base, **values, **tables}
+
+
+def _sources(profile: Profile, given: Mapping[str, Any], path: str) -> dict[str, str]:
+    sources = {}
+    for name, _ in profile.values():
+        table, _, key = name.rpartition(".")
+        documented = (
+            name == "has_upgrade"
+            or (table == "timings" and key in _DOCUMENTED)
+            or table == "version_query"
+            # Chapter 3 covers the BMS; the others' reset is a reading (R3).
+            or (name in ("reset_command", "reset_data") and profile.target.has_version_query)
+        )
+        is_given = key in (given.get(table, {}) if table else given)
+        sources[name] = path if is_given else DOCUMENT if documented else DEFAULT
+    return sources
+
+
+def _contradictions(profile: Profile) -> Iterator[Fault]:
+    """Values that are wrong together."""
+    fault = reader().fault
+    wanted = data_size(profile.reset_command)
+    if len(profile.reset_data) != wanted:
+        yield fault(
+            ("reset_data",),
+            f"has {len(profile.reset_data)} bytes, but reset_command "
+            f"0x{profile.reset_command:04X} carries {wanted}: its second byte says so.",
+        )
+    area = profile.application_area
+    if area is not None and area.end > 1 << 32:
+        yield fault(("application_area",), "goes beyond 32 bits of address.")
+    query = profile.version_query
+    if query is None:
+        return
+    if query.answer_id not in sent_ids(profile.target):
+        yield fault(
+            ("version_query", "answer_id"),
+            f"is 0x{query.answer_id:03X}, which the {profile.target.node.name} does not send.",
+            f"Put it into the table of its device, as [{profile.target.name}.version_query]; "
+            "a file's first lines are for every device.",
+        )
+    if data_size(query.command):
+        yield fault(
+            ("version_query", "command"),
+            f"is 0x{query.command:04X}: its second byte says that it carries data, but a query "
+            "has none.",
+        )
+    size_bytes = data_size(query.answer_command)
+    if query.offset + query.size_bytes > size_bytes:
+        yield fault(
+            ("version_query",),
+            f"has its text of {query.size_bytes} bytes at {query.offset}, which lies beyond the "
+            f"{size_bytes} bytes of answer_command 0x{query.answer_command:04X}.",
+        )

@@ -1,0 +1,375 @@
+"""Reads what a TOML file holds into a type, and tells everything that is wrong with it at once.
+
+The type is the description: its fields are the keys, annotations their limits, the texts behind the
+fields their help. Messages and the tables of the documentation come from it.
+"""
+
+from __future__ import annotations
+
+import datetime
+import os
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass
+from functools import cached_property
+from typing import Any, Final, Generic, TypeVar
+
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError, with_config
+from pydantic_core import to_json
+
+from flasher.errors import Fault, FlasherError, UsageError, did_you_mean, printable
+from flasher.files import parse_file, read_toml
+
+Kind = TypeVar("Kind")
+Location = tuple[str | int, ...]
+"""Where something is in a document: keys, and positions in lists."""
+Detail = tuple[str, Location, str]
+"""What the library says of a fault: its kind, where, and a text."""
+CONFIG: Final = ConfigDict(
+    extra="forbid",
+    frozen=True,
+    strict=True,  # no number becomes a text, nor the reverse
+    allow_inf_nan=False,
+    use_attribute_docstrings=True,
+)
+FAULTS_SHOWN: Final = 8
+_UNKNOWN: Final = frozenset({"extra_forbidden", "unexpected_keyword_argument"})
+_NO_TABLE: Final = frozenset({"dataclass_type", "model_type", "dict_type"})
+_SURROGATE: Final = re.compile("[\ud800-\udfff]")
+_HEXADECIMAL: Final = frozenset({0x7FF, 0xFFFF, 0xFFFF_FFFF})
+"""Limits that are shown so."""
+
+
+class Table(BaseModel):
+    """A table of a file."""
+
+    model_config = CONFIG
+
+
+@dataclass(frozen=True)
+class Key:
+    """One key of a file."""
+
+    path: str
+    """With the tables that it is in, as `limits.erase_s`."""
+    default: Any
+    allowed: str
+    """The allowed values in words."""
+    text: str
+    """What it is for."""
+
+
+class Reader(Generic[Kind]):
+    """Reads files of one kind; messages call it `what`.
+
+    `beside` are fields of the type that do not stand in the file, `also` are keys of the file that
+    are no fields of the type. `remedy` is added to what each message says is to be done.
+    """
+
+    def __init__(
+        self,
+        kind: type[Kind],
+        what: str,
+        *,
+        error: type[FlasherError] = UsageError,
+        remedy: str = "",
+        beside: Sequence[str] = (),
+        also: Sequence[str] = (),
+    ) -> None:
+        described = with_config(CONFIG)(kind) if is_dataclass(kind) else kind
+        self._adapter: TypeAdapter[Kind] = TypeAdapter(described)
+        self._what = what
+        self._error = error
+        self._remedy = remedy
+        self._beside = frozenset(beside)
+        self._also = tuple(also)
+
+    @cached_property
+    def _root(self) -> _Schema:
+        schema = self._adapter.json_schema()
+        return _Schema(schema, schema.get("$defs", {}))
+
+    @cached_property
+    def keys(self) -> dict[str, Key]:
+        """Every key that has one place in the file, by its path."""
+        found = self._root.keys(())
+        return {key.path: key for key in found if key.path not in self._beside}
+
+    def load(
+        self, path: str | os.PathLike[str], *, if_missing: str = "Correct the name.", **beside: Any
+    ) -> Kind:
+        """What a file holds. Raises UsageError when there is none, and `error` with all faults."""
+        document = read_toml(path, what=self._what, error=self._error, if_missing=if_missing)
+        return self.read(document, path, **beside)
+
+    def parse(self, raw: bytes, path: str | os.PathLike[str], **beside: Any) -> Kind:
+        """What the bytes of a file hold. Raises `error` with all faults."""
+        return self.read(parse_file(raw, path, what=self._what, error=self._error), path, **beside)
+
+    def read(
+        self, document: Mapping[str, Any], path: str | os.PathLike[str], **beside: Any
+    ) -> Kind:
+        """What is in a document. Raises `error` with all faults."""
+        value, faults = self.check(document, **beside)
+        if value is None or faults:
+            raise self.refusal(path, faults)
+        return value
+
+    def check(
+        self, document: Mapping[str, Any], prefix: Location = (), **beside: Any
+    ) -> tuple[Kind | None, list[Fault]]:
+        """What is in a document, or in the table `prefix` of one; and everything that is wrong."""
+        odd: list[Location] = []
+        plain = _for_json(dict(document), (), odd)
+        value = None
+        details: list[Detail] = [("odd", at, "") for at in odd]
+        details += [("extra_forbidden", (name,), "") for name in document if name in self._beside]
+        try:
+            # As JSON, in which strict means what a file may hold: a list for a tuple, a word for
+            # an enumeration, but no text for a number.
+            text = to_json(plain | beside, inf_nan_mode="constants")
+            value = self._adapter.validate_json(text)
+        except ValidationError as error:
+            details += [
+                (each["type"], each["loc"], str(each.get("ctx", {}).get("error", each["msg"])))
+                for each in error.errors(include_url=False)
+            ]
+        return value, self._faults(document, details, prefix)
+
+    def refusal(self, path: str | os.PathLike[str], faults: Sequence[Fault]) -> FlasherError:
+        """The error for a file with these faults."""
+        shown = printable(os.fspath(path))
+        if len(faults) == 1:
+            (fault,) = faults
+            remedy = " ".join(filter(None, (fault.remedy, self._remedy)))
+            error = self._error(fault.alone or fault.said, where=shown, remedy=remedy)
+        else:
+            listed = [f"{shown}: {fault}" for fault in faults[:FAULTS_SHOWN]]
+            if len(faults) > FAULTS_SHOWN:
+                listed.append(f"and {len(faults) - FAULTS_SHOWN} more")
+            error = self._error(
+                f"The {self._what} {shown} has {len(faults)} faults.",
+                where="\n         ".join(listed),
+                remedy=self._remedy or f"Correct the {self._what}.",
+            )
+        error.faults = tuple(faults)
+        return error
+
+    # -- faults -----------------------------------------------------------------------------------
+
+    def _faults(
+        self, document: Mapping[str, Any], details: Sequence[Detail], prefix: Location
+    ) -> list[Fault]:
+        unknown: list[Fault] = []
+        missing: dict[Location, list[str]] = {}
+        wrong: dict[str, Fault] = {}
+        for kind, location, said in details:
+            at, value = _found(document, location)
+            if kind == "missing":
+                missing.setdefault(location[:-1], []).append(str(location[-1]))
+            elif kind in _UNKNOWN or location[-1:] == ("[key]",):
+                unknown.append(self._unknown(at, prefix))
+            else:
+                fault = self._wrong(kind, at, value, said, prefix)
+                wrong.setdefault(fault.place, fault)
+        lacking = [
+            self.fault((*prefix, *at), f"has no {' and no '.join(names)}.")
+            for at, names in missing.items()
+        ]
+        # An unknown key first: it may be why another one is missing.
+        return [*unknown, *lacking, *wrong.values()]
+
+    def _unknown(self, location: Location, prefix: Location) -> Fault:
+        table, key = (*prefix, *location[:-1]), str(location[-1])
+        names = [
+            *(() if table else self._also),
+            *(name for name in self._root.at(location[:-1]).names if name not in self._beside),
+        ]
+        spelled = {path.rpartition(".")[2]: place_of((*prefix, path)) for path in self.keys}
+        spelled |= {name: name for name in names}
+        return Fault(
+            place_of((*table, key)),
+            "unknown key.",
+            did_you_mean(key.lower(), spelled, spelled.__getitem__)
+            + f"Known are: {', '.join(names)}.",
+            f"The {self._what} has an unknown key {key!a:.60}"
+            + (f" in [{place_of(table)}]." if table else "."),
+        )
+
+    def _wrong(
+        self, kind: str, location: Location, value: object, said: str, prefix: Location
+    ) -> Fault:
+        place = place_of((*prefix, *location))
+        schema = self._root.at(location)
+        if kind in _NO_TABLE:
+            return self.fault((*prefix, *location), f"is a table, [{place}].")
+        if kind in ("value_error", "assertion_error") and not schema.has_words:
+            return Fault(place, f"{printable(said)}.")
+        name = next((part for part in reversed(location) if isinstance(part, str)), "")
+        close = did_you_mean(value, schema.choices) if isinstance(value, str) else ""
+        remedy = f"{close}It is {schema.allowed(name)}"
+        remedy += f": {schema.text}" if schema.text else "."
+        return self.fault((*prefix, *location), f"cannot be {value!a:.60}.", remedy)
+
+    def fault(self, location: Location, what: str, remedy: str = "") -> Fault:
+        """A fault in words that begin with a verb: the place, or the file, is their subject."""
+        place = place_of(location)
+        return Fault(place, f"{place or f'The {self._what}'} {what}", remedy)
+
+
+@dataclass(frozen=True)
+class _Schema:
+    """A part of a JSON Schema."""
+
+    node: Mapping[str, Any]
+    definitions: Mapping[str, Any]
+
+    @cached_property
+    def kinds(self) -> tuple[_Schema, ...]:
+        """What it may be one of, without null and with references followed."""
+        node = self.node
+        if "$ref" in node:
+            node = self.definitions[node["$ref"].rpartition("/")[2]]
+        if "anyOf" not in node:
+            return (_Schema(node, self.definitions),)
+        parts = [_Schema(each, self.definitions) for each in node["anyOf"]]
+        return tuple(each for part in parts for each in part.kinds if each.node != _NULL)
+
+    def at(self, location: Location) -> _Schema:
+        """What is at this place; empty where nothing is known of it."""
+        if not location:
+            return self
+        part = location[0]
+        for each in self.kinds:
+            if isinstance(part, int):
+                found = each.node.get("items")
+            else:
+                found = each.node.get("properties", {}).get(part)
+                found = found or each.node.get("additionalProperties")
+            if found:
+                return _Schema(found, self.definitions).at(location[1:])
+        return _Schema({}, {})
+
+    def keys(self, table: Location) -> Iterator[Key]:
+        """The keys in it and in its tables."""
+        for name in self.kinds[0].node.get("properties", {}):
+            place, found = (*table, name), self.at((name,))
+            if "properties" in found.kinds[0].node:
+                yield from found.keys(place)
+            else:
+                default = found.node.get("default")
+                yield Key(place_of(place), default, found.allowed(name), found.text)
+
+    @property
+    def names(self) -> list[str]:
+        """The keys of a table."""
+        node = self.kinds[0].node
+        names = node.get("propertyNames", {})
+        return list(node.get("properties", _Schema(names, self.definitions).choices))
+
+    @property
+    def choices(self) -> list[str]:
+        """The words of a choice."""
+        return [str(word) for each in self.kinds for word in each.node.get("enum", ())]
+
+    @property
+    def has_words(self) -> bool:
+        """True when its type says in words what it is."""
+        return any("words" in each.node for each in self.kinds)
+
+    @property
+    def text(self) -> str:
+        """What it is for."""
+        return " ".join(str(self.node.get("description", "")).split())
+
+    def allowed(self, name: str) -> str:
+        """The allowed values in words; `name` is the key, which may end with a unit."""
+        return " or ".join(dict.fromkeys(each.words(name) for each in self.kinds))
+
+    def words(self, name: str) -> str:
+        """As `allowed`, for one kind of value."""
+        match self.node:
+            case {"words": str() as words}:
+                return words
+            case {"enum": words}:
+                return ", ".join(map(str, words))
+            case {"const": word}:
+                return str(word)
+            case {"type": "boolean"}:
+                return "true or false"
+            case {"type": "integer"}:
+                return f"a whole number{self._bounds()}"
+            case {"type": "number"}:
+                return f"{'seconds' if name.endswith('_s') else 'a number'}{self._bounds()}"
+            case {"type": "array", "items": items}:
+                each = _Schema(items, self.definitions).allowed(name)
+                return "a list of " + each.replace("a text", "texts").replace("a table", "tables")
+            case {"type": "string", "format": "time"}:
+                return "a time of day"
+            case {"type": "string"}:
+                return f"a text{self._size()}"
+            case _:
+                return "a table"
+
+    def _bounds(self) -> str:
+        node = self.node
+        low, above = node.get("minimum"), node.get("exclusiveMinimum")
+        high, below = node.get("maximum"), node.get("exclusiveMaximum")
+        start = f" above {_number(above)}" if above is not None else ""
+        start = f" from {_number(low)}" if low is not None else start
+        end = f" below {_number(below)}" if below is not None else ""
+        return start + (f" to {_number(high)}" if high is not None else end)
+
+    def _size(self) -> str:
+        low, high = self.node.get("minLength", 0), self.node.get("maxLength")
+        pattern = f" of the form {self.node['pattern']}" if "pattern" in self.node else ""
+        size = f" of {low} to {high} characters" if high is not None else ""
+        return size or pattern or (" that is not empty" if low else "")
+
+
+_NULL: Final = {"type": "null"}
+
+
+def place_of(location: Location) -> str:
+    """A place as people write it: `target[0].base`."""
+    place = ""
+    for part in location:
+        name = f"[{part}]" if isinstance(part, int) else printable(part)[:60]
+        place += name if isinstance(part, int) or not place else f".{name}"
+    return place
+
+
+def _number(value: float) -> str:
+    return f"0x{value:X}" if value in _HEXADECIMAL else f"{value:.12g}"
+
+
+def _found(document: Any, location: Location) -> tuple[Location, object]:
+    """The part of a location that is there, without the names that the library adds to it, and
+    what is there.
+    """
+    for at, part in enumerate(location):
+        is_there = (isinstance(document, dict) and part in document) or (
+            isinstance(document, list) and isinstance(part, int) and part < len(document)
+        )
+        if not is_there:
+            return location[:at], document
+        document = document[part]
+    return location, document
+
+
+def _for_json(value: Any, at: Location, odd: list[Location]) -> Any:
+    """What JSON can hold. Adds to `odd` the places of what it cannot, which no setting is either:
+    dates, and texts from a command line that are no text.
+    """
+    match value:
+        case dict():
+            return {key: _for_json(each, (*at, key), odd) for key, each in value.items()}
+        case list():
+            return [_for_json(each, (*at, n), odd) for n, each in enumerate(value)]
+        case str() if not _SURROGATE.search(value):
+            return value
+        case datetime.date() | str():
+            odd.append(at)
+            return None
+        case _:
+            return value
