@@ -330,7 +330,7 @@ def test_the_users_directory_is_the_systems_own(
     looked_at: list[Path] = []
     monkeypatch.setenv("HOME", "/h")
     monkeypatch.setenv("XDG_CONFIG_HOME", configured)
-    monkeypatch.setattr(Path, "is_file", looked_at.append)
+    monkeypatch.setattr(Path, "is_file", lambda path: looked_at.append(path))  # noqa: PLW0108
     find_profile("/here")
     assert looked_at == [Path("/here/flasher.toml"), Path(expected, "flasher.toml")]
 
