@@ -18,18 +18,19 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from flasher.conformance.cases.elsewhere import NOT_IMPLEMENTED
+from flasher.conformance.catalogue import NOT_IMPLEMENTED
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
-from flasher.conformance.model import CASES, Status
+from flasher.conformance.catalogue import CASES
+from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
-from flasher.conformance.selection import Selection, in_order
+from flasher.conformance.catalogue import Selection, in_order
 from flasher.mock.variants import VARIANTS, Variant
 
 PATH: Final = Path(__file__).parents[1] / "docs" / "variants.md"
 TARGET: Final = "bms"
 AREA_BYTES: Final = 80 * 1024
 """Smaller than the mock's own, since the largest image is sent often; larger than 16 bits tell."""
-_CAUGHT: Final = frozenset({Status.FAIL, Status.ERROR})
+_CAUGHT: Final = frozenset({CaseVerdict.FAIL, CaseVerdict.ERROR})
 
 _INTRODUCTION: Final = """\
 # Wrong bootloaders, and the cases that catch them
@@ -59,8 +60,8 @@ def row_of(name: str, cases: Sequence[str] = ()) -> Row:
     device = dataclasses.replace(MOCK_PROFILE, **changes)
     subject = MockSubject(TARGET, profile=device, make_device=variant_maker(name))
     report = run(subject, profile_of_mock(device), selection=Selection(cases=tuple(cases)))
-    failed = {result.case_id for result in report.results if result.status in _CAUGHT}
-    return Row(name, tuple(in_order(failed)), report.count(Status.NOT_RUN))
+    failed = {result.case_id for result in report.results if result.verdict in _CAUGHT}
+    return Row(name, tuple(in_order(failed)), report.count(CaseVerdict.NOT_RUN))
 
 
 def all_rows(jobs: int | None = None) -> list[Row]:

@@ -19,9 +19,9 @@ from flasher.cli.conformance_documents import (
 )
 from flasher.cli.conformance_text import difference_lines, list_lines
 from flasher.cli.output import Output
+from flasher.conformance.catalogue import GROUPS
 from flasher.conformance.diff import THRESHOLD_PERCENT, compare, read_run
 from flasher.conformance.real import HOST_UNCERTAINTY_S
-from flasher.conformance.selection import GROUPS
 from flasher.errors import ExitCode
 
 __all__ = ["DOCUMENTS", "add_arguments", "run"]
@@ -223,9 +223,13 @@ def run(options: argparse.Namespace, output: Output) -> int:
 
 def _list(options: argparse.Namespace, output: Output) -> int:
     from flasher.cli.conformance_run import selection_of  # noqa: PLC0415
-    from flasher.conformance.listing import listed  # noqa: PLC0415
+    from flasher.conformance import cases  # noqa: F401, PLC0415  registers the cases
+    from flasher.conformance.catalogue import CASES, case_text  # noqa: PLC0415
+    from flasher.conformance.profile import ConformanceProfile  # noqa: PLC0415
 
-    found = listed(selection_of(options))
+    selection = selection_of(options)
+    selection.check()
+    found = [case_text(case_id, ConformanceProfile()) for case_id in selection.chosen()]
     for line in list_lines(found):
         output.result(line)
     output.document(
@@ -238,7 +242,7 @@ def _list(options: argparse.Namespace, output: Output) -> int:
                     clause=case.clause,
                     requires=list(case.requires),
                     choices=list(case.choices),
-                    can_be_run=case.can_be_run,
+                    can_be_run=case.id in CASES,
                 )
                 for case in found
             ]

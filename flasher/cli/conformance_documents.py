@@ -7,8 +7,8 @@ from __future__ import annotations
 from typing import Annotated, Final, TypedDict
 
 from flasher.conformance.diff import Change, Difference, Slowdown
-from flasher.conformance.json_report import ReportDocument, status_name
-from flasher.conformance.model import Status
+from flasher.conformance.json_report import ReportDocument, verdict_name
+from flasher.conformance.results import CaseVerdict
 
 
 class ConformanceDocument(TypedDict):
@@ -42,9 +42,9 @@ class VerdictChangeDocument(TypedDict):
 
     id: str
     title: str
-    before: Annotated[str, Status] | None
+    before: Annotated[str, CaseVerdict] | None
     """null where it was not judged."""
-    after: Annotated[str, Status] | None
+    after: Annotated[str, CaseVerdict] | None
     reason: str
 
 
@@ -118,8 +118,8 @@ def _change(change: Change) -> VerdictChangeDocument:
     return VerdictChangeDocument(
         id=change.case_id,
         title=change.title,
-        before=None if change.before is None else status_name(change.before),
-        after=None if change.after is None else status_name(change.after),
+        before=None if change.before is None else verdict_name(change.before),
+        after=None if change.after is None else verdict_name(change.after),
         reason=change.reason,
     )
 

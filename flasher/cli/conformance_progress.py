@@ -8,15 +8,18 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from flasher.cli.output import Output
-from flasher.conformance.model import Case, CaseResult, Status
-from flasher.conformance.summary import BAD, reason
+from flasher.conformance.catalogue import Case
+from flasher.conformance.results import CaseResult, CaseVerdict
+from flasher.conformance.runner import RunObserver
 from flasher.protocol.text import printable
 
+_BAD: Final = (CaseVerdict.FAIL, CaseVerdict.ERROR)
+"""Verdicts that need somebody to look; cases that were not run have one reason for all of them."""
 _BAR: Final = "{n_fmt}/{total_fmt} |{bar:20}| {elapsed} {desc}"
 
 
-class Progress:
-    """A listener that tells a person; on a terminal with a bar, elsewhere only with -v."""
+class Progress(RunObserver):
+    """An observer that tells a person; on a terminal with a bar, elsewhere only with -v."""
 
     def __init__(self, output: Output) -> None:
         self._output = output
@@ -57,14 +60,14 @@ class Progress:
 
     def case_ended(self, result: CaseResult) -> None:
         """A case has its verdict; what this bench cannot run has one before the run begins."""
-        if not self._count or (result.status is Status.UNSUPPORTED and not result.seed):
+        if not self._count or (result.verdict is CaseVerdict.UNSUPPORTED and not result.seed):
             return
         self._ended += 1
         left = self._count - self._ended
-        line = f"{result.case_id} {result.status.value}"
-        if result.status in BAD:
-            line += f": {reason(result)}"
-        is_news = self._bar is not None and result.status in BAD
+        line = f"{result.case_id} {result.verdict.value}"
+        if result.verdict in _BAD:
+            line += f": {result.reason}"
+        is_news = self._bar is not None and result.verdict in _BAD
         self._output.progress(f"{printable(line)} ({left} left)", level=0 if is_news else 1)
         if self._bar is not None:
             with contextlib.suppress(OSError):

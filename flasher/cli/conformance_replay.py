@@ -6,7 +6,7 @@ import shlex
 from collections.abc import Iterator, Sequence
 from typing import Final
 
-from flasher.conformance.report import Report
+from flasher.conformance.results import RunReport
 
 _DROPPED: Final = {
     "--case": None,
@@ -35,7 +35,7 @@ _KEPT: Final = ("--allow-implausible", "--second-image", "--set", "--strict")
 """Options that an abbreviation of a dropped one could be taken for."""
 
 
-def replay_commands(report: Report, command_line: Sequence[str]) -> dict[tuple[str, int], str]:
+def replay_commands(report: RunReport, command_line: Sequence[str]) -> dict[tuple[str, int], str]:
     """The command for each result, by case id and repeat; `command_line` is without the program."""
     bench = ["flasher", *_about_the_bench(command_line)]
     found = {}
@@ -43,7 +43,7 @@ def replay_commands(report: Report, command_line: Sequence[str]) -> dict[tuple[s
         words = [*bench, "--case", result.case_id, "--seed", report.seed]
         if result.repeat > 1:
             words += ["--repeat", str(result.repeat)]
-        found[result.case_id, result.repeat] = shlex.join(words)
+        found[result.key] = shlex.join(words)
     return found
 
 

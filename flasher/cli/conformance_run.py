@@ -20,13 +20,12 @@ from flasher.cli.conformance_text import report_lines
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
+from flasher.conformance.catalogue import Selection
 from flasher.conformance.json_report import ReportDocument, report_document
-from flasher.conformance.model import Outcome, Status
 from flasher.conformance.opening import BenchOptions, check_bench, open_bench
 from flasher.conformance.real import PowerCommand, ReadbackCommand
-from flasher.conformance.report import Report
+from flasher.conformance.results import CaseVerdict, CheckOutcome, RunReport
 from flasher.conformance.runner import RunOptions, run
-from flasher.conformance.selection import Selection
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.text import printable
 
@@ -51,7 +50,7 @@ def run_suite(options: argparse.Namespace, output: Output) -> int:
             profile,
             selection=selection_of(options),
             options=RunOptions(options.seed, options.repeat, options.timeout, options.strict),
-            listener=progress,
+            observer=progress,
             stopped=stopped,
         )
         was_stopped = stopped()
@@ -113,7 +112,7 @@ def _bench(options: argparse.Namespace) -> BenchOptions:
 class _Reporting:
     options: argparse.Namespace
     output: Output
-    report: Report
+    report: RunReport
     started_at: str
 
     def all(self, *, was_stopped: bool) -> int:
@@ -146,9 +145,9 @@ class _Reporting:
         """What makes each file; its name in the options first."""
 
         def junit() -> bytes:
-            from flasher.conformance.junit import junit_xml  # noqa: PLC0415  when it is wanted
+            from flasher.conformance.reports import junit_report  # noqa: PLC0415  when wanted
 
-            return junit_xml(self.report, started_at=self.started_at, replays=replays)
+            return junit_report(self.report, started_at=self.started_at, replays=replays)
 
         def page() -> bytes:
             from flasher.conformance.html_report import html_page  # noqa: PLC0415  loads jinja2
@@ -168,20 +167,24 @@ class _Reporting:
         folder = self.options.trace_dir
         if folder is None:
             return {}
-        from flasher.conformance.traces import candump, file_name, is_traced  # noqa: PLC0415
+        from flasher.conformance.reports import (  # noqa: PLC0415
+            candump,
+            is_traced,
+            trace_file_name,
+        )
 
         written = {}
         for result in self.report.results:
             if is_traced(result):
-                name = file_name(result)
-                write_whole(folder / name, candump(result), TRACE_DIR)
-                written[result.case_id, result.repeat] = name
+                name = trace_file_name(result)
+                write_whole(folder / name, candump(result.trace), TRACE_DIR)
+                written[result.key] = name
         if written:
             self.output.progress(f"traces: {len(written)} in {printable(str(folder))}")
         return written
 
 
-def exit_code(report: Report, *, was_stopped: bool) -> ExitCode:
+def exit_code(report: RunReport, *, was_stopped: bool) -> ExitCode:
     """The exit code of a run: interrupted, the adapter, a device that never answered, else whether
     all cases passed.
     """
@@ -190,11 +193,13 @@ def exit_code(report: Report, *, was_stopped: bool) -> ExitCode:
     if report.adapter_failed:
         return ExitCode.BUS
     was_judged = any(
-        check.outcome is not Outcome.UNSUPPORTED
+        check.outcome is not CheckOutcome.UNSUPPORTED
         for result in report.results
         for check in result.checks
     )
-    never_ran = not was_judged and any(result.status is Status.NOT_RUN for result in report.results)
+    never_ran = not was_judged and any(
+        result.verdict is CaseVerdict.NOT_RUN for result in report.results
+    )
     if report.stopped and never_ran:
         return ExitCode.NO_ANSWER
     return ExitCode.OK if report.ok else ExitCode.PARTIAL

@@ -2,39 +2,40 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 from flasher.cli.output import counted, duration
+from flasher.conformance.catalogue import CASES
 from flasher.conformance.diff import Change, Difference, Run, Slowdown
-from flasher.conformance.listing import Listed
-from flasher.conformance.model import CaseResult, Outcome, Status
-from flasher.conformance.report import FINAL_IMAGE_OK, CaseText, Report
-from flasher.conformance.summary import (
-    by_case,
-    counts,
-    distribution,
-    end_of_run,
-    finding,
-    group_title,
-    headline,
-    times,
+from flasher.conformance.reports import ByResult, distribution, group_title
+from flasher.conformance.results import (
+    FINAL_IMAGE_OK,
+    CaseResult,
+    CaseText,
+    CaseVerdict,
+    CheckOutcome,
+    RunReport,
+    count_text,
 )
 from flasher.protocol.text import printable
 
 _TEXT_LIMIT: Final = 160
 _NOTES_SHOWN: Final = 12
-_TOLD: Final = (Status.FAIL, Status.ERROR, Status.INCONCLUSIVE, Status.DEVIATION)
+_TOLD: Final = (
+    CaseVerdict.FAIL,
+    CaseVerdict.ERROR,
+    CaseVerdict.INCONCLUSIVE,
+    CaseVerdict.DEVIATION,
+)
 """Verdicts whose cases have a line each; unsupported ones share one for each reason."""
 _MS: Final = 1000
-
-Replays = Mapping[tuple[str, int], str]
 
 
 # -- a run ----------------------------------------------------------------------------------------
 
 
-def report_lines(report: Report, replays: Replays, *, verbose: bool = False) -> Iterator[str]:
+def report_lines(report: RunReport, replays: ByResult, *, verbose: bool = False) -> Iterator[str]:
     """The summary of a run: groups, what went wrong with how to see it again, times, the verdict.
 
     `verbose` tells every case and every failed check.
@@ -45,11 +46,11 @@ def report_lines(report: Report, replays: Replays, *, verbose: bool = False) -> 
     )
     yield ""
     yield from _groups(report)
-    cases = by_case(report)
+    cases = report.by_case()
     if verbose:
         yield ""
         yield from (
-            _shown(f"{result.status.value:<12}  {text.id}  {text.title}")
+            _shown(f"{result.verdict.value:<12}  {text.id}  {text.title}")
             for text, results in cases
             for result in results
         )
@@ -58,7 +59,7 @@ def report_lines(report: Report, replays: Replays, *, verbose: bool = False) -> 
             line
             for text, results in cases
             for result in results
-            if result.status is status
+            if result.verdict is status
             for line in _told(text, result, replays, verbose=verbose)
         ]
         if lines:
@@ -67,50 +68,47 @@ def report_lines(report: Report, replays: Replays, *, verbose: bool = False) -> 
     yield from _not_judged(report)
     yield from _times(report, verbose=verbose)
     yield ""
-    for line in end_of_run(report):
+    for line in report.remarks():
         yield _shown(f"note: {line}")
     if report.final_image:
         verified = report.final_image == FINAL_IMAGE_OK
         said = "flashed and verified" if verified else report.final_image
         yield _shown(f"good image at the end: {said}")
     verdict = "passed" if report.ok else "NOT PASSED"
-    yield f"{verdict}: {headline(report)}; {duration(report.duration_s)} on the bus"
+    yield f"{verdict}: {report.headline}; {duration(report.duration_s)} on the bus"
 
 
-def _groups(report: Report) -> Iterator[str]:
-    groups: dict[str, list[CaseResult]] = {}
-    for text, results in by_case(report):
-        groups.setdefault(text.group, []).extend(results)
+def _groups(report: RunReport) -> Iterator[str]:
+    groups = report.by_group()
     width = max((len(group_title(group)) for group in groups), default=0)
-    for group, results in groups.items():
-        said = ", ".join(f"{count} {status.value}" for status, count in counts(results).items())
+    for group, members in groups.items():
+        said = count_text(result for _, result in members)
         yield f"{group}  {group_title(group):<{width}}  {said}"
 
 
-def _told(text: CaseText, result: CaseResult, replays: Replays, *, verbose: bool) -> Iterator[str]:
+def _told(text: CaseText, result: CaseResult, replays: ByResult, *, verbose: bool) -> Iterator[str]:
     """One line: which case, what was expected, what was got, and how to run it again."""
     repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
-    check = result.first_failure
-    said = finding(check) if check is not None else result.note
-    if result.status is Status.DEVIATION:
+    said = result.reason
+    if result.verdict is CaseVerdict.DEVIATION:
         said = f"{said} (profile: {text.deviation})"
-    head = f"{result.status.value.upper()} {text.id}{repeat} {text.title} [{text.clause}]"
-    replay = replays.get((result.case_id, result.repeat), "")
+    head = f"{result.verdict.value.upper()} {text.id}{repeat} {text.title} [{text.clause}]"
+    replay = replays.get(result.key, "")
     yield _shown(f"{head}: {_short(said)}") + (f" | replay: {replay}" if replay else "")
-    failed = [one for one in result.checks if one.outcome is Outcome.FAIL]
+    failed = [one for one in result.checks if one.outcome is CheckOutcome.FAIL]
     if verbose:
         for one in failed[1:]:
-            yield _shown(f"    also: {_short(finding(one))}")
+            yield _shown(f"    also: {_short(str(one))}")
     elif len(failed) > 1:
         yield f"    and {counted(len(failed) - 1, 'more failed check')}"
 
 
-def _not_judged(report: Report) -> Iterator[str]:
+def _not_judged(report: RunReport) -> Iterator[str]:
     """Cases without a verdict, together with those that have the same reason."""
-    reasons: dict[tuple[Status, str], list[str]] = {}
+    reasons: dict[tuple[CaseVerdict, str], list[str]] = {}
     for result in report.results:
-        if result.status in (Status.UNSUPPORTED, Status.NOT_RUN):
-            reasons.setdefault((result.status, _why(result)), []).append(result.case_id)
+        if result.verdict in (CaseVerdict.UNSUPPORTED, CaseVerdict.NOT_RUN):
+            reasons.setdefault((result.verdict, _why(result)), []).append(result.case_id)
     if reasons:
         yield ""
     for (status, why), case_ids in reasons.items():
@@ -123,12 +121,12 @@ def _not_judged(report: Report) -> Iterator[str]:
 def _why(result: CaseResult) -> str:
     if result.note:
         return result.note
-    whys = [check.got for check in result.checks if check.outcome is Outcome.UNSUPPORTED]
+    whys = [check.got for check in result.checks if check.outcome is CheckOutcome.UNSUPPORTED]
     return whys[0] if whys else "no reason given"
 
 
-def _times(report: Report, *, verbose: bool) -> Iterator[str]:
-    found = times(report)
+def _times(report: RunReport, *, verbose: bool) -> Iterator[str]:
+    found = report.times()
     if not found:
         return
     yield ""
@@ -152,16 +150,16 @@ def _times(report: Report, *, verbose: bool) -> Iterator[str]:
 # -- the list -------------------------------------------------------------------------------------
 
 
-def list_lines(cases: Sequence[Listed]) -> Iterator[str]:
+def list_lines(cases: Sequence[CaseText]) -> Iterator[str]:
     """The catalogue, a line a case."""
-    width = max((len(case.title) for case in cases if case.can_be_run), default=0)
+    width = max((len(case.title) for case in cases if case.id in CASES), default=0)
     for case in cases:
-        if not case.can_be_run:
+        if case.id not in CASES:
             yield f"{case.id}  cannot be run: {case.title}"
             continue
         needs = f"  ({', '.join(case.requires)})" if case.requires else ""
         yield f"{case.id}  {case.title:<{width}}  {case.clause}{needs}"
-    can_be_run = sum(case.can_be_run for case in cases)
+    can_be_run = sum(case.id in CASES for case in cases)
     yield f"{counted(len(cases), 'case')}, {can_be_run} of them can be run"
 
 

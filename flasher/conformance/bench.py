@@ -1,28 +1,260 @@
-"""What a case works with, in one object: `Line` (frames and messages), `Judge` (checks, times,
-power, readback), `PatientHost` (a whole upgrade) and `Dialogue` (the upgrade step by step).
+"""The bench: what a case, or a test of one's own, works with.
+
+A bench has four parts, each with one job: `tester` (frames and messages on the bus), `judge`
+(checks and measurements), `host` (a patient host that upgrades a device from any state) and
+`subject` (the device itself: power, readback, faults). The calls of the parts that nearly every
+case makes are bound here under the same names. The methods of the bench itself take an upgrade step
+by step, check what the device answers, and end the case when it is wrong.
 """
 
 from __future__ import annotations
 
+import random
 from collections.abc import Callable
 
-from flasher.conformance.dialogue import Dialogue
-from flasher.conformance.model import Case
+from flasher.conformance.host import UPDATES_MAX, PatientHost
+from flasher.conformance.judge import Judge
 from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Subject
+from flasher.conformance.tester import BusTester
+from flasher.conformance.wire import Encoder, Kind, Received, describe, packet_count, version_in
 
 
-class Bench(Dialogue):
-    """Made anew for every case; never outlives it."""
+class Bench:
+    """Made anew for every case, whose own limit is `limit_s`; never outlives it."""
 
-    @classmethod
-    def for_case(
-        cls,
-        case: Case,
+    def __init__(
+        self,
         subject: Subject,
         profile: ConformanceProfile,
-        seed: str,
-        stopped: Callable[[], bool],
-    ) -> Bench:
-        """The bench of one case."""
-        return cls(subject, profile, limit_s=case.limit_s, seed=seed, stopped=stopped)
+        *,
+        limit_s: float,
+        seed: str = "",
+        stopped: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self.subject = subject
+        self.port = subject.port
+        self.profile = profile
+        self.encoder = Encoder(
+            subject.target, profile.number("reset_command"), profile.text("reset_data").encode()
+        )
+        self.tester = tester = BusTester(subject.port, self.encoder, profile, limit_s, stopped)
+        self.judge = judge = Judge(tester)
+        self.host = host = PatientHost(tester)
+        self.random = random.Random(seed)  # noqa: S311  chosen by the seed on purpose
+        self.is_off = False
+        """True while the case has the device's power cut."""
+
+        self.choice, self.limit, self.number = profile.choice, profile.limit, profile.number
+        self.send, self.disturb = tester.send, tester.disturb
+        self.wait, self.wait_until = tester.wait, tester.wait_until
+        self.next_message, self.wait_for = tester.next_message, tester.wait_for
+        self.collect, self.forget = tester.collect, tester.forget
+        self.step, self.check, self.require = judge.step, judge.check, judge.require
+        self.require_received, self.expect = judge.require_received, judge.expect
+        self.expect_silence, self.fail = judge.expect_silence, judge.fail
+        self.measure, self.check_time = judge.measure, judge.check_time
+        self.info, self.unsupported = judge.info, judge.unsupported
+        self.upgrade, self.application_version = host.upgrade, host.application_version
+        self.application_runs, self.send_packet = host.application_runs, host.send_packet
+
+    @property
+    def now(self) -> float:
+        """The time, in seconds on the port's clock."""
+        return self.port.now()
+
+    @property
+    def good_image(self) -> bytes:
+        """The image that the device runs before and after every case."""
+        return self.subject.good_image
+
+    def second_image(self) -> bytes:
+        """Another image that runs, smaller. Raises Unsupported without one."""
+        image = self.subject.second_image
+        if image is None:
+            raise Unsupported("the bench has no second good image")
+        return image
+
+    def filler(self, packets: int) -> bytes:
+        """Bytes for a transfer that is never ended, so that nobody starts them; by the seed."""
+        return self.random.randbytes(packets * 128)
+
+    # -- into a transfer --------------------------------------------------------------------------
+
+    def reset_to_bootloader(self) -> Received:
+        """Reset the device; returns the first boot version. General feedback is not judged here."""
+        self.forget()
+        self.send(self.encoder.reset())
+        return self.await_boot_version()
+
+    def await_boot_version(self, within_s: float | None = None) -> Received:
+        """The next boot version, whatever comes before it; without one the case ends."""
+        limit_s = self.limit("first_version_s") if within_s is None else within_s
+        heard = self.wait_for(Kind.BOOT_VERSION, within_s=limit_s)
+        return self.require_received(heard, Kind.BOOT_VERSION.value, limit_s)
+
+    def wait_to_be_heard(self) -> None:
+        """After the first boot version: until the device takes the update command. That is at once,
+        or when the burst is over (up_04_burst).
+        """
+        if self.choice("up_04_burst") != "accepted":
+            self.wait_for_window()
+
+    def wait_for_window(self) -> None:
+        """After the first boot version: until the middle of the window behind the last one."""
+        gaps = self.number("versions") - 1
+        self.wait(gaps * self.limit("version_spacing_s") + self.limit("window_s") / 2)
+        self.forget()
+
+    def next_version(self) -> Received:
+        """The next boot version of the burst."""
+        return self.expect(Kind.BOOT_VERSION, within_s=4 * self.limit("version_spacing_s"))
+
+    def update(self, size_bytes: int) -> Received:
+        """Get request transfer: the update command now, and at every boot version that follows
+        (R2).
+        """
+        limit_s = self.limit("erase_s")
+        heard: Received | None = None
+        for _ in range(UPDATES_MAX):
+            sent = self.send(self.encoder.update(size_bytes))
+            heard = self.host.request_or_version(sent.left_at, limit_s)
+            if heard is None or heard.kind is Kind.REQUEST:
+                break
+        if heard is not None and heard.kind is not Kind.REQUEST:
+            heard = None
+        found = self.require_received(heard, Kind.REQUEST.value, limit_s)
+        self.measure("update command to request transfer", found.at - sent.left_at)
+        return found
+
+    def start_transfer(self, size_bytes: int) -> None:
+        """From the running application to request transfer."""
+        self.reset_to_bootloader()
+        self.update(size_bytes)
+
+    # -- packets and the end ----------------------------------------------------------------------
+
+    def packet(self, image: bytes, number: int) -> None:
+        """Send a packet of `image`; its ACK has to come."""
+        sent = self.send_packet(image, number)
+        heard = self.expect(Kind.ACK, number=number)
+        self.measure("packet to ACK", heard.at - sent.left_at)
+
+    def packets(self, image: bytes, first: int = 1, last: int | None = None) -> None:
+        """Packets `first` to `last` (the last one of the image), each one acknowledged."""
+        final = packet_count(len(image)) if last is None else last
+        for number in range(first, final + 1):
+            self.packet(image, number)
+
+    def check_packet_rejected(self, wanted: int, named: int | None = None) -> bool:
+        """The packet just sent was not taken: the answer is as the profile says (tx_01), with the
+        number `wanted` by the device or the one that the packet `named` (None: any).
+        """
+        choice = self.choice("tx_01")
+        heard = self.collect(self.limit("ack_s"))
+        numbers = [one.number for one in heard if one.kind is Kind.NAK]
+        if choice == "silence":
+            return self.check(not heard, "no answer", describe(heard))
+        if choice == "either":
+            right = named is None or all(number in (wanted, named) for number in numbers)
+            ok = right and len(numbers) == len(heard) <= 1
+            return self.check(ok, "NAK or no answer", describe(heard))
+        number = wanted if choice == "nak_expected" else named
+        ok = len(numbers) == len(heard) == 1 and number in (None, numbers[0])
+        return self.check(ok, "NAK" if number is None else f"NAK {number}", describe(heard))
+
+    def end_transfer(self) -> None:
+        """End of transfer; complete has to come."""
+        sent = self.send(self.encoder.end())
+        heard = self.expect(Kind.COMPLETE)
+        self.measure("end of transfer to complete", heard.at - sent.left_at)
+
+    def finish(self, image: bytes, first: int = 1) -> None:
+        """The rest of a transfer from packet `first` on, its end, and the application it starts."""
+        self.packets(image, first)
+        self.end_transfer()
+        self.check_image(image)
+
+    def check_upgrade(self, image: bytes | None = None) -> None:
+        """The device can be upgraded from where it is: to `image`, or to the good one."""
+        chosen = self.good_image if image is None else image
+        done = self.upgrade(chosen)
+        self.require(done.ok, "the device can be upgraded", done.reason or "it was")
+        self.check_image(chosen)
+
+    # -- what the device holds --------------------------------------------------------------------
+
+    def check_image(self, image: bytes) -> None:
+        """The application of `image` runs, and the flash holds it."""
+        self.check_application(image)
+        self.check_stored(image)
+
+    def check_application(self, image: bytes | None = None) -> None:
+        """The application of `image` (the good one) runs, and tells its version where it can."""
+        wanted = version_in(self.good_image if image is None else image)
+        if self.encoder.has_version_query and wanted is not None:
+            found = self.application_version(self.limit("start_s"))
+            self.check(found == wanted, f"application {wanted} runs", f"{found!a}")
+        else:
+            runs = self.application_runs()
+            self.check(runs, "the application runs", "it answers" if runs else "no answer")
+
+    def check_stored(self, image: bytes) -> None:
+        """The flash holds exactly `image`; nothing is judged on a bench without readback."""
+        if not self.subject.has_readback:
+            self.unsupported("the flash holds the image", "the bench has no readback")
+            return
+        stored = self.subject.readback()[: len(image)]
+        differs = next(
+            (at for at, pair in enumerate(zip(stored, image, strict=False)) if pair[0] != pair[1]),
+            len(stored),
+        )
+        got = "the image" if stored == image else f"other bytes from offset {differs} on"
+        self.check(stored == image, "the flash holds the image", got)
+
+    # -- power, and out of a transfer -------------------------------------------------------------
+
+    def power_off(self) -> None:
+        """Cut the device's power. Raises Unsupported."""
+        self.subject.power(on=False)
+        self.is_off = True
+
+    def power_on(self) -> None:
+        """Give the device its power back. Raises Unsupported."""
+        self.subject.power(on=True)
+        self.is_off = False
+
+    def power_cycle(self, off_s: float = 0.5) -> None:
+        """Off, a pause, on; what was heard until then is forgotten. Raises Unsupported."""
+        self.power_off()
+        self.wait(off_s)
+        self.forget()
+        self.power_on()
+
+    def leave_transfer(self) -> None:
+        """Abandon a transfer and be at an announcing bootloader without an application: by reset or
+        a pause where the profile says that they end a transfer; where they do not, by power.
+
+        Raises Unsupported where nothing of it is there.
+        """
+        self.forget()
+        within_s = self.limit("first_version_s")
+        if self.choice("tx_13") == "restarts":
+            self.send(self.encoder.reset())
+        elif self.choice("tx_12") == "announces":
+            within_s += self.limit("pause_s")
+        elif not self.subject.has_power:
+            raise Unsupported("no power control, and nothing else ends a transfer (tx_12, tx_13)")
+        else:
+            within_s = 0.0
+        if not self.subject.has_power:
+            self.await_boot_version(within_s)
+        elif self.wait_for(Kind.BOOT_VERSION, within_s=within_s) is None:
+            self.power_cycle()
+            self.await_boot_version()
+
+    def without_application(self) -> None:
+        """From the running application to an announcing bootloader that has none to start."""
+        self.start_transfer(len(self.good_image))
+        self.leave_transfer()

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from flasher.conformance.json_report import SCHEMA_VERSION, status_name
-from flasher.conformance.model import Status
-from flasher.conformance.summary import GRAVITY, worst
+from flasher.conformance.json_report import SCHEMA_VERSION, verdict_name
+from flasher.conformance.results import CaseVerdict, worst
 from flasher.errors import UsageError
 from flasher.files import JSON_MAX_SIZE, parse_json, read
 from flasher.protocol.text import printable
@@ -21,11 +20,9 @@ from flasher.protocol.text import printable
 THRESHOLD_PERCENT: Final = 10.0
 """A median or 95th percentile that grew by more is slower, if it grew by more than what the two
 measurements may be off together."""
-_NOT_JUDGED: Final = frozenset({Status.UNSUPPORTED, Status.NOT_RUN})
-_RANKS: Final[Mapping[Status, int]] = {
-    status: GRAVITY.index(Status.PASS if status is Status.INFO else status) for status in GRAVITY
-}
-_STATUSES: Final = {status_name(status): status for status in Status}
+_NOT_JUDGED: Final = frozenset({CaseVerdict.UNSUPPORTED, CaseVerdict.NOT_RUN})
+_RANKS: Final = {verdict: rank for rank, verdict in enumerate(CaseVerdict)} | {CaseVerdict.INFO: 0}
+_VERDICTS: Final = {verdict_name(verdict): verdict for verdict in CaseVerdict}
 _CONDITIONS: Final = ("target", "bitrate_bps", "seed", "timestamp_source", "profile_source")
 
 
@@ -47,7 +44,7 @@ class Run:
     conditions: Mapping[str, str]
     profile: Mapping[str, object]
     titles: Mapping[str, str]
-    statuses: Mapping[str, Status]
+    verdicts: Mapping[str, CaseVerdict]
     reasons: Mapping[str, str]
     times: Mapping[str, Times]
 
@@ -57,8 +54,8 @@ class Change(NamedTuple):
 
     case_id: str
     title: str
-    before: Status | None
-    after: Status | None
+    before: CaseVerdict | None
+    after: CaseVerdict | None
     reason: str
     """What the newer run says of it."""
 
@@ -98,7 +95,7 @@ class Difference:
     def is_worse(self) -> bool:
         """True when a case that was judged in both runs got worse, or a new one fails."""
         return bool(self.worse) or any(
-            change.after in (Status.FAIL, Status.ERROR) for change in self.new
+            change.after in (CaseVerdict.FAIL, CaseVerdict.ERROR) for change in self.new
         )
 
 
@@ -135,7 +132,7 @@ def compare(old: Run, new: Run, threshold_percent: float = THRESHOLD_PERCENT) ->
     fresh: list[Change] = []
     gone: list[Change] = []
     unchanged = 0
-    for case_id in dict.fromkeys((*new.statuses, *old.statuses)):
+    for case_id in dict.fromkeys((*new.verdicts, *old.verdicts)):
         before, after = _judged(old, case_id), _judged(new, case_id)
         title = new.titles.get(case_id) or old.titles.get(case_id, "")
         change = Change(case_id, title, before, after, new.reasons.get(case_id, ""))
@@ -163,8 +160,8 @@ def compare(old: Run, new: Run, threshold_percent: float = THRESHOLD_PERCENT) ->
     )
 
 
-def _judged(run: Run, case_id: str) -> Status | None:
-    status = run.statuses.get(case_id)
+def _judged(run: Run, case_id: str) -> CaseVerdict | None:
+    status = run.verdicts.get(case_id)
     return None if status in _NOT_JUDGED else status
 
 
@@ -202,12 +199,12 @@ def _other_conditions(old: Run, new: Run) -> list[str]:
 
 
 def _run_of(document: dict[str, Any], source: str) -> Run:
-    statuses: dict[str, list[Status]] = {}
+    verdicts: dict[str, list[CaseVerdict]] = {}
     reasons: dict[str, str] = {}
     for result in document["results"]:
         case_id = _shown(result["id"])
-        status = _STATUSES[result["status"]]
-        statuses.setdefault(case_id, []).append(status)
+        status = _VERDICTS[result["status"]]
+        verdicts.setdefault(case_id, []).append(status)
         findings = result["findings"]
         if findings and case_id not in reasons:
             step = f"{findings[0]['step']}: " if findings[0]["step"] else ""
@@ -221,7 +218,7 @@ def _run_of(document: dict[str, Any], source: str) -> Run:
         {key: _shown(document[key]) for key in _CONDITIONS},
         dict(document["profile"]),
         {_shown(case["id"]): _shown(case["title"]) for case in document["cases"]},
-        {case_id: worst(found) for case_id, found in statuses.items()},
+        {case_id: worst(found) for case_id, found in verdicts.items()},
         reasons,
         {
             _shown(one["name"]): Times(

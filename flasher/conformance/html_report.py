@@ -1,38 +1,31 @@
-"""From a report to the page that `flasher.report` draws: verdicts as colours and words, checks,
-and the frames of a case decoded, as far as a person reads them.
+"""The report of a run as a self-contained page: verdict, matrix of the cases, what went wrong with
+the decoded frames, how the measured times are spread.
+
+What could grow with a run is cut here; the template `conformance.html` arranges it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import islice
-from typing import Final
+from typing import Final, NamedTuple
 
-from flasher.conformance.model import CaseResult, Check, Outcome, TraceEntry
-from flasher.conformance.model import Status as Verdict
-from flasher.conformance.report import CaseText, Report
-from flasher.conformance.summary import (
-    by_case,
-    distribution,
-    end_of_run,
-    group_title,
-    headline,
-    times,
+from flasher.conformance.reports import ByResult, distribution, group_title
+from flasher.conformance.results import (
+    CaseResult,
+    CaseText,
+    CaseVerdict,
+    Check,
+    CheckOutcome,
+    RunReport,
+    TraceEntry,
 )
 from flasher.protocol.frame import Frame
-from flasher.report.base import Status
-from flasher.report.conformance_page import (
-    CaseView,
-    CheckRow,
-    Fact,
-    GroupView,
-    RunView,
-    TimesView,
-    TraceRow,
-    render,
-)
+from flasher.report import chart, spread
+from flasher.report.base import Status, render_page
 from flasher.report.scale import duration_text
 from flasher.trace.decoder import Decoder, Seen
+from flasher.trace.figures import Distribution
 
 CHECKS_SHOWN: Final = 12
 """Checks of a case that have a line: those that did not pass first."""
@@ -40,68 +33,108 @@ MESSAGES_BAD: Final = 80
 """Messages that a case that went wrong shows, the last ones before its first failed check."""
 MESSAGES_GOOD: Final = 20
 """Messages that another case shows, from its beginning."""
+HISTOGRAM_LEAST: Final = 5
+"""Fewer values than this are told by the table alone."""
+TRACES_OPEN: Final = 5
+"""With more cases that went wrong, their traces are folded; on paper they are then left out."""
 _FRAMES_A_MESSAGE: Final = 20
 _AFTER_S: Final = 0.02
 """What came so shortly after a failed check belongs to it."""
 _INFOS_SHOWN: Final = 20
-
-_COLOURS: Final[Mapping[Verdict, Status]] = {
-    Verdict.PASS: Status.GOOD,
-    Verdict.FAIL: Status.BAD,
-    Verdict.ERROR: Status.BAD,
-    Verdict.DEVIATION: Status.WARNING,
-    Verdict.INCONCLUSIVE: Status.WARNING,
-    Verdict.UNSUPPORTED: Status.NEUTRAL,
-    Verdict.INFO: Status.NEUTRAL,
-    Verdict.NOT_RUN: Status.NEUTRAL,
+_CLOCK_S: Final = 1e-6
+"""No clock tells apart what differs by less: there is nothing to draw."""
+_COLOURS: Final = {
+    CaseVerdict.PASS: Status.GOOD,
+    CaseVerdict.FAIL: Status.BAD,
+    CaseVerdict.ERROR: Status.BAD,
+    CaseVerdict.DEVIATION: Status.WARNING,
+    CaseVerdict.INCONCLUSIVE: Status.WARNING,
+    CaseVerdict.UNSUPPORTED: Status.NEUTRAL,
+    CaseVerdict.INFO: Status.NEUTRAL,
+    CaseVerdict.NOT_RUN: Status.NEUTRAL,
 }
-_CHECK_COLOURS: Final[Mapping[Outcome, Status]] = {
-    Outcome.PASS: Status.GOOD,
-    Outcome.FAIL: Status.BAD,
-    Outcome.INCONCLUSIVE: Status.WARNING,
-    Outcome.UNSUPPORTED: Status.NEUTRAL,
+_CHECK_COLOURS: Final = {
+    CheckOutcome.FAIL: Status.BAD,
+    CheckOutcome.INCONCLUSIVE: Status.WARNING,
+    CheckOutcome.UNSUPPORTED: Status.NEUTRAL,
+    CheckOutcome.PASS: Status.GOOD,
 }
-_BAD_FIRST: Final = (Outcome.FAIL, Outcome.INCONCLUSIVE, Outcome.UNSUPPORTED, Outcome.PASS)
-
-Texts = Mapping[tuple[str, int], str]
+"""Outcomes with their colours, in the order in which checks are listed."""
 
 
-def html_page(report: Report, *, started_at: str, replays: Texts, trace_files: Texts) -> str:
+class Fact(NamedTuple):
+    """A line about the run or a case."""
+
+    name: str
+    text: str
+
+
+class TraceRow(NamedTuple):
+    """A decoded message, and the text of its fields."""
+
+    seen: Seen
+    text: str
+
+
+class CaseView(NamedTuple):
+    """A result with its case, as far as the page shows them."""
+
+    text: CaseText
+    result: CaseResult
+    title: str
+    status: Status
+    facts: Sequence[Fact]
+    """Requirements, choices of the profile, seed, duration, and the like."""
+    replay: str
+    checks: Sequence[tuple[Check, Status]]
+    infos: Sequence[str]
+    trace: Sequence[TraceRow]
+    trace_text: str
+    """Which part of the case's frames `trace` is."""
+
+
+class TimesView(NamedTuple):
+    """All measurements of one name."""
+
+    name: str
+    distribution: Distribution
+    uncertainty_s: float
+    histograms: dict[str, spread.Histogram]
+    """A drawing for each width; empty where there is nothing to draw."""
+
+
+def html_page(
+    report: RunReport, *, started_at: str, replays: ByResult, trace_files: ByResult
+) -> str:
     """The page of a run. `replays` and `trace_files` are by case id and repeat."""
-    cases: dict[str, list[CaseView]] = {}
-    for text, results in by_case(report):
-        for result in results:
-            key = (result.case_id, result.repeat)
-            view = _case(text, result, replays.get(key, ""), trace_files.get(key, ""))
-            cases.setdefault(text.group, []).append(view)
-    return render(
-        RunView(
-            subject=report.subject,
-            status=Status.GOOD if report.ok else Status.BAD,
-            word="passed" if report.ok else "not passed",
-            headline=headline(report),
-            remarks=tuple(end_of_run(report)),
-            facts=tuple(_facts(report, started_at)),
-            groups=tuple(
-                GroupView(group, group_title(group), tuple(views)) for group, views in cases.items()
-            ),
-            times=tuple(
-                TimesView(
-                    name,
-                    [one.value_s for one in found],
-                    distribution(found),
-                    max(one.uncertainty_s for one in found),
-                )
-                for name, found in times(report).items()
-            ),
-            times_text=_times_text(report),
-            profile=tuple(Fact(key, str(value)) for key, value in report.profile.items()),
-            profile_text=f"Judged by: {report.profile_source}.",
-        )
+    groups = {
+        f"{group} {group_title(group)}": [
+            _case(text, result, replays.get(result.key, ""), trace_files.get(result.key, ""))
+            for text, result in members
+        ]
+        for group, members in report.by_group().items()
+    }
+    others = {
+        title: [case for case in cases if case.status is not Status.BAD]
+        for title, cases in groups.items()
+    }
+    return render_page(
+        "conformance.html",
+        report=report,
+        status=Status.GOOD if report.ok else Status.BAD,
+        word="passed" if report.ok else "not passed",
+        facts_of_run=_facts(report, started_at),
+        groups=groups,
+        troubled=[case for cases in groups.values() for case in cases if case.status is Status.BAD],
+        traces_open=TRACES_OPEN,
+        others={title: cases for title, cases in others.items() if cases},
+        times=_times(report),
+        times_text=_times_text(report),
+        profile=[Fact(key, str(value)) for key, value in report.profile.items()],
     )
 
 
-def _facts(report: Report, started_at: str) -> Sequence[Fact]:
+def _facts(report: RunReport, started_at: str) -> Sequence[Fact]:
     facts = [
         Fact("target", f"{report.target}, at {report.bitrate_bps // 1000} kbit/s"),
         Fact("started", started_at),
@@ -117,7 +150,21 @@ def _facts(report: Report, started_at: str) -> Sequence[Fact]:
     return facts
 
 
-def _times_text(report: Report) -> str:
+def _times(report: RunReport) -> Sequence[TimesView]:
+    views = []
+    for name, measured in report.times().items():
+        found = distribution(measured)
+        drawings = {}
+        is_spread = found.minimum_s > 0 and found.maximum_s - found.minimum_s > _CLOCK_S
+        if found.count >= HISTOGRAM_LEAST and is_spread:
+            values_s = [one.value_s for one in measured]
+            drawings = {width: spread.histogram(values_s, at) for width, at in chart.WIDTHS.items()}
+        unsure_s = max(one.uncertainty_s for one in measured)
+        views.append(TimesView(name, found, unsure_s, drawings))
+    return views
+
+
+def _times_text(report: RunReport) -> str:
     source = f"Time stamps: {report.timestamp_source}"
     if not report.uncertainty_s:
         return f"{source}, exact."
@@ -128,23 +175,19 @@ def _times_text(report: Report) -> str:
 
 
 def _case(text: CaseText, result: CaseResult, replay: str, trace_file: str) -> CaseView:
-    colour = _COLOURS[result.status]
+    colour = _COLOURS[result.verdict]
     trace, trace_text = _trace(result, is_bad=colour is not Status.GOOD)
     repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
-    checks = sorted(result.checks, key=lambda check: _BAD_FIRST.index(check.outcome))
+    order = list(_CHECK_COLOURS)
+    checks = sorted(result.checks, key=lambda check: order.index(check.outcome))
     return CaseView(
-        id=text.id,
-        title=f"{text.title}{repeat}",
-        clause=text.clause,
-        stimulus=text.stimulus,
-        expectation=text.expectation,
+        text,
+        result,
+        title=text.title + repeat,
         status=colour,
-        word=result.status.value,
-        note=result.note,
-        facts=tuple(_case_facts(text, result, trace_file)),
+        facts=_case_facts(text, result, trace_file),
         replay=replay if colour in (Status.BAD, Status.WARNING) else "",
-        checks=tuple(map(_check, checks[:CHECKS_SHOWN])),
-        checks_left_out=max(0, len(checks) - CHECKS_SHOWN),
+        checks=[(check, _CHECK_COLOURS[check.outcome]) for check in checks[:CHECKS_SHOWN]],
         infos=result.infos[:_INFOS_SHOWN],
         trace=trace,
         trace_text=trace_text,
@@ -168,16 +211,10 @@ def _case_facts(text: CaseText, result: CaseResult, trace_file: str) -> Sequence
     return facts
 
 
-def _check(check: Check) -> CheckRow:
-    colour = _CHECK_COLOURS[check.outcome]
-    word = check.outcome.value
-    return CheckRow(check.at_s, check.step, word, colour, check.expected, check.got)
-
-
 # -- frames ---------------------------------------------------------------------------------------
 
 
-def _trace(result: CaseResult, *, is_bad: bool) -> tuple[tuple[TraceRow, ...], str]:
+def _trace(result: CaseResult, *, is_bad: bool) -> tuple[Sequence[TraceRow], str]:
     """The messages that are shown, and which part of the case they are."""
     if not result.trace:
         return (), ""
@@ -192,25 +229,22 @@ def _trace(result: CaseResult, *, is_bad: bool) -> tuple[tuple[TraceRow, ...], s
         whole = len(rows) == len(found) and len(result.trace) <= MESSAGES_GOOD * _FRAMES_A_MESSAGE
         text = f"{'all' if whole else 'the first'} {len(rows)} messages"
     frames = len(result.trace) + result.trace_dropped
-    return tuple(rows), f"{text}; {frames:,} frames in the whole case"
+    return rows, f"{text}; {frames:,} frames in the whole case"
 
 
 def _decoded(entries: Sequence[TraceEntry]) -> list[TraceRow]:
     """What these frames say, in order; bytes that no message was made of too."""
     decoder = Decoder()
-    rows: list[TraceRow] = []
+    found: list[Seen] = []
     for entry in entries:
         due = decoder.deadline()
         if due is not None and due <= entry.at_s:
-            rows += map(_row, decoder.tick(due))
-        rows += map(_row, decoder.feed(Frame(*entry.frame), entry.at_s))
+            found += decoder.tick(due)
+        found += decoder.feed(Frame(*entry.frame), entry.at_s)
     due = decoder.deadline()
     if due is not None:
-        rows += map(_row, decoder.tick(due))
-    return rows
-
-
-def _row(seen: Seen) -> TraceRow:
-    text = ", ".join(f"{field.label} {field.text}" for field in islice(seen.fields, 8))
-    sender = seen.sender or f"{seen.can_id:03X}"
-    return TraceRow(seen.at, sender, seen.receiver, seen.title, text, seen.is_trouble)
+        found += decoder.tick(due)
+    return [
+        TraceRow(seen, ", ".join(f"{one.label} {one.text}" for one in islice(seen.fields, 8)))
+        for seen in found
+    ]

@@ -7,12 +7,18 @@ runs with one seed differ in nothing else. Frames are not in it, they go into tr
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from typing import Annotated, Final, TypedDict
 
-from flasher.conformance.model import CaseResult, Measurement, Outcome, Status
-from flasher.conformance.report import CaseText, Report
-from flasher.conformance.summary import distribution, outcomes, times
+from flasher.conformance.reports import ByResult, distribution
+from flasher.conformance.results import (
+    CaseResult,
+    CaseText,
+    CaseVerdict,
+    CheckOutcome,
+    Measurement,
+    RunReport,
+)
 
 SCHEMA_VERSION: Final = 1
 """Counts up when a field changes its meaning or goes away; not for a new one."""
@@ -42,7 +48,7 @@ class CaseCheckDocument(TypedDict):
     """One thing that was looked at and did not pass."""
 
     step: str
-    outcome: Annotated[str, Outcome]
+    outcome: Annotated[str, CheckOutcome]
     expected: str
     got: str
     at_s: float
@@ -84,7 +90,7 @@ class ResultDocument(TypedDict):
 
     id: str
     repeat: int
-    status: Annotated[str, Status]
+    status: Annotated[str, CaseVerdict]
     seed: str
     note: str
     checks: OutcomesDocument
@@ -148,17 +154,17 @@ class ReportDocument(TypedDict):
     """Cases of the catalogue about the tool, which are no part of this suite."""
 
 
-def status_name(status: Status) -> str:
+def verdict_name(verdict: CaseVerdict) -> str:
     """A verdict as JSON has it."""
-    return status.name.lower()
+    return verdict.name.lower()
 
 
 def report_document(
-    report: Report,
+    report: RunReport,
     *,
     started_at: str,
-    replays: Mapping[tuple[str, int], str],
-    trace_files: Mapping[tuple[str, int], str],
+    replays: ByResult,
+    trace_files: ByResult,
 ) -> ReportDocument:
     """The document of a run. `replays` and `trace_files` are by case id and repeat."""
     return ReportDocument(
@@ -180,18 +186,14 @@ def report_document(
         killed_by=report.killed_by,
         not_upgradable=report.not_upgradable,
         final_image=report.final_image,
-        counts={status_name(status): report.count(status) for status in Status},
+        counts={verdict_name(verdict): report.count(verdict) for verdict in CaseVerdict},
         cases=[_text(text) for text in report.cases],
         results=[
-            _result(
-                result,
-                replays.get((result.case_id, result.repeat), ""),
-                trace_files.get((result.case_id, result.repeat), ""),
-            )
+            _result(result, replays.get(result.key, ""), trace_files.get(result.key, ""))
             for result in report.results
         ],
         rescues=[RescueDocument(id=rescue.case_id, how=rescue.how) for rescue in report.rescues],
-        times=[_times(name, found) for name, found in times(report).items()],
+        times=[_times(name, found) for name, found in report.times().items()],
         not_selected=list(report.not_selected),
         host_cases=list(report.host_cases),
     )
@@ -212,19 +214,18 @@ def _text(text: CaseText) -> TextDocument:
 
 
 def _result(result: CaseResult, replay: str, trace_file: str) -> ResultDocument:
-    counted = outcomes(result)
-    bad = [check for check in result.checks if check.outcome is not Outcome.PASS]
+    bad = [check for check in result.checks if check.outcome is not CheckOutcome.PASS]
     return ResultDocument(
         id=result.case_id,
         repeat=result.repeat,
-        status=status_name(result.status),
+        status=verdict_name(result.verdict),
         seed=result.seed,
         note=result.note,
         checks=OutcomesDocument(
-            passed=counted[Outcome.PASS],
-            failed=counted[Outcome.FAIL],
-            inconclusive=counted[Outcome.INCONCLUSIVE],
-            unsupported=counted[Outcome.UNSUPPORTED],
+            passed=result.count(CheckOutcome.PASS),
+            failed=result.count(CheckOutcome.FAIL),
+            inconclusive=result.count(CheckOutcome.INCONCLUSIVE),
+            unsupported=result.count(CheckOutcome.UNSUPPORTED),
         ),
         findings=[
             CaseCheckDocument(

@@ -14,8 +14,8 @@ from typing import Final
 
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
-from flasher.conformance.model import DeviceCrashed, Unsupported
 from flasher.conformance.profile import ConformanceProfile, Value
+from flasher.conformance.results import DeviceCrashed, Unsupported
 from flasher.conformance.subject import Arrival
 from flasher.conformance.wire import RawFrame
 from flasher.errors import BusError, FlasherError

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from flasher.bus.link import Clock, Link, StampingLink
-from flasher.conformance.model import Unsupported
+from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Arrival
 from flasher.conformance.wire import RawFrame
 from flasher.errors import BusError, UsageError

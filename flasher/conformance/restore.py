@@ -10,12 +10,10 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.hearing import Kind
-from flasher.conformance.model import CaseEnded, CaseLimitReached, RunStopped
-from flasher.conformance.patient import Upgraded
 from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.results import CaseEnded, CaseLimitReached, RunStopped
 from flasher.conformance.subject import Subject
-from flasher.conformance.wire import version_in
+from flasher.conformance.wire import Kind, version_in
 
 _MARGIN_S: Final = 60.0
 _ASK_S: Final = 0.4
@@ -80,7 +78,7 @@ def is_reachable(
     bench = Bench(subject, profile, limit_s=_limit_s(subject, profile), stopped=stopped)
     within_s = profile.limit("first_version_s") + profile.limit("pause_s")
     try:
-        bench.send(bench.words.reset())
+        bench.send(bench.encoder.reset())
         if bench.wait_for(Kind.BOOT_VERSION, within_s=within_s) is not None:
             return True
         if subject.has_power:
@@ -111,9 +109,9 @@ def _limit_s(subject: Subject, profile: ConformanceProfile) -> float:
 
 def _runs(bench: Bench) -> str:
     wanted = version_in(bench.good_image)
-    if not bench.words.has_version_query or wanted is None:
+    if not bench.encoder.has_version_query or wanted is None:
         return "" if bench.application_runs() else "no application answers"
-    found = bench.application_version(bench.profile.limit("start_s"))
+    found = bench.application_version(bench.limit("start_s"))
     return "" if found == wanted else f"version {found!a}, not {wanted}"
 
 
@@ -121,27 +119,25 @@ def _upgrade(bench: Bench) -> str:
     """By the protocol: the gentle way first, so that a device is not blamed for what a reset in the
     midst of a transfer (TX-13), or an update command there (UP-08), does to it.
     """
-    blind = bench.profile.choice("up_08") == "starts_over"
-    if not blind or _answers(bench):
-        reason = _after(bench, bench.upgrade(bench.good_image, blind=blind))
-    else:
-        reason = _after(bench, bench.upgrade(bench.good_image, reset=False, blind=True))
-    if reason and bench.profile.choice("tx_12") == "announces":
-        bench.wait(bench.profile.limit("pause_s"))
-        reason = _after(bench, bench.upgrade(bench.good_image, reset=_answers(bench)))
+    blind = bench.choice("up_08") == "starts_over"
+    reset = not blind or _may_run(bench)
+    reason = _upgraded(bench, reset=reset, blind=blind)
+    if reason and bench.choice("tx_12") == "announces":
+        bench.wait(bench.limit("pause_s"))
+        reason = _upgraded(bench, reset=_may_run(bench))
     return reason
 
 
-def _answers(bench: Bench) -> bool:
+def _may_run(bench: Bench) -> bool:
     """True when an application runs, or when nobody can ask for it."""
-    return not bench.words.has_version_query or bench.application_version(_ASK_S) is not None
+    return not bench.encoder.has_version_query or bench.application_version(_ASK_S) is not None
 
 
-def _after(bench: Bench, ended: Upgraded) -> str:
+def _upgraded(bench: Bench, *, reset: bool, blind: bool = False) -> str:
+    ended = bench.upgrade(bench.good_image, reset=reset, blind=blind)
     return _runs(bench) if ended.ok else ended.reason
 
 
 def _power_cycle(bench: Bench) -> str:
     bench.power_cycle()
-    ended = bench.upgrade(bench.good_image, reset=False)
-    return _runs(bench) if ended.ok else ended.reason
+    return _upgraded(bench, reset=False)

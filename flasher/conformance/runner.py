@@ -9,28 +9,40 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import inf
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import flasher.conformance.cases  # noqa: F401  registers the cases
-from flasher.conformance import selection as choosing
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.elsewhere import HOST_CASES, NOT_IMPLEMENTED
-from flasher.conformance.execute import case_text, execute
-from flasher.conformance.model import (
+from flasher.conformance.catalogue import (
     CASES,
+    DESTRUCTIVE,
+    HOST_CASES,
+    NOT_IMPLEMENTED,
     Case,
-    CaseEnded,
-    CaseResult,
-    Check,
-    Outcome,
-    Requirement,
-    Status,
+    Selection,
+    case_text,
+    in_order,
+    known_cases,
+    what_is_missing,
 )
 from flasher.conformance.profile import ConformanceProfile, check_deviations
 from flasher.conformance.profile_keys import KEYS
-from flasher.conformance.report import FINAL_IMAGE_OK, Report, Rescue
 from flasher.conformance.restore import BY_POWER, Restored, is_reachable, needs_power, restore
-from flasher.conformance.selection import Selection
+from flasher.conformance.results import (
+    FINAL_IMAGE_OK,
+    CaseEnded,
+    CaseLimitReached,
+    CaseResult,
+    CaseStopped,
+    CaseVerdict,
+    Check,
+    CheckOutcome,
+    DeviceCrashed,
+    Rescue,
+    RunReport,
+    RunStopped,
+    Unsupported,
+)
 from flasher.conformance.subject import Subject
 from flasher.errors import BusError
 
@@ -52,45 +64,20 @@ _EVERYTHING: Final = Selection()
 _PLAIN: Final = RunOptions()
 
 
-class Listener(Protocol):
-    """Is told how a run goes on."""
+class RunObserver:
+    """Is told how a run goes on; this one does nothing with it."""
 
     def run_began(self, count: int) -> None:
         """So many case runs follow."""
-        ...
 
     def preparing(self, what: str) -> None:
         """The device is brought to the known state, for the reason `what`."""
-        ...
 
     def case_began(self, case: Case, repeat: int) -> None:
         """A case begins, for the `repeat`-th time."""
-        ...
 
     def case_ended(self, result: CaseResult) -> None:
         """A case has its verdict."""
-        ...
-
-
-class Silent:
-    """A listener that does nothing."""
-
-    def run_began(self, count: int) -> None:
-        """Nothing."""
-
-    def preparing(self, what: str) -> None:
-        """Nothing."""
-
-    def case_began(self, case: Case, repeat: int) -> None:
-        """Nothing."""
-
-    def case_ended(self, result: CaseResult) -> None:
-        """Nothing."""
-
-
-class _Turn(NamedTuple):
-    case: Case
-    repeat: int
 
 
 def run(
@@ -99,74 +86,177 @@ def run(
     *,
     selection: Selection = _EVERYTHING,
     options: RunOptions = _PLAIN,
-    listener: Listener | None = None,
+    observer: RunObserver | None = None,
     stopped: Callable[[], bool] = lambda: False,
-) -> Report:
+) -> RunReport:
     """Run the selected cases on a device and report; `stopped` is asked while it runs.
 
     Raises UsageError for a case, group or deviation that does not exist. An adapter that fails ends
     the run and is in the report.
     """
-    choosing.check_selection(selection)
-    check_deviations(profile, (*CASES, *NOT_IMPLEMENTED))
-    return Run(subject, profile, selection, options, listener or Silent(), stopped).go()
+    selection.check()
+    check_deviations(profile, known_cases())
+    return Run(subject, profile, options, observer or RunObserver(), stopped).go(selection.chosen())
+
+
+class CaseEnd(NamedTuple):
+    """How a case ended; `stop` is why the whole run has to end with it, mostly empty."""
+
+    verdict: CaseVerdict
+    note: str = ""
+    stop: str = ""
+
+
+def execute(case: Case, bench: Bench) -> CaseEnd:
+    """Run a case to its end, whatever that is; nothing that it does gets out of here."""
+    try:
+        case.run(bench)
+    except CaseStopped:
+        return CaseEnd(bench.judge.verdict)
+    except Unsupported as ended:
+        failed = bench.judge.verdict is CaseVerdict.FAIL
+        return CaseEnd(CaseVerdict.FAIL if failed else CaseVerdict.UNSUPPORTED, str(ended))
+    except RunStopped as ended:
+        return CaseEnd(CaseVerdict.NOT_RUN, str(ended), str(ended))
+    except (CaseLimitReached, DeviceCrashed) as ended:
+        bench.fail("the case comes to its end", ended)
+        return CaseEnd(CaseVerdict.FAIL, str(ended))
+    except BusError as error:
+        stop = f"the adapter failed in {case.id}: {error.what}"
+        return CaseEnd(CaseVerdict.ERROR, error.what, stop)
+    except Exception as error:  # noqa: BLE001  a bug of one case must not hide the others
+        why = f"the case itself failed: {type(error).__name__}: {error}"
+        return CaseEnd(CaseVerdict.ERROR, why)
+    verdict = bench.judge.verdict
+    return CaseEnd(verdict, "the case judged nothing" if verdict is CaseVerdict.ERROR else "")
 
 
 class Run:
-    """A run case by case (`begin`, `take`, `finish`, `report`), or whole (`go`). Its arguments are
-    those of `run`, which checks them.
-    """
+    """A run case by case (`begin`, `take`, `finish`, `report`), or whole (`go`)."""
 
     def __init__(
         self,
         subject: Subject,
         profile: ConformanceProfile,
-        selection: Selection,
         options: RunOptions,
-        listener: Listener,
+        observer: RunObserver,
         stopped: Callable[[], bool],
     ) -> None:
+        self.stopped = ""
+        """Why no further case is run; empty while the run goes on."""
         self._subject = subject
         self._profile = profile
-        self._selection = selection
         self._options = options
-        self._listener = listener
+        self._observer = observer
         self._began_at = subject.port.now()
         self._ends_at = self._began_at + (inf if options.limit_s is None else options.limit_s)
         self._asked_to_stop = stopped
         self._results: list[CaseResult] = []
         self._rescues: list[Rescue] = []
-        self._stopped = ""
         self._adapter_failed = False
         self._not_upgradable = ""
         self._killed_by = ""
         self._final_image = ""
 
-    def go(self) -> Report:
-        """Run all that is selected."""
-        chosen = [
-            case_id
-            for case_id in choosing.in_order((*CASES, *NOT_IMPLEMENTED))
-            if self._selection.has(case_id, CASES[case_id].requires if case_id in CASES else ())
-        ]
-        turns: list[_Turn] = []
+    def go(self, chosen: Sequence[str]) -> RunReport:
+        """Run the cases with these ids; one that this bench cannot run has its result at once."""
+        cases: list[Case] = []
         for case_id in chosen:
-            turns += self._turns(case_id)
-        self._listener.run_began(len(turns))
-        if turns:
-            self._go_over(turns)
+            case = CASES.get(case_id)
+            if case is None:
+                missing = NOT_IMPLEMENTED[case_id]
+            else:
+                missing = what_is_missing(case, self._subject, self._profile)
+            if case is None or missing:
+                self._add(CaseResult(case_id, CaseVerdict.UNSUPPORTED, note=missing))
+            else:
+                cases.append(case)
+        self._observer.run_began(len(cases) * self._options.repeat)
+        if cases:
+            self.begin()
+            for repeat in range(1, self._options.repeat + 1):
+                for case in cases:
+                    self.take(case, repeat)
+            self.finish()
         return self.report(chosen)
 
-    def report(self, chosen: Sequence[str] | None = None) -> Report:
-        """What came of it so far; `chosen` are the ids of the cases that belong to the run, else
-        those that have a result.
+    def begin(self) -> None:
+        """Flash the good image, so that the first case finds the known state."""
+        self._restore("before the first case", flash=True)
+
+    def take(self, case: Case, repeat: int = 1) -> CaseResult:
+        """Run a case, unless the run has come to its end before."""
+        if not self.stopped and self._subject.port.now() >= self._ends_at:
+            self.stopped = "the run's own time limit is over"
+        if not self.stopped and self._asked_to_stop():
+            self.stopped = "the run was stopped"
+        if self.stopped:
+            return self._add(CaseResult(case.id, CaseVerdict.NOT_RUN, repeat, note=self.stopped))
+        self._observer.case_began(case, repeat)
+        seed = f"{self._options.seed}/{case.id}/{repeat}"
+        bench = Bench(
+            self._subject, self._profile, limit_s=case.limit_s, seed=seed, stopped=self._must_stop
+        )
+        verdict, note, self.stopped = execute(case, bench)
+        self._adapter_failed = bool(self.stopped) and verdict is CaseVerdict.ERROR
+        duration_s, checks = bench.tester.elapsed_s, list(bench.judge.checks)
+        if not self.stopped:
+            trouble = self.restore_after(case.id, bench, flash=DESTRUCTIVE in case.requires)
+            if trouble:
+                verdict, wanted = CaseVerdict.FAIL, "the device is reachable afterwards"
+                checks.append(Check("", CheckOutcome.FAIL, wanted, trouble, duration_s))
+        is_known = case.id in self._profile.deviations
+        if verdict is CaseVerdict.FAIL and is_known:
+            verdict, note = CaseVerdict.DEVIATION, self._profile.deviations[case.id]
+        return self._add(
+            CaseResult(
+                case.id,
+                verdict,
+                repeat,
+                seed,
+                note,
+                tuple(checks),
+                tuple(bench.judge.measurements),
+                tuple(bench.judge.infos),
+                duration_s,
+                bench.tester.trace,
+                bench.tester.trace_dropped,
+                deviation_resolved=is_known and verdict is CaseVerdict.PASS,
+            )
+        )
+
+    def restore_after(self, what: str, bench: Bench, *, flash: bool) -> str:
+        """Bring the device back after a case, or a test of somebody else, that used `bench`; the
+        good image is flashed with `flash`, and when it may have been erased. Returns what was wrong
+        with the device, "" when nothing was.
         """
-        if chosen is None:
-            chosen = choosing.in_order({result.case_id for result in self._results})
-        order = {case_id: index for index, case_id in enumerate(chosen)}
-        self._results.sort(key=lambda result: (result.repeat, order[result.case_id]))
+        erased = flash or bench.tester.update_was_sent
+        return self._restore(f"after {what}", flash=erased, case_id=what, is_off=bench.is_off)
+
+    def finish(self) -> str:
+        """Flash the good image once more and verify it, by its version and by readback; returns
+        `FINAL_IMAGE_OK`, or what failed.
+        """
+        if self._killed_by:
+            self._final_image = "not flashed: the device could not be brought back"
+            return self._final_image
+        self._observer.preparing("at the end")
+        try:
+            done = restore(self._subject, self._profile, flash=True)
+            self._final_image = FINAL_IMAGE_OK if done.ok else done.reason
+            if done.ok and self._subject.has_readback:
+                image = self._subject.good_image
+                if self._subject.readback()[: len(image)] != image:
+                    self._final_image = "the flash does not hold the good image"
+        except (BusError, CaseEnded) as error:
+            self._final_image = error.what if isinstance(error, BusError) else str(error)
+        return self._final_image
+
+    def report(self, chosen: Sequence[str]) -> RunReport:
+        """The results so far; `chosen` are the ids of the cases that belong to the run."""
+        self._results.sort(key=lambda result: (result.repeat, chosen.index(result.case_id)))
         port = self._subject.port
-        return Report(
+        return RunReport(
             subject=self._subject.name,
             target=self._subject.target,
             bitrate_bps=port.bitrate_bps,
@@ -178,9 +268,9 @@ class Run:
             strict=self._options.strict,
             cases=tuple(case_text(case_id, self._profile) for case_id in chosen),
             results=tuple(self._results),
-            not_selected=tuple(choosing.in_order({*CASES, *NOT_IMPLEMENTED}.difference(chosen))),
+            not_selected=tuple(in_order(set(known_cases()).difference(chosen))),
             host_cases=HOST_CASES,
-            stopped=self._stopped,
+            stopped=self.stopped,
             adapter_failed=self._adapter_failed,
             not_upgradable=self._not_upgradable,
             killed_by=self._killed_by,
@@ -189,114 +279,31 @@ class Run:
             duration_s=port.now() - self._began_at,
         )
 
-    # -- the run ----------------------------------------------------------------------------------
-
-    def _turns(self, case_id: str) -> list[_Turn]:
-        """The runs of a case; one that this bench cannot run has its result at once."""
-        case = CASES.get(case_id)
-        missing = (
-            NOT_IMPLEMENTED[case_id]
-            if case is None
-            else choosing.what_is_missing(case, self._subject, self._profile)
-        )
-        if case is not None and not missing:
-            return [_Turn(case, repeat) for repeat in range(1, self._options.repeat + 1)]
-        self._add(CaseResult(case_id, Status.UNSUPPORTED, note=missing))
-        return []
-
-    def _go_over(self, turns: Sequence[_Turn]) -> None:
-        turns = sorted(turns, key=lambda turn: turn.repeat)
-        self.begin()
-        for turn in turns:
-            self.take(turn.case, turn.repeat)
-        self.finish()
-
-    def begin(self) -> None:
-        """Flash the good image, so that the first case finds the known state."""
-        self.restore("before the first case", flash=True)
-
-    @property
-    def stopped(self) -> str:
-        """Why no further case is run; empty while the run goes on."""
-        return self._stopped
-
-    def take(self, case: Case, repeat: int = 1) -> CaseResult:
-        """Run a case, unless the run has come to its end before."""
-        if not self._stopped and self._subject.port.now() >= self._ends_at:
-            self._stopped = "the run's own time limit is over"
-        if not self._stopped and self._asked_to_stop():
-            self._stopped = "the run was stopped"
-        if self._stopped:
-            return self._add(CaseResult(case.id, Status.NOT_RUN, repeat, note=self._stopped))
-        return self._run_turn(_Turn(case, repeat))
-
-    def _run_turn(self, turn: _Turn) -> CaseResult:
-        case = turn.case
-        self._listener.case_began(case, turn.repeat)
-        seed = f"{self._options.seed}/{case.id}/{turn.repeat}"
-        bench = Bench.for_case(case, self._subject, self._profile, seed, self._must_stop)
-        status, note, stop = execute(case, bench)
-        self._stopped = stop
-        self._adapter_failed = bool(stop) and status is Status.ERROR
-        checks = list(bench.findings.checks)
-        duration_s = bench.elapsed_s
-        if not self._stopped:
-            erased = bench.update_was_sent or Requirement.DESTRUCTIVE in case.requires
-            trouble = self.restore_after(case.id, bench, flash=erased)
-            if trouble:
-                checks.append(
-                    Check(
-                        "", Outcome.FAIL, "the device is reachable afterwards", trouble, duration_s
-                    )
-                )
-                status = Status.FAIL
-        is_known = case.id in self._profile.deviations
-        if status is Status.FAIL and is_known:
-            status, note = Status.DEVIATION, self._profile.deviations[case.id]
-        return self._add(
-            CaseResult(
-                case.id,
-                status,
-                turn.repeat,
-                seed,
-                note,
-                tuple(checks),
-                tuple(bench.findings.measurements),
-                tuple(bench.findings.infos),
-                duration_s,
-                bench.trace,
-                bench.trace_dropped,
-                deviation_resolved=is_known and status is Status.PASS,
-            )
-        )
-
     def _must_stop(self) -> bool:
         return self._asked_to_stop() or self._subject.port.now() >= self._ends_at
 
+    def _add(self, result: CaseResult) -> CaseResult:
+        self._results.append(result)
+        self._observer.case_ended(result)
+        return result
+
     # -- the known state --------------------------------------------------------------------------
 
-    def restore_after(self, case_id: str, bench: Bench, *, flash: bool) -> str:
-        """Bring the device back after a case, or a test of somebody else; as `restore`."""
-        return self.restore(f"after {case_id}", flash=flash, case_id=case_id, is_off=bench.is_off)
-
-    def restore(
-        self, when: str, *, flash: bool, case_id: str | None = None, is_off: bool = False
-    ) -> str:
-        """Bring the device back; returns what was wrong with it, "" when nothing was."""
-        self._listener.preparing(when)
+    def _restore(self, when: str, *, flash: bool, case_id: str = "", is_off: bool = False) -> str:
+        self._observer.preparing(when)
         try:
             if is_off:
                 self._subject.power(on=True)
-            done = self._bring_back(flash=flash, at_first=case_id is None)
+            done = self._bring_back(flash=flash, at_first=not case_id)
         except (BusError, CaseEnded) as error:
             self._adapter_failed = isinstance(error, BusError)
-            self._stopped = f"{when}: {error.what if isinstance(error, BusError) else error}"
+            self.stopped = f"{when}: {error.what if isinstance(error, BusError) else error}"
             return ""
         if not done.ok:
-            self._stopped = f"{when}, the device could not be brought back: {done.reason}"
-            self._killed_by = case_id or ""
+            self.stopped = f"{when}, the device could not be brought back: {done.reason}"
+            self._killed_by = case_id
             return done.reason
-        if case_id is not None and done.how == BY_POWER and not needs_power(self._profile):
+        if case_id and done.how == BY_POWER and not needs_power(self._profile):
             self._rescues.append(Rescue(case_id, done.how))
             return "not by the protocol; a power cycle brought it back"
         return ""
@@ -314,26 +321,3 @@ class Run:
             self._not_upgradable = done.reason
             return Restored("reset", done.reason)
         return done
-
-    def finish(self) -> None:
-        """Flash the good image once more and verify it: by its version, and by readback."""
-        if self._killed_by:
-            self._final_image = "not flashed: the device could not be brought back"
-            return
-        self._listener.preparing("at the end")
-        try:
-            done = restore(self._subject, self._profile, flash=True)
-            self._final_image = FINAL_IMAGE_OK if done.ok else done.reason
-            if done.ok and self._subject.has_readback:
-                image = self._subject.good_image
-                if self._subject.readback()[: len(image)] != image:
-                    self._final_image = "the flash does not hold the good image"
-        except (BusError, CaseEnded) as error:
-            self._final_image = error.what if isinstance(error, BusError) else str(error)
-
-    # -- results ----------------------------------------------------------------------------------
-
-    def _add(self, result: CaseResult) -> CaseResult:
-        self._results.append(result)
-        self._listener.case_ended(result)
-        return result

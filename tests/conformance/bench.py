@@ -6,12 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from flasher.conformance.bench import Bench
+from flasher.conformance.catalogue import CASES, Case, Requirement, Selection
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock
-from flasher.conformance.model import CASES, Case, CaseResult, Requirement, Status
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.report import Report
-from flasher.conformance.runner import RunOptions, run
-from flasher.conformance.selection import Selection
+from flasher.conformance.results import CaseResult, CaseVerdict, RunReport
+from flasher.conformance.runner import RunObserver, RunOptions, run
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
@@ -100,15 +99,15 @@ def subject(
     return MockSubject(target, profile=profile, make_device=maker(kind))
 
 
-def one(report: Report, case_id: str) -> CaseResult:
+def one(report: RunReport, case_id: str) -> CaseResult:
     """The result of a case that was run once."""
     (result,) = (result for result in report.results if result.case_id == case_id)
     return result
 
 
 @dataclass
-class Log:
-    """A listener that writes down what it is told."""
+class Log(RunObserver):
+    """An observer that writes down what it is told."""
 
     lines: list[str] = field(default_factory=list)
 
@@ -122,7 +121,7 @@ class Log:
         self.lines.append(f"begins {case.id} {repeat}")
 
     def case_ended(self, result: CaseResult) -> None:
-        self.lines.append(f"ends {result.case_id} {result.status.value}")
+        self.lines.append(f"ends {result.case_id} {result.verdict.value}")
 
 
 def run_case(
@@ -135,7 +134,7 @@ def run_case(
     strict: bool = False,
     before_others: bool = False,
     log: Log | None = None,
-) -> Report:
+) -> RunReport:
     """A run of one case that does `action` and is called FR-00; with `before_others`, RS-04 too."""
     CASES["FR-00"] = Case(
         "FR-00", "a test", "none", "something", "something", action, requires, limit_s=limit_s
@@ -146,14 +145,14 @@ def run_case(
             profile,
             selection=Selection(cases=("FR-00", "RS-04") if before_others else ("FR-00",)),
             options=RunOptions(strict=strict),
-            listener=log,
+            observer=log,
         )
     finally:
         del CASES["FR-00"]
 
 
-def status_of(action: Callable[[Bench], None]) -> Status:
-    return one(run_case(action), "FR-00").status
+def status_of(action: Callable[[Bench], None]) -> CaseVerdict:
+    return one(run_case(action), "FR-00").verdict
 
 
 def passes_once(bench: Bench) -> None:

@@ -8,15 +8,14 @@ from collections.abc import Callable
 import pytest
 
 from flasher.cli.conformance_run import exit_code
+from flasher.conformance.catalogue import Case, Selection
 from flasher.conformance.html_report import html_page
 from flasher.conformance.json_report import report_document, to_bytes
-from flasher.conformance.junit import junit_xml
 from flasher.conformance.mock import MockSubject
-from flasher.conformance.model import Case, Status
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.report import Report
-from flasher.conformance.runner import Silent, run
-from flasher.conformance.selection import Selection
+from flasher.conformance.reports import junit_report
+from flasher.conformance.results import CaseVerdict, RunReport
+from flasher.conformance.runner import RunObserver, run
 from flasher.errors import ExitCode
 from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
@@ -60,7 +59,7 @@ class MoodyDevice(MockDevice):
             self.power_on(now)
 
 
-class Unplugger(Silent):
+class Unplugger(RunObserver):
     """Pulls the adapter out when a case begins."""
 
     def __init__(self, subject: MockSubject, case_id: str) -> None:
@@ -72,17 +71,18 @@ class Unplugger(Silent):
             self._subject.bus.unplug()
 
 
-def assert_true_report(report: Report) -> None:
+def assert_true_report(report: RunReport) -> None:
     """Bounded, every selected case has a verdict, and all reports can be made of it."""
     assert report.duration_s < BOUND_S
     assert {result.case_id for result in report.results} == {text.id for text in report.cases}
     assert all(
         result.first_failure or result.note
         for result in report.results
-        if result.status in (Status.FAIL, Status.ERROR, Status.NOT_RUN, Status.UNSUPPORTED)
+        if result.verdict
+        in (CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.NOT_RUN, CaseVerdict.UNSUPPORTED)
     )
     assert not report.ok
-    for make in (html_page, junit_xml):
+    for make in (html_page, junit_report):
         assert make(report, started_at="", replays={}, **more_for(make))
     assert to_bytes(report_document(report, started_at="", replays={}, trace_files={}))
 
@@ -97,7 +97,7 @@ def test_a_deaf_device_was_never_judged() -> None:
     subject.device.hangs = subject.device.hangs_for_good = True
     report = run(subject, PROFILE, selection=SELECTION)
     assert_true_report(report)
-    assert report.count(Status.PASS) == report.count(Status.FAIL) == 0
+    assert report.count(CaseVerdict.PASS) == report.count(CaseVerdict.FAIL) == 0
     assert "before the first case" in report.stopped
     assert report.final_image != "verified"
     assert exit_code(report, was_stopped=False) is ExitCode.NO_ANSWER
@@ -106,7 +106,7 @@ def test_a_deaf_device_was_never_judged() -> None:
 def test_a_device_that_resets_at_random_fails_and_the_run_goes_on() -> None:
     report = run(MockSubject("bms", make_device=maker(MoodyDevice)), PROFILE, selection=SELECTION)
     assert_true_report(report)
-    assert report.count(Status.FAIL) > 0
+    assert report.count(CaseVerdict.FAIL) > 0
     assert exit_code(report, was_stopped=False) is ExitCode.PARTIAL
 
 
@@ -114,7 +114,7 @@ def test_a_device_that_resets_at_random_fails_and_the_run_goes_on() -> None:
 def test_behind_a_node_that_takes_the_whole_bus_nothing_can_be_judged() -> None:
     report = run(MockSubject("bms", others=[Babbler(0.0)]), IMPATIENT, selection=SELECTION)
     assert_true_report(report)
-    assert report.count(Status.NOT_RUN) == len(CASES)
+    assert report.count(CaseVerdict.NOT_RUN) == len(CASES)
     assert exit_code(report, was_stopped=False) in (ExitCode.NO_ANSWER, ExitCode.BUS)
 
 
@@ -133,19 +133,19 @@ def test_a_device_that_babbles_on_its_own_id_does_not_keep_the_run_from_its_end(
         MockSubject("bms", make_device=maker(BabblingDevice)), IMPATIENT, selection=SELECTION
     )
     assert_true_report(report)
-    assert report.count(Status.PASS) == 0
+    assert report.count(CaseVerdict.PASS) == 0
 
 
 @pytest.mark.parametrize("case_id", ["RS-01", "RS-03", "EN-01"])
 def test_an_adapter_unplugged_midway_leaves_the_verdicts_so_far(case_id: str) -> None:
     subject = MockSubject("bms")
-    report = run(subject, PROFILE, selection=SELECTION, listener=Unplugger(subject, case_id))
+    report = run(subject, PROFILE, selection=SELECTION, observer=Unplugger(subject, case_id))
     assert_true_report(report)
     assert f"the adapter failed in {case_id}" in report.stopped
     order = [result.case_id for result in report.results]
     for result in report.results:
-        if result.status is Status.PASS:
+        if result.verdict is CaseVerdict.PASS:
             assert order.index(result.case_id) < order.index(case_id)
         elif result.case_id == case_id:
-            assert result.status is Status.ERROR
+            assert result.verdict is CaseVerdict.ERROR
     assert exit_code(report, was_stopped=False) is ExitCode.BUS

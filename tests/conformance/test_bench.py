@@ -8,11 +8,10 @@ from typing import Any
 import pytest
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.faults import Fault, FaultKind
-from flasher.conformance.hearing import Kind
 from flasher.conformance.mock import GOOD_IMAGE, MOCK_PROFILE, SECOND_IMAGE, profile_of_mock
-from flasher.conformance.model import CaseLimitReached, CaseStopped
-from flasher.conformance.wire import RawFrame
+from flasher.conformance.results import CaseLimitReached, CaseStopped
+from flasher.conformance.tester import Fault, FaultKind
+from flasher.conformance.wire import Kind, RawFrame
 
 from .bench import PROFILE, subject
 
@@ -22,7 +21,7 @@ def made(limit_s: float = 100.0) -> Bench:
 
 
 def sent(bench: Bench) -> list[int]:
-    return [entry.frame.data[0] for entry in bench.trace if entry.sent]
+    return [entry.frame.data[0] for entry in bench.tester.trace if entry.sent]
 
 
 @pytest.mark.parametrize(
@@ -47,7 +46,7 @@ def test_a_fault_befalls_one_frame(fault: Fault, carried: list[int]) -> None:
 def test_a_frame_of_the_device_can_be_lost_on_its_way() -> None:
     bench = made()
     with bench.disturb(Fault(FaultKind.DROP, 0, incoming=True)):
-        bench.send(bench.words.reset())
+        bench.send(bench.encoder.reset())
         heard = bench.collect(0.04)
     assert [one.kind for one in heard] == [Kind.DAMAGED]
     with pytest.raises(ValueError, match="cannot be"):
@@ -58,7 +57,7 @@ def test_frames_can_be_sent_with_a_gap_and_at_a_time() -> None:
     bench = made()
     frames = [RawFrame(0x7FF, b"\0")] * 3
     bench.send(frames, gap_s=0.01, at=1.0)
-    times = [entry.at_s for entry in bench.trace]
+    times = [entry.at_s for entry in bench.tester.trace]
     assert times[0] > 1.0
     assert times[1] - times[0] > 0.01
     assert times[2] - times[1] > 0.01
@@ -68,14 +67,14 @@ def test_no_wait_goes_beyond_the_limit_of_the_case() -> None:
     bench = made(limit_s=1.0)
     with pytest.raises(CaseLimitReached):
         bench.collect(100.0)
-    assert bench.elapsed_s <= 1.0
+    assert bench.tester.elapsed_s <= 1.0
 
 
 def test_what_is_expected_and_does_not_come_ends_the_case() -> None:
     bench = made()
     with pytest.raises(CaseStopped):
         bench.expect(Kind.ACK, within_s=0.1, number=3)
-    (check,) = bench.findings.checks
+    (check,) = bench.judge.checks
     assert (check.expected, check.got) == ("ACK 3", "nothing within 0.1 s")
 
 
@@ -88,14 +87,14 @@ def test_the_patient_host_gets_an_image_through_a_lost_frame(lost: int) -> None:
     if ended.ok:
         bench.check_application(SECOND_IMAGE)
         bench.check_stored(SECOND_IMAGE)
-        assert all(check.outcome.value == "pass" for check in bench.findings.checks)
+        assert all(check.outcome.value == "pass" for check in bench.judge.checks)
 
 
 def test_power_can_be_cut_in_the_middle_of_a_flash_operation() -> None:
     bench = made()
     bench.reset_to_bootloader()
     bench.subject.cut_in_operation(0, 0.5, 0.3)
-    bench.send(bench.words.update(len(GOOD_IMAGE)))
+    bench.send(bench.encoder.update(len(GOOD_IMAGE)))
     # Torn while it was erased: no application, and the bootloader announces itself.
     assert bench.wait_for(Kind.REQUEST, within_s=0.2) is None
     assert bench.subject.take_cut()
@@ -108,7 +107,7 @@ def test_power_can_be_cut_in_the_middle_of_a_flash_operation() -> None:
 
 def test_a_device_that_is_off_the_bus_hears_nothing_for_that_long() -> None:
     bench = made()
-    bench.bus_off(0.5)
+    bench.subject.bus_off(0.5)
     assert bench.application_version(0.3) is None
     assert bench.application_version(1.0) is not None
 

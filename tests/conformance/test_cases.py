@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 
+from flasher.conformance.catalogue import CASES, GROUPS, Selection, group_of
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
-from flasher.conformance.model import CASES, Status
 from flasher.conformance.profile_keys import BY_PATH
+from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
-from flasher.conformance.selection import GROUPS, Selection
 from flasher.mock.variants import VARIANTS
 
 MINE = ("RS", "UP")
@@ -29,7 +29,7 @@ def failed(
     judged_by = profile_of_mock(subject.device.profile)
     selection = Selection(only) if only else Selection(groups=MINE)
     report = run(subject, judged_by, selection=selection)
-    return [result.case_id for result in report.results if result.status is not Status.PASS]
+    return [result.case_id for result in report.results if result.verdict is not CaseVerdict.PASS]
 
 
 @pytest.mark.parametrize("target", ["wmc", "bms"])
@@ -71,11 +71,11 @@ def test_a_choice_that_the_profile_does_not_state_fails() -> None:
         profile_of_mock(),
         selection=Selection(cases=("RS-02", "UP-08")),
     )
-    assert [result.status for result in report.results] == [Status.FAIL, Status.FAIL]
+    assert [result.verdict for result in report.results] == [CaseVerdict.FAIL, CaseVerdict.FAIL]
 
 
 def test_every_case_says_all_that_a_report_shows() -> None:
     for case_id, case in CASES.items():
-        assert case.group in GROUPS
+        assert group_of(case_id) in GROUPS
         assert all((case.title, case.clause, case.stimulus, case.expectation)), case_id
         assert set(case.choices) <= set(BY_PATH), case_id

@@ -6,11 +6,11 @@ from typing import Any
 
 import pytest
 
+from flasher.conformance.catalogue import CASES, Requirement, Selection
 from flasher.conformance.mock import MockSubject, profile_of_mock, variant_maker
-from flasher.conformance.model import CASES, CaseResult, Outcome, Requirement, Status
+from flasher.conformance.results import CaseResult, CaseVerdict, CheckOutcome
 from flasher.conformance.runner import run
-from flasher.conformance.selection import Selection
-from flasher.conformance.wire import Words
+from flasher.conformance.wire import Encoder
 
 from .verdicts import cases_of, not_passed, variants_of, verdicts
 
@@ -32,7 +32,7 @@ def result_of(case_id: str, variant: str | None = None, **powers: bool) -> CaseR
 
 def not_judged(result: CaseResult) -> list[str]:
     """What the bench could not do."""
-    return [check.expected for check in result.checks if check.outcome is Outcome.UNSUPPORTED]
+    return [check.expected for check in result.checks if check.outcome is CheckOutcome.UNSUPPORTED]
 
 
 def test_the_mock_passes() -> None:
@@ -62,25 +62,25 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, A
 @pytest.mark.no_cover
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
-    assert verdicts([WRONG[name]], name) == {WRONG[name]: Status.FAIL}
+    assert verdicts([WRONG[name]], name) == {WRONG[name]: CaseVerdict.FAIL}
 
 
 def test_one_image_and_readback_tell_a_torn_image_too() -> None:
     for name in ("starts-torn-image", "record-first"):
-        assert verdicts(["PW-01"], name, with_second_image=False) == {"PW-01": Status.FAIL}
+        assert verdicts(["PW-01"], name, with_second_image=False) == {"PW-01": CaseVerdict.FAIL}
     assert not_passed("PW-02", with_second_image=False) == []
 
 
 def test_versions_tell_a_torn_image_on_a_bench_without_readback() -> None:
     result = result_of("PW-01", "record-first", has_readback=False)
-    assert result.status is Status.FAIL
+    assert result.verdict is CaseVerdict.FAIL
     assert result.first_failure is not None
     assert "whole image" in result.first_failure.expected
 
 
 def test_a_bench_with_power_alone_judges_what_it_can_and_says_what_it_cannot() -> None:
     result = result_of("PW-01", has_readback=False, has_timed_cuts=False)
-    assert result.status is Status.PASS
+    assert result.verdict is CaseVerdict.PASS
     assert not_judged(result)[:2] == [
         "power cuts before, in and after every flash operation",
         "what was acknowledged is stored",
@@ -91,17 +91,17 @@ def test_a_bench_with_power_alone_judges_what_it_can_and_says_what_it_cannot() -
     ("case_id", "power"), [("PW-01", "has_power"), ("PW-02", "has_power"), ("BU-02", "has_bus_off")]
 )
 def test_what_a_bench_lacks_makes_a_case_unsupported(case_id: str, power: str) -> None:
-    assert result_of(case_id, None, **{power: False}).status is Status.UNSUPPORTED
+    assert result_of(case_id, None, **{power: False}).verdict is CaseVerdict.UNSUPPORTED
 
 
 def test_frames_that_meet_in_one_bit_time_are_left_to_an_injector() -> None:
     result = result_of("BU-06")
-    assert result.status is Status.PASS
+    assert result.verdict is CaseVerdict.PASS
     assert not_judged(result) == ["frames of one id that begin in the same bit time"]
 
 
 def test_others_take_nine_tenths_of_the_bus() -> None:
-    own = Words("bms").to_device
+    own = Encoder("bms").to_device
     trace = result_of("CO-01").trace
     sent = [entry for entry in trace if entry.sent and entry.frame.can_id != 0x001]
     share = sum(entry.frame.can_id != own for entry in sent) / len(sent)
@@ -124,7 +124,7 @@ def test_every_frame_of_every_message_is_disturbed() -> None:
 
 def test_power_is_cut_at_every_frame_of_an_upgrade_and_in_every_flash_operation() -> None:
     result = result_of("PW-01")
-    assert result.status is Status.PASS
+    assert result.verdict is CaseVerdict.PASS
     steps = {check.step for check in result.checks}
     assert {f"after frame {frame} of reset" for frame in (1, 2)} <= steps
     assert {f"after frame {frame} of the update command" for frame in (1, 2, 3)} <= steps

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from flasher.conformance.model import Status
+from flasher.conformance.results import CaseVerdict
 
 from .verdicts import cases_of, not_passed, variants_of, verdicts
 
@@ -20,13 +20,13 @@ def test_the_mock_passes_with_images_that_carry_a_checksum() -> None:
 
 
 def test_without_a_checksum_of_its_own_there_is_nothing_to_refuse_an_image_for() -> None:
-    assert verdicts(["EN-04"]) == {"EN-04": Status.UNSUPPORTED}
+    assert verdicts(["EN-04"]) == {"EN-04": CaseVerdict.UNSUPPORTED}
 
 
 def test_a_target_without_a_version_query_passes_all_but_the_version() -> None:
     found = verdicts(CASES, target="obc", image_checksum="crc32")
-    assert found.pop("EN-08") is Status.UNSUPPORTED
-    assert set(found.values()) == {Status.PASS}
+    assert found.pop("EN-08") is CaseVerdict.UNSUPPORTED
+    assert set(found.values()) == {CaseVerdict.PASS}
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,7 @@ def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
 def test_without_a_second_image_the_rest_of_a_row_of_upgrades_is_judged() -> None:
     found = verdicts(["EN-01", "EN-07", "EN-08"], with_second_image=False)
     assert found == {
-        "EN-01": Status.PASS,
-        "EN-07": Status.PASS,
-        "EN-08": Status.UNSUPPORTED,
+        "EN-01": CaseVerdict.PASS,
+        "EN-07": CaseVerdict.PASS,
+        "EN-08": CaseVerdict.UNSUPPORTED,
     }

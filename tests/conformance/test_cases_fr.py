@@ -13,12 +13,11 @@ from typing import Any
 import pytest
 
 from flasher.conformance.cases.vectors import VECTORS
+from flasher.conformance.catalogue import CASES, Selection
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
-from flasher.conformance.model import CASES, Outcome, Status
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.report import Report
+from flasher.conformance.results import CaseVerdict, CheckOutcome, RunReport
 from flasher.conformance.runner import run
-from flasher.conformance.selection import Selection
 from flasher.mock.variants import VARIANTS
 
 MINE = ("FR", "CR", "TM")
@@ -36,7 +35,7 @@ def report(
     target: str = "bms",
     judged_by: Mapping[str, str | float] | None = None,
     **choices: Any,
-) -> Report:
+) -> RunReport:
     """A run of `only` those cases, the profile being that of the device but for `judged_by`."""
     profile = replace(MOCK_PROFILE, **choices)
     make_device = None if name is None else variant_maker(name)
@@ -45,8 +44,8 @@ def report(
     return run(subject, ConformanceProfile(given), selection=Selection(only))
 
 
-def failed(done: Report) -> list[str]:
-    return [result.case_id for result in done.results if result.status is not Status.PASS]
+def failed(done: RunReport) -> list[str]:
+    return [result.case_id for result in done.results if result.verdict is not CaseVerdict.PASS]
 
 
 @pytest.mark.parametrize(
@@ -134,7 +133,7 @@ def test_gaps_that_no_product_promises_are_observed_only() -> None:
 def test_times_are_judged_all_together_and_tell_how_they_are_spread() -> None:
     """TM-05: one slow answer in many is in the report, with the limit that it breaks."""
     done = report("slow-sixteenth-packet", only=("TM-05",))
-    (check,) = (one for one in done.results[0].checks if one.outcome is Outcome.FAIL)
+    (check,) = (one for one in done.results[0].checks if one.outcome is CheckOutcome.FAIL)
     assert check.expected == "packet to ACK at most 500 ms"
     assert "median 1." in check.got
     assert "max 600.8 ms" in check.got

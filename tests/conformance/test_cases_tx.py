@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from flasher.conformance.model import Status
+from flasher.conformance.results import CaseVerdict
 
 from .verdicts import cases_of, not_passed, variants_of, verdicts
 
@@ -108,7 +108,7 @@ def test_an_image_without_filler_leaves_nothing_to_judge_about_it(
     whole = bytes(range(128)) * 8
     monkeypatch.setattr("flasher.conformance.bench.Bench.good_image", whole)
     found = verdicts(["TX-08"], with_second_image=False)
-    assert found == {"TX-08": Status.UNSUPPORTED}
+    assert found == {"TX-08": CaseVerdict.UNSUPPORTED}
 
 
 def test_nothing_is_begun_that_only_a_power_cut_could_end_where_power_is_not_controlled() -> None:
@@ -117,5 +117,5 @@ def test_nothing_is_begun_that_only_a_power_cut_could_end_where_power_is_not_con
         "update_in_transfer": "ignored",
         "with_power": False,
     }
-    assert verdicts(["TX-07"], **chosen) == {"TX-07": Status.UNSUPPORTED}
+    assert verdicts(["TX-07"], **chosen) == {"TX-07": CaseVerdict.UNSUPPORTED}
     assert not_passed("TX-12", "TX-13", **chosen) == []

@@ -14,12 +14,10 @@ from flasher.cli.conformance_replay import replay_commands
 from flasher.cli.conformance_run import exit_code
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases import rs
-from flasher.conformance.cases.elsewhere import NOT_IMPLEMENTED
+from flasher.conformance.catalogue import CASES, NOT_IMPLEMENTED, QUICK
 from flasher.conformance.mock import MockPort
-from flasher.conformance.model import CASES
 from flasher.conformance.profile import load_profile
 from flasher.conformance.profile_keys import KEYS
-from flasher.conformance.selection import QUICK
 from flasher.errors import BusError, ExitCode
 from tests.cli.conftest import SAMPLES, Flasher
 

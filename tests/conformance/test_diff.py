@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
+from flasher.conformance.catalogue import Selection
 from flasher.conformance.json_report import report_document, to_bytes
 from flasher.conformance.mock import MockSubject, variant_maker
 from flasher.conformance.runner import run
-from flasher.conformance.selection import Selection
 from flasher.errors import ExitCode
 from tests.cli.conftest import Flasher
 

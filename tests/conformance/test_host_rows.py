@@ -6,8 +6,7 @@ import ast
 from functools import cache
 from pathlib import Path
 
-from flasher.conformance.cases.elsewhere import HOST_CASES, NOT_IMPLEMENTED
-from flasher.conformance.model import CASES
+from flasher.conformance.catalogue import CASES, HOST_CASES, NOT_IMPLEMENTED
 from tests.loops import each
 
 from .host_rows import HOST_ROWS

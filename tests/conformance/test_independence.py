@@ -11,8 +11,8 @@ _PACKAGE = Path(flasher.conformance.__file__).parent
 _EDGES = {"mock", "real"}
 """Where the suite meets the rest of flasher."""
 _REPORTING = {
-    *("diff", "html_report", "json_report", "junit", "listing", "summary", "traces"),
-    *("opening", "plugin", "plugin_bench", "plugin_hooks"),
+    *("diff", "html_report", "json_report", "reports"),
+    *("opening", "plugin"),
 }
 """What opens a bench, and what tells about a run: neither makes nor judges a byte."""
 

@@ -14,11 +14,11 @@ import pytest
 
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
-from flasher.conformance.model import CASES, Status
+from flasher.conformance.catalogue import CASES, Selection
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.real import RealPort, RealSubject
+from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
-from flasher.conformance.selection import Selection
 from flasher.protocol.spec import WELLING
 from tests.peers.scripted_device import ScriptedDevice
 
@@ -126,9 +126,9 @@ def judged(kind: type[ScriptedDevice], cases: Sequence[str], **given: Value) -> 
     report = run(bench(device), profile, selection=Selection(cases=tuple(cases)))
     assert report.final_image == "verified"
     return {
-        result.case_id: f"{result.status.value}: {result.first_failure}"
+        result.case_id: f"{result.verdict.value}: {result.first_failure}"
         for result in report.results
-        if result.status not in (Status.PASS, Status.UNSUPPORTED)
+        if result.verdict not in (CaseVerdict.PASS, CaseVerdict.UNSUPPORTED)
     }
 
 

@@ -9,11 +9,11 @@ import pytest
 
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
+from flasher.conformance.catalogue import Selection
 from flasher.conformance.mock import GOOD_IMAGE, MOCK_PROFILE, profile_of_mock
-from flasher.conformance.model import Status, Unsupported
 from flasher.conformance.real import PowerCommand, ReadbackCommand, RealPort, RealSubject
+from flasher.conformance.results import CaseVerdict, Unsupported
 from flasher.conformance.runner import run
-from flasher.conformance.selection import Selection
 from flasher.conformance.wire import RawFrame
 from flasher.errors import BusError, UsageError
 from flasher.mock.model import MockDevice
@@ -40,9 +40,9 @@ def bench(*, has_power: bool) -> tuple[RealSubject, MockDevice]:
 def test_a_device_without_power_control_passes_what_it_can() -> None:
     real, device = bench(has_power=False)
     report = run(real, profile_of_mock(), selection=Selection(groups=("RS", "UP")))
-    statuses = {result.case_id: result.status for result in report.results}
-    assert statuses.pop("RS-05") is Status.UNSUPPORTED
-    assert set(statuses.values()) == {Status.PASS}
+    statuses = {result.case_id: result.verdict for result in report.results}
+    assert statuses.pop("RS-05") is CaseVerdict.UNSUPPORTED
+    assert set(statuses.values()) == {CaseVerdict.PASS}
     assert report.final_image == "verified"
     assert device.stored_image == GOOD_IMAGE
 
@@ -50,7 +50,7 @@ def test_a_device_without_power_control_passes_what_it_can() -> None:
 def test_power_control_by_a_function_is_used() -> None:
     real, _ = bench(has_power=True)
     report = run(real, profile_of_mock(), selection=Selection(cases=("RS-05",)))
-    assert [result.status for result in report.results] == [Status.PASS]
+    assert [result.verdict for result in report.results] == [CaseVerdict.PASS]
 
 
 def test_own_frames_that_come_back_are_not_taken_for_others() -> None:

@@ -13,16 +13,21 @@ import pytest
 from flasher.cli.conformance_documents import ConformanceDocument
 from flasher.cli.schema import Definitions
 from flasher.conformance.bench import Bench
+from flasher.conformance.catalogue import Selection
 from flasher.conformance.html_report import MESSAGES_BAD, html_page
 from flasher.conformance.json_report import BINS, CHECKS_KEPT, report_document, to_bytes
-from flasher.conformance.junit import junit_xml
 from flasher.conformance.mock import MockSubject, variant_maker
-from flasher.conformance.model import CaseResult, Check, Measurement, Outcome, Status
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.report import Report
+from flasher.conformance.reports import candump, is_traced, junit_report, trace_file_name
+from flasher.conformance.results import (
+    CaseResult,
+    CaseVerdict,
+    Check,
+    CheckOutcome,
+    Measurement,
+    RunReport,
+)
 from flasher.conformance.runner import RunOptions, run
-from flasher.conformance.selection import Selection
-from flasher.conformance.traces import candump, file_name, is_traced
 from tests.report.pages import Page, assert_self_contained, assert_visible
 
 from .bench import PROFILE, fails_once, passes_once, run_case
@@ -34,7 +39,7 @@ SUITE_KEYS: Final = {
 }
 
 
-def wrong_run(*case_ids: str, seed: str = "1") -> Report:
+def wrong_run(*case_ids: str, seed: str = "1") -> RunReport:
     """A run on a device that announces itself three times."""
     return run(
         MockSubject("bms", make_device=variant_maker("announces-three-times")),
@@ -44,31 +49,31 @@ def wrong_run(*case_ids: str, seed: str = "1") -> Report:
     )
 
 
-def with_status(status: Status, **more: Any) -> Report:
+def with_status(status: CaseVerdict, **more: Any) -> RunReport:
     """A run of one case with this verdict."""
     report = run_case(passes_once)
-    result = replace(report.results[0], status=status, **more)
+    result = replace(report.results[0], verdict=status, **more)
     return replace(report, results=(result,))
 
 
-def hostile_report() -> Report:
-    check = Check(HOSTILE, Outcome.FAIL, HOSTILE, HOSTILE * 50, 0.1)
-    report = with_status(Status.FAIL, note=HOSTILE, checks=(check,) * 99, infos=(HOSTILE,))
+def hostile_report() -> RunReport:
+    check = Check(HOSTILE, CheckOutcome.FAIL, HOSTILE, HOSTILE * 50, 0.1)
+    report = with_status(CaseVerdict.FAIL, note=HOSTILE, checks=(check,) * 99, infos=(HOSTILE,))
     return replace(report, subject=HOSTILE, stopped=HOSTILE, final_image=HOSTILE)
 
 
-def document_of(report: Report) -> dict[str, Any]:
+def document_of(report: RunReport) -> dict[str, Any]:
     made = report_document(report, started_at=AT, replays={}, trace_files={})
     loaded = json.loads(to_bytes(made))
     assert isinstance(loaded, dict)
     return loaded
 
 
-def junit_of(report: Report) -> ET.Element:
-    return ET.fromstring(junit_xml(report, started_at=AT, replays={}))  # noqa: S314  our own
+def junit_of(report: RunReport) -> ET.Element:
+    return ET.fromstring(junit_report(report, started_at=AT, replays={}))  # noqa: S314  our own
 
 
-def page_of(report: Report, **replays: str) -> str:
+def page_of(report: RunReport, **replays: str) -> str:
     commands = {(case_id.replace("_", "-"), 1): words for case_id, words in replays.items()}
     return html_page(report, started_at=AT, replays=commands, trace_files={})
 
@@ -111,7 +116,7 @@ def test_many_failed_checks_are_counted_and_the_first_ones_told() -> None:
 def test_times_are_told_with_their_histogram() -> None:
     values = [index / 1000 for index in range(1, 102)]
     measured = tuple(Measurement("t", value, 0.002) for value in values)
-    (times,) = document_of(with_status(Status.PASS, measurements=measured))["times"]
+    (times,) = document_of(with_status(CaseVerdict.PASS, measurements=measured))["times"]
     assert (times["count"], times["median_s"], times["p95_s"]) == (101, 0.051, 0.096)
     assert times["uncertainty_s"] == 0.002
     assert len(times["histogram"]["counts"]) == BINS
@@ -162,7 +167,7 @@ def assert_valid(root: ET.Element) -> None:
         assert int(root.get(key, "")) == sum(int(suite.get(key, "")) for suite in root)
 
 
-def verdict_of(report: Report) -> tuple[str, str]:
+def verdict_of(report: RunReport) -> tuple[str, str]:
     """The element that says how the one case ended, and its message."""
     root = junit_of(report)
     assert_valid(root)
@@ -178,13 +183,13 @@ def test_every_verdict_has_its_element() -> None:
     assert verdict_of(run_case(fails_once)) == ("failure", "expected one; got two")
     noted = {"note": "the reason", "checks": ()}
     for status, tag in (
-        (Status.ERROR, "error"),
-        (Status.UNSUPPORTED, "skipped"),
-        (Status.INCONCLUSIVE, "skipped"),
+        (CaseVerdict.ERROR, "error"),
+        (CaseVerdict.UNSUPPORTED, "skipped"),
+        (CaseVerdict.INCONCLUSIVE, "skipped"),
     ):
         found, message = verdict_of(with_status(status, **noted))
         assert (found, "the reason" in message) == (tag, True)
-    assert verdict_of(with_status(Status.INFO, infos=("seen",)))[0] == "system-out"
+    assert verdict_of(with_status(CaseVerdict.INFO, infos=("seen",)))[0] == "system-out"
 
 
 def test_a_deviation_is_told_and_one_that_is_none_any_more_fails_a_strict_run() -> None:
@@ -198,7 +203,7 @@ def test_a_deviation_is_told_and_one_that_is_none_any_more_fails_a_strict_run() 
 
 
 def test_a_run_that_broke_off_is_no_green_one() -> None:
-    report = with_status(Status.NOT_RUN, note="the adapter failed")
+    report = with_status(CaseVerdict.NOT_RUN, note="the adapter failed")
     root = junit_of(replace(report, stopped="the adapter failed", adapter_failed=True))
     assert_valid(root)
     assert root.get("errors") == "2"
@@ -209,7 +214,7 @@ def test_a_run_that_broke_off_is_no_green_one() -> None:
 
 
 def test_a_failure_tells_stimulus_seed_and_replay() -> None:
-    xml = junit_xml(wrong_run(), started_at=AT, replays={("RS-01", 1): "flasher x"})
+    xml = junit_report(wrong_run(), started_at=AT, replays={("RS-01", 1): "flasher x"})
     root = ET.fromstring(xml)  # noqa: S314  our own
     assert_valid(root)
     failure = root.find(".//failure")
@@ -261,7 +266,7 @@ def test_a_page_tells_stimulus_expected_got_and_the_decoded_trace() -> None:
 
 def test_times_are_drawn_for_a_desk_and_for_a_phone() -> None:
     measured = tuple(Measurement("t", index / 100, 0.002) for index in range(1, 20))
-    report = with_status(Status.PASS, measurements=measured)
+    report = with_status(CaseVerdict.PASS, measurements=measured)
     report = replace(report, uncertainty_s=0.002, timestamp_source="host")
     page = Page(page_of(report))
     assert_self_contained(page)
@@ -281,7 +286,7 @@ def test_hostile_text_is_shown_and_does_nothing() -> None:
 def test_a_page_stays_small_however_much_a_case_says() -> None:
     def talks(bench: Bench) -> None:
         for _ in range(300):
-            bench.send(bench.words.query_version())
+            bench.send(bench.encoder.query_version())
             bench.wait(0.01)
             bench.check(False, "a", "b" * 1000)
 
@@ -307,7 +312,7 @@ def test_a_trace_is_a_candump_log_with_both_directions() -> None:
     report = wrong_run("RS-01")
     (result,) = report.results
     assert is_traced(result)
-    lines = candump(result).decode("ascii").splitlines()
+    lines = candump(result.trace).decode("ascii").splitlines()
     assert len(lines) == len(result.trace)
     assert lines[0].endswith("752#55AA160742055245 T") or " 752#55AA160742055245" in lines[0]
 
@@ -315,6 +320,6 @@ def test_a_trace_is_a_candump_log_with_both_directions() -> None:
 def test_only_what_did_not_pass_has_a_trace_file_and_repeats_have_their_own() -> None:
     (passed,) = run_case(passes_once).results
     assert not is_traced(passed)
-    second = CaseResult("TX-03", Status.FAIL, repeat=2)
-    assert file_name(second) == "TX-03-2.log"
+    second = CaseResult("TX-03", CaseVerdict.FAIL, repeat=2)
+    assert trace_file_name(second) == "TX-03-2.log"
     assert not is_traced(second)

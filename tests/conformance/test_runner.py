@@ -7,12 +7,12 @@ import json
 import pytest
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.elsewhere import HOST_CASES, NOT_IMPLEMENTED
+from flasher.conformance.catalogue import CASES, HOST_CASES, NOT_IMPLEMENTED, Requirement, Selection
+from flasher.conformance.json_report import report_document, to_bytes
 from flasher.conformance.mock import MockSubject
-from flasher.conformance.model import CASES, Requirement, Status
 from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import RunOptions, run
-from flasher.conformance.selection import Selection
 from flasher.conformance.wire import RawFrame
 from flasher.errors import UsageError
 
@@ -53,7 +53,7 @@ def hang(bench: Bench) -> None:
 
 def test_a_case_passes_when_its_checks_do() -> None:
     report = run_case(passes)
-    assert one(report, "FR-00").status is Status.PASS
+    assert one(report, "FR-00").verdict is CaseVerdict.PASS
     assert report.ok
     assert report.final_image == "verified"
 
@@ -61,7 +61,7 @@ def test_a_case_passes_when_its_checks_do() -> None:
 def test_a_failed_check_is_in_the_result_with_its_step() -> None:
     report = run_case(fails)
     result = one(report, "FR-00")
-    assert result.status is Status.FAIL
+    assert result.verdict is CaseVerdict.FAIL
     failure = result.first_failure
     assert failure is not None
     assert (failure.step, failure.expected, failure.got) == ("second", "two", "three")
@@ -74,17 +74,17 @@ def test_a_required_check_ends_the_case() -> None:
         raise AssertionError
 
     result = one(run_case(stops), "FR-00")
-    assert result.status is Status.FAIL
+    assert result.verdict is CaseVerdict.FAIL
     assert len(result.checks) == 1
 
 
 def test_a_case_that_judges_nothing_is_an_error_of_the_suite() -> None:
-    assert status_of(lambda _bench: None) is Status.ERROR
+    assert status_of(lambda _bench: None) is CaseVerdict.ERROR
 
 
 def test_a_case_that_only_observes_is_information() -> None:
-    assert status_of(lambda bench: bench.info("seen")) is Status.INFO
-    assert status_of(lambda bench: bench.measure("a time", 0.1)) is Status.INFO
+    assert status_of(lambda bench: bench.info("seen")) is CaseVerdict.INFO
+    assert status_of(lambda bench: bench.measure("a time", 0.1)) is CaseVerdict.INFO
 
 
 def test_a_case_that_raises_is_an_error_and_the_run_goes_on() -> None:
@@ -93,9 +93,9 @@ def test_a_case_that_raises_is_an_error_and_the_run_goes_on() -> None:
 
     report = run_case(breaks, before_others=True)
     result = one(report, "FR-00")
-    assert result.status is Status.ERROR
+    assert result.verdict is CaseVerdict.ERROR
     assert "ZeroDivisionError" in result.note
-    assert one(report, "RS-04").status is Status.PASS
+    assert one(report, "RS-04").verdict is CaseVerdict.PASS
 
 
 def test_a_part_that_the_bench_cannot_do_is_said_and_the_rest_judged() -> None:
@@ -103,36 +103,38 @@ def test_a_part_that_the_bench_cannot_do_is_said_and_the_rest_judged() -> None:
         bench.unsupported("a thing", "no tool")
         passes(bench)
 
-    assert status_of(partly) is Status.PASS
-    assert status_of(lambda bench: bench.unsupported("a thing", "no tool")) is Status.UNSUPPORTED
+    assert status_of(partly) is CaseVerdict.PASS
+    assert (
+        status_of(lambda bench: bench.unsupported("a thing", "no tool")) is CaseVerdict.UNSUPPORTED
+    )
 
 
 def test_a_time_at_its_limit_is_inconclusive_within_the_uncertainty() -> None:
-    def timed(value_s: float) -> Status:
+    def timed(value_s: float) -> CaseVerdict:
         device = subject()
         device.port.uncertainty_s = 0.002
         action = lambda bench: bench.check_time("t", value_s, low_s=0.1, high_s=0.2)  # noqa: E731
-        return one(run_case(action, device=device), "FR-00").status
+        return one(run_case(action, device=device), "FR-00").verdict
 
-    assert timed(0.15) is Status.PASS
-    assert timed(0.199) is Status.INCONCLUSIVE
-    assert timed(0.101) is Status.INCONCLUSIVE
-    assert timed(0.21) is Status.FAIL
-    assert timed(0.05) is Status.FAIL
+    assert timed(0.15) is CaseVerdict.PASS
+    assert timed(0.199) is CaseVerdict.INCONCLUSIVE
+    assert timed(0.101) is CaseVerdict.INCONCLUSIVE
+    assert timed(0.21) is CaseVerdict.FAIL
+    assert timed(0.05) is CaseVerdict.FAIL
 
 
 def test_a_documented_deviation_is_no_failure() -> None:
     profile = ConformanceProfile(PROFILE.given, deviations={"FR-00": "by design"})
     report = run_case(fails, profile=profile)
     result = one(report, "FR-00")
-    assert (result.status, result.note) == (Status.DEVIATION, "by design")
+    assert (result.verdict, result.note) == (CaseVerdict.DEVIATION, "by design")
     assert report.ok
 
 
 def test_a_deviation_that_passes_is_reported_and_fails_a_strict_run() -> None:
     profile = ConformanceProfile(PROFILE.given, deviations={"FR-00": "by design"})
     report = run_case(passes, profile=profile)
-    assert one(report, "FR-00").status is Status.PASS
+    assert one(report, "FR-00").verdict is CaseVerdict.PASS
     assert report.resolved_deviations == ("FR-00",)
     assert report.ok
     assert not run_case(passes, profile=profile, strict=True).ok
@@ -146,7 +148,7 @@ def test_a_case_whose_requirement_is_missing_is_unsupported_with_the_reason() ->
     device.has_power = False
     report = run_case(passes, device=device, requires=frozenset({Requirement.POWER}))
     result = one(report, "FR-00")
-    assert (result.status, result.note) == (Status.UNSUPPORTED, "needs power control")
+    assert (result.verdict, result.note) == (CaseVerdict.UNSUPPORTED, "needs power control")
 
 
 def test_a_case_that_software_cannot_do_is_in_the_report_with_the_reason(
@@ -155,7 +157,7 @@ def test_a_case_that_software_cannot_do_is_in_the_report_with_the_reason(
     monkeypatch.setitem(NOT_IMPLEMENTED, "BU-99", "needs an injector")
     report = run(subject(), PROFILE, selection=Selection(cases=("BU-99",)))
     result = one(report, "BU-99")
-    assert result.status is Status.UNSUPPORTED
+    assert result.verdict is CaseVerdict.UNSUPPORTED
     assert "injector" in result.note
 
 
@@ -170,8 +172,8 @@ def test_what_is_not_selected_is_named() -> None:
 
 
 def test_a_quick_run_leaves_out_what_is_long_unless_it_is_named() -> None:
-    assert not Selection(quick=True).has("UP-01", CASES["UP-01"].requires)
-    assert Selection(quick=True, cases=("UP-01",)).has("UP-01", CASES["UP-01"].requires)
+    assert not Selection(quick=True).has("UP-01")
+    assert Selection(quick=True, cases=("UP-01",)).has("UP-01")
     assert Selection(groups=("UP",)).has("UP-01")
     assert not Selection(groups=("UP",)).has("RS-01")
 
@@ -211,17 +213,17 @@ def test_a_case_that_leaves_the_power_off_is_tidied_up_after() -> None:
         passes(bench)
 
     report = run_case(leaves_off, before_others=True)
-    assert one(report, "FR-00").status is Status.PASS
-    assert one(report, "RS-04").status is Status.PASS
+    assert one(report, "FR-00").verdict is CaseVerdict.PASS
+    assert one(report, "RS-04").verdict is CaseVerdict.PASS
 
 
 def test_a_device_that_only_a_power_cycle_brings_back_fails_the_case_and_the_run_goes_on() -> None:
     report = run_case(hang, device=subject(DeafDevice), before_others=True)
     result = one(report, "FR-00")
-    assert result.status is Status.FAIL
+    assert result.verdict is CaseVerdict.FAIL
     assert "power cycle" in (result.first_failure.got if result.first_failure else "")
     assert [rescue.case_id for rescue in report.rescues] == ["FR-00"]
-    assert one(report, "RS-04").status is Status.PASS
+    assert one(report, "RS-04").verdict is CaseVerdict.PASS
     assert report.final_image == "verified"
 
 
@@ -234,8 +236,8 @@ def test_a_device_that_is_killed_ends_the_run_and_names_the_case(has_power: bool
     report = run_case(hang, device=device, before_others=True)
     assert report.killed_by == "FR-00"
     assert "could not be brought back" in report.stopped
-    assert one(report, "FR-00").status is Status.FAIL
-    assert one(report, "RS-04").status is Status.NOT_RUN
+    assert one(report, "FR-00").verdict is CaseVerdict.FAIL
+    assert one(report, "RS-04").verdict is CaseVerdict.NOT_RUN
     assert not report.ok
     assert "not flashed" in report.final_image
 
@@ -246,7 +248,10 @@ def test_a_device_that_is_deaf_from_the_start_ends_the_run_in_bounded_time() -> 
     device.device.hangs = device.device.hangs_for_good = True
     report = run(device, PROFILE)
     assert "before the first case" in report.stopped
-    assert {result.status for result in report.results} <= {Status.NOT_RUN, Status.UNSUPPORTED}
+    assert {result.verdict for result in report.results} <= {
+        CaseVerdict.NOT_RUN,
+        CaseVerdict.UNSUPPORTED,
+    }
     assert report.killed_by == ""
     assert report.duration_s < 600
 
@@ -259,7 +264,7 @@ def test_a_device_that_cannot_be_upgraded_is_judged_all_the_same() -> None:
     )
     assert report.not_upgradable
     assert report.stopped == ""
-    assert one(report, "RS-04").status in (Status.PASS, Status.FAIL)
+    assert one(report, "RS-04").verdict in (CaseVerdict.PASS, CaseVerdict.FAIL)
     assert not report.ok
 
 
@@ -271,9 +276,9 @@ def test_an_adapter_that_is_unplugged_ends_the_run_with_a_true_report() -> None:
         bench.wait(1.0)
 
     report = run_case(unplug, device=device, before_others=True)
-    assert one(report, "FR-00").status is Status.ERROR
+    assert one(report, "FR-00").verdict is CaseVerdict.ERROR
     assert "adapter failed in FR-00" in report.stopped
-    assert one(report, "RS-04").status is Status.NOT_RUN
+    assert one(report, "RS-04").verdict is CaseVerdict.NOT_RUN
     assert not report.ok
 
 
@@ -310,7 +315,7 @@ def test_a_case_that_does_not_end_is_ended() -> None:
             bench.wait(10.0)
 
     result = one(run_case(waits, limit_s=60.0), "FR-00")
-    assert result.status is Status.FAIL
+    assert result.verdict is CaseVerdict.FAIL
     assert "own limit" in result.note
     assert result.duration_s <= 61
 
@@ -323,9 +328,9 @@ def test_a_run_that_takes_too_long_reports_the_rest_as_not_run() -> None:
         options=RunOptions(limit_s=5.0),
     )
     assert report.stopped
-    statuses = [result.status for result in report.results]
-    assert statuses[0] is Status.PASS
-    assert statuses[-1] is Status.NOT_RUN
+    statuses = [result.verdict for result in report.results]
+    assert statuses[0] is CaseVerdict.PASS
+    assert statuses[-1] is CaseVerdict.NOT_RUN
     assert report.final_image == "verified"
 
 
@@ -333,7 +338,7 @@ def test_somebody_can_stop_the_run() -> None:
     report = run(
         subject(), PROFILE, selection=Selection(cases=("RS-01", "RS-04")), stopped=lambda: True
     )
-    assert {result.status for result in report.results} == {Status.NOT_RUN}
+    assert {result.verdict for result in report.results} == {CaseVerdict.NOT_RUN}
     assert report.stopped
 
 
@@ -347,15 +352,13 @@ def test_the_same_seed_gives_the_same_report_and_chance_differs_by_case_and_repe
         drawn.append(bench.random.getrandbits(64))
         passes(bench)
 
-    reports = [run_case(draws).to_dict() for _ in range(2)]
+    reports = [run_case(draws) for _ in range(2)]
     assert reports[0] == reports[1]
     assert drawn[0] == drawn[1]
 
     def twice(seed: str) -> object:
         options = RunOptions(seed=seed, repeat=2)
-        return run(
-            subject(), PROFILE, selection=Selection(cases=("UP-01",)), options=options
-        ).to_dict()
+        return run(subject(), PROFILE, selection=Selection(cases=("UP-01",)), options=options)
 
     assert twice("7") == twice("7")
 
@@ -383,11 +386,14 @@ def test_a_listener_is_told_in_order() -> None:
 
 def test_the_report_is_json_with_everything_in_it() -> None:
     report = run(subject(), PROFILE, selection=Selection(cases=("RS-01",)))
-    document = json.loads(json.dumps(report.to_dict()))
-    assert document["ok"] is True
+    made = report_document(report, started_at="", replays={}, trace_files={})
+    document = json.loads(to_bytes(made))
+    assert document["passed"] is True
     (result,) = document["results"]
     assert result["status"] == "pass"
-    assert result["trace"][0][1:4] == ["tx", 0x752, "55aa160742055245"]
+    first = report.results[0].trace[0]
+    assert (first.sent, first.frame.can_id) == (True, 0x752)
+    assert first.frame.data.hex() == "55aa160742055245"
     assert [text["id"] for text in document["cases"]] == ["RS-01"]
     assert document["profile"]["tx_02"] == "ack"
 
@@ -395,7 +401,7 @@ def test_the_report_is_json_with_everything_in_it() -> None:
 def test_the_trace_keeps_the_newest_frames_and_counts_the_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("flasher.conformance.line.TRACE_FRAMES", 10)
+    monkeypatch.setattr("flasher.conformance.tester.TRACE_FRAMES", 10)
 
     def talks(bench: Bench) -> None:
         for number in range(25):

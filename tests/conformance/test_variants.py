@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pytest
 
-from flasher.conformance.model import CASES
+from flasher.conformance.catalogue import CASES
 from flasher.mock.variants import VARIANTS
 from tests.variant_matrix import Row, groups_passed, listed_rows, row_of
 

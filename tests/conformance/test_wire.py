@@ -5,15 +5,23 @@ from __future__ import annotations
 import pytest
 
 from flasher.conformance import wire
-from flasher.conformance.hearing import Heard, Kind, Listener, describe
-from flasher.conformance.wire import RawFrame, Words, build, split
+from flasher.conformance.wire import (
+    Decoder,
+    Encoder,
+    Kind,
+    RawFrame,
+    Received,
+    build,
+    describe,
+    split,
+)
 
-BMS = Words("bms")
+BMS = Encoder("bms")
 
 
-def listen(payloads: str, can_id: int = 0x725, gap_s: float = 0.001) -> list[Heard]:
+def listen(payloads: str, can_id: int = 0x725, gap_s: float = 0.001) -> list[Received]:
     """What is made of frames, given in hexadecimal."""
-    listener = Listener(BMS)
+    listener = Decoder(BMS)
     return [
         heard
         for index, payload in enumerate(payloads.split())
@@ -53,7 +61,7 @@ def test_the_crc_is_that_of_the_documents_example() -> None:
     ],
 )
 def test_what_the_tool_says_is_byte_exact(target: str, reset: str, update: str, end: str) -> None:
-    words = Words(target)
+    words = Encoder(target)
     assert said(words.reset()) == reset
     assert said(words.update(78351)) == update
     assert said(words.end()) == end
@@ -104,7 +112,7 @@ def test_a_message_that_stops_midway_is_damaged_once_another_begins() -> None:
     whole = "55AA0C04C2020100 0027EA05F0"
     heard = listen(f"55AA0C04C2020100 {whole}", gap_s=0.2)
     assert [one.kind for one in heard] == [Kind.DAMAGED, Kind.DAMAGED, Kind.DAMAGED]
-    listener = Listener(BMS)
+    listener = Decoder(BMS)
     frames = split(0x725, bytes.fromhex(whole.replace(" ", "")))
     times = [(frames[0], 0.0), (frames[0], 0.2), (frames[1], 0.201)]
     found = [one for frame, at in times for one in listener.feed(frame, at)]
@@ -131,7 +139,7 @@ def test_an_answer_with_other_data_is_another_message() -> None:
 
 
 def test_frames_that_are_no_payload_are_nothing() -> None:
-    listener = Listener(BMS)
+    listener = Decoder(BMS)
     for frame in (
         RawFrame(0x725, b""),
         RawFrame(0x725, b"\x55\xaa", is_extended=True),

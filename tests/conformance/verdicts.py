@@ -8,11 +8,11 @@ from typing import Any
 
 import flasher.conformance.cases  # noqa: F401  registers the cases
 from flasher.conformance.bench import Bench
-from flasher.conformance.execute import execute
+from flasher.conformance.catalogue import CASES, Case, group_of, what_is_missing
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
-from flasher.conformance.model import CASES, Case, Status
 from flasher.conformance.profile import ConformanceProfile, Value
-from flasher.conformance.selection import what_is_missing
+from flasher.conformance.results import CaseVerdict
+from flasher.conformance.runner import execute
 from flasher.mock.variants import VARIANTS
 
 SMALL_AREA = {"application_area_bytes": 34 * 1024}
@@ -28,7 +28,7 @@ def verdicts(
     with_second_image: bool = True,
     with_power: bool = True,
     **choices: Any,
-) -> dict[str, Status]:
+) -> dict[str, CaseVerdict]:
     """The verdict on each case of a device with these choices, or of that variant.
 
     The profile states what the device chooses, and `states` besides, or instead.
@@ -46,15 +46,15 @@ def verdicts(
     return {case_id: _verdict(CASES[case_id], subject, judged_by) for case_id in cases}
 
 
-def _verdict(case: Case, subject: MockSubject, profile: ConformanceProfile) -> Status:
+def _verdict(case: Case, subject: MockSubject, profile: ConformanceProfile) -> CaseVerdict:
     """As a run of this case alone, but for what a run does afterwards."""
     if what_is_missing(case, subject, profile):
-        return Status.UNSUPPORTED
-    bench = Bench.for_case(case, subject, profile, f"1/{case.id}/1", lambda: False)
+        return CaseVerdict.UNSUPPORTED
+    bench = Bench(subject, profile, limit_s=case.limit_s, seed=f"1/{case.id}/1")
     _put_image(subject)
     bench.wait(1.0)
     bench.forget()
-    return execute(case, bench).status
+    return execute(case, bench).verdict
 
 
 def _put_image(subject: MockSubject) -> None:
@@ -72,12 +72,12 @@ def _put_image(subject: MockSubject) -> None:
 def not_passed(*cases: str, **kwargs: Any) -> list[str]:
     """The cases that are not passed."""
     found = verdicts(cases, **kwargs)
-    return [case_id for case_id, status in found.items() if status is not Status.PASS]
+    return [case_id for case_id, status in found.items() if status is not CaseVerdict.PASS]
 
 
 def cases_of(group: str) -> list[str]:
     """The cases of a group."""
-    return [case_id for case_id, case in CASES.items() if case.group == group]
+    return [case_id for case_id, case in CASES.items() if group_of(case_id) == group]
 
 
 def variants_of(group: str) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""The cases, a file a group; importing this package registers them all in `model.CASES`.
+"""The cases, a file a group; importing this package registers them all in `catalogue.CASES`.
 
 How to write a case
 -------------------
@@ -8,7 +8,7 @@ How to write a case
         clause="4.1",                                    # section or reading (R10)
         stimulus="packets that begin with 00, 02 and FF",   # both texts stand in the reports
         expectation="not stored; packet 1 is accepted when it comes as it should",
-        requires={DESTRUCTIVE},                          # `model.Requirement`; what is missing on a
+        requires={DESTRUCTIVE},                          # `Requirement`; what is missing on a
         choices=("tx_01",),                              # bench makes the case `unsupported`
     )
     def wrong_start_byte(bench: Bench) -> None:
@@ -16,26 +16,28 @@ How to write a case
         bench.start_transfer(len(image))                 # from the application to request transfer
         for start in (0x00, 0x02, 0xFF):
             with bench.step(f"start byte {start:02X}"):  # names the checks inside
-                bench.send(bench.words.packet(1, 10, packet_payload(image, 1), start=start))
+                bench.send(bench.encoder.packet(1, 10, packet_payload(image, 1), start=start))
                 bench.check_packet_rejected(1)           # by the profile; the case goes on
         bench.finish(image)                              # all packets, end, application, readback
 
 - Before a case the application of `bench.good_image` runs. After it the runner brings the device
   back to that, whatever state it was left in; a case need not tidy up. One that may erase says
   DESTRUCTIVE. Only good images are ever ended: a transfer of `bench.filler(n)` is left as it is.
-- Never import from flasher.protocol, host, image or device: bytes come from `bench.words` and
-  `conformance.wire`, what is heard from `conformance.hearing`; `bench.hears_application` lets what
-  the application says to other nodes through. Faults: `with bench.disturb(Fault(...))` on the line;
-  `power_cycle`, `bus_off`, `subject.cut_in_operation` at the device, each with its requirement.
+- Never import from flasher.protocol, host, image or mock: bytes come from `bench.encoder` and
+  `conformance.wire`, what is received too; with `bench.tester.hears_application` so does what the
+  application sends to other nodes. Faults: `with bench.disturb(Fault(...))` on the line;
+  `power_cycle`, `subject.bus_off`, `subject.cut_in_operation` at the device, each with its
+  requirement.
 - `check` records and goes on, `require` and `expect` end the case; texts say what is expected and
   what was got. Judge what the catalogue says and no more: a choice (P) is read with
-  `bench.profile.choice("tx_01")`, a limit with `bench.profile.limit("ack_s")`.
+  `bench.choice("tx_01")`, a limit with `bench.limit("ack_s")`.
 - A part that this bench cannot do: `bench.unsupported(what, why)`; the whole case: `requires=`.
-- Times: `send` returns when the last frame had left (`left_at`), a `Heard` has `first_at` and `at`;
-  `check_time` judges, `measure` records. Waits are `wait`, `collect`, `wait_for`: all bounded.
+- Times: `send` returns when the last frame had left (`left_at`), a `Received` has `first_at` and
+  `at`; `check_time` judges, `measure` records. Waits are `wait`, `collect`, `wait_for`: all
+  bounded, `wait_for` and `expect` by the profile's limit for that message where none is given.
 - Chance comes from `bench.random` only, so that the seed repeats it. No loop without a bound.
 - Parameters are a table at the top of the file. One file a group, added to the imports below; what
-  software cannot do stands in `elsewhere.NOT_IMPLEMENTED` with the reason.
+  software cannot do stands in `catalogue.NOT_IMPLEMENTED` with the reason.
 """
 
 from __future__ import annotations

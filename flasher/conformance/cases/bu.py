@@ -16,13 +16,14 @@ from flasher.conformance.cases.bu_troubles import (
     off_bus_after,
     off_bus_in_answer,
 )
-from flasher.conformance.hearing import Heard, Kind
-from flasher.conformance.model import Requirement, case
+from flasher.conformance.catalogue import DESTRUCTIVE, LONG, Requirement, case
 from flasher.conformance.wire import (
     ACK,
     FEEDBACK,
     REPORT,
     REQUEST,
+    Kind,
+    Received,
     build,
     packet_count,
     packet_payload,
@@ -41,11 +42,11 @@ _REPORTS_AT_ONCE: Final = 4
     stimulus="each frame of reset, update command, packet and end of transfer dropped, doubled, "
     "delayed and swapped with the next one, in turn; frames of the answers dropped and doubled",
     expectation="the upgrade by a patient host completes correctly, or is refused explicitly",
-    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    requires={DESTRUCTIVE, LONG},
     limit_s=1800.0,
 )
 def disturbed_frames(bench: Bench) -> None:
-    delay_s = 1.5 * bench.profile.limit("inter_frame_s")
+    delay_s = 1.5 * bench.limit("inter_frame_s")
 
     def troubles(frames: int) -> Iterator[Trouble]:
         for fault in faults_of(frames, delay_s):
@@ -61,7 +62,7 @@ def disturbed_frames(bench: Bench) -> None:
     stimulus="the device's controller leaves the bus for 0.2 s before, between and after the "
     "frames of every message, and in the middle of its answers",
     expectation="the device is back, and the upgrade by a patient host completes correctly",
-    requires={Requirement.DESTRUCTIVE, Requirement.BUS_OFF},
+    requires={DESTRUCTIVE, Requirement.BUS_OFF},
     limit_s=1800.0,
 )
 def bus_off(bench: Bench) -> None:
@@ -81,7 +82,7 @@ def bus_off(bench: Bench) -> None:
     stimulus="answers that are not the device's on its own id, before its answer to each message "
     "and between two of them",
     expectation="the device does not mind them, or is back afterwards",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
 )
 def same_id(bench: Bench) -> None:
     image = bench.good_image
@@ -129,9 +130,9 @@ def _enter(bench: Bench, image: bytes, troubles: Troubles) -> None:
     """Reset and update command until request transfer. A device that hears only a part of them
     announces, runs, erases or waits for packet 1: all right, as long as it gets there in the end.
     """
-    limit = bench.profile.limit
+    limit = bench.limit
     names: list[str] = []
-    heard: Heard | None = None
+    heard: Received | None = None
     message = "reset"
     bench.forget()
     for _ in range(_ENTRIES_MAX):
@@ -139,12 +140,12 @@ def _enter(bench: Bench, image: bytes, troubles: Troubles) -> None:
         names += [f"{message}, {trouble.name}"] if trouble.name else []
         if message == "reset":
             within_s = limit("feedback_s") if trouble.name else limit("first_version_s")
-            with trouble.send(bench, bench.words.reset()):
+            with trouble.send(bench, bench.encoder.reset()):
                 heard = bench.wait_for(Kind.BOOT_VERSION, Kind.REQUEST, within_s=within_s)
         else:
-            within_s = bench.burst_s if trouble.name else limit("erase_s")
-            with trouble.send(bench, bench.words.update(len(image))) as sent:
-                heard = bench.request_or_version(sent.left_at, within_s)
+            within_s = bench.host.burst_s if trouble.name else limit("erase_s")
+            with trouble.send(bench, bench.encoder.update(len(image))) as sent:
+                heard = bench.host.request_or_version(sent.left_at, within_s)
             if heard is None and not _application_answers(bench):
                 heard = _ask_again(bench, image)
         if heard is not None and heard.kind is Kind.REQUEST:
@@ -157,13 +158,13 @@ def _enter(bench: Bench, image: bytes, troubles: Troubles) -> None:
 
 def _application_answers(bench: Bench) -> bool:
     """True when it is known that the bootloader was left; false where nobody can be asked."""
-    return bench.words.has_version_query and bench.application_version() is not None
+    return bench.encoder.has_version_query and bench.application_version() is not None
 
 
-def _ask_again(bench: Bench, image: bytes) -> Heard | None:
+def _ask_again(bench: Bench, image: bytes) -> Received | None:
     """The update command into the silence: request transfer may have been lost (UP-05)."""
-    sent = bench.send(bench.words.update(len(image)))
-    return bench.request_or_version(sent.left_at, bench.profile.limit("silence_s"))
+    sent = bench.send(bench.encoder.update(len(image)))
+    return bench.host.request_or_version(sent.left_at, bench.limit("silence_s"))
 
 
 def _send_packets(bench: Bench, image: bytes, troubles: Troubles) -> bool:
@@ -174,12 +175,12 @@ def _send_packets(bench: Bench, image: bytes, troubles: Troubles) -> bool:
     for number in range(1, total + 1):
         trouble = troubles.take("packet")
         with bench.step(f"packet {number}, {trouble.name}" if trouble.name else "packets"):
-            frames = bench.words.packet(number, total, packet_payload(image, number))
+            frames = bench.encoder.packet(number, total, packet_payload(image, number))
             with trouble.send(bench, frames):
-                heard = bench.wait_for(Kind.ACK, Kind.NAK, within_s=bench.profile.limit("ack_s"))
+                heard = bench.wait_for(Kind.ACK, Kind.NAK, within_s=bench.limit("ack_s"))
             last = ""
             if heard is None or heard.kind is not Kind.ACK or heard.number != number:
-                last = bench.insist_on_packet(image, number, began_at)
+                last = bench.host.insist_on_packet(image, number, began_at)
             if last.startswith(Kind.BOOT_VERSION.value):
                 bench.info(f"the device restarts: {trouble.name}")
                 return False
@@ -193,22 +194,20 @@ def _end(bench: Bench, image: bytes, troubles: Troubles) -> bool:
     device refused the image, twice and so explicitly (R6).
     """
     names: list[str] = []
-    heard: Heard | None = None
+    heard: Received | None = None
     # Before the device takes the silence for a pause in the transfer (TX-12).
-    give_up_at = bench.now + bench.profile.limit("pause_s") / 2
+    give_up_at = bench.now + bench.limit("pause_s") / 2
     while heard is None and bench.now < give_up_at and troubles.left["end of transfer"]:
         trouble = troubles.take("end of transfer")
         names.append(trouble.name)
-        with trouble.send(bench, bench.words.end()):
-            heard = bench.wait_for(
-                Kind.COMPLETE, Kind.NAK, within_s=bench.profile.limit("silence_s")
-            )
+        with trouble.send(bench, bench.encoder.end()):
+            heard = bench.wait_for(Kind.COMPLETE, Kind.NAK, within_s=bench.limit("silence_s"))
         if trouble.hits_answer:
             break
     if heard is not None and heard.kind is Kind.COMPLETE:
         return True
     with bench.step("; ".join(names) or "end of transfer"):
-        done = bench.insist_on_end(image)
+        done = bench.host.insist_on_end(image)
     if not done.ok:
         bench.info(f"{done.reason}: {'; '.join(names)}")
     return "refused" not in done.reason
@@ -219,7 +218,7 @@ def _end(bench: Bench, image: bytes, troubles: Troubles) -> bool:
 
 def _say_as_device(bench: Bench) -> None:
     """Whole answers, and the first frame of one, on the device's own id."""
-    can_id = bench.words.to_tool
+    can_id = bench.encoder.to_tool
     for command, data in ((FEEDBACK, b"ACK"), (REQUEST, bytes(2)), (ACK, b"\x01\x00")):
         bench.send(split(can_id, build(can_id, REPORT, command, data)))
     bench.send(split(can_id, build(can_id, REPORT, ACK, b"\x02\x00"))[:1])

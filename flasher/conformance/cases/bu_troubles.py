@@ -8,9 +8,11 @@ from contextlib import AbstractContextManager, contextmanager
 from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.faults import Fault, FaultKind
-from flasher.conformance.line import Sent
-from flasher.conformance.wire import RawFrame, packet_payload
+from flasher.conformance.tester import Fault, FaultKind, Sent
+from flasher.conformance.wire import (
+    RawFrame,
+    packet_payload,
+)
 
 _ANSWER_FRAMES: Final = 2
 """General feedback, ACK, complete: each one has two frames."""
@@ -36,7 +38,7 @@ class Troubles:
     def __init__(
         self, bench: Bench, image: bytes, make: Callable[[int], Iterator[Trouble]]
     ) -> None:
-        words = bench.words
+        words = bench.encoder
         self.left: Final = {
             "reset": deque(make(len(words.reset()))),
             "update command": deque(make(len(words.update(len(image))))),
@@ -96,7 +98,7 @@ def off_bus_after(after: int) -> Disturb:
     @contextmanager
     def send(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
         bench.send(frames[:after])
-        bench.bus_off(_OFF_BUS_S)
+        bench.subject.bus_off(_OFF_BUS_S)
         yield bench.send(frames[after:])
 
     return send
@@ -105,10 +107,10 @@ def off_bus_after(after: int) -> Disturb:
 @contextmanager
 def off_bus_in_answer(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
     """A message in whose answer the device's controller leaves the bus."""
-    before = bench.frames_received
+    before = bench.tester.frames_received
     sent = bench.send(frames)
-    give_up_at = bench.now + bench.profile.limit("ack_s")
-    while bench.frames_received == before and bench.now < give_up_at:
+    give_up_at = bench.now + bench.limit("ack_s")
+    while bench.tester.frames_received == before and bench.now < give_up_at:
         bench.wait(_POLL_S)
-    bench.bus_off(_OFF_BUS_S)
+    bench.subject.bus_off(_OFF_BUS_S)
     yield sent

@@ -10,8 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.hearing import Heard, Kind
-from flasher.conformance.model import Requirement, case
+from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
 from flasher.conformance.wire import (
     ACK,
     BOOT_VERSION,
@@ -19,8 +18,10 @@ from flasher.conformance.wire import (
     READ,
     REPORT,
     REQUEST,
+    Encoder,
+    Kind,
     RawFrame,
-    Words,
+    Received,
     build,
     packet_count,
     packet_payload,
@@ -85,29 +86,29 @@ _MEMORY_READ: Final = 0x4308
     stimulus="90 % bus load of other ids around reset, update command and packets; a node that "
     "takes the whole bus with id 001 for 1 s, in the announcements and in the transfer",
     expectation="nothing fails under load; what the babbling node delays goes on after it",
-    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    requires={DESTRUCTIVE, LONG},
     choices=("up_04_burst",),
 )
 def load(bench: Bench) -> None:
     image = bench.good_image
     total = packet_count(len(image))
     loaded = min(total, _LOADED_PACKETS)
-    limit = bench.profile.limit
+    limit = bench.limit
     with bench.step("a babbling node in the announcements"):
         bench.reset_to_bootloader()
         _babble(bench)
         bench.check_application()
     with bench.step("reset under load"):
         _load(bench, _LOAD_S)
-        bench.send(list(_under_load(bench.words.reset())))
+        bench.send(list(_under_load(bench.encoder.reset())))
         _expect_under_load(bench, Kind.BOOT_VERSION, limit("first_version_s"))
         bench.wait_to_be_heard()
     with bench.step("update command under load"):
-        bench.send(list(_under_load(bench.words.update(len(image)))))
+        bench.send(list(_under_load(bench.encoder.update(len(image)))))
         _expect_under_load(bench, Kind.REQUEST, limit("erase_s"))
     with bench.step("packets under load"):
         for number in range(1, loaded):
-            frames = bench.words.packet(number, total, packet_payload(image, number))
+            frames = bench.encoder.packet(number, total, packet_payload(image, number))
             bench.send(list(_under_load(frames)))
             heard = _expect_under_load(bench, Kind.ACK, limit("ack_s"))
             bench.require(heard.number == number, f"ACK {number}", heard)
@@ -117,7 +118,7 @@ def load(bench: Bench) -> None:
         _babble(bench)
         heard_all = bench.collect(limit("ack_s"))
         if not any(one.kind is Kind.ACK and one.number == loaded for one in heard_all):
-            trouble = bench.insist_on_packet(image, loaded, began_at)
+            trouble = bench.host.insist_on_packet(image, loaded, began_at)
             bench.require(not trouble, f"ACK {loaded}", trouble or "it")
     with bench.step("the rest"):
         bench.finish(image, loaded + 1)
@@ -130,18 +131,18 @@ def load(bench: Bench) -> None:
     stimulus="the upgrade of each other target, both sides of it, frame by frame between the "
     "frames of the device's own upgrade",
     expectation="no crosstalk: every packet is acknowledged once, and the image is right",
-    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    requires={DESTRUCTIVE, LONG},
     choices=("up_04_burst",),
 )
 def two_upgrades(bench: Bench) -> None:
     image = bench.good_image
     total = packet_count(len(image))
-    for other in bench.words.others():
+    for other in bench.encoder.others():
         with bench.step(f"beside the {other.target.upper()}"):
             bench.reset_to_bootloader()
             bench.wait_to_be_heard()
-            _between(bench, bench.words.update(len(image)), other.update(len(image)))
-            limit_s = bench.profile.limit("erase_s")
+            _between(bench, bench.encoder.update(len(image)), other.update(len(image)))
+            limit_s = bench.limit("erase_s")
             bench.expect(Kind.REQUEST, within_s=limit_s, ignoring=(Kind.BOOT_VERSION,))
             _say_as(bench, other, REQUEST, bytes(2))
             for number in range(1, total + 1):
@@ -149,7 +150,7 @@ def two_upgrades(bench: Bench) -> None:
             # A device that hears it ends here, or refuses.
             bench.send(other.end())
             _say_as(bench, other, COMPLETE, bytes(2))
-            bench.expect_silence(bench.profile.limit("silence_s"))
+            bench.expect_silence(bench.limit("silence_s"))
             bench.end_transfer()
             bench.check_application(image)
             bench.check_stored(image)
@@ -162,16 +163,16 @@ def two_upgrades(bench: Bench) -> None:
     stimulus="messages of chapter 3 to the device and between other nodes, during the "
     "announcements, before packet 1, between packets and before the end",
     expectation="ignored: no answer, and the upgrade goes on as if nothing had been said",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
 )
 def application_traffic(bench: Bench) -> None:
     image = bench.good_image
     total = packet_count(len(image))
-    traffic = list(_traffic(bench.words))
+    traffic = list(_traffic(bench.encoder))
     with bench.step("during the announcements"):
         bench.reset_to_bootloader()
         bench.send(traffic)
-        heard = bench.collect(bench.profile.limit("version_spacing_s"))
+        heard = bench.collect(bench.limit("version_spacing_s"))
         others = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
         bench.check(not others, "no answer", ", ".join(map(str, others)) or "nothing")
         bench.update(len(image))
@@ -212,14 +213,14 @@ def _load(bench: Bench, for_s: float) -> None:
         bench.wait(_FOREIGN_BITS / bench.port.bitrate_bps)
 
 
-def _expect_under_load(bench: Bench, kind: Kind, within_s: float) -> Heard:
+def _expect_under_load(bench: Bench, kind: Kind, within_s: float) -> Received:
     """The next message of that kind, while the load goes on."""
     until = bench.now + within_s
-    heard: Heard | None = None
+    heard: Received | None = None
     while heard is None and bench.now < until:
         bench.send(list(_foreign(_SHARE)))
         heard = bench.wait_for(kind, within_s=_FOREIGN_BITS / bench.port.bitrate_bps)
-    return bench.require_heard(heard, kind.value, within_s)
+    return bench.require_received(heard, kind.value, within_s)
 
 
 def _babble(bench: Bench) -> None:
@@ -240,33 +241,33 @@ def _between(bench: Bench, own: Sequence[RawFrame], others: Sequence[RawFrame]) 
     bench.send(frames)
 
 
-def _say_as(bench: Bench, other: Words, command: int, data: bytes) -> None:
+def _say_as(bench: Bench, other: Encoder, command: int, data: bytes) -> None:
     """What the other target answers."""
     bench.send(split(other.to_tool, build(other.to_tool, REPORT, command, data)))
 
 
-def _check_packet_beside(bench: Bench, other: Words, image: bytes, number: int) -> None:
+def _check_packet_beside(bench: Bench, other: Encoder, image: bytes, number: int) -> None:
     """A packet between the frames of the other target's, which has other bytes; then the other
     target's next one alone.
     """
     total = packet_count(len(image))
     payload = packet_payload(image, number)
     inverse = bytes(byte ^ 0xFF for byte in payload)
-    own = bench.words.packet(number, total, payload)
+    own = bench.encoder.packet(number, total, payload)
     _between(bench, own, other.packet(number, total, inverse))
-    bench.expect(Kind.ACK, within_s=bench.profile.limit("ack_s"), number=number)
+    bench.expect(Kind.ACK, within_s=bench.limit("ack_s"), number=number)
     _say_as(bench, other, ACK, number.to_bytes(2, "little"))
     if number < total:
         bench.send(other.packet(number + 1, total, inverse))
     if number == 1:
         _say_as(bench, other, BOOT_VERSION, other.boot_name.encode() + b"V1.0.0")
-        bench.expect_silence(bench.profile.limit("ack_s"))
+        bench.expect_silence(bench.limit("ack_s"))
 
 
 # -- chapter 3 ------------------------------------------------------------------------------------
 
 
-def _traffic(words: Words) -> Iterator[RawFrame]:
+def _traffic(words: Encoder) -> Iterator[RawFrame]:
     """All of it but what the device itself would say."""
     for can_id, mode, command, data in _REPORTS:
         if can_id & 0x0F0 != words.to_all & 0x0F0:

@@ -9,12 +9,14 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probing import PACKET_FRAMES, Probe, stream
 from flasher.conformance.cases.vectors import Exact
-from flasher.conformance.faults import Fault, FaultKind
-from flasher.conformance.hearing import Heard, Kind, describe
-from flasher.conformance.model import Requirement, case
+from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
+from flasher.conformance.tester import Fault, FaultKind
 from flasher.conformance.wire import (
     PACKET_BYTES,
+    Kind,
+    Received,
     crc,
+    describe,
     split,
 )
 
@@ -51,7 +53,7 @@ Damage = tuple[str, Callable[[bytes], bytes]]
     clause="2, 3",
     stimulus="a packet once for each of its 1152 bits, with that bit the other way round",
     expectation="none accepted; the packet is taken afterwards, and stored as it is",
-    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    requires={DESTRUCTIVE, LONG},
 )
 def single_bits(bench: Bench) -> None:
     probe = _calm_probe(bench)
@@ -72,7 +74,7 @@ def single_bits(bench: Bench) -> None:
     stimulus="packets with 2 to 8 bits in a row changed, chosen by the seed; each frame of a "
     "packet lost, doubled, swapped with the next one",
     expectation="none accepted; the packet is taken afterwards, and stored as it is",
-    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    requires={DESTRUCTIVE, LONG},
 )
 def bursts(bench: Bench) -> None:
     probe = _calm_probe(bench)
@@ -101,14 +103,14 @@ def bursts(bench: Bench) -> None:
     stimulus="update commands and packets whose CRC is for another id, leaves the id out, or "
     "stands low byte first",
     expectation="rejected; update command and packet with the right one are taken",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
 )
 def other_checksums(bench: Bench) -> None:
     probe = Probe(bench)
     kinds = list(_wrong_checksums(bench))
-    update = stream(bench.words.update(len(probe.image)))
+    update = stream(bench.encoder.update(len(probe.image)))
     with bench.step("update commands"):
-        to_device = bench.words.to_device
+        to_device = bench.encoder.to_device
         probe.enter_past(*(split(to_device, damage(update)) for _, damage in kinds))
     probe.plain()
     for kind in kinds:
@@ -124,12 +126,12 @@ def other_checksums(bench: Bench) -> None:
     clause="2, 3",
     stimulus="an upgrade, then the beginning of one by written-out messages",
     expectation="they are taken, and each answer is the written-out one to the last byte",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("tx_01",),
 )
 def vectors(bench: Bench) -> None:
-    exact, words = Exact(bench), bench.words
-    limit, image = bench.profile.limit, bench.good_image
+    exact, words = Exact(bench), bench.encoder
+    limit, image = bench.limit, bench.good_image
     with bench.step("upgrade"):
         exact.enter(words.update(len(image)))
         bench.packets(image)
@@ -137,12 +139,12 @@ def vectors(bench: Bench) -> None:
         exact.hear("complete", limit("complete_s"))
         bench.check_application(image)
     with bench.step("beginning of an upgrade"):
-        if bench.profile.number("largest_image_bytes") < _DOCUMENT_SIZE:
+        if bench.number("largest_image_bytes") < _DOCUMENT_SIZE:
             exact.enter(exact.frames("small_update"))
             return
         exact.enter(exact.frames("update"))
         packet = exact.frames("packet")
-        if bench.profile.choice("tx_01") != "silence":
+        if bench.choice("tx_01") != "silence":
             damaged = packet[3]._replace(data=bytes(8))
             bench.send([*packet[:3], damaged, *packet[4:]])
             exact.hear_first_nak(limit("ack_s"))
@@ -191,7 +193,7 @@ def _frame_faults() -> Iterator[Fault]:
 
 def _wrong_checksums(bench: Bench) -> Iterator[Damage]:
     """Ways to get a CRC that is not the right one, each of a message that is right so far."""
-    words = bench.words
+    words = bench.encoder
 
     def by(between: bytes) -> Callable[[bytes], bytes]:
         """The CRC with these bytes in place of the id."""
@@ -220,7 +222,7 @@ def _check_none_taken(
 
     `framed` says that each is over with its last frame, so that the next one need not wait.
     """
-    choice = bench.profile.choice("tx_01")
+    choice = bench.choice("tx_01")
     answers = choice in ("nak_expected", "nak_received")
     size = _SILENT_BATCH if framed and choice == "silence" else 1
     for start in range(0, len(damages), size):
@@ -228,9 +230,9 @@ def _check_none_taken(
         probe.keep_alive()
         raw = probe.raw()
         for _, damage in batch:
-            bench.send(split(bench.words.to_device, damage(raw)))
+            bench.send(split(bench.encoder.to_device, damage(raw)))
         if framed and answers:
-            one = bench.next_message(bench.profile.limit("ack_s"))
+            one = bench.next_message(bench.limit("ack_s"))
             heard = [] if one is None else [one]
         else:
             heard = bench.collect(probe.settle_s())
@@ -244,7 +246,7 @@ def _name(batch: Sequence[Damage]) -> str:
     return first if len(batch) == 1 else f"one of {len(batch)} damages, {first} to {last}"
 
 
-def _require_none_taken(bench: Bench, what: str, heard: Sequence[Heard]) -> None:
+def _require_none_taken(bench: Bench, what: str, heard: Sequence[Received]) -> None:
     """NAK or silence; which of them, with which number, is TX-01."""
     if any(one.kind is not Kind.NAK for one in heard):
         bench.require(False, f"NAK or no answer to {what}", describe(heard))  # noqa: FBT003

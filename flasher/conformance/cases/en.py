@@ -6,9 +6,14 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.tx import transfer_image
-from flasher.conformance.hearing import Heard, Kind, describe
-from flasher.conformance.model import Requirement, case
-from flasher.conformance.wire import packet_count, version_in
+from flasher.conformance.catalogue import DESTRUCTIVE, Requirement, case
+from flasher.conformance.wire import (
+    Kind,
+    Received,
+    describe,
+    packet_count,
+    version_in,
+)
 
 _RESET_PERIOD_S: Final = 0.2
 """A tool repeats a command at this interval (4.3)."""
@@ -25,7 +30,7 @@ _UPGRADE_KINDS: Final = (Kind.REQUEST, Kind.ACK, Kind.NAK, Kind.COMPLETE, Kind.F
     stimulus="all packets, then end of transfer; a restart afterwards",
     expectation="complete within the limit, then the new application, at once or through the "
     "bootloader (en_03), and again after the restart",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("en_03",),
 )
 def end(bench: Bench) -> None:
@@ -34,15 +39,15 @@ def end(bench: Bench) -> None:
     bench.packets(image)
     bench.end_transfer()
     with bench.step("after complete"):
-        heard = bench.wait_for(Kind.BOOT_VERSION, within_s=bench.profile.limit("first_version_s"))
-        restarts = bench.profile.choice("en_03") == "restarts"
+        heard = bench.wait_for(Kind.BOOT_VERSION, within_s=bench.limit("first_version_s"))
+        restarts = bench.choice("en_03") == "restarts"
         expected = "the bootloader announces itself" if restarts else "no boot version"
         bench.check(restarts == (heard is not None), expected, heard or "no boot version")
         bench.check_application(image)
         bench.check_stored(image)
     with bench.step("after a restart"):
         bench.reset_to_bootloader()
-        bench.collect(bench.burst_s)
+        bench.collect(bench.host.burst_s)
         bench.check_application(image)
 
 
@@ -54,7 +59,7 @@ def end(bench: Bench) -> None:
     "again after complete",
     expectation="NAK, and the transfer goes on or can be begun anew; the second one is answered as "
     "the profile says (en_02)",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("en_02", "rs_03"),
 )
 def end_early_and_twice(bench: Bench) -> None:
@@ -78,9 +83,9 @@ def end_early_and_twice(bench: Bench) -> None:
 
 def _end_refused(bench: Bench) -> None:
     """End of transfer is answered by a NAK, whatever its number (R6), and by nothing else."""
-    bench.send(bench.words.end())
-    bench.expect(Kind.NAK, within_s=bench.profile.limit("complete_s"))
-    bench.expect_silence(bench.profile.limit("ack_s"), ignoring=(Kind.BOOT_VERSION,))
+    bench.send(bench.encoder.end())
+    bench.expect(Kind.NAK, within_s=bench.limit("complete_s"))
+    bench.expect_silence(bench.limit("ack_s"), ignoring=(Kind.BOOT_VERSION,))
 
 
 def _goes_on(bench: Bench, image: bytes, stored: int) -> int:
@@ -88,19 +93,17 @@ def _goes_on(bench: Bench, image: bytes, stored: int) -> int:
     new one.
     """
     bench.send_packet(image, stored + 1)
-    heard = bench.wait_for(
-        Kind.ACK, Kind.NAK, Kind.BOOT_VERSION, within_s=bench.profile.limit("ack_s")
-    )
+    heard = bench.wait_for(Kind.ACK, Kind.NAK, Kind.BOOT_VERSION, within_s=bench.limit("ack_s"))
     if heard is not None and (heard.kind, heard.number) == (Kind.ACK, stored + 1):
         bench.check(True, f"ACK {stored + 1}", heard)  # noqa: FBT003
         return 1
     bench.info(f"after packet {stored}, an early end of transfer ends the transfer")
-    bench.send(bench.words.reset())
-    within_s = bench.profile.limit("refused_s") + bench.profile.limit("first_version_s")
+    bench.send(bench.encoder.reset())
+    within_s = bench.limit("refused_s") + bench.limit("first_version_s")
     found = heard if heard is not None and heard.kind is Kind.BOOT_VERSION else None
     found = found or bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
-    if bench.profile.choice("rs_03") == "announces":
-        bench.require_heard(found, f"ACK {stored + 1} or boot version", within_s)
+    if bench.choice("rs_03") == "announces":
+        bench.require_received(found, f"ACK {stored + 1} or boot version", within_s)
     bench.update(len(image))
     bench.packets(image, 1, stored)
     return 0
@@ -108,8 +111,8 @@ def _goes_on(bench: Bench, image: bytes, stored: int) -> int:
 
 def _check_second_end(bench: Bench, first_answer: Kind) -> None:
     """End of transfer once more, right after its answer."""
-    bench.send(bench.words.end())
-    heard = bench.collect(bench.profile.limit("ack_s"))
+    bench.send(bench.encoder.end())
+    heard = bench.collect(bench.limit("ack_s"))
     answers = [one.kind for one in heard if one.kind in _UPGRADE_KINDS]
     # An application that runs already may confirm what it does not know (R17).
     silence: list[list[Kind]] = [[], [Kind.FEEDBACK]]
@@ -117,7 +120,7 @@ def _check_second_end(bench: Bench, first_answer: Kind) -> None:
         "same_answer": [[first_answer]],
         "silence": silence,
         "either": [[first_answer], *silence],
-    }[bench.profile.choice("en_02")]
+    }[bench.choice("en_02")]
     expected = " or ".join(_in_words(kinds) for kinds in allowed)
     bench.check(answers in allowed, expected, describe(_of_upgrade(heard)))
 
@@ -127,7 +130,7 @@ def _in_words(kinds: list[Kind]) -> str:
     return ", ".join(kind.value for kind in kinds) or "silence"
 
 
-def _of_upgrade(heard: list[Heard]) -> list[Heard]:
+def _of_upgrade(heard: list[Received]) -> list[Received]:
     return [one for one in heard if one.kind in _UPGRADE_KINDS]
 
 
@@ -137,7 +140,7 @@ def _of_upgrade(heard: list[Heard]) -> list[Heard]:
     clause="4.2, 5; R6, R7",
     stimulus="the good image with another checksum, end of transfer twice; then the good image",
     expectation="NAK, the second time too (en_02); it is not started, and the device is rescuable",
-    requires={Requirement.DESTRUCTIVE, Requirement.CHECKSUM},
+    requires={DESTRUCTIVE, Requirement.CHECKSUM},
     choices=("en_02", "en_04", "rs_03"),
 )
 def wrong_checksum(bench: Bench) -> None:
@@ -145,16 +148,16 @@ def wrong_checksum(bench: Bench) -> None:
     image = bench.good_image[:-1] + bytes((bench.good_image[-1] ^ 0xFF,))
     bench.start_transfer(len(image))
     bench.packets(image)
-    bench.send(bench.words.end())
-    bench.expect(Kind.NAK, within_s=bench.profile.limit("complete_s"))
+    bench.send(bench.encoder.end())
+    bench.expect(Kind.NAK, within_s=bench.limit("complete_s"))
     with bench.step("end of transfer again"):
         _check_second_end(bench, Kind.NAK)
     with bench.step("afterwards"):
-        within_s = bench.profile.limit("refused_s")
+        within_s = bench.limit("refused_s")
         heard = bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
-        if bench.profile.choice("rs_03") == "announces":  # else it may listen silently
-            bench.require_heard(heard, Kind.BOOT_VERSION.value, within_s)
-        bench.wait(bench.burst_s)
+        if bench.choice("rs_03") == "announces":  # else it may listen silently
+            bench.require_received(heard, Kind.BOOT_VERSION.value, within_s)
+        bench.wait(bench.host.burst_s)
         runs = bench.application_runs(_NO_APPLICATION_S)
         bench.check(not runs, "no application runs", "it answers" if runs else "no answer")
     with bench.step("the good image"):
@@ -169,7 +172,7 @@ def wrong_checksum(bench: Bench) -> None:
     stimulus="three upgrades, each one begun as soon as the one before is complete, to a smaller "
     "image and back",
     expectation="each one right: nothing of the image before is left in it",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
 )
 def in_a_row(bench: Bench) -> None:
     second = bench.subject.second_image
@@ -196,16 +199,16 @@ def _enter_at_once(bench: Bench) -> None:
     """To the bootloader from a device that may be just starting its application, which hears no
     reset: it is repeated until something is heard (4.3).
     """
-    limit = bench.profile.limit
+    limit = bench.limit
     within_s = limit("start_s") + limit("first_version_s")
     deadline = bench.now + within_s
-    heard: Heard | None = None
+    heard: Received | None = None
     while heard is None and bench.now < deadline:
-        bench.send(bench.words.reset())
+        bench.send(bench.encoder.reset())
         heard = bench.wait_for(Kind.FEEDBACK, Kind.BOOT_VERSION, within_s=_RESET_PERIOD_S)
     if heard is not None and heard.kind is Kind.FEEDBACK:
         heard = bench.wait_for(Kind.BOOT_VERSION, within_s=limit("first_version_s"))
-    bench.require_heard(heard, Kind.BOOT_VERSION.value, within_s)
+    bench.require_received(heard, Kind.BOOT_VERSION.value, within_s)
 
 
 @case(
@@ -214,10 +217,10 @@ def _enter_at_once(bench: Bench) -> None:
     clause="5.1, 1540",
     stimulus="version query after an upgrade to another version, and after one back",
     expectation="the application reports the version of the image that it is",
-    requires={Requirement.DESTRUCTIVE, Requirement.SECOND_IMAGE},
+    requires={DESTRUCTIVE, Requirement.SECOND_IMAGE},
 )
 def version(bench: Bench) -> None:
-    before = bench.application_version(bench.profile.limit("start_s"))
+    before = bench.application_version(bench.limit("start_s"))
     for image in (bench.second_image(), bench.good_image):
         wanted = version_in(image)
         if wanted is None:
@@ -227,5 +230,5 @@ def version(bench: Bench) -> None:
             bench.start_transfer(len(image))
             bench.packets(image)
             bench.end_transfer()
-            before = bench.application_version(bench.profile.limit("start_s"))
+            before = bench.application_version(bench.limit("start_s"))
             bench.check(before == wanted, f"version {wanted}", f"{before!a}")

@@ -16,12 +16,13 @@ from flasher.conformance.cases.fr_stimuli import (
     wrong_lengths,
 )
 from flasher.conformance.cases.probing import ACCEPTED, EITHER, REJECTED, Probe, is_as, stream
-from flasher.conformance.hearing import Kind
-from flasher.conformance.model import Requirement, Unsupported, case
+from flasher.conformance.catalogue import DESTRUCTIVE, case
+from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
     PACKET,
     UPDATE,
     WRITE,
+    Kind,
     RawFrame,
     split,
 )
@@ -51,14 +52,14 @@ _UNKNOWN_MODES: Final = (0x00, 0x0D, 0x17, 0x96, 0xFF)
     clause="2, R19",
     stimulus="update command and packets in CAN frames of 1 to 8 bytes, all alike or by chance",
     expectation="decoded alike, or rejected (fr_01); packets in frames of 8 bytes are accepted",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("fr_01", "up_04_burst"),
 )
 def splits(bench: Bench) -> None:
-    choice, to_device = bench.profile.choice("fr_01"), bench.words.to_device
+    choice, to_device = bench.choice("fr_01"), bench.encoder.to_device
     probe = Probe(bench)
     with bench.step("update command in frames of 5 bytes"):
-        update = stream(bench.words.update(len(probe.image)))
+        update = stream(bench.encoder.update(len(probe.image)))
         probe.enter(split(to_device, update, 5), choice)
     for size in _SIZES:
         with bench.step(f"packet in frames of {size} bytes"):
@@ -77,12 +78,12 @@ def splits(bench: Bench) -> None:
     clause="2, 2.2",
     stimulus="junk in frames of its own, in the frame of the header, 55 55 AA, 55 ending a frame",
     expectation="resynchronised on the next message; one in the frame of the junk: fr_02",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("fr_02",),
 )
 def junk(bench: Bench) -> None:
-    to_device = bench.words.to_device
-    in_frame = {"found": ACCEPTED, "lost": REJECTED}.get(bench.profile.choice("fr_02"), EITHER)
+    to_device = bench.encoder.to_device
+    in_frame = {"found": ACCEPTED, "lost": REJECTED}.get(bench.choice("fr_02"), EITHER)
     probe = Probe(bench)
     probe.begin()
     long_junk = bytes(bench.random.choice(b"\x00\x11\x16\xaa\xf0") for _ in range(_LONG_JUNK_BYTES))
@@ -104,7 +105,7 @@ def junk(bench: Bench) -> None:
     clause="2",
     stimulus="packets full of 55 AA and F0, at frame boundaries too; whole messages inside data",
     expectation="no false start or end: each one acknowledged once, and stored as it is",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
 )
 def header_in_data(bench: Bench) -> None:
     payloads = dict(treacherous_payloads(bench))
@@ -122,18 +123,18 @@ def header_in_data(bench: Bench) -> None:
     clause="2",
     stimulus="packets with another last byte than F0; a packet behind a wrong tail, in its frame",
     expectation="discarded, the next message is taken; the one in the same frame: fr_04",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("fr_04",),
 )
 def wrong_tail(bench: Bench) -> None:
-    to_device = bench.words.to_device
-    behind = {"rescanned": ACCEPTED, "dropped": REJECTED}.get(bench.profile.choice("fr_04"), EITHER)
+    to_device = bench.encoder.to_device
+    behind = {"rescanned": ACCEPTED, "dropped": REJECTED}.get(bench.choice("fr_04"), EITHER)
     probe = Probe(bench)
     probe.begin()
     for tail in _WRONG_TAILS:
         with bench.step(f"packet that ends with {tail:02X}"):
             probe.discard(split(to_device, probe.raw()[:-1] + bytes((tail,))))
-    query = stream(bench.words.query_version())
+    query = stream(bench.encoder.query_version())
     for tail in (0x00, 0x55):
         with bench.step(f"query that ends with {tail:02X}, packet in the same frame"):
             broken = query[:-1] + bytes((tail,))
@@ -148,7 +149,7 @@ def wrong_tail(bench: Bench) -> None:
     stimulus="messages that end before their length is used up, then a packet: after the "
     "inter-frame timeout, and at once",
     expectation="a packet is taken after the timeout; at once it may be taken or lost",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
 )
 def broken_off(bench: Bench) -> None:
     probe = Probe(bench)
@@ -156,11 +157,11 @@ def broken_off(bench: Bench) -> None:
     at_once = []
     for name, raw in messages_broken_off(bench):
         with bench.step(name):
-            bench.send(split(bench.words.to_device, raw))
+            bench.send(split(bench.encoder.to_device, raw))
             bench.wait(probe.settle_s())
             probe.plain()
         with bench.step(f"{name}, a packet at once"):
-            frames = split(bench.words.to_device, raw) + probe.frames()
+            frames = split(bench.encoder.to_device, raw) + probe.frames()
             if probe.offer(frames, EITHER):
                 at_once.append(name)
     bench.info(f"the packet that followed at once was taken after: {', '.join(at_once) or 'none'}")
@@ -173,7 +174,7 @@ def broken_off(bench: Bench) -> None:
     stimulus="length 0 and 1; length other than the command's second byte + 2; 255 with an "
     "unknown command; all with the right CRC",
     expectation="discarded, no overflow: the next packet is taken, nothing else is stored",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
 )
 def wrong_length(bench: Bench) -> None:
     probe = Probe(bench)
@@ -182,7 +183,7 @@ def wrong_length(bench: Bench) -> None:
     for index in range(len(wrong_lengths(bench, probe.raw()))):
         name, raw = wrong_lengths(bench, probe.raw())[index]
         with bench.step(name):
-            probe.discard(split(bench.words.to_device, raw))
+            probe.discard(split(bench.encoder.to_device, raw))
     probe.check_stored()
 
 
@@ -192,18 +193,18 @@ def wrong_length(bench: Bench) -> None:
     clause="2",
     stimulus="update command padded to 8 bytes with 00, FF, AA, 55 and F0; padded end of transfer",
     expectation="as the profile says (fr_07): padding ignored, or the message rejected",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("fr_07", "up_04_burst"),
 )
 def padded(bench: Bench) -> None:
-    choice = {"ignored": ACCEPTED}.get(bench.profile.choice("fr_07"), bench.profile.choice("fr_07"))
+    choice = {"ignored": ACCEPTED}.get(bench.choice("fr_07"), bench.choice("fr_07"))
     probe = Probe(bench, bench.filler(1))
     for index, filler in enumerate(_PADDINGS):
         with bench.step(f"update command padded with {filler:02X}"):
             # In the midst of a transfer where the device starts over, which takes no pause (UP-08).
-            if index and bench.profile.choice("up_08") != "starts_over":
+            if index and bench.choice("up_08") != "starts_over":
                 bench.leave_transfer()
-            update = pad(bench.words.update(len(probe.image)), filler)
+            update = pad(bench.encoder.update(len(probe.image)), filler)
             probe.enter(update, choice, reset=not index)
             probe.plain()
     image = bench.good_image
@@ -211,10 +212,10 @@ def padded(bench: Bench) -> None:
         bench.leave_transfer()
         bench.update(len(image))
         bench.packets(image)
-        sent = bench.send(pad(bench.words.end(), 0x00))
-        within_s = bench.profile.limit("complete_s")
+        sent = bench.send(pad(bench.encoder.end(), 0x00))
+        within_s = bench.limit("complete_s")
         if choice != ACCEPTED:  # what follows needs a transfer that still lasts (TX-12)
-            within_s = min(within_s, bench.profile.limit("pause_s") / 2)
+            within_s = min(within_s, bench.limit("pause_s") / 2)
         heard = bench.wait_for(Kind.COMPLETE, within_s=within_s)
         bench.check(
             is_as(choice, heard is not None), f"end of transfer {choice}", heard or "nothing"
@@ -234,11 +235,11 @@ def padded(bench: Bench) -> None:
     stimulus="a query and the update command without a pause; queries and a packet; the last "
     "packet again and the next one",
     expectation="both decoded",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("tx_02", "up_04_burst"),
 )
 def back_to_back(bench: Bench) -> None:
-    words = bench.words
+    words = bench.encoder
     probe = Probe(bench)
     with bench.step("query, then update command"):
         query = words.query_version()
@@ -253,11 +254,11 @@ def back_to_back(bench: Bench) -> None:
         frames = probe.frames()
         bench.send(probe.previous() + frames)
         number = probe.number
-        if bench.profile.choice("tx_02") == "nak_next":
-            bench.expect(Kind.NAK, within_s=bench.profile.limit("ack_s"), number=number)
+        if bench.choice("tx_02") == "nak_next":
+            bench.expect(Kind.NAK, within_s=bench.limit("ack_s"), number=number)
         else:
-            bench.expect(Kind.ACK, within_s=bench.profile.limit("ack_s"), number=number - 1)
-        bench.expect(Kind.ACK, within_s=bench.profile.limit("ack_s"), number=number)
+            bench.expect(Kind.ACK, within_s=bench.limit("ack_s"), number=number - 1)
+        bench.expect(Kind.ACK, within_s=bench.limit("ack_s"), number=number)
 
 
 @case(
@@ -266,12 +267,12 @@ def back_to_back(bench: Bench) -> None:
     clause="2",
     stimulus="frames of 0 bytes, remote, extended and error frames between the frames of a packet",
     expectation="never taken for payload: the packet is acknowledged",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
 )
 def no_payload(bench: Bench) -> None:
     probe = Probe(bench)
     probe.begin()
-    for name, stranger in strangers(bench.words.to_device):
+    for name, stranger in strangers(bench.encoder.to_device):
         with bench.step(f"{name} between all frames"):
             try:
                 bench.send([stranger])
@@ -289,10 +290,10 @@ def no_payload(bench: Bench) -> None:
     clause="2, 4.1",
     stimulus="packets and update commands with modes that nobody has; commands that nobody has",
     expectation="rejected with NAK or silence; update command and packets are taken as before",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
 )
 def unknown(bench: Bench) -> None:
-    words = bench.words
+    words = bench.encoder
     probe = Probe(bench)
     update = words.update_text + struct.pack("<I", len(probe.image))
     with bench.step("while it announces itself"):
@@ -311,4 +312,4 @@ def unknown(bench: Bench) -> None:
 
 def _of_command(bench: Bench, command: int) -> list[RawFrame]:
     """A write of that command, with as many zeros as it says."""
-    return bench.words.message(WRITE, command, bytes(command & 0xFF))
+    return bench.encoder.message(WRITE, command, bytes(command & 0xFF))

@@ -32,7 +32,7 @@ def split_by_chance(bench: Bench, raw: bytes) -> Iterator[RawFrame]:
     at = 0
     while at < len(raw):
         size = bench.random.randint(1, _FRAME_BYTES)
-        yield RawFrame(bench.words.to_device, raw[at : at + size])
+        yield RawFrame(bench.encoder.to_device, raw[at : at + size])
         at += size
 
 
@@ -44,7 +44,7 @@ def pad(frames: list[RawFrame], filler: int) -> list[RawFrame]:
 
 def treacherous_payloads(bench: Bench) -> Iterator[tuple[str, bytes]]:
     """Data that looks like the beginning or the end of messages, whatever the frame boundaries."""
-    words, to_device = bench.words, bench.words.to_device
+    words, to_device = bench.encoder, bench.encoder.to_device
     yield "55 AA all over", _HEADER * (PACKET_BYTES // 2)
     yield "55 AA all over, odd", (b"\x00" + _HEADER * PACKET_BYTES)[:PACKET_BYTES]
     yield "F0 all over", b"\xf0" * PACKET_BYTES
@@ -66,7 +66,7 @@ def treacherous_payloads(bench: Bench) -> Iterator[tuple[str, bytes]]:
 
 def messages_broken_off(bench: Bench) -> Iterator[tuple[str, bytes]]:
     """Messages, by name, that end before their length is used up."""
-    words = bench.words
+    words = bench.encoder
     packet = stream(words.packet(1, 1, bytes(range(PACKET_BYTES))))
     query = build(words.to_device, READ, QUERY_VERSION)
     yield "length 255, two bytes follow", b"\x55\xaa\x16\xff\x77\xfd\x01\x02"
@@ -103,7 +103,7 @@ def wrong_lengths(bench: Bench, packet: bytes) -> list[tuple[str, bytes]]:
 def _sealed(bench: Bench, length: int, rest: bytes) -> bytes:
     """A message of any length field, with the CRC over all that is there."""
     body = bytes((WRITE, length)) + rest
-    covered = _HEADER + struct.pack(">H", bench.words.to_device) + body
+    covered = _HEADER + struct.pack(">H", bench.encoder.to_device) + body
     return _HEADER + body + struct.pack(">I", crc(covered)) + b"\xf0"
 
 

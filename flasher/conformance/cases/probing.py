@@ -8,8 +8,15 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.hearing import Heard, Kind, describe
-from flasher.conformance.wire import PACKET_BYTES, RawFrame, packet_count, packet_payload
+from flasher.conformance.wire import (
+    PACKET_BYTES,
+    Kind,
+    RawFrame,
+    Received,
+    describe,
+    packet_count,
+    packet_payload,
+)
 
 ACCEPTED: Final = "accepted"
 REJECTED: Final = "rejected"
@@ -42,7 +49,7 @@ class Probe:
     """
 
     def __init__(self, bench: Bench, image: bytes | None = None) -> None:
-        largest = bench.profile.number("largest_image_bytes")
+        largest = bench.number("largest_image_bytes")
         wanted = bench.filler(_PACKETS) if image is None else image
         # Some bytes more, as a whole number of packets is a matter of its own (UP-01).
         self.image = (wanted + _REST)[:largest]
@@ -65,7 +72,7 @@ class Probe:
             bench.reset_to_bootloader()
             bench.wait_to_be_heard()
         sent = bench.send(frames)
-        heard = bench.request_or_version(sent.left_at, bench.profile.limit("erase_s"))
+        heard = bench.host.request_or_version(sent.left_at, bench.limit("erase_s"))
         taken = heard is not None and heard.kind is Kind.REQUEST
         bench.check(is_as(wanted, taken), f"update command {wanted}", heard or "no answer")
         if not taken:
@@ -80,12 +87,10 @@ class Probe:
         bench.reset_to_bootloader()
         for frames in stimuli:
             bench.send(frames)
-        is_burst = bench.profile.number("versions") > 1
-        half_s = bench.profile.limit("window_s") / 2
-        deadline = bench.now + (
-            4 * bench.profile.limit("version_spacing_s") if is_burst else half_s
-        )
-        heard: list[Heard] = []
+        is_burst = bench.number("versions") > 1
+        half_s = bench.limit("window_s") / 2
+        deadline = bench.now + (4 * bench.limit("version_spacing_s") if is_burst else half_s)
+        heard: list[Received] = []
         while (one := bench.next_message(deadline - bench.now)) is not None:
             heard.append(one)
             if one.kind is not Kind.NAK:
@@ -98,7 +103,7 @@ class Probe:
 
     def settle_s(self) -> float:
         """Surely longer than a bootloader waits for the rest of a message."""
-        return 2 * self._bench.profile.limit("inter_frame_s")
+        return 2 * self._bench.limit("inter_frame_s")
 
     # -- bytes ------------------------------------------------------------------------------------
 
@@ -120,7 +125,7 @@ class Probe:
 
     def _packet(self, number: int) -> list[RawFrame]:
         total = packet_count(len(self.image))
-        return self._bench.words.packet(number, total, packet_payload(self.image, number))
+        return self._bench.encoder.packet(number, total, packet_payload(self.image, number))
 
     # -- stimuli ----------------------------------------------------------------------------------
 
@@ -135,7 +140,7 @@ class Probe:
         """Send the next packet when none was taken for so long that the device may soon give the
         transfer up (TX-12).
         """
-        if self._bench.now - self._taken_at > self._bench.profile.limit("pause_s") / 2:
+        if self._bench.now - self._taken_at > self._bench.limit("pause_s") / 2:
             self._bench.wait(self.settle_s())
             self.plain()
 
@@ -192,7 +197,7 @@ class Probe:
         way (PW-01), and what the profile lets the device keep in memory.
         """
         bench = self._bench
-        written = (self.number - 2) * PACKET_BYTES - bench.profile.number("buffer_bytes")
+        written = (self.number - 2) * PACKET_BYTES - bench.number("buffer_bytes")
         if written > 0:
             bench.check_stored(self.image[:written])
         else:
@@ -202,15 +207,15 @@ class Probe:
         self.number += 1
         self._taken_at = self._bench.now
 
-    def _is_taken(self, heard: Heard) -> bool:
+    def _is_taken(self, heard: Received) -> bool:
         return heard.kind is Kind.ACK and heard.number == self.number
 
-    def _answers(self) -> list[Heard]:
+    def _answers(self) -> list[Received]:
         """What is heard up to the ACK of the next packet and shortly behind it."""
         bench = self._bench
         # Long enough, too, that nothing of it is left when the next packet comes.
-        deadline = bench.now + max(bench.profile.limit("ack_s"), self.settle_s())
-        heard: list[Heard] = []
+        deadline = bench.now + max(bench.limit("ack_s"), self.settle_s())
+        heard: list[Received] = []
         while (one := bench.next_message(deadline - bench.now)) is not None:
             heard.append(one)
             if self._is_taken(one):

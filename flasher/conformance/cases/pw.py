@@ -15,9 +15,14 @@ from flasher.conformance.cases.pw_cuts import (
     cuts_at_frames,
     name_of,
 )
-from flasher.conformance.hearing import Heard, Kind
-from flasher.conformance.model import Requirement, case
-from flasher.conformance.wire import PACKET_BYTES, packet_count, version_in
+from flasher.conformance.catalogue import DESTRUCTIVE, LONG, POWER, case
+from flasher.conformance.wire import (
+    PACKET_BYTES,
+    Kind,
+    Received,
+    packet_count,
+    version_in,
+)
 
 _OFF_S: Final = 0.3
 _SHARES: Final = (0.0, 0.5, 1.0)
@@ -49,16 +54,16 @@ class _World:
     "before, in and after every flash operation",
     expectation="the device announces itself again, starts nothing but a whole image, and can be "
     "upgraded; what was acknowledged is stored",
-    requires={Requirement.DESTRUCTIVE, Requirement.POWER, Requirement.LONG},
+    requires={DESTRUCTIVE, POWER, LONG},
     choices=("rs_03",),
     limit_s=7200.0,
 )
 def cuts(bench: Bench) -> None:
     world = _world(bench)
     _say_what_is_not_judged(bench, world)
-    for frames in range(1, len(bench.words.reset()) + 1):
+    for frames in range(1, len(bench.encoder.reset()) + 1):
         with bench.step(f"after frame {frames} of reset"):
-            bench.send(bench.words.reset()[:frames])
+            bench.send(bench.encoder.reset()[:frames])
             _cut(bench)
             _check_after_cut(bench, world)
     total = packet_count(len(world.new))
@@ -80,7 +85,7 @@ def cuts(bench: Bench) -> None:
     "between two of them, before and at end of transfer",
     expectation="the device announces itself again, starts nothing but a whole image, and can be "
     "upgraded",
-    requires={Requirement.DESTRUCTIVE, Requirement.POWER, Requirement.LONG},
+    requires={DESTRUCTIVE, POWER, LONG},
     choices=("rs_03",),
     limit_s=3600.0,
 )
@@ -88,7 +93,7 @@ def second_cut(bench: Bench) -> None:
     world = _world(bench)
     _say_what_is_not_judged(bench, world)
     total = packet_count(len(world.new))
-    update, end = len(bench.words.update(1)), len(bench.words.end())
+    update, end = len(bench.encoder.update(1)), len(bench.encoder.end())
     second = [Cut(0, 1), Cut(0, update), Cut(1, 9), Cut(1, PACKET_FRAMES)]
     if total <= FAR_PACKET:
         second += [Cut(total, PACKET_FRAMES), Cut(total + 1, end - 1), Cut(total + 1, end)]
@@ -96,12 +101,8 @@ def second_cut(bench: Bench) -> None:
         with bench.step("first cut"):
             _go_to(bench, world, Cut(1, 9))
             _cut(bench)
-            heard = bench.wait_for(
-                Kind.BOOT_VERSION, within_s=bench.profile.limit("first_version_s")
-            )
-            bench.require_heard(
-                heard, Kind.BOOT_VERSION.value, bench.profile.limit("first_version_s")
-            )
+            heard = bench.wait_for(Kind.BOOT_VERSION, within_s=bench.limit("first_version_s"))
+            bench.require_received(heard, Kind.BOOT_VERSION.value, bench.limit("first_version_s"))
         with bench.step(f"second cut {name_of(cut, total)}"):
             world.runs = False
             _go_to(bench, world, cut)
@@ -121,7 +122,7 @@ def _world(bench: Bench) -> _World:
 
 def _say_what_is_not_judged(bench: Bench, world: _World) -> None:
     same = version_in(world.old) == version_in(world.new) or version_in(world.old) is None
-    if not bench.subject.has_readback and (same or not bench.words.has_version_query):
+    if not bench.subject.has_readback and (same or not bench.encoder.has_version_query):
         bench.unsupported(
             "what runs after a cut is a whole image",
             "it takes readback, or a version query and two images of different versions",
@@ -142,7 +143,7 @@ def _enter(bench: Bench, world: _World) -> None:
 
 def _go_to(bench: Bench, world: _World, cut: Cut) -> None:
     """The upgrade up to those frames."""
-    total, words = packet_count(len(world.new)), bench.words
+    total, words = packet_count(len(world.new)), bench.encoder
     if not cut.packet:
         if world.runs:
             bench.reset_to_bootloader()
@@ -171,11 +172,11 @@ def _check_upgrade(bench: Bench) -> None:
         bench.check_upgrade()
 
 
-def _check_after_cut(bench: Bench, world: _World, first: Heard | None = None) -> None:
+def _check_after_cut(bench: Bench, world: _World, first: Received | None = None) -> None:
     """The device announces itself (`first` was heard), or starts an application, but only a whole
     one.
     """
-    limit = bench.profile.limit
+    limit = bench.limit
     within_s = limit("first_version_s")
     if first is None:
         first = bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
@@ -185,10 +186,10 @@ def _check_after_cut(bench: Bench, world: _World, first: Heard | None = None) ->
         bench.require(world.runs, Kind.BOOT_VERSION.value, "neither that nor an application")
         return
     spacing_s = limit("version_spacing_s") + limit("version_spacing_tolerance_s")
-    heard = bench.collect(bench.burst_s + 2 * spacing_s)
+    heard = bench.collect(bench.host.burst_s + 2 * spacing_s)
     announced = 1 + sum(one.kind is Kind.BOOT_VERSION for one in heard)
     # More than a burst: it has nothing to start.
-    world.runs = announced <= bench.profile.number("versions") and _check_whole(bench, world)
+    world.runs = announced <= bench.number("versions") and _check_whole(bench, world)
     if not world.runs:
         bench.check(True, "no application is started", "none")  # noqa: FBT003
 
@@ -198,8 +199,8 @@ def _check_whole(bench: Bench, world: _World) -> bool:
     runs.
     """
     images = [world.old, world.new] if world.end_was_sent else [world.old]
-    if bench.words.has_version_query:
-        version = bench.application_version(bench.profile.limit("start_s"))
+    if bench.encoder.has_version_query:
+        version = bench.application_version(bench.limit("start_s"))
         if version is None:
             return False
         known = [version_in(image) for image in images]
@@ -245,13 +246,13 @@ def _cut_operations(bench: Bench, world: _World) -> None:
                 _check_after_cut(bench, world, version)
 
 
-def _upgrade_until_cut(bench: Bench, world: _World) -> Heard | None:
+def _upgrade_until_cut(bench: Bench, world: _World) -> Received | None:
     """Go on until the device announces itself again, and return that; None at the very end."""
-    limit = bench.profile.limit
+    limit = bench.limit
     back_s = _OFF_S + limit("first_version_s")
     bench.forget()
-    sent = bench.send(bench.words.update(len(world.new)))
-    heard = bench.request_or_version(sent.left_at, limit("erase_s") + back_s)
+    sent = bench.send(bench.encoder.update(len(world.new)))
+    heard = bench.host.request_or_version(sent.left_at, limit("erase_s") + back_s)
     for number in range(1, packet_count(len(world.new)) + 1):
         if heard is None or heard.kind is Kind.BOOT_VERSION:
             return heard
@@ -260,7 +261,7 @@ def _upgrade_until_cut(bench: Bench, world: _World) -> Heard | None:
     if heard is None or heard.kind is Kind.BOOT_VERSION:
         return heard
     world.end_was_sent = True
-    bench.send(bench.words.end())
+    bench.send(bench.encoder.end())
     heard = bench.wait_for(Kind.COMPLETE, Kind.BOOT_VERSION, within_s=limit("complete_s") + back_s)
     return heard if heard is not None and heard.kind is Kind.BOOT_VERSION else None
 
@@ -268,7 +269,7 @@ def _upgrade_until_cut(bench: Bench, world: _World) -> Heard | None:
 def _cut_after_ack(bench: Bench, world: _World) -> None:
     """What the device says it has received correctly is not lost with the power (R10)."""
     written = 2 * PACKET_BYTES
-    last = packet_count(written + bench.profile.number("buffer_bytes"))
+    last = packet_count(written + bench.number("buffer_bytes"))
     with bench.step(f"after ACK {last}"):
         if not bench.subject.has_readback or packet_count(len(world.new)) <= last:
             why = f"it takes readback and {last + 1} packets"

@@ -6,7 +6,9 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.wire import packet_count
+from flasher.conformance.wire import (
+    packet_count,
+)
 
 PACKET_FRAMES: Final = 18
 """CAN frames of one packet."""
@@ -32,7 +34,7 @@ def cuts_at_frames(bench: Bench, image: bytes) -> Iterator[Cut]:
     """Every frame of every message; of a large image's packets between the first and the last one
     some, by chance.
     """
-    for frames in range(1, len(bench.words.update(len(image))) + 1):
+    for frames in range(1, len(bench.encoder.update(len(image))) + 1):
         yield Cut(0, frames)
     total = packet_count(len(image))
     for frames in range(1, PACKET_FRAMES + 1):
@@ -46,7 +48,7 @@ def cuts_at_frames(bench: Bench, image: bytes) -> Iterator[Cut]:
     if total > 1:
         for frames in _FEW_FRAMES if total > FAR_PACKET else range(1, PACKET_FRAMES + 1):
             yield Cut(total, frames)
-    for frames in range(1, len(bench.words.end()) + 1):
+    for frames in range(1, len(bench.encoder.end()) + 1):
         yield Cut(total + 1, frames)
 
 

@@ -5,16 +5,18 @@ from __future__ import annotations
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.hearing import Heard, Kind, describe
-from flasher.conformance.model import Requirement, case
+from flasher.conformance.catalogue import DESTRUCTIVE, POWER, TIMING, case
 from flasher.conformance.wire import (
     READ,
     REPORT,
     RESET,
     RESET_TEXT,
     WRITE,
+    Encoder,
+    Kind,
     RawFrame,
-    Words,
+    Received,
+    describe,
 )
 
 _SPACING: Final = "boot version to boot version"
@@ -36,11 +38,11 @@ _IGNORED_RESETS: Final = (
     clause="4.2, 1 and 2",
     stimulus="reset to the running application",
     expectation="general feedback, then boot version 4 times, 50 ms apart",
-    requires={Requirement.TIMING},
+    requires={TIMING},
 )
 def reset(bench: Bench) -> None:
-    limit = bench.profile.limit
-    sent = bench.send(bench.words.reset())
+    limit = bench.limit
+    sent = bench.send(bench.encoder.reset())
     feedback = bench.expect(Kind.FEEDBACK, within_s=limit("feedback_s"))
     bench.measure("reset to general feedback", feedback.at - sent.left_at)
     first = bench.expect(Kind.BOOT_VERSION, within_s=limit("first_version_s"))
@@ -57,21 +59,21 @@ def reset(bench: Bench) -> None:
     choices=("rs_02",),
 )
 def reset_again(bench: Bench) -> None:
-    count = bench.profile.number("versions")
+    count = bench.number("versions")
     with bench.step("two resets in a row"):
-        bench.send(bench.words.reset() + bench.words.reset())
-        first = bench.wait_for(Kind.BOOT_VERSION, within_s=bench.profile.limit("first_version_s"))
+        bench.send(bench.encoder.reset() + bench.encoder.reset())
+        first = bench.wait_for(Kind.BOOT_VERSION, within_s=bench.limit("first_version_s"))
         bench.require(first is not None, "boot version", first or "nothing")
         _check_count(bench, count - 1, "one burst, of which the first was heard")
         bench.check_application()
     with bench.step("reset after the second boot version"):
         bench.reset_to_bootloader()
         bench.next_version()
-        bench.send(bench.words.reset())
-        if bench.profile.choice("rs_02") == "ignored":
+        bench.send(bench.encoder.reset())
+        if bench.choice("rs_02") == "ignored":
             _check_count(bench, count - 2, "the burst goes on as if nothing had happened")
         else:
-            bench.expect(Kind.BOOT_VERSION, within_s=bench.profile.limit("first_version_s"))
+            bench.expect(Kind.BOOT_VERSION, within_s=bench.limit("first_version_s"))
             _check_count(bench, count - 1, "a whole burst anew")
         bench.check_application()
 
@@ -82,23 +84,23 @@ def reset_again(bench: Bench) -> None:
     clause="4.2, 2; R14",
     stimulus="silence after the announcements, with an application and without one",
     expectation="a valid application is started; without one the bootloader stays (rs_03)",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("rs_03",),
 )
 def no_update(bench: Bench) -> None:
-    count = bench.profile.number("versions")
+    count = bench.number("versions")
     with bench.step("with an application"):
         bench.reset_to_bootloader()
-        bench.collect(bench.burst_s)
+        bench.collect(bench.host.burst_s)
         bench.check_application()
     with bench.step("without an application"):
         bench.without_application()
-        if bench.profile.choice("rs_03") == "announces":
+        if bench.choice("rs_03") == "announces":
             _check_announces_on(bench, 2 * count + 1)
             bench.check_upgrade()
         else:
-            spacing_s = bench.profile.limit("version_spacing_s")
-            heard = _versions(bench.collect(3 * count * spacing_s + bench.burst_s))
+            spacing_s = bench.limit("version_spacing_s")
+            heard = _versions(bench.collect(3 * count * spacing_s + bench.host.burst_s))
             got = f"{len(heard) + 1} boot versions"
             bench.check(len(heard) == count - 1, f"one burst of {count}, then silence", got)
             bench.update(len(bench.good_image))
@@ -113,7 +115,7 @@ def no_update(bench: Bench) -> None:
     expectation="no restart; the application runs on",
 )
 def no_reset(bench: Bench) -> None:
-    words = bench.words
+    words = bench.encoder
     for step, mode, command, data in _IGNORED_RESETS:
         _check_ignored(bench, step, words.message(mode, command, data))
     for other in words.others():
@@ -127,12 +129,12 @@ def no_reset(bench: Bench) -> None:
     clause="4.2, 1",
     stimulus="power off and on",
     expectation="boot version 4 times, 50 ms apart",
-    requires={Requirement.POWER, Requirement.TIMING},
+    requires={POWER, TIMING},
 )
 def power_up(bench: Bench) -> None:
     bench.power_cycle()
     on_at = bench.now
-    first = bench.expect(Kind.BOOT_VERSION, within_s=bench.profile.limit("first_version_s"))
+    first = bench.expect(Kind.BOOT_VERSION, within_s=bench.limit("first_version_s"))
     bench.measure("power to first boot version", first.at - on_at)
     _check_burst(bench, first)
 
@@ -141,16 +143,16 @@ def _check_announces_on(bench: Bench, wanted: int) -> None:
     """So many boot versions more. How often they come is not said anywhere (R14), but a tool does
     not wait longer for the next one than for the first.
     """
-    limit_s, heard = bench.profile.limit("first_version_s"), 0
+    limit_s, heard = bench.limit("first_version_s"), 0
     while heard < wanted and bench.wait_for(Kind.BOOT_VERSION, within_s=limit_s) is not None:
         heard += 1
     expected = f"it announces on, {wanted} boot versions more"
     bench.check(heard == wanted, expected, f"{heard} boot versions")
 
 
-def _check_burst(bench: Bench, first: Heard) -> None:
+def _check_burst(bench: Bench, first: Received) -> None:
     """The rest of a burst after its first boot version, the spacing in it, and its end."""
-    limit, count = bench.profile.limit, bench.profile.number("versions")
+    limit, count = bench.limit, bench.number("versions")
     spacing_s, tolerance_s = limit("version_spacing_s"), limit("version_spacing_tolerance_s")
     burst = [first]
     for _ in range(count - 1):
@@ -162,24 +164,24 @@ def _check_burst(bench: Bench, first: Heard) -> None:
             high_s=spacing_s + tolerance_s,
         )
     for heard in burst:
-        _check_announcement(bench, heard, bench.words)
+        _check_announcement(bench, heard, bench.encoder)
     _check_count(bench, 0, f"no more than {count} boot versions")
 
 
-def _check_announcement(bench: Bench, heard: Heard, words: Words) -> None:
+def _check_announcement(bench: Bench, heard: Received, words: Encoder) -> None:
     ok = heard.boot_name == words.boot_name and heard.has_good_version_text
     bench.check(ok, f"boot version of name {words.boot_name} and text Vx.x.x", heard)
 
 
 def _check_count(bench: Bench, count: int, expected: str) -> None:
     """So many boot versions and nothing else until burst and window are over."""
-    heard = bench.collect(bench.burst_s + bench.profile.limit("first_version_s") / 4)
+    heard = bench.collect(bench.host.burst_s + bench.limit("first_version_s") / 4)
     others = [one for one in heard if one.kind not in (Kind.BOOT_VERSION, Kind.FEEDBACK)]
     bench.check(len(_versions(heard)) == count, f"{expected}: {count}", describe(heard))
     bench.check(not others, "nothing but boot versions", describe(others))
 
 
-def _versions(heard: list[Heard]) -> list[Heard]:
+def _versions(heard: list[Received]) -> list[Received]:
     return [one for one in heard if one.kind is Kind.BOOT_VERSION]
 
 

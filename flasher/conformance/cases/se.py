@@ -9,8 +9,7 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.tx import answers, transfer_image
 from flasher.conformance.cases.up import check_update_rejected
-from flasher.conformance.hearing import Heard, Kind, describe
-from flasher.conformance.model import Requirement, case
+from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
 from flasher.conformance.wire import (
     BOOT_VERSION,
     END,
@@ -22,7 +21,10 @@ from flasher.conformance.wire import (
     REPORT,
     UPDATE,
     WRITE,
+    Kind,
     RawFrame,
+    Received,
+    describe,
     packet_count,
     split,
 )
@@ -51,7 +53,7 @@ _SETTINGS: Final = range(0x30, 0x50)
     stimulus="header after header, data without an end, long and short messages of no use: to the "
     "application, in the announcements and in a transfer",
     expectation="it goes on as if nothing had come; the window and the pause (tx_12) end in time",
-    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    requires={DESTRUCTIVE, LONG},
     choices=("tx_12",),
 )
 def endless(bench: Bench) -> None:
@@ -67,17 +69,17 @@ def endless(bench: Bench) -> None:
     for number, (name, frames) in enumerate(floods.items(), 1):
         with bench.step(f"in a transfer, before packet {number}: {name}"):
             bench.send(frames)
-            bench.collect(bench.profile.limit("ack_s") + bench.profile.limit("inter_frame_s"))
+            bench.collect(bench.limit("ack_s") + bench.limit("inter_frame_s"))
             bench.packet(image, number)
     with bench.step("in a pause of the transfer"):
-        if bench.profile.choice("tx_12") == "announces":
+        if bench.choice("tx_12") == "announces":
             _drip_into_pause(bench)
         else:
             bench.finish(image, len(floods) + 1)
 
 
 def _floods(bench: Bench) -> dict[str, list[RawFrame]]:
-    words = bench.words
+    words = bench.encoder
     # As reads: an application has nothing to write.
     long_message = words.message(READ, _UNKNOWN + 253, bytes(range(253)))
     short_message = words.message(READ, _UNKNOWN)
@@ -94,37 +96,39 @@ def _floods(bench: Bench) -> dict[str, list[RawFrame]]:
 def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
     """Until the window is over, and on: the application has to start meanwhile."""
     bench.reset_to_bootloader()
-    ends_at = bench.now + bench.burst_s
-    for _ in range(1 + int(bench.burst_s / (_FLOOD_FRAMES * 0.0004))):
+    ends_at = bench.now + bench.host.burst_s
+    for _ in range(1 + int(bench.host.burst_s / (_FLOOD_FRAMES * 0.0004))):
         if bench.now < ends_at:
             bench.send(frames)
-    if bench.words.has_version_query:
-        limit_s = bench.profile.limit("start_s")
-        heard = _drip_until(bench, Kind.VERSION_INFORMATION, limit_s, bench.words.query_version())
+    if bench.encoder.has_version_query:
+        limit_s = bench.limit("start_s")
+        heard = _drip_until(bench, Kind.VERSION_INFORMATION, limit_s, bench.encoder.query_version())
         bench.check(
             heard is not None, f"an application that answers within {limit_s:g} s", heard or "none"
         )
         # Many were asked for: a late answer is none to what follows.
-        bench.collect(bench.profile.limit("silence_s"))
+        bench.collect(bench.limit("silence_s"))
     bench.check_application()
 
 
 def _drip_into_pause(bench: Bench) -> None:
-    limit_s = bench.profile.limit("pause_s") + bench.profile.limit("first_version_s")
+    limit_s = bench.limit("pause_s") + bench.limit("first_version_s")
     heard = _drip_until(bench, Kind.BOOT_VERSION, limit_s, [])
     bench.check(heard is not None, f"boot version within {limit_s:g} s", heard or "none")
 
 
-def _drip_until(bench: Bench, kind: Kind, within_s: float, query: list[RawFrame]) -> Heard | None:
+def _drip_until(
+    bench: Bench, kind: Kind, within_s: float, query: list[RawFrame]
+) -> Received | None:
     """Useless messages and bytes, now and then, with `query` between, until `kind` is heard."""
     deadline = bench.now + within_s
-    words = bench.words
+    words = bench.encoder
     drops = cycle((words.message(READ, _UNKNOWN), split(words.to_device, _HEADS * 2)))
-    heard: Heard | None = None
+    heard: Received | None = None
     while heard is None and bench.now < deadline:
         # Quiet for long enough that the query is not taken for the rest of the bytes.
         bench.send([*next(drops)])
-        bench.wait(bench.profile.limit("inter_frame_s") + _DRIP_S if query else 0.0)
+        bench.wait(bench.limit("inter_frame_s") + _DRIP_S if query else 0.0)
         if query:
             bench.send(query)
         heard = bench.wait_for(kind, within_s=_DRIP_S)
@@ -141,7 +145,7 @@ def _drip_until(bench: Bench, kind: Kind, within_s: float, query: list[RawFrame]
     stimulus="random frames and random intact messages (by the seed) to the application, in the "
     "announcements, while it erases, before, amid and after the packets, and after complete",
     expectation="reachable, and the old or the new application is intact",
-    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    requires={DESTRUCTIVE, LONG},
     choices=("up_08",),
 )
 def noise(bench: Bench) -> None:
@@ -152,14 +156,14 @@ def noise(bench: Bench) -> None:
     with bench.step("the announcements"):
         bench.reset_to_bootloader()
         _make_noise(bench)
-        bench.collect(bench.burst_s)
+        bench.collect(bench.host.burst_s)
         bench.check_application()
         bench.check_stored(image)
     with bench.step("while it erases"):
         bench.reset_to_bootloader()
-        bench.send(bench.words.update(len(image)))
+        bench.send(bench.encoder.update(len(image)))
         _make_noise(bench)
-        bench.wait_for(Kind.REQUEST, within_s=bench.profile.limit("erase_s"))
+        bench.wait_for(Kind.REQUEST, within_s=bench.limit("erase_s"))
         done = _carry_on(bench, image, 0)
     for stored in (1, 3, packet_count(len(image))):
         with bench.step(f"after packet {stored}"):
@@ -178,9 +182,9 @@ def _carry_on(bench: Bench, image: bytes, stored: int) -> int:
     """The next step of a transfer, the end after the last packet. A device that was thrown off has
     to take a whole upgrade instead. Returns the packets stored, 0 without a transfer.
     """
-    limit = bench.profile.limit
+    limit = bench.limit
     bench.collect(limit("ack_s") + limit("inter_frame_s"))
-    heard: Heard | None
+    heard: Received | None
     if stored < packet_count(len(image)):
         bench.send_packet(image, stored + 1)
         heard = bench.wait_for(
@@ -189,12 +193,12 @@ def _carry_on(bench: Bench, image: bytes, stored: int) -> int:
         if heard is not None:
             return stored + 1
     else:
-        bench.send(bench.words.end())
+        bench.send(bench.encoder.end())
         heard = bench.wait_for(Kind.COMPLETE, within_s=limit("complete_s"))
         if heard is not None:
             return 0
     bench.info(f"the noise after packet {stored} ended the transfer")
-    done = bench.upgrade(image, blind=bench.profile.choice("up_08") == "starts_over")
+    done = bench.upgrade(image, blind=bench.choice("up_08") == "starts_over")
     bench.require(done.ok, "the transfer goes on, or the device can be upgraded", done.reason)
     bench.check_application(image)
     return 0
@@ -202,7 +206,7 @@ def _carry_on(bench: Bench, image: bytes, stored: int) -> int:
 
 def _make_noise(bench: Bench) -> None:
     """Frames of any bytes, then messages of any content with a right CRC."""
-    chance, words = bench.random, bench.words
+    chance, words = bench.random, bench.encoder
     frames = []
     for _ in range(_WILD_FRAMES):
         data = chance.randbytes(chance.randrange(9))
@@ -210,7 +214,7 @@ def _make_noise(bench: Bench) -> None:
             data = (_HEADS[: chance.randrange(1, 5)] + data)[:8]
         frames.append(RawFrame(words.to_device, data))
     bench.send(frames)
-    bench.wait(bench.profile.limit("inter_frame_s") + _DRIP_S if chance.randrange(2) else 0.0)
+    bench.wait(bench.limit("inter_frame_s") + _DRIP_S if chance.randrange(2) else 0.0)
     bench.send([frame for _ in range(_WILD_MESSAGES) for frame in _wild_message(bench)])
 
 
@@ -220,18 +224,18 @@ def _wild_message(bench: Bench) -> list[RawFrame]:
     """
     chance = bench.random
     if chance.randrange(2):
-        command = chance.choice((*_LIKELY, bench.words.reset_command))
+        command = chance.choice((*_LIKELY, bench.encoder.reset_command))
         data = chance.randbytes(command & 0xFF)
     else:
         data = chance.randbytes(chance.choice((0, 1, 2, 8, 31, 133, 253)))
         command = chance.randrange(256) << 8 | len(data)
     mode = chance.choice((READ, WRITE, REPORT, chance.randrange(256)))
-    is_reset = command == bench.words.reset_command
+    is_reset = command == bench.encoder.reset_command
     if mode == WRITE and command >> 8 in _SETTINGS and not is_reset:
         mode = READ
     if mode == WRITE and command == END:
         data = bytes((data[0] & 0xFB,))  # never the true one
-    return bench.words.message(mode, command, data)
+    return bench.encoder.message(mode, command, data)
 
 
 # -- addresses ------------------------------------------------------------------------------------
@@ -244,14 +248,14 @@ def _wild_message(bench: Bench) -> list[RawFrame]:
     stimulus="update command for sizes beyond the area, also such as become small when they are "
     "rounded up; packets with number 0 and beyond the total, with the total to match as well",
     expectation="rejected; nothing of it is stored, and application and bootloader are unharmed",
-    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    requires={DESTRUCTIVE, LONG},
     choices=("up_02", "tx_01"),
 )
 def outside(bench: Bench) -> None:
-    area = bench.profile.number("application_bytes")
+    area = bench.number("application_bytes")
     sizes = (area + 1, IMAGE_BYTES_MAX + 1, 0x8000_0000, 0xFFFF_FF80, 0xFFFF_FF81, 0xFFFF_FFFF)
     for size in dict.fromkeys(size for size in sizes if size > area):
-        check_update_rejected(bench, f"size {size:X}", bench.words.update(size))
+        check_update_rejected(bench, f"size {size:X}", bench.encoder.update(size))
     image = transfer_image(bench)
     total = packet_count(len(image))
     marker = bench.random.randbytes(PACKET_BYTES)
@@ -271,7 +275,7 @@ def outside(bench: Bench) -> None:
 
 def _number_sender(bench: Bench, total: int, marker: bytes) -> Callable[[int], None]:
     """What sends packets with impossible numbers: none of them may be acknowledged."""
-    pages = packet_count(bench.profile.number("application_bytes"))
+    pages = packet_count(bench.number("application_bytes"))
     numbers = [
         (number, named)
         for number in dict.fromkeys((0, total + 1, pages + 1, 0x8000, 0xFFFF))
@@ -282,7 +286,7 @@ def _number_sender(bench: Bench, total: int, marker: bytes) -> Callable[[int], N
     def send(stored: int) -> None:
         for number, named in numbers:
             with bench.step(f"after packet {stored}, packet {number} of {named}"):
-                bench.send(bench.words.packet(number, named, marker))
+                bench.send(bench.encoder.packet(number, named, marker))
                 heard = answers(bench)
                 others = [one for one in heard if one.kind is not Kind.NAK]
                 bench.check(not others, "NAK or silence", describe(heard))

@@ -7,9 +7,12 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probing import ACCEPTED, EITHER, PACKET_FRAMES, Probe
-from flasher.conformance.hearing import Heard, Kind
-from flasher.conformance.model import Requirement, case
-from flasher.conformance.wire import packet_count
+from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, case
+from flasher.conformance.wire import (
+    Kind,
+    Received,
+    packet_count,
+)
 
 _FEEDBACK: Final = "reset to general feedback"
 _FIRST: Final = "reset to first boot version"
@@ -36,19 +39,19 @@ _PATIENCE: Final = 3
     clause="R12",
     stimulus="packets with gaps between their frames, from 0 to just below the inter-frame timeout",
     expectation="accepted up to it (tm_02)",
-    requires={Requirement.DESTRUCTIVE, Requirement.TIMING},
+    requires={DESTRUCTIVE, TIMING},
     choices=("tm_02",),
 )
 def gaps(bench: Bench) -> None:
-    limit_s = bench.profile.limit("inter_frame_s")
-    wanted = ACCEPTED if bench.profile.choice("tm_02") == "accepted" else EITHER
+    limit_s = bench.limit("inter_frame_s")
+    wanted = ACCEPTED if bench.choice("tm_02") == "accepted" else EITHER
     probe = Probe(bench)
     probe.begin()
-    frame_s, pause_s = _longest_frame_s(bench), bench.profile.limit("pause_s")
+    frame_s, pause_s = _longest_frame_s(bench), bench.limit("pause_s")
     edge_s = frame_s + 2 * bench.port.uncertainty_s + _EDGE_S
     for gap_s in (*(share * limit_s for share in _SHARES), max(limit_s - edge_s, 0.0)):
         with bench.step(f"{gap_s * 1000:.1f} ms"):
-            began_at = bench.elapsed_s
+            began_at = bench.tester.elapsed_s
             # The whole packet takes less than the pause that may end a transfer (TX-12).
             gaps = min(int(pause_s / 2 / max(gap_s, frame_s)), PACKET_FRAMES) or 1
             taken = probe.offer(probe.frames(), EITHER, gap_s=gap_s, gaps=gaps)
@@ -73,24 +76,24 @@ def gaps(bench: Bench) -> None:
     stimulus="a transfer of many packets, an upgrade, and some resets",
     expectation="each time within the profile's limits: reset to the first boot version, their "
     "spacing, update command to request transfer, packet to ACK, end of transfer to complete",
-    requires={Requirement.DESTRUCTIVE, Requirement.TIMING, Requirement.LONG},
+    requires={DESTRUCTIVE, TIMING, LONG},
 )
 def times(bench: Bench) -> None:
     image = bench.good_image
     _enter(bench)
     if packet_count(len(image)) < _PACKETS:
         with bench.step("transfer of many packets"):
-            filler = (bench.filler(_PACKETS) + _REST)[: bench.profile.number("largest_image_bytes")]
+            filler = (bench.filler(_PACKETS) + _REST)[: bench.number("largest_image_bytes")]
             bench.update(len(filler))
             _measure_packets(bench, filler)
             bench.leave_transfer()
     with bench.step("upgrade"):
         bench.update(len(image))
         _measure_packets(bench, image)
-        sent = bench.send(bench.words.end())
-        limit_s = _PATIENCE * bench.profile.limit("complete_s")
+        sent = bench.send(bench.encoder.end())
+        limit_s = _PATIENCE * bench.limit("complete_s")
         heard = bench.wait_for(Kind.COMPLETE, within_s=limit_s)
-        found = bench.require_heard(heard, Kind.COMPLETE.value, limit_s)
+        found = bench.require_received(heard, Kind.COMPLETE.value, limit_s)
         bench.measure(_COMPLETE, found.at - sent.left_at)
     for turn in range(_RESETS):
         # Whether it starts each time is EN-01 and RS-03; what is measured by then is judged.
@@ -102,29 +105,29 @@ def times(bench: Bench) -> None:
 
 
 def _judge(bench: Bench) -> None:
-    limit = bench.profile.limit
+    limit = bench.limit
     spacing_s, tolerance_s = limit("version_spacing_s"), limit("version_spacing_tolerance_s")
-    bench.check_measured(_FIRST, high_s=limit("first_version_s"))
-    if bench.profile.number("versions") > 1:
-        bench.check_measured(
+    bench.judge.check_measured(_FIRST, high_s=limit("first_version_s"))
+    if bench.number("versions") > 1:
+        bench.judge.check_measured(
             _SPACING, low_s=spacing_s - tolerance_s, high_s=spacing_s + tolerance_s
         )
-    bench.check_measured(_REQUEST, high_s=limit("erase_s"))
-    bench.check_measured(_ANSWER, high_s=limit("ack_s"))
-    bench.check_measured(_COMPLETE, high_s=limit("complete_s"))
+    bench.judge.check_measured(_REQUEST, high_s=limit("erase_s"))
+    bench.judge.check_measured(_ANSWER, high_s=limit("ack_s"))
+    bench.judge.check_measured(_COMPLETE, high_s=limit("complete_s"))
 
 
-def _enter(bench: Bench) -> Heard:
+def _enter(bench: Bench) -> Received:
     """Reset; returns the first boot version. What is measured here is judged at the end."""
     bench.forget()
-    sent = bench.send(bench.words.reset())
-    limit_s = _PATIENCE * bench.profile.limit("first_version_s")
+    sent = bench.send(bench.encoder.reset())
+    limit_s = _PATIENCE * bench.limit("first_version_s")
     feedback = bench.next_message(limit_s)
     if feedback is not None and feedback.kind is Kind.FEEDBACK:
         bench.measure(_FEEDBACK, feedback.at - sent.left_at)
     is_there = feedback is not None and feedback.kind is Kind.BOOT_VERSION
     first = feedback if is_there else bench.wait_for(Kind.BOOT_VERSION, within_s=limit_s)
-    found = bench.require_heard(first, Kind.BOOT_VERSION.value, limit_s)
+    found = bench.require_received(first, Kind.BOOT_VERSION.value, limit_s)
     bench.measure(_FIRST, found.at - sent.left_at)
     return found
 
@@ -132,18 +135,18 @@ def _enter(bench: Bench) -> Heard:
 def _measure_burst(bench: Bench) -> None:
     """One reset and the whole burst."""
     last = _enter(bench)
-    for _ in range(bench.profile.number("versions") - 1):
-        within_s = _PATIENCE * bench.profile.limit("version_spacing_s")
+    for _ in range(bench.number("versions") - 1):
+        within_s = _PATIENCE * bench.limit("version_spacing_s")
         heard = bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
         if heard is None:
             break
         bench.measure(_SPACING, heard.at - last.at)
         last = heard
-    bench.collect(bench.burst_s)
+    bench.collect(bench.host.burst_s)
 
 
 def _measure_packets(bench: Bench, image: bytes) -> None:
-    limit_s = _PATIENCE * bench.profile.limit("ack_s")
+    limit_s = _PATIENCE * bench.limit("ack_s")
     for number in range(1, packet_count(len(image)) + 1):
         sent = bench.send_packet(image, number)
         heard = bench.expect(Kind.ACK, within_s=limit_s, number=number)
@@ -157,6 +160,6 @@ def _longest_frame_s(bench: Bench) -> float:
 
 def _widest_s(bench: Bench, since_s: float) -> float:
     """The widest gap between the packet's frames, from end to end, as it came about."""
-    sent = [entry.at_s for entry in bench.trace if entry.sent and entry.at_s > since_s]
+    sent = [entry.at_s for entry in bench.tester.trace if entry.sent and entry.at_s > since_s]
     sent = sent[:PACKET_FRAMES]
     return max(behind - before for before, behind in pairwise(sent))

@@ -8,12 +8,15 @@ from collections.abc import Collection, Iterable, Iterator
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.hearing import Heard, Kind, describe
-from flasher.conformance.model import Requirement, Unsupported, case
+from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
 from flasher.conformance.restore import needs_power
+from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
     PACKET_BYTES,
+    Kind,
     RawFrame,
+    Received,
+    describe,
     packet_count,
     packet_payload,
     split,
@@ -57,7 +60,7 @@ def stops(bench: Bench, image: bytes, numbers: Iterable[int]) -> Iterator[int]:
             # Where a frame was lost a NAK may come as late as the next message (FR-05).
             bench.expect(
                 Kind.ACK,
-                within_s=bench.profile.limit("ack_s"),
+                within_s=bench.limit("ack_s"),
                 number=number,
                 ignoring=(Kind.NAK,),
             )
@@ -65,9 +68,9 @@ def stops(bench: Bench, image: bytes, numbers: Iterable[int]) -> Iterator[int]:
     bench.finish(image, done + 1)
 
 
-def answers(bench: Bench) -> list[Heard]:
+def answers(bench: Bench) -> list[Received]:
     """What a packet is answered by: the first answer, and what follows it at once."""
-    limit = bench.profile.limit
+    limit = bench.limit
     first = bench.next_message(limit("ack_s") + limit("inter_frame_s"))
     return [] if first is None else [first, *bench.collect(_QUIET_S)]
 
@@ -76,7 +79,7 @@ def check_rejected(bench: Bench, wanted: int, named: int, *, is_plain: bool = Tr
     """A packet was rejected as tx_01 says: a NAK, or nothing. With `is_plain` false the device may
     have had reasons not to trust the number in it.
     """
-    choice = bench.profile.choice("tx_01")
+    choice = bench.choice("tx_01")
     numbers = {wanted} if choice == "nak_expected" else {named}
     if not is_plain or choice == "either":
         numbers.add(wanted)
@@ -93,7 +96,7 @@ def check_repeated(bench: Bench, number: int, total: int) -> None:
     heard = answers(bench)
     wanted = f"ACK {number}"
     allowed = {wanted}
-    if bench.profile.choice("tx_02") == "nak_next":
+    if bench.choice("tx_02") == "nak_next":
         wanted = f"NAK {number + 1}"
         # Behind the last packet there is no next one to ask for.
         allowed = {wanted, f"ACK {number}", f"NAK {number}"} if number == total else {wanted}
@@ -110,7 +113,7 @@ def check_naks(bench: Bench, numbers: Collection[int] | None, counts: Collection
     bench.check(len(heard) == len(right) in counts, f"rejected: {wanted}", describe(heard))
 
 
-def _is_nak(heard: Heard, numbers: Collection[int] | None) -> bool:
+def _is_nak(heard: Received, numbers: Collection[int] | None) -> bool:
     return heard.kind is Kind.NAK and (numbers is None or heard.number in numbers)
 
 
@@ -123,7 +126,7 @@ def _is_nak(heard: Heard, numbers: Collection[int] | None) -> bool:
     clause="4.2, 4",
     stimulus="first, second and last packet with a wrong CRC, with a wrong bit, without a frame",
     expectation="rejected (tx_01, tx_01_lost_frame); accepted when it is sent again",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("tx_01", "tx_01_lost_frame"),
 )
 def damaged(bench: Bench) -> None:
@@ -149,25 +152,25 @@ def _damages(bench: Bench, image: bytes, number: int) -> Iterator[tuple[str, int
         raw = bytearray(_raw_packet(bench, image, named))
         raw[_CRC_AT] = bytes(byte ^ 0xFF for byte in raw[_CRC_AT])
         step = "wrong CRC" if named == number else "the next one came, with a wrong CRC"
-        yield step, named, split(bench.words.to_device, bytes(raw))
+        yield step, named, split(bench.encoder.to_device, bytes(raw))
     raw = bytearray(_raw_packet(bench, image, number))
     raw[_DATA_AT] ^= 0x10
-    yield "a wrong bit", number, split(bench.words.to_device, bytes(raw))
+    yield "a wrong bit", number, split(bench.encoder.to_device, bytes(raw))
 
 
 def _raw_packet(bench: Bench, image: bytes, number: int) -> bytes:
     payload = packet_payload(image, number)
-    frames = bench.words.packet(number, packet_count(len(image)), payload)
+    frames = bench.encoder.packet(number, packet_count(len(image)), payload)
     return b"".join(frame.data for frame in frames)
 
 
 def _lose_frame(bench: Bench, image: bytes, number: int, index: int) -> None:
-    choice = bench.profile.choice("tx_01_lost_frame")
+    choice = bench.choice("tx_01_lost_frame")
     # Without the first frame there is nothing to know a packet by.
     counts = {"either": (0, 1), "nak": (1,), "silence": (0,)}[choice] if index else (0, 1)
-    trusts_it = bench.profile.choice("tx_01") in ("nak_received", "either")
+    trusts_it = bench.choice("tx_01") in ("nak_received", "either")
     with bench.step(f"packet {number} without its frame {index + 1}"):
-        frames = split(bench.words.to_device, _raw_packet(bench, image, number))
+        frames = split(bench.encoder.to_device, _raw_packet(bench, image, number))
         bench.send(frames[:index] + frames[index + 1 :])
         check_naks(bench, None if trusts_it and index <= _NUMBER_IN else {number}, counts)
 
@@ -181,7 +184,7 @@ def _lose_frame(bench: Bench, image: bytes, number: int, index: int) -> None:
     clause="R10",
     stimulus="first, second and last packet sent again after their ACK, twice each",
     expectation="ACK n again (tx_02), one answer a copy; nothing is written twice",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("tx_02",),
 )
 def repeated(bench: Bench) -> None:
@@ -194,7 +197,7 @@ def repeated(bench: Bench) -> None:
     clause="R10",
     stimulus="first, second and last packet again, with other data and a right CRC",
     expectation="answered as a repetition (tx_02); the first data stay",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("tx_02",),
 )
 def other_data(bench: Bench) -> None:
@@ -213,7 +216,7 @@ def _repeat(bench: Bench, mask: int) -> None:
         payload = bytes(byte ^ mask for byte in packet_payload(image, number))
         for copy in range(1, _REPEATS + 1):
             with bench.step(f"packet {number}, repetition {copy}"):
-                bench.send(bench.words.packet(number, total, payload))
+                bench.send(bench.encoder.packet(number, total, payload))
                 check_repeated(bench, number, total)
     bench.finish(image, total + 1)
 
@@ -227,17 +230,17 @@ def _repeat(bench: Bench, mask: int) -> None:
     clause="4.1, A385; R9",
     stimulus="the largest image, all its packets: across 255/256, up to the last one",
     expectation="every packet is accepted and stored at its place",
-    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    requires={DESTRUCTIVE, LONG},
     limit_s=7200.0,
 )
 def many_packets(bench: Bench) -> None:
     if needs_power(bench.profile) and not bench.subject.has_power:
         raise Unsupported("only power ends a transfer of this product, and none is controlled")
-    size = bench.profile.number("largest_image_bytes")
+    size = bench.number("largest_image_bytes")
     image = bench.random.randbytes(size)
     total = packet_count(size)
     bench.start_transfer(size)
-    limit_s = bench.profile.limit("ack_s")
+    limit_s = bench.limit("ack_s")
     for number in range(1, total + 1):
         sent = bench.send_packet(image, number)
         heard = bench.next_message(limit_s)
@@ -248,10 +251,10 @@ def many_packets(bench: Bench) -> None:
         bench.measure("packet to ACK", heard.at - sent.left_at)
     bench.check(True, f"ACK 1 to {total}", "all of them")  # noqa: FBT003
     # Never ended, as nobody could start it; what may still be in a buffer is not looked at.
-    buffer_bytes = max(_BUFFER_BYTES, bench.profile.number("buffer_bytes"))
+    buffer_bytes = max(_BUFFER_BYTES, bench.number("buffer_bytes"))
     if size > buffer_bytes:
         bench.check_stored(image[:-buffer_bytes])
-    if bench.profile.choice("tx_12") == "announces":
+    if bench.choice("tx_12") == "announces":
         bench.leave_transfer()
 
 
@@ -261,7 +264,7 @@ def many_packets(bench: Bench) -> None:
     clause="4.1, A385",
     stimulus="other bytes than FF behind the end of the image in the last packet",
     expectation="ignored or rejected (tx_08)",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("tx_08", "tx_01"),
 )
 def other_filler(bench: Bench) -> None:
@@ -274,9 +277,9 @@ def other_filler(bench: Bench) -> None:
     payload = rest.ljust(PACKET_BYTES, b"\x00")
     bench.start_transfer(len(image))
     bench.packets(image, 1, total - 1)
-    bench.send(bench.words.packet(total, total, payload))
-    if bench.profile.choice("tx_08") == "ignored":
-        bench.expect(Kind.ACK, within_s=bench.profile.limit("ack_s"), number=total)
+    bench.send(bench.encoder.packet(total, total, payload))
+    if bench.choice("tx_08") == "ignored":
+        bench.expect(Kind.ACK, within_s=bench.limit("ack_s"), number=total)
         bench.finish(image, total + 1)
     else:
         check_rejected(bench, total, total)

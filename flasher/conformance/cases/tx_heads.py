@@ -13,9 +13,13 @@ from flasher.conformance.cases.tx import (
     stops,
     transfer_image,
 )
-from flasher.conformance.hearing import describe
-from flasher.conformance.model import Requirement, case
-from flasher.conformance.wire import PACKET_BYTES, packet_count, packet_payload
+from flasher.conformance.catalogue import DESTRUCTIVE, case
+from flasher.conformance.wire import (
+    PACKET_BYTES,
+    describe,
+    packet_count,
+    packet_payload,
+)
 
 _NUMBER_MAX: Final = 0xFFFF
 _STORED: Final = 3
@@ -30,7 +34,7 @@ _START_BYTES: Final = (0x00, 0x02, 0x04, 0x10, 0x81, 0xFF)
     "one, 0, beyond the total, 65535; older ones, with right and with other data",
     expectation="rejected (tx_01), the older ones as the profile says (tx_03); nothing of it is "
     "stored",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("tx_01", "tx_03"),
 )
 def out_of_order(bench: Bench) -> None:
@@ -44,7 +48,7 @@ def out_of_order(bench: Bench) -> None:
         for what, mask in (("the right", 0x00), ("other", 0xFF)):
             with bench.step(f"after packet {_STORED}, packet {number} with {what} data"):
                 payload = bytes(byte ^ mask for byte in packet_payload(image, number))
-                bench.send(bench.words.packet(number, total, payload))
+                bench.send(bench.encoder.packet(number, total, payload))
                 _check_older(bench, number)
     bench.packets(image, _STORED + 1)
     _send_wrong_numbers(bench, image, total)
@@ -60,16 +64,16 @@ def _send_wrong_numbers(bench: Bench, image: bytes, stored: int) -> None:
         if 0 < number == stored or number > _NUMBER_MAX:
             continue
         with bench.step(f"after packet {stored}, number {number}"):
-            bench.send(bench.words.packet(number, total, payload))
+            bench.send(bench.encoder.packet(number, total, payload))
             if stored < total:
                 check_rejected(bench, stored + 1, number, is_plain=is_plain)
             else:
                 # All is there: which number is wanted is nobody's business.
-                check_naks(bench, None, nak_counts(bench.profile.choice("tx_01")))
+                check_naks(bench, None, nak_counts(bench.choice("tx_01")))
 
 
 def _check_older(bench: Bench, number: int) -> None:
-    choice = bench.profile.choice("tx_03")
+    choice = bench.choice("tx_03")
     if choice == "ack":
         heard = answers(bench)
         bench.check(describe(heard) == f"ACK {number}", f"ACK {number}", describe(heard))
@@ -84,7 +88,7 @@ def _check_older(bench: Bench, number: int) -> None:
     stimulus="packet 1, 4 and the last one with a total that is 1 less, 1 more, 0, 65535 or "
     "high byte first",
     expectation="rejected (tx_01); accepted with the right total",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("tx_01",),
 )
 def wrong_total(bench: Bench) -> None:
@@ -96,7 +100,7 @@ def wrong_total(bench: Bench) -> None:
     for number in stops(bench, image, (1, _STORED + 1, total)):
         for named in wrong:
             with bench.step(f"packet {number} of {named}"):
-                bench.send(bench.words.packet(number, named, packet_payload(image, number)))
+                bench.send(bench.encoder.packet(number, named, packet_payload(image, number)))
                 check_rejected(bench, number, number)
 
 
@@ -106,7 +110,7 @@ def wrong_total(bench: Bench) -> None:
     clause="4.1, A385",
     stimulus="packet 1, 4 and the last one beginning with 00, 02, 04, 10, 81 and FF",
     expectation="rejected (tx_01); accepted with 01",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("tx_01",),
 )
 def wrong_start_byte(bench: Bench) -> None:
@@ -116,5 +120,5 @@ def wrong_start_byte(bench: Bench) -> None:
         for start in _START_BYTES:
             with bench.step(f"packet {number} with {start:02X}"):
                 payload = packet_payload(image, number)
-                bench.send(bench.words.packet(number, total, payload, start=start))
+                bench.send(bench.encoder.packet(number, total, payload, start=start))
                 check_rejected(bench, number, number)

@@ -6,9 +6,11 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.tx import transfer_image
-from flasher.conformance.hearing import Kind
-from flasher.conformance.model import Requirement, case
-from flasher.conformance.wire import packet_count
+from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
+from flasher.conformance.wire import (
+    Kind,
+    packet_count,
+)
 
 _PACKETS: Final = 3
 """Packets of a transfer that is only begun."""
@@ -27,11 +29,11 @@ _JUST_NOT: Final = 0.9
     stimulus="half of limits.pause_s before a packet; more than it before packet 1, amid the "
     "packets and before the end",
     expectation="announces again, or waits on (tx_12); reachable in both",
-    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    requires={DESTRUCTIVE, LONG},
     choices=("tx_12",),
 )
 def pause(bench: Bench) -> None:
-    if bench.profile.choice("tx_12") == "announces":
+    if bench.choice("tx_12") == "announces":
         _announces(bench)
     else:
         _waits(bench)
@@ -39,7 +41,7 @@ def pause(bench: Bench) -> None:
 
 def _announces(bench: Bench) -> None:
     image = bench.filler(_PACKETS)[:-1]
-    pause_s = bench.profile.limit("pause_s")
+    pause_s = bench.limit("pause_s")
     bench.start_transfer(len(image))
     with bench.step("a short pause"):
         bench.wait(_SHORT * pause_s)
@@ -49,7 +51,7 @@ def _announces(bench: Bench) -> None:
             bench.packets(image, _next(bench, image, stored), stored)
             began_at = bench.now
             heard = bench.expect(
-                Kind.BOOT_VERSION, within_s=pause_s + bench.profile.limit("first_version_s")
+                Kind.BOOT_VERSION, within_s=pause_s + bench.limit("first_version_s")
             )
             bench.measure("pause to boot version", heard.at - began_at)
     with bench.step("upgrade after the pauses"):
@@ -68,7 +70,7 @@ def _next(bench: Bench, image: bytes, stored: int) -> int:
 def _waits(bench: Bench) -> None:
     image = transfer_image(bench)
     total = packet_count(len(image))
-    pause_s = _LONG * bench.profile.limit("pause_s")
+    pause_s = _LONG * bench.limit("pause_s")
     bench.start_transfer(len(image))
     done = 0
     for stored in (0, 1, total):
@@ -78,11 +80,11 @@ def _waits(bench: Bench) -> None:
             bench.expect_silence(pause_s)
     bench.finish(image, total + 1)
     with bench.step("a new upgrade after a pause"):
-        if bench.profile.choice("up_08") == "starts_over":
+        if bench.choice("up_08") == "starts_over":
             bench.start_transfer(len(image))
             bench.expect_silence(pause_s)
             bench.update(len(image))
-        elif bench.profile.choice("tx_13") == "restarts" or bench.subject.has_power:
+        elif bench.choice("tx_13") == "restarts" or bench.subject.has_power:
             bench.start_transfer(len(image))
             bench.expect_silence(pause_s)
             bench.leave_transfer()
@@ -99,17 +101,17 @@ def _waits(bench: Bench) -> None:
     clause="R18",
     stimulus="reset before packet 1, amid the packets and before the end",
     expectation="ignored, or restarts (tx_13); a new upgrade succeeds",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("tx_13",),
 )
 def reset(bench: Bench) -> None:
-    ignored = bench.profile.choice("tx_13") == "ignored"
+    ignored = bench.choice("tx_13") == "ignored"
     image = transfer_image(bench) if ignored else bench.filler(_PACKETS)[:-1]
     total = packet_count(len(image))
-    within_s = bench.profile.limit("first_version_s")
-    if bench.profile.choice("tx_12") == "announces":
+    within_s = bench.limit("first_version_s")
+    if bench.choice("tx_12") == "announces":
         # Later than that, it is the pause that ends the transfer.
-        within_s = min(within_s, _JUST_NOT * bench.profile.limit("pause_s"))
+        within_s = min(within_s, _JUST_NOT * bench.limit("pause_s"))
     bench.start_transfer(len(image))
     done = 0
     for stored in (0, 1, total):
@@ -119,7 +121,7 @@ def reset(bench: Bench) -> None:
                 done = 0
             bench.packets(image, done + 1, stored)
             done = stored
-            bench.send(bench.words.reset())
+            bench.send(bench.encoder.reset())
             if ignored:
                 bench.expect_silence(why="silence, no restart")
             else:

@@ -6,14 +6,15 @@ from collections.abc import Iterator
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.hearing import Kind, describe
-from flasher.conformance.model import Requirement, case
+from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, case
 from flasher.conformance.wire import (
     PACKET_BYTES,
     READ,
     UPDATE,
     WRITE,
+    Kind,
     RawFrame,
+    describe,
     packet_count,
 )
 
@@ -30,10 +31,10 @@ _FIRST_PACKETS: Final = 3
     clause="4.1, A10B; R9",
     stimulus="update command for 1, 127, 128, 129, 78351 bytes and the largest image",
     expectation="request transfer within the erase limit, and the packets of that size are taken",
-    requires={Requirement.DESTRUCTIVE, Requirement.LONG},
+    requires={DESTRUCTIVE, LONG},
 )
 def sizes(bench: Bench) -> None:
-    largest = bench.profile.number("largest_image_bytes")
+    largest = bench.number("largest_image_bytes")
     bench.reset_to_bootloader()
     for index, size in enumerate([*(size for size in _SIZES if size < largest), largest]):
         with bench.step(f"{size} bytes"):
@@ -52,13 +53,13 @@ def sizes(bench: Bench) -> None:
     clause="R9",
     stimulus="update command for 0 bytes, more than the largest image, 2^32 - 1 bytes",
     expectation="rejected before anything is erased: the old application starts",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("up_02",),
 )
 def wrong_sizes(bench: Bench) -> None:
-    largest = bench.profile.number("largest_image_bytes")
+    largest = bench.number("largest_image_bytes")
     for size in (0, largest + 1, 0xFFFF_FFFF):
-        check_update_rejected(bench, f"{size} bytes", bench.words.update(size))
+        check_update_rejected(bench, f"{size} bytes", bench.encoder.update(size))
 
 
 @case(
@@ -67,21 +68,21 @@ def wrong_sizes(bench: Bench) -> None:
     clause="R17",
     stimulus="update command, packet and end of transfer without a reset before",
     expectation="nothing erased; silence or general feedback (up_03)",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("up_03",),
 )
 def without_reset(bench: Bench) -> None:
     image = bench.good_image
     stimuli = {
-        "update command": bench.words.update(len(image)),
-        "packet": bench.words.packet(1, packet_count(len(image)), bytes(PACKET_BYTES)),
-        "end of transfer": bench.words.end(),
+        "update command": bench.encoder.update(len(image)),
+        "packet": bench.encoder.packet(1, packet_count(len(image)), bytes(PACKET_BYTES)),
+        "end of transfer": bench.encoder.end(),
     }
-    choice = bench.profile.choice("up_03")
+    choice = bench.choice("up_03")
     for step, frames in stimuli.items():
         with bench.step(step):
             bench.send(frames)
-            heard = bench.collect(bench.profile.limit("silence_s"))
+            heard = bench.collect(bench.limit("silence_s"))
             feedbacks = [one for one in heard if one.kind is Kind.FEEDBACK]
             allowed = {"either": (0, 1), "feedback": (1,), "silence": (0,)}[choice]
             ok = len(feedbacks) == len(heard) and len(heard) in allowed
@@ -90,7 +91,7 @@ def without_reset(bench: Bench) -> None:
     bench.check_application()
     with bench.step("after a restart"):
         bench.reset_to_bootloader()
-        bench.collect(bench.burst_s)
+        bench.collect(bench.host.burst_s)
         bench.check_application()
         bench.check_stored(image)
 
@@ -102,22 +103,22 @@ def without_reset(bench: Bench) -> None:
     stimulus="update command at each boot version, just before and just after the window's end",
     expectation="accepted inside the window; between the announcements and after the window as the "
     "profile says (up_04_burst, up_04)",
-    requires={Requirement.DESTRUCTIVE, Requirement.TIMING},
+    requires={DESTRUCTIVE, TIMING},
     choices=("up_04", "up_04_burst"),
 )
 def window(bench: Bench) -> None:
-    count = bench.profile.number("versions")
+    count = bench.number("versions")
     image = bench.good_image
     for version in range(1, count + 1):
         with bench.step(f"at boot version {version}"):
             _enter_at(bench, version)
-            choice = bench.profile.choice("up_04_burst") if version < count else "accepted"
+            choice = bench.choice("up_04_burst") if version < count else "accepted"
             _offer_update(bench, choice)
-    edge_s = max(bench.profile.limit("window_tolerance_s"), 2 * bench.port.uncertainty_s) + _EDGE_S
-    window_s = bench.profile.limit("window_s")
+    edge_s = max(bench.limit("window_tolerance_s"), 2 * bench.port.uncertainty_s) + _EDGE_S
+    window_s = bench.limit("window_s")
     with bench.step("just before the window's end"):
         last_at = _enter_at(bench, count)
-        frames = bench.words.update(len(image))
+        frames = bench.encoder.update(len(image))
         on_wire_s = _wire_s(bench, frames)
         bench.send(frames, at=last_at + window_s - edge_s - on_wire_s)
         _expect_request(bench)
@@ -125,7 +126,7 @@ def window(bench: Bench) -> None:
     with bench.step("just after the window's end"):
         last_at = _enter_at(bench, count)
         bench.wait_until(last_at + window_s + edge_s)
-        _offer_update(bench, bench.profile.choice("up_04"))
+        _offer_update(bench, bench.choice("up_04"))
 
 
 @case(
@@ -134,12 +135,12 @@ def window(bench: Bench) -> None:
     clause="R2, R16",
     stimulus="update command twice before request transfer; again before packet 1",
     expectation="one transfer, which begins at packet 1 and ends well",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
 )
 def repeated(bench: Bench) -> None:
     image = bench.good_image
-    update = bench.words.update(len(image))
-    quiet_s = bench.profile.limit("silence_s")
+    update = bench.encoder.update(len(image))
+    quiet_s = bench.limit("silence_s")
     with bench.step("before request transfer"):
         bench.reset_to_bootloader()
         bench.wait_for_window()  # for a device that listens there only (UP-04)
@@ -166,7 +167,7 @@ def repeated(bench: Bench) -> None:
     clause="4.1, A10B",
     stimulus="names of other targets, wrong case, payload too short and too long, as a read",
     expectation="rejected; the old application starts",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("up_02",),
 )
 def wrong_names(bench: Bench) -> None:
@@ -180,12 +181,12 @@ def wrong_names(bench: Bench) -> None:
     clause="R2",
     stimulus="update command of the same size, and of another one, after packet 3",
     expectation="starts over cleanly or rejects (up_08), and never mixes two images",
-    requires={Requirement.DESTRUCTIVE},
+    requires={DESTRUCTIVE},
     choices=("up_08",),
 )
 def in_transfer(bench: Bench) -> None:
     image = bench.good_image
-    starts_over = bench.profile.choice("up_08") == "starts_over"
+    starts_over = bench.choice("up_08") == "starts_over"
     total = packet_count(len(image))
     if total <= _FIRST_PACKETS:
         bench.unsupported("a transfer of 4 packets or more", "the good image is too small")
@@ -196,12 +197,12 @@ def in_transfer(bench: Bench) -> None:
             begun = bytes(byte ^ 0xFF for byte in image[:begun_size]) if starts_over else image
             bench.start_transfer(begun_size)
             bench.packets(begun, 1, _FIRST_PACKETS)
-            bench.send(bench.words.update(len(image) if starts_over else size))
+            bench.send(bench.encoder.update(len(image) if starts_over else size))
             if starts_over:
-                bench.expect(Kind.REQUEST, within_s=bench.profile.limit("erase_s"))
+                bench.expect(Kind.REQUEST, within_s=bench.limit("erase_s"))
                 bench.finish(image)
             else:
-                heard = bench.collect(bench.profile.limit("silence_s"))
+                heard = bench.collect(bench.limit("silence_s"))
                 others = [one for one in heard if one.kind is not Kind.NAK]
                 bench.check(not others, "no request transfer", describe(others))
                 bench.finish(image, _FIRST_PACKETS + 1)
@@ -211,8 +212,8 @@ def _offer_update(bench: Bench, choice: str) -> None:
     """Update command for the good image, taken or not as `choice` says; then the application, the
     one that was there or the new one.
     """
-    image, limit = bench.good_image, bench.profile.limit
-    bench.send(bench.words.update(len(image)))
+    image, limit = bench.good_image, bench.limit
+    bench.send(bench.encoder.update(len(image)))
     if choice == "accepted":
         _expect_request(bench)
         bench.finish(image)
@@ -230,9 +231,7 @@ def _offer_update(bench: Bench, choice: str) -> None:
 
 def _expect_request(bench: Bench) -> None:
     """Request transfer follows; boot versions that are still on their way do not count."""
-    bench.expect(
-        Kind.REQUEST, within_s=bench.profile.limit("erase_s"), ignoring=(Kind.BOOT_VERSION,)
-    )
+    bench.expect(Kind.REQUEST, within_s=bench.limit("erase_s"), ignoring=(Kind.BOOT_VERSION,))
 
 
 def _enter_at(bench: Bench, version: int) -> float:
@@ -250,7 +249,7 @@ def _wire_s(bench: Bench, frames: list[RawFrame]) -> float:
 
 
 def _wrong_updates(bench: Bench) -> Iterator[tuple[str, list[RawFrame]]]:
-    words, size = bench.words, len(bench.good_image)
+    words, size = bench.encoder, len(bench.good_image)
     payload = words.update_text + size.to_bytes(4, "little")
     for other in words.others():
         yield f"name {other.update_text.decode()}", words.update(size, other.update_text)
@@ -265,11 +264,11 @@ def check_update_rejected(bench: Bench, step: str, frames: list[RawFrame]) -> No
     """In the bootloader: no request transfer, an answer as up_02 says, and the old application
     starts as if nothing had been said.
     """
-    choice = bench.profile.choice("up_02")
+    choice = bench.choice("up_02")
     with bench.step(step):
         bench.reset_to_bootloader()
         bench.send(frames)
-        heard = bench.collect(bench.burst_s + bench.profile.limit("silence_s"))
+        heard = bench.collect(bench.host.burst_s + bench.limit("silence_s"))
         answers = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
         naks = [one for one in answers if one.kind is Kind.NAK]
         allowed = {"either": (0, 1), "nak": (1,), "silence": (0,)}[choice]

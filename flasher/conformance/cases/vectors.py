@@ -8,9 +8,18 @@ from __future__ import annotations
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.hearing import Heard, Kind
-from flasher.conformance.patient import UPDATES_MAX
-from flasher.conformance.wire import BOOT_VERSION, REPORT, RESET, RESET_TEXT, RawFrame, build, split
+from flasher.conformance.host import UPDATES_MAX
+from flasher.conformance.wire import (
+    BOOT_VERSION,
+    REPORT,
+    RESET,
+    RESET_TEXT,
+    Kind,
+    RawFrame,
+    Received,
+    build,
+    split,
+)
 
 _LEFTOVER_S: Final = 0.03
 """A boot version so soon after an update command was sent before it (R2)."""
@@ -78,12 +87,12 @@ class Exact:
 
     def __init__(self, bench: Bench) -> None:
         self._bench = bench
-        texts = VECTORS[bench.words.target]
+        texts = VECTORS[bench.encoder.target]
         self._written = {name: bytes.fromhex(text) for name, text in texts.items()}
 
     def frames(self, name: str) -> list[RawFrame]:
         """A written-out message."""
-        return split(self._bench.words.to_device, self._written[name])
+        return split(self._bench.encoder.to_device, self._written[name])
 
     def hear(self, name: str, within_s: float) -> None:
         """The next message is the written-out one; another ends the case."""
@@ -103,7 +112,7 @@ class Exact:
 
     def enter(self, update: list[RawFrame]) -> None:
         """From the application to the request transfer that this update command gets."""
-        bench, words, limit = self._bench, self._bench.words, self._bench.profile.limit
+        bench, words, limit = self._bench, self._bench.encoder, self._bench.limit
         bench.forget()
         is_own = (words.reset_command, words.reset_data) != (RESET, RESET_TEXT)
         bench.send(words.reset() if is_own else self.frames("reset"))
@@ -122,18 +131,18 @@ class Exact:
                 break
         self._judge("request", self._written["request"], heard)
 
-    def _behind_leftovers(self, asked_at: float) -> Heard | None:
+    def _behind_leftovers(self, asked_at: float) -> Received | None:
         """What follows the update command; boot versions sent before it was heard do not (R2)."""
-        heard: Heard | None = None
+        heard: Received | None = None
         for _ in range(UPDATES_MAX):
-            heard = self._bench.next_message(self._bench.profile.limit("erase_s"))
+            heard = self._bench.next_message(self._bench.limit("erase_s"))
             is_version = heard is not None and heard.kind is Kind.BOOT_VERSION
             if heard is None or not is_version or heard.at > asked_at + _LEFTOVER_S:
                 break
         return heard
 
-    def _judge(self, name: str, wanted: bytes, heard: Heard | None) -> None:
-        where = self._bench.words.to_tool
+    def _judge(self, name: str, wanted: bytes, heard: Received | None) -> None:
+        where = self._bench.encoder.to_tool
         got = "nothing" if heard is None else f"{heard.can_id:03X} {heard.raw.hex(' ').upper()}"
         ok = heard is not None and (heard.can_id, heard.raw) == (where, wanted)
         self._bench.require(ok, f"{name}: {where:03X} {wanted.hex(' ').upper()}", got)

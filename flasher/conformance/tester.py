@@ -1,4 +1,4 @@
-"""The bench's way to the bus: sends frames, puts messages together, records everything.
+"""The tester: sends frames, puts the device's messages together, records every frame.
 
 Waiting is receiving until a time, and no wait goes beyond the case's own limit.
 """
@@ -8,17 +8,27 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import Enum
 from typing import Final, NamedTuple
 
-from flasher.conformance.faults import Fault, FaultKind
-from flasher.conformance.hearing import Heard, Kind, Listener
-from flasher.conformance.model import CaseLimitReached, RunStopped, TraceEntry
+from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.results import CaseLimitReached, RunStopped, TraceEntry
 from flasher.conformance.subject import Port
-from flasher.conformance.wire import UPDATE, WRITE, RawFrame, Words
+from flasher.conformance.wire import UPDATE, WRITE, Decoder, Encoder, Kind, RawFrame, Received
 
 TRACE_FRAMES: Final = 20_000
 """Frames of a case that are kept: the newest ones."""
-_HEARD_LIMIT: Final = 50_000
+_LIMITS: Final = {
+    Kind.FEEDBACK: "feedback_s",
+    Kind.BOOT_VERSION: "first_version_s",
+    Kind.REQUEST: "erase_s",
+    Kind.ACK: "ack_s",
+    Kind.NAK: "ack_s",
+    Kind.COMPLETE: "complete_s",
+    Kind.VERSION_INFORMATION: "start_s",
+}
+_RECEIVED_LIMIT: Final = 50_000
 """Messages that wait to be looked at; a babbling device fills no memory."""
 _ECHO_LIMIT_S: Final = 2.0
 """A frame that has not left by then is taken as sent: its echo was lost."""
@@ -29,6 +39,36 @@ _POLL_S: Final = 0.2
 """Longest single wait: the time after which a wish to stop is seen."""
 
 
+class FaultKind(Enum):
+    """What happens to the frame."""
+
+    DROP = "dropped"
+    DOUBLE = "doubled"
+    DELAY = "delayed"
+    SWAP = "swapped with the next one"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault on the line, of the `index`-th frame (from 0) since `BusTester.disturb`: of those
+    that are sent or, with `incoming`, of those that arrive (which can be dropped and doubled only).
+    """
+
+    kind: FaultKind
+    index: int
+    incoming: bool = False
+    delay_s: float = 0.0
+
+    def __post_init__(self) -> None:
+        if self.incoming and self.kind not in (FaultKind.DROP, FaultKind.DOUBLE):
+            raise ValueError(f"a frame that arrives cannot be {self.kind.value}")
+
+    def __str__(self) -> str:
+        """As a step of a case."""
+        side = "received" if self.incoming else "sent"
+        return f"frame {self.index + 1} {side} is {self.kind.value}"
+
+
 class Sent(NamedTuple):
     """When a message began and when its last frame had left, in seconds."""
 
@@ -36,18 +76,20 @@ class Sent(NamedTuple):
     left_at: float
 
 
-class Line:
+class BusTester:
     """Frames out, messages in, on one `Port`, for one case that may take `limit_s`."""
 
     def __init__(
         self,
         port: Port,
-        words: Words,
+        encoder: Encoder,
+        profile: ConformanceProfile,
         limit_s: float,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         self.port = port
-        self.words = words
+        self.encoder = encoder
+        self.profile = profile
         self.began_at = port.now()
         self.ends_at = self.began_at + limit_s
         self.update_was_sent = False
@@ -59,8 +101,8 @@ class Line:
         self.left_at = self.began_at
         """When the last frame sent had left."""
         self._stopped = stopped
-        self._listener = Listener(words)
-        self._heard: deque[Heard] = deque(maxlen=_HEARD_LIMIT)
+        self._decoder = Decoder(encoder)
+        self._received: deque[Received] = deque(maxlen=_RECEIVED_LIMIT)
         self._trace: deque[TraceEntry] = deque(maxlen=TRACE_FRAMES)
         self._traced = 0
         self._echoes_due = 0
@@ -123,37 +165,44 @@ class Line:
 
     # -- receiving --------------------------------------------------------------------------------
 
-    def next_message(self, within_s: float) -> Heard | None:
+    def next_message(self, within_s: float) -> Received | None:
         """The next message that was heard, or None after `within_s`."""
         deadline = self.now + within_s
-        while not self._heard:
+        while not self._received:
             if self.now >= deadline:
                 return None
             self._pump(deadline)
-        return self._heard.popleft()
+        return self._received.popleft()
 
     def wait_for(
-        self, *kinds: Kind, within_s: float, unlike: Callable[[Heard], bool] | None = None
-    ) -> Heard | None:
-        """The next message of one of `kinds`, others skipped; None after `within_s`. One for which
-        `unlike` is true is skipped too.
+        self,
+        *kinds: Kind,
+        within_s: float | None = None,
+        unlike: Callable[[Received], bool] | None = None,
+    ) -> Received | None:
+        """The next message of one of `kinds`, others skipped; None after `within_s`, by default
+        the limit for the first kind. One for which `unlike` is true is skipped too.
         """
-        deadline = self.now + within_s
-        while (heard := self.next_message(deadline - self.now)) is not None:
-            if heard.kind in kinds and not (unlike is not None and unlike(heard)):
-                return heard
+        deadline = self.now + (self.limit_s(kinds[0]) if within_s is None else within_s)
+        while (received := self.next_message(deadline - self.now)) is not None:
+            if received.kind in kinds and not (unlike is not None and unlike(received)):
+                return received
         return None
 
-    def collect(self, for_s: float) -> list[Heard]:
+    def limit_s(self, kind: Kind) -> float:
+        """The profile's limit for the answer of that kind. Raises KeyError for one without."""
+        return self.profile.limit(_LIMITS[kind])
+
+    def collect(self, for_s: float) -> list[Received]:
         """All that is heard in the next `for_s`, and what still waited."""
         self.wait(for_s)
-        found = list(self._heard)
-        self._heard.clear()
+        found = list(self._received)
+        self._received.clear()
         return found
 
     def forget(self) -> None:
         """Forget what was heard so far and not looked at."""
-        self._heard.clear()
+        self._received.clear()
 
     # -- trace ------------------------------------------------------------------------------------
 
@@ -191,9 +240,9 @@ class Line:
         self.frames_received += 1
         copies = 1 if fault is None else {FaultKind.DROP: 0, FaultKind.DOUBLE: 2}[fault.kind]
         for _ in range(copies):
-            self._heard.extend(
+            self._received.extend(
                 heard
-                for heard in self._listener.feed(arrival.frame, arrival.at)
+                for heard in self._decoder.feed(arrival.frame, arrival.at)
                 if self.hears_application or heard.kind is not Kind.APPLICATION
             )
 
@@ -216,7 +265,7 @@ class Line:
             self._send_frame(held)
 
     def _send_frame(self, frame: RawFrame) -> None:
-        if frame.can_id == self.words.to_device and frame.data.startswith(_UPDATE_HEAD):
+        if frame.can_id == self.encoder.to_device and frame.data.startswith(_UPDATE_HEAD):
             self.update_was_sent = True
         self.port.send(frame)
         if self.port.echoes:

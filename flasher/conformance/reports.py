@@ -1,0 +1,180 @@
+"""A run as files for programs: JUnit XML for CI servers, and the frames of a case as a candump log,
+which `flasher explain`, candump's friends and python-can read.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterable, Mapping
+from typing import Final
+
+import can
+
+from flasher.conformance.catalogue import GROUPS
+from flasher.conformance.results import (
+    FINAL_IMAGE_OK,
+    CaseResult,
+    CaseText,
+    CaseVerdict,
+    CheckOutcome,
+    Measurement,
+    RunReport,
+    TraceEntry,
+)
+from flasher.protocol.frame import Frame
+from flasher.report.junit import JUnitCase, JUnitResult, JUnitSuite, junit_xml
+from flasher.trace.figures import Distribution
+from flasher.trace.recorder import ONE_TOOL_CHANNEL, message_of
+
+TRACED: Final = frozenset(
+    {CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.INCONCLUSIVE, CaseVerdict.DEVIATION}
+)
+"""Verdicts whose frames are worth a file."""
+_FINDINGS: Final = 20
+_RUN: Final = "run"
+"""The suite of what concerns the run itself: its end, the good image."""
+_JUNIT_RESULTS: Final = {
+    CaseVerdict.FAIL: JUnitResult.FAILURE,
+    CaseVerdict.ERROR: JUnitResult.ERROR,
+    CaseVerdict.NOT_RUN: JUnitResult.ERROR,
+    CaseVerdict.UNSUPPORTED: JUnitResult.SKIPPED,
+    CaseVerdict.INCONCLUSIVE: JUnitResult.SKIPPED,
+}
+"""What was not judged is skipped with its reason, but a case that was not run because the run broke
+off is an error: a server must not show green for it."""
+
+ByResult = Mapping[tuple[str, int], str]
+"""A text for results, by case id and repeat."""
+
+
+def group_title(group: str) -> str:
+    """What a group is about; its id when it is none of the catalogue's."""
+    return GROUPS.get(group, group)
+
+
+def distribution(measurements: Iterable[Measurement]) -> Distribution:
+    """How measured times are spread. Raises ValueError for none."""
+    found = Distribution.of(measurement.value_s for measurement in measurements)
+    if found is None:
+        raise ValueError("no measurements")
+    return found
+
+
+# -- JUnit ----------------------------------------------------------------------------------------
+
+
+def junit_report(report: RunReport, *, started_at: str, replays: ByResult) -> bytes:
+    """The report as JUnit XML, a suite a group. `started_at` is an ISO time, `replays` are the
+    commands that repeat a result.
+    """
+    properties = {
+        "subject": report.subject,
+        "target": report.target,
+        "bitrate_bps": report.bitrate_bps,
+        "seed": report.seed,
+        "profile": report.profile_source,
+        "timestamp_source": report.timestamp_source,
+        "uncertainty_s": report.uncertainty_s,
+    }
+    suites = {
+        f"{group} {group_title(group)}": [
+            _junit_case(text, result, report, replays.get(result.key, ""))
+            for text, result in members
+        ]
+        for group, members in report.by_group().items()
+    }
+    suites[_RUN] = _junit_run(report)
+    return junit_xml(
+        f"conformance {report.subject}",
+        [JUnitSuite(name, cases, started_at, properties) for name, cases in suites.items()],
+        report.duration_s,
+    )
+
+
+def _junit_case(text: CaseText, result: CaseResult, report: RunReport, replay: str) -> JUnitCase:
+    repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
+    ended = _JUNIT_RESULTS.get(result.verdict, JUnitResult.PASSED)
+    if result.verdict is CaseVerdict.NOT_RUN and _was_wanted(report):
+        ended = JUnitResult.SKIPPED
+    word = result.verdict.value
+    message, kind, details = result.reason or word, word, ""
+    if ended is JUnitResult.SKIPPED:
+        message, kind = f"{word}: {message}", ""
+    elif ended in (JUnitResult.FAILURE, JUnitResult.ERROR):
+        details = _details(text, result, replay)
+    elif report.strict and result.deviation_resolved:
+        ended, kind = JUnitResult.FAILURE, "resolved deviation"
+        message = f"the profile says that it deviates ({text.deviation}), but it passes"
+    is_deviation = result.verdict is CaseVerdict.DEVIATION
+    said = [f"deviation: {text.deviation}"] if is_deviation else []
+    return JUnitCase(
+        f"conformance.{text.group}",
+        f"{text.id} {text.title}{repeat}",
+        result.duration_s,
+        ended,
+        message,
+        kind,
+        details,
+        "\n".join([*said, *result.infos]),
+    )
+
+
+def _was_wanted(report: RunReport) -> bool:
+    """True when somebody ended the run, or its own limit did: nothing is wrong then."""
+    return not (report.adapter_failed or report.killed_by) and any(
+        result.verdict is not CaseVerdict.NOT_RUN and result.checks for result in report.results
+    )
+
+
+def _details(text: CaseText, result: CaseResult, replay: str) -> str:
+    failed = [check for check in result.checks if check.outcome is CheckOutcome.FAIL]
+    lines = [f"clause: {text.clause}", f"stimulus: {text.stimulus}"]
+    lines += map(str, failed[:_FINDINGS])
+    if len(failed) > _FINDINGS:
+        lines.append(f"{len(failed) - _FINDINGS} more failed checks")
+    lines.append(f"seed: {result.seed}")
+    return "\n".join([*lines, f"replay: {replay}"] if replay else lines)
+
+
+def _junit_run(report: RunReport) -> list[JUnitCase]:
+    """The run itself as two cases, so that a broken one is not green."""
+    broken = report.stopped or report.not_upgradable
+    whole = JUnitResult.ERROR if broken else JUnitResult.PASSED
+    if not report.final_image:
+        image, message, kind = JUnitResult.SKIPPED, "no case was run", ""
+    else:
+        verified = report.final_image == FINAL_IMAGE_OK
+        image = JUnitResult.PASSED if verified else JUnitResult.ERROR
+        message, kind = report.final_image, "final image"
+    class_name, remarks = f"conformance.{_RUN}", "; ".join(report.remarks())
+    return [
+        JUnitCase(class_name, "the run goes to its planned end", 0.0, whole, remarks, "stopped"),
+        JUnitCase(class_name, "the good image is back on the device", 0.0, image, message, kind),
+    ]
+
+
+# -- traces ---------------------------------------------------------------------------------------
+
+
+def trace_file_name(result: CaseResult) -> str:
+    """The name of a result's trace file: "TX-03.log", from its second repeat on "TX-03-2.log"."""
+    repeat = f"-{result.repeat}" if result.repeat > 1 else ""
+    return f"{result.case_id}{repeat}.log"
+
+
+def is_traced(result: CaseResult) -> bool:
+    """True for a result that gets a trace file."""
+    return result.verdict in TRACED and bool(result.trace)
+
+
+def candump(trace: Iterable[TraceEntry]) -> bytes:
+    """Frames as a log; times count from the beginning of the case, what the suite sent is `T`."""
+    text = io.StringIO()
+    # By its channel `flasher explain` knows it again: one tool, whatever it sends.
+    writer = can.CanutilsLogWriter(text, channel=ONE_TOOL_CHANNEL)
+    for entry in trace:
+        frame = Frame(*entry.frame)
+        writer.on_message_received(
+            message_of(frame, sent=entry.sent, at_s=entry.at_s, channel=ONE_TOOL_CHANNEL)
+        )
+    return text.getvalue().encode("ascii")

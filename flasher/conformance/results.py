@@ -1,0 +1,285 @@
+"""The results of a run as data: checks, measurements, verdicts, and the report that holds them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Final
+
+from flasher.conformance.wire import RawFrame
+
+FINAL_IMAGE_OK: Final = "verified"
+
+
+class CaseVerdict(Enum):
+    """The verdict on a case; the members are in order of gravity, the best first."""
+
+    PASS = "pass"  # noqa: S105  no password
+    INFO = "info"
+    """Nothing to judge, only measured or observed."""
+    UNSUPPORTED = "unsupported"
+    """Cannot be judged on this bench, for the reason in the note."""
+    DEVIATION = "deviation"
+    """Failed, as the profile says that it does."""
+    INCONCLUSIVE = "inconclusive"
+    """The uncertainty of the measurement is greater than the margin."""
+    NOT_RUN = "not run"
+    """The run stopped before it."""
+    ERROR = "error"
+    """The case itself went wrong: the suite or the adapter, not the device."""
+    FAIL = "fail"
+
+
+class CheckOutcome(Enum):
+    """How one check of a case ended."""
+
+    PASS = "pass"  # noqa: S105  no password
+    FAIL = "fail"
+    INCONCLUSIVE = "inconclusive"
+    UNSUPPORTED = "unsupported"
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check: the step of the case, what was expected and what was got."""
+
+    step: str
+    outcome: CheckOutcome
+    expected: str
+    got: str
+    at_s: float
+    """Seconds since the case began."""
+
+    def __str__(self) -> str:
+        step = f"{self.step}: " if self.step else ""
+        return f"{step}expected {self.expected}; got {self.got}"
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One measured time; the name says from what to what ("packet to ACK")."""
+
+    name: str
+    value_s: float
+    uncertainty_s: float
+
+
+@dataclass(frozen=True)
+class TraceEntry:
+    """One frame of a case, in seconds since the case began; `sent` by the suite or received."""
+
+    at_s: float
+    sent: bool
+    frame: RawFrame
+
+
+@dataclass(frozen=True)
+class CaseText:
+    """What a report says about a case beside its result."""
+
+    id: str
+    group: str
+    title: str
+    clause: str = ""
+    stimulus: str = ""
+    expectation: str = ""
+    requires: tuple[str, ...] = ()
+    choices: Mapping[str, str] = field(default_factory=dict)
+    """Keys of the profile that the case was judged by, with their values."""
+    deviation: str = ""
+    """The reason in the profile why the device may differ."""
+
+
+@dataclass(frozen=True)
+class CaseResult:
+    """The result of one run of a case, which `case_id` and `repeat` (from 1) identify."""
+
+    case_id: str
+    verdict: CaseVerdict
+    repeat: int = 1
+    seed: str = ""
+    note: str = ""
+    checks: tuple[Check, ...] = ()
+    measurements: tuple[Measurement, ...] = ()
+    infos: tuple[str, ...] = ()
+    """What was observed without being judged."""
+    duration_s: float = 0.0
+    trace: tuple[TraceEntry, ...] = ()
+    trace_dropped: int = 0
+    """Frames that were not kept, as there were too many; the newest ones are kept."""
+    deviation_resolved: bool = False
+    """The profile documents a deviation, but the case passes."""
+
+    @property
+    def key(self) -> tuple[str, int]:
+        """Case id and repeat."""
+        return self.case_id, self.repeat
+
+    @property
+    def first_failure(self) -> Check | None:
+        """The first check that failed, else the first that was inconclusive; None without any."""
+        for outcome in (CheckOutcome.FAIL, CheckOutcome.INCONCLUSIVE):
+            for check in self.checks:
+                if check.outcome is outcome:
+                    return check
+        return None
+
+    @property
+    def reason(self) -> str:
+        """Why the verdict is what it is, in one line: the first failure, or the note."""
+        return str(self.first_failure or self.note)
+
+    def count(self, outcome: CheckOutcome) -> int:
+        """How many checks ended so."""
+        return sum(check.outcome is outcome for check in self.checks)
+
+
+@dataclass(frozen=True)
+class Rescue:
+    """A case after which the device was not reachable as it should be, and what brought it back."""
+
+    case_id: str
+    how: str
+
+
+@dataclass(frozen=True)
+class RunReport:
+    """A run from its first case to the last. Times in seconds, on the bench's clock."""
+
+    subject: str
+    target: str
+    bitrate_bps: int
+    timestamp_source: str
+    uncertainty_s: float
+    profile_source: str
+    profile: Mapping[str, str | int | float]
+    """Every key of the profile with its value."""
+    seed: str
+    strict: bool
+    cases: tuple[CaseText, ...]
+    """The cases of `results`, each once, in the order of the catalogue."""
+    results: tuple[CaseResult, ...]
+    not_selected: tuple[str, ...] = ()
+    """Cases that the selection left out."""
+    host_cases: tuple[str, ...] = ()
+    """Cases of the catalogue that concern the host, and are no part of this suite."""
+    stopped: str = ""
+    """Why the run ended before its end; empty for a whole one."""
+    adapter_failed: bool = False
+    """True when the adapter, or a command for power or readback, is what `stopped` is about."""
+    not_upgradable: str = ""
+    """Why the good image could not be flashed before the first case; the cases were run all the
+    same, as the bootloader could be reached, and those that need an application have none."""
+    killed_by: str = ""
+    """The case after which the device could not be brought back."""
+    rescues: tuple[Rescue, ...] = ()
+    final_image: str = ""
+    """Whether the good image is back at the end: "verified", or what failed."""
+    duration_s: float = 0.0
+
+    def count(self, verdict: CaseVerdict) -> int:
+        """How many results have that verdict."""
+        return sum(result.verdict is verdict for result in self.results)
+
+    @property
+    def resolved_deviations(self) -> tuple[str, ...]:
+        """Cases that pass although the profile documents a deviation."""
+        return tuple(result.case_id for result in self.results if result.deviation_resolved)
+
+    @property
+    def ok(self) -> bool:
+        """True when nothing failed, nothing was left out by a stop, and the good image is back."""
+        if self.stopped or self.final_image != FINAL_IMAGE_OK:
+            return False
+        if self.strict and self.resolved_deviations:
+            return False
+        bad = (CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.NOT_RUN)
+        return not any(result.verdict in bad for result in self.results)
+
+    @property
+    def headline(self) -> str:
+        """The run in one line."""
+        return count_text(self.results) or "no case"
+
+    def by_case(self) -> list[tuple[CaseText, list[CaseResult]]]:
+        """Every case with its results, in the order of the catalogue."""
+        return [
+            (text, [result for result in self.results if result.case_id == text.id])
+            for text in self.cases
+        ]
+
+    def by_group(self) -> dict[str, list[tuple[CaseText, CaseResult]]]:
+        """Every result with its case, by group, in the order of the catalogue."""
+        found: dict[str, list[tuple[CaseText, CaseResult]]] = {}
+        for text, results in self.by_case():
+            found.setdefault(text.group, []).extend((text, result) for result in results)
+        return found
+
+    def times(self) -> dict[str, list[Measurement]]:
+        """All measurements by name, in the order in which the names came first."""
+        found: dict[str, list[Measurement]] = {}
+        for result in self.results:
+            for measurement in result.measurements:
+                found.setdefault(measurement.name, []).append(measurement)
+        return found
+
+    def remarks(self) -> list[str]:
+        """What a reader must know of how the run itself went; empty for one to its planned end."""
+        lines = []
+        if self.stopped:
+            lines.append(f"the run ended early: {self.stopped}")
+        if self.killed_by:
+            lines.append(f"{self.killed_by} left a device that could not be brought back")
+        if self.not_upgradable:
+            lines.append(
+                "the good image could not be flashed before the first case, so that cases about a "
+                f"running application had none: {self.not_upgradable}"
+            )
+        lines += [f"after {rescue.case_id}: {rescue.how}" for rescue in self.rescues]
+        if self.resolved_deviations:
+            named = ", ".join(dict.fromkeys(self.resolved_deviations))
+            lines.append(f"deviations in the profile that are none any more: {named}")
+        return lines
+
+
+def worst(verdicts: Iterable[CaseVerdict]) -> CaseVerdict:
+    """The gravest of some verdicts. Raises ValueError for none."""
+    return max(verdicts, key=list(CaseVerdict).index)
+
+
+def count_text(results: Iterable[CaseResult]) -> str:
+    """How many results have each verdict, from the best to the worst; "" for none."""
+    verdicts = [result.verdict for result in results]
+    return ", ".join(
+        f"{verdicts.count(verdict)} {verdict.value}"
+        for verdict in CaseVerdict
+        if verdict in verdicts
+    )
+
+
+# -- how a case ends early ------------------------------------------------------------------------
+
+
+class CaseEnded(Exception):  # noqa: N818  most of them are no errors
+    """Base of what ends a case before its last line; the text is the reason."""
+
+
+class CaseStopped(CaseEnded):
+    """A check failed, and what follows would judge nothing; the check is recorded."""
+
+
+class Unsupported(CaseEnded):
+    """This bench cannot do what the case needs."""
+
+
+class CaseLimitReached(CaseEnded):
+    """The case took longer than it may."""
+
+
+class DeviceCrashed(CaseEnded):
+    """The device model stopped at something that a real part does not allow."""
+
+
+class RunStopped(CaseEnded):
+    """Somebody wants the run to end."""

@@ -1,0 +1,162 @@
+"""The pytest plugin of flasher: the conformance suite, and a team's own cases beside it, as tests.
+
+pytest loads this module wherever flasher is installed (`-p no:pytest_flasher` leaves it out), so it
+only declares options and fixtures, and is not part of the package: flasher is imported when a test
+asks for a device. Without a `--btl-*` option nothing is changed.
+
+    pytest --btl-mock --btl-suite
+    pytest --btl-target bms --btl-interface socketcan --btl-channel can0 --btl-good-image ok.hex
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from flasher.conformance.bench import Bench
+    from flasher.conformance.plugin import BenchTrace, Measurements, PluginRun
+    from flasher.conformance.profile import ConformanceProfile
+    from flasher.conformance.subject import Port, Subject
+
+_MARKERS = (
+    "destructive: erases the application of the device under test, which is put back afterwards",
+    "needs_power: switches the device under test off and on; skipped without power control",
+    "timing: judges times; what the adapter's time stamps are worth decides",
+)
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """The options, which all begin with --btl."""
+    group = parser.getgroup("btl", "bootloader under test (flasher conformance)")
+
+    def add(name: str, metavar: str, text: str, **more: Any) -> None:
+        group.addoption(name, metavar=metavar, help=text, **more)
+
+    def add_flag(name: str, text: str) -> None:
+        group.addoption(name, action="store_true", help=text)
+
+    several: dict[str, Any] = {"action": "append", "default": []}
+    add("--btl-target", "wmc|bms|obc", "the device (default with --btl-mock: bms)")
+    add("--btl-interface", "BACKEND", "python-can's back end for the adapter")
+    add("--btl-channel", "CHANNEL", "which adapter or port: can0, ...")
+    add("--btl-bitrate", "BPS", "bits per second (default 250000)", type=int)
+    add("--btl-bus-kwarg", "KEY=VALUE", "one more argument for the back end; repeatable", **several)
+    add("--btl-profile", "FILE", "the product's choices and limits (TOML)")
+    add("--btl-good-image", "IMAGE", "an image that runs on the device")
+    add("--btl-second-image", "IMAGE", "another one, smaller, of another version")
+    add_flag("--btl-allow-implausible", "whatever these images look like")
+    add("--btl-power-cmd", "COMMAND", "switches the device, as 'relay 3 {on|off}'")
+    add("--btl-readback-cmd", "COMMAND", "dumps the flash, as 'dump {file}'")
+    add("--btl-uncertainty", "SECONDS", "how far times may be off", type=float)
+    add_flag("--btl-mock", "test the built-in device model, on a virtual clock")
+    add("--btl-variant", "NAME", "with --btl-mock: one that is deliberately wrong")
+    add("--btl-set", "KEY=VALUE", "with --btl-mock: a choice of it; repeatable", **several)
+    add("--btl-seed", "SEED", "decides all that is left to chance", default="1")
+    add_flag("--btl-suite", "collect the cases of the conformance suite too")
+    add_flag("--btl-quick", "of the suite only what takes under a minute")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Declare the markers; everything else only where a bench is named."""
+    for line in _MARKERS:
+        config.addinivalue_line("markers", line)
+    if _is_active(config):
+        from flasher.conformance.plugin import Hooks  # noqa: PLC0415  not for others
+
+        config.pluginmanager.register(Hooks(config), "flasher-conformance-hooks")
+    elif config.getoption("btl_suite"):
+        raise pytest.UsageError("--btl-suite needs a device: --btl-target, or --btl-mock")
+
+
+def _is_active(config: pytest.Config) -> bool:
+    """True when the command line names a device under test."""
+    return bool(config.getoption("btl_mock") or config.getoption("btl_target"))
+
+
+# -- the bench, once a session --------------------------------------------------------------------
+
+
+@pytest.fixture(scope="session")
+def btl_power_control() -> Callable[[bool], None] | None:
+    """To be overridden, in the conftest.py of the root directory: a function that switches the
+    device on (True) or off, in place of --btl-power-cmd.
+    """
+    return None
+
+
+@pytest.fixture(scope="session")
+def btl_readback_control() -> Callable[[], bytes] | None:
+    """To be overridden as `btl_power_control`: a function that yields the application area."""
+    return None
+
+
+@pytest.fixture(scope="session")
+def btl_run(
+    request: pytest.FixtureRequest,
+    btl_power_control: Callable[[bool], None] | None,
+    btl_readback_control: Callable[[], bytes] | None,
+) -> Iterator[PluginRun]:
+    """The run on the one device: opened with the first test that needs it; at the end the good
+    image is flashed and verified.
+    """
+    if not _is_active(request.config):
+        pytest.skip("no device under test: give --btl-target with an adapter, or --btl-mock")
+    from flasher.conformance.plugin import opened_run  # noqa: PLC0415  only where it is used
+
+    with opened_run(request.config, btl_power_control, btl_readback_control) as run:
+        yield run
+
+
+@pytest.fixture(scope="session")
+def btl_device(btl_run: PluginRun) -> Subject:
+    """The device under test: its images, and what this bench can do to it."""
+    return btl_run.subject
+
+
+@pytest.fixture(scope="session")
+def btl_bus(btl_device: Subject) -> Port:
+    """The way to the bus: single frames, with their times."""
+    return btl_device.port
+
+
+@pytest.fixture(scope="session")
+def btl_profile(btl_run: PluginRun) -> ConformanceProfile:
+    """What the product is judged by."""
+    return btl_run.profile
+
+
+@pytest.fixture(scope="session")
+def btl_measurements(btl_run: PluginRun) -> Measurements:
+    """The times of the whole session, by name."""
+    return btl_run.measurements
+
+
+# -- for one test ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def btl_bench(request: pytest.FixtureRequest, btl_run: PluginRun) -> Iterator[Bench]:
+    """What a case works with. The good image's application runs before the test and after it; a
+    check that failed fails the test, even where the test went on.
+    """
+    node: Any = request.node
+    yield from btl_run.bench_for(node)
+
+
+@pytest.fixture
+def btl_power(btl_bench: Bench) -> Callable[[bool], None]:
+    """A function that switches the device on (True) or off; skips without power control."""
+    if not btl_bench.subject.has_power:
+        pytest.skip("needs power control")
+    return lambda on: btl_bench.power_on() if on else btl_bench.power_off()
+
+
+@pytest.fixture
+def btl_trace(btl_bench: Bench) -> BenchTrace:
+    """The frames of this test so far, and how to save them."""
+    from flasher.conformance.plugin import BenchTrace  # noqa: PLC0415
+
+    return BenchTrace(btl_bench)
