@@ -18,12 +18,10 @@ from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from flasher.conformance.catalogue import NOT_IMPLEMENTED
+from flasher.conformance.catalogue import CASES, NOT_IMPLEMENTED, Selection, in_order
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
-from flasher.conformance.catalogue import CASES
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
-from flasher.conformance.catalogue import Selection, in_order
 from flasher.mock.variants import VARIANTS, Variant
 
 PATH: Final = Path(__file__).parents[1] / "docs" / "variants.md"

@@ -72,7 +72,7 @@ def _suite(suite: JUnitSuite) -> ET.Element:
         failures=str(results.count(JUnitResult.FAILURE)),
         errors=str(results.count(JUnitResult.ERROR)),
         skipped=str(results.count(JUnitResult.SKIPPED)),
-        time=f"{sum(case.time_s for case in suite.cases):.3f}",
+        time=f"{sum(round(case.time_s, 3) for case in suite.cases):.3f}",
     )
     if suite.timestamp:
         element.set("timestamp", suite.timestamp)

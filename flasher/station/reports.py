@@ -10,9 +10,8 @@ from dataclasses import dataclass
 from datetime import datetime
 from enum import Enum, IntEnum
 from typing import Any, Final
-from xml.etree import ElementTree as Xml
 
-from flasher.protocol.text import printable
+from flasher.report.junit import JUnitCase, JUnitResult, JUnitSuite, junit_xml
 from flasher.station.records.model import (
     Figures,
     RunFilter,
@@ -65,17 +64,11 @@ class Report:
         skipped. Golden units are left out, as in the figures; a run that goes on is no result.
         """
         cases = [
-            run
+            _junit_case(run)
             for run in self.runs
             if run["kind"] != RunKind.GOLDEN.value and run["state"] != RunState.RUNNING.value
         ]
-        suite = Xml.Element("testsuite", _junit_counts(cases) | {"name": "station"})
-        for run in cases:
-            _junit_case(suite, run)
-        suites = Xml.Element("testsuites")
-        suites.append(suite)
-        Xml.indent(suites)
-        return Xml.tostring(suites, encoding="unicode", xml_declaration=True) + "\n"
+        return junit_xml("station", [JUnitSuite("station", cases)]).decode("ascii")
 
 
 def make_report(records: Records, chosen: RunFilter) -> Report:
@@ -118,48 +111,22 @@ def _cell(value: object) -> str:
     return "" if value is None else str(value)
 
 
-_ELEMENTS: Final[dict[object, str]] = {
-    RunState.FAIL.value: "failure",
-    RunState.ERROR.value: "error",
-    RunState.INTERRUPTED.value: "error",
-    RunState.ABORTED.value: "skipped",
+_JUNIT_RESULTS: Final[dict[object, JUnitResult]] = {
+    RunState.FAIL.value: JUnitResult.FAILURE,
+    RunState.ERROR.value: JUnitResult.ERROR,
+    RunState.INTERRUPTED.value: JUnitResult.ERROR,
+    RunState.ABORTED.value: JUnitResult.SKIPPED,
 }
 
 
-def _xml(text: str) -> str:
-    """A text as XML can hold it: it has no way to say control characters."""
-    return text if text.isascii() and text.isprintable() else printable(text)
-
-
-def _seconds(runs: list[Row]) -> float:
-    return sum(float(run["duration_s"] or 0.0) for run in runs)
-
-
-def _junit_counts(runs: list[Row]) -> dict[str, str]:
-    found = [_ELEMENTS.get(run["state"], "") for run in runs]
-    return {
-        "tests": str(len(runs)),
-        "failures": str(found.count("failure")),
-        "errors": str(found.count("error")),
-        "skipped": str(found.count("skipped")),
-        "time": f"{_seconds(runs):.3f}",
-    }
-
-
-def _junit_case(suite: Xml.Element, run: Row) -> None:
-    case = Xml.SubElement(
-        suite,
-        "testcase",
-        {
-            "classname": _xml(
-                f"{'virtual ' if run['is_virtual'] else ''}{run['recipe']} {run['recipe_revision']}"
-            ),
-            "name": _xml(str(run["serial"])),
-            "time": f"{_seconds([run]):.3f}",
-            "timestamp": str(run["begun_at"]),
-        },
+def _junit_case(run: Row) -> JUnitCase:
+    virtual = "virtual " if run["is_virtual"] else ""
+    return JUnitCase(
+        f"{virtual}{run['recipe']} {run['recipe_revision']}",
+        str(run["serial"]),
+        float(run["duration_s"] or 0.0),
+        _JUNIT_RESULTS.get(run["state"], JUnitResult.PASSED),
+        message=str(run["text"]),
+        type=str(run["code"]),
+        timestamp=str(run["begun_at"]),
     )
-    element = _ELEMENTS.get(run["state"])
-    if element is not None:
-        told = {"type": _xml(str(run["code"])), "message": _xml(str(run["text"]))}
-        Xml.SubElement(case, element, told)
