@@ -113,7 +113,7 @@ def measure(folder: Path, runs: int) -> None:
         records = store.read
         timed("figures of all runs", records.figures)
         timed("figures of one lot", lambda: records.figures(RunFilter(lot="L001")))
-        timed("all runs", records.runs)
+        timed("all runs", records.table)
         timed("report of all as CSV", lambda: make_report(records, RunFilter()).to_csv())
         timed("report of all as JSON document", lambda: make_report(records, RunFilter()).to_dict())
         timed("report of all as JUnit", lambda: make_report(records, RunFilter()).to_junit())
@@ -121,7 +121,7 @@ def measure(folder: Path, runs: int) -> None:
         timed("certificate", lambda: certificate(store, records.unit("W0000017")))
         timed("backup", lambda: store.backup(folder / "backup.sqlite"))
         began = time.perf_counter()
-        problems = store.verify()
+        problems = store.examine().problems
         print(f"  verify: {len(problems)} problems, {time.perf_counter() - began:.1f} s")
         print(f"  figures: {records.figures()}")
     size_bytes = (folder / "backup.sqlite").stat().st_size

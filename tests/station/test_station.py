@@ -81,7 +81,7 @@ def test_a_unit_is_scanned_connected_run_and_shown(line: LineBench) -> None:
     run = line.bench.store.read.run(ended.run_id)
     assert run.run.state is RunState.PASS
     assert [step.name for step in run.steps] == ["flash bms", "save"]
-    assert line.bench.store.verify() == ()
+    assert line.bench.store.examine().problems == ()
 
 
 def test_pass_is_on_disk_before_it_is_shown(line: LineBench, bench: Bench) -> None:
@@ -454,7 +454,7 @@ def test_a_recipe_that_was_changed_stops_the_line(line: LineBench) -> None:
     line.arrive("A")
     assert line.last(LineStopped).code == "RECIPE_CHANGED"
     assert line.state("B") is SocketState.STOPPED
-    assert line.bench.store.read.runs() == ()
+    assert line.bench.store.read.table() == []
 
 
 def test_a_person_aborts_a_run(line: LineBench) -> None:
@@ -554,7 +554,7 @@ def test_a_full_disk_under_a_run_is_never_green(line: LineBench, bench: Bench) -
     bench.store.database.close()
     line.scan("RESUME")
     assert line.last(RunEnded).code == "RECORD_NOT_SAVED"
-    assert bench.store.read.state(SERIAL, "BAT-36") is UnitState.RECHECK
+    assert bench.store.read.unit(SERIAL).state is UnitState.RECHECK
 
 
 def test_a_claim_that_cannot_be_saved_begins_nothing(line: LineBench, bench: Bench) -> None:
@@ -640,7 +640,7 @@ def test_a_process_that_dies_costs_its_own_run_and_no_other(line: LineBench) -> 
     line.ports["A"].is_gone = True
     line.turn()
     assert line.last(RunEnded).code == "PROCESS_DIED"
-    assert line.bench.store.read.state(SERIAL, "BAT-36") is UnitState.RECHECK
+    assert line.bench.store.read.unit(SERIAL).state is UnitState.RECHECK
     assert line.state("B") is SocketState.RUNNING
     line.work("B")
     line.end("B")

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from datetime import datetime
-from itertools import islice
 from typing import Any, Final
 
 from sqlalchemy import Connection, Table, func, select, true
@@ -20,6 +18,7 @@ from sqlalchemy import Connection, Table, func, select, true
 from flasher.station.records import schema
 from flasher.station.records.keys import Head, SigningKey
 from flasher.station.records.model import utc_text
+from flasher.station.records.rows import grouped, named
 from flasher.station.records.schema import audit, station
 
 GENESIS: Final = "0" * 64
@@ -58,7 +57,7 @@ class Trail:
         self, now: datetime, event: str, data: Mapping[str, Any], run_id: int | None = None
     ) -> None:
         """Add a row, in the transaction of what it tells."""
-        station_id = self._station_id()
+        station_id = named(self.connection, station, name=self.station)
         last = self.connection.execute(
             select(audit.c.number, audit.c.hash)
             .where(audit.c.station_id == station_id)
@@ -81,14 +80,6 @@ class Trail:
         )
         head = Head(self.station, number, row["at"], found, signature, self.key.public)
         self.heads.append(head)
-
-    def _station_id(self) -> int:
-        query = select(station.c.id).where(station.c.name == self.station)
-        found = self.connection.execute(query).scalar_one_or_none()
-        if found is None:
-            made = self.connection.execute(station.insert().values(name=self.station))
-            found = made.inserted_primary_key[0]  # type: ignore[index]  # its key is one column
-        return int(found)
 
 
 def canonical(data: Any) -> str:
@@ -207,95 +198,53 @@ _OUTCOME: Final = frozenset(
     ["state", "code", "text", "ended_at", "ended_monotonic_s", "verification_reached", "log_sha256"]
 )
 """Columns of a run that its end writes."""
-_BATCH: Final = 500
-"""Keys in one IN (...): every back end takes so many."""
 
 
-def batches(run_ids: Iterable[int]) -> Iterator[list[int]]:
-    """Runs in parts of a size that `digests_of` takes."""
-    rest = iter(run_ids)
-    while some := list(islice(rest, _BATCH)):
-        yield some
-
-
-def digests_of(connection: Connection, run_ids: Sequence[int]) -> dict[int, dict[str, str]]:
-    """The digests of runs, by what they cover; a run that is not there is left
-    out.
+def digests_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dict[str, str]]:
+    """The digests of runs, by what they cover; a run that is not there is left out. They cover
+    names and contents, not keys of tables alone.
     """
-    named = _Named(connection)
-    found = {}
-    targets = _parts(connection, schema.run_target, run_ids)
+    known: dict[tuple[str, Any], dict[str, Any] | None] = {}
+
+    def row_of(table: Table, key: Any) -> dict[str, Any] | None:
+        if (table.name, key) not in known:
+            row = connection.execute(select(table).where(table.c.id == key)).mappings().first()
+            known[table.name, key] = None if row is None else dict(row)
+        return known[table.name, key]
+
+    def parts_of(table: Table) -> dict[int, list[dict[str, Any]]]:
+        query = select(table).order_by(table.c.id)
+        return grouped(connection, query, table.c.run_id, run_ids)
+
+    measurement, step = schema.measurement, schema.step
+    of_steps = select(measurement, step.c.run_id).join_from(measurement, step)
+    targets = parts_of(schema.run_target)
     parts = {
-        "steps": _parts(connection, schema.step, run_ids),
-        "measurements": _measurements(connection, run_ids),
-        "writes": _parts(connection, schema.device_write, run_ids),
-        "attachments": _parts(connection, schema.attachment, run_ids),
+        "steps": parts_of(step),
+        "measurements": grouped(
+            connection, of_steps.order_by(measurement.c.id), step.c.run_id, run_ids
+        ),
+        "writes": parts_of(schema.device_write),
+        "attachments": parts_of(schema.attachment),
         "targets": targets,
     }
-    for row in _rows(connection, schema.run, schema.run.c.id, run_ids):
-        run_id = row["id"]
+    runs = select(schema.run).order_by(schema.run.c.id)
+    found = {}
+    for run_id, (row,) in grouped(connection, runs, schema.run.c.id, run_ids).items():
         claim = {name: value for name, value in row.items() if name not in _OUTCOME}
         wanted = [{**each, "reached": None} for each in targets[run_id]]
-        socket = named.row(schema.socket, row["socket_id"])
+        socket = row_of(schema.socket, row["socket_id"])
         data = {
             "run": row,
             CLAIM: [claim, wanted],
-            "unit": named.row(schema.unit, row["unit_id"]),
+            "unit": row_of(schema.unit, row["unit_id"]),
             "socket": socket,
-            "station": named.row(schema.station, socket and socket["station_id"]),
-            "operator": named.row(schema.operator, row["operator_id"]),
-            "recipe": named.row(schema.recipe, row["recipe_id"]),
-            "lot": named.row(schema.lot, row["lot_id"]),
-            "artifacts": [
-                named.row(schema.artifact, each["artifact_id"]) for each in targets[run_id]
-            ],
+            "station": row_of(schema.station, socket and socket["station_id"]),
+            "operator": row_of(schema.operator, row["operator_id"]),
+            "recipe": row_of(schema.recipe, row["recipe_id"]),
+            "lot": row_of(schema.lot, row["lot_id"]),
+            "artifacts": [row_of(schema.artifact, each["artifact_id"]) for each in targets[run_id]],
             **{name: rows[run_id] for name, rows in parts.items()},
         }
         found[run_id] = {name: digest(value) for name, value in data.items()}
     return found
-
-
-class _Named:
-    """Rows by their keys, each read once."""
-
-    def __init__(self, connection: Connection) -> None:
-        self._connection = connection
-        self._known: dict[tuple[str, Any], dict[str, Any] | None] = {}
-
-    def row(self, table: Table, key: Any) -> dict[str, Any] | None:
-        if (table.name, key) not in self._known:
-            rows = _rows(self._connection, table, table.c.id, [key])
-            self._known[table.name, key] = rows[0] if rows else None
-        return self._known[table.name, key]
-
-
-def _parts(
-    connection: Connection, table: Table, run_ids: Collection[int]
-) -> dict[int, list[dict[str, Any]]]:
-    found = defaultdict(list)
-    for row in _rows(connection, table, table.c.run_id, run_ids):
-        found[row["run_id"]].append(row)
-    return found
-
-
-def _measurements(
-    connection: Connection, run_ids: Collection[int]
-) -> dict[int, list[dict[str, Any]]]:
-    table, step = schema.measurement, schema.step
-    query = (
-        select(table, step.c.run_id)
-        .join_from(table, step)
-        .where(step.c.run_id.in_(run_ids))
-        .order_by(table.c.id)
-    )
-    found = defaultdict(list)
-    for row in connection.execute(query).mappings():
-        found[row["run_id"]].append(dict(row))
-    return found
-
-
-def _rows(
-    connection: Connection, table: Table, column: Any, keys: Collection[Any]
-) -> list[dict[str, Any]]:
-    query = select(table).where(column.in_(keys)).order_by(table.c.id)
-    return [dict(row) for row in connection.execute(query).mappings()]

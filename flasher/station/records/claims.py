@@ -4,8 +4,9 @@ so that two sockets cannot both find the last place of a lot free.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
+from pathlib import PurePath
 from typing import Any, Final
 
 from sqlalchemy import Connection, func, select
@@ -26,7 +27,7 @@ from flasher.station.records.model import (
     utc_moment,
     utc_text,
 )
-from flasher.station.records.rows import add_targets, insert, named, recipe_row
+from flasher.station.records.rows import insert, named
 from flasher.station.records.schema import recipe, run, socket, station, unit
 
 CLOCK_TOLERANCE: Final = timedelta(minutes=5)
@@ -56,56 +57,57 @@ class Order:
         rule = self.loaded.recipe.golden
         return rule is not None and self.serial in rule.serial_numbers
 
-
-def make_order(
-    serial: str,
-    socket: str,
-    loaded: LoadedRecipe,
-    operator: str,
-    lot: str,
-    reason: str,
-    now: datetime,
-    *,
-    is_virtual: bool = False,
-) -> Order:
-    """A checked order. Raises ClaimRefusedError, UsageError."""
-    try:
-        scan = loaded.scan(serial, now.astimezone().date(), lot)
-    except ValueError as error:
-        raise ClaimRefusedError(
-            Refusal.WRONG_SERIAL,
-            f"No serial number of this recipe: {error}.",
-            remedy="Scan the label of the unit again.",
-        ) from error
-    if not loaded.is_unchanged():
-        raise ClaimRefusedError(
-            Refusal.RECIPE_CHANGED,
-            f"The recipe {printable(str(loaded.path))}, or a file that it names, was changed.",
-            remedy="Check it with `flasher station check`, then start the station again.",
-        )
-    if not operator.strip() or not socket.strip():
-        raise UsageError("A run needs an operator and a socket.")
-    return Order(serial, socket, loaded, operator, scan.lot, reason, is_virtual)
+    def checked(self, now: datetime) -> Order:
+        """The order with the lot that its serial number names. Raises ClaimRefusedError,
+        UsageError.
+        """
+        try:
+            scan = self.loaded.scan(self.serial, now.astimezone().date(), self.lot)
+        except ValueError as error:
+            raise ClaimRefusedError(
+                Refusal.WRONG_SERIAL,
+                f"No serial number of this recipe: {error}.",
+                remedy="Scan the label of the unit again.",
+            ) from error
+        if not self.loaded.is_unchanged():
+            path = printable(str(self.loaded.path))
+            raise ClaimRefusedError(
+                Refusal.RECIPE_CHANGED,
+                f"The recipe {path}, or a file that it names, was changed.",
+                remedy="Check it with `flasher station check`, then start the station again.",
+            )
+        if not self.operator.strip() or not self.socket.strip():
+            raise UsageError("A run needs an operator and a socket.")
+        return replace(self, lot=scan.lot)
 
 
 def begin_run(trail: Trail, order: Order, now: datetime, monotonic_s: float) -> Claim:
     """Begin a run when every rule allows it. Raises ClaimRefusedError."""
     connection = trail.connection
-    _check_clock(trail, now)
+    last = chain.latest(connection, trail.station)
+    if last is not None and now < utc_moment(last) - CLOCK_TOLERANCE:
+        # It would stand before the runs that were made.
+        raise ClaimRefusedError(
+            Refusal.CLOCK,
+            f"The clock says {utc_text(now)[:19]} UTC, but {trail.station} has records of"
+            f" {last[:19]} UTC.",
+            remedy="Set the clock of this computer. If the clock is right and that record is not:"
+            " end the station, then flasher station accept clock.",
+        )
     unit_id = named(connection, schema.unit, part=order.part, serial=order.serial)
     station_id = named(connection, schema.station, name=trail.station)
     socket_id = named(connection, schema.socket, station_id=station_id, name=order.socket)
     lot_id = None
     if order.lot:
         lot_id = named(connection, schema.lot, part=order.part, name=order.lot)
-    kind, before, count = kind_of(connection, order, unit_id, socket_id, lot_id, now)
+    kind, before, count = _kind_of(connection, order, unit_id, socket_id, lot_id, now)
     loaded = order.loaded
     run_id = insert(
         connection,
         schema.run,
         unit_id=unit_id,
         socket_id=socket_id,
-        recipe_id=recipe_row(trail, loaded, now),
+        recipe_id=_recipe_id(trail, loaded, now),
         lot_id=lot_id,
         operator_id=named(connection, schema.operator, name=order.operator),
         kind=kind.value,
@@ -119,27 +121,52 @@ def begin_run(trail: Trail, order: Order, now: datetime, monotonic_s: float) -> 
         verification_required=int(loaded.required),
         allow_completed_not_read_back=loaded.recipe.allow_completed_not_read_back,
     )
-    add_targets(connection, run_id, loaded.targets)
+    for position, target in enumerate(loaded.targets, 1):
+        artifact_id = named(
+            connection,
+            schema.artifact,
+            target=target.name,
+            sha256=target.image.sha256,
+            name=PurePath(target.image.source).name,
+            version=target.version,
+            size_bytes=target.image.size_bytes,
+        )
+        insert(
+            connection,
+            schema.run_target,
+            run_id=run_id,
+            artifact_id=artifact_id,
+            position=position,
+            target=target.name,
+            required=int(target.required),
+        )
     digests = digests_of(connection, [run_id])[run_id]
     data = {"serial": order.serial, "digests": {name: digests[name] for name in CLAIM_PARTS}}
     trail.append(now, chain.CLAIMED, data, run_id)
     return Claim(RunId(run_id), kind, order.serial, order.part, before, count)
 
 
-def _check_clock(trail: Trail, now: datetime) -> None:
-    """A clock that was set back would put this run before those that were made."""
-    last = chain.latest(trail.connection, trail.station)
-    if last is not None and now < utc_moment(last) - CLOCK_TOLERANCE:
-        raise ClaimRefusedError(
-            Refusal.CLOCK,
-            f"The clock says {utc_text(now)[:19]} UTC, but {trail.station} has records of"
-            f" {last[:19]} UTC.",
-            remedy="Set the clock of this computer. If the clock is right and that record is not:"
-            " end the station, then flasher station accept clock.",
-        )
+def _recipe_id(trail: Trail, loaded: LoadedRecipe, now: datetime) -> int:
+    """The recipe's row; it holds the whole text, so that it can be read years later."""
+    query = select(recipe.c.id).where(recipe.c.sha256 == loaded.sha256)
+    found = trail.connection.execute(query).scalar_one_or_none()
+    if found is not None:
+        return int(found)
+    rule = loaded.recipe
+    facts = {"name": rule.name, "revision": rule.revision, "sha256": loaded.sha256}
+    trail.append(now, "recipe", facts)
+    return insert(
+        trail.connection,
+        recipe,
+        **facts,
+        part=rule.part,
+        content=loaded.content,
+        verification_required=int(loaded.required),
+        allow_completed_not_read_back=rule.allow_completed_not_read_back,
+    )
 
 
-def kind_of(
+def _kind_of(
     connection: Connection,
     order: Order,
     unit_id: int,
@@ -276,9 +303,8 @@ def _check_golden(connection: Connection, order: Order, socket_id: int, now: dat
 
 
 def is_due(rule: Golden, last_pass: datetime | None, now: datetime) -> bool:
-    """True when a golden unit has to pass first. `last_pass` is when one last did on this socket.
-
-    `now` has the time zone of the clock on the wall, in which the shifts start.
+    """True when a golden unit has to pass first. `last_pass` is when one last did on this socket;
+    `now` is in the local time zone, in which the shifts start.
     """
     if last_pass is None:
         return True

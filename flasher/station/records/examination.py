@@ -6,12 +6,13 @@ from collections import defaultdict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Any, Final
 
+from pydantic import ValidationError
 from sqlalchemy import Connection, func, select
 
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
-from flasher.station.records.chain import NAMED, OWN, batches, digests_of
+from flasher.station.records.chain import NAMED, OWN, digests_of
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
 from flasher.station.records.files import FileStore
@@ -27,31 +28,82 @@ from flasher.station.records.model import (
     RunState,
 )
 from flasher.station.records.proof import contradictions, hear
-from flasher.station.records.queries import details_of, run_records
+from flasher.station.records.queries import details_of
+from flasher.station.records.rows import batches
 from flasher.station.records.signing import KeptPlace
 from flasher.station.records.triggers import differences, fingerprint_of
 from flasher.trace.reader import read_trace
 
+_RUNS_NAMED: Final = 5
 
-class TrailsCheck:
-    """One look at all audit trails, against the heads that are kept of them."""
 
-    def __init__(self, place: KeptPlace) -> None:
+class Examiner:
+    """One examination of the records."""
+
+    def __init__(self, database: Database, files: FileStore, place: KeptPlace) -> None:
+        self._database = database
+        self._files = files
         self._place = place
+        self._remarks: list[str] = []
+        self._kept: list[KeptHeads] = []
+        self._unkept: list[str] = []
         self._schema: dict[tuple[str, str], None] = {}
         """How the schema differs from what any chain states of it, each difference once."""
-        self.remarks: list[str] = []
-        self.kept: list[KeptHeads] = []
-        self.unkept: list[str] = []
-        self.claims: dict[int, Mapping[str, str]] = {}
+        self._claims: dict[int, Mapping[str, str]] = {}
         """The digests that the chains state for each run, at its claim."""
-        self.endings: dict[int, Mapping[str, str]] = {}
+        self._endings: dict[int, Mapping[str, str]] = {}
         """And at its end."""
+        self._traces = 0
+        self._nameless = 0
 
-    def problems(self, connection: Connection) -> Iterator[Problem]:
-        """What is wrong; fills the rest."""
-        info = connection.execute(select(schema.schema_info)).mappings().one()
-        records_id, found = info["records_id"], fingerprint_of(connection)
+    def examine(self, runs: Collection[RunId] | None = None) -> Examination:
+        """Look at everything, and of the runs at these or at all."""
+        with self._database.reading() as connection:
+            problems = tuple(self._problems(connection, runs))
+        if self._nameless:
+            self._remarks.append(
+                f"{self._nameless} PASS of devices that name no serial number: their traces do not"
+                " tell which unit it was"
+            )
+        return Examination(
+            problems, tuple(self._remarks), tuple(self._kept), tuple(self._unkept), self._traces
+        )
+
+    def _problems(
+        self, connection: Connection, runs: Collection[RunId] | None
+    ) -> Iterator[Problem]:
+        if self._database.backend == "sqlite":
+            yield from _sqlite_problems(connection)
+        yield from self._trails(connection)
+        run = schema.run.c
+        there = list(connection.execute(select(run.id).order_by(run.id)).scalars())
+        for run_id in sorted((self._claims.keys() | self._endings.keys()) - set(there)):
+            yield Problem(f"run {run_id}", "it is missing: the audit trail knows it", (run_id,))
+        chosen = there if runs is None else sorted(set(there) & set(runs))
+        changed: dict[tuple[str, str], list[int]] = defaultdict(list)
+        for some in batches(chosen):
+            for run_id, digests in digests_of(connection, some).items():
+                yield from self._digests(run_id, digests, changed)
+            yield from self._runs(connection, some)
+        for (part, _), run_ids in changed.items():
+            shown = ", ".join(map(str, run_ids[:_RUNS_NAMED]))
+            more = f" and {len(run_ids) - _RUNS_NAMED} more" if len(run_ids) > _RUNS_NAMED else ""
+            what = f"changed after it was recorded: {NAMED[part]}"
+            yield Problem(f"{part} of run {shown}{more}", what, tuple(run_ids))
+        of_pass = select(run.log_sha256).where(run.state == RunState.PASS.value)
+        twice = of_pass.group_by(run.log_sha256).having(func.count() > 1)
+        for sha256 in connection.execute(twice).scalars().all():
+            with_it = select(run.id).where(run.log_sha256 == sha256).order_by(run.id)
+            same = tuple(connection.execute(with_it).scalars())
+            shown = ", ".join(map(str, same[:_RUNS_NAMED]))
+            yield Problem(f"runs {shown}", "they have one and the same trace", same)
+
+    # -- audit trails -----------------------------------------------------------------------------
+
+    def _trails(self, connection: Connection) -> Iterator[Problem]:
+        """Go through all audit trails, and hold them against the heads that are kept of them."""
+        records_id = connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
+        found = fingerprint_of(connection)
         names = list(connection.execute(select(schema.station.c.name)).scalars())
         kept_of = self._place.files(records_id, names)
         for name in dict.fromkeys([*names, *kept_of]):
@@ -101,37 +153,31 @@ class TrailsCheck:
             stated = _table(data.get("schema")) or stated
             if row["event"] == chain.RESTORED:
                 restored[expected] = _lost(data)
-            self._note(shown, row, data)
-            self._vouch(row, data)
+            self._take_row(shown, row, data)
             for what in _contradictions(name, records_id, row["event"], data):
                 yield Problem(where, what)
         if hashes:
             self._schema |= dict.fromkeys(differences(stated, found))
 
-    def _note(self, shown: str, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
+    def _take_row(self, shown: str, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
+        """Note what an intact row vouches for, and what a person should know of it."""
         said = f"{row['at'][:10]} by {printable(str(data.get('by')))}"
+        digests = _table(data.get("digests")) if row["run_id"] is not None else {}
         match row["event"]:
             case chain.KEY_LOST:
-                self.remarks.append(f"{shown}: the key was declared lost on {said}")
+                self._remarks.append(f"{shown}: the key was declared lost on {said}")
             case chain.RESTORED:
                 lost = _lost(data)
-                self.remarks.append(
+                self._remarks.append(
                     f"{shown}: rows {lost.start} to {lost.stop - 1} of an earlier chain were given"
                     f" up as lost on {said}"
                 )
             case chain.CLOCK:
-                self.remarks.append(f"{shown}: the clock was released on {said}")
-            case _:
-                pass
-
-    def _vouch(self, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
-        digests = _table(data.get("digests"))
-        if row["run_id"] is None or not digests:
-            return
-        if row["event"] in chain.ENDINGS:
-            self.endings[row["run_id"]] = digests
-        elif row["event"] == chain.CLAIMED:
-            self.claims[row["run_id"]] = digests
+                self._remarks.append(f"{shown}: the clock was released on {said}")
+            case chain.CLAIMED if digests:
+                self._claims[row["run_id"]] = digests
+            case ending if ending in chain.ENDINGS and digests:
+                self._endings[row["run_id"]] = digests
 
     def _heads(
         self,
@@ -145,7 +191,7 @@ class TrailsCheck:
         place = printable(str(self._place.folder))
         if not kept:
             if hashes:
-                self.unkept.append(name)
+                self._unkept.append(name)
                 if self._place.is_named:
                     yield Problem(f"heads of {shown}", f"none of these records is kept in {place}")
             return
@@ -172,7 +218,89 @@ class TrailsCheck:
         if held:
             numbers = [head.number for head in held]
             path = self._place.folder
-            self.kept.append(KeptHeads(name, path, min(numbers), max(numbers)))
+            self._kept.append(KeptHeads(name, path, min(numbers), max(numbers)))
+
+    # -- runs -------------------------------------------------------------------------------------
+
+    def _digests(
+        self, run_id: int, digests: Mapping[str, str], changed: dict[tuple[str, str], list[int]]
+    ) -> Iterator[Problem]:
+        """Hold a run against what the trails vouch for; `changed` collects what several share."""
+        where = f"run {run_id}"
+        stated = (self._claims.get(run_id, {}), self._endings.get(run_id, {}))
+        if not any(stated):
+            yield Problem(where, "the audit trail does not know it", (run_id,))
+        wrong = {
+            part: digests.get(part, "")
+            for each in stated
+            for part in each
+            if each[part] != digests.get(part)
+        }
+        for part in wrong.keys() & NAMED.keys():
+            changed[part, wrong[part]].append(run_id)
+        own = [words for part, words in OWN.items() if part in wrong]
+        if own:
+            what = f"changed after it was recorded: {', '.join(own)}"
+            yield Problem(where, what, (run_id,))
+
+    def _runs(self, connection: Connection, run_ids: list[int]) -> Iterator[Problem]:
+        """What the runs are, and their attachments."""
+        try:
+            found = tuple(details_of(connection, schema.run.c.id.in_(run_ids)))
+        except ValidationError as error:
+            if len(run_ids) > 1:
+                for run_id in run_ids:
+                    yield from self._runs(connection, [run_id])
+            else:
+                (first, *_) = error.errors()
+                said = printable(f"{first['input']!r:.80} as {first['loc'][-1]}")
+                yield Problem(f"run {run_ids[0]}", f"it cannot be read: {said}", tuple(run_ids))
+            return
+        for details in found:
+            run_id = details.run.run_id
+            is_over = details.run.state is not RunState.RUNNING
+            is_known = run_id in self._claims or run_id in self._endings
+            if is_known and is_over != (run_id in self._endings):
+                what = "it is finished" if is_over else "it goes on"
+                what += ", but the audit trail says otherwise"
+                yield Problem(f"run {run_id}", what, (run_id,))
+            yield from self._attachments(details)
+
+    def _attachments(self, details: RunDetails) -> Iterator[Problem]:
+        run = details.run
+        traces = [
+            file
+            for file in details.attachments
+            if file.kind == TRACE and file.sha256 == run.log_sha256
+        ]
+        for file in details.attachments:
+            wrong = self._files.check(file.sha256)
+            if wrong:
+                where = f"run {run.run_id}, attachment {file.sha256}"
+                yield Problem(where, wrong, (run.run_id,))
+                if file in traces:
+                    return
+        if run.state is RunState.PASS:
+            yield from self._trace(details, traces)
+
+    def _trace(self, details: RunDetails, traces: list[AttachmentFile]) -> Iterator[Problem]:
+        """Hold a PASS against its own trace."""
+        run = details.run
+        where = f"run {run.run_id}, PASS of {printable(run.serial)}"
+        if not traces:
+            yield Problem(where, "there is no trace to hold it against", (run.run_id,))
+            return
+        try:
+            with self._files.named(traces[0]) as path:
+                heard = hear((target.target for target in details.targets), read_trace(path))
+        except (UsageError, RecordError) as error:
+            what = f"its trace cannot be read: {error.cause or error.what}"
+            yield Problem(where, what, (run.run_id,))
+            return
+        self._traces += 1
+        self._nameless += not any(each.serial for each in heard.values())
+        for what in contradictions(details, heard):
+            yield Problem(where, f"its trace says otherwise: {what}", (run.run_id,))
 
 
 def _counting(
@@ -218,163 +346,6 @@ def _lost(data: Mapping[str, Any]) -> range:
     if isinstance(first, int) and isinstance(last, int):
         return range(first, last + 1)
     return range(0)
-
-
-_RUNS_NAMED: Final = 5
-
-
-class Examiner:
-    """One examination of the records."""
-
-    def __init__(self, database: Database, files: FileStore, place: KeptPlace) -> None:
-        self._database = database
-        self._files = files
-        self._trails = TrailsCheck(place)
-        self._traces = 0
-        self._nameless = 0
-
-    def examine(self, runs: Collection[RunId] | None = None) -> Examination:
-        """Look at everything, and of the runs at these or at all."""
-        with self._database.reading() as connection:
-            problems = tuple(self._problems(connection, runs))
-        trails = self._trails
-        if self._nameless:
-            trails.remarks.append(
-                f"{self._nameless} PASS of devices that name no serial number: their traces do not"
-                " tell which unit it was"
-            )
-        return Examination(
-            problems,
-            tuple(trails.remarks),
-            tuple(trails.kept),
-            tuple(trails.unkept),
-            self._traces,
-        )
-
-    def _problems(
-        self, connection: Connection, runs: Collection[RunId] | None
-    ) -> Iterator[Problem]:
-        if self._database.backend == "sqlite":
-            yield from _sqlite_problems(connection)
-        yield from self._trails.problems(connection)
-        query = select(schema.run.c.id).order_by(schema.run.c.id)
-        chosen = list(connection.execute(query).scalars())
-        for run_id in sorted(
-            (self._trails.claims.keys() | self._trails.endings.keys()) - set(chosen)
-        ):
-            yield Problem(f"run {run_id}", "it is missing: the audit trail knows it", (run_id,))
-        if runs is not None:
-            chosen = sorted(set(chosen) & set(runs))
-        changed: dict[tuple[str, str], list[int]] = defaultdict(list)
-        for batch in batches(chosen):
-            yield from self._runs(connection, batch, changed)
-        for (part, _), run_ids in changed.items():
-            shown = ", ".join(map(str, run_ids[:_RUNS_NAMED]))
-            more = f" and {len(run_ids) - _RUNS_NAMED} more" if len(run_ids) > _RUNS_NAMED else ""
-            what = f"changed after it was recorded: {NAMED[part]}"
-            yield Problem(f"{part} of run {shown}{more}", what, tuple(run_ids))
-        yield from self._traces_used_twice(connection)
-
-    # -- runs -------------------------------------------------------------------------------------
-
-    def _runs(
-        self, connection: Connection, run_ids: list[int], changed: dict[tuple[str, str], list[int]]
-    ) -> Iterator[Problem]:
-        for run_id, digests in digests_of(connection, run_ids).items():
-            where = f"run {run_id}"
-            claim, ending = (
-                self._trails.claims.get(run_id, {}),
-                self._trails.endings.get(run_id, {}),
-            )
-            if not claim and not ending:
-                yield Problem(where, "the audit trail does not know it", (run_id,))
-            wrong = {
-                part: digests.get(part, "")
-                for stated in (claim, ending)
-                for part in stated
-                if stated[part] != digests.get(part)
-            }
-            for part in wrong.keys() & NAMED.keys():
-                changed[part, wrong[part]].append(run_id)
-            own = [words for part, words in OWN.items() if part in wrong]
-            if own:
-                what = f"changed after it was recorded: {', '.join(own)}"
-                yield Problem(where, what, (run_id,))
-        yield from self._parts(connection, run_ids)
-
-    def _parts(self, connection: Connection, run_ids: list[int]) -> Iterator[Problem]:
-        """What the runs are, and their attachments."""
-        try:
-            found = tuple(details_of(connection, run_records(connection, run_ids)))
-        except ValueError as error:  # a word or a time that no station writes
-            if len(run_ids) > 1:
-                for run_id in run_ids:
-                    yield from self._parts(connection, [run_id])
-            else:
-                said = printable(f"{error!s:.100}")
-                what = f"it cannot be read: {said}"
-                yield Problem(f"run {run_ids[0]}", what, tuple(run_ids))
-            return
-        for details in found:
-            run_id = details.run.run_id
-            is_over = details.run.state is not RunState.RUNNING
-            is_known = run_id in self._trails.claims or run_id in self._trails.endings
-            if is_known and is_over != (run_id in self._trails.endings):
-                what = "it is finished" if is_over else "it goes on"
-                what += ", but the audit trail says otherwise"
-                yield Problem(f"run {run_id}", what, (run_id,))
-            yield from self._attachments(details)
-
-    def _attachments(self, details: RunDetails) -> Iterator[Problem]:
-        run = details.run
-        traces = [
-            file
-            for file in details.attachments
-            if file.kind == TRACE and file.sha256 == run.log_sha256
-        ]
-        for file in details.attachments:
-            wrong = self._files.check(file.sha256)
-            if wrong:
-                where = f"run {run.run_id}, attachment {file.sha256}"
-                yield Problem(where, wrong, (run.run_id,))
-                if file in traces:
-                    return
-        if run.state is RunState.PASS:
-            yield from self._trace(details, traces)
-
-    def _trace(self, details: RunDetails, traces: list[AttachmentFile]) -> Iterator[Problem]:
-        """Hold a PASS against its own trace."""
-        run = details.run
-        where = f"run {run.run_id}, PASS of {printable(run.serial)}"
-        if not traces:
-            yield Problem(where, "there is no trace to hold it against", (run.run_id,))
-            return
-        try:
-            with self._files.named(traces[0]) as path:
-                heard = hear((target.target for target in details.targets), read_trace(path))
-        except (UsageError, RecordError) as error:
-            what = f"its trace cannot be read: {error.cause or error.what}"
-            yield Problem(where, what, (run.run_id,))
-            return
-        self._traces += 1
-        self._nameless += not any(each.serial for each in heard.values())
-        for what in contradictions(details, heard):
-            yield Problem(where, f"its trace says otherwise: {what}", (run.run_id,))
-
-    @staticmethod
-    def _traces_used_twice(connection: Connection) -> Iterator[Problem]:
-        run = schema.run.c
-        query = (
-            select(run.log_sha256)
-            .where(run.state == RunState.PASS.value)
-            .group_by(run.log_sha256)
-            .having(func.count() > 1)
-        )
-        for sha256 in connection.execute(query).scalars().all():
-            of_trace = select(run.id).where(run.log_sha256 == sha256).order_by(run.id)
-            run_ids = tuple(connection.execute(of_trace).scalars())
-            shown = ", ".join(map(str, run_ids[:_RUNS_NAMED]))
-            yield Problem(f"runs {shown}", "they have one and the same trace", run_ids)
 
 
 def _sqlite_problems(connection: Connection) -> Iterator[Problem]:

@@ -6,7 +6,7 @@
     write = store.intent(claim.run_id, "bms", "flash", "V1r0r4_20220512")
     ... the act ...
     store.verified(write, "V1r0r4_20220512")
-    store.step(claim.run_id, StepName.FLASH, StepState.PASS, ...)
+    store.step(claim.run_id, "flash", StepState.PASS, ...)
     trace = store.add_file("trace", path)
     store.finish(claim.run_id, Ending(RunState.PASS, "OK", "", ...))   # only now show PASS
 
@@ -19,25 +19,27 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Final, Self
 
-from sqlalchemy import select, update
+from sqlalchemy import func, select, update
 
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records import chain, queries, schema
+from flasher.station.records import chain, schema
 from flasher.station.records.backup import make_backup
-from flasher.station.records.claims import begin_run, make_order
+from flasher.station.records.chain import Trail, digests_of
+from flasher.station.records.claims import Order, begin_run
 from flasher.station.records.database import (
     DEFAULT_LOCK_TIMEOUT_S,
     Database,
     locate,
     open_database,
 )
-from flasher.station.records.errors import RuleBrokenError
+from flasher.station.records.errors import NotFoundError, RuleBrokenError
 from flasher.station.records.examination import Examiner
 from flasher.station.records.files import FileStore
 from flasher.station.records.model import (
@@ -50,23 +52,14 @@ from flasher.station.records.model import (
     Ending,
     Examination,
     Measurement,
-    Problem,
     RunId,
     RunState,
     StepState,
     WriteId,
     utc_text,
 )
-from flasher.station.records.rows import (
-    add_attachments,
-    add_ending,
-    add_step,
-    end_run,
-    insert,
-    is_saved,
-    one_row,
-    weakest,
-)
+from flasher.station.records.queries import Records
+from flasher.station.records.rows import insert
 from flasher.station.records.signing import Keeping, Signer
 
 _USUAL: Final = Keeping()
@@ -95,7 +88,7 @@ class Store:
         self.station = station
         self.files = FileStore(database.location.folder)
         self.signer = Signer(database, station, clock.utc, keeping)
-        self.read = queries.Records(database)
+        self.read = Records(database)
         self._clock = clock
         self._lock = database.station_lock(station)
 
@@ -185,10 +178,10 @@ class Store:
             ).scalars()
             found = tuple(RunId(run_id) for run_id in left if run_id not in known)
             for run_id in found:
-                add_attachments(trail.connection, run_id, self.files.add_spooled(run_id))
-                end_run(
+                _end_run(
                     trail,
                     run_id,
+                    self.files.add_spooled(run_id),
                     now,
                     state=RunState.INTERRUPTED.value,
                     code="STATION_DIED",
@@ -214,9 +207,7 @@ class Store:
         Raises ClaimRefusedError, RecordError (before `recover` too).
         """
         now = self._clock.utc()
-        order = make_order(
-            serial, socket, recipe, operator, lot, reason, now, is_virtual=is_virtual
-        )
+        order = Order(serial, socket, recipe, operator, lot, reason, is_virtual).checked(now)
         # One claim at a time, of all stations: two must not find the last place of a lot free.
         with self.signer.writing("claims") as trail:
             return begin_run(trail, order, now, self._clock.monotonic_s())
@@ -249,7 +240,8 @@ class Store:
                 .where(table.c.id == write_id)
                 .values(verified_at=utc_text(self._clock.utc()), read_back=read_back)
             )
-            one_row(done.rowcount, f"write {write_id}")
+            if done.rowcount != 1:
+                raise NotFoundError(f"There is no write {write_id}.")
 
     def step(
         self,
@@ -271,12 +263,19 @@ class Store:
             if not all(math.isfinite(number) for number in numbers if number is not None):
                 raise RuleBrokenError(f"{each.name}: {_ONLY_FINITE}.", where=f"run {run_id}")
         ended_s = self._clock.monotonic_s()
+        table = schema.step.c
+        counted = select(
+            func.coalesce(func.max(table.position), 0), func.count().filter(table.name == name)
+        ).where(table.run_id == run_id)
         with self.database.writing() as connection:
-            add_step(
+            position, tries = connection.execute(counted).one()
+            step_id = insert(
                 connection,
-                run_id,
-                str(name),
-                measurements,
+                schema.step,
+                run_id=run_id,
+                position=position + 1,
+                name=name,
+                try_number=tries + 1,
                 state=state.value,
                 code=code,
                 text=text,
@@ -284,6 +283,8 @@ class Store:
                 begun_monotonic_s=ended_s - duration_s,
                 duration_s=duration_s,
             )
+            for each in measurements:
+                insert(connection, schema.measurement, step_id=step_id, **asdict(each))
 
     def add_file(self, kind: str, path: Path) -> AttachmentFile:
         """Store a file by its hash, for an `Ending` to name; on disk when it returns."""
@@ -305,19 +306,36 @@ class Store:
             if wrong:
                 raise RuleBrokenError(f"{file.name}: {wrong}", where=f"run {run_id}")
         now = self._clock.utc()
+        run, target = schema.run.c, schema.run_target.c
+        saved = select(run.state, run.code, run.text, run.log_sha256).where(run.id == run_id)
         with self.signer.writing() as trail:
-            if is_saved(trail.connection, run_id, ending):
+            connection = trail.connection
+            found = connection.execute(saved).one_or_none()
+            if found is None:
+                raise NotFoundError(f"There is no run {run_id}.")
+            if found == (ending.state.value, ending.code, ending.text, ending.log_sha256):
                 return
-            add_ending(trail.connection, run_id, ending)
-            end_run(
+            for name, level in ending.verified.items():
+                changed = connection.execute(
+                    update(schema.run_target)
+                    .where(target.run_id == run_id, target.target == name)
+                    .values(reached=int(level))
+                )
+                if changed.rowcount != 1:
+                    raise NotFoundError(f"There is no target {name} of run {run_id}.")
+            levels = select(target.reached).where(target.run_id == run_id)
+            reached = list(connection.execute(levels).scalars())
+            _end_run(
                 trail,
                 run_id,
+                ending.attachments,
                 now,
                 state=ending.state.value,
                 code=ending.code,
                 text=ending.text,
                 ended_monotonic_s=self._clock.monotonic_s(),
-                verification_reached=weakest(trail.connection, run_id),
+                # The weakest of all targets.
+                verification_reached=None if not reached or None in reached else min(reached),
                 log_sha256=ending.log_sha256,
             )
 
@@ -328,13 +346,6 @@ class Store:
         with self.signer.writing() as trail:
             trail.append(self._clock.utc(), event.value, data, run_id)
 
-    def correct(self, run_id: RunId, operator: str, text: str) -> None:
-        """Add a remark to a finished run, which itself never changes."""
-        with self.signer.writing() as trail:
-            queries.state_of(trail.connection, run_id)
-            data = {"by": operator, "text": text}
-            trail.append(self._clock.utc(), "correction", data, run_id)
-
     # -- care -------------------------------------------------------------------------------------
 
     def backup(self, path: Path) -> Backup:
@@ -342,10 +353,6 @@ class Store:
         the attachments are copied beside it as `NAME.files`. SQLite only. Raises RecordError.
         """
         return make_backup(self.database, self.files, path)
-
-    def verify(self) -> tuple[Problem, ...]:
-        """Everything that is not as it has to be: database, audit trail, runs, attachments."""
-        return self.examine().problems
 
     def examine(self, runs: Collection[RunId] | None = None) -> Examination:
         """What holds of the records and what does not, with the reasons; of these runs, or of all.
@@ -374,3 +381,20 @@ class Store:
         """Go on with a new key, since the one before is gone. Raises UsageError when it is not."""
         self._lock.acquire()
         self.signer.replace_lost(operator, reason)
+
+
+def _end_run(
+    trail: Trail, run_id: int, attached: Iterable[AttachmentFile], now: datetime, **values: Any
+) -> None:
+    """End a run with its attachments, and let the audit trail vouch for it and all its parts."""
+    connection, run = trail.connection, schema.run
+    for file in attached:
+        insert(connection, schema.attachment, run_id=run_id, **asdict(file))
+    begun_at = connection.execute(select(run.c.begun_at).where(run.c.id == run_id)).scalar_one()
+    # A clock that was set back does not make a run end before it began.
+    ended_at = max(utc_text(now), begun_at)
+    connection.execute(update(run).where(run.c.id == run_id).values(ended_at=ended_at, **values))
+    interrupted = values["state"] == RunState.INTERRUPTED.value
+    event = chain.INTERRUPTED if interrupted else chain.FINISHED
+    digests = digests_of(connection, [run_id])[run_id]
+    trail.append(now, event, {"state": values["state"], "digests": digests}, run_id)

@@ -27,9 +27,9 @@ def test_a_backup_made_while_a_unit_runs_is_whole_and_opens_by_itself(bench: Ben
     bench.make(RunState.PASS, "W2605004", "B")
     keeping = Keeping(bench.folder / "of nobody")  # the kept heads know the later run as well
     with Store.open(str(path), station="line-2", create=False, keeping=keeping) as copy:
-        assert not copy.verify()
-        assert copy.read.state(SERIAL, "BAT-36") is UnitState.PASS
-        assert copy.read.state("W2605004", "BAT-36") is UnitState.NEW
+        assert not copy.examine().problems
+        assert copy.read.unit(SERIAL).state is UnitState.PASS
+        assert copy.read.units("W2605004") == ()
 
 
 def test_a_backup_that_fails_leaves_the_old_one(bench: Bench) -> None:
@@ -55,18 +55,10 @@ def test_an_attachment_that_is_gone_or_changed_is_found(
     bench.make()
     (file,) = bench.store.read.unit(SERIAL).runs[0].attachments
     spoil(bench.store.files.path(file.sha256))
-    (problem,) = bench.store.verify()
+    (problem,) = bench.store.examine().problems
     assert file.sha256 in problem.where
     with pytest.raises(RecordsDamagedError):
         bench.store.files.read(file.sha256)
-
-
-def test_a_correction_is_a_new_row_and_part_of_the_chain(bench: Bench) -> None:
-    run_id = bench.make()
-    before = bench.store.read.run(run_id)
-    bench.store.correct(run_id, "jo", "wrong lot on the card, it was L2")
-    assert bench.store.read.run(run_id) == before
-    assert not bench.store.verify()
 
 
 def test_what_a_person_did_at_the_station_is_part_of_the_chain(bench: Bench) -> None:
@@ -77,4 +69,4 @@ def test_what_a_person_did_at_the_station_is_part_of_the_chain(bench: Bench) -> 
         rows = connection.execute(select(audit).order_by(audit.c.id.desc()).limit(2)).all()
     assert [(row.event, row.run_id) for row in rows] == [("abort", run_id), ("operator", None)]
     assert json.loads(rows[1].data) == {"before": "jo", "now": "al"}
-    assert not bench.store.verify()
+    assert not bench.store.examine().problems

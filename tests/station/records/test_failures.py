@@ -46,7 +46,7 @@ def test_a_full_disk_saves_no_pass_and_the_run_can_be_finished_later(bench: Benc
         connection.exec_driver_sql(f"PRAGMA max_page_count = {pages + 1000}")
     bench.store.finish(run_id, long)
     assert bench.store.read.run(run_id).run.state is RunState.PASS
-    assert not bench.store.verify()
+    assert not bench.store.examine().problems
 
 
 def test_a_locked_database_is_waited_for_and_then_an_error(bench: Bench) -> None:
@@ -110,7 +110,7 @@ def test_a_damaged_page_is_found(bench: Bench) -> None:
     (bench.folder / "copy.sqlite").write_bytes(data)
     try:
         with Store.open(str(bench.folder / "copy.sqlite"), station="x", create=False) as store:
-            assert store.verify()
+            assert store.examine().problems
     except RecordsDamagedError as error:
         assert "damaged" in str(error)  # noqa: PT017  either is right
 
@@ -194,7 +194,7 @@ def test_records_in_memory_need_a_folder_for_their_files(tmp_path: Path) -> None
         "sqlite://", station="x", folder=tmp_path / "files", clock=FakeClock()
     ) as store:
         assert store.recover() == ()
-        assert not store.verify()
+        assert not store.examine().problems
 
 
 def test_a_trace_that_cannot_be_stored_is_an_error_and_leaves_no_part(

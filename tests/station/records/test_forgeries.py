@@ -105,7 +105,7 @@ def examined(
     keeping = Keeping(folder / "keys", **named)
     files = plant.store.files.folder
     with Store.open(str(copy), station="x", folder=files, read_only=True, keeping=keeping) as store:
-        return store.verify()
+        return store.examine().problems
 
 
 def told(problems: tuple[Problem, ...], where: str, what: str) -> bool:
@@ -219,7 +219,7 @@ def test_an_older_copy_is_told(bench: Bench) -> None:
     bench.store.close()
     older.replace(bench.path)
     with bench.opened() as store:
-        (problem,) = store.verify()
+        (problem,) = store.examine().problems
     assert "ends at row 4, but row 6" in problem.what
     assert "an older copy" in problem.what
 
@@ -237,17 +237,17 @@ def test_a_pass_with_the_trace_of_something_else_is_told(bench: Bench) -> None:
     }
     for serial, (messages, what) in traces.items():
         run_id = passed(bench, serial, write_trace(folder / f"{serial}.log.gz", messages))
-        assert told(bench.store.verify(), f"run {run_id}, PASS of {serial}", what)
+        assert told(bench.store.examine().problems, f"run {run_id}, PASS of {serial}", what)
     run_id = bench.claim("W2605015").run_id
     write = bench.store.intent(run_id, "bms", "serial-number", "W2605015")
     bench.store.verified(write, "W2605015")
     bench.work(run_id)
     bench.store.finish(run_id, bench.ending(trace=bench.traced("W2605015")))
-    assert told(bench.store.verify(), f"run {run_id}", "W2605015 is not written in it")
+    assert told(bench.store.examine().problems, f"run {run_id}", "W2605015 is not written in it")
     broken = folder / "broken.log.gz"
     broken.write_bytes(b"no trace")
     run_id = passed(bench, "W2605016", broken)
-    assert told(bench.store.verify(), f"run {run_id}", "its trace cannot be read")
+    assert told(bench.store.examine().problems, f"run {run_id}", "its trace cannot be read")
 
 
 IMAGES_BMS = IMAGES[next(target for target in IMAGES if target.name == "bms")]
@@ -274,7 +274,7 @@ def test_wholly_new_records_are_told_where_the_heads_have_to_be(
         assert not found.is_checked_elsewhere
     keeping = Keeping(heads=plant.keys)
     with Store.open(new, station="x", read_only=True, keeping=keeping) as store:
-        assert told(store.verify(), "heads of line-2", "none of these records is kept")
+        assert told(store.examine().problems, "heads of line-2", "none of these records is kept")
 
 
 def test_kept_heads_that_were_changed_are_told(plant: Bench, tmp_path: Path) -> None:

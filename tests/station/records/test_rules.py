@@ -15,6 +15,7 @@ from flasher.station.records import (
     Ending,
     Measurement,
     RuleBrokenError,
+    RunId,
     RunState,
     StepState,
 )
@@ -231,7 +232,7 @@ def test_a_pass_without_any_step_is_none(any_bench: Bench) -> None:
 def test_a_step_does_not_pass_with_a_measurement_out_of_limits(
     running: Bench, measured: Measurement
 ) -> None:
-    run_id = running.store.read.runs()[0].run_id
+    run_id = RunId(1)
     with pytest.raises(RuleBrokenError):
         running.store.step(run_id, "check", StepState.PASS, duration_s=1.0, measurements=[measured])
     assert not running.store.read.run(run_id).steps

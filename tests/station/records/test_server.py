@@ -168,7 +168,7 @@ def test_of_two_stations_that_claim_one_unit_one_gets_it(bench: Bench) -> None:
     assert len(begun) == len(set(begun)) == 5  # each unit once, and no more than the lot takes
     refusals = {each for each in every if isinstance(each, Refusal)}
     assert refusals <= {Refusal.UNIT_RUNNING, Refusal.LOT_FULL}
-    assert not bench.store.verify()
+    assert not bench.store.examine().problems
 
 
 def test_who_reads_sees_one_moment_while_others_write(bench: Bench) -> None:

@@ -20,6 +20,7 @@ from flasher.station.records import (
     KeyMissingError,
     RecordsCutError,
     Refusal,
+    RunId,
     RunState,
     SchemaVersionError,
     Store,
@@ -87,8 +88,8 @@ def test_after_a_rotation_another_key_signs_and_the_chain_holds(bench: Bench) ->
     bench.make(serial=OTHER)
     assert bench.store.signer.public != before
     reopened(bench).recover()
-    assert not bench.store.verify()
-    assert bench.store.read.head_of(bench.store.read.runs()[0].run_id).key == before  # type: ignore[union-attr]
+    assert not bench.store.examine().problems
+    assert bench.store.read.head_of(RunId(1)).key == before  # type: ignore[union-attr]
 
 
 def test_a_rotation_that_a_crash_cut_short_is_ended_at_the_next_start(
@@ -100,7 +101,7 @@ def test_a_rotation_that_a_crash_cut_short_is_ended_at_the_next_start(
             bench.store.rotate_key("jo")
     reopened(bench).recover()
     bench.make()
-    assert not bench.store.verify()
+    assert not bench.store.examine().problems
     assert not list(bench.keys.glob("*.new"))
 
 
@@ -143,7 +144,7 @@ def test_half_a_line_that_a_crash_left_spoils_nothing(bench: Bench) -> None:
     with kept.open("a") as file:
         file.write('{"at": "2026')
     bench.make()
-    (problem,) = bench.store.verify()
+    (problem,) = bench.store.examine().problems
     assert "is no head" in problem.what
     kept.write_text("".join(line for line in kept.read_text().splitlines(keepends=True)[:-1]))
 
@@ -210,7 +211,7 @@ def test_a_clock_behind_the_last_record_begins_no_unit_until_a_person_releases_i
     bench.make(serial=OTHER)
     bench.clock.now -= timedelta(minutes=4)
     bench.claim("W2605004")
-    assert not bench.store.verify()
+    assert not bench.store.examine().problems
 
 
 # -- the traces of a dead station -----------------------------------------------------------------
@@ -232,7 +233,7 @@ def test_the_trace_of_an_interrupted_run_is_attached(
     assert file.kind == kind
     assert bench.store.files.read(file.sha256) == b"frames" + names[0].encode()
     assert not list(bench.store.files.spool.iterdir())
-    assert not bench.store.verify()
+    assert not bench.store.examine().problems
 
 
 # -- reading changes nothing ----------------------------------------------------------------------
@@ -248,7 +249,7 @@ def test_reading_changes_no_byte_and_a_report_of_a_backup_leaves_nothing_beside_
     before = {path: path.read_bytes() for path in copy.parent.rglob("*") if path.is_file()}
     keeping = Keeping(bench.keys)
     with Store.open(str(copy), station="x", read_only=True, keeping=keeping) as store:
-        assert not store.verify()
+        assert not store.examine().problems
         assert store.read.unit(SERIAL).last
         with pytest.raises(Exception, match="read-only"), store.database.writing() as connection:
             connection.exec_driver_sql("DELETE FROM audit")
@@ -265,7 +266,7 @@ def test_records_on_media_that_nobody_can_write_are_read(
     with Store.open(
         str(bench.path), station="x", read_only=True, keeping=Keeping(bench.keys)
     ) as store:
-        assert not store.verify()
+        assert not store.examine().problems
     assert not bench.path.with_name(bench.path.name + "-wal").exists()
 
 
@@ -321,7 +322,7 @@ def test_what_was_wrong_with_records_of_version_1_is_said_and_stays_said(old: Pa
     assert problem.startswith("run 2: it was changed after it was finished")
     keeping = Keeping(old.parent / "keys")
     with Store.open(str(old), station="x", read_only=True, keeping=keeping) as store:
-        assert any(problem in each.what for each in store.verify())
+        assert any(problem in each.what for each in store.examine().problems)
         assert store.read.units("W2605003")[0].runs[0].run.state is RunState.FAIL
 
 
