@@ -6,8 +6,11 @@ connection is used. A setting that does not hold (a network disk without WAL) is
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import importlib
 import os
+import re
 import sqlite3
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -19,6 +22,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Final
 from uuid import uuid4
 
+from filelock import FileLock, Timeout
 from sqlalchemy import Connection, Engine, create_engine, event, inspect, select, text
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError
@@ -29,13 +33,14 @@ from flasher.protocol.text import printable
 from flasher.station.records.errors import (
     NOT_SAVED,
     RecordError,
+    RecordsDamagedError,
     RecordsMovedError,
     SchemaVersionError,
+    StationBusyError,
     mapped,
 )
-from flasher.station.records.files import sync_folder
-from flasher.station.records.lock import StationLock
-from flasher.station.records.model import utc_text
+from flasher.station.records.files import FileStore, sync_folder, whole_file
+from flasher.station.records.model import Backup, utc_text
 from flasher.station.records.schema import SCHEMA_VERSION, metadata, schema_info
 from flasher.station.records.triggers import trigger_statements
 
@@ -189,7 +194,7 @@ class Database:
             lock: ServerLock = _server().ServerLock(self.engine, station, self.location.shown)
             self._check_station = lock.check
             return lock
-        return StationLock.of(station, self.location.folder)
+        return StationLock(station, self.location.folder)
 
     def close(self) -> None:
         """Close all connections."""
@@ -240,6 +245,35 @@ class Database:
                     cause="it lies on a network disk, or on a disk that cannot be written",
                     remedy="Keep the records on a disk of this computer.",
                 )
+
+
+class StationLock:
+    """One process is the station: held from `acquire` until `release` or the end of the process."""
+
+    def __init__(self, station: str, folder: Path) -> None:
+        name = f"station-{re.sub(r'[^A-Za-z0-9_-]', '_', station)}.lock"
+        self._path = folder / name
+        self._lock = FileLock(self._path, timeout=0, thread_local=False)
+
+    def acquire(self) -> None:
+        """Become the station. Raises StationBusyError when another process is, RecordError."""
+        if self._lock.is_locked:
+            return
+        shown = printable(str(self._path))
+        with mapped(shown, writes=True):
+            self._path.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                self._lock.acquire()
+            except Timeout as error:
+                raise StationBusyError(
+                    "Another process is this station already.",
+                    where=shown,
+                    remedy="Use the station that runs, or end it first.",
+                ) from error
+
+    def release(self) -> None:
+        """Let another process be the station."""
+        self._lock.release(force=True)
 
 
 def _server() -> ModuleType:
@@ -359,3 +393,49 @@ def _create(database: Database, now: datetime) -> None:
             )
         if database.location.file is not None:
             sync_folder(database.location.file.parent)
+
+
+def make_backup(database: Database, files: FileStore, path: Path) -> Backup:
+    """Copy the database to `path` while others use it, and the attachments that it names to
+    `NAME.files` beside it: these never change once they are there.
+
+    A file that is at `path` is replaced only by a whole copy. Raises RecordError; UsageError for
+    a back end that has tools of its own, or a place that is the database itself.
+    """
+    source = database.location.file
+    if source is None:
+        raise UsageError(
+            f"{database.backend} records are not copied by flasher.",
+            remedy="Use the backup of the database itself (pg_dump), and copy the files folder.",
+        )
+    if path.resolve() == source.resolve():
+        raise UsageError("A backup cannot replace the database itself.", remedy="Name another.")
+    with mapped(printable(str(path)), writes=True):
+        with whole_file(path) as part:
+            copy_sqlite(source, part)
+            with contextlib.closing(sqlite3.connect(part)) as copy:
+                (found,) = copy.execute("PRAGMA integrity_check").fetchone()
+                if found != "ok":
+                    raise RecordsDamagedError(
+                        "The database is damaged: the copy does not hold together.",
+                        where=printable(str(found)),
+                        remedy="Keep the last good backup.",
+                    )
+                named = copy.execute("SELECT DISTINCT sha256 FROM attachment").fetchall()
+            target = FileStore(path.with_name(path.name + ".files"))
+            for (sha256,) in named:
+                if not target.path(sha256).exists():
+                    target.add("backup", files.path(sha256))
+        data = path.read_bytes()
+    return Backup(path, hashlib.sha256(data).hexdigest(), len(data))
+
+
+def copy_sqlite(source: Path, part: Path) -> None:
+    """A consistent copy of a database that others may be using."""
+    with (
+        contextlib.closing(read_only_sqlite(source)) as original,
+        contextlib.closing(sqlite3.connect(part)) as copy,
+    ):
+        original.backup(copy)
+        # One file, without a log beside it that would be lost in copying it on.
+        copy.execute("PRAGMA journal_mode = DELETE")

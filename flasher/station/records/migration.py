@@ -19,12 +19,10 @@ from sqlalchemy import Column, Connection, Integer, MetaData, String, Table, ins
 
 from flasher.errors import UsageError
 from flasher.station.records import chain, schema
-from flasher.station.records.backup import copy_sqlite
 from flasher.station.records.chain import CLAIM_PARTS, Trail, digests_of
-from flasher.station.records.database import Database, locate
+from flasher.station.records.database import Database, StationLock, copy_sqlite, locate
 from flasher.station.records.files import whole_file
 from flasher.station.records.keys import SigningKey, file_name
-from flasher.station.records.lock import StationLock
 from flasher.station.records.rows import batches
 from flasher.station.records.signing import Keeping, KeptPlace, key_folder
 from flasher.station.records.triggers import final_table, fingerprint_of, trigger_statements
@@ -75,7 +73,7 @@ def migrate(
             names = _stations_of_version_1(connection, location.shown)
         station = choose(names)
         for name in dict.fromkeys((*names, station)):
-            lock = StationLock.of(name, location.folder)
+            lock = StationLock(name, location.folder)
             held.callback(lock.release)
             lock.acquire()
         backup = _backup(location.file)

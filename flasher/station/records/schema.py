@@ -54,6 +54,10 @@ def _to(table: str, *, nullable: bool = False, index: bool = False) -> Column[in
     )
 
 
+def _table(name: str, *columns: Any) -> Table:
+    return Table(name, metadata, _key(), *columns)
+
+
 def _text(name: str, size: int = 200) -> Column[str]:
     return Column(name, String(size), nullable=False)
 
@@ -80,23 +84,16 @@ schema_info: Final = Table(
 )
 """`records_id` tells these records, and every copy of them, from all others."""
 
-station: Final = Table("station", metadata, _key(), _text("name"), UniqueConstraint("name"))
+station: Final = _table("station", _text("name"), UniqueConstraint("name"))
 
-socket: Final = Table(
-    "socket",
-    metadata,
-    _key(),
-    _to("station"),
-    _text("name"),
-    UniqueConstraint("station_id", "name"),
+socket: Final = _table(
+    "socket", _to("station"), _text("name"), UniqueConstraint("station_id", "name")
 )
 
-operator: Final = Table("operator", metadata, _key(), _text("name"), UniqueConstraint("name"))
+operator: Final = _table("operator", _text("name"), UniqueConstraint("name"))
 
-artifact: Final = Table(
+artifact: Final = _table(
     "artifact",
-    metadata,
-    _key(),
     _text("target", 16),
     _text("name"),
     _text("version", 64),
@@ -106,10 +103,8 @@ artifact: Final = Table(
     CheckConstraint("length(sha256) = 64", name="sha256_is_whole"),
 )
 
-recipe: Final = Table(
+recipe: Final = _table(
     "recipe",
-    metadata,
-    _key(),
     _text("name"),
     _text("revision", 64),
     _text("part"),
@@ -122,19 +117,10 @@ recipe: Final = Table(
     CheckConstraint(f"verification_required {_LEVELS}", name="level_is_known"),
 )
 
-lot: Final = Table(
-    "lot",
-    metadata,
-    _key(),
-    _text("part"),
-    _text("name"),
-    UniqueConstraint("part", "name"),
-)
+lot: Final = _table("lot", _text("part"), _text("name"), UniqueConstraint("part", "name"))
 
-unit: Final = Table(
+unit: Final = _table(
     "unit",
-    metadata,
-    _key(),
     _text("part"),
     _text("serial"),
     UniqueConstraint("part", "serial"),
@@ -142,10 +128,8 @@ unit: Final = Table(
     CheckConstraint("serial <> '' AND part <> ''", name="unit_has_a_name"),
 )
 
-run: Final = Table(
+run: Final = _table(
     "run",
-    metadata,
-    _key(),
     _to("unit"),
     _to("socket"),
     _to("recipe"),
@@ -209,10 +193,8 @@ for _name, _column in (
 ):
     Index(_name, _column, unique=True, sqlite_where=_RUNNING, postgresql_where=_RUNNING)
 
-run_target: Final = Table(
+run_target: Final = _table(
     "run_target",
-    metadata,
-    _key(),
     _to("run"),
     _to("artifact"),
     Column("position", SmallInteger, nullable=False),
@@ -223,10 +205,8 @@ run_target: Final = Table(
     CheckConstraint(f"required {_LEVELS} AND reached {_LEVELS}", name="levels_are_known"),
 )
 
-step: Final = Table(
+step: Final = _table(
     "step",
-    metadata,
-    _key(),
     _to("run"),
     Column("position", Integer, nullable=False),
     _text("name", 32),
@@ -242,10 +222,8 @@ step: Final = Table(
     CheckConstraint("duration_s >= 0 AND try_number >= 1", name="step_is_possible"),
 )
 
-measurement: Final = Table(
+measurement: Final = _table(
     "measurement",
-    metadata,
-    _key(),
     _to("step", index=True),
     _text("name"),
     Column("value", Float, nullable=True),
@@ -257,10 +235,8 @@ measurement: Final = Table(
     CheckConstraint("(value IS NULL) <> (text IS NULL)", name="number_or_text"),
 )
 
-device_write: Final = Table(
+device_write: Final = _table(
     "device_write",
-    metadata,
-    _key(),
     _to("run", index=True),
     _text("target", 16),
     _text("what", 64),
@@ -272,10 +248,8 @@ device_write: Final = Table(
     CheckConstraint("read_back IS NULL OR verified_at IS NOT NULL", name="read_back_is_verified"),
 )
 
-attachment: Final = Table(
+attachment: Final = _table(
     "attachment",
-    metadata,
-    _key(),
     _to("run", index=True),
     _text("kind", 32),
     _text("name"),
@@ -285,10 +259,8 @@ attachment: Final = Table(
     CheckConstraint("length(sha256) = 64", name="sha256_is_whole"),
 )
 
-audit: Final = Table(
+audit: Final = _table(
     "audit",
-    metadata,
-    _key(),
     _to("station"),
     Column("number", BigInteger, nullable=False),
     _utc("at"),

@@ -30,13 +30,13 @@ from sqlalchemy import func, select, update
 
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import chain, schema
-from flasher.station.records.backup import make_backup
 from flasher.station.records.chain import Trail, digests_of
 from flasher.station.records.claims import Order, begin_run
 from flasher.station.records.database import (
     DEFAULT_LOCK_TIMEOUT_S,
     Database,
     locate,
+    make_backup,
     open_database,
 )
 from flasher.station.records.errors import NotFoundError, RuleBrokenError

@@ -15,20 +15,9 @@ from sqlalchemy import Connection, text
 
 from flasher.station.records.schema import metadata
 
-_RUN_IS_OVER: Final = "(SELECT state FROM run WHERE id = {row}.run_id) <> 'RUNNING'"
-_STEP_IS_OVER: Final = (
-    "(SELECT run.state FROM run JOIN step ON step.run_id = run.id WHERE step.id = {row}.step_id)"
-    " <> 'RUNNING'"
-)
-_OUT_OF_LIMITS: Final = (
-    "(({m}.value IS NOT NULL AND (({m}.low IS NOT NULL AND {m}.value < {m}.low)"
-    " OR ({m}.high IS NOT NULL AND {m}.value > {m}.high)))"
-    " OR ({m}.expected IS NOT NULL AND ({m}.text IS NULL OR {m}.text <> {m}.expected)))"
-)
-
 
 class Rule(NamedTuple):
-    """`when` is what must not be, at `event` ("BEFORE UPDATE") on `table`; `text` says it."""
+    """`when` is what must not be, before `event` on `table`; `text` says it."""
 
     name: str
     table: str
@@ -37,273 +26,219 @@ class Rule(NamedTuple):
     text: str
 
 
-def _finished_parts() -> list[Rule]:
-    """No part of a finished run is added, changed or taken away."""
-    rules = []
-    for table, over in (
-        ("run_target", _RUN_IS_OVER),
-        ("step", _RUN_IS_OVER),
-        ("measurement", _STEP_IS_OVER),
-        ("device_write", _RUN_IS_OVER),
-        ("attachment", _RUN_IS_OVER),
-    ):
-        said = f"a finished run is immutable: {table}"
-        rules += [
-            Rule(f"{table}_insert", table, "BEFORE INSERT", over.format(row="NEW"), said),
-            Rule(
-                f"{table}_update",
-                table,
-                "BEFORE UPDATE",
-                f"{over.format(row='OLD')} OR {over.format(row='NEW')}",
-                said,
-            ),
-            Rule(f"{table}_delete", table, "BEFORE DELETE", "1 = 1", "records are not deleted"),
-        ]
-    return rules
+_ALWAYS: Final = "1 = 1"
+_NOT_DELETED: Final = "records are not deleted"
+_CLAIM_IS_FINAL: Final = "what a run was claimed with is final"
+_RUN_IS_OVER: Final = "(SELECT state FROM run WHERE id = {row}.run_id) <> 'RUNNING'"
+_STEP_IS_OVER: Final = (
+    "(SELECT run.state FROM run JOIN step ON step.run_id = run.id WHERE step.id = {row}.step_id)"
+    " <> 'RUNNING'"
+)
+_PARTS: Final = {
+    "run_target": _RUN_IS_OVER,
+    "step": _RUN_IS_OVER,
+    "measurement": _STEP_IS_OVER,
+    "device_write": _RUN_IS_OVER,
+    "attachment": _RUN_IS_OVER,
+}
+"""The parts of a run, and when their run is over."""
+_NAMED: Final = ("station", "socket", "operator", "lot", "unit", "recipe", "artifact")
+"""What runs refer to."""
 
 
 def _differs(*columns: str) -> str:
     return " OR ".join(f"NEW.{name} <> OLD.{name}" for name in columns)
 
 
-_TO_PASS: Final = "NEW.state = 'PASS' AND "  # noqa: S105
-_RUN_RULES: Final = (
-    Rule("run_insert", "run", "BEFORE INSERT", "NEW.state <> 'RUNNING'", "a run begins RUNNING"),
-    Rule("run_update", "run", "BEFORE UPDATE", "OLD.state <> 'RUNNING'", "a finished run is final"),
-    Rule(
-        "run_claim",
-        "run",
-        "BEFORE UPDATE",
-        _differs(
-            "id",
-            "unit_id",
-            "socket_id",
-            "recipe_id",
-            "operator_id",
-            "kind",
-            "is_virtual",
-            "reason",
-            "begun_at",
-            "begun_monotonic_s",
-            "verification_required",
-            "allow_completed_not_read_back",
+_OF_TABLES: Final[Mapping[tuple[str, str], Mapping[str, tuple[str, str]]]] = {
+    ("run", "INSERT"): {
+        "run_insert": ("NEW.state <> 'RUNNING'", "a run begins RUNNING"),
+        "run_nature": (
+            (
+                "EXISTS (SELECT 1 FROM run WHERE run.unit_id = NEW.unit_id"
+                " AND run.is_virtual <> NEW.is_virtual)"
+            ),
+            "a unit is real or virtual, never both",
+        ),
+        "run_from_recipe": (
+            (
+                "NOT EXISTS (SELECT 1 FROM recipe WHERE recipe.id = NEW.recipe_id"
+                " AND recipe.verification_required = NEW.verification_required"
+                " AND recipe.allow_completed_not_read_back = NEW.allow_completed_not_read_back)"
+            ),
+            "a run asks for the verification of its recipe",
+        ),
+    },
+    ("run", "UPDATE"): {
+        "run_update": ("OLD.state <> 'RUNNING'", "a finished run is final"),
+        "run_claim": (
+            _differs("id", "unit_id", "socket_id", "recipe_id", "operator_id", "kind", "is_virtual")
+            + " OR "
+            + _differs("reason", "begun_at", "begun_monotonic_s", "verification_required")
+            + " OR "
+            + _differs("allow_completed_not_read_back")
+            + " OR COALESCE(NEW.lot_id, 0) <> COALESCE(OLD.lot_id, 0)",
+            _CLAIM_IS_FINAL,
+        ),
+    },
+    ("run", "UPDATE to PASS"): {
+        "pass_targets": (
+            (
+                "(NOT EXISTS (SELECT 1 FROM run_target WHERE run_id = NEW.id)"
+                " OR EXISTS (SELECT 1 FROM run_target WHERE run_id = NEW.id"
+                " AND (reached IS NULL OR reached < required OR reached < NEW.verification_reached)))"
+            ),
+            "PASS needs every target verified as the recipe asks",
+        ),
+        "pass_log": (
+            (
+                "NOT EXISTS (SELECT 1 FROM attachment WHERE run_id = NEW.id"
+                " AND sha256 = NEW.log_sha256)"
+            ),
+            "PASS needs its log attached",
+        ),
+        "pass_steps": (
+            (
+                "(NOT EXISTS (SELECT 1 FROM step WHERE run_id = NEW.id AND state = 'PASS'"
+                " AND name <> 'save')"
+                " OR EXISTS (SELECT 1 FROM step AS s WHERE s.run_id = NEW.id"
+                " AND s.state NOT IN ('PASS', 'SKIPPED')"
+                " AND NOT EXISTS (SELECT 1 FROM step AS later WHERE later.run_id = s.run_id"
+                " AND later.name = s.name AND later.position > s.position)))"
+            ),
+            "PASS needs the last try of every step to pass",
+        ),
+        "pass_writes": (
+            (
+                "EXISTS (SELECT 1 FROM device_write AS w WHERE w.run_id = NEW.id"
+                " AND w.verified_at IS NULL AND NOT EXISTS (SELECT 1 FROM device_write AS later"
+                " WHERE later.run_id = w.run_id AND later.target = w.target AND later.what = w.what"
+                " AND later.id > w.id))"
+            ),
+            "PASS needs every write verified",
+        ),
+        "pass_flashes": (
+            (
+                "NEW.kind IN ('production', 'reflash')"
+                " AND EXISTS (SELECT 1 FROM run_target AS t WHERE t.run_id = NEW.id"
+                " AND NOT EXISTS (SELECT 1 FROM device_write AS w WHERE w.run_id = t.run_id"
+                " AND w.target = t.target AND w.what = 'flash' AND w.verified_at IS NOT NULL))"
+            ),
+            "PASS needs every target flashed, in a first run",
+        ),
+    },
+    ("run", "DELETE"): {"run_delete": (_ALWAYS, _NOT_DELETED)},
+    ("measurement", "INSERT"): {
+        "step_limits": (
+            (
+                "(SELECT state FROM step WHERE id = NEW.step_id) = 'PASS' AND "
+                "((NEW.value IS NOT NULL AND ((NEW.low IS NOT NULL AND NEW.value < NEW.low)"
+                " OR (NEW.high IS NOT NULL AND NEW.value > NEW.high)))"
+                " OR (NEW.expected IS NOT NULL AND (NEW.text IS NULL OR NEW.text <> NEW.expected)))"
+            ),
+            "a step with a measurement out of its limits did not pass",
         )
-        + " OR COALESCE(NEW.lot_id, 0) <> COALESCE(OLD.lot_id, 0)",
-        "what a run was claimed with is final",
-    ),
-    Rule(
-        "run_nature",
-        "run",
-        "BEFORE INSERT",
-        "EXISTS (SELECT 1 FROM run WHERE run.unit_id = NEW.unit_id"
-        " AND run.is_virtual <> NEW.is_virtual)",
-        "a unit is real or virtual, never both",
-    ),
-    Rule("run_delete", "run", "BEFORE DELETE", "1 = 1", "records are not deleted"),
-    Rule(
-        "run_from_recipe",
-        "run",
-        "BEFORE INSERT",
-        "NOT EXISTS (SELECT 1 FROM recipe WHERE recipe.id = NEW.recipe_id"
-        " AND recipe.verification_required = NEW.verification_required"
-        " AND recipe.allow_completed_not_read_back = NEW.allow_completed_not_read_back)",
-        "a run asks for the verification of its recipe",
-    ),
-    Rule(
-        "pass_targets",
-        "run",
-        "BEFORE UPDATE",
-        _TO_PASS + "(NOT EXISTS (SELECT 1 FROM run_target WHERE run_id = NEW.id)"
-        " OR EXISTS (SELECT 1 FROM run_target WHERE run_id = NEW.id"
-        " AND (reached IS NULL OR reached < required OR reached < NEW.verification_reached)))",
-        "PASS needs every target verified as the recipe asks",
-    ),
-    Rule(
-        "pass_log",
-        "run",
-        "BEFORE UPDATE",
-        _TO_PASS + "NOT EXISTS (SELECT 1 FROM attachment WHERE run_id = NEW.id"
-        " AND sha256 = NEW.log_sha256)",
-        "PASS needs its log attached",
-    ),
-    Rule(
-        "pass_steps",
-        "run",
-        "BEFORE UPDATE",
-        _TO_PASS + "(NOT EXISTS (SELECT 1 FROM step WHERE run_id = NEW.id AND state = 'PASS'"
-        " AND name <> 'save')"
-        " OR EXISTS (SELECT 1 FROM step AS s WHERE s.run_id = NEW.id"
-        " AND s.state NOT IN ('PASS', 'SKIPPED')"
-        " AND NOT EXISTS (SELECT 1 FROM step AS later WHERE later.run_id = s.run_id"
-        " AND later.name = s.name AND later.position > s.position)))",
-        "PASS needs the last try of every step to pass",
-    ),
-    Rule(
-        "pass_writes",
-        "run",
-        "BEFORE UPDATE",
-        _TO_PASS + "EXISTS (SELECT 1 FROM device_write AS w WHERE w.run_id = NEW.id"
-        " AND w.verified_at IS NULL AND NOT EXISTS (SELECT 1 FROM device_write AS later"
-        " WHERE later.run_id = w.run_id AND later.target = w.target AND later.what = w.what"
-        " AND later.id > w.id))",
-        "PASS needs every write verified",
-    ),
-    Rule(
-        "pass_flashes",
-        "run",
-        "BEFORE UPDATE",
-        _TO_PASS + "NEW.kind IN ('production', 'reflash')"
-        " AND EXISTS (SELECT 1 FROM run_target AS t WHERE t.run_id = NEW.id"
-        " AND NOT EXISTS (SELECT 1 FROM device_write AS w WHERE w.run_id = t.run_id"
-        " AND w.target = t.target AND w.what = 'flash' AND w.verified_at IS NOT NULL))",
-        "PASS needs every target flashed, in a first run",
-    ),
-)
-_PART_RULES: Final = (
-    Rule(
-        "step_limits",
-        "measurement",
-        "BEFORE INSERT",
-        "(SELECT state FROM step WHERE id = NEW.step_id) = 'PASS' AND "
-        + _OUT_OF_LIMITS.format(m="NEW"),
-        "a step with a measurement out of its limits did not pass",
-    ),
-    Rule(
-        "step_final",
-        "step",
-        "BEFORE UPDATE",
-        "1 = 1",
-        "a step is recorded once; a new try is a new row",
-    ),
-    Rule(
-        "measurement_final",
-        "measurement",
-        "BEFORE UPDATE",
-        "1 = 1",
-        "a measurement is never changed",
-    ),
-    Rule(
-        "write_final",
-        "device_write",
-        "BEFORE UPDATE",
-        "OLD.verified_at IS NOT NULL OR "
-        + _differs("run_id", "target", "what", "value", "id")
-        + " OR "
-        + _differs("intended_at", "intended_monotonic_s"),
-        "an intent is never changed, and verified once",
-    ),
-    Rule(
-        "target_final",
-        "run_target",
-        "BEFORE UPDATE",
-        _differs("id", "run_id", "artifact_id", "target", "position", "required"),
-        "what a run was claimed with is final",
-    ),
-    Rule("attachment_final", "attachment", "BEFORE UPDATE", "1 = 1", "attachments are final"),
-    Rule("audit_update", "audit", "BEFORE UPDATE", "1 = 1", "the audit trail is append-only"),
-    Rule("audit_delete", "audit", "BEFORE DELETE", "1 = 1", "the audit trail is append-only"),
-    Rule(
-        "audit_chain",
-        "audit",
-        "BEFORE INSERT",
-        "EXISTS (SELECT 1 FROM audit WHERE station_id = NEW.station_id)"
-        " AND NOT EXISTS (SELECT 1 FROM audit WHERE station_id = NEW.station_id"
-        " AND number = NEW.number - 1 AND hash = NEW.previous_hash)",
-        "an audit row names the hash of the row before it",
-    ),
-)
+    },
+    ("measurement", "UPDATE"): {
+        "measurement_final": (_ALWAYS, "a measurement is never changed"),
+    },
+    ("step", "UPDATE"): {
+        "step_final": (_ALWAYS, "a step is recorded once; a new try is a new row"),
+    },
+    ("device_write", "UPDATE"): {
+        "write_final": (
+            "OLD.verified_at IS NOT NULL OR "
+            + _differs("run_id", "target", "what", "value", "id")
+            + " OR "
+            + _differs("intended_at", "intended_monotonic_s"),
+            "an intent is never changed, and verified once",
+        )
+    },
+    ("run_target", "UPDATE"): {
+        "target_final": (
+            _differs("id", "run_id", "artifact_id", "target", "position", "required"),
+            _CLAIM_IS_FINAL,
+        )
+    },
+    ("attachment", "UPDATE"): {"attachment_final": (_ALWAYS, "attachments are final")},
+    ("audit", "UPDATE"): {"audit_update": (_ALWAYS, "the audit trail is append-only")},
+    ("audit", "DELETE"): {"audit_delete": (_ALWAYS, "the audit trail is append-only")},
+    ("audit", "INSERT"): {
+        "audit_chain": (
+            (
+                "EXISTS (SELECT 1 FROM audit WHERE station_id = NEW.station_id)"
+                " AND NOT EXISTS (SELECT 1 FROM audit WHERE station_id = NEW.station_id"
+                " AND number = NEW.number - 1 AND hash = NEW.previous_hash)"
+            ),
+            "an audit row names the hash of the row before it",
+        )
+    },
+}
+"""By table and event: the name of each rule, what must not be, and the words that say it."""
 
 
-_NAMED: Final = ("station", "socket", "operator", "lot", "unit", "recipe", "artifact")
-
-
-def _named_rows() -> list[Rule]:
-    """What runs refer to keeps its name and its content."""
-    rules = []
+def _rules() -> Iterator[Rule]:
+    for (table, at), rules in _OF_TABLES.items():
+        event, _, to = at.partition(" to ")
+        begin = f"NEW.state = '{to}' AND " if to else ""
+        for name, (when, said) in rules.items():
+            yield Rule(name, table, event, begin + when, said)
+    for table, over in _PARTS.items():  # no part of a finished run is added, changed or taken away
+        said = f"a finished run is immutable: {table}"
+        old, new = over.format(row="OLD"), over.format(row="NEW")
+        yield Rule(f"{table}_insert", table, "INSERT", new, said)
+        yield Rule(f"{table}_update", table, "UPDATE", f"{old} OR {new}", said)
+        yield Rule(f"{table}_delete", table, "DELETE", _ALWAYS, _NOT_DELETED)
     for table in _NAMED:
-        said = f"a {table} is final"
-        rules += [
-            Rule(f"{table}_update", table, "BEFORE UPDATE", "1 = 1", said),
-            Rule(f"{table}_delete", table, "BEFORE DELETE", "1 = 1", "records are not deleted"),
-        ]
-    return rules
+        yield Rule(f"{table}_update", table, "UPDATE", _ALWAYS, f"a {table} is final")
+        yield Rule(f"{table}_delete", table, "DELETE", _ALWAYS, _NOT_DELETED)
+    # SQLite's REPLACE deletes without a trigger where another program does not ask for it.
+    for table in (*_NAMED, "run", *_PARTS, "audit"):
+        is_there = f"EXISTS (SELECT 1 FROM {table} WHERE id = NEW.id)"
+        yield Rule(f"{table}_replace", table, "INSERT", is_there, "records are not replaced")
 
 
-def _no_replacing() -> list[Rule]:
-    """SQLite's REPLACE deletes without a trigger where another program does not ask for it."""
-    tables = (
-        *_NAMED,
-        "run",
-        "run_target",
-        "step",
-        "measurement",
-        "device_write",
-        "attachment",
-        "audit",
-    )
-    return [
-        Rule(
-            f"{table}_replace",
-            table,
-            "BEFORE INSERT",
-            f"EXISTS (SELECT 1 FROM {table} WHERE id = NEW.id)",
-            "records are not replaced",
-        )
-        for table in tables
-    ]
-
-
-RULES: Final = (
-    *_RUN_RULES,
-    *_finished_parts(),
-    *_named_rows(),
-    *_PART_RULES,
-    *_no_replacing(),
-)
+RULES: Final = tuple(_rules())
 
 
 def trigger_statements(dialect: str) -> list[str]:
     """The SQL that makes the triggers."""
-    more = _no_truncating() if dialect == "postgresql" else ()
-    return [*_statements(dialect, RULES), *more]
+    statements = _statements(dialect, RULES)
+    if dialect == "postgresql":
+        # TRUNCATE deletes all rows, and no trigger of a row sees it; SQLite has no such command.
+        name = "truncate_is_refused"
+        statements.append(_function(name, f"RAISE EXCEPTION '{_NOT_DELETED}'"))
+        statements += [
+            f"CREATE TRIGGER {table}_truncate BEFORE TRUNCATE ON {table}"
+            f" FOR EACH STATEMENT EXECUTE FUNCTION {name}()"
+            for table in metadata.tables
+        ]
+    return statements
 
 
 def final_table(dialect: str, table: str) -> list[str]:
     """The SQL that makes triggers which keep a table as it is."""
     said = f"{table} is final"
     events = ("INSERT", "UPDATE", "DELETE")
-    rules = (Rule(f"{table}_{e.lower()}", table, f"BEFORE {e}", "1 = 1", said) for e in events)
-    return _statements(dialect, rules)
+    return _statements(
+        dialect, (Rule(f"{table}_{e.lower()}", table, e, _ALWAYS, said) for e in events)
+    )
 
 
 def _statements(dialect: str, rules: Iterable[Rule]) -> list[str]:
-    if dialect == "sqlite":
-        return [
-            f"CREATE TRIGGER {rule.name} {rule.event} ON {rule.table} WHEN {rule.when}"
-            f" BEGIN SELECT RAISE(ABORT, '{rule.text}'); END"
-            for rule in rules
-        ]
-    return [statement for rule in rules for statement in _postgresql(rule)]
-
-
-def _no_truncating() -> Iterator[str]:
-    """TRUNCATE deletes all rows, and no trigger of a row sees it; SQLite has no such command."""
-    yield _function("truncate_is_refused", "RAISE EXCEPTION 'records are not deleted'")
-    for table in metadata.tables:
-        yield (
-            f"CREATE TRIGGER {table}_truncate BEFORE TRUNCATE ON {table}"
-            " FOR EACH STATEMENT EXECUTE FUNCTION truncate_is_refused()"
-        )
-
-
-def _postgresql(rule: Rule) -> tuple[str, str]:
-    result = "OLD" if rule.event.endswith("DELETE") else "NEW"
-    refuse = f"RAISE EXCEPTION '{rule.text}' USING ERRCODE = 'check_violation'"
-    trigger = (
-        f"CREATE TRIGGER {rule.name} {rule.event} ON {rule.table}"
-        f" FOR EACH ROW EXECUTE FUNCTION {rule.name}()"
-    )
-    return _function(rule.name, f"IF {rule.when} THEN {refuse}; END IF; RETURN {result}"), trigger
+    found = []
+    for rule in rules:
+        trigger = f"CREATE TRIGGER {rule.name} BEFORE {rule.event} ON {rule.table}"
+        if dialect == "sqlite":
+            refuse = f"SELECT RAISE(ABORT, '{rule.text}')"
+            found.append(f"{trigger} WHEN {rule.when} BEGIN {refuse}; END")
+            continue
+        refuse = f"RAISE EXCEPTION '{rule.text}' USING ERRCODE = 'check_violation'"
+        result = "OLD" if rule.event == "DELETE" else "NEW"
+        body = f"IF {rule.when} THEN {refuse}; END IF; RETURN {result}"
+        found.append(_function(rule.name, body))
+        found.append(f"{trigger} FOR EACH ROW EXECUTE FUNCTION {rule.name}()")
+    return found
 
 
 def _function(name: str, body: str) -> str:
