@@ -11,7 +11,7 @@ import subprocess
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Final
+from typing import Final, Protocol
 
 from flasher.errors import BusError, FlasherError
 from flasher.protocol.text import printable
@@ -21,6 +21,18 @@ OFF_S: Final = 1.0
 """How long the power stays off: long enough for capacitors of a controller."""
 COMMAND_LIMIT_S: Final = 10.0
 Run = Callable[[Sequence[str]], None]
+
+
+class PowerControl(Protocol):
+    """Switches the unit off and on."""
+
+    def begin_cycle(self) -> None:
+        """Begin; returns at once. Raises BusError when the one before failed."""
+        ...
+
+    def check(self) -> None:
+        """Raises BusError when a cycle failed."""
+        ...
 
 
 class PowerCommand:

@@ -1,4 +1,4 @@
-"""Whether a unit is in the socket, and which: what was heard of it lately.
+"""Listening to a bus: announcements of a bootloader, and whether a unit is in the socket.
 
 Units talk by themselves, announce themselves when their power comes, or are asked for their version
 while the socket is idle; the answer may name the unit's serial number. A target that can do none of
@@ -7,40 +7,115 @@ it is not seen; then only a person knows.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Final
 
 from flasher.host.query import Request
 from flasher.protocol import catalogue
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import data_size
+from flasher.protocol.messages import BootVersion, decode
+from flasher.protocol.spec import Target, data_size
+from flasher.protocol.text import printable
+from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.protocol.wire import Message, Reassembler, encode, split
-from flasher.station.listening import BootWatcher
+from flasher.settings.profile import sent_ids
 from flasher.station.messages import PresenceChanged
-from flasher.station.unit_device import UnitDevice
+from flasher.station.recipe_file import LoadedTarget
+
+_LOOK_EVERY_S: Final = 0.05
+
+
+class BootWatcher:
+    """A driver's tap that counts the announcements of a device's bootloader."""
+
+    def __init__(self, target: Target, timings: Timings = DEFAULT_TIMINGS) -> None:
+        self._answers = Reassembler(target.answer_id, timings.inter_frame_timeout_s)
+        self._own_ids = frozenset(sent_ids(target))
+        self.announcements = 0
+        self.version = ""
+        """As announced last, escaped."""
+        self.heard_at: float | None = None
+        """When the device last said anything."""
+        self.announced_at: float | None = None
+
+    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
+        if sent or not frame.is_payload or frame.can_id not in self._own_ids:
+            return
+        self.heard_at = now
+        if frame.can_id != self._answers.can_id:
+            return
+        for found in self._answers.feed(frame.data, now):
+            row = decode(found) if isinstance(found, Message) else None
+            if isinstance(row, BootVersion):
+                self.announcements += 1
+                self.announced_at = now
+                self.version = printable(row.version)
+
+
+class Listen:
+    """An engine that sends nothing, and listens until `enough(now)` or for `limit_s`."""
+
+    def __init__(
+        self, limit_s: float, enough: Callable[[float], bool] = lambda _now: False
+    ) -> None:
+        self._limit_s = limit_s
+        self._enough = enough
+        self._ends_at: float | None = None
+        self._look_at = float("-inf")
+        self.done = False
+
+    def receive(self, frame: Frame, now: float) -> None:
+        self.done = self.done or self._enough(now)  # taps have looked at the frame
+
+    def tick(self, now: float) -> None:
+        if self._ends_at is None:
+            self._ends_at = now + self._limit_s
+        self._look_at = min(now + _LOOK_EVERY_S, self._ends_at)
+        self.done = self.done or now >= self._ends_at or self._enough(now)
+
+    def deadline(self) -> float | None:
+        return None if self.done else self._look_at  # soon: what is enough may be a silence
+
+    def next_frame(self, now: float) -> Frame | None:
+        return None
+
+    def frame_sent(self, now: float) -> None:
+        pass
+
+    def cancel(self, now: float) -> None:
+        self.done = True
+
+    def take_events(self) -> Sequence[object]:
+        return ()
 
 
 class Presence:
     """Watches an idle bus; pure: frames and times come from outside."""
 
-    def __init__(self, devices: Sequence[UnitDevice], *, silence_s: float, probe_s: float) -> None:
+    def __init__(
+        self, targets: Sequence[LoadedTarget], *, silence_s: float, probe_s: float
+    ) -> None:
         self._silence_s = silence_s
         self._probe_s = probe_s
-        self._watchers = [BootWatcher(device.loaded.target) for device in devices]
+        self._watchers = [BootWatcher(each.target) for each in targets]
         self._answers: list[tuple[Request, Reassembler]] = []
-        for device in devices:
-            request = device.version_request
+        for each in targets:
+            request = each.profile.upgrade_options().version_request_for(each.target)
             if request is not None:
-                limit_s = device.loaded.profile.timings.inter_frame_timeout_s
+                limit_s = each.profile.timings.inter_frame_timeout_s
                 answers = Reassembler(request.answer_item.can_id, limit_s)
                 self._answers.append((request, answers))
         self._probed_at: float | None = None
-        self._announcements = 0
         self.begin()
 
     @property
     def sees_units(self) -> bool:
         """True when a unit that is there can be asked."""
         return bool(self._answers)
+
+    @property
+    def _announced(self) -> int:
+        return sum(watcher.announcements for watcher in self._watchers)
 
     def begin(self) -> None:
         """Forget what was heard: after a run, or while nothing could be heard, all may differ."""
@@ -51,7 +126,7 @@ class Presence:
         self._serials: dict[int, str] = {}
         """What the targets said in their version answers, by the ids of these."""
         self._told_serial: str | None = None
-        self._announcements = sum(watcher.announcements for watcher in self._watchers)
+        self._announcements = self._announced
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         """One frame of an idle bus."""
@@ -75,11 +150,6 @@ class Presence:
             version = item.content.from_data(message.data)
             self._serials[item.can_id] = str(getattr(version, "serial_number", ""))
 
-    @property
-    def _serial(self) -> str | None:
-        """What the unit says that it is; None before it has said anything."""
-        return next(filter(None, self._serials.values()), "") if self._serials else None
-
     def probe(self, now: float) -> list[Frame]:
         """What is to be sent now: a question to each target that can be asked, in its time."""
         if self._probed_at is not None and now - self._probed_at < self._probe_s:
@@ -99,14 +169,14 @@ class Presence:
         is_soon = self.is_there is None and now - self._began_at < self._silence_s
         if is_soon and not heard:
             return None
-        if heard == self.is_there and self._serial == self._told_serial:
+        # What the unit says that it is; None before it has said anything.
+        serial = next(filter(None, self._serials.values()), "") if self._serials else None
+        if heard == self.is_there and serial == self._told_serial:
             return None
         self.is_there = heard
         if not heard:
             self._serials, self._told_serial = {}, None
             return PresenceChanged(is_there=False, how=f"nothing heard for {self._silence_s:g} s")
-        self._told_serial = self._serial
-        announced = sum(watcher.announcements for watcher in self._watchers)
-        how = "boot version" if announced > self._announcements else "traffic"
-        self._announcements = announced
-        return PresenceChanged(is_there=True, how=how, serial=self._serial)
+        how = "boot version" if self._announced > self._announcements else "traffic"
+        self._told_serial, self._announcements = serial, self._announced
+        return PresenceChanged(is_there=True, how=how, serial=serial)

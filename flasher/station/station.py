@@ -48,16 +48,12 @@ from flasher.station.messages import (
     Finished,
     FromWorker,
     Intent,
-    Note,
     PresenceChanged,
-    Progress,
-    Prompt,
     Ready,
     Reply,
-    RunNote,
+    RunEvent,
     RunOrder,
     RunResult,
-    StepBegan,
     StepReport,
     WorkerSetup,
 )
@@ -326,8 +322,8 @@ class Station:
                 self._feed(socket, message)
             case Ask(number, what):
                 self._answer(socket, number, what)
-            case Note(note):
-                self._pass_on(socket, note)
+            case StepStarted() | Progressed() | OperatorPrompted():
+                self._pass_on(socket, message)
             case Finished():
                 self.supervisor.worked(socket)
                 self._end(socket, message)
@@ -478,20 +474,12 @@ class Station:
             )
         )
 
-    def _pass_on(self, socket: str, note: RunNote) -> None:
-        """What a run says becomes an event."""
+    def _pass_on(self, socket: str, event: RunEvent) -> None:
         run = self._runs.get(socket)
-        if run is None:
-            return
-        serial = run.claim.serial
-        match note:
-            case StepBegan(step, target, try_number):
-                run.where = f"{step.value} {target}".strip()
-                self.tell(StepStarted(socket, serial, step, try_number, target))
-            case Progress(step, target, share, left_s):
-                self.tell(Progressed(socket, serial, step, share, left_s, target))
-            case Prompt(text, limit_s):
-                self.tell(OperatorPrompted(socket, text, limit_s))
+        if run is not None:
+            if isinstance(event, StepStarted):
+                run.where = f"{event.step.value} {event.target}".strip()
+            self.tell(replace(event, socket=socket))
 
     # -- its end ----------------------------------------------------------------------------------
 

@@ -14,27 +14,25 @@ from flasher.host.items import Readable
 from flasher.host.write import WritePlan, field_changes
 from flasher.station import codes
 from flasher.station.codes import Code
-from flasher.station.messages import RunOrder, StepFailedError, write_key
+from flasher.station.messages import RunOrder, write_key
 from flasher.station.recipe import Limit
 from flasher.station.recipe_check import codec_of, readable_of
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import Measurement, RunKind, StepName
 from flasher.station.template import Scan, fill
-from flasher.station.unit_device import Identified, UnitDevice
+from flasher.station.unit_target import Identified, StepFailedError, UnitTarget
 
 SERIAL_ITEM: Final = "serial-number"
 """The item that gives a unit its number."""
-_OF_CHECK: Final = {
+BEFORE: Final = "before "
+"""Begins the names of measurements of what must not change."""
+OF_CHECK: Final = {
     Check.HARDWARE: codes.WRONG_HARDWARE,
     Check.DOWNGRADE: codes.OLD_VERSION,
     Check.PREVIOUS: codes.OLD_VERSION,
     Check.IN_USE: codes.IN_USE,
 }
-
-
-def code_of(check: Check) -> Code:
-    """The code of a check that speaks against the unit."""
-    return _OF_CHECK.get(check, codes.NOT_FOR_DEVICE)
+"""The code of a check that speaks against the unit, where it is not NOT_FOR_DEVICE."""
 
 
 def check_texts(allowed: Sequence[str], found: str | None, code: Code) -> None:
@@ -50,8 +48,14 @@ def check_texts(allowed: Sequence[str], found: str | None, code: Code) -> None:
 def check_measured(measured: Sequence[Measurement]) -> None:
     """Hold measurements against their limits. Raises StepFailedError."""
     for each in measured:
-        if not each.is_within:
-            raise StepFailedError(codes.LIMIT, f"{each.name} is {_shown(each)}.")
+        if each.is_within:
+            continue
+        shown = f"{each.text!a}, expected is {each.expected!a}"
+        if each.value is not None:
+            low = "" if each.low is None else f"from {each.low:g} "
+            high = "" if each.high is None else f"to {each.high:g}"
+            shown = f"{each.value:g} {each.unit}; allowed is {low}{high}".strip()
+        raise StepFailedError(codes.LIMIT, f"{each.name} is {shown}.")
 
 
 def wanted_text(plan: WritePlan) -> str:
@@ -71,40 +75,26 @@ def said_of(name: str, found: Identified) -> list[Measurement]:
     ]
 
 
-def state_words(device: UnitDevice, found: Identified) -> str:
+def state_words(target: UnitTarget, found: Identified) -> str:
     """What a device is doing."""
     if found.is_in_bootloader:
-        return f"in its bootloader {device.watcher.version}".strip()
+        return f"in its bootloader {target.watcher.version}".strip()
     if found.seen.version is None:
-        return "cannot be asked" if device.version_request is None else "silent"
+        return "cannot be asked" if target.version_request is None else "silent"
     return found.seen.firmware_version or "answers"
 
 
-def _shown(each: Measurement) -> str:
-    if each.value is None:
-        return f"{each.text!a}, expected is {each.expected!a}"
-    low = "" if each.low is None else f"from {each.low:g} "
-    high = "" if each.high is None else f"to {each.high:g}"
-    return f"{each.value:g} {each.unit}; allowed is {low}{high}".strip()
-
-
-BEFORE: Final = "before "
-"""Begins the names of measurements of what must not change."""
-
-
 class UnitReads:
-    """Reads of one run."""
+    """What one run reads of its unit."""
 
     def __init__(
-        self, order: RunOrder, recipe: LoadedRecipe, scan: Scan, devices: Sequence[UnitDevice]
+        self, order: RunOrder, recipe: LoadedRecipe, scan: Scan, targets: Sequence[UnitTarget]
     ) -> None:
         self._order = order
         self._recipe = recipe
         self._scan = scan
-        self._devices = {device.name: device for device in devices}
+        self._targets = {target.name: target for target in targets}
         self._before: dict[str, str] = {}
-
-    # -- limits -----------------------------------------------------------------------------------
 
     def limits(
         self, step: StepName, askable: Collection[str] | None = None
@@ -118,7 +108,7 @@ class UnitReads:
 
     def _measure(self, limit: Limit) -> Measurement:
         codec = codec_of(self._recipe, limit)
-        values = self._devices[limit.target].read(readable_of(self._recipe, limit))
+        values = self._targets[limit.target].read(readable_of(self._recipe, limit))
         value, shown = values[limit.field]
         name = f"{limit.target} {limit.item} {limit.field}"
         if limit.expected is not None:
@@ -138,7 +128,7 @@ class UnitReads:
             if target in askable:
                 now = self._texts(target, readable)
             else:
-                start = _name(target, readable, "")
+                start = f"{target} {readable.name} "
                 now = {name: text for name, text in known.items() if name.startswith(start)}
                 if not now:
                     raise StepFailedError(
@@ -146,13 +136,9 @@ class UnitReads:
                         f"{target} {readable.name} cannot be read: it runs no application.",
                     )
             for name, text in now.items():
-                first = known.get(name, text)
-                self._before[name] = first
-                if text != first:
-                    raise StepFailedError(
-                        codes.CHANGED, f"{name} was {first!a}, and is {text!a} now."
-                    )
-                yield Measurement(f"{BEFORE}{name}", text=first)
+                self._before[name] = known.get(name, text)
+                self._check_unchanged(name, text)
+                yield Measurement(f"{BEFORE}{name}", text=text)
 
     def unchanged(self, measured: list[Measurement]) -> None:
         """Hold what must not change against what it was. Raises StepFailedError."""
@@ -160,18 +146,20 @@ class UnitReads:
             for name, text in self._texts(target, readable).items():
                 first = self._before.get(name)
                 measured.append(Measurement(f"unchanged {name}", text=text, expected=first))
-                if text != first:
-                    raise StepFailedError(
-                        codes.CHANGED, f"{name} was {first!a}, and is {text!a} now."
-                    )
+                self._check_unchanged(name, text)
+
+    def _check_unchanged(self, name: str, text: str) -> None:
+        first = self._before.get(name)
+        if text != first:
+            raise StepFailedError(codes.CHANGED, f"{name} was {first!a}, and is {text!a} now.")
 
     def _unchanged(self) -> Iterator[tuple[str, Readable]]:
         for part in self._recipe.recipe.unchanged:
             yield part.target, readable_of(self._recipe, part)
 
     def _texts(self, target: str, readable: Readable) -> dict[str, str]:
-        fields = self._devices[target].read(readable)
-        return {_name(target, readable, field): shown for field, (_, shown) in fields.items()}
+        fields = self._targets[target].read(readable)
+        return {f"{target} {readable.name} {name}": shown for name, (_, shown) in fields.items()}
 
     # -- what was written -------------------------------------------------------------------------
 
@@ -184,12 +172,12 @@ class UnitReads:
                 measured.append(Measurement(key, text="written, cannot be read back"))
                 continue
             try:
-                fields = self._devices[plan.target.name].read(read_back)
+                fields = self._targets[plan.target.name].read(read_back)
             except NoAnswerError as error:
                 raise StepFailedError(codes.NOT_RUNNING, error.what) from error
-            wanted = {name: codec for name, codec in type(plan.content).LAYOUT if name in fields}
+            wanted = [name for name, _ in type(plan.content).LAYOUT if name in fields]
             found = ", ".join(fields[name][1] for name in wanted)
-            expected = ", ".join(change.new for change in field_changes(plan, None))
+            expected = wanted_text(plan)
             if self._order.kind is RunKind.VERIFY_ONLY:
                 # Made on another day, perhaps: what it was given then is what it must have.
                 expected = self._order.written_before.get(key, expected)
@@ -198,7 +186,3 @@ class UnitReads:
                 raise StepFailedError(
                     codes.WRITE_DIFFERS, f"{key} reads {found!a} instead of {expected!a}."
                 )
-
-
-def _name(target: str, readable: Readable, field: str) -> str:
-    return f"{target} {readable.name} {field}"

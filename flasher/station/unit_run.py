@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from typing import Final
 
 from flasher.api import Connection
@@ -23,25 +22,22 @@ from flasher.errors import (
     WrongDeviceError,
 )
 from flasher.station import codes
-from flasher.station.codes import Code
-from flasher.station.listening import Listen
+from flasher.station.events import OperatorPrompted, Progressed, StepStarted
 from flasher.station.messages import (
-    CancelledError,
     Journal,
     JournalError,
-    PowerControl,
-    Progress,
+    RunEvent,
     RunOrder,
     RunResult,
-    StepBegan,
-    StepFailedError,
     StepReport,
-    Tell,
 )
+from flasher.station.power import PowerControl
+from flasher.station.presence import Listen
+from flasher.station.recipe import StepRule
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import Measurement, RunState, StepName, StepState
-from flasher.station.unit_device import UnitDevice
 from flasher.station.unit_steps import Act, UnitSteps
+from flasher.station.unit_target import StepFailedError, UnitTarget
 
 _PROGRESS_S: Final = 0.25
 """Progress is told this often at the most: it must never fill the way to the station."""
@@ -50,11 +46,12 @@ _STATES: Final = {
     RunState.ERROR: StepState.ERROR,
     RunState.ABORTED: StepState.ERROR,
 }
-_BY_ERROR: Final[tuple[tuple[type[FlasherError], Code], ...]] = (
+_BY_ERROR: Final = (
     (BusError, codes.BUS),
     (NoAnswerError, codes.NO_ANSWER),
     (WrongDeviceError, codes.NOT_FOR_DEVICE),
     (VerificationError, codes.WRITE_DIFFERS),
+    (FlasherError, codes.RECIPE),
 )
 
 
@@ -69,158 +66,149 @@ class UnitRun:
         journal: Journal,
         *,
         taps: Sequence[Tap] = (),
-        tell: Tell = lambda _note: None,
+        tell: Callable[[RunEvent], None] = lambda _event: None,
         cancelled: Callable[[], bool] = lambda: False,
         power: PowerControl | None = None,
     ) -> None:
         self._order = order
         self._recipe = recipe
         self._connection = connection
+        self._clock = connection.clock
         self._journal = journal
         self._taps = taps
         self._tell = tell
         self._cancelled = cancelled
         self._power = power
-        self._step_ends_at: float | None = None
         self._step: tuple[StepName, str] = (StepName.CONNECT, "")
         self._step_began_at = 0.0
+        self._step_ends_at: float | None = None
         self._told_at = float("-inf")
-        self._steps: UnitSteps | None = None
 
     def run(self) -> RunResult:
         """Do it. Raises nothing but what is a bug."""
-        clock = self._connection.clock
-        began_at = clock.now()
-        code, text = codes.OK, ""
+        began_at = self._clock.now()
+        code, text, verified = codes.OK, "", {}
         try:
-            for step, target, act in self._acts():
-                self._do(step, target, act)
+            steps = self._steps()
+            for step, target, act in steps.acts():
+                self._do(steps, step, target, act)
+            verified = dict(steps.verified)
         except StepFailedError as failed:
             code, text = failed.code, failed.text
         except JournalError as error:
             code, text = codes.RECORD_NOT_SAVED, error.what
-        steps = self._steps
-        verified = steps.verified if steps is not None and code is codes.OK else {}
-        return RunResult(code.outcome, code.name, text, clock.now() - began_at, dict(verified))
+        duration_s = self._clock.now() - began_at
+        return RunResult(code.outcome, code.name, text, duration_s, verified)
 
-    def _acts(self) -> Sequence[tuple[StepName, str, Act | None]]:
+    def _steps(self) -> UnitSteps:
+        def prompt(text: str, limit_s: float | None) -> None:
+            self._tell(OperatorPrompted("", text, limit_s))
+
         try:
-            devices = [
-                UnitDevice(target, self._connection, self._taps, self._is_over)
-                for target in self._recipe.targets
+            targets = [
+                UnitTarget(each, self._connection, self._taps, self._is_over)
+                for each in self._recipe.targets
             ]
-            self._steps = UnitSteps(
-                self._order, self._recipe, devices, self._journal, self._power, self._progress
+            return UnitSteps(
+                self._order,
+                self._recipe,
+                targets,
+                self._journal,
+                self._power,
+                self._progress,
+                prompt,
             )
-            self._steps.flashing.tell = self._tell
         except FlasherError as error:
             raise StepFailedError(codes.RECIPE, error.what) from error
-        return self._steps.acts()
 
     # -- one step ---------------------------------------------------------------------------------
 
-    def _do(self, step: StepName, target: str, act: Act | None) -> None:
+    def _do(self, steps: UnitSteps, step: StepName, target: str, act: Act | None) -> None:
         """Try a step as often as the recipe says. Raises StepFailedError."""
         rule = self._recipe.recipe.rule(step)
         if act is None:
             self._journal.step(StepReport(step, target, 1, StepState.SKIPPED, 0.0))
             return
+        self._step = step, target
         for try_number in range(1, rule.tries + 1):
-            failed = self._try(step, target, act, try_number, rule.time_limit_s)
+            failed = self._try(steps, act, try_number, rule.time_limit_s)
             if failed is None:
                 return
             if not failed.code.may_retry or try_number == rule.tries:
                 raise failed
-            self._before_next_try(failed, rule.pause_s, power_cycle=rule.power_cycle)
+            self._before_next_try(steps, failed, rule)
 
     def _try(
-        self, step: StepName, target: str, act: Act, try_number: int, limit_s: float | None
+        self, steps: UnitSteps, act: Act, try_number: int, limit_s: float | None
     ) -> StepFailedError | None:
-        clock = self._connection.clock
-        began_at = clock.now()
-        self._step, self._step_began_at = (step, target), began_at
+        step, target = self._step
+        began_at = self._step_began_at = self._clock.now()
         self._told_at = float("-inf")
         self._step_ends_at = None if limit_s is None else began_at + limit_s
-        self._tell(StepBegan(step, target, try_number))
+        self._tell(StepStarted("", self._order.serial, step, try_number, target))
         measured: list[Measurement] = []
         failed, text = None, ""
         try:
-            self._check_cancelled()
+            steps.targets[0].check_cancelled()
             text = act(measured)
         except StepFailedError as error:
             failed = error
-        except (CancelledError, InterruptedByUserError) as error:
-            failed = self._why_over(step, getattr(error, "what", ""))
+        except InterruptedByUserError:
+            code, text = codes.TOO_SLOW, "It was not done in time."
+            if self._cancelled():
+                code, text = codes.OPERATOR_ABORT, f"Stopped in {step.value}."
+            failed = StepFailedError(code, f"{text} {steps.left_behind}".strip())
         except JournalError:
             raise
         except FlasherError as error:
-            failed = self._known(error)
+            code = next(code for kind, code in _BY_ERROR if isinstance(error, kind))
+            words = f"{error.what} ({error.cause})" if error.cause else error.what
+            failed = StepFailedError(code, words)
         finally:
             self._step_ends_at = None
-        duration_s = clock.now() - began_at
+        duration_s = self._clock.now() - began_at
         if limit_s is not None:
             measured.append(Measurement("duration", duration_s, "s", high=limit_s))
             if failed is None and duration_s > limit_s:
                 failed = StepFailedError(
                     codes.TOO_SLOW, f"{step.value}: {duration_s:.1f} s, {limit_s:g} s are allowed."
                 )
-        report = StepReport(
-            step, target, try_number, StepState.PASS, duration_s, "", text, tuple(measured)
-        )
+        state, code_name = StepState.PASS, ""
         if failed is not None:
-            state = _STATES[failed.code.outcome]
-            report = replace(report, state=state, code=failed.code.name, text=failed.text)
-        self._journal.step(report)
+            state, code_name, text = _STATES[failed.code.outcome], failed.code.name, failed.text
+        self._journal.step(
+            StepReport(
+                step, target, try_number, state, duration_s, code_name, text, tuple(measured)
+            )
+        )
         return failed
 
-    def _check_cancelled(self) -> None:
-        if self._cancelled():
-            raise CancelledError
-
-    def _why_over(self, step: StepName, what: str) -> StepFailedError:
-        """The run was cancelled, or the step's time is over."""
-        left = self._steps.flashing.left_behind if self._steps is not None else ""
-        if self._cancelled():
-            return StepFailedError(codes.OPERATOR_ABORT, f"Stopped in {step.value}. {left}".strip())
-        return StepFailedError(
-            codes.TOO_SLOW, f"{what or 'It was not done in time.'} {left}".strip()
-        )
-
-    @staticmethod
-    def _known(error: FlasherError) -> StepFailedError:
-        code = next((code for kind, code in _BY_ERROR if isinstance(error, kind)), codes.RECIPE)
-        words = f"{error.what} ({error.cause})" if error.cause else error.what
-        return StepFailedError(code, words)
-
-    def _before_next_try(
-        self, failed: StepFailedError, pause_s: float, *, power_cycle: bool
-    ) -> None:
+    def _before_next_try(self, steps: UnitSteps, failed: StepFailedError, rule: StepRule) -> None:
         if failed.code is codes.BUS:
             # It may be back; when it is not, the next try says so.
             with suppress(BusError):
                 self._connection.link.reopen()
         try:
-            if power_cycle and self._power is not None:
+            if rule.power_cycle and self._power is not None:
                 self._power.begin_cycle()
-            if pause_s and self._steps is not None:
-                self._steps.devices[0].run(Listen(pause_s, lambda _now: False))
-        except CancelledError:
+            if rule.pause_s:
+                steps.targets[0].run(Listen(rule.pause_s))
+        except InterruptedByUserError:
             return
         except BusError as error:
             raise StepFailedError(codes.BUS, error.what) from error
 
     def _is_over(self) -> bool:
         """Asked between frames: a person stopped it, or the step's time is over."""
-        if self._cancelled():
-            return True
         ends_at = self._step_ends_at
-        return ends_at is not None and self._connection.clock.now() >= ends_at
+        return self._cancelled() or (ends_at is not None and self._clock.now() >= ends_at)
 
     def _progress(self, share: float) -> None:
-        now = self._connection.clock.now()
+        now = self._clock.now()
         if now - self._told_at < _PROGRESS_S and share < 1:
             return
         self._told_at = now
         passed_s = now - self._step_began_at
         left_s = passed_s / share * (1 - share) if share > 0 else None
-        self._tell(Progress(*self._step, share, left_s))
+        step, target = self._step
+        self._tell(Progressed("", self._order.serial, step, share, left_s, target))

@@ -39,24 +39,21 @@ from flasher.station.messages import (
     FromWorker,
     Intent,
     JournalError,
-    Note,
-    PowerControl,
     PresenceChanged,
     Quit,
     Ready,
     Reply,
-    RunNote,
+    RunEvent,
     RunResult,
     StepReport,
     ToWorker,
     TraceFile,
     WorkerSetup,
 )
-from flasher.station.power import PowerCommand
+from flasher.station.power import PowerCommand, PowerControl
 from flasher.station.presence import Presence
 from flasher.station.recipe_file import LoadedRecipe, load_recipe
 from flasher.station.records.model import RunState, WriteId
-from flasher.station.unit_device import UnitDevice
 from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import VirtualSocket
 from flasher.trace.recorder import Recorder
@@ -111,10 +108,10 @@ class StationPipe:
             self.is_gone = self.is_over = True
             raise StationGoneError from error
 
-    def tell(self, note: RunNote) -> None:
+    def tell(self, event: RunEvent) -> None:
         """Tell what goes on; a dead station is noticed elsewhere, between two messages."""
         with suppress(StationGoneError):
-            self.send(Note(note))
+            self.send(event)
 
     def look(self, wait_s: float = 0.0) -> None:
         """Take in what the station said, and tell it that this process is alive."""
@@ -219,8 +216,7 @@ class Worker:
         self._virtual = virtual
         self._power: PowerControl | None = PowerCommand(setup.power) if setup.power else virtual
         self._journal = PipeJournal(pipe, setup.reply_limit_s)
-        devices = [UnitDevice(each, connection, (), pipe.is_stopped) for each in recipe.targets]
-        self._presence = Presence(devices, silence_s=setup.silence_s, probe_s=setup.probe_s)
+        self._presence = Presence(recipe.targets, silence_s=setup.silence_s, probe_s=setup.probe_s)
         self._is_down = False
         """The adapter failed."""
         self._is_blocked = False

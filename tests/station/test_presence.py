@@ -15,7 +15,6 @@ from flasher.protocol.spec import BMS, WMC, Mode
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message, encode, split
 from flasher.station.presence import Presence
-from flasher.station.unit_device import UnitDevice
 from tests.station.unit_bench import UnitBench
 
 TRAFFIC = Frame(0x720, b"\x55\xaa\x0c\x12\x10\x10\x00\x00")
@@ -24,8 +23,7 @@ TRAFFIC = Frame(0x720, b"\x55\xaa\x0c\x12\x10\x10\x00\x00")
 @pytest.fixture
 def presence(tmp_path: Path) -> Presence:
     bench = UnitBench(tmp_path)
-    device = UnitDevice(bench.recipe.targets[0], bench.connection, (), lambda: False)
-    return Presence([device], silence_s=2.0, probe_s=0.5)
+    return Presence(bench.recipe.targets, silence_s=2.0, probe_s=0.5)
 
 
 def test_nothing_is_said_before_it_is_known(presence: Presence) -> None:
@@ -112,10 +110,5 @@ def test_a_unit_that_cannot_be_asked_is_said_to_be_unseen(tmp_path: Path) -> Non
     loaded = bench.recipe.targets[0]
     profile = replace(loaded.profile, target=WMC, version_query=None)
     firmware = loaded.firmware.model_copy(update={"target": "wmc"})
-    device = UnitDevice(
-        replace(loaded, firmware=firmware, profile=profile),
-        bench.connection,
-        (),
-        lambda: False,
-    )
-    assert not Presence([device], silence_s=2.0, probe_s=0.5).sees_units
+    target = replace(loaded, firmware=firmware, profile=profile)
+    assert not Presence([target], silence_s=2.0, probe_s=0.5).sees_units

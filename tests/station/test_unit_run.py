@@ -12,7 +12,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WMC
 from flasher.settings.manifest import release_of, to_toml
 from flasher.station.codes import CODES, OF_ENDING
-from flasher.station.messages import Progress, Prompt
+from flasher.station.events import OperatorPrompted, Progressed
 from flasher.station.records.model import RunKind, RunState, StepName, StepState, Verified
 from flasher.station.records.proof import hear
 from flasher.trace.reader import read_trace
@@ -117,7 +117,7 @@ def test_the_memory_is_read_back_where_the_recipe_asks_for_it(tmp_path: Path) ->
     bench = UnitBench(tmp_path, text)
     result = bench.run()
     assert result.verified == {"bms": Verified.MEMORY}, result.text
-    shares = [note.share for note in bench.notes if isinstance(note, Progress)]
+    shares = [note.share for note in bench.notes if isinstance(note, Progressed)]
     assert shares[-1] == 1.0
 
 
@@ -409,7 +409,10 @@ def test_without_power_control_a_person_is_asked_for_a_half_flashed_unit(tmp_pat
     bench.device.power_cut(0.0)
 
     def switch_on() -> bool:
-        if any(isinstance(note, Prompt) for note in bench.notes) and not bench.device.has_power:
+        if (
+            any(isinstance(note, OperatorPrompted) for note in bench.notes)
+            and not bench.device.has_power
+        ):
             bench.device.power_on(bench.clock.now())
         return False
 

@@ -17,6 +17,7 @@ from flasher.bus.simulated import SimulatedBus
 from flasher.errors import UsageError
 from flasher.protocol.spec import WELLING
 from flasher.station.config import MockUnits
+from flasher.station.events import StepStarted
 from flasher.station.messages import (
     Abort,
     AdapterDown,
@@ -27,7 +28,6 @@ from flasher.station.messages import (
     FromWorker,
     Intent,
     JournalError,
-    Note,
     PresenceChanged,
     Quit,
     Ready,
@@ -113,7 +113,7 @@ def test_a_unit_that_comes_is_run_and_its_trace_is_closed(tmp_path: Path) -> Non
     assert not socket.trace.exists()
     assert isinstance(socket.channel.sent[0], Ready)
     assert socket.channel.of(Beat)
-    assert socket.channel.of(Note)
+    assert socket.channel.of(StepStarted)
 
 
 def test_it_does_nothing_before_the_reply(tmp_path: Path) -> None:

@@ -15,13 +15,13 @@ from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, WELLING, Target
 from flasher.station.messages import (
     JournalError,
-    PowerControl,
-    RunNote,
+    RunEvent,
     RunOrder,
     RunResult,
     StepReport,
     Texts,
 )
+from flasher.station.power import PowerControl
 from flasher.station.records.model import RunId, RunKind, StepName, StepState, WriteId
 from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import Place
@@ -88,7 +88,7 @@ class UnitBench:
             place.device = MockDevice(target, bitrate_bps=WELLING.bitrate_bps, profile=profile)
         self.connection = Connection(self.bus.link(), self.clock, "a simulated bus")
         self.journal = Notes()
-        self.notes: list[RunNote] = []
+        self.notes: list[RunEvent] = []
         self.is_cancelled: Callable[[], bool] = lambda: False
         self.power: PowerControl | None = None
         self.taps: Sequence[Tap] = ()

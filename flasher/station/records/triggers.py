@@ -86,7 +86,8 @@ _OF_TABLES: Final[Mapping[tuple[str, str], Mapping[str, tuple[str, str]]]] = {
             (
                 "(NOT EXISTS (SELECT 1 FROM run_target WHERE run_id = NEW.id)"
                 " OR EXISTS (SELECT 1 FROM run_target WHERE run_id = NEW.id"
-                " AND (reached IS NULL OR reached < required OR reached < NEW.verification_reached)))"
+                " AND (reached IS NULL OR reached < required"
+                " OR reached < NEW.verification_reached)))"
             ),
             "PASS needs every target verified as the recipe asks",
         ),

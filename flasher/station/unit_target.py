@@ -1,0 +1,177 @@
+"""One target of the unit in the socket: its `Device`, and what the station asks beside it.
+
+Nothing here decides what a bad answer means: `unit_steps` does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from flasher.api import Connection, release_checked, release_options
+from flasher.driver import Tap
+from flasher.errors import InterruptedByUserError, NoAnswerError
+from flasher.host.identify import Identify
+from flasher.host.identity import Seen
+from flasher.host.items import Readable, meaningful_fields
+from flasher.host.options import UpgradeOptions
+from flasher.host.query import Request
+from flasher.protocol.catalogue import BY_KEY
+from flasher.protocol.contents import Reset
+from flasher.protocol.engine import Engine
+from flasher.protocol.fields import Content
+from flasher.protocol.spec import Command
+from flasher.station.codes import Code
+from flasher.station.power import PowerControl
+from flasher.station.presence import BootWatcher, Listen
+from flasher.station.recipe_file import LoadedTarget
+
+BURST_QUIET_S: Final = 0.3
+"""No further announcement for so long: the burst (4 of them, 50 ms apart) is over."""
+
+
+class StepFailedError(Exception):
+    """A try of a step failed; the run decides whether there is another one."""
+
+    def __init__(self, code: Code, text: str, *, needs_rescue: bool = False) -> None:
+        super().__init__(text)
+        self.code = code
+        self.text = text
+        self.needs_rescue = needs_rescue
+
+
+@dataclass(frozen=True)
+class Identified:
+    """What a device said of itself before the first write."""
+
+    seen: Seen
+    is_in_bootloader: bool
+    answers: int
+    """Different version answers: two are two devices."""
+
+    @property
+    def serial_number(self) -> str:
+        """Its own; empty where it does not say it."""
+        return str(getattr(self.seen.version, "serial_number", ""))
+
+
+class UnitTarget:
+    """A target on the bus. Methods raise BusError, and InterruptedByUserError when the run is to
+    end.
+    """
+
+    def __init__(
+        self,
+        loaded: LoadedTarget,
+        connection: Connection,
+        taps: Sequence[Tap],
+        cancelled: Callable[[], bool],
+    ) -> None:
+        self.loaded = loaded
+        self.name = loaded.name
+        self.clock = connection.clock
+        self.watcher = BootWatcher(loaded.target, loaded.profile.timings)
+        # Nobody else has this adapter, and each flash listens itself.
+        self.device = connection.device(
+            profile=loaded.profile,
+            is_alone=True,
+            taps=(*taps, self.watcher),
+            cancelled=cancelled,
+        )
+        self.image = release_checked(loaded.image, loaded.release)
+        self.plan = self.device.plan(self.image)
+        # A unit without an application is rescued here.
+        self.identity = loaded.profile.identity(release=loaded.release, goes_on_unchecked=True)
+        self.version_request = self.options().version_request_for(loaded.target)
+        """How it is asked for its version; None where nobody knows."""
+        self._cancelled = cancelled
+
+    def options(self, **overrides: object) -> UpgradeOptions:
+        """The options of an upgrade, those of the product."""
+        chosen = self.loaded.profile.upgrade_options(**overrides)
+        return release_options(chosen, self.loaded.release)
+
+    # -- asking -----------------------------------------------------------------------------------
+
+    def identify(self) -> Identified:
+        """Ask it who it is; silence is no error here. One that has just been switched on passes
+        through its bootloader (R19): only one that goes on announcing itself has no application.
+        """
+        found = self._identify_once()
+        if not found.is_in_bootloader or self.version_request is None:
+            return found
+        self.run(Listen(self.loaded.profile.timings.announcing_on_s, self._is_quiet))
+        if not self._is_quiet(self.clock.now()) or self.await_application() is None:
+            return found
+        return self._identify_once()
+
+    def _identify_once(self) -> Identified:
+        asked = Identify(self.plan, self.options())
+        before = self.watcher.announcements
+        self.run(asked)
+        announced = asked.heard is not None or self.watcher.announcements > before
+        return Identified(asked.seen, announced, len(asked.answers))
+
+    def is_silent(self, found: Identified) -> bool:
+        """It could have answered, and did not."""
+        asked = self.version_request is not None
+        return asked and found.seen.version is None and not found.is_in_bootloader
+
+    def await_application(self) -> Content | None:
+        """Its version answer as soon as it runs; None when it does not in the time of a start."""
+        give_up_at = self.clock.now() + self.loaded.profile.timings.application_start_timeout_s
+        while True:
+            try:
+                return self.device.version()
+            except NoAnswerError:
+                if self.clock.now() >= give_up_at:
+                    return None
+
+    def read(self, what: Readable) -> Mapping[str, tuple[object, str]]:
+        """The fields of something readable: value, and as it is shown. Raises NoAnswerError."""
+        content = self.device.ask(Request(what.item))
+        return {
+            name: (getattr(content, name), codec.show(getattr(content, name)))
+            for name, codec in meaningful_fields(type(content))
+            if what.field in ("", name)
+        }
+
+    # -- restarting -------------------------------------------------------------------------------
+
+    def restart(self, power: PowerControl | None) -> bool:
+        """Switch it off and on, or reset it as documented; True when its bootloader then announced
+        itself. Raises NoAnswerError.
+        """
+        watcher, before = self.watcher, self.watcher.announcements
+        if power is not None:
+            power.begin_cycle()
+        else:
+            item = BY_KEY.get((self.loaded.target.request_id, Command.RESET))
+            if item is None:
+                raise NoAnswerError(f"The documents give no reset for the {self.name}.")
+            self.device.ask(Request(item, Reset()))
+
+        def is_over(now: float) -> bool:
+            return watcher.announcements > before and self._is_quiet(now)
+
+        self.run(Listen(self.loaded.profile.timings.boot_version_timeout_s, is_over))
+        if power is not None:
+            power.check()
+        return watcher.announcements > before
+
+    def _is_quiet(self, now: float) -> bool:
+        announced_at = self.watcher.announced_at
+        return announced_at is None or now - announced_at >= BURST_QUIET_S
+
+    # -- running ----------------------------------------------------------------------------------
+
+    def check_cancelled(self) -> None:
+        """Raises InterruptedByUserError when the run is to end."""
+        if self._cancelled():
+            raise InterruptedByUserError("The run is to end.")
+
+    def run(self, engine: Engine, on_event: Callable[[object], None] | None = None) -> None:
+        """Run an engine of the station on the connection."""
+        self.device.run(engine, on_event=on_event)
+        self.check_cancelled()
