@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from io import BufferedReader
 from typing import Any, Final
 
-from flasher.errors import FlasherError, UsageError, printable
+from flasher.errors import Fault, FlasherError, UsageError, printable
 
 TOML_MAX_SIZE: Final = 256 * 1024
 """In bytes, of any file of settings."""
@@ -117,13 +117,15 @@ def parse_file(
     try:
         return parse_toml(raw)
     except ValueError as problem:
-        shown = printable(os.fspath(path))
-        raise error(
-            f"The {what} {shown} is no TOML file that can be read: {printable(str(problem))}.",
+        shown, why = printable(os.fspath(path)), printable(str(problem))
+        refusal = error(
+            f"The {what} {shown} is no TOML file that can be read: {why}.",
             where=shown,
             remedy="Texts stand in quotes, lists in brackets, tables as [name], numbers as 0x4205 "
             "or 0.5.",
-        ) from problem
+        )
+        refusal.faults = (Fault("", f"It is no TOML file: {why}.", refusal.remedy),)
+        raise refusal from problem
 
 
 def parse_toml(raw: bytes) -> dict[str, Any]:

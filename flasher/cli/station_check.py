@@ -12,29 +12,31 @@ from flasher.cli.station_documents import (
     RecipeFindingDocument,
     StationCheckDocument,
 )
-from flasher.errors import ExitCode
+from flasher.errors import ExitCode, UsageError
 from flasher.protocol.text import printable
 from flasher.station.adapters import Resolved, detect, resolve
 from flasher.station.config import load_config
-from flasher.station.recipe_check import check_recipe
-from flasher.station.recipe_file import LoadedRecipe, RecipeError
-from flasher.station.template import fill
+from flasher.station.recipe import fill
+from flasher.station.recipe_file import LoadedRecipe, load_checked
 
 
 def run(options: argparse.Namespace, output: Output) -> int:
     """Run the command; returns the exit code."""
     # The day is the plant's: it goes into what is written.
     day = datetime.now().astimezone().date()
-    found = check_recipe(options.recipe, day)
-    if found.recipe is None or found.findings:
-        error = RecipeError(options.recipe, found.findings)
+    try:
+        recipe = load_checked(options.recipe, day)
+    except UsageError as error:
+        if not error.faults:
+            raise
         findings = [
-            RecipeFindingDocument(where=each.where, what=each.what, remedy=each.remedy)
-            for each in found.findings
+            RecipeFindingDocument(
+                where=each.place or "the whole file", what=each.what, remedy=each.remedy
+            )
+            for each in error.faults
         ]
         output.failure(error, findings=findings)
         return error.exit_code
-    recipe = found.recipe
     for line in _lines(recipe, day):
         output.result(line)
     sockets = {} if options.sockets is None else adapters_of(options)

@@ -37,7 +37,7 @@ from flasher.errors import BusError, ExitCode, FlasherError, InterruptedByUserEr
 from flasher.protocol.text import printable
 from flasher.station import codes
 from flasher.station.options import StationOptions
-from flasher.station.recipe_check import load_checked
+from flasher.station.recipe_file import load_checked
 from flasher.station.records import RecordError, Store
 from flasher.station.station import Station
 from flasher.station.supervisor import Launch, ProcessPort

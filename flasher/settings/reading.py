@@ -163,7 +163,10 @@ class Reader(Generic[Kind]):
         unknown: list[Fault] = []
         missing: dict[Location, list[str]] = {}
         wrong: dict[str, Fault] = {}
+        places = [location for kind, location, _ in details if kind != "too_short"]
         for kind, location, said in details:
+            if kind == "too_short" and any(each[: len(location)] == location for each in places):
+                continue  # what is wrong in a list is not counted
             at, value = _found(document, location)
             if kind == "missing":
                 missing.setdefault(location[:-1], []).append(str(location[-1]))
@@ -303,7 +306,8 @@ class _Schema:
                 return f"{'seconds' if name.endswith('_s') else 'a number'}{self._bounds()}"
             case {"type": "array", "items": items}:
                 each = _Schema(items, self.definitions).allowed(name)
-                return "a list of " + each.replace("a text", "texts").replace("a table", "tables")
+                each = each.replace("a text", "texts", 1).replace("a table", "tables", 1)
+                return f"a list of {each}{', not empty' if self.node.get('minItems') else ''}"
             case {"type": "string", "format": "time"}:
                 return "a time of day"
             case {"type": "string"}:

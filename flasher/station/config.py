@@ -28,27 +28,26 @@ from typing import Annotated, Any, Final
 from pydantic import Field, field_validator, model_validator
 
 from flasher.errors import UsageError
-from flasher.files import TOML_MAX_SIZE, read
-from flasher.station.recipe import Part, Words
-from flasher.station.recipe_file import parse
+from flasher.settings.reading import Reader, Table
+from flasher.station.recipe import ShortText
 from flasher.station.records.database import DEFAULT_LOCK_TIMEOUT_S
 
 SOCKETS_MAX: Final = 64
-_WHAT: Final = "station file"
 _SWITCH: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 _NOT_FOR_BUS: Final = frozenset({"interface", "channel", "serial_number", "usb_path"})
 Share = Annotated[float, Field(ge=0, le=1)]
 BusValue = bool | int | float | str
 
 
-class MockUnits(Part):
+class MockUnits(Table):
     """What virtual units a socket without an adapter meets: shares of 1 of all units."""
 
     bad: Share = 0.0
-    """They take the image, and then do not run it, or refuse it."""
+    """Units that take the image, and then do not run it, or refuse it."""
     slow: Share = 0.0
+    """Units that take long."""
     dead: Share = 0.0
-    """They never answer."""
+    """Units that never answer."""
     seed: int = Field(default=1, ge=0)
     """The same seed and serial number is the same unit."""
 
@@ -59,10 +58,10 @@ class MockUnits(Part):
         return self
 
 
-class SocketConfig(Part):
+class SocketConfig(Table):
     """One socket: an adapter of its own, or virtual units."""
 
-    name: Words
+    name: ShortText
     interface: str = ""
     """As python-can names it."""
     channel: str = ""
@@ -108,10 +107,10 @@ class SocketConfig(Part):
         return self
 
 
-class StationConfig(Part):
+class StationConfig(Table):
     """The whole file."""
 
-    name: Words = "station"
+    name: ShortText = "station"
     records: str = "records.sqlite"
     """A file beside this one, or the URL of a PostgreSQL server."""
     files: str = ""
@@ -136,6 +135,9 @@ class StationConfig(Part):
         return self
 
 
+CONFIG: Final = Reader(StationConfig, "station file")
+
+
 def _no_two(what: str, values: list[str]) -> None:
     twice = [value for value, count in Counter(values).items() if count > 1]
     if twice:
@@ -143,10 +145,10 @@ def _no_two(what: str, values: list[str]) -> None:
 
 
 def load_config(path: Path) -> StationConfig:
-    """The station's file. Relative places in it are beside it. Raises UsageError (RecipeError)
-    naming every key that is wrong.
+    """The station's file. Relative places in it are beside it. Raises UsageError naming every key
+    that is wrong.
     """
-    config = parse(StationConfig, path, read(path, TOML_MAX_SIZE, what=_WHAT), _WHAT)
+    config = CONFIG.load(path)
     here = path.parent
     changes: dict[str, str] = {}
     if "://" not in config.records:

@@ -1,5 +1,5 @@
-"""What a recipe says: how one product is made, as data. `recipe_file` reads it, `recipe_check`
-holds it against its images and the protocol.
+"""What a recipe says: how one product is made, as data. `recipe_file` reads it with its images, and
+holds it against them and the protocol.
 
     name = "Battery 36 V, line 2"
     part = "BAT-36-10"
@@ -18,17 +18,25 @@ holds it against its images and the protocol.
     target = "bms"
     item = "serial-number"
     values = ["{serial}"]
+
+Values are templates, filled in from the scan: `{serial}`, `{lot}`, `{date:%Y%m%d}`, `{match.week}`.
+They are not Python's own formatting, which reaches into objects: a template is data, and knows
+these words and no others. `{{` and `}}` are the brackets themselves.
 """
 
 from __future__ import annotations
 
-from datetime import time
+import re
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from datetime import date, time
 from enum import StrEnum
 from typing import Annotated, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from flasher.protocol.spec import TARGETS, Target, find_target
+from flasher.settings.reading import Reader, Table
 from flasher.station import checkdigit
 from flasher.station.pattern import TEXT_MAX, pattern_of
 from flasher.station.records.model import StepName, Verified
@@ -36,16 +44,9 @@ from flasher.station.records.model import StepName, Verified
 _TIME_MAX_S: Final = 3600.0
 _TRIES_MAX: Final = 10
 
-Words = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
+ShortText = Annotated[str, Field(min_length=1, max_length=200, pattern=r"^[^\x00-\x1f\x7f]+$")]
 Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
 Seconds = Annotated[float, Field(gt=0, le=_TIME_MAX_S)]
-
-
-class Part(BaseModel):
-    """A table of a recipe: no unknown keys, nothing converted behind one's back, never changed."""
-
-    # Texts of TOML become words of ours (enums), but no number becomes a text or the reverse.
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def _target_name(value: str) -> str:
@@ -55,12 +56,11 @@ def _target_name(value: str) -> str:
     return target.name
 
 
-class TargetPart(Part):
+class TargetTable(Table):
     """A table for one of the targets."""
 
-    target: str
-
-    _check_target = field_validator("target")(_target_name)
+    target: Annotated[str, AfterValidator(_target_name)]
+    """The device."""
 
     @property
     def device(self) -> Target:
@@ -68,18 +68,19 @@ class TargetPart(Part):
         return TARGETS[self.target]
 
 
-class SerialNumber(Part):
+class SerialNumber(Table):
     """How serial numbers look."""
 
     pattern: str
+    """Which texts are serial numbers (`pattern`), and its named groups."""
     example: str = Field(min_length=1, max_length=TEXT_MAX)
     """A good serial number; `station check` tries the whole recipe with it."""
     check_digit: str = ""
-    """A method of `checkdigit.CHECKS`; empty: none."""
+    """Its method; without it there is none."""
     check_group: str = ""
-    """The group that the check digit is of; empty: the whole serial number."""
+    """The group that the check digit is of; without it the whole serial number."""
     lot_group: str = ""
-    """The group that is the lot; empty: the lot does not stand in the serial number."""
+    """The group that is the lot, where it stands in the serial number."""
     number_group: str = ""
     """The group with the running number."""
     number_min: int = Field(default=0, ge=0)
@@ -128,7 +129,7 @@ class SerialNumber(Part):
         return groups
 
 
-class Lot(Part):
+class Lot(Table):
     """What holds for a lot."""
 
     quantity_max: int | None = Field(default=None, ge=1)
@@ -150,44 +151,44 @@ class Verify(StrEnum):
         return Verified[self.name]
 
 
-class Firmware(TargetPart):
+class Firmware(TargetTable):
     """A target, and what it is flashed with. Targets are done in the order of the recipe."""
 
     image: str = Field(min_length=1)
     manifest: str = ""
-    """Empty: the one beside the image, `IMAGE.toml`."""
+    """What its maker states of it; without it the one beside the image, `IMAGE.toml`."""
     sha256: Sha256
     """Of the bytes to be sent, as in the manifest."""
-    base: int | None = Field(default=None, ge=0, lt=1 << 32)
-    hardware_versions: tuple[Words, ...] = ()
+    base: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
+    hardware_versions: tuple[ShortText, ...] = ()
     """Narrower than the manifest's, which hold as well; * stands for any text."""
-    previous_versions: tuple[Words, ...] = ()
-    """Running versions that it may replace; empty: as the manifest says."""
+    previous_versions: tuple[ShortText, ...] = ()
+    """Running versions that it may replace; without it as the manifest says."""
     verify: Verify | None = None
-    """None: the version where the target can be asked for it, else completed."""
+    """How far it is verified; without it the version, where it can be asked for, else completed."""
 
 
-class Write(TargetPart):
-    """Something to write to a unit, with values that are templates; see `template`."""
+class Write(TargetTable):
+    """Something to write to a unit, with values that are templates."""
 
-    item: Words
+    item: ShortText
     values: tuple[str, ...] = Field(min_length=1)
     manufacturer: bool = False
     """Needed for what the document reserves for the manufacturer."""
 
 
-class Unchanged(TargetPart):
+class Unchanged(TargetTable):
     """Something that must read the same after the run as before it."""
 
-    item: Words
+    item: ShortText
 
 
-class Limit(TargetPart):
+class Limit(TargetTable):
     """Something that is measured in a step, with its limits."""
 
     step: Literal[StepName.IDENTIFY, StepName.CHECK, StepName.VERIFY] = StepName.CHECK
-    item: Words
-    field: Words
+    item: ShortText
+    field: ShortText
     low: float | None = None
     high: float | None = None
     expected: str | None = None
@@ -203,7 +204,7 @@ class Limit(TargetPart):
         return self
 
 
-class StepRule(Part):
+class StepRule(Table):
     """How long a step may take, and when it is tried again."""
 
     time_limit_s: Seconds | None = None
@@ -222,10 +223,10 @@ class Duplicate(StrEnum):
     REFLASH_WITH_REASON = "reflash-with-reason"
 
 
-class Golden(Part):
+class Golden(Table):
     """Known good units that test a socket before it may go on. Their runs count in no figure."""
 
-    serial_numbers: tuple[Words, ...] = Field(min_length=1)
+    serial_numbers: tuple[ShortText, ...] = Field(min_length=1)
     shift_starts: tuple[time, ...] = ()
     """Local times at which a shift starts; one must pass on each socket after each."""
     every_h: float | None = Field(default=None, gt=0, le=24 * 31)
@@ -239,11 +240,11 @@ class Golden(Part):
         return self
 
 
-class Recipe(Part):
+class Recipe(Table):
     """A recipe. `target` and `write` are in the order in which they are done."""
 
-    name: Words
-    part: Words
+    name: ShortText
+    part: ShortText
     """The product. A serial number is unique for its part."""
     revision: Annotated[str, Field(min_length=1, max_length=64)]
     notes: str = ""
@@ -278,3 +279,61 @@ class Recipe(Part):
 
 
 _USUAL: Final = StepRule()
+RECIPE: Final = Reader(Recipe, "recipe")
+
+
+# -- templates ------------------------------------------------------------------------------------
+
+DATE_DEFAULT: Final = "%Y%m%d"
+_DATE_FORM: Final = re.compile(r"(?:%[YymdjGVu]|[0-9A-Za-z_ /-])+")
+_PART: Final = re.compile(r"\{\{|\}\}|\{([^{}]*)\}|[{}]|[^{}]+")
+_GROUP: Final = "match."
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What is known of a unit before it is connected."""
+
+    serial: str
+    day: date
+    """The day of production, where the station stands."""
+    lot: str = ""
+    groups: Mapping[str, str] = field(default_factory=dict)
+    """The named groups of the serial number's pattern."""
+
+
+def fill(template: str, scan: Scan) -> str:
+    """The text of a template. Raises ValueError for a word that it does not know."""
+    return "".join(_part(part, scan) for part in _PART.finditer(template))
+
+
+def check_template(template: str, groups: Collection[str]) -> None:
+    """Raises ValueError for a template that cannot be filled with these groups of the pattern."""
+    fill(template, Scan("", date(2000, 1, 1), "", dict.fromkeys(groups, "")))
+
+
+def uses_lot(template: str) -> bool:
+    """True when the template needs a lot."""
+    return any(part[1] == "lot" for part in _PART.finditer(template))
+
+
+def _part(part: re.Match[str], scan: Scan) -> str:
+    word = part[1]
+    if word is None:
+        if part[0] in ("{", "}"):
+            raise ValueError(f"a bracket {part[0]} stands alone; write it twice for itself")
+        return part[0][0] if part[0] in ("{{", "}}") else part[0]
+    name, _, form = word.partition(":")
+    if name == "date":
+        form = form or DATE_DEFAULT
+        if _DATE_FORM.fullmatch(form) is None:
+            raise ValueError(f"{{{word}}} is no date: use %Y %y %m %d %j %G %V %u")
+        return scan.day.strftime(form)
+    if word == "serial":
+        return scan.serial
+    if word == "lot":
+        return scan.lot
+    if word.startswith(_GROUP) and word.removeprefix(_GROUP) in scan.groups:
+        return scan.groups[word.removeprefix(_GROUP)]
+    known = ["{serial}", "{lot}", "{date:%Y%m%d}", *(f"{{match.{g}}}" for g in scan.groups)]
+    raise ValueError(f"{{{word}}} is not known: {', '.join(known)}")

@@ -1,4 +1,5 @@
-"""Reads a recipe with its images from disk, once, and tells later whether the disk still agrees.
+"""Reads a recipe with its images from disk, once; holds it against them, the protocol and a sample
+scan, before a shift and not in it; and tells later whether the disk still agrees.
 
 A recipe reaches nothing outside of its own folder: no absolute path, no `..`, no link that leads
 out of it.
@@ -6,7 +7,6 @@ out of it.
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import os
 from collections.abc import Iterator, Mapping
@@ -14,54 +14,37 @@ from dataclasses import dataclass, field
 from datetime import date
 from functools import cached_property
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, Final, TypeVar
+from typing import Final
 
-from pydantic import BaseModel, ValidationError
-
-from flasher.errors import FlasherError, UsageError
-from flasher.files import TOML_MAX_SIZE, opened, parse_toml, read
+from flasher.errors import Fault, FlasherError, UsageError
+from flasher.files import TOML_MAX_SIZE, opened, read
+from flasher.host.identity import judge_bytes
+from flasher.host.items import Readable, find, meaningful_fields, readable
+from flasher.host.read import READ_MEMORY
 from flasher.host.write import WritePlan, plan_write
 from flasher.image.image import Image
 from flasher.image.load import FILE_MAX_SIZE, load
-from flasher.image.release import Release
+from flasher.image.plan import plan
+from flasher.image.release import Release, check_target
+from flasher.protocol.fields import Codec, Number
 from flasher.protocol.spec import Target
-from flasher.protocol.text import printable
 from flasher.settings.manifest import manifest_path, read_release
 from flasher.settings.profile import Profile, load_profile
-from flasher.station.recipe import Firmware, Recipe, Verify, Write
+from flasher.station.recipe import (
+    RECIPE,
+    Firmware,
+    Limit,
+    Recipe,
+    Scan,
+    Unchanged,
+    Write,
+    check_template,
+    fill,
+    uses_lot,
+)
 from flasher.station.records.model import Verified
-from flasher.station.template import Scan, fill
 
-Model = TypeVar("Model", bound=BaseModel)
-_UNKNOWN_KEY: Final = "unknown key."
-FINDINGS_SHOWN: Final = 8
-
-
-@dataclass(frozen=True)
-class Finding:
-    """Something that speaks against a recipe."""
-
-    where: str
-    what: str
-    remedy: str = ""
-
-    def __str__(self) -> str:
-        rest = f" {self.remedy}" if self.remedy else ""
-        return f"{self.where}: {self.what}{rest}"
-
-
-class RecipeError(UsageError):
-    """A recipe that cannot be used; `findings` are all that was found, not the first alone."""
-
-    def __init__(self, path: Path, findings: tuple[Finding, ...], what: str = "recipe") -> None:
-        shown = "\n         ".join(str(finding) for finding in findings[:FINDINGS_SHOWN])
-        more = len(findings) - FINDINGS_SHOWN
-        super().__init__(
-            f"The {what} {printable(str(path))} cannot be used.",
-            where=shown + (f"\n         and {more} more" if more > 0 else ""),
-            remedy=f"Correct the {what}.",
-        )
-        self.findings = findings
+_SAMPLE_LOT: Final = "LOT1"
 
 
 @dataclass(frozen=True)
@@ -153,82 +136,53 @@ class LoadedRecipe:
 def load_recipe(path: Path) -> LoadedRecipe:
     """The recipe at `path` with its images.
 
-    Raises RecipeError with all that is wrong with the file, or with files that it names. It does
-    not try values: `recipe_check.check_recipe` does.
+    Raises UsageError with all that is wrong with the file, or with files that it names. It does not
+    try values: `load_checked` does.
     """
-    findings: list[Finding] = []
     raw = read(path, TOML_MAX_SIZE, what="recipe")
-    recipe = parse(Recipe, path, raw)
+    recipe = RECIPE.parse(raw, path)
     files = {path: hashlib.sha256(raw).hexdigest()}
-    targets = []
-    for number, firmware in enumerate(recipe.target, 1):
-        loaded = _load_target(path, recipe, firmware, f"target {number}", findings)
-        if loaded is not None:
-            targets.append(loaded[0])
-            files |= loaded[1]
-    if findings:
-        raise RecipeError(path, tuple(findings))
+    targets: list[LoadedTarget] = []
+    faults: list[Fault] = []
+    for number, firmware in enumerate(recipe.target):
+        try:
+            target, its_files = _load_target(path, recipe, firmware)
+        except ValueError as error:
+            remedy = "Copy it there, and name it by its name."
+            faults.append(Fault(f"target[{number}]", f"{error}.", remedy))
+        except FlasherError as error:
+            faults.append(Fault(f"target[{number}]", error.what, error.remedy))
+        else:
+            targets.append(target)
+            files |= its_files
+    if faults:
+        raise RECIPE.refusal(path, faults)
     return LoadedRecipe(recipe, path, files[path], raw.decode("utf-8-sig"), tuple(targets), files)
+
+
+def load_checked(path: Path, day: date) -> LoadedRecipe:
+    """A recipe with its images that everything agrees with that can be known without a device;
+    `day` is the sample's. Raises UsageError with all that is wrong.
+    """
+    loaded = load_recipe(path)
+    faults = [
+        *(
+            fault
+            for number, target in enumerate(loaded.targets)
+            for fault in _check_target(loaded, target, f"target[{number}]")
+        ),
+        *_check_scan(loaded, day),
+        *_check_reads(loaded),
+        *_check_golden(loaded),
+    ]
+    if faults:
+        raise RECIPE.refusal(path, faults)
+    return loaded
 
 
 def _sha256(path: Path) -> str:
     with opened(path, FILE_MAX_SIZE) as (file, _):
         return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def parse(model: type[Model], path: Path, raw: bytes, what: str = "recipe") -> Model:
-    """A TOML file as a checked model. Raises RecipeError with all that is wrong."""
-    try:
-        return model.model_validate(parse_toml(raw))
-    except ValidationError as error:
-        # An unknown key first: it may be why another one is missing.
-        found = sorted(_findings(model, error), key=lambda each: each.what != _UNKNOWN_KEY)
-        raise RecipeError(path, tuple(found), what) from error
-    except ValueError as error:
-        no_toml = Finding(
-            printable(str(path)),
-            f"it is no TOML file: {printable(str(error))}.",
-            "Texts stand in quotes, lists in brackets, tables as [name].",
-        )
-        raise RecipeError(path, (no_toml,), what) from error
-
-
-def _findings(model: type[BaseModel], error: ValidationError) -> Iterator[Finding]:
-    for detail in error.errors(include_url=False, include_context=False):
-        where = ".".join(_shown(part) for part in detail["loc"]) or "the whole file"
-        if detail["type"] == "extra_forbidden":
-            key = str(detail["loc"][-1])
-            names = _keys_at(model, detail["loc"][:-1])
-            close = difflib.get_close_matches(key.lower(), names, n=1)
-            guess = f"Did you mean {close[0]}? " if close else ""
-            yield Finding(where, _UNKNOWN_KEY, f"{guess}Known are: {', '.join(names)}.")
-        else:
-            said = printable(detail["msg"].removeprefix("Value error, "))
-            yield Finding(where, f"{said[:1].lower()}{said[1:]}.")
-
-
-def _shown(part: str | int) -> str:
-    return str(part + 1) if isinstance(part, int) else printable(part)[:60]
-
-
-def _keys_at(model: type[BaseModel], location: tuple[str | int, ...]) -> list[str]:
-    """The keys of the table at this place of a document."""
-    found: type[BaseModel] | None = model
-    for part in location:
-        if not isinstance(part, str) or found is None or part not in found.model_fields:
-            continue
-        found = _model_in(found.model_fields[part].annotation)
-    return list(found.model_fields) if found is not None else []
-
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    for argument in getattr(annotation, "__args__", ()):
-        found = _model_in(argument)
-        if found is not None:
-            return found
-    return None
 
 
 # -- files of a recipe ----------------------------------------------------------------------------
@@ -250,35 +204,159 @@ def inside(recipe_path: Path, name: str) -> Path:
 
 
 def _load_target(
-    path: Path, recipe: Recipe, firmware: Firmware, where: str, findings: list[Finding]
-) -> tuple[LoadedTarget, dict[Path, str]] | None:
-    """The target with its files; None, and findings, where something is wrong with them."""
-    before = len(findings)
-    try:
-        image_path = inside(path, firmware.image)
-        default = manifest_path(firmware.image)
-        manifest = inside(path, firmware.manifest or str(default))
-        profile_path = inside(path, recipe.profile) if recipe.profile else None
-        files = [image_path, manifest, *([profile_path] if profile_path else [])]
-        # Before and after loading: what was loaded is what was hashed.
-        hashes = {file: _sha256(file) for file in files}
-        image = load(image_path, base=firmware.base)
-        release = read_release(manifest)
-        # Without a profile of its own: what lies about on the computer must not matter.
-        profile = load_profile(profile_path or os.devnull, firmware.device)
-        if any(_sha256(file) != sha256 for file, sha256 in hashes.items()):
-            findings.append(Finding(where, "a file changed while it was read.", "Try again."))
-    except ValueError as error:
-        findings.append(Finding(where, f"{error}.", "Copy it there, and name it by its name."))
-    except FlasherError as error:
-        findings.append(Finding(where, error.what, error.remedy))
-    if len(findings) > before:
-        return None
-    required = _required(firmware, profile)
+    path: Path, recipe: Recipe, firmware: Firmware
+) -> tuple[LoadedTarget, dict[Path, str]]:
+    """The target with its files. Raises ValueError, FlasherError for what is wrong with them."""
+    image_path = inside(path, firmware.image)
+    manifest = inside(path, firmware.manifest or str(manifest_path(firmware.image)))
+    profile_path = inside(path, recipe.profile) if recipe.profile else None
+    files = [image_path, manifest, *([profile_path] if profile_path else [])]
+    # Before and after loading: what was loaded is what was hashed.
+    hashes = {file: _sha256(file) for file in files}
+    image = load(image_path, base=firmware.base)
+    release = read_release(manifest)
+    # Without a profile of its own: what lies about on the computer must not matter.
+    profile = load_profile(profile_path or os.devnull, firmware.device)
+    if any(_sha256(file) != sha256 for file, sha256 in hashes.items()):
+        raise UsageError("a file changed while it was read.", remedy="Try again.")
+    if firmware.verify is not None:
+        required = firmware.verify.level
+    else:
+        can_ask = profile.version_query is not None
+        required = Verified.VERSION if can_ask else Verified.COMPLETED
     return LoadedTarget(firmware, image, release, profile, required), hashes
 
 
-def _required(firmware: Firmware, profile: Profile) -> Verified:
-    if firmware.verify is not None:
-        return firmware.verify.level
-    return Verify.VERSION.level if profile.version_query is not None else Verified.COMPLETED
+# -- checks ---------------------------------------------------------------------------------------
+
+
+def _check_target(loaded: LoadedRecipe, target: LoadedTarget, where: str) -> Iterator[Fault]:
+    if target.firmware.sha256 != target.image.sha256:
+        yield Fault(
+            where,
+            f"sha256 is {target.firmware.sha256}, the image has {target.image.sha256}.",
+            "Take the image that the recipe was released with, or release a new recipe.",
+        )
+    try:
+        target.release.check_bytes(target.image)
+        check_target(target.image, target.release, target.target)
+        identity = target.profile.identity(release=target.release)
+        for found in judge_bytes(target.image, identity):
+            if found.ending is not None:
+                yield Fault(where, f"{found.text}.", "Name the firmware file itself.")
+        target.profile.check_fits(target.image)
+        plan(target.image, target.target, target.profile.dialect.bitrate_bps)
+    except FlasherError as error:
+        yield Fault(where, error.what, error.remedy)
+    if not target.profile.has_upgrade:
+        yield Fault(where, "its profile has no upgrade (has_upgrade).")
+    yield from _check_level(loaded, target, where)
+
+
+def _check_level(loaded: LoadedRecipe, target: LoadedTarget, where: str) -> Iterator[Fault]:
+    if target.required is Verified.COMPLETED:
+        if not loaded.recipe.allow_completed_not_read_back:
+            yield Fault(
+                where,
+                "nothing of it is read back, and allow_completed_not_read_back is false.",
+                "Name a profile with its version_query, or allow it.",
+            )
+        return
+    if target.required is Verified.MEMORY:
+        if READ_MEMORY.receiver is not target.target.node:
+            yield Fault(where, "its memory cannot be read.", "Verify the version.")
+        elif target.image.base is None:
+            yield Fault(where, "a raw binary can be read back only with its base.")
+        return
+    if not target.can_read_version:
+        yield Fault(
+            where,
+            "it cannot be asked for its version.",
+            "Name a profile with its version_query, or verify = 'completed'.",
+        )
+    elif target.image.version is None:
+        yield Fault(
+            where,
+            "the image names no version that could be compared.",
+            "Verify the memory, or verify = 'completed'.",
+        )
+
+
+def _check_scan(loaded: LoadedRecipe, day: date) -> Iterator[Fault]:
+    recipe = loaded.recipe
+    scan = loaded.scan(recipe.serial_number.example, day)
+    has_lot = bool(recipe.serial_number.lot_group) or recipe.lot.required
+    if not scan.lot and has_lot:
+        scan = Scan(scan.serial, day, _SAMPLE_LOT, scan.groups)
+    for number, write in enumerate(recipe.write):
+        where = f"write[{number}]"
+        try:
+            loaded.write_plan(write, scan)
+        except UsageError as error:
+            yield Fault(where, error.what, error.remedy)
+        if not has_lot and any(map(uses_lot, write.values)):
+            yield Fault(
+                where, "{lot} is used, but a unit may have none.", "Set lot.required = true."
+            )
+        if any(
+            (write.target, write.item) == (each.target, each.item) for each in recipe.write[:number]
+        ):
+            yield Fault(where, f"{write.item} is written twice.", "Leave one of them.")
+
+
+def _check_reads(loaded: LoadedRecipe) -> Iterator[Fault]:
+    groups = loaded.scan(loaded.recipe.serial_number.example, date(2000, 1, 1)).groups
+    written = {(write.target, write.item.lower()) for write in loaded.recipe.write}
+    for number, unchanged in enumerate(loaded.recipe.unchanged):
+        try:
+            found = readable_of(loaded, unchanged)
+        except UsageError as error:
+            yield Fault(f"unchanged[{number}]", error.what, error.remedy)
+            continue
+        if (unchanged.target, found.name) in written:
+            yield Fault(f"unchanged[{number}]", f"{found.name} is written by this recipe.")
+    for number, limit in enumerate(loaded.recipe.limit):
+        where = f"limit[{number}]"
+        try:
+            codec = codec_of(loaded, limit)
+            if limit.expected is not None:
+                check_template(limit.expected, groups)
+        except UsageError as error:
+            yield Fault(where, error.what, error.remedy)
+        except ValueError as error:
+            yield Fault(where, f"{error}.")
+        else:
+            if isinstance(codec, Number) != (limit.expected is None):
+                kind = (
+                    "a number: give low or high"
+                    if isinstance(codec, Number)
+                    else "no number: give expected"
+                )
+                yield Fault(where, f"{limit.field} is {kind}.")
+
+
+def readable_of(loaded: LoadedRecipe, part: Unchanged | Limit) -> Readable:
+    """What a table of the recipe wants to read. Raises UsageError for what cannot be."""
+    target = next(each for each in loaded.targets if each.name == part.target)
+    return find(part.item, readable(target.target, target.profile.dialect), target.target, "read")
+
+
+def codec_of(loaded: LoadedRecipe, limit: Limit) -> Codec:
+    """The field that a limit is for; its name is `limit.field`. Raises UsageError without one."""
+    found = readable_of(loaded, limit)
+    fields = dict(meaningful_fields(found.content))
+    if limit.field not in fields:
+        raise UsageError(
+            f"{found.name} has no field {limit.field!a:.40}.",
+            remedy=f"There are: {', '.join(fields)}.",
+        )
+    return fields[limit.field]
+
+
+def _check_golden(loaded: LoadedRecipe) -> Iterator[Fault]:
+    golden = loaded.recipe.golden
+    for number, serial in enumerate(golden.serial_numbers if golden is not None else ()):
+        try:
+            loaded.recipe.serial_number.read(serial)
+        except ValueError as error:
+            yield Fault(f"golden.serial_numbers[{number}]", f"{error}.")

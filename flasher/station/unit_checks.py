@@ -15,11 +15,9 @@ from flasher.host.write import WritePlan, field_changes
 from flasher.station import codes
 from flasher.station.codes import Code
 from flasher.station.messages import RunOrder, write_key
-from flasher.station.recipe import Limit
-from flasher.station.recipe_check import codec_of, readable_of
-from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.recipe import Limit, Scan, fill
+from flasher.station.recipe_file import LoadedRecipe, codec_of, readable_of
 from flasher.station.records.model import Measurement, RunKind, StepName
-from flasher.station.template import Scan, fill
 from flasher.station.unit_target import Identified, StepFailedError, UnitTarget
 
 SERIAL_ITEM: Final = "serial-number"

@@ -18,11 +18,12 @@ import pytest
 from flasher.cli.main import main
 from flasher.cli.station_views import JsonLines
 from flasher.errors import ExitCode
+from flasher.settings.reading import Table
 from flasher.station.codes import CODES
 from flasher.station.config import StationConfig
 from flasher.station.events import SocketState, StationEvent, StepStarted
 from flasher.station.messages import CannotWork
-from flasher.station.recipe import Part, Recipe
+from flasher.station.recipe import Recipe
 from flasher.station.records import DiskFullError, RunState, StepState, Store
 from flasher.station.scans import Word
 from tests.cli.conftest import SAMPLES, Flasher, Run
@@ -84,7 +85,9 @@ def test_everything_that_speaks_against_a_recipe_is_said(
     assert "Did you mean part?" in run.err
     run = flasher("station", "check", recipe, "--json")
     hold_output(schema, run.out, 2)
-    assert len(run.document["findings"]) >= 4
+    said = [f"{finding['where']} {finding['what']}" for finding in run.document["findings"]]
+    assert said[:2] == ["parts unknown key.", "revison unknown key."]
+    assert "has no part and no revision" in said[2]
 
 
 def test_a_changed_image_is_found_before_the_shift(flasher: Flasher, recipe: Path) -> None:
@@ -419,7 +422,7 @@ def test_the_guide_lists_every_code_with_what_to_do() -> None:
 
 
 @pytest.mark.parametrize("model", [Recipe, StationConfig], ids=lambda model: model.__name__)
-def test_the_guide_names_every_key(model: type[Part]) -> None:
+def test_the_guide_names_every_key(model: type[Table]) -> None:
     guide = GUIDE.read_text(encoding="utf-8")
     tables = [model]
     for table in tables:
@@ -429,9 +432,9 @@ def test_the_guide_names_every_key(model: type[Part]) -> None:
     assert len(tables) > 2
 
 
-def parts_in(annotation: Any) -> list[type[Part]]:
+def parts_in(annotation: Any) -> list[type[Table]]:
     """The tables of a recipe in the type of a key."""
-    if isinstance(annotation, type) and issubclass(annotation, Part):
+    if isinstance(annotation, type) and issubclass(annotation, Table):
         return [annotation]
     return [part for argument in get_args(annotation) for part in parts_in(argument)]
 

@@ -18,8 +18,7 @@ from sqlalchemy import event
 from flasher.image.image import Image
 from flasher.protocol.spec import BMS, WMC, Target
 from flasher.settings.manifest import release_of, to_toml
-from flasher.station.recipe_check import load_checked
-from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.recipe_file import LoadedRecipe, load_checked
 from flasher.station.records import Claim, Ending, Keeping, RunId, RunState, StepState, Store
 from flasher.station.records.model import Verified
 from tests.station.traces import run_messages, write_trace

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from flasher.station.checkdigit import CHECKS
 from flasher.station.pattern import TEXT_MAX, WAYS_MAX, Pattern
-from flasher.station.template import Scan, check, fill, uses_lot
+from flasher.station.recipe import Scan, check_template, fill, uses_lot
 from tests.loops import each
 
 STANDARD_EXAMPLES = {
@@ -121,7 +121,7 @@ def test_a_template_is_filled_from_the_scan(template: str, text: str) -> None:
 )  # fmt: skip
 def test_a_template_reaches_nothing_but_the_scan(template: str) -> None:
     with pytest.raises(ValueError, match=r"."):
-        check(template, ["week"])
+        check_template(template, ["week"])
 
 
 def test_it_is_known_whether_a_template_needs_a_lot() -> None:
