@@ -263,8 +263,10 @@ def _diff(options: argparse.Namespace, output: Output) -> int:
 
 
 def _profile(options: argparse.Namespace, output: Output) -> int:
-    from flasher.conformance.profile import ConformanceProfile  # noqa: PLC0415
-    from flasher.conformance.profile_keys import KEYS  # noqa: PLC0415
+    from flasher.conformance.profile import (  # noqa: PLC0415
+        ConformanceProfile,
+        profile_keys,
+    )
 
     profile = ConformanceProfile()
     if options.mock or options.choices:
@@ -280,7 +282,7 @@ def _profile(options: argparse.Namespace, output: Output) -> int:
                 ProfileKeyDocument(
                     key=key.path, default=key.default, allowed=key.allowed, meaning=key.text
                 )
-                for key in KEYS
+                for key in profile_keys().values()
             ],
             toml=toml,
         )

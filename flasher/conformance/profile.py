@@ -19,24 +19,180 @@ import os
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
-from flasher.conformance.profile_keys import BY_PATH, CHOICES, DEVICE, KEYS, LIMITS, Key
-from flasher.errors import UsageError, did_you_mean, printable
+from annotated_types import Interval
+from pydantic import AfterValidator, Field, model_validator
+
+from flasher.conformance.wire import IMAGE_BYTES_MAX, RESET, RESET_TEXT
+from flasher.errors import Fault, did_you_mean, printable
 from flasher.files import read_toml
+from flasher.form import Form
+from flasher.settings.reading import Key, Reader, Table
 
 DEVIATIONS: Final = "deviations"
-_TABLES: Final = (LIMITS, DEVICE)
+_TABLES: Final = ("limits", "device")
 _CASE_ID: Final = re.compile(r"[A-Z]{2}-\d\d")
+_TEXT_MAX: Final = 253
 Value = str | int | float
+
+
+def _ascii(value: object) -> str:
+    if not isinstance(value, str) or not value.isascii() or len(value) > _TEXT_MAX:
+        raise TypeError
+    return value
+
+
+def _check_deviations(deviations: dict[str, str]) -> dict[str, str]:
+    for case_id, reason in deviations.items():
+        if not _CASE_ID.fullmatch(case_id):
+            raise ValueError(
+                f'{case_id!a:.60} is no case; write the id of a case and a reason, as "TX-03" = '
+                '"why"'
+            )
+        if not reason.strip():
+            raise ValueError(f"{case_id} has no reason; say in a text why the product differs")
+    return deviations
+
+
+Limit = Annotated[float, Interval(ge=0, le=3600)]
+Ascii = Annotated[str, Form("a text in ASCII", _ascii)]
+
+
+class Limits(Table):
+    """Times; the defaults are this project's readings of the document."""
+
+    feedback_s: Limit = 1.0
+    """From reset to general feedback."""
+    first_version_s: Limit = 5.0
+    """From reset or power-up to the first boot version (R12)."""
+    version_spacing_s: Limit = 0.05
+    """Between two boot versions."""
+    version_spacing_tolerance_s: Limit = 0.01
+    """How far that spacing may be off."""
+    window_s: Limit = 0.198
+    """From the burst's last boot version to the window's end (UP-04)."""
+    window_tolerance_s: Limit = 0.002
+    """How far the window's end may be off."""
+    start_s: Limit = 5.0
+    """From the window's end, or complete, to an application that answers."""
+    erase_s: Limit = 10.0
+    """From the update command to request transfer (R12)."""
+    ack_s: Limit = 0.5
+    """From a packet to its ACK or NAK (R12)."""
+    complete_s: Limit = 10.0
+    """From end of transfer to the final answer (R12)."""
+    inter_frame_s: Limit = 0.1
+    """Between two frames of one message (R12)."""
+    pause_s: Limit = 5.0
+    """The pause in a transfer that tx_12 is about."""
+    refused_s: Limit = 2.0
+    """From a refused image to the next boot version."""
+    silence_s: Limit = 0.7
+    """How long the bus is watched before it counts as silent."""
+
+
+class DeviceFacts(Table):
+    """Sizes and words of the product."""
+
+    application_bytes: Annotated[int, Interval(ge=1, le=0xFFFF_FFFF)] = IMAGE_BYTES_MAX
+    """Size of the application area."""
+    largest_image_bytes: Annotated[int, Interval(ge=1, le=IMAGE_BYTES_MAX)] = IMAGE_BYTES_MAX
+    """The largest image that is taken."""
+    reset_command: Annotated[int, Interval(ge=0, le=0xFFFF)] = RESET
+    """Command that restarts into the bootloader (R3)."""
+    reset_data: Ascii = RESET_TEXT.decode()
+    """Data of that command."""
+    versions: Annotated[int, Interval(ge=1, le=100)] = 4
+    """Boot versions in a burst."""
+    buffer_bytes: Annotated[int, Interval(ge=0, le=IMAGE_BYTES_MAX)] = 0
+    """What it has acknowledged and may not have written yet, until the end of transfer."""
+
+    @model_validator(mode="after")
+    def _check_together(self) -> DeviceFacts:
+        if self.largest_image_bytes > self.application_bytes:
+            raise ValueError("largest_image_bytes is more than device.application_bytes holds")
+        if len(self.reset_data) != self.reset_command & 0xFF:
+            raise ValueError(
+                "reset_data does not have the size that reset_command says (its second byte)"
+            )
+        return self
+
+
+class Contents(Table):
+    """A file without its rationales. Keys named after a case (`tx_02`) are the choices that the
+    catalogue marks P.
+    """
+
+    fr_01: Literal["accepted", "rejected", "either"] = "accepted"
+    """A message in CAN frames of 1 to 7 bytes (other than 8 and a rest)."""
+    fr_02: Literal["found", "lost", "either"] = "found"
+    """Junk in the same CAN frame before a message: the message is found, or lost."""
+    fr_04: Literal["rescanned", "dropped", "either"] = "rescanned"
+    """What follows a wrong tail in the same CAN frame is looked at again, or dropped."""
+    fr_07: Literal["ignored", "rejected", "either"] = "ignored"
+    """A last CAN frame padded to 8 bytes."""
+    rs_02: Literal["ignored", "restarts"] = "ignored"
+    """Reset that reaches the announcing bootloader (R18)."""
+    rs_03: Literal["announces", "listens"] = "announces"
+    """After the burst, with no application to start: announces on, or listens silently (R14)."""
+    up_02: Literal["silence", "nak", "either"] = "silence"
+    """Answer to an update command that is rejected."""
+    up_03: Literal["either", "feedback", "silence"] = "either"
+    """Answer of the running application to upgrade messages (R17)."""
+    up_04: Literal["rejected", "accepted", "either"] = "rejected"
+    """Update command just after the window's end."""
+    up_04_burst: Literal["accepted", "rejected", "either"] = "accepted"
+    """Update command between the announcements of a burst, not behind the last one (R2)."""
+    up_08: Literal["starts_over", "rejected"] = "starts_over"
+    """Update command in the middle of a transfer."""
+    tx_01: Literal["nak_expected", "nak_received", "silence", "either"] = "nak_expected"
+    """Answer to a damaged or impossible packet: NAK with the number wanted, NAK with the number it
+    names, or nothing; either: one or the other, packet by packet.
+    """
+    tx_01_lost_frame: Literal["either", "nak", "silence"] = "either"
+    """Answer to a packet of which a frame is lost."""
+    tx_02: Literal["ack", "nak_next"] = "ack"
+    """The packet stored last, again: ACK n, or NAK n+1 (R10)."""
+    tx_03: Literal["ack", "nak", "silence"] = "ack"
+    """A packet older than the last one stored."""
+    tx_08: Literal["ignored", "rejected"] = "ignored"
+    """Last packet: other bytes than FF beyond the size."""
+    tx_12: Literal["announces", "waits"] = "announces"
+    """A pause in the transfer longer than limits.pause_s: announces again, or waits on."""
+    tx_13: Literal["ignored", "restarts"] = "ignored"
+    """Reset during a transfer."""
+    en_02: Literal["same_answer", "silence", "either"] = "same_answer"
+    """End of transfer again, once answered."""
+    en_03: Literal["starts", "restarts"] = "starts"
+    """After complete: starts the application at once, or through the bootloader (R11)."""
+    en_04: Literal["none", "crc32"] = "none"
+    """Checksum inside the product's images; crc32: the last four bytes are the CRC-32 of the rest,
+    little-endian (R7).
+    """
+    tm_02: Literal["accepted", "either"] = "accepted"
+    """Frames of a message up to limits.inter_frame_s apart."""
+    limits: Limits = Limits()
+    device: DeviceFacts = DeviceFacts()
+    deviations: Annotated[dict[str, str], AfterValidator(_check_deviations)] = Field(
+        default_factory=dict
+    )
+    """Cases in which the product differs, with the reason."""
+
+
+_READER: Final = Reader(Contents, "profile")
+
+
+def profile_keys() -> dict[str, Key]:
+    """Every key by its path (`tx_02`, `limits.erase_s`)."""
+    return {path: key for path, key in _READER.keys.items() if path != DEVIATIONS}
 
 
 @dataclass(frozen=True)
 class ConformanceProfile:
     """What differs from the defaults, by path (`tx_02`, `limits.erase_s`), with the rationales.
 
-    `deviations` is case id to reason. Raises UsageError for an unknown key, a value that is not
-    allowed, and values that contradict each other.
+    `deviations` is case id to reason. Raises UsageError with everything that is wrong.
     """
 
     given: Mapping[str, Value] = field(default_factory=dict)
@@ -45,34 +201,11 @@ class ConformanceProfile:
     source: str = "defaults"
 
     def __post_init__(self) -> None:
+        document: dict[str, Any] = {DEVIATIONS: dict(self.deviations)}
         for path, value in self.given.items():
-            key = BY_PATH.get(path)
-            if key is None:
-                raise _unknown(path, self.source)
-            if not key.accepts(value):
-                raise UsageError(
-                    f"{path} cannot be {value!a:.60}.",
-                    where=self.source,
-                    remedy=f"It is {key.allowed}: {key.text}.",
-                )
-        for case_id in self.deviations:
-            if not _CASE_ID.fullmatch(case_id):
-                raise UsageError(
-                    f"[deviations] names {case_id!a:.60}, which is no case.",
-                    where=self.source,
-                    remedy='Write the id of a case and a reason, as "TX-03" = "why".',
-                )
-        if self.number("largest_image_bytes") > self.number("application_bytes"):
-            raise UsageError(
-                "device.largest_image_bytes is more than device.application_bytes holds.",
-                where=self.source,
-            )
-        if len(self.text("reset_data")) != self.number("reset_command") & 0xFF:
-            raise UsageError(
-                "device.reset_data does not have the size that device.reset_command says "
-                "(its second byte).",
-                where=self.source,
-            )
+            table, _, name = path.rpartition(".")
+            (document.setdefault(table, {}) if table else document)[name] = value
+        _READER.read(document, self.source)
 
     def choice(self, name: str) -> str:
         """The choice of that name ("tx_02"). Raises KeyError for one that does not exist."""
@@ -80,126 +213,103 @@ class ConformanceProfile:
 
     def limit(self, name: str) -> float:
         """The time of that name in the table `limits` ("erase_s"), in seconds."""
-        return float(self.value(f"{LIMITS}.{name}"))
+        return float(self.value(f"limits.{name}"))
 
     def number(self, name: str) -> int:
         """The number of that name in the table `device` ("largest_image_bytes")."""
-        return int(self.value(f"{DEVICE}.{name}"))
+        return int(self.value(f"device.{name}"))
 
     def text(self, name: str) -> str:
         """The text of that name in the table `device` ("reset_data")."""
-        return str(self.value(f"{DEVICE}.{name}"))
+        return str(self.value(f"device.{name}"))
 
     def value(self, path: str) -> Value:
         """The value of any key by its path. Raises KeyError."""
-        return self.given.get(path, BY_PATH[path].default)
+        value: Value = self.given.get(path, _READER.keys[path].default)
+        return value
 
     def to_toml(self) -> str:
         """The whole profile as a file: every key with its help, defaults as comments."""
         lines: list[str] = []
-        for table in (CHOICES, *_TABLES):
-            if table:
+        table = ""
+        for path, key in profile_keys().items():
+            its_table, _, name = path.rpartition(".")
+            if its_table != table:
+                table = its_table
                 lines += ["", f"[{table}]"]
-            for key in KEYS:
-                if key.table == table:
-                    lines += [f"# {key.text} ({key.allowed})", self._line(key)]
+            lines += [f"# {key.text} ({key.allowed})", self._line(path, name)]
         lines += ["", f"[{DEVIATIONS}]", '# "TX-03" = "why the product differs here"']
         lines += [f"{_quoted(name)} = {_quoted(why)}" for name, why in self.deviations.items()]
         return "\n".join(lines) + "\n"
 
-    def _line(self, key: Key) -> str:
-        value = self.value(key.path)
+    def _line(self, path: str, name: str) -> str:
+        value = self.value(path)
         shown = _quoted(value) if isinstance(value, str) else repr(value)
-        why = self.rationales.get(key.path)
+        why = self.rationales.get(path)
         if why is not None:
             shown = f"{{ value = {shown}, rationale = {_quoted(why)} }}"
-        return f"{'' if key.path in self.given else '# '}{key.name} = {shown}"
+        return f"{'' if path in self.given else '# '}{name} = {shown}"
 
 
 def load_profile(path: str | os.PathLike[str]) -> ConformanceProfile:
-    """Read a profile. Raises UsageError for a file that cannot be read, is no TOML, or holds what
-    is not allowed.
+    """Read a profile. Raises UsageError for a file that cannot be read, is no TOML, or with
+    everything that is wrong with it.
     """
-    return read_profile(read_toml(path, what="profile"), printable(os.fspath(path)))
+    return read_profile(read_toml(path, what="profile"), os.fspath(path))
 
 
 def read_profile(document: Mapping[str, Any], source: str) -> ConformanceProfile:
     """A profile from what a TOML file holds. Raises UsageError."""
-    given: dict[str, Value] = {}
+    plain: dict[str, Any] = {}
     rationales: dict[str, str] = {}
-    deviations: dict[str, str] = {}
+    faults: list[Fault] = []
+
+    def without_rationale(path: str, content: Any) -> Any:
+        if not isinstance(content, dict) or path not in _READER.keys:
+            return content
+        why = content.get("rationale", "")
+        if set(content) - {"value", "rationale"} or "value" not in content:
+            remedy = f'Write {path.rpartition(".")[2]} = {{ value = ..., rationale = "why" }}.'
+            said = f"{path} is a value, or a table of value and rationale."
+            faults.append(Fault(path, said, remedy))
+            return _READER.keys[path].default
+        if not isinstance(why, str):
+            faults.append(Fault(f"{path}.rationale", f"The rationale of {path} is a text."))
+        elif why:
+            rationales[path] = why
+        return content["value"]
+
     for name, content in document.items():
-        if name not in (*_TABLES, DEVIATIONS):
-            _take(name, content, given, rationales, source)
-            continue
-        if not isinstance(content, dict):
-            raise UsageError(f"{name} is a table, [{name}].", where=source)
-        for inner, value in content.items():
-            if name != DEVIATIONS:
-                _take(f"{name}.{inner}", value, given, rationales, source)
-            elif isinstance(value, str) and value.strip():
-                deviations[inner] = value
-            else:
-                raise UsageError(
-                    f"The deviation of {inner!a:.60} has no reason.",
-                    where=source,
-                    remedy="Say in a text why the product differs.",
-                )
-    return ConformanceProfile(given, rationales, deviations, source)
+        if name in _TABLES and isinstance(content, dict):
+            plain[name] = {
+                key: without_rationale(f"{name}.{key}", value) for key, value in content.items()
+            }
+        elif name != DEVIATIONS:
+            plain[name] = without_rationale(name, content)
+        else:
+            plain[name] = content
+    faults += _READER.check(plain)[1]
+    if faults:
+        raise _READER.refusal(source, faults)
+    given = {name: value for name, value in plain.items() if not isinstance(value, dict)}
+    for table in _TABLES:
+        given |= {f"{table}.{name}": value for name, value in plain.get(table, {}).items()}
+    return ConformanceProfile(given, rationales, plain.get(DEVIATIONS, {}), printable(source))
 
 
 def check_deviations(profile: ConformanceProfile, known: Collection[str]) -> None:
     """Raise UsageError when a deviation names a case that the suite does not have."""
-    for case_id in profile.deviations:
-        if case_id not in known:
-            raise UsageError(
-                f"[deviations] names {case_id}, which is no case of the suite.",
-                where=profile.source,
-                remedy=did_you_mean(case_id, known).rstrip(),
-            )
-
-
-def describe_keys() -> list[tuple[str, str, str, str]]:
-    """All keys as (path, default, allowed values, help): the documentation's table."""
-    return [(key.path, str(key.default), key.allowed, key.text) for key in KEYS]
-
-
-def _take(
-    path: str,
-    content: object,
-    given: dict[str, Value],
-    rationales: dict[str, str],
-    source: str,
-) -> None:
-    if path not in BY_PATH:
-        raise _unknown(path, source)
-    if isinstance(content, dict):
-        rationale = content.get("rationale", "")
-        if set(content) - {"value", "rationale"} or "value" not in content:
-            raise UsageError(
-                f"{path} is a value, or a table of value and rationale.",
-                where=source,
-                remedy=f'Write {path.rpartition(".")[2]} = {{ value = ..., rationale = "why" }}.',
-            )
-        if not isinstance(rationale, str):
-            raise UsageError(f"The rationale of {path} is a text.", where=source)
-        if rationale:
-            rationales[path] = rationale
-        content = content["value"]
-    if not isinstance(content, str | int | float):
-        content = repr(content)
-    given[path] = content
-
-
-def _unknown(path: str, source: str) -> UsageError:
-    name = path.rpartition(".")[2]
-    names = {key.name: key.path for key in KEYS}
-    hint = did_you_mean(name, names, names.__getitem__)
-    return UsageError(
-        f"The profile has an unknown key {path!a:.80}.",
-        where=source,
-        remedy=f"{hint}Known: {', '.join(BY_PATH)}; and the table {DEVIATIONS}.",
-    )
+    faults = [
+        Fault(
+            f"{DEVIATIONS}.{case_id}",
+            f"[{DEVIATIONS}] names {case_id}, which is no case of the suite.",
+            did_you_mean(case_id, known).rstrip(),
+        )
+        for case_id in profile.deviations
+        if case_id not in known
+    ]
+    if faults:
+        raise _READER.refusal(profile.source, faults)
 
 
 def _quoted(text: str) -> str:

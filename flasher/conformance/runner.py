@@ -25,8 +25,7 @@ from flasher.conformance.catalogue import (
     known_cases,
     what_is_missing,
 )
-from flasher.conformance.profile import ConformanceProfile, check_deviations
-from flasher.conformance.profile_keys import KEYS
+from flasher.conformance.profile import ConformanceProfile, check_deviations, profile_keys
 from flasher.conformance.restore import BY_POWER, Restored, is_reachable, needs_power, restore
 from flasher.conformance.results import (
     FINAL_IMAGE_OK,
@@ -263,7 +262,7 @@ class Run:
             timestamp_source=port.timestamp_source,
             uncertainty_s=port.uncertainty_s,
             profile_source=self._profile.source,
-            profile={key.path: self._profile.value(key.path) for key in KEYS},
+            profile={path: self._profile.value(path) for path in profile_keys()},
             seed=self._options.seed,
             strict=self._options.strict,
             cases=tuple(case_text(case_id, self._profile) for case_id in chosen),

@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Final
 
-from flasher.conformance.profile import describe_keys
+from flasher.conformance.profile import profile_keys
 
 GUIDE: Final = Path(__file__).parents[2] / "docs" / "conformance.md"
 BEGIN: Final = "<!-- keys: python -m tests.conformance.profile_table -->\n"
@@ -20,8 +20,10 @@ END: Final = "<!-- end of keys -->"
 def table() -> str:
     """The rows of all keys."""
     rows = ["| key | default | allowed | meaning |", "|---|---|---|---|"]
-    for path, default, allowed, text in describe_keys():
-        rows.append(f"| `{path}` | {default} | {allowed} | {text} |")
+    rows += [
+        f"| `{key.path}` | {key.default} | {key.allowed} | {key.text} |"
+        for key in profile_keys().values()
+    ]
     return "\n".join(rows) + "\n"
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from flasher.conformance.catalogue import CASES, GROUPS, Selection, group_of
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
-from flasher.conformance.profile_keys import BY_PATH
+from flasher.conformance.profile import profile_keys
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.mock.variants import VARIANTS
@@ -78,4 +78,4 @@ def test_every_case_says_all_that_a_report_shows() -> None:
     for case_id, case in CASES.items():
         assert group_of(case_id) in GROUPS
         assert all((case.title, case.clause, case.stimulus, case.expectation)), case_id
-        assert set(case.choices) <= set(BY_PATH), case_id
+        assert set(case.choices) <= set(profile_keys()), case_id
