@@ -216,12 +216,12 @@ def connect_mock(
     from flasher.bus.link import PacedClock, VirtualClock  # noqa: PLC0415
     from flasher.bus.simulated import SimulatedBus  # noqa: PLC0415
     from flasher.mock.model import MockDevice  # noqa: PLC0415
-    from flasher.mock.profile import DeviceProfile, set_option  # noqa: PLC0415
+    from flasher.mock.profile import DeviceProfile  # noqa: PLC0415
     from flasher.mock.system import System  # noqa: PLC0415
 
     chosen, node = as_dialect(dialect), as_target(target)
     bitrate_bps = chosen.bitrate_bps
-    own = set_option(profile or DeviceProfile(), "dialect", chosen.name)
+    own = (profile or DeviceProfile()).speaking(chosen)
     clock: Clock = PacedClock(speed) if speed else VirtualClock()
     bus = SimulatedBus(bitrate_bps, clock)
     if system:

@@ -105,6 +105,6 @@ def _items(parsed_args: argparse.Namespace, **_: Any) -> list[str]:
 
 def _mock_choices(**_: Any) -> list[str]:
     """KEY= of each choice of the device model."""
-    from flasher.mock.profile import describe_options  # noqa: PLC0415
+    from flasher.settings.device_model import describe_options  # noqa: PLC0415
 
     return [f"{key}=" for key, _, _ in describe_options()]

@@ -17,7 +17,7 @@ from flasher.driver import drive
 from flasher.errors import ExitCode, UsageError
 from flasher.log import BY_DEVICE, log_event
 from flasher.mock.model import MockDevice
-from flasher.mock.profile import DeviceProfile, describe_options, set_option
+from flasher.mock.profile import DeviceProfile
 from flasher.mock.system import System
 from flasher.mock.variants import VARIANTS, find, make
 from flasher.protocol.engine import Engine
@@ -25,6 +25,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import Dialect, Target
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.settings.device_model import describe_options, set_options
 
 _SAVE_IMAGE: Final = "--save-image"
 _QUIET_S: Final = 2.5 * DEFAULT_TIMINGS.command_repeat_s
@@ -137,7 +138,7 @@ def run(options: argparse.Namespace, output: Output) -> int:
     dialect = api.as_dialect(options.dialect)
     if options.save_image is not None:
         check_writable(Path(options.save_image), _SAVE_IMAGE)
-    profile = set_option(_profile(options.choices), "dialect", dialect.name)
+    profile = set_options(DeviceProfile(), options.choices).speaking(dialect)
     engine, device = _served(options, dialect, profile)
     watcher = _Watcher(device, options.save_image, output)
     output.shown_events = SHOWN
@@ -209,16 +210,6 @@ def _list_variants(output: Output) -> None:
         for variant in VARIANTS.values()
     ]
     output.document(VariantsDocument(variants=documents))
-
-
-def _profile(choices: list[str]) -> DeviceProfile:
-    profile = DeviceProfile()
-    for choice in choices:
-        key, equals, value = choice.partition("=")
-        if not equals:
-            raise UsageError(f"--set {choice}: write KEY=VALUE.")
-        profile = set_option(profile, key, value)
-    return profile
 
 
 class _Tool:

@@ -22,9 +22,10 @@ from flasher.conformance.subject import Subject
 from flasher.errors import UsageError
 from flasher.image.load import load
 from flasher.image.plausible import check_plausible
-from flasher.mock.profile import DeviceProfile, set_option
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import WELLING
 from flasher.protocol.text import printable
+from flasher.settings.device_model import set_options
 
 _ECHOING: Final[Mapping[str, Mapping[str, Any]]] = {
     "socketcan": {"receive_own_messages": True},
@@ -131,13 +132,7 @@ def device_profile(choices: Sequence[str]) -> DeviceProfile:
     """The device model with these choices, each KEY=VALUE. Raises UsageError."""
     from flasher.conformance.mock import MOCK_PROFILE  # noqa: PLC0415  only for the mock
 
-    profile = MOCK_PROFILE
-    for choice in choices:
-        key, equals, value = choice.partition("=")
-        if not equals:
-            raise UsageError(f"{printable(choice)}: write KEY=VALUE.")
-        profile = set_option(profile, key, value)
-    return profile
+    return set_options(MOCK_PROFILE, choices)
 
 
 def _check_size(good: bytes, profile: ConformanceProfile) -> None:

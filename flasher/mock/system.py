@@ -12,7 +12,7 @@ from typing import Final
 from flasher.mock.application import Application
 from flasher.mock.machine import Machine, Unit
 from flasher.mock.model import MockDevice
-from flasher.mock.profile import DeviceProfile, set_option
+from flasher.mock.profile import DeviceProfile
 from flasher.mock.talkers import Talker
 from flasher.protocol.echoes import Echoes
 from flasher.protocol.frame import Frame
@@ -41,8 +41,8 @@ class System:
         has_application: bool = True,
     ) -> None:
         self.dialect = dialect
-        own_profile = set_option(profile, "dialect", dialect.name)
-        plain_profile = set_option(_DEFAULT_PROFILE, "dialect", dialect.name)
+        own_profile = profile.speaking(dialect)
+        plain_profile = _DEFAULT_PROFILE.speaking(dialect)
         self.members: dict[Node, Machine] = {}
         """Each node's machine."""
         for node in dialect.nodes:

@@ -55,6 +55,8 @@ class Key:
     default: Any
     allowed: str
     """The allowed values in words."""
+    choices: tuple[str, ...]
+    """The words, where it is a choice."""
     text: str
     """What it is for."""
 
@@ -261,7 +263,8 @@ class _Schema:
                 yield from found.keys(place)
             else:
                 default = found.node.get("default")
-                yield Key(place_of(place), default, found.allowed(name), found.text)
+                allowed, choices = found.allowed(name), tuple(found.choices)
+                yield Key(place_of(place), default, allowed, choices, found.text)
 
     @property
     def names(self) -> list[str]:

@@ -15,8 +15,9 @@ import pytest
 from flasher.api import connect_mock
 from flasher.bus.simulated import SimulatedLink
 from flasher.errors import BusError, ExitCode
-from flasher.mock.profile import DeviceProfile, set_option
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
+from flasher.settings.device_model import set_option
 from tests.cli.conftest import SAMPLES, Flasher
 
 BMS = SAMPLES / "bms.hex"

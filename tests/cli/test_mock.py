@@ -21,9 +21,9 @@ from flasher.cli import mock as mock_command
 from flasher.driver import drive
 from flasher.errors import ExitCode
 from flasher.host.outcome import Outcome
-from flasher.mock.profile import describe_options
 from flasher.mock.variants import VARIANTS
 from flasher.protocol.wire import Message, encode
+from flasher.settings.device_model import describe_options
 from tests.cli.conftest import Flasher, Run
 from tests.firmware import VECTORS
 
@@ -401,9 +401,9 @@ def test_a_choice_changes_the_device(serve: Serve, host: Host) -> None:
 @pytest.mark.parametrize(
     ("choice", "words"),
     [
-        ("boot_verson=V1.0.0", ("boot_verson", "did you mean boot_version?")),
-        ("window_s=soon", ("window_s is a number, not 'soon'", "0.05")),
-        ("window_s=-1", ("window_s is a number from 0 on",)),
+        ("boot_verson=V1.0.0", ("boot_verson", "Did you mean boot_version?")),
+        ("window_s=soon", ("window_s cannot be 'soon'", "0.05")),
+        ("window_s=-1", ("window_s cannot be '-1'", "a number from 0 on")),
         ("bad_packet=nak", ("bad_packet cannot be 'nak'", "nak_expected")),
         ("page_size_bytes=100", ("page_size_bytes is a multiple of 128",)),
         ("boot_version=V1", ("6 ASCII characters",)),

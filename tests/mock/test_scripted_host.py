@@ -9,9 +9,10 @@ import dataclasses
 import pytest
 
 from flasher.mock.model import MockDevice
-from flasher.mock.profile import DeviceProfile, describe_options, set_option
+from flasher.mock.profile import DeviceProfile
 from flasher.mock.table import State
 from flasher.protocol.spec import BMS, TARGETS, WELLING, Target
+from flasher.settings.device_model import describe_options, set_option
 from tests.loops import each
 from tests.mock.bench import image_of
 from tests.peers.dialogue import strays

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime, time, timedelta
 from typing import Any
 
 import pytest
@@ -219,7 +219,7 @@ def test_a_run_needs_an_operator_and_a_socket(bench: Bench) -> None:
 
 
 def test_shifts_start_by_the_clock_on_the_wall() -> None:
-    rule = Golden.model_validate({"serial_numbers": ["G"], "shift_starts": ["06:00", "22:00"]})
+    rule = Golden(serial_numbers=("G",), shift_starts=(time(6), time(22)))
     zone = datetime(2026, 5, 17, tzinfo=UTC).astimezone().tzinfo
 
     def at(day: int, hour: int) -> datetime:
