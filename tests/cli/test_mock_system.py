@@ -191,7 +191,7 @@ def test_faults_and_an_idle_shutdown_can_be_set(flasher: Flasher, serve: Serve) 
     ("words", "problem"),
     [
         (("--set", "faults"), "write KEY=VALUE"),
-        (("--set", "falts=1"), "did you mean faults"),
+        (("--set", "falts=1"), "Did you mean faults"),
         (("--set", "silent_queries=38G0"), "is no command"),
         (("--set", "dialect=klingon"), "dialect cannot be"),
     ],
