@@ -186,7 +186,7 @@ def plain_value(value: Any) -> Any:
         case datetime():
             return value.isoformat()
         case Content():
-            from flasher.cli.content_text import content_document  # noqa: PLC0415  rarely needed
+            from flasher.cli.look.content_text import content_document  # noqa: PLC0415  rarely needed
 
             return content_document(value)
         case dict():

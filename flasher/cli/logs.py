@@ -19,7 +19,7 @@ from flasher.errors import UsageError, hide_passwords
 from flasher.log import ROOT
 from flasher.protocol.text import printable
 
-OPTION: Final = "--log-file"
+LOG_FILE: Final = "--log-file"
 _PYTHON_CAN: Final = "can"
 _FORGOTTEN_BUS: Final = "was not properly shut down"
 """What python-can says of a bus that it could not open: the failure itself was told."""
@@ -73,7 +73,7 @@ class Logs:
         self._attach(ROOT, _at(flasher_level, screen))
         self._attach(_PYTHON_CAN, _at(can_level, _Screen(self._output)))
         if log_file is not None:
-            check_not_read(log_file, OPTION, others)
+            check_not_read(log_file, LOG_FILE, others)
             self._file = _File(Path(log_file))
             self._attach(ROOT, _at(logging.DEBUG, self._file))
             self._attach(_PYTHON_CAN, _at(_FILE_CAN_LEVEL, _Forward(self._file)))
@@ -116,13 +116,13 @@ class _File(logging.FileHandler):
     """Every record with its time, appended. `failure` says why it is incomplete, if it is."""
 
     def __init__(self, path: Path) -> None:
-        check_writable(path, OPTION, is_appended_to=True)
+        check_writable(path, LOG_FILE, is_appended_to=True)
         try:
             super().__init__(path, encoding="utf-8", errors="backslashreplace")
         except OSError as error:
             raise UsageError(
                 f"{printable(str(path))} cannot be written: {error.strerror}.",
-                where=OPTION,
+                where=LOG_FILE,
                 remedy="Name a file in a folder that exists and has room.",
             ) from error
         self._shown = printable(str(path))

@@ -22,7 +22,7 @@ from flasher.cli.terminal import painted, takes_colour, unpainted, wrapped
 from flasher.errors import ExitCode, FlasherError, UsageError
 
 _LOG: Final = logging.getLogger("flasher.cli")
-_SAID: Final = {"said": True}
+SAID: Final = {"said": True}
 """Marks log records of what was printed, so that -v does not print it twice."""
 
 
@@ -55,7 +55,7 @@ class Output:
 
     def leave_terminal(self, why: str) -> None:
         """Say nothing more where a terminal was; files and pipes still get everything."""
-        _LOG.warning("%s", why, extra=_SAID)
+        _LOG.warning("%s", why, extra=SAID)
         for stream in self._terminals:
             _give_up(stream)
 
@@ -75,8 +75,12 @@ class Output:
     def result(self, text: str) -> None:
         """A line of the result; silent when JSON is wanted."""
         if not self.json_wanted:
-            _LOG.info("%s", unpainted(text), extra=_SAID)
+            _LOG.info("%s", unpainted(text), extra=SAID)
             _print_stdout(wrapped(text, sys.stdout))
+
+    def print_help(self, text: str) -> None:
+        """Help, laid out for the window; it is printed when JSON is wanted too."""
+        _print_stdout("\n".join(line.rstrip() for line in text.rstrip().splitlines()))
 
     def document(
         self, document: Mapping[str, object], *, exit_code: ExitCode = ExitCode.OK
@@ -99,7 +103,7 @@ class Output:
         """
         if self.json_wanted:
             text = json.dumps({"schema": SCHEMA_VERSION, **line})
-            _LOG.debug("%s", text, extra=_SAID)
+            _LOG.debug("%s", text, extra=SAID)
             _print_stdout(text)
 
     def event(self, event: object) -> None:
@@ -109,13 +113,13 @@ class Output:
 
     def progress(self, text: str, *, level: int = 0) -> None:
         """A line on how it goes."""
-        _LOG.log(logging.INFO if level < 2 else logging.DEBUG, "%s", text, extra=_SAID)
+        _LOG.log(logging.INFO if level < 2 else logging.DEBUG, "%s", text, extra=SAID)
         if self.verbosity >= level:
             self.say(text)
 
     def error_line(self, text: str) -> None:
         """A line that is never silenced."""
-        _LOG.error("%s", unpainted(text), extra=_SAID)
+        _LOG.error("%s", unpainted(text), extra=SAID)
         self.say(text)
 
     def verdict(self, verdict: Verdict) -> None:
@@ -130,7 +134,7 @@ class Output:
 
     def failure(self, error: FlasherError, **more: Any) -> None:
         """An error as a person reads it, and as the JSON document of the command."""
-        _LOG.error("error: %s", error, extra=_SAID)
+        _LOG.error("error: %s", error, extra=SAID)
         head = painted("error:", "red") if self.colour else "error:"
         self.say(f"{head} {error}")
         if self.ending is not None:

@@ -1,6 +1,6 @@
 """What every command on a bus keeps of its frames: a trace if one is wanted, a bundle if it fails.
 
-    with recording(options, output, target=target) as record:
+    with recording(options, bus, output, target=target) as record:
         with connect(...) as connection:
             record.opened(connection)
             connection.device(target).identify(taps=record.taps)
@@ -11,22 +11,23 @@ wrong here changes what the command says or its exit code.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
 import os
-import sys
 import traceback
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from platformdirs import user_state_path
 
 from flasher.api import Connection
-from flasher.cli.arguments import bit_rate, bus_config, open_connection
 from flasher.cli.files import check_not_read
+from flasher.cli.framework import command_line, option, option_set, typed_values
+from flasher.cli.options import Bus
 from flasher.cli.output import Output
+from flasher.cli.values import TRACE_SUFFIXES, FilePath, FolderPath
 from flasher.driver import Tap
 from flasher.errors import ExitCode, FlasherError, InterruptedByUserError
 from flasher.protocol.spec import Target
@@ -57,21 +58,30 @@ _BUNDLES_KEPT: Final = 50
 """In the folder that nobody chose."""
 
 
-def add_recording(parser: argparse.ArgumentParser) -> None:
-    """The options of a command that talks on a bus."""
-    group = parser.add_argument_group("recording")
-    group.add_argument(
-        "--trace-file", metavar="FILE", help="record all frames; format by suffix (.asc .blf ...)"
-    )
-    group.add_argument(
-        "--bundle-dir",
-        metavar="DIR",
-        type=Path,
+@dataclass(frozen=True)
+class RecordingOptions:
+    """What a command that talks on a bus leaves of it."""
+
+    trace_file: str | None = None
+    bundle_dir: Path | None = None
+    no_bundle: bool = False
+
+
+recording_options: Final = option_set(
+    "recorded",
+    RecordingOptions,
+    option(
+        "--trace-file", metavar="FILE", type=FilePath(*TRACE_SUFFIXES), panel="recording",
+        brief=True, help="record all frames; format by suffix (.asc .blf ...)",
+    ),
+    option(
+        "--bundle-dir", metavar="DIR", type=FolderPath(), panel="recording",
         help="where a failure leaves its bundle: last frames, transcript, report "
         f"(default: ${BUNDLE_FOLDER}, else the user's own state folder, the last {_BUNDLES_KEPT}; "
         "flasher explain --last reads the latest)",
-    )
-    group.add_argument("--no-bundle", action="store_true", help="leave none")
+    ),
+    option("--no-bundle", is_flag=True, panel="recording", help="leave none"),
+)  # fmt: skip
 
 
 def bundle_folder(chosen: Path | None = None) -> Path:
@@ -112,12 +122,12 @@ class Recording:
 
 @contextmanager
 def recording(
-    options: argparse.Namespace, output: Output, *, target: Target | None = None
+    options: RecordingOptions, bus: Bus, output: Output, *, target: Target | None = None
 ) -> Iterator[Recording]:
-    """Record what goes over the bus while the block runs. `options` are those of `add_recording`
-    and of the bus. Raises UsageError for a trace file that cannot be written.
+    """Record what goes over the bus while the block runs. Raises UsageError for a trace file that
+    cannot be written.
     """
-    facts = _circumstances(options, target)
+    facts = _circumstances(bus, target)
     record = Recording(target, facts["bitrate_bps"])
     record.facts |= facts
     try:
@@ -137,25 +147,25 @@ def recording(
 
 @contextmanager
 def recorded_connection(
-    options: argparse.Namespace, output: Output, target: Target
+    options: RecordingOptions, bus: Bus, output: Output, target: Target
 ) -> Iterator[tuple[Connection, Recording]]:
     """The bus that the options name, with a recording of it: for commands that ask one thing."""
     with (
-        recording(options, output, target=target) as record,
-        open_connection(options, target) as connection,
+        recording(options, bus, output, target=target) as record,
+        bus.connect(target) as connection,
     ):
         record.opened(connection)
         yield connection, record
 
 
 @contextmanager
-def _trace_file(options: argparse.Namespace, record: Recording, output: Output) -> Iterator[None]:
+def _trace_file(options: RecordingOptions, record: Recording, output: Output) -> Iterator[None]:
     """Records to a file, if one is named."""
-    path: str | None = options.trace_file
+    path = options.trace_file
     if path is None:
         yield
         return
-    check_not_read(path, "--trace-file", _other_texts(options, "trace_file"))
+    check_not_read(path, "--trace-file", typed_values(but="trace_file"))
     from flasher.trace.recorder import Recorder  # noqa: PLC0415  loads python-can
 
     with Recorder(path) as recorder:
@@ -166,13 +176,8 @@ def _trace_file(options: argparse.Namespace, record: Recording, output: Output) 
         output.error_line(f"warning: the trace {reason}")
 
 
-def _other_texts(options: argparse.Namespace, but: str) -> list[object]:
-    """What else stands on the command line, and may name a file."""
-    return [value for name, value in vars(options).items() if name != but]
-
-
 def _leave_bundle(
-    options: argparse.Namespace, output: Output, record: Recording, error: BaseException | None
+    options: RecordingOptions, output: Output, record: Recording, error: BaseException | None
 ) -> None:
     own = isinstance(error, FlasherError) and error.exit_code not in _WITH_BUNDLE
     if own and not record.is_alone:
@@ -204,16 +209,14 @@ def _leave_bundle(
             output.error_line("        flasher explain --last tells what happened")
 
 
-def _circumstances(options: argparse.Namespace, target: Target | None) -> dict[str, Any]:
-    rate = bit_rate(options)
-    words = getattr(options, "command_line", None) or sys.argv[1:]
+def _circumstances(bus: Bus, target: Target | None) -> dict[str, Any]:
     return {
-        "command_line": ["flasher", *map(printable, words)],
+        "command_line": ["flasher", *map(printable, command_line())],
         "target": None if target is None else target.name,
-        "dialect": options.dialect,
-        "bus": {} if options.mock else bus_config(options),
-        "bitrate_bps": rate.bps,
-        "bitrate_source": rate.source,
+        "dialect": bus.dialect_name,
+        "bus": {} if bus.mock else bus.config,
+        "bitrate_bps": bus.bit_rate.bps,
+        "bitrate_source": bus.bit_rate.source,
     }
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ast
 import dataclasses
-import importlib
 import inspect
 import textwrap
 from collections.abc import Iterable, Mapping, Sequence
@@ -206,10 +205,7 @@ def event_classes() -> list[type]:
 
 def command_modules() -> dict[str, ModuleType]:
     """The module of every command."""
-    return {
-        command: importlib.import_module(f"flasher.cli.{module}")
-        for command, (module, _) in COMMANDS.items()
-    }
+    return {command: entry.module() for command, entry in COMMANDS.items()}
 
 
 def _add_line(known: Definitions, described: type) -> str:

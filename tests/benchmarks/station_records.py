@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from flasher.cli.station_records import certificate
+from flasher.cli.station.records import certificate
 from flasher.protocol.spec import BMS
 from flasher.station.records import (
     Ending,

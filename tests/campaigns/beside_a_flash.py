@@ -45,7 +45,7 @@ def beside_processes(folder: Path, seed: int, counts: Counter[str]) -> str:
     """One flash among processes; returns what went wrong, or nothing."""
     image = VECTORS + random.Random(seed).randbytes(SIZE_BYTES - len(VECTORS))
     (folder / "image.bin").write_bytes(image)
-    options = ("--bus-kwargs", "hop_limit=0", f"port={free_port()}")
+    options = ("--bus-kwargs", "hop_limit=0", "--bus-kwargs", f"port={free_port()}")
     bus = ("-i", "udp_multicast", "-c", GROUP, *options)
     words = ("flash", "-t", "bms", "--verify", "none", "--json", "--events", "--no-bundle", *bus)
     over = threading.Event()

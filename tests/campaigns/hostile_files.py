@@ -22,8 +22,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from flasher.cli.documents import plain_value
-from flasher.cli.explain_text import story_lines
-from flasher.cli.station_scans import read_scans
+from flasher.cli.look.explain_text import story_lines
+from flasher.cli.station.scans import read_scans
 from flasher.conformance import diff
 from flasher.conformance import profile as conformance_profile
 from flasher.errors import ExitCode, FlasherError

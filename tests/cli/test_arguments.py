@@ -1,18 +1,18 @@
-"""Arguments that commands share: numbers, targets, and python-can's own bus arguments."""
+"""Arguments that commands share: numbers, targets, and python-can's own bus values."""
 
 from __future__ import annotations
 
-import argparse
 import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import can
+import click
 import pytest
 
-from flasher.cli import arguments
-from flasher.cli.lists import gather_lists
+from flasher.cli import values
+from flasher.cli.options import can_filter
 from flasher.errors import ExitCode
 from flasher.protocol.spec import BMS, OBC, TARGETS, WMC
 from tests.cli.conftest import SAMPLES, Flasher
@@ -28,77 +28,74 @@ OBC_BIN = SAMPLES / "obc.bin"
     [("0", 0), ("1_000", 1000), ("0XfF", 255), ("2k", 2048), ("0x2K", 2048), ("3m", 3 << 20)],
 )
 def test_numbers_are_decimal_or_hexadecimal_with_a_suffix(text: str, value: int) -> None:
-    assert arguments.number(text) == value
+    assert values.number(text) == value
 
 
 @pytest.mark.parametrize("text", ["", "-1", "1.5", "0b1", "12x", "K", "1 K", "0x", "٣"])
 def test_what_is_no_number_is_refused(text: str) -> None:
-    with pytest.raises(argparse.ArgumentTypeError, match="is no number"):
-        arguments.number(text)
+    with pytest.raises(click.BadParameter, match="is no number"):
+        values.number(text)
 
 
 def test_a_range_is_two_numbers_and_a_colon() -> None:
-    assert arguments.address_range("0x8004000:0x8004800") == (0x8004000, 0x8004800)
-    with pytest.raises(argparse.ArgumentTypeError, match="START:END"):
-        arguments.address_range("0x8004000")
+    assert values.address_range("0x8004000:0x8004800") == (0x8004000, 0x8004800)
+    with pytest.raises(click.BadParameter, match="START:END"):
+        values.address_range("0x8004000")
 
 
 @pytest.mark.parametrize("text", ["-0.1", "nan", "inf", "soon", ""])
 def test_a_time_is_a_finite_number_of_seconds(text: str) -> None:
-    assert arguments.seconds("0.25") == 0.25
-    assert arguments.seconds("0") == 0.0
-    with pytest.raises(argparse.ArgumentTypeError, match="is no time"):
-        arguments.seconds(text)
+    assert values.seconds("0.25") == 0.25
+    assert values.seconds("0") == 0.0
+    with pytest.raises(click.BadParameter, match="is no time"):
+        values.seconds(text)
 
 
 @pytest.mark.parametrize("text", ["0.01", "-1", "fast"])
 def test_a_speed_is_zero_or_fast_enough_to_be_stopped(text: str) -> None:
-    assert arguments.speed("0") == 0.0
-    assert arguments.speed("0.1") == 0.1
-    with pytest.raises(argparse.ArgumentTypeError):
-        arguments.speed(text)
+    assert values.speed("0") == 0.0
+    assert values.speed("0.1") == 0.1
+    with pytest.raises(click.BadParameter):
+        values.speed(text)
 
 
 def test_a_count_begins_at_one() -> None:
-    assert arguments.count("1") == 1
-    with pytest.raises(argparse.ArgumentTypeError, match="1 or more"):
-        arguments.count("0")
+    assert values.count("1") == 1
+    with pytest.raises(click.BadParameter, match="1 or more"):
+        values.count("0")
 
 
 def test_targets_go_by_every_name_that_the_documents_use() -> None:
-    assert [arguments.target(name) for name in ("wmc", "MC", "bms", "obc", "Pbu")] == [
+    assert [values.target(name) for name in ("wmc", "MC", "bms", "obc", "Pbu")] == [
         WMC, WMC, BMS, OBC, OBC,
     ]  # fmt: skip
-    with pytest.raises(argparse.ArgumentTypeError) as caught:
-        arguments.target("hmi")
-    assert all(name in str(caught.value) for name in TARGETS)
-
-
-# -- lists ----------------------------------------------------------------------------------------
+    with pytest.raises(click.BadParameter) as caught:
+        values.target("hmi")
+    assert all(name in caught.value.message for name in TARGETS)
 
 
 @pytest.mark.parametrize(
-    ("typed", "read"),
-    [
-        ("flash f.hex -t bms", "flash f.hex -t bms"),
-        ("flash --bus-kwargs a=1 b=2 f.hex", "flash f.hex --bus-kwargs a=1 b=2"),
-        ("flash --bus-kwargs a=1 -t bms f.hex", "flash -t bms f.hex --bus-kwargs a=1"),
-        ("flash --bus-kwargs=a=1 f.hex", "flash f.hex --bus-kwargs a=1"),
-        ("flash --bus-kwargs a=1 --bus-kwargs b=2 f", "flash f --bus-kwargs a=1 b=2"),
-        ("flash --bus-kwargs a=1 ./b=2.hex", "flash ./b=2.hex --bus-kwargs a=1"),
-        ("flash --filter 725:7FF 7A~7f dad.hex", "flash dad.hex --filter 725:7FF 7A~7f"),
-        ("flash --timing brp=2 sjw=1 f.hex", "flash f.hex --timing brp=2 sjw=1"),
-        ("flash --bus-kwargs a=1 -- b=2", "flash --bus-kwargs a=1 -- b=2"),
-        ("flash -- --bus-kwargs a=1", "flash -- --bus-kwargs a=1"),
-        # What is no value stays with its option, which says so.
-        ("flash --bus-kwargs f.hex", "flash --bus-kwargs f.hex"),
-        ("flash f.hex --bus-kwargs", "flash f.hex --bus-kwargs"),
-        ("flash --bus-kwargs -t bms f.hex", "flash -t bms f.hex --bus-kwargs"),
-        ("", ""),
-    ],
+    ("text", "read"), [("a=1", ("a", "1")), ("a=", ("a", "")), ("a_1=x y=2", ("a_1", "x y=2"))]
 )
-def test_a_list_ends_at_the_first_word_that_is_no_value(typed: str, read: str) -> None:
-    assert gather_lists(typed.split()) == read.split()
+def test_a_keyword_has_a_value(text: str, read: tuple[str, str]) -> None:
+    assert values.key_value(text) == read
+
+
+@pytest.mark.parametrize("text", ["", "a", "=1", "1=2", "./b=2.hex"])
+def test_what_is_no_keyword_is_refused(text: str) -> None:
+    with pytest.raises(click.BadParameter, match="is not KEY=VALUE"):
+        values.key_value(text)
+
+
+def test_a_filter_is_two_hexadecimal_numbers() -> None:
+    assert can_filter("725:7ff") == {"can_id": 0x725, "can_mask": 0x7FF}
+    assert can_filter("725~7FF") == {"can_id": 0x20000725, "can_mask": 0x7FF}
+    for text in ("725", "725:", "x:7FF", "725:7FF:1"):
+        with pytest.raises(click.BadParameter, match="is not ID:MASK"):
+            can_filter(text)
+
+
+# -- the bus --------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -118,12 +115,12 @@ def configurations(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
 SHORT = ("--timeout", "0.01", "--allow-outside-vector")
 
 
-def test_the_image_survives_behind_bus_kwargs(
+def test_the_image_may_stand_between_options_that_repeat(
     flasher: Flasher, configurations: list[dict[str, Any]]
 ) -> None:
     run = flasher(
         "flash", "-t", "obc", *SHORT, "-i", "udp_multicast", "-c", "239.74.163.2",
-        "--bus-kwargs", "hop_limit=0", "port=43210", OBC_BIN,
+        "--bus-kwargs", "hop_limit=0", OBC_BIN, "--bus-kwargs", "port=43210",
     )  # fmt: skip
     assert run.code == ExitCode.NO_ANSWER
     (config,) = configurations
@@ -157,10 +154,9 @@ def test_filters_and_the_bit_rate_reach_python_can(
 def test_a_bit_timing_takes_the_place_of_the_bit_rate(
     flasher: Flasher, configurations: list[dict[str, Any]]
 ) -> None:
-    timing = ["f_clock=8_000_000", "tseg1=13", "tseg2=2", "sjw=1", "brp=2", "nof_samples=1"]
-    run = flasher(
-        "flash", "-t", "obc", *SHORT, "-i", "virtual", "--timing", *timing, OBC_BIN, "--json"
-    )
+    given = ("f_clock=8_000_000", "tseg1=13", "tseg2=2", "sjw=1", "brp=2", "nof_samples=1")
+    timing = [word for each in given for word in ("--timing", each)]
+    run = flasher("flash", "-t", "obc", *SHORT, "-i", "virtual", *timing, OBC_BIN, "--json")
     assert run.document["exit_code"] == ExitCode.NO_ANSWER
     assert configurations[0]["timing"].bitrate == 250_000
     assert "bitrate" not in configurations[0]
@@ -172,6 +168,23 @@ def test_bus_kwargs_without_a_value_are_wrong_usage(flasher: Flasher) -> None:
     run = flasher("flash", "-t", "obc", "-i", "virtual", "--bus-kwargs", OBC_BIN)
     assert run.code == ExitCode.USAGE
     assert f"'{OBC_BIN}'" in run.err
+
+
+def test_a_second_value_behind_an_option_that_repeats_is_wrong_usage(flasher: Flasher) -> None:
+    run = flasher("flash", "--bus-kwargs", "a=1", "b=2", OBC_BIN, "-t", "obc", "-i", "virtual")
+    assert run.code == ExitCode.USAGE
+    assert "--bus-kwargs takes one value, and may be repeated" in run.err
+
+
+def test_behind_two_dashes_everything_is_positional(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    image = SAMPLES / "obc.bin"
+    for name in ("b=2", "--bus-kwargs", "-t"):
+        (tmp_path / name).write_bytes(image.read_bytes())
+        run = flasher("image-info", "--json", "--", name)
+        assert run.document["image"]["source"] == name
 
 
 def test_the_image_options_reach_the_loader(flasher: Flasher, tmp_path: Path) -> None:

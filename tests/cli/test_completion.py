@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import argparse
-import io
 import re
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import click
 import pytest
-from argcomplete.finders import CompletionFinder
+from click.shell_completion import ShellComplete
 
-from flasher.cli import completion, manual
-from flasher.cli.lists import gather_lists
-from flasher.cli.main import COMMANDS, build_parser, main, with_actions
+from flasher.cli.framework import Group, Session
+from flasher.cli.logs import Logs
+from flasher.cli.main import COMMANDS
+from flasher.cli.main import flasher as program
+from flasher.cli.output import Output
 from flasher.errors import ExitCode
 from tests.cli.conftest import Flasher
 from tests.end_to_end.processes import FLASHER, clean_environment
@@ -24,38 +25,15 @@ from tests.end_to_end.processes import FLASHER, clean_environment
 Complete = Callable[[str], set[str]]
 
 
-@pytest.fixture(scope="module")
-def whole() -> argparse.ArgumentParser:
-    """The parser with every command's options."""
-    return build_parser(COMMANDS)
-
-
-class Finder(CompletionFinder):
-    """argcomplete's own, but for its log on file descriptor 9, which is somebody else's here."""
-
-    def _init_debug_stream(self) -> None:
-        """The standard error stream."""
-
-
 @pytest.fixture
 def complete(monkeypatch: pytest.MonkeyPatch) -> Complete:
-    """What is offered behind the words so far, options left out unless one was begun."""
-    monkeypatch.setattr("flasher.cli.completion._NETWORK", Path("no-such-folder"))
-    parser = build_parser(COMMANDS)
-    for each in with_actions(parser):
-        completion.prepare(each)
+    """What is offered behind the words so far; "FILES" where the shell offers files by itself."""
+    monkeypatch.setattr("flasher.cli.values._NETWORK", Path("no-such-folder"))
 
     def offered(line: str) -> set[str]:
-        monkeypatch.setenv("_ARGCOMPLETE", "1")
-        monkeypatch.setenv("_ARGCOMPLETE_IFS", "\n")
-        monkeypatch.setenv("COMP_LINE", line)
-        monkeypatch.setenv("COMP_POINT", str(len(line)))
-        stream = io.StringIO()
-        with pytest.raises(SystemExit):
-            Finder()(parser, exit_method=sys.exit, output_stream=stream)
-        words = {word.strip() for word in stream.getvalue().split("\n")}
-        is_option = line.rsplit(" ", maxsplit=1)[-1].startswith("-")
-        return {word for word in words if word and word.startswith("-") == is_option}
+        *words, begun = line.split(" ")[1:]
+        found = ShellComplete(program, {}, "flasher", "_C").get_completions(words, begun)
+        return {"FILES" if each.type == "file" else str(each.value) for each in found}
 
     return offered
 
@@ -83,6 +61,7 @@ def test_options_of_the_command_are_offered(complete: Complete) -> None:
         ("flasher profile ", {"show", "check"}),
         ("flasher read ver", {"version-information"}),
         ("flasher read mem", {"memory"}),
+        ("flasher read -t wmc ver", set()),
         ("flasher write user-string-1", {"user-string-1"}),
         ("flasher mock -t bms --set repeated_p", {"repeated_packet="}),
         ("flasher flash x.hex --timeout ", set()),
@@ -101,7 +80,9 @@ def test_values_are_offered(complete: Complete, line: str, offered: set[str]) ->
         ("flasher monitor ", {"c.asc", "folder/"}),
         ("flasher flash a.hex --trace-file ", {"c.asc", "folder/"}),
         ("flasher flash a.hex --profile ", {"d.toml", "folder/"}),
-        ("flasher info --log-file ", {"a.hex", "b.s19", "c.asc", "d.toml", "e.txt", "folder/"}),
+        ("flasher flash fol", {"folder/f.hex", "folder/g.bin"}),
+        ("flasher flash folder/f", {"folder/f.hex"}),
+        ("flasher info --log-file ", {"FILES"}),
     ],
 )
 def test_files_are_offered_by_their_suffix(
@@ -111,9 +92,9 @@ def test_files_are_offered_by_their_suffix(
     line: str,
     offered: set[str],
 ) -> None:
-    for name in ("a.hex", "b.s19", "c.asc", "d.toml", "e.txt"):
-        (tmp_path / name).touch()
     (tmp_path / "folder").mkdir()
+    for name in ("a.hex", "b.s19", "c.asc", "d.toml", "e.txt", "folder/f.hex", "folder/g.bin"):
+        (tmp_path / name).touch()
     monkeypatch.chdir(tmp_path)
     assert complete(line) == offered
 
@@ -125,109 +106,124 @@ def test_can_interfaces_of_linux_are_offered_as_channels(
         (tmp_path / name).mkdir()
         (tmp_path / name / "type").write_text(f"{kind}\n")
     (tmp_path / "gone").mkdir()
-    monkeypatch.setattr("flasher.cli.completion._NETWORK", tmp_path)
+    monkeypatch.setattr("flasher.cli.values._NETWORK", tmp_path)
     assert complete("flasher scan -c ") == {"can0", "vcan1"}
 
 
-def test_the_program_itself_answers_the_shell(tmp_path: Path) -> None:
-    answer = tmp_path / "answer"
-    line = "flasher flash x.hex -t b"
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_the_program_itself_answers_the_shell(shell: str) -> None:
     asked = {
-        "_ARGCOMPLETE": "1",
-        "_ARGCOMPLETE_IFS": "\n",
-        "_ARGCOMPLETE_STDOUT_FILENAME": str(answer),
-        "COMP_LINE": line,
-        "COMP_POINT": str(len(line)),
+        "_FLASHER_COMPLETE": f"{shell}_complete",
+        "COMP_WORDS": "flasher flash x.hex -t b",
+        "COMP_CWORD": "4" if shell == "zsh" else "b",
     }
     done = subprocess.run(
-        FLASHER, env=clean_environment() | asked, capture_output=True, timeout=30, check=False
+        FLASHER, env=clean_environment() | asked, capture_output=True, timeout=30, check=True
     )
-    assert answer.read_text().split() == ["bms"]
-    assert (done.stdout, done.stderr) == (b"", b"")
+    assert b"bms" in done.stdout
+    assert b"wmc" not in done.stdout
+    assert done.stderr == b""
 
 
-def test_without_argcomplete_nothing_is_said(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("_ARGCOMPLETE", "1")
-    monkeypatch.setitem(sys.modules, "argcomplete", None)
-    monkeypatch.delitem(sys.modules, "flasher.cli.completion")
-    assert main([]) != ExitCode.OK
-    assert capsys.readouterr() == ("", "")
-
-
-@pytest.mark.parametrize("name", ["__main__.py", "cli/main.py"])
-def test_modules_are_marked_for_global_completion(name: str) -> None:
-    """argcomplete looks into the first 1024 characters of the module that a script runs."""
-    text = (Path(manual.__file__).parents[1] / name).read_text("utf-8")
-    assert "PYTHON_ARGCOMPLETE_OK" in text[:1024]
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_is_told_how_to_ask(shell: str) -> None:
+    done = subprocess.run(
+        FLASHER,
+        env=clean_environment() | {"_FLASHER_COMPLETE": f"{shell}_source"},
+        capture_output=True,
+        timeout=30,
+        check=True,
+    )
+    assert f"_FLASHER_COMPLETE={shell}_complete".encode() in done.stdout
 
 
 # -- help ------------------------------------------------------------------------------------------
 
 
-def examples_of(parser: argparse.ArgumentParser) -> list[list[str]]:
+def examples_of(command: click.Command) -> list[list[str]]:
     """The words of every example; the remark behind it, and what it is piped into, left out."""
     found = []
-    for line in re.sub(r"\s*\\\n\s*", " ", parser.epilog or "").splitlines():
+    for line in re.sub(r"\s*\\\n\s*", " ", command.epilog or "").splitlines():
         if line.startswith("  flasher "):
-            command = re.split(r"\s{2,}| \| | > ", line.strip())[0]
-            found.append(shlex.split(command)[1:])
+            words = re.split(r"\s{2,}| \| | > ", line.strip())[0]
+            found.append(shlex.split(words)[1:])
     return found
 
 
-@pytest.fixture
-def wide(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A terminal wider than help is."""
-    monkeypatch.setenv("COLUMNS", "200")
+def command_of(name: str | None) -> click.Command:
+    return program if name is None else COMMANDS[name].load()
 
 
 @pytest.mark.parametrize("command", [None, *COMMANDS])
-@pytest.mark.usefixtures("wide")
-def test_help_is_a_manual_page(whole: argparse.ArgumentParser, command: str | None) -> None:
-    parser = command_parser(whole, command) if command else whole
-    said = parser.format_help()
+@pytest.mark.parametrize("columns", [60, 80, 200])
+def test_help_is_a_manual_page(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch, command: str | None, columns: int
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(columns))
+    said = flasher(*([command] if command else []), "--help").out
     assert max(map(len, said.splitlines())) <= 100
-    for section in ("usage: flasher", "output:", "examples:", "exit codes:"):
+    for section in ("Usage: flasher", "output:", "examples:", "exit codes:"):
         assert section in said
-    assert parser.description
-    assert parser.description.strip()
+    assert command_of(command).help
     if command:
         assert "files and environment:" in said
         assert "NO_COLOR" in said
-    assert len(examples_of(parser)) >= 3
+    assert len(examples_of(command_of(command))) >= 3
     assert "R|" not in said
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_short_help_has_what_is_needed_most(flasher: Flasher, command: str) -> None:
+    short, whole = (flasher(command, option).out for option in ("-h", "--help"))
+    assert len(short.splitlines()) < len(whole.splitlines())
+    assert f"every option: flasher {command} --help" in short
+    assert "examples:" in short
+    assert "exit codes:" not in short
+    if "--mock-speed" in whole:
+        assert "--mock " in short
+        assert "--channel" in short
+        assert "--mock-speed" not in short
+        assert "--bus-kwargs" not in short
+
+
 @pytest.mark.parametrize("command", [None, *COMMANDS])
-def test_every_example_parses(whole: argparse.ArgumentParser, command: str | None) -> None:
-    for words in examples_of(command_parser(whole, command) if command else whole):
-        options = whole.parse_args(gather_lists(words))
-        assert command in (None, options.command)
+def test_every_example_parses(monkeypatch: pytest.MonkeyPatch, command: str | None) -> None:
+    monkeypatch.setattr("click.Context.invoke", lambda *_, **__: ExitCode.OK)
+    for words in examples_of(command_of(command)):
+        output = Output()
+        with Logs(output) as logs:
+            session = Session(output, logs, words, "")
+            with program.make_context("flasher", list(words), obj=session) as ctx:
+                program.invoke(ctx)
+        assert command in (None, output.command)
 
 
-def command_parser(whole: argparse.ArgumentParser, command: str) -> argparse.ArgumentParser:
-    parsers = {parser.prog: parser for parser in with_actions(whole)}
-    return parsers[f"flasher {command}"]
+def with_actions(command: click.Command) -> Iterator[click.Command]:
+    """A command and its actions (`flasher profile show`)."""
+    yield command
+    if isinstance(command, Group):
+        yield from command.commands.values()
 
 
-def test_actions_of_a_command_take_the_output_options_too(whole: argparse.ArgumentParser) -> None:
-    for parser in with_actions(whole):
-        assert "--log-file" in parser.format_help(), parser.prog
+@pytest.mark.parametrize("command", COMMANDS)
+def test_actions_of_a_command_take_the_output_options_too(command: str) -> None:
+    for each in with_actions(command_of(command)):
+        assert any("--log-file" in param.opts for param in each.params), each.name
 
 
 def test_help_lists_the_commands_by_purpose(flasher: Flasher) -> None:
     said = flasher("--help").out
-    for title, names in manual.PURPOSES.items():
-        known = [name for name in names if name in COMMANDS]
-        assert (f"\n{title}:\n" in said) == bool(known)
-    for name, (_, summary) in COMMANDS.items():
-        assert re.search(rf"^  {name} +{re.escape(summary)}$", said, re.MULTILINE)
-
-
-def test_a_command_without_a_purpose_is_listed_too() -> None:
-    groups = dict(manual.commands_by_purpose({"new": ("new", "does it"), "scan": ("scan", "s")}))
-    assert groups == {"look at devices and the bus": "scan  s", "others": "new   does it"}
+    for title in (
+        "upgrade a device",
+        "look at devices and the bus",
+        "when something goes wrong",
+        "without hardware, and for bootloaders",
+        "at the end of a production line",
+        "what a product does its own way",
+    ):
+        assert f"\n{title}:\n" in said
+    for name, entry in COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(entry.summary)}$", said, re.MULTILINE)
 
 
 @pytest.mark.parametrize(
@@ -235,26 +231,46 @@ def test_a_command_without_a_purpose_is_listed_too() -> None:
     [
         ("image-info", ["3 image rejected"], ["5 no answer", "CAN_INTERFACE"]),
         ("scan", ["5 no answer", "CAN_INTERFACE", "can.conf"], ["3 image", "flasher.toml"]),
-        ("profile", ["flasher.toml"], ["4 adapter"]),
+        ("profile", [], ["4 adapter"]),
         (None, [f"{int(code)} " for code in ExitCode], []),
     ],
 )
 def test_help_tells_the_exit_codes_and_what_is_read(
-    whole: argparse.ArgumentParser, command: str | None, told: list[str], untold: list[str]
+    flasher: Flasher, command: str | None, told: list[str], untold: list[str]
 ) -> None:
-    epilog = str((command_parser(whole, command) if command else whole).epilog)
-    assert all(text in epilog for text in told)
-    assert not any(text in epilog for text in untold)
+    said = flasher(*([command] if command else []), "--help").out
+    said = said[said.index("exit codes:") :]
+    assert all(text in said for text in told)
+    assert not any(text in said for text in untold)
 
 
-def test_only_the_chosen_command_is_imported() -> None:
+def test_an_action_tells_what_it_reads(flasher: Flasher) -> None:
+    assert "  flasher.toml" in flasher("profile", "show", "--help").out
+
+
+def test_no_command_is_imported_for_the_list_of_commands() -> None:
     """So that `flasher --help` is quick."""
     script = (
-        "import sys; from flasher.cli.main import main; main(['--help']); "
-        "print([n for n in ('can', 'rich', 'tqdm', 'argcomplete', 'jinja2') if n in sys.modules])"
+        "import sys; from flasher.cli.main import COMMANDS, main; main(['--help']); "
+        "names = {e.place.partition(':')[0] for e in COMMANDS.values()}; "
+        "print([n for n in ('can', 'tqdm', 'jinja2', 'pydantic', 'intelhex') if n in sys.modules], "
+        "[n for n in names if f'flasher.cli.{n}' in sys.modules])"
     )
     done = subprocess.run(
         [sys.executable, "-c", script],
         env=clean_environment(), capture_output=True, text=True, timeout=30, check=True,
     )  # fmt: skip
-    assert done.stdout.splitlines()[-1] == "[]"
+    assert done.stdout.splitlines()[-1] == "[] []"
+
+
+def test_only_the_chosen_command_is_imported() -> None:
+    script = (
+        "import sys; from flasher.cli.main import COMMANDS, main; main(['scan', '--help']); "
+        "names = {e.place.partition(':')[0] for e in COMMANDS.values()}; "
+        "print([n for n in names if f'flasher.cli.{n}' in sys.modules])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        env=clean_environment(), capture_output=True, text=True, timeout=30, check=True,
+    )  # fmt: skip
+    assert done.stdout.splitlines()[-1] == "['look.scan']"

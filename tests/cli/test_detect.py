@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from flasher.cli import detect_child
-from flasher.cli.detect import Detection, Found
+from flasher.cli.look import detect_child
+from flasher.cli.look.detect import Detection, Found
 
 # Stands for the process that asks: the answer of each back end goes by its name.
 CHILD = """

@@ -164,7 +164,7 @@ def test_what_was_not_answered_is_marked_and_red(
     ]
     page = (tmp_path / "t.html").read_text("utf-8")
     assert page.count("not answered") >= 3
-    monkeypatch.setattr("flasher.cli.explain.takes_colour", lambda _stream: True)
+    monkeypatch.setattr("flasher.cli.look.explain.takes_colour", lambda _stream: True)
     red = [line for line in flasher("explain", path).out.splitlines() if "\x1b[1;31m" in line]
     assert len(red) == len(marked)
 

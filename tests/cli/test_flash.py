@@ -295,7 +295,7 @@ def test_an_adapter_that_fails_in_the_middle_says_how_far_it_came_and_what_is_le
 def test_filters_do_not_disturb_the_json_on_stdout(flasher: Flasher) -> None:
     run = flasher(
         "flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0", "--json",
-        "--filter", "725:7FF", "720:7FF",
+        "--filter", "725:7FF", "--filter", "720:7FF",
     )  # fmt: skip
     assert run.document["ok"] is True
 

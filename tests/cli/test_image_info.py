@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from flasher.cli.arguments import number
+from flasher.cli.values import number
 from flasher.errors import ExitCode
 from tests.cli.conftest import SAMPLES, Flasher
 

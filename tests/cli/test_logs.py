@@ -73,7 +73,7 @@ def test_a_log_that_cannot_be_written_is_refused_before_anything_happens(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     ran: list[object] = []
-    monkeypatch.setattr("flasher.cli.image_info.run", lambda *_: ran.append(1))
+    monkeypatch.setattr("flasher.cli.options.load", lambda *_, **__: ran.append(1))
     run = flasher("image-info", OBC, "--log-file", name, "--json")
     assert run.code == run.document["exit_code"] == 2
     assert run.document["error"]["where"] == "--log-file"
@@ -120,7 +120,7 @@ def test_the_lines_of_a_bug_are_in_the_file(
     def fail(*_: object) -> int:
         raise RuntimeError("boom\x1b[2J")
 
-    monkeypatch.setattr("flasher.cli.image_info.run", fail)
+    monkeypatch.setattr("flasher.cli.upgrade.image_info.vector_table", fail)
     path = tmp_path / "flasher.log"
     run = flasher("image-info", OBC, "--log-file", path)
     assert run.code == 1

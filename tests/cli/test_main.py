@@ -37,7 +37,7 @@ needs_dev_full = pytest.mark.skipif(not DEV_FULL.exists(), reason="there is no /
 def test_help_is_on_stdout_with_examples(flasher: Flasher, command: str | None) -> None:
     run = flasher(*([command] if command else []), "--help")
     assert run.code == ExitCode.OK
-    assert "usage: flasher" in run.out
+    assert "Usage: flasher" in run.out
     assert "examples:" in run.out
     assert run.err == ""
 

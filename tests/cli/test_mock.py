@@ -17,7 +17,7 @@ import can
 import pytest
 
 from flasher import api
-from flasher.cli import mock as mock_command
+from flasher.cli.bench import mock as mock_command
 from flasher.driver import drive
 from flasher.errors import ExitCode
 from flasher.host.outcome import Outcome
@@ -117,7 +117,7 @@ def host(monkeypatch: pytest.MonkeyPatch) -> Iterator[Host]:
     monkeypatch.setattr(mock_command, "drive", drive_and_tell)
     # So that the mock sees sooner that it may end.
     monkeypatch.setattr("flasher.driver.MAX_WAIT_S", 0.02)
-    monkeypatch.setattr("flasher.cli.mock._QUIET_S", 0.3)
+    monkeypatch.setattr("flasher.cli.bench.mock._QUIET_S", 0.3)
     yield beside
     if beside._thread.ident is not None:
         beside.join()

@@ -87,7 +87,7 @@ def serve(monkeypatch: pytest.MonkeyPatch) -> Serve:
             yield lambda: clock.now() >= until_s
 
         monkeypatch.setattr("flasher.api.connect", connect)
-        monkeypatch.setattr("flasher.cli.mock.stop_on_signal", interrupted)
+        monkeypatch.setattr("flasher.cli.bench.mock.stop_on_signal", interrupted)
         return opened
 
     return prepare

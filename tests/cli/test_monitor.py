@@ -16,7 +16,7 @@ import can
 import pytest
 from rich.console import Console, ConsoleDimensions
 
-from flasher.cli.monitor_table import BoardView
+from flasher.cli.look.monitor_table import BoardView
 from flasher.errors import ExitCode
 from flasher.protocol.frame import Frame
 from flasher.trace.decoder import Seen
@@ -159,7 +159,7 @@ def test_a_table_of_a_trace_is_printed_once(
         (("--mock", "--message", "runing"), "no message has these words"),
         (("--mock", "--node", "abs"), "there is no node"),
         (("--mock", "--count", "0"), "must be 1 or more"),
-        (("--mock", "--lines", "--table"), "not allowed with"),
+        (("--mock", "--lines", "--table"), "do not go together"),
     ],
 )
 def test_wrong_usage_says_what_is_wrong(

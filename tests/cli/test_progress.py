@@ -16,7 +16,7 @@ import pytest
 from flasher import events
 from flasher.api import make_plan
 from flasher.cli.output import Output
-from flasher.cli.progress import Progress, because
+from flasher.cli.upgrade.progress import Progress, because
 from flasher.errors import BusError, ExitCode
 from flasher.events import Phase
 from flasher.host.table import TABLE, Action, Event

@@ -21,7 +21,7 @@ MOCK = ("--mock", "--mock-speed", "0")
 def battery(monkeypatch: pytest.MonkeyPatch) -> Battery:
     """What stands on the bus in place of the device model."""
     battery = Battery()
-    monkeypatch.setattr("flasher.cli.arguments.connect_mock", lambda *_, **__: opened(battery))
+    monkeypatch.setattr("flasher.cli.options.connect_mock", lambda *_, **__: opened(battery))
     return battery
 
 
@@ -30,7 +30,7 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
     """A terminal to ask on; write the answer into it."""
     typed = io.StringIO()
     monkeypatch.setattr(sys, "stdin", typed)
-    monkeypatch.setattr("flasher.cli.write._is_terminal", lambda: True)
+    monkeypatch.setattr("flasher.cli.look.write._is_terminal", lambda: True)
     return typed
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,8 +11,9 @@ import can
 import pytest
 
 from flasher.api import Device
+from flasher.cli.options import Bus
 from flasher.cli.output import Output
-from flasher.cli.recording import BUNDLE_FOLDER, add_recording, recording
+from flasher.cli.recording import BUNDLE_FOLDER, RecordingOptions, recording
 from flasher.driver import Tap
 from flasher.errors import (
     BusError,
@@ -32,14 +32,12 @@ from tests.trace.tape import Tape
 from .conftest import SAMPLES, Flasher
 
 MOCK = ("--mock", "--mock-speed", "0")
+NOTHING = RecordingOptions()
 
 
-def options(*words: str | Path) -> argparse.Namespace:
-    parser = argparse.ArgumentParser()
-    add_recording(parser)
-    chosen = parser.parse_args([str(word) for word in words])
-    chosen.dialect, chosen.mock, chosen.command_line = "welling", False, ["flash", "a b", "\x1b"]
-    return chosen
+@pytest.fixture(autouse=True)
+def command_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.argv", ["flasher", "flash", "a b", "\x1b"])
 
 
 def bundles(folder: Path) -> list[Path]:
@@ -52,9 +50,9 @@ def report_of(bundle: Path) -> dict[str, Any]:
     return loaded
 
 
-def run_into(error: BaseException, *words: str | Path) -> None:
+def run_into(error: BaseException, options: RecordingOptions = NOTHING) -> None:
     def command() -> None:
-        with recording(options(*words), Output(), target=BMS) as record:
+        with recording(options, Bus(), Output(), target=BMS) as record:
             for at, frame in Tape().to_packet(3).packet(3):
                 for tap in record.taps:
                     tap(frame, sent=frame.can_id == 0x752, now=at)
@@ -134,7 +132,7 @@ def test_the_users_own_folder_keeps_the_last_fifty_and_explain_finds_the_latest(
     assert folder.stat().st_mode & 0o777 == 0o700
     assert "failure 52" in flasher("explain", "--last").out
     assert bundles(work) == []
-    run_into(BusError("elsewhere"), "--bundle-dir", work)
+    run_into(BusError("elsewhere"), RecordingOptions(bundle_dir=work))
     assert len(bundles(work)) == 1
     both = flasher("explain", "--last", work)
     assert (both.code, flasher("explain").code) == (ExitCode.USAGE, ExitCode.USAGE)
@@ -160,7 +158,7 @@ def test_a_bug_leaves_a_bundle_with_its_traceback(bundle_folder: Path) -> None:
 
 
 def test_a_failure_that_is_returned_can_be_handed_in(bundle_folder: Path) -> None:
-    with recording(options(), Output()) as record:
+    with recording(NOTHING, Bus(), Output()) as record:
         record.flight(Frame(0x752, b""), sent=True, now=1.0)
         record.facts["outcome"] = {"ending": "refused"}
         record.failed(FlasherError("x"))
@@ -170,18 +168,18 @@ def test_a_failure_that_is_returned_can_be_handed_in(bundle_folder: Path) -> Non
 
 
 def test_success_leaves_none(bundle_folder: Path) -> None:
-    with recording(options(), Output(), target=BMS) as record:
+    with recording(NOTHING, Bus(), Output(), target=BMS) as record:
         assert record.link_report() is None
     assert bundles(bundle_folder) == []
 
 
 def test_no_bundle_leaves_none(bundle_folder: Path) -> None:
-    run_into(BusError("x"), "--no-bundle")
+    run_into(BusError("x"), RecordingOptions(no_bundle=True))
     assert bundles(bundle_folder) == []
 
 
 def test_the_option_goes_before_the_environment(tmp_path: Path, bundle_folder: Path) -> None:
-    run_into(BusError("x"), "--bundle-dir", tmp_path / "here")
+    run_into(BusError("x"), RecordingOptions(bundle_dir=tmp_path / "here"))
     assert len(bundles(tmp_path / "here")) == 1
     assert bundles(bundle_folder) == []
 
@@ -190,7 +188,7 @@ def test_a_folder_that_cannot_be_written_is_one_warning_and_the_error_stays(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_bytes(b"")
-    run_into(BusError("x"), "--bundle-dir", tmp_path / "file")
+    run_into(BusError("x"), RecordingOptions(bundle_dir=tmp_path / "file"))
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1
     assert lines[0].startswith(f"warning: no bundle in {tmp_path / 'file'}: ")
@@ -198,7 +196,7 @@ def test_a_folder_that_cannot_be_written_is_one_warning_and_the_error_stays(
 
 def test_a_trace_file_holds_both_directions(tmp_path: Path) -> None:
     path = tmp_path / "trace.log"
-    with recording(options("--trace-file", path), Output()) as record:
+    with recording(RecordingOptions(trace_file=str(path)), Bus(), Output()) as record:
         for tap in record.taps:
             tap(Frame(0x752, b"\x01"), sent=True, now=1.0)
             tap(Frame(0x725, b"\x02"), sent=False, now=2.0)
@@ -211,7 +209,7 @@ def test_the_echoes_of_an_adapter_are_in_neither_trace_nor_bundle_nor_figures(
 ) -> None:
     """An interface such as udp_multicast hears its own frames: they are no repetitions."""
     path, tape = tmp_path / "trace.log", Tape().to_packet(7)
-    with recording(options("--trace-file", path), Output(), target=BMS) as record:
+    with recording(RecordingOptions(trace_file=str(path)), Bus(), Output(), target=BMS) as record:
         for now, frame in tape.frames:
             is_own = frame.can_id == BMS.request_id
             for tap in record.taps:
@@ -229,7 +227,10 @@ def test_the_echoes_of_an_adapter_are_in_neither_trace_nor_bundle_nor_figures(
 
 
 def test_a_trace_file_that_cannot_be_written_is_wrong_usage(bundle_folder: Path) -> None:
-    with pytest.raises(UsageError), recording(options("--trace-file", "/nowhere/x"), Output()):
+    with (
+        pytest.raises(UsageError),
+        recording(RecordingOptions(trace_file="/nowhere/x"), Bus(), Output()),
+    ):
         pytest.fail("it began all the same")
     assert bundles(bundle_folder) == []
 

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import shlex
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from zlib import crc32
 
+import click
 import pytest
 
 from flasher import events
-from flasher.cli.repair import repair_command
+from flasher.cli.upgrade.flash import repair_command
 from flasher.errors import ExitCode
 from flasher.events import Phase
 from tests.cli.conftest import SAMPLES, Flasher
@@ -62,7 +63,7 @@ def test_rescue_is_one_json_document_too(flasher: Flasher) -> None:
         (),
         ("--timeout", "30", "--skip-same-version"),
         ("--timeo=30", "--skip", "--retries", "2", "--verify", "none"),
-        ("--bus-kwargs", "a=1", "b=two"),
+        ("--bus-kwargs", "a=1", "--bus-kwargs", "b=two"),
     ],
     ids=" ".join,
 )
@@ -87,36 +88,63 @@ def test_the_command_that_is_named_repairs_as_it_stands(
     assert stage.has == IMAGE.data
 
 
+@pytest.fixture
+def repair_of(flasher: Flasher, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """The command that repairs what an upgrade left that was typed like this."""
+
+    def repair(typed: str, *, is_refused: bool = False) -> str:
+        def run(*_: object, **__: object) -> int:
+            named.append(repair_command(click.get_current_context(), is_refused=is_refused))
+            return 0
+
+        named: list[str] = []
+        monkeypatch.setattr("flasher.cli.upgrade.flash._Upgrade.run", run)
+        assert flasher(*shlex.split(typed)).code == ExitCode.OK
+        return named[0]
+
+    return repair
+
+
 @pytest.mark.parametrize(
     ("typed", "repair"),
     [
         ("flash a.hex -t bms", "rescue a.hex -t bms"),
         ("-v flash a.hex -t bms --json", "-v rescue a.hex -t bms --json"),
+        ("-vv flash -qt bms a.hex", "-v -v rescue a.hex -t bms -q"),
         ("rescue a.hex -t bms --wait 300", "rescue a.hex -t bms --wait 300"),
-        ("flash -t bms --timeout 5 a.hex", "rescue -t bms a.hex"),
-        ("flash -t bms --timeout=5 a.hex", "rescue -t bms a.hex"),
-        ("flash -t bms --timing f_clock=8 a.hex", "rescue -t bms --timing f_clock=8 a.hex"),
+        ("flash -t bms --timeout 5 a.hex", "rescue a.hex -t bms"),
+        ("flash -t bms --timeout=5 a.hex", "rescue a.hex -t bms"),
+        ("flash -t bms --timing f_clock=8 a.hex", "rescue a.hex -t bms --timing f_clock=8"),
+        (
+            "flash --bus-kwargs a=1 -t bms a.hex --bus-kwargs b='2 3'",
+            "rescue a.hex -t bms --bus-kwargs a=1 --bus-kwargs 'b=2 3'",
+        ),
         ("flash --skip-same a.hex -t bms", "rescue a.hex -t bms"),
         ("--log-file flash flash a.hex -t bms", "--log-file flash rescue a.hex -t bms"),
-        ("--log flash flash a.hex -t bms", "--log flash rescue a.hex -t bms"),
+        ("--log flash flash a.hex -t bms", "--log-file flash rescue a.hex -t bms"),
         ("flash -t bms -- --timeout", "rescue -t bms -- --timeout"),
         ("flash flash -t bms", "rescue flash -t bms"),
         ("flash 'a b.hex' -t bms -c '$x'", "rescue 'a b.hex' -t bms -c '$x'"),
     ],
 )
-def test_the_repair_is_what_was_typed_without_what_does_not_fit(typed: str, repair: str) -> None:
-    words = shlex.split(typed)
-    command = "rescue" if "rescue" in words else "flash"
-    assert repair_command(words, command) == f"flasher {repair}"
+def test_the_repair_is_what_was_typed_without_what_does_not_fit(
+    repair_of: Callable[..., str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    typed: str,
+    repair: str,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert repair_of(typed) == f"flasher {repair}"
 
 
 @pytest.mark.parametrize(
     ("typed", "repair"),
     [
         ("flash a.hex -t bms", "rescue OTHER_IMAGE -t bms"),
-        ("flash -t bms bms", "rescue -t bms OTHER_IMAGE"),
+        ("flash -t bms bms", "rescue OTHER_IMAGE -t bms"),
         ("flash bms -t bms", "rescue OTHER_IMAGE -t bms"),
-        ("flash -t bms -- a.hex", "rescue -t bms -- OTHER_IMAGE"),
+        ("flash -t bms -- a.hex", "rescue OTHER_IMAGE -t bms"),
         (
             "flash a.hex -t bms --base 0 --range=0:9 --man m.toml -f --allow-hardware -b 250000",
             "rescue OTHER_IMAGE -t bms -b 250000",
@@ -124,11 +152,9 @@ def test_the_repair_is_what_was_typed_without_what_does_not_fit(typed: str, repa
     ],
 )
 def test_a_refused_image_is_not_named_again_nor_what_was_said_about_it(
-    typed: str, repair: str
+    repair_of: Callable[..., str], typed: str, repair: str
 ) -> None:
-    words = shlex.split(typed)
-    image = "bms" if "a.hex" not in words else "a.hex"
-    assert repair_command(words, "flash", image) == f"flasher {repair}"
+    assert repair_of(typed, is_refused=True) == f"flasher {repair}"
 
 
 def test_after_a_refusal_the_one_command_can_be_right_and_spares_the_evidence(
@@ -189,7 +215,7 @@ def test_ctrl_c_in_every_phase_says_what_the_device_has_and_how_to_repair_it(
         for _ in range(times):
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("flasher.cli.progress.Progress.__call__", show)
+    monkeypatch.setattr("flasher.cli.upgrade.progress.Progress.__call__", show)
     image = tmp_path / "image.bin"
     image.write_bytes(IMAGE.data)
     run = flasher("flash", image, "-t", "bms", "-i", "virtual", "--json")
@@ -237,7 +263,7 @@ def test_ctrl_c_in_the_verification_says_that_the_image_is_there(
         if isinstance(event, events.VerificationStarted):
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("flasher.cli.progress.Progress.__call__", show)
+    monkeypatch.setattr("flasher.cli.upgrade.progress.Progress.__call__", show)
     image = tmp_path / "image.bin"
     image.write_bytes(IMAGE.data)
     run = flasher("flash", image, "-t", "bms", "-i", "virtual", "--json")
@@ -256,7 +282,7 @@ def test_ctrl_c_while_the_adapter_is_awaited_is_heard_at_once(
         if isinstance(event, events.AdapterLost):
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr("flasher.cli.progress.Progress.__call__", show)
+    monkeypatch.setattr("flasher.cli.upgrade.progress.Progress.__call__", show)
     stage.at_packet[2] = stage.bus.unplug
     image = tmp_path / "image.bin"
     image.write_bytes(IMAGE.data)

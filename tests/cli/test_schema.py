@@ -101,7 +101,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("explain", Path("upgrade.log")),
         ("explain", Path("nothing.log")),
         ("mock", "-t", "bms", "-i", "virtual", "-c", "schema"),
-        ("conformance", "-t", "bms", "--mock", "--case", "RS-01", "EN-04"),
+        ("conformance", "-t", "bms", "--mock", "--case", "RS-01", "--case", "EN-04"),
         ("conformance", "--list"),
         ("conformance", "profile"),
         ("station", "check", SAMPLES / "station" / "recipe.toml"),
@@ -129,7 +129,7 @@ def files(flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, req
         for event in (*map(make, event_classes()), events.PacketStored(1, 9)):
             on_event(event)
 
-    monkeypatch.setattr("flasher.cli.mock.drive", drive)
+    monkeypatch.setattr("flasher.cli.bench.mock.drive", drive)
 
 
 @pytest.mark.parametrize(
@@ -195,8 +195,8 @@ def test_a_trace_with_everything_in_it_is_as_described(
 def test_a_refused_write_says_that_nothing_was_written(
     flasher: Flasher, schema: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("flasher.cli.write._is_terminal", lambda: True)
-    monkeypatch.setattr("flasher.cli.write._agrees", lambda _plan: False)
+    monkeypatch.setattr("flasher.cli.look.write._is_terminal", lambda: True)
+    monkeypatch.setattr("flasher.cli.look.write._agrees", lambda _plan: False)
     run = flasher("write", "user-string-1", "x", *MOCK, "--json")
     hold_output(schema, run.out, 130)
     assert run.document["written"] is False
@@ -208,7 +208,7 @@ def test_a_bug_is_a_document_too(
     def fail(*_: object) -> int:
         raise RuntimeError("boom")
 
-    monkeypatch.setattr("flasher.cli.image_info.run", fail)
+    monkeypatch.setattr("flasher.cli.upgrade.image_info.vector_table", fail)
     hold_output(schema, flasher("image-info", OBC, "--json").out, 1)
 
 

@@ -16,7 +16,7 @@ from xml.etree import ElementTree as Xml
 import pytest
 
 from flasher.cli.main import main
-from flasher.cli.station_views import JsonLines
+from flasher.cli.station.views import JsonLines
 from flasher.errors import ExitCode
 from flasher.settings.reading import Table
 from flasher.station.codes import CODES
@@ -45,7 +45,7 @@ FAST = ("--mock-speed", "0", "--mock-dead", "0", "--mock-slow", "0")
 @pytest.fixture(autouse=True)
 def threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """No processes, and nobody at a keyboard."""
-    monkeypatch.setattr("flasher.cli.station_run.LAUNCH", ThreadPort)
+    monkeypatch.setattr("flasher.cli.station.run.LAUNCH", ThreadPort)
     monkeypatch.setattr(sys, "stdin", io.StringIO())
 
 
@@ -237,7 +237,7 @@ def test_sockets_that_can_never_work_end_the_station(
                 return CannotWork("The recipe was changed.")
             raise EOFError
 
-    monkeypatch.setattr("flasher.cli.station_run.LAUNCH", Broken)
+    monkeypatch.setattr("flasher.cli.station.run.LAUNCH", Broken)
     run = flasher("station", "run", "--recipe", recipe, "--mock-sockets", "1", *FAST)
     assert run.code == ExitCode.BUS
     assert "The recipe was changed." in lines_of(run)[1]["error"]["what"]

@@ -10,7 +10,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from flasher.cli import station_records
+from flasher.cli.station import records as station_records
 from flasher.errors import ExitCode
 from tests.cli.conftest import Flasher
 from tests.cli.station_threads import ThreadPort
@@ -27,7 +27,7 @@ ENCODED = {"s3cr3t": "s3cr3t", "s3cr3t@x/y:z": "s3cr3t%40x%2Fy%3Az"}
 @pytest.fixture(autouse=True)
 def threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """No processes, and nobody at a keyboard."""
-    monkeypatch.setattr("flasher.cli.station_run.LAUNCH", ThreadPort)
+    monkeypatch.setattr("flasher.cli.station.run.LAUNCH", ThreadPort)
     monkeypatch.setattr(sys, "stdin", io.StringIO())
 
 

@@ -15,12 +15,12 @@ from rich.console import Console
 
 from flasher.cli.documents import to_json
 from flasher.cli.output import Output
-from flasher.cli.station_board import Board
-from flasher.cli.station_documents import LINES
-from flasher.cli.station_keys import LineReader, Typing
-from flasher.cli.station_scans import ScanFile
-from flasher.cli.station_table import StationTable
-from flasher.cli.station_views import Table
+from flasher.cli.station.board import Board
+from flasher.cli.station.documents import LINES
+from flasher.cli.station.keys import LineReader, Typing
+from flasher.cli.station.scans import ScanFile
+from flasher.cli.station.table import StationTable
+from flasher.cli.station.views import Table
 from flasher.errors import UsageError
 from flasher.station.events import (
     FiguresChanged,
@@ -308,8 +308,8 @@ def test_on_a_terminal_the_table_is_refreshed_and_the_summary_stays(
     monkeypatch.setattr(screen, "isatty", lambda: True)
     for name, value in {"TERM": "xterm-256color", "COLUMNS": "100", "LINES": "30"}.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setattr("flasher.cli.station_run.LAUNCH", ThreadPort)
-    monkeypatch.setattr("flasher.cli.station_views.REFRESH_S", 0.0)
+    monkeypatch.setattr("flasher.cli.station.run.LAUNCH", ThreadPort)
+    monkeypatch.setattr("flasher.cli.station.views.REFRESH_S", 0.0)
     recipe = write_recipe(tmp_path, USUAL + WRITE)
     words = ("--mock-sockets", "2", "--units", "2", "--mock-bad", "0", *FAST)
     with os.fdopen(slave, "r") as keys:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from flasher.cli.upgrade_text import verdict_of
+from flasher.cli.upgrade.text import verdict_of
 from flasher.events import Phase
 from flasher.host.outcome import DeviceLeft, Outcome, Statistics
 from flasher.host.session import Result

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from flasher.cli.conformance_replay import replay_commands
-from flasher.cli.conformance_run import exit_code
+from flasher.cli.bench.conformance_replay import replay_commands
+from flasher.cli.bench.conformance_run import exit_code
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases import rs
 from flasher.conformance.catalogue import CASES, NOT_IMPLEMENTED, QUICK
@@ -24,7 +24,7 @@ from . import profile_table
 from .bench import fails_once, passes_once, run_case
 
 MOCK = ("conformance", "-t", "bms", "--mock")
-WRONG = (*MOCK, "--variant", "announces-three-times", "--case", "RS-01", "RS-04")
+WRONG = (*MOCK, "--variant", "announces-three-times", "--case", "RS-01", "--case", "RS-04")
 
 
 def test_a_device_that_follows_the_protocol_passes(flasher: Flasher) -> None:
@@ -69,7 +69,7 @@ def test_the_list_shows_what_can_be_run_and_what_cannot(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(NOT_IMPLEMENTED, "BU-99", "needs an injector")
-    run = flasher("conformance", "--list", "--case", "RS-05", "bu-99")
+    run = flasher("conformance", "--list", "--case", "RS-05", "--case", "bu-99")
     assert run.code == 0
     assert "RS-05  power-up" in run.out
     assert "BU-99  cannot be run: needs an injector" in run.out

@@ -10,7 +10,7 @@ from typing import Any, Final
 import jsonschema
 import pytest
 
-from flasher.cli.conformance_documents import ConformanceDocument
+from flasher.cli.bench.conformance_documents import ConformanceDocument
 from flasher.cli.schema import Definitions
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import Selection

@@ -91,7 +91,6 @@ def transfer(
 ) -> subprocess.CompletedProcess[str]:
     """Flash `image` to `mock` and see that it stored the same bytes, as `out.bin`."""
     (folder / name).write_bytes(image)
-    # The file comes last on purpose: it survives behind `--bus-kwargs k=v k=v`.
     done = run_flasher("flash", "-t", "bms", *bus, name, folder=folder)
     assert done.returncode == 0, done.stderr
     mock.wait_for("image:")

@@ -17,7 +17,7 @@ def test_a_mock_in_another_process_gets_the_verdicts_that_the_built_in_one_gets(
     bus: tuple[str, ...], tmp_path: Path
 ) -> None:
     (tmp_path / "good.bin").write_bytes(IMAGE)
-    wanted = ("--case", "FR-08", "UP-08")
+    wanted = ("--case", "FR-08", "--case", "UP-08")
     with MockProcess("-t", "bms", *bus, folder=tmp_path):
         done = run_flasher(
             *("conformance", "-t", "bms", "--good-image", "good.bin", *wanted, "--json", *bus),

@@ -42,7 +42,7 @@ def bus() -> tuple[str, ...]:
             pytest.skip(f"multicast cannot be sent here: {error}")
     if heard is None:
         pytest.skip("multicast does not come back on this machine")
-    options = ("--bus-kwargs", "hop_limit=0", f"port={port}")
+    options = ("--bus-kwargs", "hop_limit=0", "--bus-kwargs", f"port={port}")
     return ("-i", "udp_multicast", "-c", GROUP, *options)
 
 

@@ -15,7 +15,7 @@ import sys
 import tempfile
 
 # What most of them need, once.
-import flasher.cli.station_check
+import flasher.cli.station.check
 import flasher.conformance.diff
 import flasher.conformance.runner
 import flasher.trace.source  # noqa: F401

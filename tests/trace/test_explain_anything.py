@@ -8,7 +8,7 @@ import random
 import pytest
 
 from flasher.cli.documents import plain_value
-from flasher.cli.explain_text import story_lines
+from flasher.cli.look.explain_text import story_lines
 from flasher.protocol.bittime import message_bits
 from flasher.protocol.frame import Frame
 from flasher.trace.explain import explain

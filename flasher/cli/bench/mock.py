@@ -1,0 +1,319 @@
+"""`flasher mock`: the device model, or a whole bicycle, on any python-can bus until interrupted."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Final, TypedDict
+
+import click
+
+from flasher import api, events
+from flasher.cli import values
+from flasher.cli.documents import to_json
+from flasher.cli.files import check_writable, write_whole
+from flasher.cli.framework import command, option
+from flasher.cli.options import Bus, bus_options, target_option
+from flasher.cli.output import Output, byte_count
+from flasher.cli.stop import stop_on_signal
+from flasher.driver import drive
+from flasher.errors import ExitCode, UsageError
+from flasher.log import BY_DEVICE, log_event
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
+from flasher.mock.system import System
+from flasher.mock.variants import VARIANTS, find, make
+from flasher.protocol.engine import Engine
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import Dialect, Target
+from flasher.protocol.text import printable
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.settings.device_model import describe_options, set_options
+
+_SAVE_IMAGE: Final = "--save-image"
+_QUIET_S: Final = 2.5 * DEFAULT_TIMINGS.command_repeat_s
+"""A tool that is quiet for this long has verified what it sent."""
+_EXAMPLES: Final = """\
+examples:
+  flasher mock -t bms -i socketcan -c vcan0
+  flasher mock -t mc -i udp_multicast -c 239.74.163.2 --bus-kwargs hop_limit=0 \\
+      --bus-kwargs port=43210
+  flasher mock -t bms -i socketcan -c vcan0 --no-app --save-image received.bin
+  flasher mock -t bms -i socketcan -c vcan0 --set repeated_packet=nak_next
+  flasher mock -t bms --system -i socketcan -c vcan0
+  flasher mock --list-variants
+  flasher mock -t bms -i socketcan -c vcan0 --variant accepts-early-end
+
+Ends with exit code 0 when interrupted.
+
+choices for --set, the first value is the default:
+"""
+SHOWN: Final = BY_DEVICE | {events.BytesDamaged}
+"""The events that are printed: the log on stderr leaves them out."""
+
+
+class MockDocument(TypedDict):
+    """What the device model received."""
+
+    images: int
+    """Complete upgrades."""
+
+
+class VariantDocument(TypedDict):
+    """A deliberately wrong device model."""
+
+    name: str
+    clause: str
+    """The case that it fails."""
+    also: list[str]
+    """Other cases that it may fail."""
+    summary: str
+    upgrade_works: bool
+    """False when not even an undisturbed upgrade to an ordinary image ends well."""
+
+
+class VariantsDocument(TypedDict):
+    """What --variant takes."""
+
+    variants: list[VariantDocument]
+
+
+DOCUMENTS: Final = (MockDocument, VariantsDocument)
+
+
+def _settings(_ctx: click.Context) -> list[str]:
+    """What a shell offers for --set."""
+    return [f"{key}=" for key, _, _ in describe_options()]
+
+
+def _variants(_ctx: click.Context) -> list[str]:
+    """What a shell offers for --variant."""
+    return list(VARIANTS)
+
+
+def _examples() -> str:
+    rows = [f"  {key:<24} {values}\n      {summary}" for key, values, summary in describe_options()]
+    return _EXAMPLES + "\n".join(rows)
+
+
+@command(epilog=_examples(), exit_codes=(ExitCode.BUS,))
+@target_option(required=False)
+@option(
+    _SAVE_IMAGE,
+    metavar="FILE",
+    type=values.FilePath("bin", gives=Path),
+    panel="device model",
+    brief=True,
+    help="write each image that was received completely",
+)
+@option(
+    "--no-app",
+    is_flag=True,
+    panel="device model",
+    brief=True,
+    help="start without a valid application (R14)",
+)
+@option(
+    "--set",
+    "choices",
+    multiple=True,
+    metavar="KEY=VALUE",
+    panel="device model",
+    brief=True,
+    shell_complete=values.offers(_settings),
+    help="set a choice of the device; may be repeated, see below",
+)
+@option(
+    "--system",
+    is_flag=True,
+    panel="device model",
+    help="serve as a whole bicycle; what is printed is about the target",
+)
+@option(
+    "--variant",
+    metavar="NAME",
+    panel="device model",
+    shell_complete=values.offers(_variants),
+    help="serve as a device that is wrong in one thing, see --list-variants",
+)
+@option(
+    "--list-variants",
+    is_flag=True,
+    panel="device model",
+    help="list what --variant takes, with the clause that each violates, and end",
+)
+@option(
+    "--upgrades",
+    type=values.count,
+    metavar="N",
+    panel="device model",
+    help="end after N complete upgrades, when the tool asks no more",
+)
+@bus_options(mock=None)
+def mock(
+    output: Output,
+    target: Target | None,
+    bus: Bus,
+    *,
+    save_image: Path | None,
+    no_app: bool,
+    choices: tuple[str, ...],
+    system: bool,
+    variant: str | None,
+    list_variants: bool,
+    upgrades: int | None,
+) -> int:
+    """Serve as a device: its application and its bootloader. With --system, as all devices of a
+    bicycle, which talk to each other.
+    """
+    if list_variants:
+        _list_variants(output)
+        return ExitCode.OK
+    if target is None:
+        raise UsageError(
+            "flasher mock: -t/--target is required.", remedy="Write -t wmc, bms or obc."
+        )
+    dialect = bus.dialect
+    if save_image is not None:
+        check_writable(save_image, _SAVE_IMAGE)
+    profile = set_options(DeviceProfile(), choices).speaking(dialect)
+    engine, device = _served(
+        target, dialect, profile, variant, is_system=system, has_application=not no_app
+    )
+    watcher = _Watcher(device, save_image, output)
+    output.shown_events = SHOWN
+    tool = _Tool(target)
+    with (
+        api.connect(dialect, holder=None, **bus.config) as connection,
+        stop_on_signal() as stopped,
+    ):
+        if not dialect.has_upgrade:
+            output.progress(
+                f"note: the {dialect.name.upper()} document has no upgrade; behind its RESET "
+                "stands Welling's bootloader here"
+            )
+        served = "a whole bicycle" if system else target.node.name
+        if variant is not None:
+            found = find(variant)
+            served = f"{served} that is wrong ({found.clause}: {found.summary})"
+        output.progress(f"{served} on {connection.name}; Ctrl-C ends it")
+        drive(
+            engine,
+            connection.link,
+            connection.clock,
+            taps=[tool],
+            on_event=watcher,
+            cancelled=lambda: (
+                stopped() or (watcher.images == upgrades and tool.is_quiet(connection.clock.now()))
+            ),
+        )
+    output.document(MockDocument(images=watcher.images))
+    return ExitCode.OK
+
+
+def _served(
+    target: Target,
+    dialect: Dialect,
+    profile: DeviceProfile,
+    variant: str | None,
+    *,
+    is_system: bool,
+    has_application: bool,
+) -> tuple[Engine, MockDevice]:
+    """What is put on the bus, and the device of it that is watched."""
+    if is_system:
+        if variant is not None:
+            raise UsageError(
+                "--variant and --system do not go together.",
+                remedy="Leave one out: a variant is served alone.",
+            )
+        system = System(dialect, target, profile=profile, has_application=has_application)
+        return system, system.device
+    build = MockDevice if variant is None else partial(make, variant)
+    device = build(
+        target,
+        bitrate_bps=dialect.bitrate_bps,
+        profile=profile,
+        has_application=has_application,
+    )
+    return device, device
+
+
+def _list_variants(output: Output) -> None:
+    width = max(map(len, VARIANTS))
+    for variant in VARIANTS.values():
+        output.result(f"{variant.name:<{width}}  {variant.clause}  {variant.summary}")
+    documents = [
+        VariantDocument(
+            name=variant.name,
+            clause=variant.clause,
+            also=list(variant.also),
+            summary=variant.summary,
+            upgrade_works=variant.upgrade_works,
+        )
+        for variant in VARIANTS.values()
+    ]
+    output.document(VariantsDocument(variants=documents))
+
+
+class _Tool:
+    """Tap: tells when the tool has nothing more to say to the target."""
+
+    def __init__(self, target: Target) -> None:
+        self._request_id = target.request_id
+        self._last_at = 0.0
+
+    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
+        if frame.can_id == self._request_id:
+            self._last_at = now
+
+    def is_quiet(self, now: float) -> bool:
+        """True when even the repetition of a query would have come."""
+        return now - self._last_at >= _QUIET_S
+
+
+class _Watcher:
+    """Prints what the device model sees, and saves what it received."""
+
+    def __init__(self, device: MockDevice, save_to: Path | None, output: Output) -> None:
+        self._device = device
+        self._save_to = save_to
+        self._output = output
+        self.images = 0
+
+    def __call__(self, event: object) -> None:
+        log_event(event)
+        match event:
+            case events.DeviceStateEntered(state, detail):
+                self._say("state", f"{state}{f': {detail}' if detail else ''}", event)
+            case events.PacketStored(number, total) if number == total:
+                self._say("packets", f"all {total:,} stored", event)
+            case events.PacketStored(number, total) if number == 1:
+                self._say("packets", f"first of {total:,} stored", event)
+            case events.ImageStored(size_bytes, sha256):
+                self._save()
+                self.images += 1
+                self._say("image", f"{byte_count(size_bytes)}, sha256 {sha256}", event)
+            case events.DeviceWritten(name, before, after):
+                self._say(
+                    "written", f"{name}: {after or 'empty'} (before: {before or 'empty'})", event
+                )
+            case events.ShutdownAnnounced(why):
+                self._say("power", f"SHUTDOWN sent: {why}", event)
+            case events.ShutdownEnded(ready, silent):
+                others = f"; no answer from {', '.join(silent)}" if silent else ""
+                self._say("power", f"off; ready: {', '.join(ready) or 'nobody'}{others}", event)
+            case events.DeviceReported(what):
+                self._say("note", what, event)
+            case events.BytesDamaged(can_id, reason, data):
+                self._say("damage", f"0x{can_id:03X}: {reason}: {data[:16].hex(' ')} ...", event)
+
+    def _say(self, kind: str, text: str, event: object) -> None:
+        self._output.result(f"{kind + ':':<9}{text}")
+        self._output.line({**to_json(event), "text": text})
+
+    def _save(self) -> None:
+        image = self._device.stored_image
+        if self._save_to and image is not None:
+            write_whole(self._save_to, image, _SAVE_IMAGE)
+            self._output.result(f"saved:   {printable(str(self._save_to))}")

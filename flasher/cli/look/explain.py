@@ -1,0 +1,143 @@
+"""`flasher explain`: the story of a recorded trace, with a verdict."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Final, TypedDict
+
+from flasher.cli import values
+from flasher.cli.documents import plain_value
+from flasher.cli.files import check_not_read, check_writable, write_whole
+from flasher.cli.framework import argument, command, option
+from flasher.cli.look.explain_text import story_lines
+from flasher.cli.output import Output
+from flasher.cli.recording import bundle_folder
+from flasher.cli.terminal import painted, takes_colour
+from flasher.errors import ExitCode, UsageError
+from flasher.protocol.text import printable
+from flasher.trace.story import Story
+
+
+class ExplainDocument(TypedDict):
+    """The story of a trace. Times in seconds since its first frame."""
+
+    story: Annotated[dict[str, Any], Story]
+
+
+DOCUMENTS: Final = (ExplainDocument,)
+_HTML: Final = "--html"
+_LAST: Final = "--last"
+_EXAMPLES: Final = """\
+examples:
+  flasher explain upgrade.asc
+  flasher explain --last                                 what the latest failure has left
+  flasher explain upgrade.blf --html story.html          one page with diagrams
+  flasher explain upgrade.log --json | jq .story.verdict
+  flasher explain upgrade.log --all --packets            every message, every packet
+
+Exit code 0 whenever the trace can be read, whatever the verdict is.
+"""
+
+
+@command(epilog=_EXAMPLES, exit_codes=(ExitCode.INTERRUPTED,))
+@argument(
+    "trace",
+    metavar="TRACE",
+    required=False,
+    type=values.FilePath(*values.TRACE_SUFFIXES, gives=Path),
+    help="a recorded trace (.asc .blf .log ...), or the folder of a bundle",
+)
+@option(_LAST, is_flag=True, brief=True, help="the bundle that the latest failed command has left")
+@option(
+    "-b",
+    "--bitrate",
+    type=values.count,
+    metavar="BPS",
+    help="bit rate of the bus that was recorded (default: the dialect's)",
+)
+@option(
+    "--all",
+    "everything",
+    is_flag=True,
+    panel="how to show it",
+    brief=True,
+    help="every message on a line of its own, packets too",
+)
+@option(
+    "--packets",
+    is_flag=True,
+    panel="how to show it",
+    help="a table of all packets with their answer times",
+)
+@option(
+    _HTML,
+    type=values.FilePath("html", gives=Path),
+    metavar="FILE",
+    panel="how to show it",
+    brief=True,
+    help="write the story as one self-contained page as well",
+)
+def explain(
+    output: Output,
+    *,
+    trace: Path | None,
+    last: bool,
+    bitrate: int | None,
+    everything: bool,
+    packets: bool,
+    html: Path | None,
+) -> int:
+    """Read a recorded trace, or the bundle that a failed command has left, and tell what happened:
+    the verdict and its likely cause, phases and messages with their times, how quickly both ends
+    answered, how full the bus was, who else was on it. No bus is opened. Goes by CAN ids, whoever
+    recorded it.
+    """
+    from flasher.trace.bundle import OLDER_TRACE, REPORT, TRACE  # noqa: PLC0415  loads python-can
+    from flasher.trace.source import explain_path  # noqa: PLC0415  loads python-can
+
+    source = _source(trace, last=last)
+    if html is not None:
+        check_writable(html, _HTML)
+        read = [source]
+        if source.is_dir():
+            read += [source / name for name in (TRACE, OLDER_TRACE, REPORT)]
+        check_not_read(html, _HTML, read)
+    story = explain_path(source, bitrate_bps=bitrate, everything=everything)
+    paint = _painted if takes_colour(sys.stdout) else str
+    for line in story_lines(story, packets=packets):
+        output.result(paint(line))
+    if html is not None:
+        from flasher.report.explain_page import render  # noqa: PLC0415  loads jinja2
+
+        write_whole(html, render(story).encode("utf-8"), _HTML)
+        output.progress(f"page: {printable(str(html))}")
+    output.document(ExplainDocument(story=plain_value(story)))
+    return ExitCode.OK
+
+
+def _painted(line: str) -> str:
+    """A line for a terminal: what went wrong is red."""
+    is_bad = "  ! " in line or line.endswith("  none")
+    return painted(line, "red") if is_bad else line
+
+
+def _source(trace: Path | None, *, last: bool) -> Path:
+    """The trace or bundle to read. Raises UsageError where none is named, or both ways are."""
+    from flasher.trace.bundle import bundles  # noqa: PLC0415  loads python-can
+
+    if last == (trace is not None):
+        raise UsageError(
+            "flasher explain: name one trace or bundle.", remedy=f"Write either TRACE or {_LAST}."
+        )
+    if trace is not None:
+        return trace
+    folder = bundle_folder()
+    found = bundles(folder)
+    if not found:
+        raise UsageError(
+            f"There is no bundle in {printable(str(folder))}.",
+            cause="no command has failed on the bus yet, or bundles go to another folder",
+            remedy="Name the folder that the failed command has printed.",
+        )
+    return found[-1]

@@ -1,0 +1,153 @@
+"""`flasher info`: identity, versions, state, faults, production and history of a device."""
+
+from __future__ import annotations
+
+from typing import Final, TypedDict
+
+from flasher.cli.documents import FieldValue, HeardDocument
+from flasher.cli.framework import command
+from flasher.cli.look.content_text import content_document, content_lines, row_line
+from flasher.cli.look.survey_text import heard_document, heard_lines
+from flasher.cli.options import Bus, bus_options, target_option
+from flasher.cli.output import Output
+from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
+from flasher.cli.stop import stop_on_signal
+from flasher.errors import ExitCode, NoAnswerError
+from flasher.procedures import INFO_LISTEN_ONLY_S, DeviceInfo, Reading
+from flasher.protocol.spec import WELLING, Dialect, Target
+
+_EXAMPLES: Final = """\
+examples:
+  flasher info -t bms --mock
+  flasher info -t bms -i socketcan -c can0
+  flasher info -t bms -i socketcan -c can0 --json > record.json
+  flasher info -t wmc -i socketcan -c can0       it cannot be asked: shows what it sends
+
+What the device does not answer is shown as such: an older one does not know every question.
+"""
+
+
+class InfoDocument(TypedDict):
+    """What a device tells about itself."""
+
+    target: str
+    dialect: str
+    can_be_asked: bool
+    """False where the documents give no question to ask it."""
+    items: dict[str, dict[str, FieldValue] | None]
+    """Each item with its fields; null for one that was not answered."""
+    unanswered: dict[str, str]
+    """Why, for each of those."""
+    faults: FieldValue
+    heard: HeardDocument | None
+
+
+DOCUMENTS: Final = (InfoDocument,)
+
+
+@command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.INTERRUPTED))
+@target_option()
+@bus_options()
+@recording_options
+def info(output: Output, target: Target, bus: Bus, recorded: RecordingOptions) -> int:
+    """Ask one device everything that the documents let a tool ask (identity, versions, state,
+    history), and show the answers with what it sends by itself. Nothing is written, and nothing is
+    reset.
+    """
+    with (
+        recorded_connection(recorded, bus, output, target) as (connection, record),
+        stop_on_signal() as stopped,
+    ):
+        output.progress(f"asking the {target.node.name} on {connection.name} ...")
+        device = connection.device(target, dialect=bus.dialect)
+        found = device.identify(taps=record.taps, cancelled=stopped)
+        if not found.is_there:
+            record.failed(_silent(found))
+    if not found.is_there:
+        error = _silent(found)
+        output.failure(error, **_document(found))
+        return error.exit_code
+    for line in _lines(found):
+        output.result(line)
+    output.document(_document(found))
+    return ExitCode.OK
+
+
+def _silent(found: DeviceInfo) -> NoAnswerError:
+    node = found.target.node.name
+    if found.readings:
+        return NoAnswerError(
+            f"The {node} answered nothing and sent nothing.",
+            cause="it is off, asleep or not connected, or the bit rate or dialect is another",
+            remedy="Wake it with its key; see who is on the bus with flasher scan.",
+        )
+    return NoAnswerError(
+        f"The {node} sent nothing in {INFO_LISTEN_ONLY_S:g} s, and the documents give no"
+        " question to ask it.",
+        cause="it is off, or it has nothing to say: it speaks by itself only now and then",
+        remedy="Try again while it is switched on; flasher scan shows who else is there.",
+    )
+
+
+def _lines(found: DeviceInfo) -> list[str]:
+    node = found.target.node.name
+    lines = [f"{node}, {found.dialect.name} dialect"]
+    if not found.readings:
+        lines.append("The documents give no question to ask it; this is what it sent by itself:")
+        lines += heard_lines(found.survey.heard[found.target.node], contents=True)
+        if found.survey.faults:
+            lines += ["", "faults of the battery", *content_lines(found.survey.faults)]
+        return lines
+    for reading in found.readings:
+        if reading.answer is not None:
+            lines += ["", _title(reading), *content_lines(reading.answer)]
+    faults = found.survey.faults
+    lines += ["", "faults", *(content_lines(faults) if faults else [_no_faults(found.dialect)])]
+    missing = [reading for reading in found.readings if reading.answer is None]
+    if missing:
+        lines += ["", "not answered"]
+        lines += [row_line(_title(reading), _why(reading)) for reading in missing]
+    heard = found.survey.heard[found.target.node]
+    if heard.boot_version:
+        lines += ["", f"its bootloader announced itself meanwhile: {heard.boot_version}"]
+    if heard.damaged:
+        lines += ["", f"bytes from it that made no message: {heard.damaged} times"]
+    return lines
+
+
+def _title(reading: Reading) -> str:
+    return reading.name.replace("-", " ")
+
+
+def _no_faults(dialect: Dialect) -> str:
+    """A fault is heard, not asked for: how long to wait for one only one document says."""
+    is_periodic = dialect is WELLING
+    proviso = "" if is_periodic else "; how often they are sent is not documented: see monitor"
+    return row_line("faults", f"none heard{proviso}")
+
+
+def _why(reading: Reading) -> str:
+    if not reading.was_asked:
+        return "not asked: the device is silent"
+    if reading.misfit:
+        return f"came in another form: {reading.misfit}"
+    return "no answer"
+
+
+def _document(found: DeviceInfo) -> InfoDocument:
+    faults = found.survey.faults
+    heard = found.survey.heard.get(found.target.node)
+    return {
+        "target": found.target.name,
+        "dialect": found.dialect.name,
+        "can_be_asked": bool(found.readings),
+        "items": {
+            reading.name: content_document(reading.answer) if reading.answer else None
+            for reading in found.readings
+        },
+        "unanswered": {
+            reading.name: _why(reading) for reading in found.readings if reading.answer is None
+        },
+        "faults": content_document(faults)["faults"] if faults else [],
+        "heard": heard_document(heard) if heard else None,
+    }

@@ -1,0 +1,183 @@
+"""`flasher monitor`: what is said on the bus, live or out of a recorded trace."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterable
+from contextlib import ExitStack
+from typing import Final, TypedDict
+
+from flasher.cli import values
+from flasher.cli.framework import argument, command, option
+from flasher.cli.look.monitor_views import FrameLine, Lines, SeenLine, Table
+from flasher.cli.options import Bus, bus_options, target_option
+from flasher.cli.output import Output, counted
+from flasher.cli.stop import stop_on_signal
+from flasher.driver import drive
+from flasher.errors import ExitCode, UsageError
+from flasher.protocol.spec import BMS, Target
+from flasher.protocol.text import printable
+from flasher.trace.decoder import Kind, message_titles
+from flasher.trace.watcher import Filter, Watcher, replay
+
+REFRESH_S: Final = 0.25
+"""Time between two refreshes of the table: slow enough to read, quick enough to follow."""
+_EXAMPLES: Final = """\
+examples:
+  flasher monitor -i socketcan -c can0
+  flasher monitor -i socketcan -c can0 --node bms --message "running information"
+  flasher monitor -i pcan -c PCAN_USBBUS1 --errors --duration 60
+  flasher monitor upgrade.asc                            a recorded trace
+  flasher monitor upgrade.blf --json | jq .message
+
+Nothing is sent. On a terminal it is a table of the latest of each message, elsewhere one line a
+message; `*` marks what changed since the same message before. Ctrl-C ends it with exit code 0.
+"""
+
+
+class MonitorDocument(TypedDict):
+    """How much was seen."""
+
+    frames: int
+    messages: int
+    """Shown, after the filters."""
+    troubles: int
+
+
+DOCUMENTS: Final = (MonitorDocument,)
+LINES: Final = (SeenLine, FrameLine)
+
+
+@command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS,))
+@argument(
+    "trace",
+    metavar="TRACE",
+    required=False,
+    type=values.FilePath(*values.TRACE_SUFFIXES),
+    help="a recorded trace (.asc .blf .log ...), no bus",
+)
+@target_option(required=False)
+@option(
+    "--node",
+    "nodes",
+    multiple=True,
+    type=values.node,
+    metavar="wmc|bms|obc|hmi|cdl",
+    brief=True,
+    panel="what to show (default: everything)",
+    shell_complete=values.offers(values.node_names),
+    help="only what this node sends or is sent; may be repeated",
+)
+@option(
+    "--message",
+    "messages",
+    multiple=True,
+    metavar="WORDS",
+    brief=True,
+    panel="what to show (default: everything)",
+    help="only messages with these words in their title; may be repeated",
+)
+@option(
+    "--errors",
+    is_flag=True,
+    panel="what to show (default: everything)",
+    help="only trouble: damaged, malformed and unknown messages, error frames, NAK, faults",
+)
+@option(
+    "--lines",
+    is_flag=True,
+    panel="how to show it",
+    brief=True,
+    help="one line a message, on a terminal too",
+)
+@option(
+    "--table",
+    is_flag=True,
+    panel="how to show it",
+    help="a table, elsewhere than on a terminal too: at the end",
+)
+@option("--raw", is_flag=True, panel="how to show it", help="also every frame as it came (lines)")
+@option(
+    "--count", type=values.count, metavar="N", panel="how to show it", help="end after N messages"
+)
+@option(
+    "--duration",
+    type=values.seconds,
+    metavar="S",
+    panel="how to show it",
+    brief=True,
+    help="end after S seconds",
+)
+@bus_options(mock="watch a device model in this process")
+def monitor(
+    output: Output,
+    target: Target | None,
+    bus: Bus,
+    *,
+    trace: str | None,
+    nodes: tuple[str, ...],
+    messages: tuple[str, ...],
+    errors: bool,
+    lines: bool,
+    table: bool,
+    raw: bool,
+    count: int | None,
+    duration: float | None,
+) -> int:
+    """Show decoded traffic, of a bus or of a recorded trace. Nothing is sent; the adapter still
+    acknowledges frames, as every node does.
+    """
+    if lines and table:
+        raise UsageError("--lines and --table do not go together.", remedy="Leave one out.")
+    if trace is not None and (bus.mock or bus.interface is not None):
+        raise UsageError(
+            "A trace is read without a bus.", remedy="Leave out either TRACE or --mock and -i."
+        )
+    _check_messages(messages)
+    terminal = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
+    is_live = terminal and trace is None
+    wants_table = (table or is_live) and not (lines or raw or output.json_wanted)
+    view = Table(output, live=is_live) if wants_table else Lines(output)
+    watcher = Watcher(
+        Filter(frozenset(nodes), messages, errors),
+        raw=raw,
+        count=count,
+        duration_s=duration,
+        pulse_s=REFRESH_S if view.is_live else None,
+        dialect=bus.dialect,
+    )
+    with ExitStack() as stack:
+        if trace is None:
+            connection = stack.enter_context(bus.connect(target or BMS, asks=False))
+            view.name = printable(connection.name)
+            cancelled = stack.enter_context(stop_on_signal())
+            output.progress(f"watching {view.name}; Ctrl-C ends it")
+            stack.enter_context(view)
+            drive(watcher, connection.link, connection.clock, on_event=view, cancelled=cancelled)
+        else:
+            from flasher.trace.reader import read_trace  # noqa: PLC0415  loads python-can
+
+            view.name = printable(trace)
+            cancelled = stack.enter_context(stop_on_signal())
+            stack.enter_context(view)
+            replay(watcher, read_trace(trace), view, cancelled)
+    output.progress(
+        f"{counted(view.messages, 'message')} shown of {counted(watcher.frames, 'frame')}, "
+        f"{view.troubles:,} with trouble"
+    )
+    output.document(
+        MonitorDocument(frames=watcher.frames, messages=view.messages, troubles=view.troubles)
+    )
+    return ExitCode.OK
+
+
+def _check_messages(wanted: Iterable[str]) -> None:
+    """Raises UsageError for words that are in no title."""
+    titles = message_titles() + tuple(kind.value for kind in Kind)
+    for words in wanted:
+        if not any(words.lower() in title.lower() for title in titles):
+            raise UsageError(
+                f"--message {words!a}: no message has these words in its title.",
+                remedy=f"Titles are {', '.join(titles)}.",
+            )

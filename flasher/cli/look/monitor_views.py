@@ -1,0 +1,224 @@
+"""How `flasher monitor` shows what a watcher sees: line by line, as JSON lines, or as a table."""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated, Final, Literal, Self, TypedDict
+
+from flasher.cli.documents import FieldValue
+from flasher.cli.output import Output, counted
+from flasher.protocol.frame import Frame
+from flasher.trace.decoder import Field, Kind, Seen
+from flasher.trace.watcher import Board, FrameSeen, Pulse
+
+if TYPE_CHECKING:  # rich is loaded only where a table is shown
+    from rich.console import RenderableType
+
+_VALUE_WIDTH: Final = 64
+"""Longer values are cut in lines, unless -v is given."""
+
+
+_Route = TypedDict("_Route", {"from": str, "to": str})
+
+
+class SeenLine(_Route):
+    """A message, a damage or a foreign frame, decoded. `from` and `to` are nodes, "all", or empty
+    for an id of no node.
+    """
+
+    event: Literal["Seen"]
+    at_s: float
+    """Since the first of them."""
+    kind: Annotated[str, Kind]
+    can_id: int
+    command: int | None
+    message: str
+    """Its title in the documents."""
+    trouble: bool
+    fields: dict[str, FieldValue]
+    changed: list[str]
+    """Fields that differ from the same message before."""
+    in_dialect: bool
+    """False for a message that the document of --dialect does not have."""
+
+
+class FrameLine(TypedDict):
+    """A CAN frame as it came (--raw)."""
+
+    event: Literal["Frame"]
+    at_s: float
+    kind: Literal["frame"]
+    can_id: int
+    data: str
+    """In hexadecimal."""
+    extended: bool
+    remote: bool
+    error: bool
+
+
+def route(seen: Seen) -> str:
+    """Who to whom; empty for an id of no node."""
+    return f"{seen.sender} > {seen.receiver}" if seen.sender else ""
+
+
+class View:
+    """Takes the watcher's events; times are counted from the first of them."""
+
+    is_live = False
+    """True when it wants to be refreshed from time to time."""
+
+    def __init__(self, output: Output) -> None:
+        self.output = output
+        self.board = Board()
+        self.name = ""
+        self.messages = 0
+        self.troubles = 0
+        self._origin: float | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        """Nothing is held."""
+
+    def __call__(self, event: object) -> None:
+        """Show one event."""
+        match event:
+            case Seen():
+                self.messages += 1
+                self.troubles += event.is_trouble
+                self.show(event, self.since(event.at), self.board.add(event))
+            case FrameSeen(at, frame):
+                self.show_frame(frame, self.since(at))
+            case Pulse(at):
+                self.refresh(at)
+
+    def since(self, at: float) -> float:
+        """Seconds since the first event."""
+        if self._origin is None:
+            self._origin = at
+        return at - self._origin
+
+    def show(self, seen: Seen, at_s: float, changed: frozenset[str]) -> None:
+        """A message, a damage, a foreign frame."""
+
+    def show_frame(self, frame: Frame, at_s: float) -> None:
+        """A frame, where frames are wanted."""
+
+    def refresh(self, now: float) -> None:
+        """The time to refresh has come."""
+
+
+class Lines(View):
+    """One line, or one JSON document, for each."""
+
+    def show(self, seen: Seen, at_s: float, changed: frozenset[str]) -> None:
+        self.output.result(_line(seen, at_s, changed, cut=self.output.verbosity < 1))
+        self.output.line(_document(seen, at_s, changed))
+
+    def show_frame(self, frame: Frame, at_s: float) -> None:
+        self.output.result(f"{at_s:10.3f}  {frame.can_id:03X}  {_frame_text(frame)}")
+        line: FrameLine = {
+            "event": "Frame",
+            "at_s": round(at_s, 6),
+            "kind": "frame",
+            "can_id": frame.can_id,
+            "data": frame.data.hex(),
+            "extended": frame.is_extended,
+            "remote": frame.is_remote,
+            "error": frame.is_error,
+        }
+        self.output.line(line)
+
+
+class Table(View):
+    """The board: refreshed in place, or printed once at the end."""
+
+    def __init__(self, output: Output, *, live: bool) -> None:
+        super().__init__(output)
+        self.is_live = live
+        from rich.console import Console  # noqa: PLC0415
+        from rich.live import Live  # noqa: PLC0415
+
+        self._console = Console(markup=False, highlight=False, emoji=False)
+        # No thread refreshes: the watcher's pulse does, between two frames. On a screen of its own
+        # lines are written over each other, without erasing them first: nothing flickers.
+        self._live = Live(console=self._console, screen=True, auto_refresh=False) if live else None
+        from flasher.cli.look.monitor_table import BoardView  # noqa: PLC0415  loads rich
+
+        self._view = BoardView(self._console)
+        self._last_at = 0.0
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+        if kind is None:
+            self._console.print(self._view_now())
+
+    def show(self, seen: Seen, at_s: float, changed: frozenset[str]) -> None:
+        self._last_at = seen.at
+
+    def refresh(self, now: float) -> None:
+        self._last_at = now
+        if self._live is not None:
+            self._live.update(self._view_now(), refresh=True)
+
+    def _view_now(self) -> RenderableType:
+        said = f"{self.since(self._last_at):.1f} s, {counted(self.messages, 'message')}"
+        title = f"{self.name}: {said}, {self.troubles:,} with trouble"
+        return self._view.draw(self.board, self._last_at, title)
+
+
+def _line(seen: Seen, at_s: float, changed: frozenset[str], *, cut: bool) -> str:
+    """Time, id, sender to receiver, title, fields with units."""
+    cut = cut and not seen.is_alarm  # no fault is left out
+    said = ", ".join(_field_text(shown, shown.name in changed, cut=cut) for shown in seen.fields)
+    mark = "! " if seen.is_trouble else ""
+    text = f"{at_s:10.3f}  {seen.can_id:03X}  {route(seen):<9}  {mark}{seen.marked_title}"
+    return f"{text}: {said}" if said else text
+
+
+def _field_text(shown: Field, is_changed: bool, *, cut: bool) -> str:  # noqa: FBT001
+    text = shown.text
+    if cut and len(text) > _VALUE_WIDTH:
+        text = f"{text[:_VALUE_WIDTH].rstrip()} ..."
+    return f"{'*' if is_changed else ''}{shown.label} {text} {shown.unit}".rstrip()
+
+
+def _document(seen: Seen, at_s: float, changed: frozenset[str]) -> SeenLine:
+    return {
+        "event": "Seen",
+        "at_s": round(at_s, 6),
+        "kind": seen.kind.name.lower(),
+        "can_id": seen.can_id,
+        "command": seen.command,
+        "from": seen.sender,
+        "to": seen.receiver,
+        "message": seen.title,
+        "trouble": seen.is_trouble,
+        "fields": {shown.name: shown.value for shown in seen.fields},
+        "changed": sorted(changed),
+        "in_dialect": seen.in_dialect,
+    }
+
+
+def _frame_text(frame: Frame) -> str:
+    words = [f"[{len(frame.data)}]", frame.data.hex(" ")]
+    words += ["29-bit id"] * frame.is_extended
+    words += ["remote request"] * frame.is_remote + ["error frame"] * frame.is_error
+    return " ".join(word for word in words if word)

@@ -1,0 +1,274 @@
+"""`flasher read`: read an item of a device by its name, or its memory."""
+
+from __future__ import annotations
+
+import io
+import sys
+from pathlib import Path
+from typing import Any, Final, Literal, NotRequired, Self, TypedDict
+
+import click
+
+from flasher.api import as_dialect
+from flasher.cli import values
+from flasher.cli.documents import FieldValue
+from flasher.cli.files import check_writable, write_whole
+from flasher.cli.framework import argument, command, option
+from flasher.cli.look.content_text import content_document, content_lines
+from flasher.cli.options import Bus, bus_options, target_option
+from flasher.cli.output import Output, byte_count
+from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
+from flasher.cli.stop import stop_on_signal
+from flasher.errors import ExitCode, NoAnswerError, UsageError
+from flasher.events import QueryAnswered
+from flasher.host.items import find, meaningful_fields, readable
+from flasher.host.read import check_range, piece_of
+from flasher.protocol.contents import Memory
+from flasher.protocol.fields import label
+from flasher.protocol.spec import BMS, WELLING, Dialect, Target
+from flasher.protocol.text import printable
+
+MEMORY: Final = "memory"
+_OUTPUT: Final = "--output"
+_HEX_SUFFIXES: Final = frozenset({".hex", ".ihex", ".ihx"})
+_DUMP_WIDTH: Final = 16
+_EXAMPLES: Final = """\
+examples:
+  flasher read --list
+  flasher read version-information -t bms -i socketcan -c can0
+  flasher read serial-number -t bms --mock
+  flasher read memory 0x8004000 0x8014000 -t bms -o application.hex -i socketcan -c can0
+
+END of a memory range is exclusive. The format of FILE goes by its suffix (.hex is Intel HEX, all
+else raw binary) or --format. FILE is written whole or not at all.
+"""
+
+
+class ItemDocument(TypedDict):
+    """An item that was read."""
+
+    target: str
+    item: str
+    fields: dict[str, FieldValue]
+
+
+class MemoryDocument(TypedDict):
+    """Memory that was read, `end` exclusive: `data` in hexadecimal, or the file it is in."""
+
+    target: str
+    start: int
+    end: int
+    data: NotRequired[str]
+    file: NotRequired[str]
+    format: NotRequired[Literal["hex", "bin"]]
+
+
+class ReadableDocument(TypedDict):
+    """The items that can be read, with the names of their fields."""
+
+    items: dict[str, list[str]]
+
+
+DOCUMENTS: Final = (ItemDocument, MemoryDocument, ReadableDocument)
+
+
+def _items(ctx: click.Context) -> list[str]:
+    """What a shell offers: what can be read of the target, where it is given."""
+    dialect = as_dialect(ctx.params.get("dialect_name") or WELLING.name)
+    return [*readable(ctx.params.get("target") or BMS, dialect), MEMORY]
+
+
+@command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.INTERRUPTED))
+@argument(
+    "item",
+    required=False,
+    metavar="ITEM",
+    shell_complete=values.offers(_items),
+    help="what to read; see --list",
+)
+@argument("bounds", nargs=-1, metavar="[START END]", help="for memory: which")
+@target_option(required=False)
+@option("--list", "is_list", is_flag=True, panel="read", brief=True, help="list the items and stop")
+@option(
+    "-o",
+    _OUTPUT,
+    "file",
+    metavar="FILE",
+    type=values.FilePath(gives=Path),
+    panel="read",
+    brief=True,
+    help="write memory to this file",
+)
+@option("--format", type=click.Choice(("hex", "bin")), panel="read", help="format of FILE")
+@bus_options()
+@recording_options
+def read(
+    output: Output,
+    target: Target | None,
+    bus: Bus,
+    recorded: RecordingOptions,
+    *,
+    item: str | None,
+    bounds: tuple[str, ...],
+    is_list: bool,
+    file: Path | None,
+    format: str | None,  # noqa: A002  the name of the option
+) -> int:
+    """Read an item of a device by its name, or its memory. --list names the items. Nothing is
+    written. The documents let a tool read from the BMS only.
+    """
+    target = target or BMS
+    if is_list:
+        return _list(target, bus.dialect, output)
+    if item is None:
+        raise UsageError("Nothing to read was named.", remedy="See flasher read --list.")
+    if item.lower() != MEMORY:
+        if bounds or file or format:
+            raise UsageError(
+                "START, END, --output and --format are for `flasher read memory` only."
+            )
+        return _read_item(item, target, bus, recorded, output)
+    start, end = _range(bounds)
+    if target is not BMS:
+        raise UsageError(f"The documents give no way to read memory of the {target.node.name}.")
+    if file is None and format:
+        raise UsageError("--format needs --output FILE.")
+    if file is not None:
+        check_writable(file, _OUTPUT)
+    data = _read_memory(start, end, bus, recorded, output)
+    document: MemoryDocument = {"target": target.name, "start": start, "end": end}
+    if file is not None:
+        is_hex = format == "hex" or (format is None and file.suffix.lower() in _HEX_SUFFIXES)
+        write_whole(file, _intel_hex(start, data) if is_hex else data, _OUTPUT)
+        output.result(f"{byte_count(len(data))} from 0x{start:08X} in {printable(str(file))}")
+        document["file"] = str(file)
+        document["format"] = "hex" if is_hex else "bin"
+    else:
+        for at in range(0, len(data), _DUMP_WIDTH):
+            output.result(_dump_line(start + at, data[at : at + _DUMP_WIDTH]))
+        document["data"] = data.hex()
+    output.document(document)
+    return ExitCode.OK
+
+
+def _read_item(
+    item: str, target: Target, bus: Bus, recorded: RecordingOptions, output: Output
+) -> int:
+    entry = find(item, readable(target, bus.dialect), target, "read")
+    with (
+        recorded_connection(recorded, bus, output, target) as (connection, record),
+        stop_on_signal() as stopped,
+    ):
+        device = connection.device(target, dialect=bus.dialect)
+        answer = device.read(entry.name, taps=record.taps, cancelled=stopped)
+    document = content_document(answer)
+    for line in content_lines(answer, entry.field):
+        output.result(line)
+    if entry.field:
+        document = {entry.field: document[entry.field]}
+    output.document(ItemDocument(target=target.name, item=entry.name, fields=document))
+    return ExitCode.OK
+
+
+# -- memory ---------------------------------------------------------------------------------------
+
+
+def _read_memory(
+    start: int, end: int, bus: Bus, recorded: RecordingOptions, output: Output
+) -> bytes:
+    with (
+        recorded_connection(recorded, bus, output, BMS) as (connection, record),
+        stop_on_signal() as stopped,
+        _MemoryProgress(end - start, output) as progress,
+    ):
+        try:
+            device = connection.device(BMS, dialect=bus.dialect)
+            return device.read_memory(
+                start, end, taps=record.taps, on_event=progress, cancelled=stopped
+            )
+        except NoAnswerError as error:
+            error.remedy = f"{error.remedy} No file was written."
+            raise
+
+
+def _range(bounds: tuple[str, ...]) -> tuple[int, int]:
+    if len(bounds) != 2:
+        raise UsageError("Reading memory takes START and END.", remedy="END is exclusive.")
+    try:
+        start, end = (values.number(bound) for bound in bounds)
+    except click.BadParameter as error:
+        raise UsageError(f"{error.message}.") from error
+    check_range(start, end)
+    return start, end
+
+
+def _dump_line(address: int, data: bytes) -> str:
+    text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in data)
+    return f"{address:08X}  {data.hex(' '):<{_DUMP_WIDTH * 3 - 1}}  {text}"
+
+
+def _intel_hex(start: int, data: bytes) -> bytes:
+    from intelhex import IntelHex  # noqa: PLC0415  only where it is asked for
+
+    image = IntelHex()
+    image.frombytes(data, offset=start)
+    text = io.StringIO()
+    image.write_hex_file(text)
+    return text.getvalue().encode("ascii")
+
+
+class _MemoryProgress:
+    """A bar on a terminal, nothing elsewhere."""
+
+    def __init__(self, size_bytes: int, output: Output) -> None:
+        self._size_bytes = size_bytes
+        self._output = output
+        self._wants_bar = sys.stderr.isatty() and output.verbosity >= 0
+        self._bar: Any = None
+
+    def __enter__(self) -> Self:
+        if self._wants_bar:
+            from tqdm import tqdm  # noqa: PLC0415  only where a bar is shown
+
+            self._bar = tqdm(
+                total=self._size_bytes,
+                unit="B",
+                unit_scale=True,
+                desc=MEMORY,
+                file=sys.stderr,
+                dynamic_ncols=True,
+            )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def __call__(self, event: object) -> None:
+        """Take an event of the reading."""
+        self._output.event(event)
+        if (
+            self._bar is not None
+            and isinstance(event, QueryAnswered)
+            and isinstance(event.content, Memory)
+        ):
+            self._bar.update(len(piece_of(event.content)))
+
+
+def _list(target: Target, dialect: Dialect, output: Output) -> int:
+    items = readable(target, dialect)
+    document: dict[str, list[str]] = {}
+    for name, entry in items.items():
+        fields = [
+            (field, codec)
+            for field, codec in meaningful_fields(entry.content)
+            if entry.field in ("", field)
+        ]
+        document[name] = [field for field, _ in fields]
+        output.result(f"{name:<24} {', '.join(label(*field) for field in fields)}")
+    if items:
+        output.result(f"{MEMORY:<24} START END [-o FILE]")
+    else:
+        output.result(f"The documents give the tool nothing to read from the {target.node.name}.")
+    output.document(ReadableDocument(items=document))
+    return ExitCode.OK

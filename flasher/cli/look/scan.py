@@ -1,0 +1,129 @@
+"""`flasher scan`: who is on the bus."""
+
+from __future__ import annotations
+
+from typing import Final, Literal, TypedDict
+
+from flasher.bus.bit_rate import BitRate
+from flasher.cli.documents import HeardDocument
+from flasher.cli.framework import command
+from flasher.cli.look.survey_text import heard_document, heard_lines
+from flasher.cli.options import Bus, bus_options, target_option
+from flasher.cli.output import Output, counted
+from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
+from flasher.cli.stop import stop_on_signal
+from flasher.errors import ExitCode, NoAnswerError
+from flasher.host.survey import Survey
+from flasher.procedures import SCAN_LISTEN_S
+from flasher.protocol.spec import BMS, DIALECTS, Dialect, Target
+
+_EXAMPLES: Final = """\
+examples:
+  flasher scan --mock
+  flasher scan -i socketcan -c can0
+  flasher scan --dialect motinova -i pcan -c PCAN_USBBUS1      listens at 125 kbit/s
+
+Listens for a second, then asks the BMS, the only device that the documents let us ask. Who is not
+listed may still be there: most devices speak only now and then.
+"""
+
+
+class ScanDocument(TypedDict):
+    """Who is on the bus."""
+
+    bitrate_bps: int
+    bitrate_source: str
+    """Where it comes from."""
+    bitrate_is_assumed: Literal[True]
+    """Frames do not tell it."""
+    dialect: str | None
+    dialect_because: str
+    nodes: dict[str, HeardDocument]
+    foreign_frames: int
+    """Under ids of no node of the documents."""
+
+
+DOCUMENTS: Final = (ScanDocument,)
+
+
+@command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.INTERRUPTED))
+@target_option(required=False)
+@bus_options()
+@recording_options
+def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOptions) -> int:
+    """Find out who is on the bus, and which dialect is spoken. Sends one round of queries to the
+    battery, and nothing else: no bit rate is tried, since a wrong one disturbs a live bus.
+    """
+    dialect, rate = bus.dialect, bus.bit_rate
+    bitrate_bps = rate.bps
+    with (
+        recorded_connection(recorded, bus, output, target or BMS) as (connection, record),
+        stop_on_signal() as stopped,
+    ):
+        output.progress(f"listening for {SCAN_LISTEN_S:g} s on {connection.name} ...")
+        survey = connection.scan(dialect, taps=record.taps, cancelled=stopped)
+        if not survey.heard:
+            record.failed(_silent(survey, bitrate_bps))
+    guessed, why = judge_dialect(survey, bitrate_bps)
+    document = _bus_document(survey, rate, guessed, why)
+    if not survey.heard:
+        error = _silent(survey, bitrate_bps)
+        output.failure(error, **document)
+        return error.exit_code
+    for line in _lines(survey, rate, dialect, guessed, why):
+        output.result(line)
+    output.document(document)
+    return ExitCode.OK
+
+
+def judge_dialect(survey: Survey, bitrate_bps: int) -> tuple[Dialect | None, str]:
+    """The dialect that is spoken and why, from the traffic or else the bit rate in use."""
+    guessed, why = survey.guess_dialect()
+    if guessed is not None:
+        return guessed, why
+    if any(heard.messages for heard in survey.heard.values()):
+        for dialect in DIALECTS.values():
+            if dialect.bitrate_bps == bitrate_bps:
+                return dialect, f"by the bit rate alone, which is an assumption; {why}"
+    return None, why
+
+
+def _silent(survey: Survey, bitrate_bps: int) -> NoAnswerError:
+    foreign = ""
+    if survey.foreign_frames:
+        foreign = f"; {counted(survey.foreign_frames, 'frame')} under ids of other protocols came"
+    return NoAnswerError(
+        f"Nobody of the drive system was heard at {bitrate_bps / 1000:g} kbit/s{foreign}.",
+        cause="everything is off or asleep, the wiring is open, or the bit rate is another",
+        remedy="Switch the system on; try --dialect motinova (125 kbit/s) or welling (250).",
+    )
+
+
+def _lines(
+    survey: Survey, rate: BitRate, asked: Dialect, guessed: Dialect | None, why: str
+) -> list[str]:
+    lines = [
+        f"bit rate: {rate}; frames do not tell it",
+        f"dialect:  {guessed.name if guessed else 'unknown'} ({why})",
+    ]
+    if guessed is not None and guessed is not asked:
+        lines.append(f"          it was asked as {asked.name}: use --dialect {guessed.name}")
+    for node, heard in sorted(survey.heard.items(), key=lambda pair: pair[0].value):
+        unasked = ": nothing was asked" if survey.other_tool_heard else ""
+        note = f" (another tool{unasked})" if node.name == "CDL" else ""
+        lines += ["", f"{node.name}{note}", *heard_lines(heard)]
+    if survey.foreign_frames:
+        lines += ["", f"frames under ids of other protocols: {survey.foreign_frames}"]
+    return lines
+
+
+def _bus_document(survey: Survey, rate: BitRate, guessed: Dialect | None, why: str) -> ScanDocument:
+    return {
+        "bitrate_bps": rate.bps,
+        "bitrate_source": rate.source,
+        "bitrate_is_assumed": True,
+        "dialect": guessed.name if guessed else None,
+        "dialect_because": why,
+        "nodes": {node.name.lower(): heard_document(h) for node, h in survey.heard.items()},
+        "foreign_frames": survey.foreign_frames,
+    }

@@ -1,0 +1,216 @@
+"""`flasher write`: write an item of a device by its name, and read it back."""
+
+from __future__ import annotations
+
+import sys
+from typing import Final, Literal, TypedDict
+
+import click
+
+from flasher.api import as_dialect
+from flasher.cli import values
+from flasher.cli.framework import argument, command, option
+from flasher.cli.options import Bus, bus_options, target_option
+from flasher.cli.output import Output
+from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
+from flasher.cli.stop import stop_on_signal
+from flasher.errors import ExitCode, InterruptedByUserError, UsageError
+from flasher.host.items import writable
+from flasher.host.write import FieldChange, WritePlan, Written, field_changes, plan_write
+from flasher.protocol.fields import Content, label
+from flasher.protocol.spec import BMS, WELLING, Dialect, Target
+
+_EXAMPLES: Final = """\
+examples:
+  flasher write --list
+  flasher write user-string-1 -t bms "rack 7" -i socketcan -c can0
+  flasher write serial-number -t bms W2605001 --manufacturer --yes -i socketcan -c can0
+  flasher write production-information -t bms ACME SUZHOU 20260517 --manufacturer --mock
+  flasher write check-code -t bms 00112233445566778899AABB --mock
+
+Shows the old and the new value and asks before it writes; without a terminal --yes is needed. Exit
+code 10 when the write is not confirmed or reads back differently, 5 when the device is silent.
+"""
+
+
+class ChangeDocument(TypedDict):
+    """A field of a write; null where a value is not known."""
+
+    old: str | None
+    new: str
+    read_back: str | None
+
+
+class WrittenDocument(TypedDict):
+    """How a write ended."""
+
+    target: str
+    item: str
+    confirmed: bool
+    """True when the device acknowledged the write."""
+    fields: dict[str, ChangeDocument]
+
+
+class NotWrittenDocument(TypedDict):
+    """The write was not agreed to."""
+
+    written: Literal[False]
+
+
+class WritableItem(TypedDict):
+    """What an item is made of."""
+
+    fields: list[str]
+    manufacturer_only: bool
+
+
+class WritableDocument(TypedDict):
+    """The items that can be written."""
+
+    items: dict[str, WritableItem]
+
+
+DOCUMENTS: Final = (WrittenDocument, NotWrittenDocument, WritableDocument)
+
+
+def _items(ctx: click.Context) -> list[str]:
+    """What a shell offers: what can be written to the target, where it is given."""
+    dialect = as_dialect(ctx.params.get("dialect_name") or WELLING.name)
+    return list(writable(ctx.params.get("target") or BMS, dialect))
+
+
+@command(
+    epilog=_EXAMPLES,
+    exit_codes=(
+        ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.VERIFICATION, ExitCode.INTERRUPTED,
+    ),
+)  # fmt: skip
+@argument(
+    "item",
+    required=False,
+    metavar="ITEM",
+    shell_complete=values.offers(_items),
+    help="what to write; see --list",
+)
+@argument("new", nargs=-1, metavar="VALUE...", help="one for each of its fields")
+@target_option(required=False)
+@option(
+    "--list", "is_list", is_flag=True, panel="write", brief=True, help="list the items and stop"
+)
+@option("-y", "--yes", is_flag=True, panel="write", brief=True, help="do not ask")
+@option(
+    "--manufacturer",
+    is_flag=True,
+    panel="write",
+    help="write what the document reserves for the manufacturer",
+)
+@bus_options()
+@recording_options
+def write(
+    output: Output,
+    target: Target | None,
+    bus: Bus,
+    recorded: RecordingOptions,
+    *,
+    item: str | None,
+    new: tuple[str, ...],
+    is_list: bool,
+    yes: bool,
+    manufacturer: bool,
+) -> int:
+    """Write an item of a device by its name, and read it back. --list names the items. Firmware is
+    not written by this command: see flasher flash.
+    """
+    target = target or BMS
+    if is_list:
+        return _list(target, bus.dialect, output)
+    if item is None:
+        raise UsageError("Nothing to write was named.", remedy="See flasher write --list.")
+    plan = plan_write(item, list(new), target, dialect=bus.dialect, manufacturer=manufacturer)
+    if not yes and not _is_terminal():
+        raise UsageError(
+            f"Writing {plan.writable.name} needs a confirmation, and there is no terminal to ask.",
+            remedy="Add --yes.",
+        )
+    with recorded_connection(recorded, bus, output, target) as (connection, record):
+        device = connection.device(target, dialect=bus.dialect, taps=record.taps)
+        with stop_on_signal() as stopped:
+            old = device.content_before(plan, cancelled=stopped)
+        _show(plan, old, output)
+        if not yes and not _agrees(plan):
+            output.progress("nothing was written")
+            output.document({"written": False}, exit_code=ExitCode.INTERRUPTED)
+            return ExitCode.INTERRUPTED
+        with stop_on_signal(lambda: output.error_line("the write ends first ...")):
+            written = device.carry_out(plan, old)
+        if (error := written.error()) is not None:
+            record.failed(error)
+    return _conclude(written, output)
+
+
+def _show(plan: WritePlan, old: Content | None, output: Output) -> None:
+    output.result(f"{plan.target.node.name} {plan.writable.name}")
+    for change in field_changes(plan, old):
+        before = "unknown" if change.old is None else repr(change.old)
+        output.result(f"  {change.name:<16} old {before}  new {change.new!r}")
+
+
+def _conclude(written: Written, output: Output) -> int:
+    error = written.error()
+    if error is not None:
+        output.failure(error, **_document(written))
+        return error.exit_code
+    read_back = "read back right" if written.read_back else "there is no query to read it back"
+    output.result(f"written: confirmed by the device, {read_back}")
+    output.document(_document(written))
+    return ExitCode.OK
+
+
+def _document(written: Written) -> WrittenDocument:
+    return {
+        "target": written.plan.target.name,
+        "item": written.plan.writable.name,
+        "confirmed": written.is_confirmed,
+        "fields": {change.name.replace(" ", "_"): _change(change) for change in written.changes},
+    }
+
+
+def _change(change: FieldChange) -> ChangeDocument:
+    return {"old": change.old, "new": change.new, "read_back": change.read_back}
+
+
+def _is_terminal() -> bool:
+    return sys.stdin.isatty() and sys.stderr.isatty()
+
+
+def _agrees(plan: WritePlan) -> bool:
+    sys.stderr.write(f"Write {plan.writable.name} to the {plan.target.node.name}? [y/N] ")
+    sys.stderr.flush()
+    try:
+        answer = sys.stdin.readline()
+    except KeyboardInterrupt as interrupt:
+        sys.stderr.write("\n")
+        raise InterruptedByUserError(
+            f"Interrupted at the question: nothing was written to the {plan.target.node.name}, and "
+            "nothing was sent to it but the question for the old value.",
+        ) from interrupt
+    return answer.strip().lower() in {"y", "yes"}
+
+
+def _list(target: Target, dialect: Dialect, output: Output) -> int:
+    items = writable(target, dialect)
+    for name, entry in items.items():
+        values = " ".join(label(n, codec).upper().replace(" ", "_") for n, codec in entry.fields)
+        only = "  (manufacturer only)" if entry.item.manufacturer_only else ""
+        output.result(f"{name:<24} {values}{only}")
+    if not items:
+        output.result(f"The documents give the tool nothing to write to the {target.node.name}.")
+    document = {
+        name: WritableItem(
+            fields=[field for field, _ in entry.fields],
+            manufacturer_only=entry.item.manufacturer_only,
+        )
+        for name, entry in items.items()
+    }
+    output.document(WritableDocument(items=document))
+    return ExitCode.OK

@@ -1,0 +1,288 @@
+"""Options that several commands have, each declared once: image, target, bus and mock."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import click
+
+from flasher.api import Connection, as_dialect, connect, connect_mock
+from flasher.api import bit_rate as settle_bit_rate
+from flasher.bus.bit_rate import BitRate
+from flasher.cli import values
+from flasher.cli.framework import Decorator, argument, option, option_set
+from flasher.host.options import FRAME_GAP_SHARE, PACKET_GAP_MAX_S
+from flasher.image.image import Image
+from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, FORMATS, load
+from flasher.mock.profile import DeviceProfile
+from flasher.protocol.spec import DIALECTS, TARGET_ALIASES, TARGETS, WELLING, Dialect, Target
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.settings.profile import FILE_NAME
+
+IMPLAUSIBLE: Final = "bytes that do not look like a program for the device"
+"""What --allow-implausible lets through."""
+
+
+# -- the device ------------------------------------------------------------------------------------
+
+
+def target_option(*, required: bool = True) -> Decorator:
+    """Which device."""
+    return option(
+        "-t", "--target", type=values.target, required=required, brief=True, panel="device",
+        metavar="|".join((*TARGETS, *TARGET_ALIASES)),
+        shell_complete=values.offers(values.target_names),
+        help="the device: mc is another name for wmc, pbu for obc",
+    )  # fmt: skip
+
+
+dialect_option: Final = option(
+    "--dialect", "dialect_name", type=click.Choice(tuple(DIALECTS)), default=WELLING.name,
+    panel="device", help="which protocol document holds",
+)  # fmt: skip
+profile_option: Final = option(
+    "--profile", metavar="FILE", type=values.FilePath("toml"), panel="device",
+    help=f"target profile (default: {FILE_NAME} here or in the user's configuration)",
+)  # fmt: skip
+
+
+# -- the image -------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class ImageOptions:
+    """An image file, and what decides which of its bytes are sent."""
+
+    image: str
+    format: str | None
+    base: int | None
+    range_: tuple[int, int] | None
+    fill_gaps_up_to: int
+    allow_outside_vector: bool
+
+    def load(self, *, force: bool = False) -> Image:
+        """The image. Raises ImageError, UsageError."""
+        return load(
+            self.image,
+            format=self.format,
+            base=self.base,
+            range_=self.range_,
+            fill_gaps_up_to=self.fill_gaps_up_to,
+            allow_outside_vector=self.allow_outside_vector or force,
+        )
+
+
+image_options: Final = option_set(
+    "image",
+    ImageOptions,
+    argument(
+        "image", metavar="IMAGE", type=values.FilePath(*values.IMAGE_SUFFIXES),
+        help="Intel HEX, S-record, ELF or raw binary",
+    ),
+    option(
+        "--format", type=click.Choice(FORMATS), panel="image",
+        help="read IMAGE as this, do not detect",
+    ),
+    option(
+        "--base", type=values.number, metavar="ADDRESS", panel="image", brief=True,
+        help="address of a raw binary's first byte",
+    ),
+    option(
+        "--range", "range_", type=values.address_range, metavar="START:END", panel="image",
+        help="send only these addresses, END exclusive",
+    ),
+    option(
+        "--fill-gaps-up-to", type=values.number, default=str(DEFAULT_FILL_GAPS_UP_TO),
+        metavar="BYTES", panel="image",
+        help="fill gaps between segments with FF up to this size; larger ones are refused",
+    ),
+    option(
+        "--allow-outside-vector", is_flag=True, panel="image",
+        help="send an image whose reset vector points outside of it",
+    ),
+)  # fmt: skip
+
+
+def allow_implausible_option(panel: str | None = None) -> Decorator:
+    """For a command that has no other --allow-... for a device."""
+    return option(
+        "--allow-implausible", is_flag=True, panel=panel, help=f"let through {IMPLAUSIBLE}"
+    )
+
+
+def gap_options(function: Callable[..., int]) -> Callable[..., int]:
+    """--frame-gap and --packet-gap."""
+    frame_gap_max_s = FRAME_GAP_SHARE * DEFAULT_TIMINGS.inter_frame_timeout_s
+    function = option(
+        "--packet-gap", type=values.seconds, metavar="S", panel="upgrade",
+        help="seconds of silence before each packet, for slow receivers; at most "
+        f"{PACKET_GAP_MAX_S:g}",
+    )(function)  # fmt: skip
+    decorated: Callable[..., int] = option(
+        "--frame-gap", type=values.seconds, metavar="S", panel="upgrade",
+        help="seconds of silence between the frames of a message, for slow receivers; at most "
+        f"{frame_gap_max_s:g}, or as a profile's inter_frame_timeout_s allows",
+    )(function)  # fmt: skip
+    return decorated
+
+
+# -- the bus ---------------------------------------------------------------------------------------
+
+_KEYWORDS: Final = ("interface", "channel", "bitrate", "fd", "data_bitrate")
+"""Options that have the names of python-can's keywords."""
+_FILTER: Final = re.compile(r"([0-9A-Fa-f]+)([:~])([0-9A-Fa-f]+)")
+_INVERTED: Final = 0x20000000
+"""python-can's flag for a filter that lets through all others."""
+
+
+def _timing(pairs: tuple[tuple[str, str], ...]) -> Any:
+    """python-can's bit timing. Raises click.BadParameter."""
+    import can  # noqa: PLC0415  slow
+
+    try:
+        given: dict[str, Any] = {key: int(value) for key, value in pairs}
+        return (can.BitTimingFd if "nom_brp" in given else can.BitTiming)(**given)
+    except (TypeError, ValueError) as error:
+        raise click.BadParameter(f"{error}", param_hint="--timing") from error
+
+
+def can_filter(text: str) -> dict[str, int]:
+    """A filter of python-can: ID:MASK, or ID~MASK for all others, in hexadecimal."""
+    match = _FILTER.fullmatch(text)
+    if match is None:
+        raise click.BadParameter(f"{text!a} is not ID:MASK in hexadecimal")
+    inverted = _INVERTED if match[2] == "~" else 0
+    return {"can_id": int(match[1], 16) | inverted, "can_mask": int(match[3], 16)}
+
+
+@dataclass(frozen=True)
+class Bus:
+    """The bus that the options name: an adapter, or a device model in this process."""
+
+    dialect_name: str = WELLING.name
+    mock: bool = False
+    mock_speed: float = 1.0
+    interface: str | None = None
+    channel: str | None = None
+    bitrate: int | None = None
+    fd: bool | None = None
+    data_bitrate: int | None = None
+    timing: tuple[tuple[str, str], ...] = ()
+    can_filters: tuple[dict[str, int], ...] = ()
+    bus_kwargs: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def dialect(self) -> Dialect:
+        """The protocol document that holds."""
+        return as_dialect(self.dialect_name)
+
+    @cached_property
+    def config(self) -> dict[str, Any]:
+        """The keywords for python-can that were given on the command line."""
+        given = {name: getattr(self, name) for name in _KEYWORDS if getattr(self, name) is not None}
+        if self.timing:
+            given["timing"] = _timing(self.timing)
+        if self.can_filters:
+            given["can_filters"] = list(self.can_filters)
+        if self.bus_kwargs:
+            from can.util import cast_from_string  # noqa: PLC0415  slow
+
+            given |= {key: cast_from_string(value) for key, value in self.bus_kwargs}
+        return given
+
+    @cached_property
+    def bit_rate(self) -> BitRate:
+        """Asked once: what is planned, said and recorded. Raises UsageError, BusError."""
+        if self.mock:
+            return BitRate(self.dialect.bitrate_bps, "the dialect's")
+        return settle_bit_rate(self.dialect, **self.config)
+
+    def connect(
+        self, target: Target, *, asks: bool = True
+    ) -> contextlib.AbstractContextManager[Connection]:
+        """An adapter, or a whole bicycle with the model of `target`. With `asks` False nothing will
+        be sent.
+        """
+        if self.mock:
+            riding = DeviceProfile(battery_use="riding")  # so that there is something to see
+            return connect_mock(
+                target, self.dialect, speed=self.mock_speed, system=True, profile=riding
+            )
+        return connect(self.dialect, holder=holder() if asks else None, **self.config)
+
+
+def holder() -> str:
+    """What other programs are told of this command while it has the adapter."""
+    return " ".join(click.get_current_context().command_path.split()[:2])
+
+
+_ADAPTER: Final = (
+    option(
+        "-i", "--interface", type=values.interface, metavar="BACKEND", panel="bus", brief=True,
+        shell_complete=values.offers(values.interface_names),
+        help="python-can's back end for the adapter: socketcan, pcan, kvaser, vector, slcan, ...",
+    ),
+    option(
+        "-c", "--channel", metavar="CHANNEL", panel="bus", brief=True,
+        shell_complete=values.offers(values.channels),
+        help="which adapter or port: can0, PCAN_USBBUS1, 0, COM3, ...",
+    ),
+    option(
+        "-b", "--bitrate", type=int, metavar="BPS", panel="bus",
+        help="bits per second (default: the dialect's)",
+    ),
+    option(
+        "--fd", is_flag=True,
+        default=None, panel="bus",
+        help="open the adapter for CAN FD; the protocol itself uses classical frames",
+    ),
+    option(
+        "--data-bitrate", type=int, metavar="BPS", panel="bus",
+        help="bits per second of the data phase of CAN FD",
+    ),
+    option(
+        "--timing", type=values.key_value, multiple=True, metavar="KEY=VALUE", panel="bus",
+        help="bit timing: f_clock, brp, tseg1, tseg2, sjw, ..., each by an option of its own",
+    ),
+    option(
+        "--filter", "can_filters", type=can_filter, multiple=True, metavar="ID:MASK", panel="bus",
+        help="a filter of the adapter, in hexadecimal; ID~MASK for all others; may be repeated. At "
+        "least the device's answers must pass: 725:7FF and 720:7FF for the BMS",
+    ),
+    option(
+        "--bus-kwargs", type=values.key_value, multiple=True, metavar="KEY=VALUE", panel="bus",
+        help="one more argument for the back end, such as app_name=CANalyzer; may be repeated",
+    ),
+)  # fmt: skip
+
+
+def mock_options(
+    what: str, speed: Callable[[str], float] = values.seconds
+) -> tuple[Decorator, ...]:
+    """--mock and its speed; `what` says what it is used for."""
+    return (
+        option("--mock", is_flag=True, panel="without hardware", brief=True, help=what),
+        option(
+            "--mock-speed", type=speed, default=1.0, metavar="X", panel="without hardware",
+            help="times as fast as a real bus; 0 takes no time",
+        ),
+    )  # fmt: skip
+
+
+adapter_options: Final = option_set("bus", Bus, *_ADAPTER)
+"""The bus of a command that has neither a dialect nor a mock in place of the adapter."""
+
+
+def bus_options(
+    *,
+    mock: str | None = "use a device model in this process",
+    speed: Callable[[str], float] = values.seconds,
+) -> Decorator:
+    """The bus of a command: dialect, adapter, and the mock in its place unless that is None."""
+    in_its_place = () if mock is None else mock_options(mock, speed)
+    return option_set("bus", Bus, dialect_option, *in_its_place, *_ADAPTER)

@@ -1,0 +1,1 @@
+"""The commands of the end-of-line station."""

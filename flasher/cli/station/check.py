@@ -1,0 +1,99 @@
+"""`flasher station check`: a recipe with its images, and a station's file, before a shift."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import date, datetime
+from types import SimpleNamespace
+
+from flasher.cli.output import Output, byte_count
+from flasher.cli.station.documents import (
+    CheckedTargetDocument,
+    RecipeFindingDocument,
+    StationCheckDocument,
+)
+from flasher.errors import ExitCode, UsageError
+from flasher.protocol.text import printable
+from flasher.station.adapters import Resolved, detect, resolve
+from flasher.station.config import load_config
+from flasher.station.recipe import fill
+from flasher.station.recipe_file import LoadedRecipe, load_checked
+
+
+def run(options: SimpleNamespace, output: Output) -> int:
+    """Run the command; returns the exit code."""
+    # The day is the plant's: it goes into what is written.
+    day = datetime.now().astimezone().date()
+    try:
+        recipe = load_checked(options.recipe, day)
+    except UsageError as error:
+        if not error.faults:
+            raise
+        findings = [
+            RecipeFindingDocument(
+                where=each.place or "the whole file", what=each.what, remedy=each.remedy
+            )
+            for each in error.faults
+        ]
+        output.failure(error, findings=findings)
+        return error.exit_code
+    for line in _lines(recipe, day):
+        output.result(line)
+    sockets = {} if options.sockets is None else adapters_of(options)
+    for name, adapter in sockets.items():
+        output.result(f"socket {printable(name)}: {printable(adapter)}")
+    output.result("nothing speaks against it")
+    output.document(_document(recipe, sockets))
+    return ExitCode.OK
+
+
+def adapters_of(options: SimpleNamespace) -> dict[str, str]:
+    """The adapter of each socket of --sockets. Raises UsageError, BusError."""
+    sockets = load_config(options.sockets).socket
+    return {each.config.name: _adapter(each) for each in resolve(sockets, detect(sockets))}
+
+
+def _adapter(socket: Resolved) -> str:
+    if socket.bus is None:
+        return "virtual units"
+    return f"{socket.bus['interface']} {socket.bus['channel']}"
+
+
+def _lines(recipe: LoadedRecipe, day: date) -> Iterator[str]:
+    said = recipe.recipe
+    yield printable(f"{recipe.path}: {said.name}, part {said.part}, revision {said.revision}")
+    yield f"  sha256:   {recipe.sha256}"
+    for target in recipe.targets:
+        version = target.version or "no version named"
+        yield printable(
+            f"  flash:    {target.name.upper()}: {target.firmware.image}, {version}, "
+            f"{byte_count(target.image.size_bytes)}; {target.required.words}"
+        )
+    yield printable(f"  example:  {said.serial_number.example}")
+    scan = recipe.scan(said.serial_number.example, day)
+    for write in said.write:
+        values = " ".join(fill(each, scan) for each in write.values)
+        yield printable(f"  write:    {write.target.upper()} {write.item}: {values}")
+    for kept in said.unchanged:
+        yield printable(f"  keep:     {kept.target.upper()} {kept.item}")
+
+
+def _document(recipe: LoadedRecipe, sockets: dict[str, str]) -> StationCheckDocument:
+    return StationCheckDocument(
+        recipe=recipe.recipe.name,
+        part=recipe.recipe.part,
+        revision=recipe.recipe.revision,
+        sha256=recipe.sha256,
+        targets=[
+            CheckedTargetDocument(
+                target=target.name,
+                image=printable(target.firmware.image),
+                sha256=target.image.sha256,
+                size_bytes=target.image.size_bytes,
+                version=target.version,
+                required=target.required.words,
+            )
+            for target in recipe.targets
+        ],
+        sockets=sockets,
+    )

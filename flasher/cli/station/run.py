@@ -1,0 +1,298 @@
+"""`flasher station run`: scans in, units flashed, a view of it; ends by itself when the scans are
+used up.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack
+from datetime import datetime
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Final
+
+from flasher.cli.output import Output
+from flasher.cli.station.documents import (
+    EndedUnitDocument,
+    FiguresDocument,
+    RefusedScanDocument,
+    StationRunDocument,
+    figures_document,
+)
+from flasher.cli.station.keys import LineReader, Typing, keyboard
+from flasher.cli.station.scans import ScanFile, read_scans
+from flasher.cli.station.setup import (
+    Place,
+    find_place,
+    make_setups,
+    opened_records,
+    operator_of,
+)
+from flasher.cli.station.text import figures_line
+from flasher.cli.station.views import JsonLines, Lines, Table, View
+from flasher.cli.stop import stop_on_signal
+from flasher.errors import BusError, ExitCode, FlasherError, InterruptedByUserError, UsageError
+from flasher.protocol.text import printable
+from flasher.station import codes
+from flasher.station.options import StationOptions
+from flasher.station.recipe_file import load_checked
+from flasher.station.records import RecordError, Store
+from flasher.station.station import Station
+from flasher.station.supervisor import Launch, ProcessPort
+
+LAUNCH: Launch = ProcessPort
+"""How a socket's process is made."""
+END_LIMIT_S: Final = 10.0
+"""How long stopped runs have to say their end; what does not is INTERRUPTED at the next start."""
+
+
+def run(options: SimpleNamespace, output: Output) -> int:
+    """Run the command; returns the exit code. Without a terminal it speaks JSON."""
+    is_terminal = sys.stdout.isatty()
+    if not (is_terminal or options.lines):
+        output.json_wanted = True
+    scans = None if options.scans is None else read_scans(options.scans)
+    recipe = load_checked(options.recipe, datetime.now().astimezone().date())
+    place = find_place(options)
+    with opened_records(options, place.config) as store:
+        session = _Session(options, output, place, store, _choose_view(options, output))
+        session.station = Station(
+            store,
+            recipe,
+            make_setups(options, place, recipe, store),
+            operator=operator_of(options),
+            lot=options.lot,
+            on_event=session.view,
+            options=StationOptions(
+                scans_labels=session.scans_itself,
+                end_limit_s=END_LIMIT_S,
+                mixes_virtual=options.mix_virtual,
+            ),
+            launch=LAUNCH,
+        )
+        if scans is not None:
+            session.file = ScanFile(
+                scans, [each.name for each in session.station.sockets], session.station.submit
+            )
+        session.work()
+        return session.report()
+
+
+def _choose_view(options: SimpleNamespace, output: Output) -> View:
+    if output.json_wanted:
+        return JsonLines(output)
+    if options.lines or os.environ.get("TERM") == "dumb":
+        return Lines(output)
+    return Table(output)
+
+
+class _Session:
+    """A station at work, from its start to its end."""
+
+    station: Station
+
+    def __init__(
+        self, options: SimpleNamespace, output: Output, place: Place, store: Store, view: View
+    ) -> None:
+        self.view = view
+        self.file: ScanFile | None = None
+        self.scans_itself = place.is_virtual and options.scans is None and not options.scan_by_hand
+        self._options = options
+        self._output = output
+        self._store = store
+        self._pipe: LineReader | None = None
+        self._typing: Typing | None = None
+        self._was_submitted = False
+        self._is_used_up = False
+        self._is_stopped = False
+        self._failure: FlasherError | None = None
+        self._is_temporary = options.mock_sockets is not None and options.database is None
+
+    # -- at work ----------------------------------------------------------------------------------
+
+    def work(self) -> None:
+        """Until the scans are used up, or somebody ends it. Raises RecordError when the station
+        cannot begin.
+        """
+        try:
+            with ExitStack() as stack:
+                stopped = stack.enter_context(stop_on_signal(self._say_stop, self._stop_now))
+                stack.enter_context(self.view)
+                self._open_scans(stack)
+                self.station.run(until=lambda: self._is_over(is_stopped=stopped()))
+        except KeyboardInterrupt:
+            self._failure = _stopped_now()
+
+    def _open_scans(self, stack: ExitStack) -> None:
+        """Listen to the keyboard, or to the pipe where that is where the scans come from."""
+        if sys.stdin is None:
+            return
+        if sys.stdin.isatty():
+            if isinstance(self.view, Table):
+                self._typing = Typing(self.station.submit)
+                stack.enter_context(keyboard(self._typing))
+            else:
+                LineReader(sys.stdin, self.station.submit).start()
+        elif self.file is None and not self.scans_itself:
+            self._pipe = LineReader(sys.stdin, self.station.submit)
+            self._pipe.start()
+
+    def _stop_now(self) -> None:
+        """A second Ctrl-C; called in the handler of the signal."""
+        # No exception: it could tear the station's turn, and a socket would wait for its answer.
+        self._failure = _stopped_now()
+        self.station.abort_all()
+
+    def _say_stop(self) -> None:
+        self._is_stopped = True
+        text = "No further unit is begun; those that run are finished. Ctrl-C again stops them."
+        self.view.board.said, self.view.board.is_refusal = text, False
+        self._output.progress(text)
+        self.view.refresh()
+
+    def _is_over(self, *, is_stopped: bool) -> bool:
+        """Asked once a turn, in the station's thread."""
+        if self._typing is not None:
+            self.view.typed = self._typing.text
+        self.view.refresh()
+        if is_stopped:
+            return True
+        try:
+            self._check_sockets()
+            if self.file is not None and not self.station.is_line_stopped:
+                self.file.turn(self.station.sockets, self.view.board.labels)
+        except FlasherError as error:
+            self._failure = error
+            return True
+        if self.station.is_line_stopped and (self.file or self.scans_itself) and not self._typing:
+            return not self.station.is_running  # nobody is there who could scan RESUME
+        # What was submitted last is understood only in the station's next turn.
+        was_submitted, self._was_submitted = self._was_submitted, self._scans_used_up()
+        self._is_used_up = was_submitted and self._was_submitted and self._is_quiet()
+        return self._is_used_up
+
+    def _check_sockets(self) -> None:
+        """Raises BusError when no socket will ever work again."""
+        broken = self.view.board.broken
+        if broken.keys() >= {each.name for each in self.station.sockets}:
+            name, reason = next(iter(broken.items()))
+            raise BusError(
+                f"No socket can work; socket {printable(name)}: {printable(reason)}",
+                remedy="Mend it, then start the station again.",
+            )
+
+    def _scans_used_up(self) -> bool:
+        if self.file is not None:
+            return self.file.is_used_up
+        if self.scans_itself:
+            wanted = self._options.units
+            return wanted is not None and self.view.board.arrivals >= wanted
+        return self._pipe is not None and self._pipe.is_at_end
+
+    def _is_quiet(self) -> bool:
+        """True when nothing runs, and no label waits."""
+        is_busy = any(socket.is_busy for socket in self.station.sockets)
+        return not (is_busy or self.view.board.waiting)
+
+    # -- its end ----------------------------------------------------------------------------------
+
+    def report(self) -> int:
+        """Say what came of it; the exit code."""
+        board = self.view.board
+        code = ExitCode.PARTIAL if board.bad_units or self._not_done() else ExitCode.OK
+        for line in self._summary():
+            self._output.result(line)
+        error = self._failure or self._line_error() or self._incomplete()
+        if error is not None:
+            self._output.failure(error, **self._document())
+            return error.exit_code
+        self._output.document(self._document(), exit_code=code)
+        return code
+
+    def _line_error(self) -> FlasherError | None:
+        """Why the line stood at the end."""
+        stopped = self.view.board.stopped
+        if stopped is None:
+            return None
+        is_record = stopped.code == codes.RECORD_NOT_SAVED.name
+        kind = RecordError if is_record else UsageError
+        return kind(f"The line was stopped: {stopped.reason}", remedy=stopped.remedy)
+
+    def _incomplete(self) -> FlasherError | None:
+        """A list that was not worked off to its end; a shift just ends."""
+        is_list = self.file is not None or bool(self._options.units)
+        if not is_list or self._is_used_up:
+            return None
+        return InterruptedByUserError(
+            "Ended before all units were done.", remedy="Start it again with those that are left."
+        )
+
+    def _not_done(self) -> list[str]:
+        """Labels of the file that were refused, and have no run."""
+        if self.file is None:
+            return []
+        ended = self.view.board.ended
+        refused = {each.text for each in self.view.board.refused}
+        return sorted(label for label in self.file.labels if label in refused - ended.keys())
+
+    def _summary(self) -> Iterator[str]:
+        board = self.view.board
+        if board.virtual_sockets:
+            yield board.virtual_words
+        if board.figures is not None:
+            yield figures_line(board.figures)
+        for each in board.bad_units:
+            text = f"{each.outcome.value:<8} {each.serial}, socket {each.socket}: {each.code}: "
+            yield printable(text + each.text)
+            yield printable(f"{'':8} {each.action}")
+        for label in self._not_done():
+            last = next(each for each in reversed(board.refused) if each.text == label)
+            yield printable(f"{'refused':<8} {label}: {last.code}: {last.reason} {last.remedy}")
+        if not self._is_temporary:
+            yield f"records: {self._store.database.location.shown}"
+
+    def _figures(self) -> FiguresDocument | None:
+        try:
+            return figures_document(self.station.figures)
+        except RecordError:
+            return None
+
+    def _document(self) -> StationRunDocument:
+        board, recipe = self.view.board, self.station.recipe.recipe
+        location = self._store.database.location
+        return StationRunDocument(
+            station=self._store.station,
+            recipe=recipe.name,
+            revision=recipe.revision,
+            records="" if self._is_temporary else str(location.file or Path(location.shown)),
+            is_complete=self._is_used_up,
+            figures=self._figures(),
+            units=[
+                EndedUnitDocument(
+                    serial=each.serial,
+                    socket=each.socket,
+                    run_id=each.run_id,
+                    outcome=each.outcome.name.lower(),
+                    code=each.code,
+                    text=each.text,
+                    action=each.action,
+                    duration_s=each.duration_s,
+                    is_virtual=each.is_virtual,
+                )
+                for each in board.ended.values()
+            ],
+            refused=[
+                RefusedScanDocument(
+                    text=each.text, code=each.code, reason=each.reason, remedy=each.remedy
+                )
+                for each in board.refused
+            ],
+        )
+
+
+def _stopped_now() -> InterruptedByUserError:
+    return InterruptedByUserError(
+        "Stopped at once.", remedy="Units that were being flashed are RECHECK: scan them again."
+    )

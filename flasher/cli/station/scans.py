@@ -1,0 +1,117 @@
+"""A file of scans, worked off as a patient operator would: each label when a unit waits for it."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Collection, Iterable, Mapping
+from typing import Final
+
+from flasher.cli.station.keys import Submit
+from flasher.errors import UsageError
+from flasher.files import read
+from flasher.protocol.text import printable
+from flasher.station.scans import Command, Label, Word, understand
+from flasher.station.station import SocketView
+
+FILE_MAX_SIZE: Final = 4 * 1024 * 1024
+"""In bytes."""
+OPTION: Final = "--scans"
+
+
+def read_scans(path: str) -> list[str]:
+    """The scans of a file; empty lines and those that begin with # are none. Raises UsageError."""
+    shown = printable(path)
+    raw = read(path, FILE_MAX_SIZE, what="file of scans")
+    try:
+        text = raw.decode("utf-8-sig")
+    except ValueError as error:
+        raise UsageError(f"{shown} cannot be read: it is no text.", where=OPTION) from error
+    lines = [line.strip() for line in text.splitlines()]
+    scans = [line for line in lines if line and not line.startswith("#")]
+    if not scans:
+        raise UsageError(
+            f"{shown} holds no scans.",
+            where=OPTION,
+            remedy="One scan a line: a label, or a command.",
+        )
+    return scans
+
+
+class ScanFile:
+    """The scans of a file. A label goes to the socket that was named before it, else to the next
+    one in which a unit waits; a virtual unit gets its own label, where the file has it.
+
+    Units are waited for without end: the line is the clock.
+    """
+
+    def __init__(self, scans: list[str], sockets: Collection[str], submit: Submit) -> None:
+        """Raises UsageError for a socket that there is not."""
+        names = {name.lower() for name in sockets}
+        for each in map(understand, scans):
+            if not isinstance(each, Command) or each.word is not Word.SOCKET:
+                continue
+            if each.argument.lower() not in names:
+                raise UsageError(
+                    f"There is no socket {printable(each.argument)}.",
+                    where=OPTION,
+                    remedy=f"There are: {', '.join(map(printable, sockets))}.",
+                )
+        self.labels = frozenset(
+            label.serial for label in map(understand, scans) if isinstance(label, Label)
+        )
+        self._left = deque(scans)
+        self._submit = submit
+
+    @property
+    def is_used_up(self) -> bool:
+        """True when every scan was submitted."""
+        return not self._left
+
+    def turn(self, sockets: Iterable[SocketView], borne: Mapping[str, str]) -> None:
+        """Submit the next scan, when its time has come. `borne` are the labels of virtual units, by
+        their sockets. Raises UsageError where no socket can tell that a unit is in it.
+        """
+        if not self._left:
+            return
+        sockets = tuple(sockets)
+        working = [socket for socket in sockets if socket.can_work]
+        if working and not any(socket.sees_units for socket in working):
+            raise UsageError(
+                "No socket of this station sees whether a unit is in it.",
+                where=OPTION,
+                remedy="Scan each unit when it is in its socket.",
+            )
+        scan = understand(self._left[0])
+        if isinstance(scan, Label):
+            self._label(sockets, borne)
+        elif isinstance(scan, Command) and scan.word is Word.SOCKET and len(self._left) > 1:
+            named = next(e for e in sockets if e.name.lower() == scan.argument.lower())
+            if named.awaits_label:
+                self._submit(self._left.popleft())
+                self._submit(self._left.popleft())
+        else:
+            self._submit(self._left.popleft())
+
+    def _label(self, sockets: Iterable[SocketView], borne: Mapping[str, str]) -> None:
+        """Give a label to a unit that waits."""
+        ahead = self._until_command()
+        for socket in sockets:
+            if not (socket.awaits_label and socket.sees_units):
+                continue
+            own = borne.get(socket.name, "")
+            # A virtual unit whose label comes later in the file waits for it.
+            label = own if own in ahead else next((e for e in ahead if e not in borne.values()), "")
+            if label:
+                self._left.remove(label)
+                self._submit(f"{Word.SOCKET.value} {socket.name}")
+                self._submit(label)
+                return
+
+    def _until_command(self) -> list[str]:
+        """The labels up to the next command."""
+        ahead: list[str] = []
+        for text in self._left:
+            if not isinstance(understand(text), Label):
+                break
+            ahead.append(text)
+        return ahead

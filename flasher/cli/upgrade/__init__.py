@@ -1,0 +1,1 @@
+"""Commands that upgrade a device, or look at what would be sent."""

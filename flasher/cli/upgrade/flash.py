@@ -1,0 +1,472 @@
+"""`flasher flash` and `flasher rescue`: one upgrade, from the file to the last line."""
+
+from __future__ import annotations
+
+import shlex
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass, replace
+from typing import Final
+
+import click
+
+from flasher import api
+from flasher.cli import values
+from flasher.cli.framework import command, option, option_set, retyped
+from flasher.cli.options import (
+    IMPLAUSIBLE,
+    Bus,
+    ImageOptions,
+    bus_options,
+    gap_options,
+    holder,
+    image_options,
+    profile_option,
+    target_option,
+)
+from flasher.cli.output import Output
+from flasher.cli.recording import Recording, RecordingOptions, recording, recording_options
+from flasher.cli.stop import stop_on_signal
+from flasher.cli.upgrade.plan_text import image_lines, plan_document, plan_lines, vector_lines
+from flasher.cli.upgrade.progress import Progress
+from flasher.cli.upgrade.text import (
+    DryRunDocument,
+    UpgradeDocument,
+    check_documents,
+    check_line,
+    dry_run_document,
+    failed,
+    link_lines,
+    summary_lines,
+    upgrade_document,
+    verdict_of,
+)
+from flasher.errors import ExitCode, FlasherError
+from flasher.events import CheckMade
+from flasher.host.identity import WAIVABLE, Check
+from flasher.host.options import DEFAULT_ATTEMPTS, DEFAULT_POWER_UP_TIMEOUT_S, UpgradeOptions
+from flasher.host.outcome import AGAIN
+from flasher.host.session import Result
+from flasher.host.verify import Level
+from flasher.image.cortexm import vector_table
+from flasher.image.plan import Plan
+from flasher.image.release import Release
+from flasher.protocol.spec import Target
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.settings.profile import Profile, load_profile
+
+DOCUMENTS: Final = (UpgradeDocument, DryRunDocument)
+_FLASH_EXAMPLES: Final = """\
+examples:
+  flasher flash firmware.hex -t bms --mock              try it without hardware
+  flasher flash firmware.hex -t bms -i socketcan -c can0
+  flasher flash firmware.bin -t mc -i kvaser -c 0 --base 0x8004000
+  flasher flash firmware.hex -t bms --skip-same-version -i socketcan -c can0
+  flasher flash firmware.hex -t obc --dry-run           show the plan, open no adapter
+
+"Transferred" (every packet acknowledged), "completed" (the device said so) and "running version X"
+(the new application answered) are three claims; the last lines say which of them were made good.
+"""
+_RESCUE_EXAMPLES: Final = """\
+examples:
+  flasher rescue firmware.hex -t bms -i socketcan -c can0
+  flasher rescue firmware.hex -t bms -i pcan -c PCAN_USBBUS1 --wait 300
+  flasher rescue firmware.hex -t bms --mock             try it without hardware
+
+Start it, then take the device's supply away for some seconds and give it back. It works for a
+device that announces itself at power-up only as well as for one that announces itself for ever.
+Nothing is sent before the device announces itself; hardware and running version cannot be checked,
+since no application runs.
+"""
+_EXIT_CODES: Final = (
+    ExitCode.IMAGE,
+    ExitCode.BUS,
+    ExitCode.NO_ANSWER,
+    ExitCode.WRONG_DEVICE,
+    ExitCode.TRANSFER,
+    ExitCode.REFUSED,
+    ExitCode.UNCONFIRMED,
+    ExitCode.VERIFICATION,
+    ExitCode.INTERRUPTED,
+)
+_WAIVERS: Final = {
+    "implausible": IMPLAUSIBLE,
+    "other-target": "an image that its manifest, or a name inside, gives to another target",
+    "hardware": "a hardware version that the manifest does not list",
+    "downgrade": "an image that is older than what runs",
+    "previous-version": "a running version that the manifest does not replace",
+    "in-use": "a vehicle whose battery gives much current",
+    "boot-name": "a bootloader that gives another name than the target's",
+    "boot-version": "a bootloader that is older than the manifest asks for",
+}
+"""What each --allow-... lets through."""
+
+
+# -- what the user chooses -------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class UpgradeChoices:
+    """How the upgrade goes, and which checks are waived."""
+
+    manifest: str | None
+    profile: str | None
+    dry_run: bool
+    verify: str | None
+    retries: int | None
+    attempts: int | None
+    timeout: float | None
+    adapter_wait: float | None
+    frame_gap: float | None
+    packet_gap: float | None
+    nak_next_is_ack: bool
+    allow_implausible: bool
+    allow_other_target: bool
+    allow_hardware: bool
+    allow_downgrade: bool
+    allow_previous_version: bool
+    allow_in_use: bool
+    allow_boot_name: bool
+    allow_boot_version: bool
+    force: bool
+
+    def allows(self, name: str) -> bool:
+        """True when --allow-NAME or --force was given."""
+        return self.force or getattr(self, f"allow_{name.replace('-', '_')}")
+
+    def waived(self) -> frozenset[Check]:
+        """The checks of image and device that are waived."""
+        return frozenset(check for check in WAIVABLE if self.allows(check.value))
+
+    def options(self, profile: Profile, release: Release | None) -> UpgradeOptions:
+        """The profile's choices, the command line's where it makes any, and what the manifest asks
+        of the bootloader. Raises UsageError where they do not go together.
+        """
+        chosen = profile.upgrade_options(
+            packet_tries=self.retries,
+            attempts=self.attempts,
+            timeout_s=self.timeout,
+            adapter_return_s=self.adapter_wait,
+            frame_gap_s=self.frame_gap,
+            packet_gap_s=self.packet_gap,
+            nak_next_is_ack=self.nak_next_is_ack or None,
+            allow_boot_name=self.allows("boot-name") or None,
+        )
+        return chosen if self.allows("boot-version") else api.release_options(chosen, release)
+
+    def level(self, plan: Plan, chosen: UpgradeOptions) -> Level:
+        """How far the upgrade is verified. Raises UsageError for a level that the target has no
+        query for.
+        """
+        if self.verify is None:
+            return api.default_level(plan.target, chosen)
+        level = Level(self.verify)
+        api.check_level(plan, level, chosen)
+        return level
+
+
+_upgrade_options: Final = option_set(
+    "choices",
+    UpgradeChoices,
+    option(
+        "--manifest", metavar="FILE", type=values.FilePath("toml"), panel="image",
+        help="the image's release manifest (default: IMAGE.toml beside the image, if there is one)",
+    ),
+    profile_option,
+    option(
+        "-n", "--dry-run", is_flag=True, panel="upgrade", brief=True,
+        help="show the plan and stop",
+    ),
+    option(
+        "--verify", type=click.Choice([level.value for level in Level]), panel="upgrade",
+        help="after the upgrade: ask the new application for its version, or read the whole image "
+        "back as well (default: version where the target has a query for it, else none)",
+    ),
+    option(
+        "--retries", type=values.count, metavar="N", panel="upgrade",
+        help=f"send a packet up to N times (default {DEFAULT_TIMINGS.packet_tries})",
+    ),
+    option(
+        "--attempts", type=values.count, metavar="N", panel="upgrade",
+        help="begin the upgrade up to N times: when the device restarts, a packet is lost for good "
+        f"or the adapter comes back (default {DEFAULT_ATTEMPTS})",
+    ),
+    option(
+        "--timeout", type=values.seconds, metavar="S", panel="upgrade",
+        help="overall deadline in seconds, of all attempts together (default: computed from the "
+        "plan)",
+    ),
+    option(
+        "--adapter-wait", type=values.seconds, metavar="S", panel="upgrade",
+        help="seconds that a lost adapter may take to come back "
+        f"(default {UpgradeOptions.adapter_return_s})",
+    ),
+    gap_options,
+    option(
+        "--nak-next-is-ack", is_flag=True, panel="upgrade",
+        help="for bootloaders that answer a repeated packet n with NAK n+1",
+    ),
+    *(
+        option(
+            f"--allow-{name}", is_flag=True, panel="checks before the first write",
+            help=f"let through {what}",
+        )
+        for name, what in _WAIVERS.items()
+    ),
+    option(
+        "-f", "--force", is_flag=True, panel="checks before the first write",
+        help="the same as every --allow-... together; neither a damaged file nor a second tool is "
+        "waived by any",
+    ),
+)  # fmt: skip
+
+
+# -- the commands ----------------------------------------------------------------------------------
+
+
+@command(epilog=_FLASH_EXAMPLES, exit_codes=(*_EXIT_CODES, ExitCode.NOTHING_TO_DO))
+@target_option()
+@image_options
+@_upgrade_options
+@option(
+    "--skip-same-version",
+    is_flag=True,
+    panel="upgrade",
+    help="leave a device alone that already runs the image's version: exit code 11",
+)
+@bus_options(mock="upgrade a device model in this process", speed=values.speed)
+@recording_options
+def flash(
+    output: Output,
+    target: Target,
+    image: ImageOptions,
+    choices: UpgradeChoices,
+    bus: Bus,
+    recorded: RecordingOptions,
+    *,
+    skip_same_version: bool,
+) -> int:
+    """Upgrade a device: ask it who it is, check that the image belongs there, reset it into its
+    bootloader, transfer, wait for the final answer, verify. A device that sits in its bootloader
+    already, and announces itself, goes straight on; one that announces itself only at power-up
+    needs `flasher rescue`.
+    """
+    upgrade = _Upgrade(output, target, image, choices, bus, recorded)
+    return upgrade.run(skip_same_version=skip_same_version)
+
+
+@command(epilog=_RESCUE_EXAMPLES, exit_codes=_EXIT_CODES)
+@target_option()
+@image_options
+@_upgrade_options
+@option(
+    "--wait",
+    type=values.seconds,
+    metavar="S",
+    panel="upgrade",
+    brief=True,
+    help=f"seconds to wait for the announcement (default {DEFAULT_POWER_UP_TIMEOUT_S:g})",
+)
+@bus_options(mock="upgrade a device model in this process", speed=values.speed)
+@recording_options
+def rescue(
+    output: Output,
+    target: Target,
+    image: ImageOptions,
+    choices: UpgradeChoices,
+    bus: Bus,
+    recorded: RecordingOptions,
+    *,
+    wait: float | None,
+) -> int:
+    """Upgrade a device that does not start any more: wait for the announcement that its bootloader
+    makes at power-up, answer it, transfer, wait for the final answer, verify.
+    """
+    upgrade = _Upgrade(output, target, image, choices, bus, recorded)
+    return upgrade.run(at_power_up=True, power_up_timeout_s=wait)
+
+
+@dataclass
+class _Upgrade:
+    """One upgrade, and what is said about it."""
+
+    output: Output
+    target: Target
+    image: ImageOptions
+    choices: UpgradeChoices
+    bus: Bus
+    recorded: RecordingOptions
+
+    def run(
+        self,
+        *,
+        at_power_up: bool = False,
+        power_up_timeout_s: float | None = None,
+        skip_same_version: bool = False,
+    ) -> int:
+        """Returns the exit code."""
+        output, choices = self.output, self.choices
+        output.ending = failed
+        profile = load_profile(choices.profile, self.target, self.bus.dialect)
+        release = api.find_release(self.image.image, choices.manifest)
+        image = api.release_checked(self.image.load(force=choices.force), release)
+        profile.check_fits(image)
+        plan = api.make_plan(
+            image,
+            self.target,
+            self.bus.dialect,
+            bitrate_bps=self.bus.bit_rate.bps,
+            has_upgrade=profile.has_upgrade,
+        )
+        if power_up_timeout_s is None:
+            power_up_timeout_s = profile.power_up_timeout_s
+        chosen = replace(
+            choices.options(profile, release),
+            at_power_up=at_power_up,
+            power_up_timeout_s=power_up_timeout_s,
+        )
+        show = output.result if choices.dry_run else output.progress
+        for line in (
+            *image_lines(image),
+            *vector_lines(vector_table(image)),
+            *plan_lines(plan, chosen),
+        ):
+            show(line)
+        identity = profile.identity(
+            release=release,
+            waived=choices.waived(),
+            skip_same_version=skip_same_version,
+            goes_on_unchecked=at_power_up,
+        )
+        checks = [found.event for found in api.check_image(plan, identity)]
+        if choices.dry_run:
+            for check in checks:
+                output.result(check_line(check))
+            output.result("dry run: nothing was sent")
+            output.document(dry_run_document(plan, chosen, checks))
+            return ExitCode.OK
+        return self._carry_out(plan, chosen, choices.level(plan, chosen), identity)
+
+    def _carry_out(
+        self, plan: Plan, chosen: UpgradeOptions, level: Level, identity: api.Identity
+    ) -> int:
+        checks: list[CheckMade] = []
+        with recording(self.recorded, self.bus, self.output, target=plan.target) as record:
+            record.facts["plan"] = plan_document(plan, chosen)
+            record.facts["image_sha256"] = plan.image.sha256
+            try:
+                result, took_s = self._upgrade(record, checks, plan, chosen, level, identity)
+            except FlasherError as failure:
+                self._add_repair(failure)
+                raise
+            link, error = record.link_report(), result.error()
+            document = upgrade_document(plan, chosen, result, checks, link)
+            record.facts["outcome"] = document["outcome"]
+            record.facts["verification"] = document["verification"]
+            if error is not None:
+                self._add_repair(error)
+                record.failed(error)
+        # The bundle is told of before the error, so that the verdict stands at the end.
+        output = self.output
+        show = output.result if error is None else output.progress
+        if result.outcome.ok:
+            for line in summary_lines(result, plan):
+                show(line)
+        if link is not None:
+            for line in link_lines(link):
+                output.progress(line, level=1)
+        verdict = verdict_of(result, checks, took_s)
+        if error is None:
+            output.verdict(verdict)
+            output.document(document, exit_code=result.exit_code)
+        else:
+            output.ending = lambda _error: verdict
+            output.failure(error, **document)
+        return result.exit_code
+
+    def _upgrade(
+        self,
+        record: Recording,
+        checks: list[CheckMade],
+        plan: Plan,
+        chosen: UpgradeOptions,
+        level: Level,
+        identity: api.Identity,
+    ) -> tuple[Result, float]:
+        """The result, and how many seconds it took; `checks` are those that were made."""
+        output = self.output
+        with ExitStack() as stack:
+            connection = stack.enter_context(self._connect(at_power_up=chosen.at_power_up))
+            record.opened(connection)
+            output.progress(f"on {connection.name} at {connection.bit_rate}")
+            progress = stack.enter_context(Progress(plan, output))
+            stop = stack.enter_context(
+                stop_on_signal(lambda: output.error_line("stopping at the end of the message ..."))
+            )
+
+            def hung_up() -> bool:
+                if stop.has_hung_up and not record.is_alone:
+                    record.is_alone = True
+                    output.leave_terminal("the terminal is gone")
+                return stop.has_hung_up
+
+            def on_event(event: object) -> None:
+                if isinstance(event, CheckMade):
+                    checks.append(event)
+                    record.facts["checks"] = check_documents(checks)
+                output.event(event)
+                progress(event)
+
+            began_at = connection.clock.now()
+            device = connection.device(self.target, dialect=self.bus.dialect)
+            result = device.upgrade(
+                plan,
+                options=chosen,
+                verify=level,
+                identity=identity,
+                taps=record.taps,
+                on_event=on_event,
+                cancelled=stop.asked,
+                hung_up=hung_up,
+            )
+            return result, connection.clock.now() - began_at
+
+    def _connect(self, *, at_power_up: bool) -> AbstractContextManager[api.Connection]:
+        bus = self.bus
+        if bus.mock:
+            return api.connect_mock(
+                self.target, bus.dialect, speed=bus.mock_speed, has_application=not at_power_up
+            )
+        return api.connect(bus.dialect, holder=holder(), **bus.config)
+
+    def _add_repair(self, error: FlasherError) -> None:
+        """The exact command that repairs a device that was left without an application."""
+        if error.needs_rescue and not self.bus.mock:
+            # An image that the device has refused repairs nothing.
+            is_refused = error.exit_code is ExitCode.REFUSED
+            error.command = repair_command(click.get_current_context(), is_refused=is_refused)
+            error.remedy = error.remedy.replace(f"{AGAIN} ", "")
+
+
+# -- the command that repairs ----------------------------------------------------------------------
+
+OTHER_IMAGE: Final = "OTHER_IMAGE"
+"""Stands for an image that the device accepts, where it has refused the one that was sent."""
+_LEFT_OUT: Final = frozenset({"--timeout", "--trace-file", "--skip-same-version"})
+"""What does not fit: a deadline meant for a device that answers at once (here somebody has to
+switch it off and on), a trace that is evidence now, what `rescue` has not."""
+_OF_THE_IMAGE: Final = frozenset(
+    {"--format", "--base", "--range", "--fill-gaps-up-to", "--manifest", "--force"}
+)
+
+
+def repair_command(ctx: click.Context, *, is_refused: bool) -> str:
+    """The `flasher rescue` for the command of `ctx`, as a shell takes it. What was said about an
+    image that the device has refused is left out.
+    """
+
+    def is_left_out(name: str) -> bool:
+        of_the_image = name in _OF_THE_IMAGE or name.startswith("--allow-")
+        return name in _LEFT_OUT or (is_refused and of_the_image)
+
+    replaced = {"image": OTHER_IMAGE} if is_refused else {}
+    return shlex.join(["flasher", *retyped(ctx, "rescue", without=is_left_out, replaced=replaced)])

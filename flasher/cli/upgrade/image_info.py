@@ -1,0 +1,104 @@
+"""`flasher image-info`: what is in a file, what would be sent, how long it takes on the bus."""
+
+from __future__ import annotations
+
+import contextlib
+from typing import Final, TypedDict
+
+from flasher import api
+from flasher.cli.documents import ImageDocument, PlanDocument
+from flasher.cli.framework import command
+from flasher.cli.options import (
+    ImageOptions,
+    allow_implausible_option,
+    dialect_option,
+    gap_options,
+    image_options,
+    profile_option,
+    target_option,
+)
+from flasher.cli.output import Output
+from flasher.cli.upgrade.manifest_text import ManifestBesideDocument, beside_line, manifest_beside
+from flasher.cli.upgrade.plan_text import (
+    image_document,
+    image_lines,
+    plan_document,
+    plan_lines,
+    vector_lines,
+)
+from flasher.cli.upgrade.text import check_line
+from flasher.errors import ExitCode, FlasherError
+from flasher.host.identity import Check, judge_bytes
+from flasher.image.cortexm import vector_table
+from flasher.protocol.spec import BMS, Target
+from flasher.settings.profile import load_profile
+
+_EXAMPLES: Final = """\
+examples:
+  flasher image-info firmware.hex
+  flasher image-info firmware.bin --base 0x8004000 -t wmc
+  flasher image-info merged.hex --range 0x8004000:0x8020000
+"""
+
+
+class ImageInfoDocument(TypedDict):
+    """What is in a file, what lies beside it, and what an upgrade would send."""
+
+    image: ImageDocument
+    manifest: ManifestBesideDocument
+    plan: PlanDocument
+    """For the BMS where no target was named: others differ by the ids alone."""
+
+
+DOCUMENTS: Final = (ImageInfoDocument,)
+
+
+@command(epilog=_EXAMPLES, exit_codes=(ExitCode.IMAGE,))
+@image_options
+@allow_implausible_option("image")
+@target_option(required=False)
+@dialect_option
+@profile_option
+@gap_options
+def image_info(
+    output: Output,
+    image: ImageOptions,
+    target: Target | None,
+    *,
+    dialect_name: str,
+    profile: str | None,
+    frame_gap: float | None,
+    packet_gap: float | None,
+    allow_implausible: bool,
+) -> int:
+    """Show what is in an image file and what an upgrade would send. Opens no adapter. A file that
+    no device should get is shown as far as it can be read, and refused as flasher flash refuses it.
+    """
+    loaded = image.load()
+    table = vector_table(loaded)
+    # The time differs by stuff bits only between targets: any one serves for the figure.
+    settings = load_profile(profile, target or BMS, api.as_dialect(dialect_name))
+    plan = api.make_plan(
+        loaded, settings.target, settings.dialect, has_upgrade=settings.has_upgrade
+    )
+    chosen = settings.upgrade_options(frame_gap_s=frame_gap, packet_gap_s=packet_gap)
+    beside = manifest_beside(image.image, loaded, target)
+    lines = [*image_lines(loaded), *vector_lines(table), beside_line(beside)]
+    for line in (*lines, *plan_lines(plan, chosen)):
+        output.result(line)
+    document = ImageInfoDocument(
+        image=image_document(loaded, table), manifest=beside, plan=plan_document(plan, chosen)
+    )
+    release = None
+    with contextlib.suppress(FlasherError):  # told in `beside`
+        release = api.find_release(image.image)
+    waived = frozenset({Check.PLAUSIBLE} if allow_implausible else ())
+    identity = settings.identity(release=release, waived=waived)
+    for found in judge_bytes(loaded, identity):
+        error = api.refusal(plan, found)
+        if error is not None:
+            output.failure(error, **document)
+            return error.exit_code
+        output.result(check_line(found.event))
+    output.document(document)
+    return ExitCode.OK

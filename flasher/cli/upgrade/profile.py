@@ -1,0 +1,148 @@
+"""`flasher profile`: what holds for a target, where each value comes from, and whether a file is
+right.
+"""
+
+from __future__ import annotations
+
+from typing import Final, TypedDict
+
+from flasher.api import as_dialect
+from flasher.cli.framework import argument, group
+from flasher.cli.options import dialect_option, profile_option, target_option
+from flasher.cli.output import Output
+from flasher.cli.values import FilePath
+from flasher.errors import ExitCode
+from flasher.image.plausible import Cpu
+from flasher.protocol.spec import Target
+from flasher.protocol.text import printable
+from flasher.settings.profile import FILE_NAME, check_profile, load_profile
+
+_EXAMPLES: Final = f"""\
+examples:
+  flasher profile show -t bms
+  flasher profile show -t mc --profile bench.toml
+  flasher profile check bench.toml
+
+Without --profile, {FILE_NAME} of the working directory holds, else the one of the user's
+configuration directory. Values before the first table are for every device, a table such as [wmc]
+is for one:
+
+  attempts = 5
+  [timings]
+  ack_timeout_s = 1.0
+  [wmc]
+  frame_gap_s = 0.001
+  reset_command = 0x4205
+  reset_data = "RESET"
+  [wmc.application_area]
+  start = 0x08004000
+  size_bytes = 0x1C000
+"""
+_HEXADECIMAL: Final = frozenset(
+    {"command", "answer_command", "answer_id", "reset_command", "start"}
+)
+
+ProfileValue = str | bool | int | float | list[int] | None
+"""Bytes are a list of their values, as in the file."""
+
+
+class SourcedValue(TypedDict):
+    """A value of a profile and where it comes from."""
+
+    value: ProfileValue
+    source: str
+    """"default", "document", or the path of a file."""
+
+
+class ProfileDocument(TypedDict):
+    """Every value that holds for a target; those of a table have its name before a point."""
+
+    target: str
+    dialect: str
+    values: dict[str, SourcedValue]
+
+
+class CheckedProfileDocument(TypedDict):
+    """A profile that is right."""
+
+    file: str
+    targets: list[str]
+    """The targets that it has values of their own for."""
+
+
+DOCUMENTS: Final = (ProfileDocument, CheckedProfileDocument)
+
+
+@group(epilog=_EXAMPLES)
+def profile() -> None:
+    """Show what holds for a target and where each value comes from, or check a file. Opens no
+    adapter.
+    """
+
+
+@profile.action("check")
+@argument("file", metavar="FILE", type=FilePath("toml"), help="the file to check")
+def check(output: Output, *, file: str) -> int:
+    """Check whether a file is right."""
+    names = [target.name for target in check_profile(file)]
+    own = f"with values of their own for {', '.join(names)}" if names else "for every device alike"
+    output.result(f"{printable(file)}: right, {own}")
+    output.document(CheckedProfileDocument(file=file, targets=names))
+    return ExitCode.OK
+
+
+@profile.action("show")
+@target_option()
+@dialect_option
+@profile_option
+def show(output: Output, target: Target, *, dialect_name: str, profile: str | None) -> int:
+    """Show every value with its source."""
+    holds = load_profile(profile, target, as_dialect(dialect_name))
+    rows = [(name, _shown(name, value)) for name, value in holds.values()]
+    widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
+    for name, shown in rows:
+        source = printable(holds.sources[name])
+        output.result(f"{name:<{widths[0]}}  {shown:<{widths[1]}}  {source}")
+    document: ProfileDocument = {
+        "target": holds.target.name,
+        "dialect": holds.dialect.name,
+        "values": {
+            name: {"value": _plain(value), "source": holds.sources[name]}
+            for name, value in holds.values()
+        },
+    }
+    output.document(document)
+    return ExitCode.OK
+
+
+def _shown(name: str, value: object) -> str:
+    """A value as the file would have it."""
+    match value:
+        case None:
+            return "not set"
+        case bool():
+            return str(value).lower()
+        case Cpu():
+            return f'"{value.value}"'
+        case bytes() if value.isascii() and value.decode().isprintable():
+            return f'"{value.decode()}"'
+        case bytes():
+            return str(list(value))
+        case int() if name.rpartition(".")[2] in _HEXADECIMAL:
+            return f"0x{value:04X}"
+        case int():
+            return str(int(value))
+        case _:
+            return str(value)
+
+
+def _plain(value: object) -> ProfileValue:
+    match value:
+        case bytes():
+            return list(value)
+        case Cpu():
+            return value.value
+        case None | bool() | int() | float() | str():
+            return value
+        case _:
+            raise TypeError(f"a profile has no value like {value!r}")

@@ -1,0 +1,249 @@
+"""An upgrade in words and as JSON, for `flash` and `rescue`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Annotated, Final, NotRequired, TypedDict
+
+from flasher.cli.documents import (
+    ImageDocument,
+    OutcomeDocument,
+    PlanDocument,
+    VerificationDocument,
+)
+from flasher.cli.output import Verdict, byte_count, counted, duration
+from flasher.cli.upgrade.plan_text import image_document, plan_document
+from flasher.errors import FlasherError, InterruptedByUserError
+from flasher.events import CheckMade
+from flasher.host.identity import Verdict as Judgement
+from flasher.host.options import UpgradeOptions
+from flasher.host.outcome import DeviceLeft, Outcome
+from flasher.host.session import Result
+from flasher.host.table import Ending
+from flasher.host.verify import Level, Verification, possible_levels
+from flasher.host.verify import Verdict as Verified
+from flasher.image.cortexm import vector_table
+from flasher.image.plan import Plan
+from flasher.trace.figures import Distribution, LinkReport
+
+_NO_QUERY = ": the document gives this target no query for it"
+
+
+class CheckDocument(TypedDict):
+    """Something that was checked before the first write."""
+
+    check: str
+    verdict: Annotated[str, Judgement]
+    text: str
+
+
+class UpgradeDocument(TypedDict):
+    """An upgrade. Transferred, completed and running are three claims: see `outcome` for the first
+    two, `verification` for the third.
+    """
+
+    image: ImageDocument
+    plan: PlanDocument
+    checks: list[CheckDocument]
+    outcome: OutcomeDocument
+    verification: VerificationDocument
+    previous_version: str | None
+    """What ran before; null where it could not be asked."""
+    shutdown_heard: bool
+    """The battery sent SHUTDOWN meanwhile."""
+    link: NotRequired[Annotated[dict[str, object], LinkReport]]
+    """Times on the line; missing when no packet was answered."""
+
+
+class DryRunDocument(TypedDict):
+    """The plan of an upgrade that was not carried out."""
+
+    dry_run: bool
+    image: ImageDocument
+    plan: PlanDocument
+    checks: list[CheckDocument]
+
+
+# -- in words -------------------------------------------------------------------------------------
+
+
+def check_line(check: CheckMade) -> str:
+    """A check that was made, in one line."""
+    return f"check: {check.verdict}: {check.text}"
+
+
+_LEFT: Final = {
+    DeviceLeft.UNTOUCHED: "nothing was erased",
+    DeviceLeft.PERHAPS_ERASED: "its application is perhaps erased",
+    DeviceLeft.NO_APPLICATION: "it has no application now",
+    DeviceLeft.UNKNOWN: "it has every byte, what it runs is not known",
+    DeviceLeft.NEW: "it has the new image",
+}
+
+
+def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Verdict:
+    """The last line of an upgrade that was carried out, or was not needed."""
+    outcome, node = result.outcome, result.outcome.target.node.name
+    took = f"  {took_s:.1f} s"
+    error = result.error()
+    if error is not None:
+        left = "" if outcome.ok else f"; {_LEFT[outcome.device_left]}"
+        return failed(error, left + took)
+    if not result.ok:
+        return Verdict("NOTHING TO DO", f"{node}: {outcome.detail}{took}", "green")
+    was = f", was {result.previous_version}" if result.previous_version else ""
+    verification = result.verification
+    remark = "memory read back" if verification.level is Level.MEMORY else "version read back"
+    if verification.verdict is Verified.NOT_ASKED and result.running_version is None:
+        remark = "not asked" if _has_query(result) else "no version query"
+    elif verification.verdict is Verified.VERSION_UNJUDGED:
+        remark = "the image names no version to compare with"
+    if outcome.ending is Ending.CONFIRMED_BY_VERSION:
+        remark += ", but it did not say complete"
+    warnings = sum(check.verdict in ("warned", "waived") for check in checks)
+    remark += f"; {counted(warnings, 'warning')}" if warnings else ""
+    if result.running_version is None:
+        text = f"{node} confirmed the image{was}; what runs is not known ({remark})"
+    else:
+        text = f"{node} runs {result.running_version}{was} ({remark})"
+    is_sure = verification.verdict in (Verified.VERSION_RIGHT, Verified.MEMORY_RIGHT)
+    is_sure &= outcome.ending is Ending.COMPLETED and not warnings and not result.shutdown_heard
+    return Verdict("OK", text + took, "green" if is_sure else "yellow")
+
+
+_LINE_MAX: Final = 120
+"""Of what failed: a remark in brackets stands in the error alone where it makes more of it."""
+
+
+def failed(error: FlasherError, more: str = "") -> Verdict:
+    """The last line of an upgrade that was not. The error itself is told in full above it."""
+    word = "STOPPED" if isinstance(error, InterruptedByUserError) else "FAILED"
+    what = error.what.partition(" (" if more else ". ")[0].removesuffix(".")
+    if len(what) > _LINE_MAX:
+        what = what.partition(" (")[0]
+    if error.needs_rescue and not more:
+        more = "; it has no application now, or perhaps none"
+    return Verdict(word, what + more, "red")
+
+
+def summary_lines(result: Result, plan: Plan) -> list[str]:
+    """The final lines of an upgrade that went through: three claims, kept apart."""
+    outcome = result.outcome
+    figures = outcome.statistics
+    transfer_s = figures.transfer_s or 0.0
+    sent = f"{byte_count(plan.image.size_bytes)} in {counted(plan.total_packets, 'packet')}"
+    faults = f"{figures.repetitions} repeated, {figures.naks} NAK"
+    whole = f"{counted(figures.attempts, 'attempt')}, {duration(figures.duration_s)} in all"
+    return [
+        f"transferred:  {sent}, {duration(transfer_s)}{_rate(plan, transfer_s)}",
+        f"              {faults}, {whole}",
+        f"boot version: {outcome.boot_version}",
+        f"completed:    {outcome.ending.value}",
+        f"running:      {_running(result)}",
+    ]
+
+
+def link_lines(report: LinkReport) -> list[str]:
+    """How long each end took, as min / median / p95 / p99 / max."""
+    return [
+        f"{end:<13} {_figures(figures)} ms {doing}"
+        for end, figures, doing in (
+            ("device took:", report.device_answer, "to answer a packet"),
+            ("host took:", report.host_turnaround, "to send the next (min/median/p95/p99/max)"),
+        )
+        if figures is not None
+    ]
+
+
+def _figures(of: Distribution) -> str:
+    times = (of.minimum_s, of.median_s, of.p95_s, of.p99_s, of.maximum_s)
+    return " / ".join(f"{each * 1000:.2f}" for each in times)
+
+
+def _running(result: Result) -> str:
+    """What is known of the application that runs now, and how."""
+    verification = result.verification
+    if verification.verdict is Verified.NOT_ASKED:
+        no_query = "" if _has_query(result) else _NO_QUERY
+        return result.running_version or f"not asked{no_query}"
+    return f"{result.running_version or 'unknown'} ({verification.verdict.value})"
+
+
+def _has_query(result: Result) -> bool:
+    return possible_levels(result.outcome.target) != (Level.NONE,)
+
+
+def _rate(plan: Plan, transfer_s: float) -> str:
+    """Bytes per second and how close to the line rate that is."""
+    if not transfer_s:
+        return ""
+    share = plan.transfer_wire_s / transfer_s
+    line = f"{plan.bitrate_bps / 1000:g} kbit/s line"
+    # A bus in memory or on a network has no bit rate to keep to.
+    closeness = f"{min(share, 1):.0%} of a {line}" if share <= 1.02 else f"faster than a {line}"
+    return f" ({plan.image.size_bytes / transfer_s / 1000:.1f} kB/s, {closeness})"
+
+
+# -- as JSON --------------------------------------------------------------------------------------
+
+
+def upgrade_document(
+    plan: Plan,
+    options: UpgradeOptions,
+    result: Result,
+    checks: Iterable[CheckMade],
+    link: LinkReport | None,
+) -> UpgradeDocument:
+    """The document of an upgrade, good or bad."""
+    document = UpgradeDocument(
+        image=image_document(plan.image, vector_table(plan.image)),
+        plan=plan_document(plan, options),
+        checks=check_documents(checks),
+        outcome=_outcome_document(result.outcome),
+        verification=_verification_document(result.verification, result.running_version),
+        previous_version=result.previous_version,
+        shutdown_heard=result.shutdown_heard,
+    )
+    if link is not None:
+        document["link"] = dataclasses.asdict(link)
+    return document
+
+
+def dry_run_document(
+    plan: Plan, options: UpgradeOptions, checks: Iterable[CheckMade]
+) -> DryRunDocument:
+    """The document of a plan that is not carried out."""
+    return DryRunDocument(
+        dry_run=True,
+        image=image_document(plan.image, vector_table(plan.image)),
+        plan=plan_document(plan, options),
+        checks=check_documents(checks),
+    )
+
+
+def check_documents(checks: Iterable[CheckMade]) -> list[CheckDocument]:
+    """The checks that were made, in order."""
+    return [CheckDocument(check=c.check, verdict=c.verdict, text=c.text) for c in checks]
+
+
+def _outcome_document(outcome: Outcome) -> OutcomeDocument:
+    return OutcomeDocument(
+        ending=outcome.ending.name.lower(),
+        phase=outcome.phase.name.lower(),
+        packet=outcome.packet,
+        device_left=outcome.device_left.name.lower(),
+        boot_version=outcome.boot_version,
+        running_version=outcome.running_version,
+        detail=outcome.detail,
+        statistics=dataclasses.asdict(outcome.statistics),
+    )
+
+
+def _verification_document(of: Verification, running: str | None) -> VerificationDocument:
+    return VerificationDocument(
+        level=of.level.value,
+        verdict=of.verdict.name.lower(),
+        running_version=running,
+        detail=of.detail,
+    )

@@ -1,0 +1,215 @@
+"""Values on the command line: how each is read, and what a shell offers for it."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any, Final
+
+import click
+from click.shell_completion import CompletionItem
+
+from flasher.errors import UsageError, did_you_mean
+from flasher.protocol.spec import TARGET_ALIASES, TARGETS, Node, Target
+
+IMAGE_SUFFIXES: Final = (
+    "hex", "ihex", "ihx", "s19", "s28", "s37", "srec", "mot", "elf", "axf", "out", "bin",
+)  # fmt: skip
+TRACE_SUFFIXES: Final = ("asc", "blf", "csv", "db", "log", "mf4", "trc", "gz")
+SLOWEST: Final = 0.1
+"""Of the mock's speeds."""
+_NUMBER: Final = re.compile(r"(0[xX][0-9a-fA-F_]+|[0-9][0-9_]*)([kKmM]?)")
+_SUFFIXES: Final = {"": 1, "k": 1024, "m": 1024 * 1024}
+_KEY_VALUE: Final = re.compile(r"([A-Za-z_]\w*)=(.*)")
+_NETWORK: Final = Path("/sys/class/net")
+_LINK_TYPE_CAN: Final = "280"
+"""ARPHRD_CAN of Linux."""
+
+
+# -- numbers ---------------------------------------------------------------------------------------
+
+
+def number(text: str) -> int:
+    """A whole number: decimal or 0x, with K or M for 1024 and 1024 * 1024."""
+    match = _NUMBER.fullmatch(text)
+    if match is None:
+        raise click.BadParameter(f"{text!r} is no number (decimal, 0x..., K or M suffix)")
+    return (
+        int(match[1], 0 if match[1].lower().startswith("0x") else 10) * _SUFFIXES[match[2].lower()]
+    )
+
+
+def address_range(text: str) -> tuple[int, int]:
+    """START:END, the end exclusive."""
+    start, colon, end = text.partition(":")
+    if not colon:
+        raise click.BadParameter(f"{text!r} is no range; write START:END")
+    return number(start), number(end)
+
+
+def seconds(text: str) -> float:
+    """A time in seconds, zero or more."""
+    with contextlib.suppress(ValueError):
+        value = float(text)
+        if 0 <= value < float("inf"):
+            return value
+    raise click.BadParameter(f"{text!r} is no time in seconds")
+
+
+def speed(text: str) -> float:
+    """Times as fast as a real bus: 0, or a number that is not so small that nothing moves."""
+    value = seconds(text)
+    if value and value < SLOWEST:
+        raise click.BadParameter(f"must be 0, or {SLOWEST} and more")
+    return value
+
+
+def count(text: str) -> int:
+    """A whole number from 1 on."""
+    value = number(text)
+    if value < 1:
+        raise click.BadParameter("must be 1 or more")
+    return value
+
+
+def key_value(text: str) -> tuple[str, str]:
+    """KEY=VALUE."""
+    match = _KEY_VALUE.fullmatch(text)
+    if match is None:
+        raise click.BadParameter(f"{text!r} is not KEY=VALUE")
+    return match[1], match[2]
+
+
+# -- names -----------------------------------------------------------------------------------------
+
+
+def target(text: str) -> Target:
+    """A target by its name or alias."""
+    from flasher.api import as_target  # noqa: PLC0415  not needed to show help
+
+    try:
+        return as_target(text)
+    except UsageError as error:
+        raise click.BadParameter(error.what) from error
+
+
+def node(text: str) -> str:
+    """A node of the bus by its name, or a target by another name."""
+    alias = TARGET_ALIASES.get(text.lower())
+    name = text.upper() if alias is None else alias.node.name
+    if name not in Node.__members__:
+        known = ", ".join(_NODES)
+        raise click.BadParameter(f"there is no node {text!a}; nodes are {known}")
+    return name
+
+
+def interface(text: str) -> str:
+    """A back end of python-can."""
+    known = interface_names()
+    if text not in known:
+        hint = did_you_mean(text, known)
+        raise click.BadParameter(f"there is no {text!a}. {hint}Known are {', '.join(known)}")
+    return text
+
+
+_NODES: Final = (*(each.name.lower() for each in Node), *TARGET_ALIASES)
+
+
+def offers(known: Callable[..., Iterable[str]]) -> Callable[..., list[str]]:
+    """What `shell_complete` of an option takes: the words that begin as typed.
+    `known` is called with the context.
+    """
+
+    def complete(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
+        return [word for word in known(ctx) if word.startswith(incomplete)]
+
+    return complete
+
+
+def target_names(_ctx: click.Context) -> Iterable[str]:
+    """For --target."""
+    return (*TARGETS, *TARGET_ALIASES)
+
+
+def node_names(_ctx: click.Context) -> Iterable[str]:
+    """For --node."""
+    return _NODES
+
+
+def interface_names(_ctx: click.Context | None = None) -> list[str]:
+    """For --interface."""
+    import can  # noqa: PLC0415  slow
+
+    return sorted(can.VALID_INTERFACES)
+
+
+def channels(_ctx: click.Context) -> list[str]:
+    """For --channel: the CAN interfaces of Linux. Other back ends do not name theirs without
+    opening them.
+    """
+    if not _NETWORK.is_dir():
+        return []
+    return sorted(link.name for link in _NETWORK.iterdir() if _is_can(link / "type"))
+
+
+def _is_can(kind: Path) -> bool:
+    try:
+        return kind.read_text().strip() == _LINK_TYPE_CAN
+    except OSError:
+        return False
+
+
+# -- files -----------------------------------------------------------------------------------------
+
+
+class FilePath(click.ParamType[Any]):
+    """The name of a file, as text or as a `Path`. What is wrong with it is told when it is opened.
+
+    A shell offers folders, and the files with one of the `suffixes`.
+    """
+
+    name = "file"
+
+    def __init__(self, *suffixes: str, gives: Callable[[str], Any] = str) -> None:
+        self._suffixes = tuple(f".{suffix}" for suffix in suffixes)
+        self._gives = gives
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return self._gives(value)
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        if not self._suffixes:
+            return [CompletionItem(incomplete, type="file")]
+        found = self._matching(incomplete)
+        while len(found) == 1 and found[0].endswith("/") and (inside := self._matching(found[0])):
+            found = inside  # shells write a blank behind the only word that is offered
+        return [CompletionItem(name) for name in found]
+
+    def _matching(self, begun: str) -> list[str]:
+        folder, slash, name = begun.rpartition("/")
+        found = []
+        with contextlib.suppress(OSError):
+            for path in sorted(Path(folder + slash or ".").iterdir()):
+                if path.name.startswith(name) and path.is_dir():
+                    found.append(f"{folder}{slash}{path.name}/")
+                elif path.name.startswith(name) and path.suffix.lower() in self._suffixes:
+                    found.append(f"{folder}{slash}{path.name}")
+        return found
+
+
+class FolderPath(click.ParamType[Path]):
+    """The name of a folder."""
+
+    name = "folder"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        return Path(value)
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        return [CompletionItem(incomplete, type="dir")]
