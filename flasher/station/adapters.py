@@ -1,4 +1,5 @@
-"""Which adapter belongs to which socket: by serial number or place on the USB.
+"""From the sockets of a station's file to what their processes are given: each socket finds its
+adapter by serial number or place on the USB.
 
 `resolve` is a pure function of what was detected; `detect` asks python-can, pyserial and the
 system.
@@ -17,6 +18,8 @@ import can
 from flasher.errors import BusError, UsageError
 from flasher.protocol.text import printable
 from flasher.station.config import SocketConfig
+from flasher.station.messages import VirtualUnits, WorkerSetup
+from flasher.station.recipe_file import LoadedRecipe
 
 _SERIAL_KEYS: Final = ("serial_number", "serial", "unique_hardware_id", "hw_serial", "hwid")
 """Where back ends of python-can put an adapter's serial number."""
@@ -95,6 +98,38 @@ def _resolve(socket: SocketConfig, detected: Sequence[Detected]) -> Resolved:
             remedy="Name the channel as well.",
         )
     return Resolved(socket, bus | {"channel": channels[0]})
+
+
+def worker_setups(
+    sockets: Sequence[Resolved],
+    recipe: LoadedRecipe,
+    *,
+    first_number: int = 1,
+    units: int | None = None,
+    speed: float = 1.0,
+    leave_after_s: float = 1.0,
+) -> list[WorkerSetup]:
+    """What each socket's process needs. Virtual units are numbered from `first_number` on, no
+    number twice, and dealt out like cards: `units` in all, or without end.
+    """
+    files = {str(path): sha256 for path, sha256 in recipe.files.items()}
+    total = len(sockets)
+    setups = []
+    for at, each in enumerate(sockets):
+        virtual = None
+        if each.config.mock is not None:
+            count = None if units is None else (units - at + total - 1) // total
+            virtual = VirtualUnits(
+                each.config.mock,
+                first_number + at,
+                total,
+                speed=speed,
+                leave_after_s=leave_after_s,
+                count=count,
+            )
+        name, power = each.config.name, each.config.power
+        setups.append(WorkerSetup(name, recipe.path, files, each.bus, virtual, power))
+    return setups
 
 
 # -- what is plugged in ---------------------------------------------------------------------------

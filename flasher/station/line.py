@@ -28,13 +28,13 @@ from flasher.station.events import (
     UnitArrived,
     UnitRemoved,
 )
-from flasher.station.messages import PresenceChanged
+from flasher.station.messages import AdapterDown, PresenceChanged, Ready
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import AuditEvent, RunState
 from flasher.station.scans import (
     Command,
     Label,
-    Nonsense,
+    NotUnderstood,
     Refused,
     Word,
     check_first,
@@ -48,7 +48,7 @@ from flasher.station.scans import (
     understand,
     was_in,
 )
-from flasher.station.socket import LastRun, Phase, Seen, Socket, Why
+from flasher.station.socket import Binding, LastRun, Occupancy, Phase, Socket
 
 ARRIVAL_LIMIT_S: Final = 20.0
 SCAN_LIMIT_S: Final = 120.0
@@ -64,20 +64,6 @@ _RESUME: Final = Word.RESUME.value.lower()
 
 
 # -- what the line is told, and what it wants done ------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Ready:
-    """The socket can work. `sees_units` is False where a unit that is there may say nothing."""
-
-    sees_units: bool
-
-
-@dataclass(frozen=True)
-class Down:
-    """The socket cannot work for now: its adapter failed, or its process is gone."""
-
-    reason: str
 
 
 @dataclass(frozen=True)
@@ -116,11 +102,13 @@ class NotSaved:
     remedy: str
 
 
-SocketInput = Ready | Down | PresenceChanged | Claimed | NotClaimed | Ended | Saved | NotSaved
+SocketInput = (
+    Ready | AdapterDown | PresenceChanged | Claimed | NotClaimed | Ended | Saved | NotSaved
+)
 
 
 @dataclass(frozen=True)
-class Claim:
+class ClaimRun:
     """Ask the records for a run of this unit; `Claimed`, `NotClaimed` or `NotSaved` answers."""
 
     socket: str
@@ -131,14 +119,14 @@ class Claim:
 
 
 @dataclass(frozen=True)
-class Resume:
+class SaveAgain:
     """Try once more to save how the runs of these sockets ended; then call `Line.resumed`."""
 
     sockets: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Abort:
+class AbortRun:
     """Stop the run of this socket at its next safe place."""
 
     socket: str
@@ -159,7 +147,7 @@ class Audit:
     data: Mapping[str, str]
 
 
-Effect = Claim | Resume | Abort | Tell | Audit
+Effect = ClaimRun | SaveAgain | AbortRun | Tell | Audit
 
 
 # -- the line -------------------------------------------------------------------------------------
@@ -232,24 +220,24 @@ class Line:
         socket.is_last_there = socket.is_last_there and was_short
         socket.out_of_service, socket.sees_units = None, what.sees_units
         if not what.sees_units:
-            socket.seen = Seen.SILENT
+            socket.occupancy = Occupancy.SILENT
 
-    def _down(self, socket: Socket, what: Down, now: float) -> None:
+    def _down(self, socket: Socket, what: AdapterDown, now: float) -> None:
         if socket.can_work or not socket.out_since_s:
             socket.out_since_s = now
         socket.out_of_service = what.reason or "It cannot work."
         self._drop_label(socket, f"Socket {socket.name} is out of service.", "when it works again")
         # What happens in it cannot be seen now. What was silent before stays doubtful.
         socket.own, socket.is_own_known = None, False
-        if socket.seen is not Seen.SILENT:
-            socket.seen = Seen.UNKNOWN
+        if socket.occupancy is not Occupancy.SILENT:
+            socket.occupancy = Occupancy.UNKNOWN
 
     def _unit(self, socket: Socket, what: PresenceChanged, now: float) -> None:
         """A unit is heard, says who it is, or is heard no more."""
         if not what.is_there:
             self._silent(socket, is_certain=what.is_certain)
             return
-        was_silent = socket.seen in (Seen.SILENT, Seen.EMPTY)
+        was_silent = socket.occupancy in (Occupancy.SILENT, Occupancy.EMPTY)
         is_new = socket.hear(what, is_serial=self._is_serial(what.serial or ""))
         if is_new:
             self._tell(UnitArrived(socket.name, what.how, what.label))
@@ -257,12 +245,12 @@ class Line:
             return
         if what.label and self._scans_labels and not socket.label:
             self._scan_borne(socket, what.label, now)
-        elif (is_new or was_silent) and socket.label and socket.why is Why.NAMED:
+        elif (is_new or was_silent) and socket.label and socket.binding is Binding.NAMED:
             self._arrived_where_named(socket, what.label, now)
         elif self._label and socket.own == self._label and socket.awaits_label:
             serial = self._label
             self._forget_scans()
-            self._bind(socket, serial, Why.SAID, now)
+            self._bind(socket, serial, Binding.SAID, now)
         elif is_new:
             self._arrived_elsewhere(socket)
 
@@ -270,7 +258,7 @@ class Line:
         if not socket.fall_silent(is_certain=is_certain):
             return
         self._tell(UnitRemoved(socket.name))
-        if socket.why is Why.NAMED:
+        if socket.binding is Binding.NAMED:
             socket.begin_at_s = None  # the one that arrived was not the one
         else:
             # It was meant for the unit that was there.
@@ -291,7 +279,9 @@ class Line:
             socket.begin_at_s = now if borne else now + IDENTIFY_S
 
     def _arrived_elsewhere(self, socket: Socket) -> None:
-        named = next((e for e in self.sockets.values() if e.label and e.why is Why.NAMED), None)
+        named = next(
+            (e for e in self.sockets.values() if e.label and e.binding is Binding.NAMED), None
+        )
         if named is not None and socket.awaits_label:
             text = (
                 f"Wrong socket: {printable(named.label)} goes into socket {named.name}. "
@@ -324,7 +314,7 @@ class Line:
         # In the run it may have got its number: what is heard from now on counts.
         socket.own, socket.is_own_known = None, False
         if not socket.is_virtual and socket.sees_units:
-            socket.seen = Seen.UNKNOWN
+            socket.occupancy = Occupancy.UNKNOWN
 
     def _saved(self, socket: Socket, what: Saved, _now: float) -> None:
         socket.phase, socket.note, socket.serial = Phase.REST, "", ""
@@ -366,7 +356,7 @@ class Line:
                 return "label", self._take_label(serial, now)
             case Command(word, argument):
                 return word.value.lower(), self._COMMANDS[word](self, argument, now)
-            case Nonsense(why):
+            case NotUnderstood(why):
                 raise Refused("NOT_UNDERSTOOD", why, "Scan the label again.")
 
     def _take_label(self, serial: str, now: float) -> Socket | None:
@@ -383,7 +373,7 @@ class Line:
             return None
         socket, why = placed
         self._bind(socket, serial, why, now)
-        if why is not Why.SAID and not socket.is_due(now):
+        if why is not Binding.SAID and not socket.is_due(now):
             self._tell(OperatorPrompted(socket.name, socket.wanted))
         return socket
 
@@ -402,7 +392,7 @@ class Line:
             if each is chosen or each.label == serial:
                 each.let_go()  # what was scanned for it before, or it was put elsewhere
         self._forget_scans()
-        self._bind(chosen, serial, Why.SAID, now)
+        self._bind(chosen, serial, Binding.SAID, now)
         if was_here:
             chosen.begin_at_s = now  # said twice: do not wait until it is heard
 
@@ -452,7 +442,7 @@ class Line:
             check_fits(self.sockets, socket, self._label)
             serial = self._label
             self._forget_scans()
-            self._bind(socket, serial, Why.SAID, now)
+            self._bind(socket, serial, Binding.SAID, now)
         else:
             self._forget_scans()
             # Its label waits until it is said whether it is another one.
@@ -473,7 +463,7 @@ class Line:
         if socket.phase is not Phase.RUN:
             raise Refused("NOT_RUNNING", f"Nothing runs in socket {socket.name}.", "Nothing to do.")
         self._audit(AuditEvent.ABORT, socket=socket.name, serial=socket.serial)
-        self._effects.append(Abort(socket.name))
+        self._effects.append(AbortRun(socket.name))
         return socket
 
     def _free(self, argument: str, _now: float) -> Socket:
@@ -482,7 +472,7 @@ class Line:
         self._drop_label(socket, f"Socket {socket.name} is free.", "when it is connected")
         socket.last, socket.is_last_there, socket.interrupted, socket.note = None, False, "", ""
         if socket.can_work and not (socket.is_there and socket.sees_units):
-            socket.seen = Seen.EMPTY
+            socket.occupancy = Occupancy.EMPTY
         return socket
 
     def _cancel(self, _argument: str, _now: float) -> None:
@@ -508,10 +498,10 @@ class Line:
             raise Refused("NOT_STOPPED", "The line is not stopped.", "Nothing to do.")
         self._audit(AuditEvent.RESUME, code=self.stopped.code)
         unsaved = [each.name for each in self.sockets.values() if each.phase is Phase.SAVE]
-        self._effects.append(Resume(tuple(unsaved)))
+        self._effects.append(SaveAgain(tuple(unsaved)))
 
     def resumed(self, now: float, *, all_saved: bool) -> None:
-        """What came of `Resume`: the line goes on, or stands where it stood."""
+        """What came of `SaveAgain`: the line goes on, or stands where it stood."""
         word = Word.RESUME.value
         if all_saved:
             self.stopped = None
@@ -548,7 +538,7 @@ class Line:
                 serial, socket.label, socket.begin_at_s = socket.label, "", None
                 socket.phase, socket.serial = Phase.CLAIM, serial
                 reason = self._reasons.get(serial, "")
-                self._effects.append(Claim(socket.name, serial, self.operator, self.lot, reason))
+                self._effects.append(ClaimRun(socket.name, serial, self.operator, self.lot, reason))
         for socket in self.sockets.values():
             shown = socket.view(self.stopped, is_only=len(self.sockets) == 1)
             if socket.shown != shown and socket.phase is not Phase.CLAIM:
@@ -556,19 +546,19 @@ class Line:
                 state, serial, text = shown
                 self._tell(SocketChanged(socket.name, state, serial, text))
 
-    def _bind(self, socket: Socket, serial: str, why: Why, now: float) -> None:
+    def _bind(self, socket: Socket, serial: str, why: Binding, now: float) -> None:
         """The label is the one of the unit in this socket, or of the one that comes into it."""
         if self._reason:
             self._reasons[serial], self._reason = self._reason, ""
         was_here = serial in (socket.interrupted, socket.last.serial if socket.last else "")
-        socket.label, socket.why, socket.note = serial, why, ""
+        socket.label, socket.binding, socket.note = serial, why, ""
         socket.begin_at_s, socket.bound_at_s = None, now
-        if why is Why.NAMED:
+        if why is Binding.NAMED:
             return  # the unit that has passed is shown until it has left
         socket.last, socket.is_last_there = None, False
-        if not socket.sees_units or (was_here and why is Why.SAID):
+        if not socket.sees_units or (was_here and why is Binding.SAID):
             socket.begin_at_s = now  # it may sit in its bootloader, and say nothing
-        elif why is Why.SAID or (why is Why.ONLY and was_here):
+        elif why is Binding.SAID or (why is Binding.ONLY and was_here):
             socket.begin_at_s = now + self._arrival_limit_s
 
     def _drop_label(self, socket: Socket, reason: str, when: str) -> None:
@@ -626,23 +616,23 @@ class Line:
             self._refuse(label, refused.code, refused.reason, refused.remedy, socket)
         else:
             self._tell(ScanAccepted(label, "label", socket.name))
-            self._bind(socket, label, Why.SAID, now)
+            self._bind(socket, label, Binding.SAID, now)
 
     # -- the tables -------------------------------------------------------------------------------
 
     _TABLE: ClassVar[Mapping[Phase, Mapping[type, Callable[..., None]]]] = {
-        Phase.REST: {Ready: _ready, Down: _down, PresenceChanged: _unit},
+        Phase.REST: {Ready: _ready, AdapterDown: _down, PresenceChanged: _unit},
         Phase.CLAIM: {Claimed: _claimed, NotClaimed: _not_claimed, NotSaved: _claim_failed},
         Phase.RUN: {
             Ready: _ready,
-            Down: _down,
+            AdapterDown: _down,
             PresenceChanged: _unit,
             NotSaved: _not_saved,
             Ended: _ended,
         },
         Phase.SAVE: {
             Ready: _ready,
-            Down: _down,
+            AdapterDown: _down,
             PresenceChanged: _unit,
             NotSaved: _not_saved,
             Saved: _saved,

@@ -17,7 +17,6 @@ from flasher.station.records.model import (
     RunFilter,
     RunKind,
     RunState,
-    UnitLife,
     utc_text,
 )
 from flasher.station.records.queries import Records
@@ -74,11 +73,6 @@ class Report:
 def make_report(records: Records, chosen: RunFilter) -> Report:
     """The report of a filter. Raises RecordError."""
     return Report(chosen, records.figures(chosen), records.table(chosen))
-
-
-def unit_document(life: UnitLife) -> dict[str, Any]:
-    """The whole life of a unit in JSON's types."""
-    return {"schema": SCHEMA_VERSION, **plain(life)}
 
 
 def plain(value: Any) -> Any:

@@ -32,7 +32,7 @@ from flasher.station import codes
 from flasher.station.pattern import TEXT_MAX
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import RunState
-from flasher.station.socket import LastRun, Phase, Seen, Socket, Why
+from flasher.station.socket import Binding, LastRun, Occupancy, Phase, Socket
 
 _COMMAND_MAX: Final = 200
 
@@ -70,27 +70,29 @@ class Command:
 
 
 @dataclass(frozen=True)
-class Nonsense:
+class NotUnderstood:
     """It is neither; `why` says so."""
 
     why: str
 
 
-def understand(text: str) -> Label | Command | Nonsense:
+def understand(text: str) -> Label | Command | NotUnderstood:
     """What was scanned. Whether a label is one of the recipe is not looked at."""
     scanned = text.strip()
     if not scanned:
-        return Nonsense("Nothing was scanned.")
+        return NotUnderstood("Nothing was scanned.")
     if not scanned.isprintable() or len(scanned) > _COMMAND_MAX:
-        return Nonsense("It holds characters that no label has, or too many.")
+        return NotUnderstood("It holds characters that no label has, or too many.")
     first, _, rest = scanned.partition(" ")
     word = next((each for each in Word if each.value == first.upper()), None)
     if word is not None and (word in ALONE) == (not rest.strip()):
         return Command(word, rest.strip())
     if word is not None:
-        return Nonsense(f"{word.value} stands alone." if word in ALONE else f"{word.value} what?")
+        return NotUnderstood(
+            f"{word.value} stands alone." if word in ALONE else f"{word.value} what?"
+        )
     if len(scanned) > TEXT_MAX:
-        return Nonsense(f"It is longer than {TEXT_MAX} characters.")
+        return NotUnderstood(f"It is longer than {TEXT_MAX} characters.")
     return Label(scanned)
 
 
@@ -108,7 +110,7 @@ class Refused(Exception):  # noqa: N818  a scan that changes nothing
         self.remedy = remedy
 
 
-def place(sockets: Sockets, serial: str) -> tuple[Socket, Why] | None:
+def place(sockets: Sockets, serial: str) -> tuple[Socket, Binding] | None:
     """The socket of a label that was scanned alone; None where a person has to say it.
 
     Raises Refused.
@@ -118,7 +120,7 @@ def place(sockets: Sockets, serial: str) -> tuple[Socket, Why] | None:
         return only, _why_only(only, serial)
     found = _where_it_is(sockets, serial)
     if found is not None:
-        return found, Why.SAID
+        return found, Binding.SAID
     starting = next((each for each in sockets.values() if each.is_starting), None)
     if starting is not None:
         raise Refused(
@@ -129,9 +131,9 @@ def place(sockets: Sockets, serial: str) -> tuple[Socket, Why] | None:
     may_be_in = (each.awaits_label and not each.is_of_another(serial) for each in sockets.values())
     if was_in(sockets, serial) is not None or any(may_be_in):
         return None
-    empty = (e for e in sockets.values() if e.seen is Seen.EMPTY and e.can_work)
+    empty = (e for e in sockets.values() if e.occupancy is Occupancy.EMPTY and e.can_work)
     named = next((e for e in empty if e.phase is Phase.REST and not e.label), None)
-    return None if named is None else (named, Why.NAMED)
+    return None if named is None else (named, Binding.NAMED)
 
 
 def was_in(sockets: Sockets, serial: str) -> Socket | None:
@@ -143,16 +145,16 @@ def was_in(sockets: Sockets, serial: str) -> Socket | None:
     return None
 
 
-def _why_only(only: Socket, serial: str) -> Why:
+def _why_only(only: Socket, serial: str) -> Binding:
     check_service(only)
     check_free(only)
     if only.label:
         raise one_at_a_time(only.label, only.wanted)
     last = only.verdict
     if last is None or last.serial == serial:
-        return Why.ONLY
-    if only.seen is not Seen.SILENT:
-        return Why.NAMED  # the next one, when this one is out
+        return Binding.ONLY
+    if only.occupancy is not Occupancy.SILENT:
+        return Binding.NAMED  # the next one, when this one is out
     if last.outcome is not RunState.PASS and not last.has_talked and only.sees_units:
         # It may sit in its bootloader, and announce itself at any time.
         raise Refused(
@@ -160,7 +162,7 @@ def _why_only(only: Socket, serial: str) -> Why:
             f"{printable(last.serial)} may still be in socket {only.name}.",
             f"Take it out, scan FREE {only.name}, then the label again.",
         )
-    return Why.ONLY
+    return Binding.ONLY
 
 
 def _where_it_is(sockets: Sockets, serial: str) -> Socket | None:
@@ -202,7 +204,7 @@ def check_first(sockets: Sockets, serial: str, waiting: str) -> None:
         if each.label == serial:
             again = f"If it is there, scan SOCKET {each.name}, then the label."
             raise Refused("DOUBLE_SCAN", "It was scanned already.", f"{each.wanted} {again}")
-        if each.label and each.why is Why.NAMED:
+        if each.label and each.binding is Binding.NAMED:
             raise one_at_a_time(each.label, each.wanted)
     if waiting:
         remedy = f"Scan the card of the socket that {printable(waiting)} is in."
@@ -234,7 +236,7 @@ def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
 def check_one_socket(sockets: Sockets, socket: Socket, serial: str) -> None:
     """Raises Refused for a label that a person gave to another socket."""
     for each in sockets.values():
-        if each is not socket and each.label == serial and each.why is not Why.NAMED:
+        if each is not socket and each.label == serial and each.binding is not Binding.NAMED:
             reason = f"It was scanned for socket {each.name}."
             raise Refused("DOUBLE_SCAN", reason, f"{each.wanted} Or scan CANCEL.")
 

@@ -34,7 +34,7 @@ class Phase(Enum):
     SAVE = "the run is over, its end is not on disk"
 
 
-class Seen(Enum):
+class Occupancy(Enum):
     """What is known of a unit in the socket."""
 
     UNKNOWN = "nothing is known since its process began"
@@ -43,7 +43,7 @@ class Seen(Enum):
     EMPTY = "no unit is in it"
 
 
-class Why(Enum):
+class Binding(Enum):
     """Why a label is the one of the unit in a socket."""
 
     NAMED = "the station named the socket: the unit has to arrive there, from now on"
@@ -75,7 +75,7 @@ class Socket:
     out_of_service: str | None = ""
     """Why it cannot work; empty while it starts, None when it can."""
     sees_units: bool = True
-    seen: Seen = Seen.UNKNOWN
+    occupancy: Occupancy = Occupancy.UNKNOWN
     own: str | None = None
     """The serial number that the unit itself says; empty: it has none; None: not said yet."""
     is_own_known: bool = False
@@ -84,7 +84,7 @@ class Socket:
     """The label that a virtual unit bears."""
     label: str = ""
     """The label of the next run."""
-    why: Why = Why.SAID
+    binding: Binding = Binding.SAID
     begin_at_s: float | None = None
     """When the run begins although no unit is heard, or although it does not say who it is."""
     bound_at_s: float = 0.0
@@ -113,7 +113,7 @@ class Socket:
     @property
     def is_there(self) -> bool:
         """True while a unit is heard in it."""
-        return self.seen is Seen.THERE
+        return self.occupancy is Occupancy.THERE
 
     @property
     def is_running(self) -> bool:
@@ -121,17 +121,27 @@ class Socket:
         return self.phase in (Phase.CLAIM, Phase.RUN)
 
     @property
+    def is_busy(self) -> bool:
+        """True while a run goes on, is not saved yet, or has its label."""
+        return self.phase is not Phase.REST or bool(self.label)
+
+    @property
+    def state(self) -> SocketState:
+        """What was told last."""
+        return SocketState.STARTING if self.shown is None else self.shown[0]
+
+    @property
     def verdict(self) -> LastRun | None:
         """The last run, as long as its unit is believed to be in the socket."""
         last = self.last
-        if last is None or last.outcome is None or self.seen is Seen.EMPTY:
+        if last is None or last.outcome is None or self.occupancy is Occupancy.EMPTY:
             return None
         return last if self.is_last_there else None
 
     @property
     def holds(self) -> LastRun | None:
         """The last run, while its unit is still heard, or nothing speaks against it yet."""
-        return None if self.seen is Seen.SILENT else self.verdict
+        return None if self.occupancy is Occupancy.SILENT else self.verdict
 
     @property
     def awaits_label(self) -> bool:
@@ -144,7 +154,7 @@ class Socket:
         """True while nobody can say whether a unit is in it."""
         if self.phase is not Phase.REST or self.verdict is not None:
             return False
-        is_listening = self.sees_units and self.seen is Seen.UNKNOWN
+        is_listening = self.sees_units and self.occupancy is Occupancy.UNKNOWN
         return self.out_of_service == "" or (self.can_work and is_listening)
 
     # -- the unit in it ---------------------------------------------------------------------------
@@ -153,7 +163,7 @@ class Socket:
         """A unit is heard, or says who it is; `is_serial`: by a number of the recipe. True when it
         is another one than before.
         """
-        before, self.seen = self.seen, Seen.THERE
+        before, self.occupancy = self.occupancy, Occupancy.THERE
         if what.serial is not None:
             self.own, self.is_own_known = what.serial, is_serial
         is_new = self._is_new(before) or bool(what.label)
@@ -162,19 +172,19 @@ class Socket:
             self.borne = what.label
         return is_new
 
-    def _is_new(self, before: Seen) -> bool:
+    def _is_new(self, before: Occupancy) -> bool:
         last = self.last
         if last is None:
-            return before is not Seen.THERE
+            return before is not Occupancy.THERE
         if self.own == last.serial:
             self.last = replace(last, has_talked=True, has_said=True)
             self.is_last_there = True
             return False
         says_other = self.own is not None and (last.has_said or self.is_own_known)
-        if says_other or before in (Seen.SILENT, Seen.EMPTY):
+        if says_other or before in (Occupancy.SILENT, Occupancy.EMPTY):
             # Another unit; or one that was silent for a while, and does not say who it is.
             was_last, self.is_last_there = self.is_last_there, False
-            return was_last or before is not Seen.THERE
+            return was_last or before is not Occupancy.THERE
         self.last = replace(last, has_talked=True)
         return False
 
@@ -185,20 +195,20 @@ class Socket:
 
     def fall_silent(self, *, is_certain: bool) -> bool:
         """Nothing is heard any more, or nothing is in it for certain. True when a unit was."""
-        before = self.seen
-        is_out = is_certain or self.is_own_known or before is Seen.EMPTY
-        self.seen = Seen.EMPTY if is_out else Seen.SILENT
+        before = self.occupancy
+        is_out = is_certain or self.is_own_known or before is Occupancy.EMPTY
+        self.occupancy = Occupancy.EMPTY if is_out else Occupancy.SILENT
         self.own, self.is_own_known, self.borne = None, False, ""
         self._forget_note()
         if is_certain:
             self.last = None
-        return before is Seen.THERE
+        return before is Occupancy.THERE
 
     def let_go(self) -> str:
         """The label is not the one of this socket any more; returns it."""
         label, self.label, self.begin_at_s = self.label, "", None
-        if label and self.seen is Seen.EMPTY:
-            self.seen = Seen.SILENT  # its unit may have been put in, and sleep
+        if label and self.occupancy is Occupancy.EMPTY:
+            self.occupancy = Occupancy.SILENT  # its unit may have been put in, and sleep
         return label
 
     def is_of_another(self, label: str) -> bool:
@@ -211,7 +221,7 @@ class Socket:
         if not (self.label and is_free):
             return False
         is_time = self.begin_at_s is not None and now >= self.begin_at_s
-        if self.why is Why.NAMED:
+        if self.binding is Binding.NAMED:
             # It has arrived, and said who it is or has had the time for it.
             has_arrived = self.is_there and self.begin_at_s is not None
             is_time = has_arrived and (self.own is not None or is_time)
@@ -225,7 +235,7 @@ class Socket:
     def wanted(self) -> str:
         """What its label waits for."""
         shown = printable(self.label)
-        if self.why is not Why.NAMED:
+        if self.binding is not Binding.NAMED:
             return f"Connect {shown}."
         if self.verdict is not None:
             return f"Take {printable(self.verdict.serial)} out, then connect {shown}."
@@ -266,7 +276,7 @@ class Socket:
             return SocketState.SCAN, "", self.note + borne
         if self.is_there:
             return SocketState.SCAN, "", self._asked_for(card) + borne
-        if self.seen is Seen.EMPTY:
+        if self.occupancy is Occupancy.EMPTY:
             return SocketState.EMPTY, "", ""
         return SocketState.SILENT, "", "Nothing is heard: no unit, or one that sleeps."
 

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Final
 
+from flasher.errors import UsageError
 from flasher.log import log_event
 from flasher.station import codes, line
 from flasher.station.codes import CODES
@@ -30,7 +31,6 @@ from flasher.station.events import (
     RecordNotSaved,
     RunEnded,
     RunStarted,
-    SocketState,
     StationEvent,
     StationStarted,
     StationStopped,
@@ -38,7 +38,7 @@ from flasher.station.events import (
     StepStarted,
     WorkerFailed,
 )
-from flasher.station.line import Line
+from flasher.station.line import ARRIVAL_LIMIT_S, SCAN_LIMIT_S, Line
 from flasher.station.messages import (
     Abort,
     AdapterDown,
@@ -57,7 +57,6 @@ from flasher.station.messages import (
     StepReport,
     WorkerSetup,
 )
-from flasher.station.options import StationOptions, check_natures
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.errors import ClaimRefusedError, RecordError, Refusal
 from flasher.station.records.model import (
@@ -72,7 +71,7 @@ from flasher.station.records.model import (
 from flasher.station.records.store import Store, SystemClock
 from flasher.station.runs import ActiveRun, before_of, save, verified_words
 from flasher.station.socket import Phase, Socket
-from flasher.station.supervisor import Launch, ProcessPort, Supervisor, WorkerLost
+from flasher.station.supervisor import HANG_S, Launch, ProcessPort, Supervisor, WorkerLost
 
 TURN_S: Final = 0.1
 """How long a turn of the loop waits at the most."""
@@ -80,21 +79,19 @@ EventHandler = Callable[[StationEvent], None]
 
 
 @dataclass(frozen=True)
-class SocketView:
-    """A socket for somebody who looks; `Station.sockets`."""
+class StationOptions:
+    """What may be set; the defaults are for a line with people."""
 
-    name: str
-    state: SocketState
-    text: str
-    serial: str
-    is_there: bool
-    """A unit is heard in it."""
-    can_work: bool
-    sees_units: bool
-    awaits_label: bool
-    """A unit is in it that has no label yet."""
-    is_busy: bool
-    """A run goes on, is not saved yet, or has its label."""
+    arrival_limit_s: float = ARRIVAL_LIMIT_S
+    scan_limit_s: float = SCAN_LIMIT_S
+    """Both as `Line` has them."""
+    hang_s: float = HANG_S
+    end_limit_s: float = 30.0
+    """How long runs may take to end when the station is ended."""
+    scans_labels: bool = False
+    """Virtual units are scanned by themselves."""
+    mixes_virtual: bool = False
+    """Real and virtual units may share the records; one serial number is never both."""
 
 
 class Station:
@@ -151,7 +148,7 @@ class Station:
         Raises RecordError; UsageError for records of the other kind of units.
         """
         sockets = self.line.sockets
-        check_natures(
+        _check_natures(
             self.store.read.natures(),
             frozenset(each.is_virtual for each in sockets.values()),
             self.options,
@@ -247,26 +244,9 @@ class Station:
         return self.line.stopped is not None
 
     @property
-    def sockets(self) -> tuple[SocketView, ...]:
-        """All sockets as they are now."""
-        views = []
-        for socket in self.line.sockets.values():
-            state, serial, text = socket.shown or (SocketState.STARTING, "", "")
-            is_busy = socket.phase is not Phase.REST or bool(socket.label)
-            views.append(
-                SocketView(
-                    socket.name,
-                    state,
-                    text,
-                    serial,
-                    socket.is_there,
-                    socket.can_work,
-                    socket.sees_units,
-                    socket.awaits_label,
-                    is_busy,
-                )
-            )
-        return tuple(views)
+    def sockets(self) -> tuple[Socket, ...]:
+        """All sockets as they are now, to look at."""
+        return tuple(self.line.sockets.values())
 
     @property
     def figures(self) -> Figures:
@@ -300,12 +280,12 @@ class Station:
                 match effect:
                     case line.Tell(event):
                         self.tell(event)
-                    case line.Claim():
+                    case line.ClaimRun():
                         self.line.feed(effect.socket, self._claim(effect), self._now)
                         self._begin(effect.socket)
-                    case line.Abort(socket):
+                    case line.AbortRun(socket):
                         self.supervisor.send(socket, Abort())
-                    case line.Resume(sockets):
+                    case line.SaveAgain(sockets):
                         saved = [self._save(socket) for socket in sockets]  # every one is tried
                         all_saved = self._end_unknown() and all(saved)
                         self.line.resumed(self._now, all_saved=all_saved)
@@ -314,11 +294,7 @@ class Station:
 
     def _hear(self, socket: str, message: FromWorker | WorkerLost) -> None:
         match message:
-            case Ready(_, sees_units):
-                self._feed(socket, line.Ready(sees_units))
-            case AdapterDown(reason):
-                self._feed(socket, line.Down(reason))
-            case PresenceChanged():
+            case Ready() | AdapterDown() | PresenceChanged():
                 self._feed(socket, message)
             case Ask(number, what):
                 self._answer(socket, number, what)
@@ -329,7 +305,7 @@ class Station:
                 self._end(socket, message)
             case WorkerLost(reason, hung, restart_in_s):
                 self._end_lost(socket, reason, hung=hung)
-                self._feed(socket, line.Down(reason))
+                self._feed(socket, AdapterDown(reason))
                 self.tell(WorkerFailed(socket, reason, restart_in_s))
             case _:
                 pass  # beats and last words: the supervisor has taken note
@@ -369,7 +345,7 @@ class Station:
 
     # -- beginning --------------------------------------------------------------------------------
 
-    def _claim(self, order: line.Claim) -> line.SocketInput:
+    def _claim(self, order: line.ClaimRun) -> line.SocketInput:
         """Have the run in the records, on disk."""
         serial, socket = order.serial, self.line.sockets[order.socket]
         part = self.recipe.recipe.part
@@ -552,3 +528,24 @@ def _said(error: RecordError) -> str:
 
 def _utc_text(moment: datetime) -> str:
     return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"
+
+
+def _check_natures(known: frozenset[bool], own: frozenset[bool], options: StationOptions) -> None:
+    """Whether sockets may use records that know virtual units (True), real ones (False); `own`:
+    the same of the sockets.
+
+    Raises UsageError: a PASS of a virtual unit must not be taken for one of a product.
+    """
+    if options.mixes_virtual or len(own | known) < len((True, False)):
+        return
+    if len(own) > 1:
+        what = "Some sockets of this station have adapters, others have virtual units."
+    elif True in own:
+        what = "These records hold real units, and this station has virtual ones."
+    else:
+        what = "These records hold virtual units, and this station has adapters."
+    raise UsageError(
+        what,
+        remedy="Keep records of virtual units in a database of their own; --mix-virtual has them"
+        " in one.",
+    )

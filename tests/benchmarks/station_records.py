@@ -27,7 +27,7 @@ from flasher.station.records import (
     Store,
 )
 from flasher.station.records.model import StepName, Verified
-from flasher.station.reports import make_report, unit_document
+from flasher.station.reports import make_report, plain
 from tests.station.factory import BMS_VERSION, HEAD, Bench, make_recipe, target_table
 
 SERIAL_NUMBER = """
@@ -117,7 +117,7 @@ def measure(folder: Path, runs: int) -> None:
         timed("report of all as CSV", lambda: make_report(records, RunFilter()).to_csv())
         timed("report of all as JSON document", lambda: make_report(records, RunFilter()).to_dict())
         timed("report of all as JUnit", lambda: make_report(records, RunFilter()).to_junit())
-        timed("one unit", lambda: unit_document(records.unit("W0000017")))
+        timed("one unit", lambda: plain(records.unit("W0000017")))
         timed("certificate", lambda: certificate(store, records.unit("W0000017")))
         timed("backup", lambda: store.backup(folder / "backup.sqlite"))
         began = time.perf_counter()

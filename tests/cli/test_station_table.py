@@ -40,7 +40,7 @@ from flasher.station.events import (
     WorkerFailed,
 )
 from flasher.station.records.model import Figures, RunId, RunKind, RunState, StepName
-from flasher.station.station import SocketView
+from flasher.station.socket import Occupancy, Socket
 from tests.cli.conftest import Flasher
 from tests.cli.station_threads import ThreadPort
 from tests.cli.test_schema import hold
@@ -243,22 +243,12 @@ def test_a_pipe_is_read_to_its_end() -> None:
     assert [scan.strip() for scan in scans] == ["W2", "RESUME"]
 
 
-def socket_view(name: str, *, is_there: bool = True, sees_units: bool = True) -> SocketView:
-    state = SocketState.SCAN if is_there else SocketState.EMPTY
-    return SocketView(
-        name,
-        state,
-        text="",
-        serial="",
-        is_there=is_there,
-        can_work=True,
-        sees_units=sees_units,
-        awaits_label=is_there,
-        is_busy=False,
-    )
+def socket_view(name: str, *, is_there: bool = True, sees_units: bool = True) -> Socket:
+    occupancy = Occupancy.THERE if is_there else Occupancy.EMPTY
+    return Socket(name, out_of_service=None, sees_units=sees_units, occupancy=occupancy)
 
 
-def worked_off(scans: list[str], sockets: list[SocketView], borne: dict[str, str]) -> list[str]:
+def worked_off(scans: list[str], sockets: list[Socket], borne: dict[str, str]) -> list[str]:
     """What is submitted in one turn."""
     submitted: list[str] = []
     file = ScanFile(scans, [socket.name for socket in sockets], submitted.append)

@@ -24,9 +24,8 @@ from flasher.station.messages import (
     TraceFile,
     WorkerSetup,
 )
-from flasher.station.options import StationOptions
 from flasher.station.records.model import Measurement, RunState, StepName, StepState, Verified
-from flasher.station.station import Station
+from flasher.station.station import Station, StationOptions
 from tests.station.factory import Bench
 
 Event = TypeVar("Event")
@@ -131,10 +130,11 @@ class LineBench:
         self.turn()
 
     def text(self, socket: str) -> str:
-        return next(view.text for view in self.station.sockets if view.name == socket)
+        shown = self.station.line.sockets[socket].shown
+        return "" if shown is None else shown[2]
 
     def state(self, socket: str) -> SocketState:
-        return next(view.state for view in self.station.sockets if view.name == socket)
+        return self.station.line.sockets[socket].state
 
     def of(self, kind: type[Event]) -> list[Event]:
         """The events of a kind so far."""

@@ -23,9 +23,9 @@ from flasher.station.events import (
     StationEvent,
 )
 from flasher.station.line import Line
-from flasher.station.messages import PresenceChanged
+from flasher.station.messages import AdapterDown, PresenceChanged, Ready
 from flasher.station.records.model import RunState
-from flasher.station.socket import Socket, Why
+from flasher.station.socket import Binding, Socket
 
 SOCKETS: Final = ("A", "B", "C")
 _LABEL: Final = re.compile(r"W[0-9]{4}")
@@ -140,7 +140,7 @@ class World:
 
     def feed(self, name: str, what: line.SocketInput) -> None:
         self.note(f"{name} {what}")
-        self.way = "named" if self.line.sockets[name].why is Why.NAMED else "card"
+        self.way = "named" if self.line.sockets[name].binding is Binding.NAMED else "card"
         self.line.feed(name, what, self.now)
         self.carry_out()
 
@@ -158,9 +158,9 @@ class World:
                 match effect:
                     case line.Tell(event):
                         self.look(event)
-                    case line.Claim(socket, serial):
+                    case line.ClaimRun(socket, serial):
                         self.claim(socket, serial)
-                    case line.Resume(sockets):
+                    case line.SaveAgain(sockets):
                         saved = [self.save(name) for name in sockets]
                         self.line.resumed(self.now, all_saved=all(saved))
                     case _:
@@ -219,7 +219,7 @@ class World:
         bay = self.bays[name]
         if not bay.works:
             bay.works = True
-            self.feed(name, line.Ready(sees_units=True))
+            self.feed(name, Ready("a bus", sees_units=True))
         if bay.run:
             return
         sees = self.truth(bay)
@@ -239,7 +239,7 @@ class World:
         if bay.run:
             self.end_run(name, RunState.ERROR)
         bay.told = None
-        self.feed(name, line.Down("its process ended"))
+        self.feed(name, AdapterDown("its process ended"))
 
     # -- what is looked at ------------------------------------------------------------------------
 

@@ -15,7 +15,7 @@ from flasher.station.events import SocketChanged
 from flasher.station.line import Line
 from flasher.station.messages import PresenceChanged
 from flasher.station.records.model import RunState
-from flasher.station.socket import Phase, Seen, Socket, Why
+from flasher.station.socket import Binding, Occupancy, Phase, Socket
 from tests.station.line_world import Walk, World
 
 STEPS = 100
@@ -59,7 +59,7 @@ def bind_to_the_first_arrival(patch: pytest.MonkeyPatch) -> None:
     def arrived(self: Line, socket: Socket) -> None:
         if self._label:
             serial, self._label = self._label, ""
-            self._bind(socket, serial, Why.SAID, 0.0)
+            self._bind(socket, serial, Binding.SAID, 0.0)
 
     patch.setattr(Line, "_arrived_elsewhere", arrived)
 
@@ -88,21 +88,23 @@ def take_silence_for_an_empty_socket(patch: pytest.MonkeyPatch) -> None:
 
     def fall_silent(self: Socket, *, is_certain: bool) -> bool:
         was_there = real(self, is_certain=is_certain)
-        self.seen = Seen.EMPTY
+        self.occupancy = Occupancy.EMPTY
         return was_there
 
     patch.setattr(Socket, "fall_silent", fall_silent)
 
 
 def name_a_socket_of_which_nothing_is_known(patch: pytest.MonkeyPatch) -> None:
-    def place(sockets: scans.Sockets, serial: str) -> tuple[Socket, Why] | None:
+    def place(sockets: scans.Sockets, serial: str) -> tuple[Socket, Binding] | None:
         try:
             found = scans.place(sockets, serial)
         except scans.Refused:
             found = None
         free = (e for e in sockets.values() if e.can_work and e.phase is Phase.REST)
-        unknown = next((e for e in free if e.seen is not Seen.THERE and not e.label), None)
-        return found or (None if unknown is None else (unknown, Why.NAMED))
+        unknown = next(
+            (e for e in free if e.occupancy is not Occupancy.THERE and not e.label), None
+        )
+        return found or (None if unknown is None else (unknown, Binding.NAMED))
 
     patch.setattr(line, "place", place)
 
@@ -110,7 +112,7 @@ def name_a_socket_of_which_nothing_is_known(patch: pytest.MonkeyPatch) -> None:
 def take_who_wakes_for_the_unit_that_passed(patch: pytest.MonkeyPatch) -> None:
     real = Socket._is_new
 
-    def is_new(self: Socket, before: Seen) -> bool:
+    def is_new(self: Socket, before: Occupancy) -> bool:
         was_there = self.is_last_there
         found = real(self, before)
         self.is_last_there = was_there or self.is_last_there

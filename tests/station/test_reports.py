@@ -22,7 +22,7 @@ from flasher.station.records import (
     UnitLife,
     UnitState,
 )
-from flasher.station.reports import Report, make_report, unit_document
+from flasher.station.reports import Report, make_report, plain
 from tests.station.factory import SERIAL, USUAL, Bench
 
 HOSTILE = "<script>alert(1)</script>\u202e\x07"
@@ -122,7 +122,7 @@ def test_a_report_of_a_filter_names_it(plant: Bench) -> None:
 
 
 def test_the_life_of_a_unit_is_a_document(plant: Bench) -> None:
-    document = json.loads(json.dumps(unit_document(plant.store.read.unit("W2605003"))))
+    document = json.loads(json.dumps(plain(plant.store.read.unit("W2605003"))))
     assert document["state"] == "PASS"
     assert [run["run"]["state"] for run in document["runs"]] == ["FAIL", "PASS"]
     assert document["runs"][1]["targets"][0]["reached"] == "version"

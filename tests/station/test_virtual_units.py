@@ -9,11 +9,10 @@ from pathlib import Path
 import pytest
 
 from flasher.errors import UsageError
-from flasher.station.adapters import resolve
+from flasher.station.adapters import resolve, worker_setups
 from flasher.station.config import MockUnits, mock_config
 from flasher.station.messages import RunOrder, RunResult, VirtualUnits
 from flasher.station.records.model import RunId, RunKind
-from flasher.station.setups import worker_setups
 from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import Health, VirtualSocket, health_of, serial_numbers
 from tests.station.factory import DAY, HEAD, SERIAL_NUMBER, USUAL, make_recipe

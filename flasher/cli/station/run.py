@@ -36,10 +36,9 @@ from flasher.cli.stop import stop_on_signal
 from flasher.errors import BusError, ExitCode, FlasherError, InterruptedByUserError, UsageError
 from flasher.protocol.text import printable
 from flasher.station import codes
-from flasher.station.options import StationOptions
 from flasher.station.recipe_file import load_checked
 from flasher.station.records import RecordError, Store
-from flasher.station.station import Station
+from flasher.station.station import Station, StationOptions
 from flasher.station.supervisor import Launch, ProcessPort
 
 LAUNCH: Launch = ProcessPort

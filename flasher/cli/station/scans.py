@@ -11,7 +11,7 @@ from flasher.errors import UsageError
 from flasher.files import read
 from flasher.protocol.text import printable
 from flasher.station.scans import Command, Label, Word, understand
-from flasher.station.station import SocketView
+from flasher.station.socket import Socket
 
 FILE_MAX_SIZE: Final = 4 * 1024 * 1024
 """In bytes."""
@@ -67,7 +67,7 @@ class ScanFile:
         """True when every scan was submitted."""
         return not self._left
 
-    def turn(self, sockets: Iterable[SocketView], borne: Mapping[str, str]) -> None:
+    def turn(self, sockets: Iterable[Socket], borne: Mapping[str, str]) -> None:
         """Submit the next scan, when its time has come. `borne` are the labels of virtual units, by
         their sockets. Raises UsageError where no socket can tell that a unit is in it.
         """
@@ -92,7 +92,7 @@ class ScanFile:
         else:
             self._submit(self._left.popleft())
 
-    def _label(self, sockets: Iterable[SocketView], borne: Mapping[str, str]) -> None:
+    def _label(self, sockets: Iterable[Socket], borne: Mapping[str, str]) -> None:
         """Give a label to a unit that waits."""
         ahead = self._until_command()
         for socket in sockets:
