@@ -14,7 +14,7 @@ from typing import Final
 
 from flasher.station import codes
 from flasher.station.codes import CODES, Code
-from flasher.station.messages import Finished, RunOrder, RunResult, Texts, flash_value, write_key
+from flasher.station.messages import Finished, RunOrder, RunResult, flash_value, write_key
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.errors import RuleBrokenError
 from flasher.station.records.model import (
@@ -140,37 +140,35 @@ _OPEN: Final = frozenset({RunState.INTERRUPTED, RunState.ERROR, RunState.ABORTED
 FLASH: Final = "flash"
 
 
-@dataclass(frozen=True)
-class Before:
-    """The fields of `RunOrder` of these names."""
-
-    known_before: Texts = field(default_factory=dict)
-    flashed_before: frozenset[str] = frozenset()
-    written_before: Texts = field(default_factory=dict)
-
-
-def before_of(life: UnitLife | None, recipe: LoadedRecipe, *, is_reworked: bool = False) -> Before:
-    """What the next run of a unit has to know. A verdict ends a story: what came before the last
-    PASS or FAIL is not the state in which this run finds the unit. But what must not change is
-    held until a PASS: a run that failed after its first write may be what changed it. Only for a
-    unit that `is_reworked` it is read anew.
+def with_history(
+    order: RunOrder, life: UnitLife | None, recipe: LoadedRecipe, *, is_reworked: bool = False
+) -> RunOrder:
+    """The order with what the unit's runs before mean for it. A verdict ends a story: what came
+    before the last PASS or FAIL is not the state in which this run finds the unit. But what must
+    not change is held until a PASS: a run that failed after its first write may be what changed it.
+    Only for a unit that `is_reworked` it is read anew.
     """
-    if life is None:
-        return Before()
-    runs = list(life.runs)
-    since = next((at for at, run in reversed(list(enumerate(runs))) if not _is_open(run)), -1)
-    still_open = runs[since + 1 :]
-    passed_at = [at for at, run in enumerate(runs) if run.run.state is RunState.PASS]
-    passed = runs[passed_at[-1]] if passed_at else None
-    unfinished = runs[passed_at[-1] + 1 :] if passed_at else runs
-    bound = still_open if is_reworked else unfinished
-    return Before(
-        _known(bound), _flashed(still_open, recipe), {} if passed is None else _written(passed)
+    runs = [] if life is None else list(life.runs)
+    still_open = _after(runs, lambda run: run.run.state not in _OPEN)
+    unfinished = _after(runs, lambda run: run.run.state is RunState.PASS)
+    passed = next((run for run in reversed(runs) if run.run.state is RunState.PASS), None)
+    written = passed.writes if passed is not None else ()
+    return replace(
+        order,
+        known_before=_known(still_open if is_reworked else unfinished),
+        flashed_before=_flashed(still_open, recipe),
+        written_before={
+            write_key(write.target, write.what): write.value
+            for write in written
+            if write.what != FLASH
+        },
     )
 
 
-def _is_open(run: RunDetails) -> bool:
-    return run.run.state in _OPEN
+def _after(runs: list[RunDetails], ends: Callable[[RunDetails], bool]) -> list[RunDetails]:
+    """The runs behind the last one that ends a story."""
+    last = next((at for at in reversed(range(len(runs))) if ends(runs[at])), -1)
+    return runs[last + 1 :]
 
 
 def _known(runs: Sequence[RunDetails]) -> dict[str, str]:
@@ -197,11 +195,3 @@ def _flashed(runs: Sequence[RunDetails], recipe: LoadedRecipe) -> frozenset[str]
         for name, write in last.items()
         if write.value == wanted.get(name) and write.read_back is not None
     )
-
-
-def _written(run: RunDetails) -> dict[str, str]:
-    return {
-        write_key(write.target, write.what): write.value
-        for write in run.writes
-        if write.what != FLASH
-    }

@@ -17,7 +17,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime
 from typing import Final
 
 from flasher.errors import UsageError
@@ -69,7 +68,7 @@ from flasher.station.records.model import (
     RunState,
 )
 from flasher.station.records.store import Store, SystemClock
-from flasher.station.runs import ActiveRun, before_of, save, verified_words
+from flasher.station.runs import ActiveRun, save, verified_words, with_history
 from flasher.station.socket import Phase, Socket
 from flasher.station.supervisor import HANG_S, Launch, ProcessPort, Supervisor, WorkerLost
 
@@ -265,7 +264,8 @@ class Station:
     def tell(self, event: StationEvent) -> None:
         """An event leaves."""
         try:
-            self._on_event(replace(event, at=_utc_text(self.clock.utc())))
+            at = self.clock.utc().isoformat(timespec="milliseconds").replace("+00:00", "Z")
+            self._on_event(replace(event, at=at))
         except Exception as error:  # noqa: BLE001  who looks on must not stop the line
             log_event(error)
 
@@ -347,14 +347,12 @@ class Station:
 
     def _claim(self, order: line.ClaimRun) -> line.SocketInput:
         """Have the run in the records, on disk."""
-        serial, socket = order.serial, self.line.sockets[order.socket]
-        part = self.recipe.recipe.part
+        socket, part = self.line.sockets[order.socket], self.recipe.recipe.part
         try:
-            lives = self.store.read.units(serial)
+            lives = self.store.read.units(order.serial)
             life = next((life for life in lives if life.part == part), None)
-            before = before_of(life, self.recipe, is_reworked=bool(order.reason))
             claim = self.store.claim(
-                serial,
+                order.serial,
                 order.socket,
                 self.recipe,
                 order.operator,
@@ -366,46 +364,36 @@ class Station:
             is_changed = error.refusal is Refusal.RECIPE_CHANGED
             return line.NotClaimed(error.refusal.value, error.what, error.remedy, is_changed)
         except RecordError as error:
-            self._not_saved(order.socket, serial, None, error)
+            self._not_saved(order.socket, order.serial, None, error)
             return line.NotSaved(error.what, error.remedy)
+        day = self.clock.utc().astimezone().date()
+        run_order = RunOrder(claim.run_id, claim.kind, claim.serial, day, order.lot)
+        run_order = with_history(run_order, life, self.recipe, is_reworked=bool(order.reason))
         trace = self.store.files.spooled(claim.run_id)
-        run_order = RunOrder(
-            claim.run_id,
-            claim.kind,
-            claim.serial,
-            self.clock.utc().astimezone().date(),
-            order.lot,
-            before.known_before,
-            before.flashed_before,
-            before.written_before,
-        )
         self._runs[order.socket] = ActiveRun(claim, trace, self._now, order=run_order)
         return line.Claimed()
 
     def _begin(self, socket: str) -> None:
         """Let the process of a socket work on what was claimed, if anything was."""
-        run = self._runs.get(socket)
-        if run is None or run.finished is not None:
+        run = self._going(socket)
+        if run is None:
             return
-        claim = run.claim
-        self.tell(
-            RunStarted(
-                socket,
-                claim.serial,
-                claim.run_id,
-                claim.kind,
-                self.line.sockets[socket].is_virtual,
-            )
-        )
+        claim, is_virtual = run.claim, self.line.sockets[socket].is_virtual
+        self.tell(RunStarted(socket, claim.serial, claim.run_id, claim.kind, is_virtual))
         if not self.supervisor.send(socket, Begin(run.order, run.trace)):
             self._end_lost(socket, codes.PROCESS_DIED.meaning, hung=False)
+
+    def _going(self, socket: str) -> ActiveRun | None:
+        """The run of a socket, until its process has said its end."""
+        run = self._runs.get(socket)
+        return run if run is not None and run.finished is None else None
 
     # -- while a run goes on ----------------------------------------------------------------------
 
     def _answer(self, socket: str, number: int, what: Intent | Done | StepReport) -> None:
         """Put something on disk, then let the process go on."""
-        run = self._runs.get(socket)
-        if run is None or run.finished is not None:
+        run = self._going(socket)
+        if run is None:
             reply = Reply(number, error="The run is not one of this station.")
             self.supervisor.send(socket, reply)
             return
@@ -461,25 +449,22 @@ class Station:
 
     def _end(self, socket: str, finished: Finished) -> None:
         """The process said how the run ended: save it, then show it."""
-        run = self._runs.get(socket)
-        if run is None or run.finished is not None:
+        run = self._going(socket)
+        if run is None:
             return
-        run.finished = finished
-        run.ended_s = self._now
+        run.finished, run.ended_s = finished, self._now
         self._feed(socket, line.Ended())
         self._save(socket)
         self._carry_out()
 
     def _end_lost(self, socket: str, reason: str, *, hung: bool) -> None:
         """The process is gone, and its run with it."""
-        run = self._runs.get(socket)
-        if run is None or run.finished is not None:
+        run = self._going(socket)
+        if run is None:
             return
         code = codes.PROCESS_HUNG if hung else codes.PROCESS_DIED
-        result = RunResult(
-            code.outcome, code.name, f"In {run.where}: {reason}.", self._now - run.begun_s
-        )
-        self._end(socket, Finished(result, None))
+        text, duration_s = f"In {run.where}: {reason}.", self._now - run.begun_s
+        self._end(socket, Finished(RunResult(code.outcome, code.name, text, duration_s), None))
 
     def _save(self, socket: str) -> bool:
         """Save the end of a run, and show it when it is on disk; False when it is not."""
@@ -524,10 +509,6 @@ def _said(error: RecordError) -> str:
     """What is wrong and where, in one line; what to do stands elsewhere."""
     where = f" ({error.where})" if error.where else ""
     return f"{error.what.rstrip('.')}{where}."
-
-
-def _utc_text(moment: datetime) -> str:
-    return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"
 
 
 def _check_natures(known: frozenset[bool], own: frozenset[bool], options: StationOptions) -> None:

@@ -39,7 +39,9 @@ class Port(Protocol):
         ...
 
     def receive(self) -> FromWorker | None:
-        """The next message, None when there is none. Raises EOFError when the process is gone."""
+        """The next message, None when there is none. Raises EOFError or OSError when the process is
+        gone.
+        """
         ...
 
     def kill(self) -> None:
@@ -66,11 +68,9 @@ class ProcessPort:
 
     @property
     def waitable(self) -> Connection[Any, Any]:
-        """The pipe."""
         return self._channel
 
     def send(self, message: ToWorker) -> bool:
-        """False when the process is gone."""
         try:
             self._channel.send(message)
         except (OSError, ValueError):
@@ -78,20 +78,17 @@ class ProcessPort:
         return True
 
     def receive(self) -> FromWorker | None:
-        """The next message. Raises EOFError when the process is gone, OSError likewise."""
         if not self._channel.poll():
             return None
         message: FromWorker = self._channel.recv()
         return message
 
     def kill(self) -> None:
-        """End it at once."""
         self._process.kill()
         self._process.join()
         self._channel.close()
 
     def join(self, limit_s: float) -> bool:
-        """Wait for its end."""
         self._process.join(limit_s)
         return self._process.exitcode is not None
 
@@ -140,12 +137,6 @@ class Supervisor:
         self._hang_s = hang_s
 
     @property
-    def waitables(self) -> Sequence[Any]:
-        """Where messages come from."""
-        ports = (slot.port for slot in self._slots.values())
-        return [port.waitable for port in ports if port is not None and port.waitable is not None]
-
-    @property
     def ports(self) -> Mapping[str, Port]:
         """The processes that are there, by socket."""
         return {name: slot.port for name, slot in self._slots.items() if slot.port is not None}
@@ -157,7 +148,8 @@ class Supervisor:
 
     def wait(self, extra: Sequence[Any], limit_s: float) -> None:
         """Return when there is something to receive, at the latest after `limit_s`."""
-        waitables = [*self.waitables, *extra]
+        found = [port.waitable for port in self.ports.values()]
+        waitables = [*filter(None, found), *extra]
         if waitables:
             with suppress(OSError):
                 wait(waitables, timeout=limit_s)
@@ -181,14 +173,6 @@ class Supervisor:
                 reason = f"its process said nothing for {limit_s:g} s, and was ended"
                 found.append((name, self._lose(slot, reason, hung=True)))
         return found
-
-    def replace(self, socket: str) -> None:
-        """End a process at once; it is started again at the next `poll`."""
-        slot = self._slots[socket]
-        if slot.port is not None:
-            slot.port.kill()
-            slot.port = None
-        slot.start_at = self._now()
 
     def close(self) -> None:
         """Let all processes end; those that do not in time are ended."""

@@ -17,16 +17,17 @@ from pathlib import Path
 
 from flasher.cli.station.records import certificate
 from flasher.protocol.spec import BMS
-from flasher.station.records import (
+from flasher.station.records.model import (
     Ending,
-    Keeping,
     Measurement,
     RunFilter,
     RunState,
+    StepName,
     StepState,
-    Store,
+    Verified,
 )
-from flasher.station.records.model import StepName, Verified
+from flasher.station.records.signing import Keeping
+from flasher.station.records.store import Store
 from flasher.station.reports import make_report, plain
 from tests.station.factory import BMS_VERSION, HEAD, Bench, make_recipe, target_table
 

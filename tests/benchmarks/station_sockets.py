@@ -21,8 +21,9 @@ from flasher.station.config import MockUnits
 from flasher.station.events import RunEnded, RunStarted, StationEvent, StepEnded
 from flasher.station.messages import VirtualUnits, WorkerSetup
 from flasher.station.recipe_file import LoadedRecipe, load_recipe
-from flasher.station.records import Keeping, RunState, Store
-from flasher.station.records.model import StepName
+from flasher.station.records.model import RunState, StepName
+from flasher.station.records.signing import Keeping
+from flasher.station.records.store import Store
 from flasher.station.station import Station, StationOptions
 
 SAMPLE = Path(__file__).parents[2] / "firmware_samples" / "bms.hex"

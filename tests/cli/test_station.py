@@ -24,7 +24,9 @@ from flasher.station.config import StationConfig
 from flasher.station.events import SocketState, StationEvent, StepStarted
 from flasher.station.messages import CannotWork
 from flasher.station.recipe import Recipe
-from flasher.station.records import DiskFullError, RunState, StepState, Store
+from flasher.station.records.errors import DiskFullError
+from flasher.station.records.model import RunState, StepState
+from flasher.station.records.store import Store
 from flasher.station.scans import Word
 from tests.cli.conftest import SAMPLES, Flasher, Run
 from tests.cli.station_threads import ThreadPort

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from flasher.errors import ExitCode
-from flasher.station.records import RunState
+from flasher.station.records.model import RunState
 from tests.cli.conftest import Flasher
 from tests.cli.test_schema import hold_output
 from tests.station.factory import SERIAL, Bench

@@ -17,8 +17,8 @@ from typing import Any
 import psycopg
 from sqlalchemy import Connection, NullPool, Table, create_engine
 
-from flasher.station.records import Store
 from flasher.station.records.schema import metadata
+from flasher.station.records.store import Store
 from tests.station.factory import FakeClock
 
 OWNER = "postgres"

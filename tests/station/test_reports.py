@@ -14,7 +14,7 @@ import pytest
 
 from flasher.errors import UsageError
 from flasher.station.certificate import render_certificate
-from flasher.station.records import (
+from flasher.station.records.model import (
     Measurement,
     RunFilter,
     RunState,

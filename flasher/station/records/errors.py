@@ -5,6 +5,7 @@ Whoever gets a `RecordError` from an operation that writes must not show PASS: n
 
 from __future__ import annotations
 
+import errno
 import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -85,7 +86,6 @@ class Refusal(StrEnum):
     LOT_FULL = "LOT_FULL"
     LOT_NEEDED = "LOT_NEEDED"
     GOLDEN_DUE = "GOLDEN_DUE"
-    NOT_GOLDEN = "NOT_GOLDEN"
     OTHER_NATURE = "OTHER_NATURE"
     """The records know this serial number as a virtual unit, and it is a real one; or the other way
     round."""
@@ -107,6 +107,9 @@ class ClaimRefusedError(FlasherError):
 
 _Kind = tuple[type[RecordError], str, str]
 """The error, why, and what to do."""
+_MAKE_ROOM: Final = "Make room on the disk, then retry."
+_LET_WRITE: Final = "Let this user write the file and its folder."
+_LAST_BACKUP: Final = "Stop. Keep the {}, and go on with the last backup."
 _UNKNOWN: Final[_Kind] = (
     RecordError,
     "the database does not work",
@@ -117,8 +120,8 @@ _RULE: Final[_Kind] = (
     "the database refuses it",
     "This is a fault of the station: keep its log, and report it.",
 )
-_KINDS: Final[dict[int, _Kind]] = {
-    sqlite3.SQLITE_FULL: (DiskFullError, "the disk is full", "Make room on the disk, then retry."),
+_SQLITE: Final[dict[int, _Kind]] = {
+    sqlite3.SQLITE_FULL: (DiskFullError, "the disk is full", _MAKE_ROOM),
     sqlite3.SQLITE_BUSY: (
         RecordsLockedError,
         "another program holds the database",
@@ -129,11 +132,7 @@ _KINDS: Final[dict[int, _Kind]] = {
         "the database is locked",
         "End the program that holds it, then retry.",
     ),
-    sqlite3.SQLITE_READONLY: (
-        RecordsReadOnlyError,
-        "the database is read-only",
-        "Let this user write the file and its folder.",
-    ),
+    sqlite3.SQLITE_READONLY: (RecordsReadOnlyError, "the database is read-only", _LET_WRITE),
     sqlite3.SQLITE_CANTOPEN: (
         RecordsReadOnlyError,
         "the database cannot be opened",
@@ -142,7 +141,7 @@ _KINDS: Final[dict[int, _Kind]] = {
     sqlite3.SQLITE_CORRUPT: (
         RecordsDamagedError,
         "the database is damaged",
-        "Stop. Keep the file, and go on with the last backup.",
+        _LAST_BACKUP.format("file"),
     ),
     sqlite3.SQLITE_NOTADB: (
         RecordsDamagedError,
@@ -156,6 +155,7 @@ _KINDS: Final[dict[int, _Kind]] = {
     ),
     sqlite3.SQLITE_CONSTRAINT: _RULE,
 }
+"""By the primary error code."""
 
 LOCK_NOT_AVAILABLE: Final = "55P03"
 _NO_SERVER: Final[_Kind] = (
@@ -168,7 +168,8 @@ _TOO_SLOW: Final[_Kind] = (
     "the database server did not finish in time",
     "Find what holds it up (pg_stat_activity shows it), then retry.",
 )
-_SQLSTATES: Final[dict[str, _Kind]] = {
+_POSTGRESQL: Final[dict[str, _Kind]] = {
+    "": _NO_SERVER,
     "08": _NO_SERVER,
     "23": _RULE,
     "25006": (
@@ -191,60 +192,40 @@ _SQLSTATES: Final[dict[str, _Kind]] = {
     "57": _NO_SERVER,
     "57014": _TOO_SLOW,
     "58": (DiskFullError, "the database server cannot write", "Check its disk, then retry."),
-    "XX": (
-        RecordsDamagedError,
-        "the database is damaged",
-        "Stop. Keep the database, and go on with the last backup.",
+    "XX": (RecordsDamagedError, "the database is damaged", _LAST_BACKUP.format("database")),
+}
+"""By SQLSTATE or its class; without one there was no answer."""
+_SYSTEM: Final[dict[int, _Kind]] = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT), (DiskFullError, "", _MAKE_ROOM)),
+    **dict.fromkeys(
+        (errno.EACCES, errno.EPERM, errno.EROFS), (RecordsReadOnlyError, "", _LET_WRITE)
     ),
 }
-"""What a PostgreSQL server answers."""
 
 
 @contextmanager
 def mapped(where: str, *, writes: bool) -> Iterator[None]:
     """Foreign errors inside become RecordErrors; `where` names the database for a person."""
+    error: Exception
+    cause = ""
     try:
         yield
-    except (exc.SQLAlchemyError, sqlite3.Error) as error:
-        raise record_error(error, where, writes=writes) from error
-    except OSError as error:
-        raise file_error(error, where, writes=writes) from error
-
-
-def record_error(error: Exception, where: str, *, writes: bool) -> RecordError:
-    """The error that stands for one of SQLAlchemy or a driver."""
-    original = getattr(error, "orig", None) or error
-    state = getattr(original, "sqlstate", None)
-    if isinstance(error, exc.DBAPIError) and not isinstance(original, sqlite3.Error):
-        kind, why, remedy = _of_server(state)
+    except (exc.SQLAlchemyError, sqlite3.Error) as found:
+        original = getattr(found, "orig", None) or found
+        if isinstance(found, exc.DBAPIError) and not isinstance(original, sqlite3.Error):
+            state = getattr(original, "sqlstate", None) or ""
+            chosen = _POSTGRESQL.get(state) or _POSTGRESQL.get(state[:2], _UNKNOWN)
+        else:
+            code = getattr(original, "sqlite_errorcode", None) or 0
+            chosen = _SQLITE.get(code & 0xFF, _UNKNOWN)
+        kind, why, remedy = chosen
+        said = getattr(getattr(original, "diag", None), "message_primary", None) or str(original)
+        cause, error = " ".join(said.split()), found
+    except OSError as found:
+        usual = (RecordError, "", "Check the disk and the rights of the folder.")
+        kind, _, remedy = _SYSTEM.get(found.errno or 0, usual)
+        why, error = found.strerror or type(found).__name__, found
     else:
-        code = getattr(original, "sqlite_errorcode", None) or 0
-        kind, why, remedy = _KINDS.get(code & 0xFF, _UNKNOWN)
-    said = getattr(getattr(original, "diag", None), "message_primary", None) or str(original)
-    cause = " ".join(said.split())
-    return kind(f"{_begin(writes=writes)}: {why}.", where=where, cause=cause, remedy=remedy)
-
-
-def _of_server(state: str | None) -> _Kind:
-    """By SQLSTATE: the whole of it, else its class; None: there was no answer."""
-    if state is None:
-        return _NO_SERVER
-    return _SQLSTATES.get(state) or _SQLSTATES.get(state[:2]) or _UNKNOWN
-
-
-def file_error(error: OSError, where: str, *, writes: bool) -> RecordError:
-    """The error that stands for one of the file system."""
-    import errno  # noqa: PLC0415  only where something failed
-
-    kind: type[RecordError] = RecordError
-    remedy = "Check the disk and the rights of the folder."
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        kind, remedy = DiskFullError, "Make room on the disk, then retry."
-    elif error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        kind, remedy = RecordsReadOnlyError, "Let this user write the file and its folder."
-    why = error.strerror or type(error).__name__
-    return kind(f"{_begin(writes=writes)}: {why}.", where=where, remedy=remedy)
-
-
-def _begin(*, writes: bool) -> str:
-    return NOT_SAVED if writes else "The records cannot be read"
+        return
+    begin = NOT_SAVED if writes else "The records cannot be read"
+    raise kind(f"{begin}: {why}.", where=where, cause=cause, remedy=remedy) from error

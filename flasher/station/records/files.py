@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Final
 
 from flasher.protocol.text import printable
-from flasher.station.records.errors import RecordError, RecordsDamagedError, file_error, mapped
+from flasher.station.records.errors import RecordError, RecordsDamagedError, mapped
 from flasher.station.records.model import TORN_TRACE, TRACE, AttachmentFile
 
 _CHUNK_BYTES: Final = 1 << 20
@@ -125,22 +125,16 @@ class FileStore:
     def read(self, sha256: str) -> bytes:
         """The bytes of a file. Raises RecordsDamagedError when it is gone or was changed."""
         path = self.path(sha256)
-        try:
-            data = path.read_bytes()
-        except FileNotFoundError as error:
-            raise RecordsDamagedError(
-                "An attachment is missing.",
-                where=printable(str(path)),
-                remedy="Fetch it from a backup.",
-            ) from error
-        except OSError as error:
-            raise file_error(error, printable(str(path)), writes=False) from error
+        shown, remedy = printable(str(path)), "Fetch it from a backup."
+        with mapped(shown, writes=False):
+            try:
+                data = path.read_bytes()
+            except FileNotFoundError as error:
+                what = "An attachment is missing."
+                raise RecordsDamagedError(what, where=shown, remedy=remedy) from error
         if hashlib.sha256(data).hexdigest() != sha256:
-            raise RecordsDamagedError(
-                "An attachment is not what was stored: its hash differs.",
-                where=printable(str(path)),
-                remedy="Fetch it from a backup.",
-            )
+            what = "An attachment is not what was stored: its hash differs."
+            raise RecordsDamagedError(what, where=shown, remedy=remedy)
         return data
 
     def check(self, sha256: str) -> str:

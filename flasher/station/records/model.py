@@ -12,8 +12,6 @@ from typing import Final, NewType, Protocol
 RunId = NewType("RunId", int)
 WriteId = NewType("WriteId", int)
 
-_UTC: Final = "+00:00"
-
 
 class Clock(Protocol):
     """Where the records take the time from."""
@@ -33,7 +31,7 @@ def utc_text(moment: datetime) -> str:
     if moment.tzinfo is None:
         raise ValueError("a time without a zone is no moment")
     # isoformat: a report has ten thousands of them, and strftime takes twenty times as long.
-    return moment.astimezone(UTC).isoformat(timespec="microseconds").removesuffix(_UTC) + "Z"
+    return moment.astimezone(UTC).isoformat(timespec="microseconds").removesuffix("+00:00") + "Z"
 
 
 def utc_moment(text: str) -> datetime:
@@ -106,6 +104,35 @@ class UnitState(StrEnum):
         if last in (RunState.RUNNING, RunState.PASS, RunState.FAIL):
             return cls(last.value)
         return cls.RECHECK
+
+
+class StepName(StrEnum):
+    """A step of a run, in the order in which they come."""
+
+    CONNECT = "connect"
+    IDENTIFY = "identify"
+    CHECK = "check"
+    FLASH = "flash"
+    WRITE = "write"
+    RESTART = "restart"
+    VERIFY = "verify"
+    SAVE = "save"
+
+
+class Verified(IntEnum):
+    """How far a target was verified; more is greater."""
+
+    COMPLETED = 0
+    """The device confirmed the complete image; nothing was read back."""
+    VERSION = 1
+    """The new application runs and names the version of the image."""
+    MEMORY = 2
+    """Version, and every byte of the image read back."""
+
+    @property
+    def words(self) -> str:
+        """As a person reads it."""
+        return ("completed, not read back", "version read back", "memory read back")[self]
 
 
 class StepState(StrEnum):
@@ -383,39 +410,3 @@ class Backup:
     path: Path
     sha256: str
     size_bytes: int
-
-
-class StepName(StrEnum):
-    """A step of a run, in the order in which they come."""
-
-    CONNECT = "connect"
-    IDENTIFY = "identify"
-    CHECK = "check"
-    FLASH = "flash"
-    WRITE = "write"
-    RESTART = "restart"
-    VERIFY = "verify"
-    SAVE = "save"
-
-
-class Verified(IntEnum):
-    """How far a target was verified; more is greater."""
-
-    COMPLETED = 0
-    """The device confirmed the complete image; nothing was read back."""
-    VERSION = 1
-    """The new application runs and names the version of the image."""
-    MEMORY = 2
-    """Version, and every byte of the image read back."""
-
-    @property
-    def words(self) -> str:
-        """As a person reads it."""
-        return _WORDS[self]
-
-
-_WORDS = {
-    Verified.COMPLETED: "completed, not read back",
-    Verified.VERSION: "version read back",
-    Verified.MEMORY: "memory read back",
-}

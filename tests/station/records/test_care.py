@@ -10,9 +10,11 @@ import pytest
 from sqlalchemy import select
 
 from flasher.errors import UsageError
-from flasher.station.records import AuditEvent, RecordsDamagedError, RunState, Store, UnitState
+from flasher.station.records.errors import RecordsDamagedError
+from flasher.station.records.model import AuditEvent, RunState, UnitState
 from flasher.station.records.schema import audit
 from flasher.station.records.signing import Keeping
+from flasher.station.records.store import Store
 from tests.station.factory import SERIAL, Bench
 
 

@@ -12,19 +12,19 @@ from pathlib import Path
 import pytest
 
 from flasher.errors import UsageError
-from flasher.station.records import (
+from flasher.station.records.database import locate
+from flasher.station.records.errors import (
     DiskFullError,
     RecordError,
     RecordsDamagedError,
     RecordsLockedError,
     RecordsMovedError,
     RecordsReadOnlyError,
-    RunState,
     SchemaVersionError,
-    Store,
 )
-from flasher.station.records.database import locate
+from flasher.station.records.model import RunState
 from flasher.station.records.schema import SCHEMA_VERSION
+from flasher.station.records.store import Store
 from tests.station.factory import Bench, FakeClock
 
 

@@ -11,15 +11,8 @@ from typing import Any
 import psycopg
 import pytest
 
-from flasher.station.records import (
-    Ending,
-    Measurement,
-    RuleBrokenError,
-    RunId,
-    RunState,
-    StepState,
-)
-from flasher.station.records.model import Verified
+from flasher.station.records.errors import RuleBrokenError
+from flasher.station.records.model import Ending, Measurement, RunId, RunState, StepState, Verified
 from flasher.station.records.schema import metadata
 from flasher.station.records.triggers import RULES
 from tests.station.factory import BMS_VERSION, Bench

@@ -12,18 +12,16 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from flasher.station.records import (
-    AuditEvent,
-    Claim,
+from flasher.station.records import server
+from flasher.station.records.errors import (
     ClaimRefusedError,
     RecordError,
     RecordsLockedError,
     Refusal,
-    RunState,
     StationBusyError,
-    Store,
-    server,
 )
+from flasher.station.records.model import AuditEvent, Claim, RunState
+from flasher.station.records.store import Store
 from tests.station.factory import SERIAL, USUAL, Bench
 from tests.station.postgres import Server
 from tests.station.records.test_rules import refused

@@ -13,21 +13,19 @@ from pathlib import Path
 import pytest
 
 from flasher.errors import UsageError
-from flasher.station.records import (
+from flasher.station.records.errors import (
     ClaimRefusedError,
     DiskFullError,
-    Keeping,
     KeyMissingError,
     RecordsCutError,
     Refusal,
-    RunId,
-    RunState,
     SchemaVersionError,
-    Store,
 )
 from flasher.station.records.keys import HeadsFile, SigningKey
 from flasher.station.records.migration import migrate
-from flasher.station.records.model import TORN_TRACE, TRACE
+from flasher.station.records.model import TORN_TRACE, TRACE, RunId, RunState
+from flasher.station.records.signing import Keeping
+from flasher.station.records.store import Store
 from tests.station.factory import SERIAL, Bench
 
 OTHER = "W2605003"

@@ -10,21 +10,23 @@ import pytest
 
 from flasher.errors import UsageError
 from flasher.station.recipe import Golden
-from flasher.station.records import (
+from flasher.station.records.claims import is_due, last_shift_start
+from flasher.station.records.errors import (
     ClaimRefusedError,
     NotFoundError,
     RecordError,
     Refusal,
+    StationBusyError,
+)
+from flasher.station.records.model import (
     RunFilter,
     RunId,
     RunKind,
     RunState,
-    StationBusyError,
     StepState,
     UnitState,
+    Verified,
 )
-from flasher.station.records.claims import is_due, last_shift_start
-from flasher.station.records.model import Verified
 from tests.station.factory import BMS_VERSION, SERIAL, USUAL, Bench
 
 GOLDEN = '\n[golden]\nserial_numbers = ["W2600001"]\nevery_h = 8\n'
