@@ -37,28 +37,26 @@ PEACE_LIMIT_S: Final = 120.0
 _KILL_LIMIT_S: Final = 20.0
 _MOMENTS_MAX: Final = 24
 _WORKERS_END_S: Final = 15.0
-IMAGE: Final = Image.from_bytes(
-    b"BMS\0" + NEW_VERSION.encode() + bytes(at % 251 for at in range(6000))
-)
-RECIPE: Final = f"""\
+IMAGE_BYTES: Final = 6000
+RECIPE: Final = """\
 name = "Campaign"
 part = "BAT-36"
 revision = "1"
 duplicate = "verify-only"
 
 [serial_number]
-pattern = 'W[0-9]{{7}}'
+pattern = 'W[0-9]{7}'
 example = "W2605002"
 
 [[target]]
 target = "bms"
 image = "bms.bin"
-sha256 = "{IMAGE.sha256}"
+sha256 = "SHA256"
 
 [[write]]
 target = "bms"
 item = "serial-number"
-values = ["{{serial}}"]
+values = ["{serial}"]
 manufacturer = true
 
 [[unchanged]]
@@ -67,12 +65,13 @@ item = "physical-id"
 """
 
 
-def write_files(folder: Path, ports: list[int], records: str) -> list[str]:
+def write_files(folder: Path, ports: list[int], records: str, image: Image) -> list[str]:
     """Recipe, image, manifest and the station's file; the options that name them."""
-    (folder / "bms.bin").write_bytes(IMAGE.data)
-    manifest = to_toml(release_of(IMAGE, BMS))
+    (folder / "bms.bin").write_bytes(image.data)
+    manifest = to_toml(release_of(image, BMS))
     (folder / "bms.bin.toml").write_text(manifest, encoding="utf-8")
-    (folder / "recipe.toml").write_text(RECIPE, encoding="utf-8")
+    recipe = RECIPE.replace("SHA256", image.sha256)
+    (folder / "recipe.toml").write_text(recipe, encoding="utf-8")
     lines = ['name = "line"', f'records = "{records}"', 'files = "files"']
     for number, port in enumerate(ports, 1):
         bus = bus_of(port)
@@ -87,12 +86,20 @@ def write_files(folder: Path, ports: list[int], records: str) -> list[str]:
 class Campaign:
     """One station process after the other, one operator, and units that outlive them all."""
 
-    def __init__(self, folder: Path, units: Units, ports: list[int], seed: int, words: list[str]):
+    def __init__(
+        self,
+        folder: Path,
+        units: Units,
+        ports: list[int],
+        seed: int,
+        words: list[str],
+        image: Image,
+    ) -> None:
         self._folder = folder
         self._words = words
         self._random = random.Random(seed)
         places = {str(at): Place(str(at), port) for at, port in enumerate(ports, 1)}
-        self.operator = Operator(units, places, IMAGE.data, self._random)
+        self.operator = Operator(units, places, image.data, self._random)
         self.counts = self.operator.counts
         self.problems = self.operator.problems
         self._station: Station | None = None
@@ -163,9 +170,11 @@ class Campaign:
 
     def _check_records(self) -> None:
         """What was shown is in the records, and the records hold together."""
-        document = self._say("verify")
-        self.problems += [f"{each['where']}: {each['what']}" for each in document["problems"]]
-        runs = {run["run_id"]: run for run in self._say("report")["runs"]}
+        asked = {action: self._ask(action) for action in ("verify", "report")}
+        said = {action: self._said(action, process) for action, process in asked.items()}
+        problems = said["verify"]["problems"]
+        self.problems += [f"{each['where']}: {each['what']}" for each in problems]
+        runs = {run["run_id"]: run for run in said["report"]["runs"]}
         for event in self.operator.shown:
             run = runs.get(event["run_id"])
             if run is None or run["serial"] != event["serial"]:
@@ -181,9 +190,12 @@ class Campaign:
         for state in set(states):
             self.counts[f"saved {state}"] = states.count(state)
 
-    def _say(self, action: str) -> dict[str, list[dict[str, str]]]:
+    def _ask(self, action: str) -> subprocess.Popen[str]:
         words = [sys.executable, "-m", "flasher", "station", action, "--json", *self._words[2:4]]
-        said = subprocess.run(words, capture_output=True, text=True, check=False).stdout
+        return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+
+    def _said(self, action: str, process: subprocess.Popen[str]) -> dict[str, list[dict[str, str]]]:
+        said, _ = process.communicate()
         document: dict[str, list[dict[str, str]]] = json.loads(said.splitlines()[-1])
         if "error" in document:
             self.problems.append(f"station {action}: {document['error']}")
@@ -192,13 +204,20 @@ class Campaign:
 
 @contextmanager
 def campaign(
-    folder: Path, seed: int, *, sockets: int = 2, records: str = "records.sqlite"
+    folder: Path,
+    seed: int,
+    *,
+    sockets: int = 2,
+    records: str = "records.sqlite",
+    image_bytes: int = IMAGE_BYTES,
 ) -> Iterator[Campaign]:
     """A campaign that is ready to begin."""
     ports = [free_port() for _ in range(sockets)]
-    words = write_files(folder, ports, records)
+    data = b"BMS\0" + NEW_VERSION.encode() + bytes(at % 251 for at in range(image_bytes))
+    image = Image.from_bytes(data)
+    words = write_files(folder, ports, records, image)
     with Units(ports, folder / "stderr") as units:
-        made = Campaign(folder, units, ports, seed, words)
+        made = Campaign(folder, units, ports, seed, words, image)
         try:
             yield made
         finally:

@@ -37,7 +37,7 @@ def test_after_kills_all_that_was_shown_is_true_and_every_unit_gets_through(
     if back_end == "postgresql":
         server: Server = request.getfixturevalue("postgres")
         records = server.url(server.database())
-    with campaign(tmp_path, seed=1, records=records) as made:
+    with campaign(tmp_path, seed=1, records=records, image_bytes=1500) as made:
         if back_end == "sqlite":
             made.kill_once(worker=True)
         made.kill_once(worker=False)
