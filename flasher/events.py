@@ -15,14 +15,14 @@ from enum import Enum
 class Phase(Enum):
     """Where an upgrade stands, in the words of the protocol."""
 
-    LISTEN = "listening for another tool"
-    IDENTIFY = "asking the device who it is"
-    RESET = "resetting the application"
-    BOOT = "waiting for the boot version"
-    UPDATE = "waiting for request transfer"
-    TRANSFER = "transferring"
-    END = "waiting for the final answer"
-    CONFIRM = "asking the new application for its version"
+    LISTEN = "listen"
+    IDENTIFY = "identify"
+    RESET = "reset"
+    BOOT = "boot"
+    UPDATE = "update"
+    TRANSFER = "transfer"
+    END = "end"
+    CONFIRM = "confirm"
 
 
 @dataclass(frozen=True)

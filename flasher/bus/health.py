@@ -19,12 +19,12 @@ from flasher.protocol.frame import Frame
 class TroubleKind(Enum):
     """What an error frame reports, the worst first."""
 
-    BUS_OFF = "bus-off"
+    BUS_OFF = "bus_off"
     RESTARTED = "restarted"
-    NOT_ACKNOWLEDGED = "not acknowledged"
-    PASSIVE = "error-passive"
-    WARNING = "error-warning"
-    OTHER = "bus error"
+    NOT_ACKNOWLEDGED = "not_acknowledged"
+    PASSIVE = "passive"
+    WARNING = "warning"
+    OTHER = "other"
 
 
 @dataclass(frozen=True)
@@ -176,9 +176,9 @@ def _trouble(
 class ControllerState(Enum):
     """How far a CAN controller takes part in the traffic."""
 
-    ACTIVE = "error-active"
-    PASSIVE = "error-passive"
-    BUS_OFF = "bus-off"
+    ACTIVE = "active"
+    PASSIVE = "passive"
+    BUS_OFF = "bus_off"
     UNKNOWN = "unknown"
 
 

@@ -32,8 +32,8 @@ Run = Callable[[Sequence[str]], str]
 class Unseen(Enum):
     """Why nothing can be said about an interface."""
 
-    MISSING = "there is no such interface"
-    CANNOT_TELL = "this system does not tell"
+    MISSING = "missing"
+    CANNOT_TELL = "cannot_tell"
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from flasher.events import Phase
 from flasher.host.table import Ending
 from flasher.image.plan import Plan
 from flasher.image.plausible import UNLIKELY
+from flasher.prose import prose
 from flasher.protocol.spec import Target
 
 
@@ -68,7 +69,7 @@ class Statistics:
 def standing(phase: Phase, packet: int | None, total_packets: int, attempt: int) -> str:
     """Where an upgrade stands, in words."""
     of_packets = f", packet {packet} of {total_packets}" if packet else ""
-    return f"{phase.value}{of_packets}" + (f", attempt {attempt}" if attempt > 1 else "")
+    return f"{prose(phase)}{of_packets}" + (f", attempt {attempt}" if attempt > 1 else "")
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from flasher.host.verify import (
     VersionCheck,
 )
 from flasher.image.plan import Plan
+from flasher.prose import prose
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.frame import Frame
 
@@ -93,7 +94,7 @@ class Session:
             case Upgrade() as upgrade:
                 return upgrade.standing
             case Identify() as asked:
-                return asked.phase.value
+                return prose(asked.phase)
             case Check() as check:
                 return f"verifying by {check.level.value}"
 

@@ -44,11 +44,11 @@ class Message(NamedTuple):
 class DamageReason(Enum):
     """Why received bytes were not taken for a message."""
 
-    JUNK = "bytes outside of any message"
-    BAD_LENGTH = "length field does not fit the command"
-    BAD_CRC = "wrong CRC"
-    BAD_TAIL = "wrong tail"
-    INCOMPLETE = "the rest of the message did not come in time"
+    JUNK = "junk"
+    BAD_LENGTH = "bad_length"
+    BAD_CRC = "bad_crc"
+    BAD_TAIL = "bad_tail"
+    INCOMPLETE = "incomplete"
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from flasher.prose import prose
 from flasher.report import scale
 
 TEXT_LIMIT: Final = 400
@@ -85,6 +86,7 @@ def _environment() -> Environment:
     )
     environment.filters["duration"] = scale.duration_text
     environment.filters["counted"] = counted
+    environment.filters["prose"] = prose
     environment.filters["percent"] = percent
     environment.filters["shortened"] = shortened
     environment.globals["Status"] = Status

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
+from flasher.prose import prose
 from flasher.protocol.spec import Node
 from flasher.report import chart, sequence, spread
 from flasher.report.base import Status, render_page
@@ -190,7 +191,7 @@ def _phases(upgrade: UpgradeStory) -> Iterable[PhaseRow]:
         if whole_s > 0:
             begin, length = begin / whole_s, length / whole_s
         yield PhaseRow(
-            span.phase.value, span.attempt, span.begin_s, length_s, _share(begin), _share(length)
+            prose(span.phase), span.attempt, span.begin_s, length_s, _share(begin), _share(length)
         )
 
 

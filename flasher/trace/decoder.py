@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Final, NamedTuple
 
+from flasher.prose import prose
 from flasher.protocol import catalogue, messages
 from flasher.protocol.contents import Faults
 from flasher.protocol.fields import Bits, Content, Reserved, Text, flag_names, label
@@ -27,14 +28,14 @@ class Kind(Enum):
     """What was seen."""
 
     MESSAGE = "message"
-    UNKNOWN = "unknown message"
+    UNKNOWN = "unknown"
     """Intact, but no row of the documents."""
-    MALFORMED = "malformed message"
+    MALFORMED = "malformed"
     """A row of the documents, but not with the mode or the data that it has there."""
-    DAMAGED = "damaged bytes"
-    FOREIGN = "foreign frame"
+    DAMAGED = "damaged"
+    FOREIGN = "foreign"
     """A frame that no node of the documents sends."""
-    ERROR_FRAME = "error frame"
+    ERROR_FRAME = "error_frame"
 
 
 class Field(NamedTuple):
@@ -134,7 +135,7 @@ class Decoder:
     def feed(self, frame: Frame, now: float) -> Iterator[Seen]:
         """What the frame completed, in order: usually nothing, sometimes more than one."""
         if frame.is_error:
-            yield Seen(now, Kind.ERROR_FRAME, frame.can_id, Kind.ERROR_FRAME.value)
+            yield Seen(now, Kind.ERROR_FRAME, frame.can_id, prose(Kind.ERROR_FRAME))
             return
         stream = self._streams.get(frame.can_id)
         if stream is None or not frame.is_payload:
@@ -163,8 +164,9 @@ class Decoder:
     def _describe(self, found: Message | Damage, now: float) -> Seen:
         sender, receiver = _ROUTES[found.can_id]
         if isinstance(found, Damage):
-            fields = (_plain("reason", found.reason.value), _raw("bytes", found.data))
-            title = Kind.DAMAGED.value
+            reason = Field("reason", found.reason.value, "reason", prose(found.reason))
+            fields = (reason, _raw("bytes", found.data))
+            title = prose(Kind.DAMAGED)
             return Seen(now, Kind.DAMAGED, found.can_id, title, sender, receiver, fields=fields)
         kind, title, shown, alarm = _judge(found)
         return Seen(
@@ -187,11 +189,11 @@ def _judge(message: Message) -> tuple[Kind, str, tuple[Field, ...], bool]:
     if message.can_id in _TO_DEVICE | _TO_TOOL:
         row = messages.decode(message)
         if isinstance(row, messages.Malformed):
-            return Kind.MALFORMED, Kind.MALFORMED.value, _undecoded(message, row.problem), False
+            return Kind.MALFORMED, prose(Kind.MALFORMED), _undecoded(message, row.problem), False
         if not isinstance(row, messages.Unknown) and _goes_this_way(row, message.can_id):
             alarm = isinstance(row, messages.Nak)
             return Kind.MESSAGE, _TITLES[type(row)], _row_fields(row), alarm
-    return Kind.UNKNOWN, Kind.UNKNOWN.value, _undecoded(message), False
+    return Kind.UNKNOWN, prose(Kind.UNKNOWN), _undecoded(message), False
 
 
 def _goes_this_way(row: messages.Row, of_id: int) -> bool:
@@ -260,7 +262,7 @@ def _foreign(frame: Frame, now: float) -> Seen:
     if frame.is_remote:
         fields.insert(0, _plain("frame", "remote request"))
     sender, receiver = ("", "") if frame.is_extended else _ROUTES.get(frame.can_id, ("", ""))
-    title = Kind.FOREIGN.value
+    title = prose(Kind.FOREIGN)
     return Seen(now, Kind.FOREIGN, frame.can_id, title, sender, receiver, fields=tuple(fields))
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Final
 
+from flasher.prose import explanation
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import (
     BMS,
@@ -26,7 +27,6 @@ from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.trace.busload import MAX_TALKERS, BusCounter
 from flasher.trace.decoder import Kind
 from flasher.trace.dialogue import Dialogue
-from flasher.trace.explanations import EXPLANATIONS
 from flasher.trace.pieces import Piece, Pieces, bits_of
 from flasher.trace.steps import MAX_STEPS, StepList, mark_unanswered, step_of
 from flasher.trace.story import (
@@ -316,7 +316,7 @@ class _Reading:
             text = "There is no frame in it."
         if bus.error_frames:
             text += f" Error frames: {bus.error_frames:,}."
-        likely, remedy = EXPLANATIONS[cause]
+        likely, remedy = explanation(cause)
         return Verdict(cause, None, None, 0, text, likely, remedy)
 
 

@@ -10,11 +10,11 @@ from typing import Any, Final
 
 from flasher.errors import FlasherError, UsageError
 from flasher.files import JSON_MAX_SIZE, opened, parse_json, read
+from flasher.prose import explanation
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
 from flasher.trace.bundle import OLDER_TRACE, REPORT, TRACE
 from flasher.trace.explain import explain
-from flasher.trace.explanations import EXPLANATIONS
 from flasher.trace.reader import read_trace
 from flasher.trace.recorder import ONE_TOOL_CHANNEL
 from flasher.trace.story import Cause, Recorded, Story, Verdict
@@ -75,8 +75,8 @@ def _as_the_tool_ended(story: Story) -> Story:
             verdict,
             cause=Cause.TOOL_ENDED,
             text=f"{verdict.text} Here the tool ended: {said}".rstrip(": "),
-            likely=EXPLANATIONS[Cause.TOOL_ENDED].likely,
-            remedy=EXPLANATIONS[Cause.TOOL_ENDED].remedy,
+            likely=explanation(Cause.TOOL_ENDED).likely,
+            remedy=explanation(Cause.TOOL_ENDED).remedy,
         )
 
     upgrades = [*story.upgrades]

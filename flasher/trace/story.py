@@ -40,39 +40,39 @@ class Cause(Enum):
     # It went well.
     COMPLETED = "completed"
     """The device said complete. A version that it answered afterwards is in the verdict's text."""
-    CONFIRMED_BY_VERSION = "final answer lost, new application answers"
+    CONFIRMED_BY_VERSION = "confirmed_by_version"
 
     # It did not begin.
-    NOBODY_ACKNOWLEDGES = "nobody acknowledges on the bus"
-    NO_BOOT_VERSION = "no boot version after the reset"
-    NO_REQUEST = "no request transfer after the update command"
-    UPDATE_NOT_TAKEN = "the bootloader does not take the update command"
-    WRONG_DEVICE = "another kind of device"
-    TWO_DEVICES = "two devices on one CAN id"
+    NOBODY_ACKNOWLEDGES = "nobody_acknowledges"
+    NO_BOOT_VERSION = "no_boot_version"
+    NO_REQUEST = "no_request"
+    UPDATE_NOT_TAKEN = "update_not_taken"
+    WRONG_DEVICE = "wrong_device"
+    TWO_DEVICES = "two_devices"
 
     # It broke off.
-    PACKET_REFUSED = "a packet was refused again and again"
-    PACKET_UNANSWERED = "a packet was never answered"
-    PACKET_DAMAGED = "damaged frames in the transfer"
-    DEVICE_RESTARTED = "the device restarted in the middle"
-    SECOND_TOOL = "two tools speak on the bus"
-    SHUTDOWN = "the battery sent SHUTDOWN: it switches off"
-    BUS_TROUBLE = "error frames on the bus"
-    TOOL_STOPPED = "the tool fell silent in the middle"
-    TOOL_ENDED = "the tool gave up in the middle"
+    PACKET_REFUSED = "packet_refused"
+    PACKET_UNANSWERED = "packet_unanswered"
+    PACKET_DAMAGED = "packet_damaged"
+    DEVICE_RESTARTED = "device_restarted"
+    SECOND_TOOL = "second_tool"
+    SHUTDOWN = "shutdown"
+    BUS_TROUBLE = "bus_trouble"
+    TOOL_STOPPED = "tool_stopped"
+    TOOL_ENDED = "tool_ended"
     """By its own word, in a bundle."""
 
     # The end.
-    REFUSED = "refused at the end"
-    UNCONFIRMED = "the final answer never came"
-    COMPLETE_TOO_EARLY = "complete before the end of the transfer"
-    OTHER_VERSION = "completed, but another version answers"
+    REFUSED = "refused"
+    UNCONFIRMED = "unconfirmed"
+    COMPLETE_TOO_EARLY = "complete_too_early"
+    OTHER_VERSION = "other_version"
 
     # What the trace is.
-    RECORDING_ENDS = "the recording ends in the middle"
-    QUERIES_ONLY = "no upgrade, but drive-system traffic"
-    FOREIGN_ONLY = "no upgrade, only traffic of other kinds"
-    EMPTY = "nothing in this trace"
+    RECORDING_ENDS = "recording_ends"
+    QUERIES_ONLY = "queries_only"
+    FOREIGN_ONLY = "foreign_only"
+    EMPTY = "empty"
 
     @property
     def is_good(self) -> bool:
@@ -222,7 +222,7 @@ class UpgradeStory:
 class TalkerKind(Enum):
     """Who else was heard."""
 
-    NODE = "node of the drive system"
+    NODE = "node"
     FOREIGN = "foreign"
 
 

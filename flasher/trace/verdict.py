@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final, NamedTuple
 
+from flasher.prose import explanation
 from flasher.protocol.text import BOOT_VERSION_FORM
-from flasher.trace.explanations import EXPLANATIONS, NOTHING
 from flasher.trace.facts import Facts
 from flasher.trace.story import Cause, Phase, Verdict
 
@@ -51,7 +51,7 @@ def judge(upgrade: Facts, until_s: float, *, is_alone: bool) -> Verdict:
         # The device did not come back: what happened before says more than that.
         return replace(upgrade.earlier, text=f"{upgrade.earlier.text} Then: {found.text}")
     packet = upgrade.current if upgrade.phase is Phase.TRANSFER else None
-    likely, remedy = EXPLANATIONS.get(found.cause, NOTHING)
+    likely, remedy = explanation(found.cause)
     names = {"node": upgrade.target.node.name, "boot_name": upgrade.target.boot_name}
     return Verdict(
         cause=found.cause,

@@ -18,6 +18,7 @@ from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending
 from flasher.mock.profile import DeviceProfile
+from flasher.prose import prose
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BOOT_VERSION_BURST
 from tests.end_to_end.stage import IMAGE, NEW, SMALL, Stage, image_of
@@ -244,7 +245,7 @@ def test_an_adapter_that_is_lost_for_good_in_any_phase_is_exit_4(phase: Phase) -
     when(stage, phase, stage.bus.unplug)
     with pytest.raises(BusError) as caught:
         stage.flash()
-    assert phase.value in caught.value.where
+    assert prose(phase) in caught.value.where
     assert "State of the device: " in caught.value.remedy
     assert caught.value.needs_rescue is (phase in PHASES[4:])
     assert stage.has in (None, IMAGE.data) or phase in PHASES[:5]

@@ -211,7 +211,7 @@ def test_a_damaged_answer_is_reported_and_the_question_repeated() -> None:
         bench.engine.receive(frame, bench.now)
     bench.run(0.35)
     damages = [event for event in bench.events if isinstance(event, events.BytesDamaged)]
-    assert (damages[0].can_id, damages[0].reason) == (0x720, "wrong CRC")
+    assert (damages[0].can_id, damages[0].reason) == (0x720, "bad_crc")
     assert len(bench.starts()) == 2
 
 

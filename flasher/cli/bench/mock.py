@@ -23,6 +23,7 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.system import System
 from flasher.mock.variants import VARIANTS, find, make
+from flasher.prose import prose_of
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import Dialect, Target
@@ -306,7 +307,8 @@ class _Watcher:
             case events.DeviceReported(what):
                 self._say("note", what, event)
             case events.BytesDamaged(can_id, reason, data):
-                self._say("damage", f"0x{can_id:03X}: {reason}: {data[:16].hex(' ')} ...", event)
+                why = prose_of("DamageReason", reason)
+                self._say("damage", f"0x{can_id:03X}: {why}: {data[:16].hex(' ')} ...", event)
 
     def _say(self, kind: str, text: str, event: object) -> None:
         self._output.result(f"{kind + ':':<9}{text}")

@@ -14,6 +14,7 @@ from flasher.bus.opening import start_command
 from flasher.cli.look.detect import Detected
 from flasher.cli.output import counted
 from flasher.errors import BusError
+from flasher.prose import prose
 from flasher.protocol.spec import FRAMES_PER_PACKET
 from flasher.protocol.text import printable
 
@@ -196,7 +197,7 @@ def health_findings(health: LinkHealth, channel: str, *, is_socketcan: bool) -> 
     if health.tx_errors is not None:
         counters = f", error counters: transmit {health.tx_errors}, receive {health.rx_errors}"
     restart = (f"ip link set {channel} type can restart",) if is_socketcan else ()
-    what = f"the controller is {health.state.value}{counters}"
+    what = f"the controller is {prose(health.state)}{counters}"
     if health.state is ControllerState.ACTIVE:
         yield Finding(Severity.OK, "bus", what)
     elif health.state is ControllerState.BUS_OFF:

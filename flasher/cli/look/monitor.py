@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from contextlib import ExitStack
 from typing import Final, TypedDict
 
+from flasher.prose import prose
 from flasher.cli import values
 from flasher.cli.framework import argument, command, option
 from flasher.cli.look.monitor_views import FrameLine, Lines, SeenLine, Table
@@ -174,7 +175,7 @@ def monitor(
 
 def _check_messages(wanted: Iterable[str]) -> None:
     """Raises UsageError for words that are in no title."""
-    titles = message_titles() + tuple(kind.value for kind in Kind)
+    titles = message_titles() + tuple(map(prose, Kind))
     for words in wanted:
         if not any(words.lower() in title.lower() for title in titles):
             raise UsageError(

@@ -7,6 +7,7 @@ from typing import Final
 
 from flasher.cli.look.explain_text import story_lines
 from flasher.cli.output import counted, duration
+from flasher.prose import prose
 from flasher.protocol.text import printable
 from flasher.station.records.model import (
     Figures,
@@ -126,7 +127,7 @@ def _story_lines(story: Story | str, *, full: bool) -> Iterator[str]:
         yield from (f"  | {line}".rstrip() for line in story_lines(story))
         return
     frames = f"{counted(story.frames, 'frame')} in {duration(story.duration_s)}"
-    yield f"  trace:    {frames}: {story.verdict.cause.value}"
+    yield f"  trace:    {frames}: {prose(story.verdict.cause)}"
     yield f"            {story.verdict.text}"
     if story.verdict.likely:
         yield f"            likely cause: {story.verdict.likely}"

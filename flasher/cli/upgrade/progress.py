@@ -12,6 +12,7 @@ from flasher.cli.output import Output
 from flasher.cli.terminal import painted
 from flasher.host.table import Event
 from flasher.image.plan import Plan
+from flasher.prose import prose, prose_of
 from flasher.protocol.spec import PACKET_DATA_SIZE
 
 SHOWN: Final = frozenset(
@@ -95,7 +96,7 @@ class Progress:
             case events.PhaseEntered(phase, _):
                 if phase is not events.Phase.TRANSFER:
                     self._close_bar()
-                output.progress(f"{phase.value} ...")
+                output.progress(f"{prose(phase)} ...")
             case events.AttemptStarted(attempt, reason):
                 self._close_bar()
                 output.progress(f"{because(reason)}: beginning again, attempt {attempt}")
@@ -182,6 +183,7 @@ def _note(event: object) -> tuple[str, int] | None:
         case events.Reported(what):
             return f"note: {what}", 1
         case events.BytesDamaged(can_id, reason, data):
-            return f"bytes on 0x{can_id:03X} ignored: {reason}: {data[:24].hex(' ')}", 2
+            why = prose_of("DamageReason", reason)
+            return f"bytes on 0x{can_id:03X} ignored: {why}: {data[:24].hex(' ')}", 2
         case _:
             return None

@@ -1,0 +1,207 @@
+"""What people read for the words that programs see: everything that is said of an enumeration.
+
+The members of enumerations have stable words as values, which stand in JSON and in records; their
+sentences stand here, by the name of the enumeration and the word, and can be translated here.
+"""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Final, NamedTuple
+
+_TEXTS: Final[dict[str, dict[str, str]]] = {
+    "Phase": {
+        "listen": "listening for another tool",
+        "identify": "asking the device who it is",
+        "reset": "resetting the application",
+        "boot": "waiting for the boot version",
+        "update": "waiting for request transfer",
+        "transfer": "transferring",
+        "end": "waiting for the final answer",
+        "confirm": "asking the new application for its version",
+    },
+    "DamageReason": {
+        "junk": "bytes outside of any message",
+        "bad_length": "length field does not fit the command",
+        "bad_crc": "wrong CRC",
+        "bad_tail": "wrong tail",
+        "incomplete": "the rest of the message did not come in time",
+    },
+    "Cause": {
+        "completed": "completed",
+        "confirmed_by_version": "final answer lost, new application answers",
+        "nobody_acknowledges": "nobody acknowledges on the bus",
+        "no_boot_version": "no boot version after the reset",
+        "no_request": "no request transfer after the update command",
+        "update_not_taken": "the bootloader does not take the update command",
+        "wrong_device": "another kind of device",
+        "two_devices": "two devices on one CAN id",
+        "packet_refused": "a packet was refused again and again",
+        "packet_unanswered": "a packet was never answered",
+        "packet_damaged": "damaged frames in the transfer",
+        "device_restarted": "the device restarted in the middle",
+        "second_tool": "two tools speak on the bus",
+        "shutdown": "the battery sent SHUTDOWN: it switches off",
+        "bus_trouble": "error frames on the bus",
+        "tool_stopped": "the tool fell silent in the middle",
+        "tool_ended": "the tool gave up in the middle",
+        "refused": "refused at the end",
+        "unconfirmed": "the final answer never came",
+        "complete_too_early": "complete before the end of the transfer",
+        "other_version": "completed, but another version answers",
+        "recording_ends": "the recording ends in the middle",
+        "queries_only": "no upgrade, but drive-system traffic",
+        "foreign_only": "no upgrade, only traffic of other kinds",
+        "empty": "nothing in this trace",
+    },
+    "TalkerKind": {
+        "node": "node of the drive system",
+        "foreign": "foreign",
+    },
+    "Kind": {
+        "message": "message",
+        "unknown": "unknown message",
+        "malformed": "malformed message",
+        "damaged": "damaged bytes",
+        "foreign": "foreign frame",
+        "error_frame": "error frame",
+    },
+    "ControllerState": {
+        "active": "error-active",
+        "passive": "error-passive",
+        "bus_off": "bus-off",
+        "unknown": "unknown",
+    },
+}
+
+
+def prose(word: Enum) -> str:
+    """The text for a member of an enumeration."""
+    return _TEXTS[type(word).__name__][word.value]
+
+
+def prose_of(enumeration: str, word: str) -> str:
+    """The text for a word of the enumeration of this name; the word itself where there is none."""
+    return _TEXTS[enumeration].get(word, word)
+
+
+# -- what a recorded trace shows ------------------------------------------------------------------
+
+
+class Explanation(NamedTuple):
+    """Likely cause and remedy, with {node} and {boot_name} to be filled in."""
+
+    likely: str
+    remedy: str
+
+
+_NOTHING: Final = Explanation("", "")
+_AGAIN: Final = "Then run the upgrade again."
+_RESCUE: Final = "The device stays in its bootloader until an image is flashed completely."
+
+_EXPLANATIONS: Final[dict[str, Explanation]] = {
+    "nobody_acknowledges": Explanation(
+        "no device is connected or powered, the bit rate is another one, CAN-H and CAN-L are "
+        "swapped, or the termination is missing",
+        f"Check supply, wiring, the 120 ohm termination at both ends, and the bit rate. {_AGAIN}",
+    ),
+    "no_boot_version": Explanation(
+        "the device has no power, sleeps, is not on this bus, or its bootloader announces itself "
+        "only at power-up",
+        "Check supply and wiring. A device that announces itself at power-up only is reached by "
+        "flasher rescue and a power cycle.",
+    ),
+    "no_request": Explanation(
+        "erasing takes longer than the tool waited, the device refuses this size or target, or it "
+        "hangs",
+        f"Power-cycle the device. {_AGAIN} If it happens again, allow more time for erasing.",
+    ),
+    "update_not_taken": Explanation(
+        "the update command names another target or too large an image, or it comes when the "
+        "bootloader does not listen",
+        "Check that the device is a {node} and that the image fits it.",
+    ),
+    "wrong_device": Explanation(
+        "the connected device is no {node}, whose bootloader calls itself {boot_name}",
+        "Check what is connected and which target was named.",
+    ),
+    "two_devices": Explanation(
+        "two devices of the same kind are on the bus",
+        f"Disconnect one of them. {_AGAIN}",
+    ),
+    "packet_refused": Explanation(
+        "the device cannot store this packet (flash that is worn, locked or not erased), or it "
+        "receives it damaged each time",
+        f"Check supply and wiring. {_AGAIN} If it stops there again, the device is defective.",
+    ),
+    "packet_unanswered": Explanation(
+        "the device lost power or contact, hangs, or its answers do not get through",
+        f"Check supply and wiring, power-cycle the device. {_AGAIN} {_RESCUE}",
+    ),
+    "packet_damaged": Explanation(
+        "the line is disturbed, an adapter loses frames, or two senders share one id",
+        "Check wiring, termination and ground; try another adapter or a shorter cable. "
+        f"{_AGAIN} {_RESCUE}",
+    ),
+    "device_restarted": Explanation(
+        "its supply drops, its watchdog bites, it does not accept what it is sent, or two devices "
+        "of the same kind answer",
+        f"Check the supply, and that there is one {{node}} only. {_AGAIN} {_RESCUE}",
+    ),
+    "second_tool": Explanation(
+        "a second dongle, a diagnostic program or another copy of this tool is on the bus",
+        f"Disconnect or stop the other tool. {_AGAIN}",
+    ),
+    "shutdown": Explanation(
+        "the key was held, or the battery found the vehicle idle and switched everything off",
+        f"Switch the battery on and keep it awake. {_AGAIN} {_RESCUE}",
+    ),
+    "bus_trouble": Explanation(
+        "a loose contact, a missing termination, or a node with another bit rate",
+        f"Check wiring and termination; disconnect other nodes one by one. {_AGAIN}",
+    ),
+    "tool_stopped": Explanation(
+        "the tool was interrupted, its computer or adapter failed, or it was unplugged",
+        f"Look at what the tool reported. {_AGAIN} {_RESCUE}",
+    ),
+    "tool_ended": Explanation(
+        "the tool itself ended the upgrade, for the reason that it reported",
+        "Do what the tool said then: it names the state of the device too.",
+    ),
+    "refused": Explanation(
+        "the image is not meant for this device, or the checksum that it carries is wrong",
+        f"Look at the image (flasher image-info) and flash one that fits. {_RESCUE}",
+    ),
+    "unconfirmed": Explanation(
+        "the answer was lost, or the device restarted without sending it",
+        "Unconfirmed is not done: see whether the new application runs (flasher info), or flash "
+        "it again.",
+    ),
+    "complete_too_early": Explanation(
+        "the bootloader counts other packets than the tool, or does not follow the protocol",
+        "Report the boot version to its maker, and see what the device runs (flasher info).",
+    ),
+    "other_version": Explanation(
+        "the device fell back to an older image, or the image names its version wrongly",
+        "Compare with flasher image-info, then flash the right image.",
+    ),
+    "recording_ends": Explanation(
+        "the recording was stopped or its file was cut off before the upgrade was over",
+        "Record a whole upgrade: begin before the tool starts, stop after it has ended.",
+    ),
+    "queries_only": Explanation("", "See what is said with flasher monitor TRACE."),
+    "foreign_only": Explanation(
+        "this is another bus, or another bit rate or filter was set when it was recorded",
+        "Record the drive system's bus with all ids.",
+    ),
+    "empty": Explanation(
+        "nothing was sent while it was recorded, the adapter did not hear it, or the file is no "
+        "trace of its suffix's format",
+        "See with flasher doctor whether the adapter hears the bus.",
+    ),
+}
+
+
+def explanation(cause: Enum) -> Explanation:
+    """What is said to a cause; empty where it speaks for itself."""
+    return _EXPLANATIONS.get(cause.value, _NOTHING)

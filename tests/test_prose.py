@@ -1,0 +1,41 @@
+"""Every word that programs see has its text for people, and every text its word."""
+
+from __future__ import annotations
+
+from enum import Enum
+
+import pytest
+
+from flasher import prose
+from flasher.bus.health import ControllerState
+from flasher.events import Phase
+from flasher.protocol.wire import DamageReason
+from flasher.trace import decoder
+from flasher.trace.story import Cause, TalkerKind
+
+TOLD: tuple[type[Enum], ...] = (
+    Cause,
+    ControllerState,
+    DamageReason,
+    Phase,
+    TalkerKind,
+    decoder.Kind,
+)
+
+
+@pytest.mark.parametrize("told", TOLD, ids=lambda told: told.__name__)
+def test_every_member_has_a_word_and_a_text(told: type[Enum]) -> None:
+    for member in told:
+        assert member.value == member.name.lower()
+        assert prose.prose(member)
+    assert prose._TEXTS[told.__name__].keys() == {member.value for member in told}
+
+
+def test_nothing_else_is_in_the_catalogue() -> None:
+    assert prose._TEXTS.keys() == {told.__name__ for told in TOLD}
+    assert prose._EXPLANATIONS.keys() <= {cause.value for cause in Cause}
+
+
+def test_a_word_that_is_not_known_stands_for_itself() -> None:
+    assert prose.prose_of("DamageReason", "bad_crc") == "wrong CRC"
+    assert prose.prose_of("DamageReason", "cut short") == "cut short"
