@@ -8,7 +8,6 @@ from collections.abc import Iterable
 from contextlib import ExitStack
 from typing import Final, TypedDict
 
-from flasher.prose import prose
 from flasher.cli import values
 from flasher.cli.framework import argument, command, option
 from flasher.cli.look.monitor_views import FrameLine, Lines, SeenLine, Table
@@ -17,6 +16,7 @@ from flasher.cli.output import Output, counted
 from flasher.cli.stop import stop_on_signal
 from flasher.driver import drive
 from flasher.errors import ExitCode, UsageError
+from flasher.prose import prose
 from flasher.protocol.spec import BMS, Target
 from flasher.protocol.text import printable
 from flasher.trace.decoder import Kind, message_titles
