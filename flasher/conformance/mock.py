@@ -52,39 +52,6 @@ GOOD_IMAGE: Final = model_image("V2r0r1_20240131", 10 * 128 - 3)
 SECOND_IMAGE: Final = model_image("V1r9r0_20230517", 6 * 128)
 
 
-class _Witness:
-    """Hears every frame on the bus, as an engine that says nothing."""
-
-    done = False
-
-    def __init__(self, bus: SimulatedBus) -> None:
-        self.heard: deque[tuple[Frame, float]] = deque()
-        self._bus = bus
-
-    def receive(self, frame: Frame, now: float) -> None:
-        # It stands in for the adapter, which may be off the bus.
-        if self._bus.faults.takes_part:
-            self.heard.append((frame, now))
-
-    def tick(self, now: float) -> None:
-        """Nothing is ever due."""
-
-    def deadline(self) -> float | None:
-        return None
-
-    def next_frame(self, now: float) -> Frame | None:
-        return None
-
-    def frame_sent(self, now: float) -> None:
-        """Nothing is ever sent."""
-
-    def cancel(self, now: float) -> None:
-        """Nothing is under way."""
-
-    def take_events(self) -> Sequence[object]:
-        return ()
-
-
 class MockPort:
     """A way onto a simulated bus: exact end times of all frames, the own ones included."""
 
@@ -92,17 +59,16 @@ class MockPort:
     timestamp_source = "simulated bus"
     uncertainty_s = 0.0
 
-    def __init__(self, bus: SimulatedBus, bitrate_bps: int) -> None:
+    def __init__(self, bitrate_bps: int) -> None:
         self.bitrate_bps = bitrate_bps
-        self._bus = bus
-        self._link = bus.link()
-        self._witness = _Witness(bus)
-        bus.attach(self._witness)
+        self.bus = SimulatedBus(bitrate_bps, VirtualClock(), self._record)
+        self._link = self.bus.link()
+        self._arrived: deque[tuple[Frame, float]] = deque()
         self._pending: deque[Frame] = deque()
 
     def now(self) -> float:
         """Virtual seconds."""
-        return self._bus.clock.now()
+        return self.bus.clock.now()
 
     def send(self, frame: RawFrame) -> None:
         """Queue a frame. Raises BusError for an adapter in trouble, DeviceCrashed."""
@@ -113,31 +79,26 @@ class MockPort:
 
     def receive(self, deadline: float) -> Arrival | None:
         """Let time pass until there is a frame or `deadline` has come. Raises as `send`."""
-        heard = self._witness.heard
         with _CRASHES:
-            while not heard:
+            while not self._arrived:
                 if self.now() >= deadline:
                     return None
-                self._bus.advance(deadline)
-                self._look_at_adapter()
-        frame, at = heard.popleft()
+                self.bus.advance(deadline)
+                # The link has the same frames; it reports errors, and raises when unplugged.
+                while (seen := self._link.receive(_AT_ONCE)) is not None:
+                    if seen.is_error:
+                        self._arrived.append((seen, self.now()))
+        frame, at = self._arrived.popleft()
         is_echo = bool(self._pending) and frame is self._pending[0]
         if is_echo:
             self._pending.popleft()
         return Arrival(RawFrame(*frame), at, is_echo)
 
-    def drain(self) -> int:
-        """Forget what arrived."""
-        count = len(self._witness.heard)
-        self._witness.heard.clear()
-        self._pending.clear()
-        return count
-
-    def _look_at_adapter(self) -> None:
-        """The link has the same frames, which are known, and raises when it was unplugged."""
-        while (frame := self._link.receive(_AT_ONCE)) is not None:
-            if frame.is_error:
-                self._witness.heard.append((frame, self.now()))
+    def _record(self, frame: Frame, at: float) -> Sequence[Frame]:
+        """Take note of every frame on the wire, unless the adapter is off the bus."""
+        if self.bus.faults.takes_part:
+            self._arrived.append((frame, at))
+        return (frame,)
 
 
 class _Crashes(AbstractContextManager[None]):
@@ -179,11 +140,11 @@ class MockSubject:
         self.good_image = good_image
         self.second_image = second_image
         self.device = (make_device or plain_device)(target, profile)
-        self.bus = SimulatedBus(WELLING.bitrate_bps, VirtualClock())
+        self.port = MockPort(WELLING.bitrate_bps)
+        self.bus = self.port.bus
         self._injector = FaultInjector(self.device)
         for engine in (self._injector, *others):
             self.bus.attach(engine)
-        self.port = MockPort(self.bus, WELLING.bitrate_bps)
 
     def power(self, *, on: bool) -> None:
         """Switch the device on or off now. Raises DeviceCrashed."""

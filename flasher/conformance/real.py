@@ -101,11 +101,6 @@ class RealPort:
             return True
         return False
 
-    def drain(self) -> int:
-        """Throw away what waits."""
-        self._own.clear()
-        return self._link.drain()
-
 
 class RealSubject:
     """A device behind an open adapter. Without `power` and `readback` the cases that need them
@@ -177,7 +172,7 @@ class PowerCommand:
         self._limit_s = limit_s
 
     def __call__(self, on: bool) -> None:  # noqa: FBT001  it is the one argument
-        """Run the command. Raises BusError when it fails or takes too long."""
+        """Switch the device. Raises BusError when the command fails or takes too long."""
         words = [_SWITCH.sub(r"\1" if on else r"\2", word) for word in self._template]
         _run(words, self._limit_s, "power")
 
