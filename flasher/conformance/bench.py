@@ -53,7 +53,8 @@ class Bench:
         self.collect, self.forget = tester.collect, tester.forget
         self.step, self.check, self.require = judge.step, judge.check, judge.require
         self.require_received, self.expect = judge.require_received, judge.expect
-        self.expect_silence, self.fail = judge.expect_silence, judge.fail
+        self.await_message, self.expect_silence = judge.await_message, judge.expect_silence
+        self.succeed, self.fail, self.check_only = judge.succeed, judge.fail, judge.check_only
         self.measure, self.check_time = judge.measure, judge.check_time
         self.info, self.unsupported = judge.info, judge.unsupported
         self.upgrade, self.application_version = host.upgrade, host.application_version
@@ -86,13 +87,7 @@ class Bench:
         """Reset the device; returns the first boot version. General feedback is not judged here."""
         self.forget()
         self.send(self.encoder.reset())
-        return self.await_boot_version()
-
-    def await_boot_version(self, within_s: float | None = None) -> Received:
-        """The next boot version, whatever comes before it; without one the case ends."""
-        limit_s = self.limit("first_version_s") if within_s is None else within_s
-        heard = self.wait_for(Kind.BOOT_VERSION, within_s=limit_s)
-        return self.require_received(heard, Kind.BOOT_VERSION.value, limit_s)
+        return self.await_message(Kind.BOOT_VERSION)
 
     def wait_to_be_heard(self) -> None:
         """After the first boot version: until the device takes the update command. That is at once,
@@ -249,10 +244,10 @@ class Bench:
         else:
             within_s = 0.0
         if not self.subject.has_power:
-            self.await_boot_version(within_s)
+            self.await_message(Kind.BOOT_VERSION, within_s=within_s)
         elif self.wait_for(Kind.BOOT_VERSION, within_s=within_s) is None:
             self.power_cycle()
-            self.await_boot_version()
+            self.await_message(Kind.BOOT_VERSION)
 
     def without_application(self) -> None:
         """From the running application to an announcing bootloader that has none to start."""

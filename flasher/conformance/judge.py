@@ -66,9 +66,13 @@ class Judge:
         if not self.check(ok, expected, got):
             raise CaseStopped(expected)
 
+    def succeed(self, expected: str, got: object) -> None:
+        """Record a check that passed."""
+        self.check(True, expected, got)  # noqa: FBT003
+
     def fail(self, expected: str, got: object) -> None:
         """Record a failed check."""
-        self._record(CheckOutcome.FAIL, expected, str(got))
+        self.check(False, expected, got)  # noqa: FBT003
 
     def require_received(
         self, received: Received | None, expected: str, within_s: float
@@ -78,6 +82,14 @@ class Judge:
             self.fail(expected, f"nothing within {within_s:g} s")
             raise CaseStopped(expected)
         return received
+
+    def await_message(self, kind: Kind, *, within_s: float | None = None) -> Received:
+        """The next message of `kind`, others skipped, by default within the profile's limit for
+        that kind; without one the case ends.
+        """
+        limit_s = self._tester.limit_s(kind) if within_s is None else within_s
+        received = self._tester.wait_for(kind, within_s=limit_s)
+        return self.require_received(received, kind.value, limit_s)
 
     def expect(
         self,
@@ -108,6 +120,11 @@ class Judge:
         silence_s = self._tester.profile.limit("silence_s") if for_s is None else for_s
         found = [one for one in self._tester.collect(silence_s) if one.kind not in ignoring]
         return self.check(not found, why, describe(found))
+
+    def check_only(self, received: Sequence[Received], *kinds: Kind, why: str) -> bool:
+        """Nothing but messages of these kinds was received."""
+        others = [one for one in received if one.kind not in kinds]
+        return self.check(not others, why, describe(others))
 
     def unsupported(self, what: str, why: str) -> None:
         """Record that a part of the case cannot be judged here; the other parts go on."""

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from functools import lru_cache
@@ -104,6 +104,16 @@ def split(can_id: int, raw: bytes, size_bytes: int = 8) -> list[RawFrame]:
     ]
 
 
+def joined(frames: Iterable[RawFrame]) -> bytes:
+    """The bytes that frames carry."""
+    return b"".join(frame.data for frame in frames)
+
+
+def inverted(data: bytes | bytearray) -> bytes:
+    """The same bytes with every bit the other way round."""
+    return bytes(byte ^ 0xFF for byte in data)
+
+
 def packet_count(size_bytes: int) -> int:
     """How many packets an image of that size has."""
     return -(-size_bytes // PACKET_BYTES)
@@ -167,9 +177,13 @@ class Encoder:
             if name != self.target
         ]
 
+    def frames(self, raw: bytes, size_bytes: int = 8) -> list[RawFrame]:
+        """Any bytes to this target."""
+        return split(self.to_device, raw, size_bytes)
+
     def message(self, mode: int, command: int, data: bytes = b"") -> list[RawFrame]:
         """Any message to this target."""
-        return split(self.to_device, build(self.to_device, mode, command, data))
+        return self.frames(build(self.to_device, mode, command, data))
 
     def reset(self) -> list[RawFrame]:
         """Restart into the bootloader."""
@@ -193,6 +207,10 @@ class Encoder:
     def end(self) -> list[RawFrame]:
         """End of transfer."""
         return self.message(WRITE, END, END_MARK)
+
+    def answer(self, command: int, data: bytes) -> list[RawFrame]:
+        """What this target itself sends to the tool: a report."""
+        return split(self.to_tool, build(self.to_tool, REPORT, command, data))
 
     def query_version(self) -> list[RawFrame]:
         """Ask the application for its version information."""

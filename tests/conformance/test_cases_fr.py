@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from flasher.conformance.cases.vectors import VECTORS
+from flasher.conformance.cases.cr import VECTORS
 from flasher.conformance.catalogue import CASES, Selection
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.profile import ConformanceProfile

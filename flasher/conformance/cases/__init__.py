@@ -52,6 +52,4 @@ from flasher.conformance.cases import rs as rs
 from flasher.conformance.cases import se as se
 from flasher.conformance.cases import tm as tm
 from flasher.conformance.cases import tx as tx
-from flasher.conformance.cases import tx_heads as tx_heads
-from flasher.conformance.cases import tx_ways as tx_ways
 from flasher.conformance.cases import up as up

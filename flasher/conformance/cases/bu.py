@@ -4,35 +4,133 @@ controller leaves the bus; somebody else uses the device's id.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Final
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.bu_troubles import (
-    Trouble,
-    Troubles,
-    faults_of,
-    faulty,
-    off_bus_after,
-    off_bus_in_answer,
-)
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, Requirement, case
+from flasher.conformance.tester import Fault, FaultKind, Sent
 from flasher.conformance.wire import (
     ACK,
     FEEDBACK,
-    REPORT,
     REQUEST,
     Kind,
+    RawFrame,
     Received,
-    build,
     packet_count,
-    packet_payload,
-    split,
 )
 
 _ENTRIES_MAX: Final = 60
 """Resets and update commands on the way into a transfer; ends a device that never gets there."""
+_ANSWER_FRAMES: Final = 2
+"""General feedback, ACK, complete: each one has two frames."""
+_OFF_BUS_S: Final = 0.2
+_POLL_S: Final = 0.0002
+"""Shorter than a frame, so that an answer can be hit in its middle."""
 _REPORTS_AT_ONCE: Final = 4
+
+
+# -- what befalls the messages ---------------------------------------------------------------------
+
+_Disturb = Callable[[Bench, Sequence[RawFrame]], AbstractContextManager[Sent]]
+
+
+class _Trouble(NamedTuple):
+    """What befalls one message: `send` sends it, and what it yields is waited for inside."""
+
+    name: str
+    send: _Disturb
+    hits_answer: bool = False
+    """True when the message itself arrives, so that the device goes on."""
+
+
+class _Troubles:
+    """What is still to happen to each of the tool's messages, in turn."""
+
+    def __init__(
+        self, bench: Bench, image: bytes, make: Callable[[int], Iterator[_Trouble]]
+    ) -> None:
+        encoder = bench.encoder
+        self.left: Final = {
+            "reset": deque(make(len(encoder.reset()))),
+            "update command": deque(make(len(encoder.update(len(image))))),
+            "packet": deque(make(len(encoder.packet_of(image, 1)))),
+            "end of transfer": deque(make(len(encoder.end()))),
+        }
+
+    @property
+    def rounds_max(self) -> int:
+        """More upgrades than that are never needed: each one takes a trouble of every message."""
+        return 1 + max(map(len, self.left.values()))
+
+    def __bool__(self) -> bool:
+        return any(self.left.values())
+
+    def take(self, message: str) -> _Trouble:
+        """The next one; none is left when everything happened."""
+        queue = self.left[message]
+        return queue.popleft() if queue else _NO_TROUBLE
+
+
+@contextmanager
+def _sent_well(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
+    yield bench.send(frames)
+
+
+_NO_TROUBLE: Final = _Trouble("", _sent_well)
+
+
+def _faults_of(frames: int, delay_s: float) -> Iterator[Fault]:
+    """All that can happen to one of the frames of a message, and to those of its answer."""
+    for index in range(frames):
+        yield Fault(FaultKind.DROP, index)
+        yield Fault(FaultKind.DOUBLE, index)
+        if index:
+            yield Fault(FaultKind.DELAY, index, delay_s=delay_s)
+            yield Fault(FaultKind.SWAP, index - 1)
+    for index in range(_ANSWER_FRAMES):
+        for kind in (FaultKind.DROP, FaultKind.DOUBLE):
+            yield Fault(kind, index, incoming=True)
+
+
+def _faulty(fault: Fault) -> _Disturb:
+    """A message in which, or in whose answer, this fault happens."""
+
+    @contextmanager
+    def send(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
+        with bench.disturb(fault):
+            yield bench.send(frames)
+
+    return send
+
+
+def _off_bus_after(after: int) -> _Disturb:
+    """A message in which the device's controller leaves the bus after so many frames."""
+
+    @contextmanager
+    def send(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
+        bench.send(frames[:after])
+        bench.subject.bus_off(_OFF_BUS_S)
+        yield bench.send(frames[after:])
+
+    return send
+
+
+@contextmanager
+def _off_bus_in_answer(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
+    """A message in whose answer the device's controller leaves the bus."""
+    before = bench.tester.frames_received
+    sent = bench.send(frames)
+    give_up_at = bench.now + bench.limit("ack_s")
+    while bench.tester.frames_received == before and bench.now < give_up_at:
+        bench.wait(_POLL_S)
+    bench.subject.bus_off(_OFF_BUS_S)
+    yield sent
+
+
+# -- the cases -----------------------------------------------------------------------------------
 
 
 @case(
@@ -48,9 +146,9 @@ _REPORTS_AT_ONCE: Final = 4
 def disturbed_frames(bench: Bench) -> None:
     delay_s = 1.5 * bench.limit("inter_frame_s")
 
-    def troubles(frames: int) -> Iterator[Trouble]:
-        for fault in faults_of(frames, delay_s):
-            yield Trouble(str(fault), faulty(fault), fault.incoming)
+    def troubles(frames: int) -> Iterator[_Trouble]:
+        for fault in _faults_of(frames, delay_s):
+            yield _Trouble(str(fault), _faulty(fault), fault.incoming)
 
     _upgrade_in_trouble(bench, troubles)
 
@@ -66,11 +164,11 @@ def disturbed_frames(bench: Bench) -> None:
     limit_s=1800.0,
 )
 def bus_off(bench: Bench) -> None:
-    def troubles(frames: int) -> Iterator[Trouble]:
+    def troubles(frames: int) -> Iterator[_Trouble]:
         for after in range(frames + 1):
             name = f"bus-off after {after} of {frames} frames"
-            yield Trouble(name, off_bus_after(after), hits_answer=after == frames)
-        yield Trouble("bus-off in the middle of the answer", off_bus_in_answer, hits_answer=True)
+            yield _Trouble(name, _off_bus_after(after), hits_answer=after == frames)
+        yield _Trouble("bus-off in the middle of the answer", _off_bus_in_answer, hits_answer=True)
 
     _upgrade_in_trouble(bench, troubles)
 
@@ -99,8 +197,7 @@ def same_id(bench: Bench) -> None:
                 _say_as_device(bench)
             bench.packet(image, number)
         bench.end_transfer()
-        bench.check_application()
-        bench.check_stored(image)
+        bench.check_image(image)
     bench.unsupported(
         "frames of one id that begin in the same bit time", "it takes an injector to make them meet"
     )
@@ -109,24 +206,20 @@ def same_id(bench: Bench) -> None:
 # -- an upgrade in which something happens to every message --------------------------------------
 
 
-def _upgrade_in_trouble(bench: Bench, make: Callable[[int], Iterator[Trouble]]) -> None:
+def _upgrade_in_trouble(bench: Bench, make: Callable[[int], Iterator[_Trouble]]) -> None:
     """Upgrade again and again until everything has happened, once in each message at the most."""
     image = bench.good_image
-    troubles = Troubles(bench, image, make)
+    troubles = _Troubles(bench, image, make)
     for _ in range(troubles.rounds_max):
         if not troubles:
             break
         _enter(bench, image, troubles)
-        if not _send_packets(bench, image, troubles):
-            continue
-        if not _end(bench, image, troubles):
-            continue
-        bench.check_application(image)
-        bench.check_stored(image)
+        if _send_packets(bench, image, troubles) and _end(bench, image, troubles):
+            bench.check_image(image)
     bench.check(not troubles, "the upgrades come to their end", "the device restarts in each one")
 
 
-def _enter(bench: Bench, image: bytes, troubles: Troubles) -> None:
+def _enter(bench: Bench, image: bytes, troubles: _Troubles) -> None:
     """Reset and update command until request transfer. A device that hears only a part of them
     announces, runs, erases or waits for packet 1: all right, as long as it gets there in the end.
     """
@@ -146,8 +239,12 @@ def _enter(bench: Bench, image: bytes, troubles: Troubles) -> None:
             within_s = bench.host.burst_s if trouble.name else limit("erase_s")
             with trouble.send(bench, bench.encoder.update(len(image))) as sent:
                 heard = bench.host.request_or_version(sent.left_at, within_s)
-            if heard is None and not _application_answers(bench):
-                heard = _ask_again(bench, image)
+            # It is not known that the bootloader was left: request transfer may be lost (UP-05).
+            if heard is None and not (
+                bench.encoder.has_version_query and bench.application_version() is not None
+            ):
+                sent = bench.send(bench.encoder.update(len(image)))
+                heard = bench.host.request_or_version(sent.left_at, limit("silence_s"))
         if heard is not None and heard.kind is Kind.REQUEST:
             break
         message = "reset" if heard is None else "update command"
@@ -156,18 +253,7 @@ def _enter(bench: Bench, image: bytes, troubles: Troubles) -> None:
         bench.require(is_there, Kind.REQUEST.value, heard or "nothing in many tries")
 
 
-def _application_answers(bench: Bench) -> bool:
-    """True when it is known that the bootloader was left; false where nobody can be asked."""
-    return bench.encoder.has_version_query and bench.application_version() is not None
-
-
-def _ask_again(bench: Bench, image: bytes) -> Received | None:
-    """The update command into the silence: request transfer may have been lost (UP-05)."""
-    sent = bench.send(bench.encoder.update(len(image)))
-    return bench.host.request_or_version(sent.left_at, bench.limit("silence_s"))
-
-
-def _send_packets(bench: Bench, image: bytes, troubles: Troubles) -> bool:
+def _send_packets(bench: Bench, image: bytes, troubles: _Troubles) -> bool:
     """All packets, each one in its own trouble and then undisturbed until it is acknowledged.
     False when the device restarted: it said so, and the upgrade begins anew (R11).
     """
@@ -175,9 +261,8 @@ def _send_packets(bench: Bench, image: bytes, troubles: Troubles) -> bool:
     for number in range(1, total + 1):
         trouble = troubles.take("packet")
         with bench.step(f"packet {number}, {trouble.name}" if trouble.name else "packets"):
-            frames = bench.encoder.packet(number, total, packet_payload(image, number))
-            with trouble.send(bench, frames):
-                heard = bench.wait_for(Kind.ACK, Kind.NAK, within_s=bench.limit("ack_s"))
+            with trouble.send(bench, bench.encoder.packet_of(image, number)):
+                heard = bench.wait_for(Kind.ACK, Kind.NAK)
             last = ""
             if heard is None or heard.kind is not Kind.ACK or heard.number != number:
                 last = bench.host.insist_on_packet(image, number, began_at)
@@ -189,7 +274,7 @@ def _send_packets(bench: Bench, image: bytes, troubles: Troubles) -> bool:
     return True
 
 
-def _end(bench: Bench, image: bytes, troubles: Troubles) -> bool:
+def _end(bench: Bench, image: bytes, troubles: _Troubles) -> bool:
     """End of transfer, in one trouble after the other as long as it is not heard; false when the
     device refused the image, twice and so explicitly (R6).
     """
@@ -218,7 +303,7 @@ def _end(bench: Bench, image: bytes, troubles: Troubles) -> bool:
 
 def _say_as_device(bench: Bench) -> None:
     """Whole answers, and the first frame of one, on the device's own id."""
-    can_id = bench.encoder.to_tool
+    answer = bench.encoder.answer
     for command, data in ((FEEDBACK, b"ACK"), (REQUEST, bytes(2)), (ACK, b"\x01\x00")):
-        bench.send(split(can_id, build(can_id, REPORT, command, data)))
-    bench.send(split(can_id, build(can_id, REPORT, ACK, b"\x02\x00"))[:1])
+        bench.send(answer(command, data))
+    bench.send(answer(ACK, b"\x02\x00")[:1])

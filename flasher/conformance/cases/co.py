@@ -23,6 +23,7 @@ from flasher.conformance.wire import (
     RawFrame,
     Received,
     build,
+    inverted,
     packet_count,
     packet_payload,
     split,
@@ -35,6 +36,9 @@ _FOREIGN_BITS: Final = 111
 """A frame of 8 bytes without stuff bits: so long is the gap that stays free."""
 _SHARE: Final = 9
 """Frames of others to one of the upgrade, or to one free place: 90 % of the bus."""
+_FOREIGN: Final = [
+    RawFrame(_FOREIGN_IDS[index % len(_FOREIGN_IDS)], _FOREIGN_DATA) for index in range(_SHARE)
+]
 _LOAD_S: Final = 0.3
 _LOADED_PACKETS: Final = 24
 """Packets that are sent under load; more of them show nothing new."""
@@ -93,30 +97,28 @@ def load(bench: Bench) -> None:
     image = bench.good_image
     total = packet_count(len(image))
     loaded = min(total, _LOADED_PACKETS)
-    limit = bench.limit
     with bench.step("a babbling node in the announcements"):
         bench.reset_to_bootloader()
         _babble(bench)
         bench.check_application()
     with bench.step("reset under load"):
         _load(bench, _LOAD_S)
-        bench.send(list(_under_load(bench.encoder.reset())))
-        _expect_under_load(bench, Kind.BOOT_VERSION, limit("first_version_s"))
+        bench.send(_under_load(bench.encoder.reset()))
+        _expect_under_load(bench, Kind.BOOT_VERSION)
         bench.wait_to_be_heard()
     with bench.step("update command under load"):
-        bench.send(list(_under_load(bench.encoder.update(len(image)))))
-        _expect_under_load(bench, Kind.REQUEST, limit("erase_s"))
+        bench.send(_under_load(bench.encoder.update(len(image))))
+        _expect_under_load(bench, Kind.REQUEST)
     with bench.step("packets under load"):
         for number in range(1, loaded):
-            frames = bench.encoder.packet(number, total, packet_payload(image, number))
-            bench.send(list(_under_load(frames)))
-            heard = _expect_under_load(bench, Kind.ACK, limit("ack_s"))
+            bench.send(_under_load(bench.encoder.packet_of(image, number)))
+            heard = _expect_under_load(bench, Kind.ACK)
             bench.require(heard.number == number, f"ACK {number}", heard)
     with bench.step("a babbling node in the transfer"):
         began_at = bench.now
         bench.send_packet(image, loaded)
         _babble(bench)
-        heard_all = bench.collect(limit("ack_s"))
+        heard_all = bench.collect(bench.limit("ack_s"))
         if not any(one.kind is Kind.ACK and one.number == loaded for one in heard_all):
             trouble = bench.host.insist_on_packet(image, loaded, began_at)
             bench.require(not trouble, f"ACK {loaded}", trouble or "it")
@@ -142,18 +144,16 @@ def two_upgrades(bench: Bench) -> None:
             bench.reset_to_bootloader()
             bench.wait_to_be_heard()
             _between(bench, bench.encoder.update(len(image)), other.update(len(image)))
-            limit_s = bench.limit("erase_s")
-            bench.expect(Kind.REQUEST, within_s=limit_s, ignoring=(Kind.BOOT_VERSION,))
-            _say_as(bench, other, REQUEST, bytes(2))
+            bench.expect(Kind.REQUEST, ignoring=(Kind.BOOT_VERSION,))
+            bench.send(other.answer(REQUEST, bytes(2)))
             for number in range(1, total + 1):
                 _check_packet_beside(bench, other, image, number)
             # A device that hears it ends here, or refuses.
             bench.send(other.end())
-            _say_as(bench, other, COMPLETE, bytes(2))
+            bench.send(other.answer(COMPLETE, bytes(2)))
             bench.expect_silence(bench.limit("silence_s"))
             bench.end_transfer()
-            bench.check_application(image)
-            bench.check_stored(image)
+            bench.check_image(image)
 
 
 @case(
@@ -173,8 +173,7 @@ def application_traffic(bench: Bench) -> None:
         bench.reset_to_bootloader()
         bench.send(traffic)
         heard = bench.collect(bench.limit("version_spacing_s"))
-        others = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
-        bench.check(not others, "no answer", ", ".join(map(str, others)) or "nothing")
+        bench.check_only(heard, Kind.BOOT_VERSION, why="no answer")
         bench.update(len(image))
     middle = max(1, total // 2)
     for before, first, last in (("packet 1", 1, middle), ("a packet", middle + 1, total)):
@@ -186,39 +185,32 @@ def application_traffic(bench: Bench) -> None:
         bench.send(traffic)
         bench.expect_silence()
         bench.end_transfer()
-        bench.check_application(image)
-        bench.check_stored(image)
+        bench.check_image(image)
 
 
 # -- load -----------------------------------------------------------------------------------------
 
 
-def _foreign(count: int) -> Iterator[RawFrame]:
-    for index in range(count):
-        yield RawFrame(_FOREIGN_IDS[index % len(_FOREIGN_IDS)], _FOREIGN_DATA)
-
-
-def _under_load(frames: Sequence[RawFrame]) -> Iterator[RawFrame]:
+def _under_load(frames: Sequence[RawFrame]) -> list[RawFrame]:
     """Frames of the upgrade, each one behind nine of others."""
-    for frame in frames:
-        yield from _foreign(_SHARE)
-        yield frame
+    return [one for frame in frames for one in (*_FOREIGN, frame)]
 
 
 def _load(bench: Bench, for_s: float) -> None:
     """Nine frames of others, then as much time as one takes, and so on."""
     until = bench.now + for_s
     while bench.now < until:
-        bench.send(list(_foreign(_SHARE)))
+        bench.send(_FOREIGN)
         bench.wait(_FOREIGN_BITS / bench.port.bitrate_bps)
 
 
-def _expect_under_load(bench: Bench, kind: Kind, within_s: float) -> Received:
+def _expect_under_load(bench: Bench, kind: Kind) -> Received:
     """The next message of that kind, while the load goes on."""
+    within_s = bench.tester.limit_s(kind)
     until = bench.now + within_s
     heard: Received | None = None
     while heard is None and bench.now < until:
-        bench.send(list(_foreign(_SHARE)))
+        bench.send(_FOREIGN)
         heard = bench.wait_for(kind, within_s=_FOREIGN_BITS / bench.port.bitrate_bps)
     return bench.require_received(heard, kind.value, within_s)
 
@@ -241,37 +233,31 @@ def _between(bench: Bench, own: Sequence[RawFrame], others: Sequence[RawFrame]) 
     bench.send(frames)
 
 
-def _say_as(bench: Bench, other: Encoder, command: int, data: bytes) -> None:
-    """What the other target answers."""
-    bench.send(split(other.to_tool, build(other.to_tool, REPORT, command, data)))
-
-
 def _check_packet_beside(bench: Bench, other: Encoder, image: bytes, number: int) -> None:
     """A packet between the frames of the other target's, which has other bytes; then the other
     target's next one alone.
     """
     total = packet_count(len(image))
-    payload = packet_payload(image, number)
-    inverse = bytes(byte ^ 0xFF for byte in payload)
-    own = bench.encoder.packet(number, total, payload)
+    inverse = inverted(packet_payload(image, number))
+    own = bench.encoder.packet_of(image, number)
     _between(bench, own, other.packet(number, total, inverse))
-    bench.expect(Kind.ACK, within_s=bench.limit("ack_s"), number=number)
-    _say_as(bench, other, ACK, number.to_bytes(2, "little"))
+    bench.expect(Kind.ACK, number=number)
+    bench.send(other.answer(ACK, number.to_bytes(2, "little")))
     if number < total:
         bench.send(other.packet(number + 1, total, inverse))
     if number == 1:
-        _say_as(bench, other, BOOT_VERSION, other.boot_name.encode() + b"V1.0.0")
+        bench.send(other.answer(BOOT_VERSION, other.boot_name.encode() + b"V1.0.0"))
         bench.expect_silence(bench.limit("ack_s"))
 
 
 # -- chapter 3 ------------------------------------------------------------------------------------
 
 
-def _traffic(words: Encoder) -> Iterator[RawFrame]:
+def _traffic(encoder: Encoder) -> Iterator[RawFrame]:
     """All of it but what the device itself would say."""
     for can_id, mode, command, data in _REPORTS:
-        if can_id & 0x0F0 != words.to_all & 0x0F0:
+        if can_id & 0x0F0 != encoder.to_all & 0x0F0:
             yield from split(can_id, build(can_id, mode, command, data))
     for command in _QUERIES:
-        yield from words.message(READ, command)
-    yield from words.message(READ, _MEMORY_READ, bytes(4) + (128).to_bytes(4, "little"))
+        yield from encoder.message(READ, command)
+    yield from encoder.message(READ, _MEMORY_READ, bytes(4) + (128).to_bytes(4, "little"))

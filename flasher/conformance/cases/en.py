@@ -7,13 +7,7 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.tx import transfer_image
 from flasher.conformance.catalogue import DESTRUCTIVE, Requirement, case
-from flasher.conformance.wire import (
-    Kind,
-    Received,
-    describe,
-    packet_count,
-    version_in,
-)
+from flasher.conformance.wire import Kind, Received, describe, packet_count, version_in
 
 _RESET_PERIOD_S: Final = 0.2
 """A tool repeats a command at this interval (4.3)."""
@@ -39,12 +33,11 @@ def end(bench: Bench) -> None:
     bench.packets(image)
     bench.end_transfer()
     with bench.step("after complete"):
-        heard = bench.wait_for(Kind.BOOT_VERSION, within_s=bench.limit("first_version_s"))
+        heard = bench.wait_for(Kind.BOOT_VERSION)
         restarts = bench.choice("en_03") == "restarts"
         expected = "the bootloader announces itself" if restarts else "no boot version"
         bench.check(restarts == (heard is not None), expected, heard or "no boot version")
-        bench.check_application(image)
-        bench.check_stored(image)
+        bench.check_image(image)
     with bench.step("after a restart"):
         bench.reset_to_bootloader()
         bench.collect(bench.host.burst_s)
@@ -71,21 +64,16 @@ def end_early_and_twice(bench: Bench) -> None:
         with bench.step(f"end of transfer after packet {stored} of {total}"):
             bench.packets(image, done + 1, stored)
             done = stored
-            _end_refused(bench)
+            bench.send(bench.encoder.end())
+            # A NAK of any number (R6), and nothing else.
+            bench.expect(Kind.NAK, within_s=bench.limit("complete_s"))
+            bench.expect_silence(bench.limit("ack_s"), ignoring=(Kind.BOOT_VERSION,))
             done += _goes_on(bench, image, stored)
     bench.packets(image, done + 1)
     bench.end_transfer()
     with bench.step("end of transfer after complete"):
         _check_second_end(bench, Kind.COMPLETE)
-        bench.check_application(image)
-        bench.check_stored(image)
-
-
-def _end_refused(bench: Bench) -> None:
-    """End of transfer is answered by a NAK, whatever its number (R6), and by nothing else."""
-    bench.send(bench.encoder.end())
-    bench.expect(Kind.NAK, within_s=bench.limit("complete_s"))
-    bench.expect_silence(bench.limit("ack_s"), ignoring=(Kind.BOOT_VERSION,))
+        bench.check_image(image)
 
 
 def _goes_on(bench: Bench, image: bytes, stored: int) -> int:
@@ -93,9 +81,9 @@ def _goes_on(bench: Bench, image: bytes, stored: int) -> int:
     new one.
     """
     bench.send_packet(image, stored + 1)
-    heard = bench.wait_for(Kind.ACK, Kind.NAK, Kind.BOOT_VERSION, within_s=bench.limit("ack_s"))
+    heard = bench.wait_for(Kind.ACK, Kind.NAK, Kind.BOOT_VERSION)
     if heard is not None and (heard.kind, heard.number) == (Kind.ACK, stored + 1):
-        bench.check(True, f"ACK {stored + 1}", heard)  # noqa: FBT003
+        bench.succeed(f"ACK {stored + 1}", heard)
         return 1
     bench.info(f"after packet {stored}, an early end of transfer ends the transfer")
     bench.send(bench.encoder.reset())
@@ -113,7 +101,7 @@ def _check_second_end(bench: Bench, first_answer: Kind) -> None:
     """End of transfer once more, right after its answer."""
     bench.send(bench.encoder.end())
     heard = bench.collect(bench.limit("ack_s"))
-    answers = [one.kind for one in heard if one.kind in _UPGRADE_KINDS]
+    answers = [one for one in heard if one.kind in _UPGRADE_KINDS]
     # An application that runs already may confirm what it does not know (R17).
     silence: list[list[Kind]] = [[], [Kind.FEEDBACK]]
     allowed = {
@@ -121,17 +109,9 @@ def _check_second_end(bench: Bench, first_answer: Kind) -> None:
         "silence": silence,
         "either": [[first_answer], *silence],
     }[bench.choice("en_02")]
-    expected = " or ".join(_in_words(kinds) for kinds in allowed)
-    bench.check(answers in allowed, expected, describe(_of_upgrade(heard)))
-
-
-def _in_words(kinds: list[Kind]) -> str:
-    """Kinds in words; "silence" for none."""
-    return ", ".join(kind.value for kind in kinds) or "silence"
-
-
-def _of_upgrade(heard: list[Received]) -> list[Received]:
-    return [one for one in heard if one.kind in _UPGRADE_KINDS]
+    names = (", ".join(kind.value for kind in kinds) or "silence" for kinds in allowed)
+    ok = [one.kind for one in answers] in allowed
+    bench.check(ok, " or ".join(names), describe(answers))
 
 
 @case(
@@ -188,8 +168,7 @@ def in_a_row(bench: Bench) -> None:
             bench.update(len(image))
             bench.packets(image)
             bench.end_transfer()
-    bench.check_application(images[-1])
-    bench.check_stored(images[-1])
+    bench.check_image(images[-1])
     with bench.step("the smaller image runs"):
         bench.start_transfer(len(second))
         bench.finish(second)
@@ -199,15 +178,14 @@ def _enter_at_once(bench: Bench) -> None:
     """To the bootloader from a device that may be just starting its application, which hears no
     reset: it is repeated until something is heard (4.3).
     """
-    limit = bench.limit
-    within_s = limit("start_s") + limit("first_version_s")
+    within_s = bench.limit("start_s") + bench.limit("first_version_s")
     deadline = bench.now + within_s
     heard: Received | None = None
     while heard is None and bench.now < deadline:
         bench.send(bench.encoder.reset())
         heard = bench.wait_for(Kind.FEEDBACK, Kind.BOOT_VERSION, within_s=_RESET_PERIOD_S)
     if heard is not None and heard.kind is Kind.FEEDBACK:
-        heard = bench.wait_for(Kind.BOOT_VERSION, within_s=limit("first_version_s"))
+        heard = bench.wait_for(Kind.BOOT_VERSION)
     bench.require_received(heard, Kind.BOOT_VERSION.value, within_s)
 
 

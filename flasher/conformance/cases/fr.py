@@ -3,46 +3,66 @@
 from __future__ import annotations
 
 import struct
+from collections.abc import Callable, Iterator
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.fr_stimuli import (
-    UNKNOWN,
-    messages_broken_off,
-    pad,
-    split_by_chance,
-    strangers,
-    treacherous_payloads,
-    wrong_lengths,
-)
-from flasher.conformance.cases.probing import ACCEPTED, EITHER, REJECTED, Probe, is_as, stream
+from flasher.conformance.cases.probing import ACCEPTED, EITHER, REJECTED, Probe, is_as
 from flasher.conformance.catalogue import DESTRUCTIVE, case
 from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
+    END,
+    END_MARK,
     PACKET,
+    PACKET_BYTES,
+    QUERY_VERSION,
+    READ,
     UPDATE,
     WRITE,
     Kind,
     RawFrame,
-    split,
+    build,
+    joined,
+    message_crc,
 )
 
 _FRAME_BYTES: Final = 8
+_HEADER: Final = b"\x55\xaa"
 _SIZES: Final = range(1, _FRAME_BYTES)
 _RANDOM_SPLITS: Final = 7
-_JUNK_FRAMES: Final = (
-    b"\x12",
-    b"\x00" * 8,
-    b"\xaa\x55\xf0",
-    b"\xf0" * 8 + b"\xaa" * 8 + b"\x16" * 3,
-)
+_JUNK_FRAMES: Final = (b"\x12", bytes(8), b"\xaa\x55\xf0", b"\xf0" * 8 + b"\xaa" * 8 + b"\x16" * 3)
 """None of them holds a header, nor the beginning of one at its end."""
 _LONG_JUNK_BYTES: Final = 300
 """More than the longest message."""
 _JUNK_IN_FRAME: Final = (b"\x12", b"\x55", b"\x55\x55", b"\xaa", b"\xf0\x00\x34", b"\x12" * 7)
 _WRONG_TAILS: Final = (0x00, 0x0F, 0xF1, 0x55, 0xFF)
 _PADDINGS: Final = (0x00, 0xFF, 0xAA, 0x55, 0xF0)
-_UNKNOWN_COMMANDS: Final = (0x0000, 0x0100, 0x7704, 0xA202, 0xC601, 0xFF10, UNKNOWN)
+_UNKNOWN: Final = 0x77FD
+"""A command that nobody has, with as many bytes as a message can hold."""
+_UNKNOWN_COMMANDS: Final = (0x0000, 0x0100, 0x7704, 0xA202, 0xC601, 0xFF10, _UNKNOWN)
+_PACKET: Final = PACKET.to_bytes(2, "big")
+_END: Final = END.to_bytes(2, "big") + END_MARK
+_WRONG_LENGTHS: Final[tuple[tuple[str, int, Callable[[bytes], bytes]], ...]] = (
+    ("length 0", 0, lambda _: b""),
+    ("length 0, a packet follows", 0, lambda data: _PACKET + data),
+    ("length 0, end of transfer follows", 0, lambda _: _END),
+    ("length 1", 1, lambda _: b"\xa4"),
+    ("length 1, a packet follows", 1, lambda data: _PACKET + data),
+    ("packet, length less by one", 134, lambda data: _PACKET + data),
+    ("packet, length greater by one", 136, lambda data: _PACKET + data),
+    ("packet with a byte more", 136, lambda data: _PACKET + data + b"\xff"),
+    ("packet with a byte less", 134, lambda data: _PACKET + data[:-1]),
+    ("end of transfer with a byte more", 4, lambda _: _END + b"\x00"),
+    ("packet of 253 bytes", 255, lambda data: _PACKET + data.ljust(253, b"\xff")),
+    ("255 with an unknown command", 255, lambda _: _UNKNOWN.to_bytes(2, "big") + bytes(253)),
+    (
+        "255, unknown, with other bytes",
+        255,
+        lambda data: _UNKNOWN.to_bytes(2, "big") + data.ljust(253),
+    ),
+)
+"""Messages whose length is wrong and whose CRC is right: name, length, and what follows it, made of
+the data of the next packet."""
 _UNKNOWN_MODES: Final = (0x00, 0x0D, 0x17, 0x96, 0xFF)
 
 
@@ -56,19 +76,18 @@ _UNKNOWN_MODES: Final = (0x00, 0x0D, 0x17, 0x96, 0xFF)
     choices=("fr_01", "up_04_burst"),
 )
 def splits(bench: Bench) -> None:
-    choice, to_device = bench.choice("fr_01"), bench.encoder.to_device
-    probe = Probe(bench)
+    choice, probe = bench.choice("fr_01"), Probe(bench)
     with bench.step("update command in frames of 5 bytes"):
-        update = stream(bench.encoder.update(len(probe.image)))
-        probe.enter(split(to_device, update, 5), choice)
+        update = joined(bench.encoder.update(len(probe.image)))
+        probe.enter(bench.encoder.frames(update, 5), choice)
     for size in _SIZES:
         with bench.step(f"packet in frames of {size} bytes"):
-            probe.offer(split(to_device, probe.raw(), size), choice)
+            probe.offer(bench.encoder.frames(probe.raw(), size), choice)
     with bench.step("packet in frames of 8 bytes"):
         probe.offer(probe.frames(), ACCEPTED)
     for turn in range(_RANDOM_SPLITS):
         with bench.step(f"packet split by chance, {turn + 1}"):
-            probe.offer(list(split_by_chance(bench, probe.raw())), choice)
+            probe.offer(list(_split_by_chance(bench, probe.raw())), choice)
     probe.check_stored()
 
 
@@ -82,8 +101,7 @@ def splits(bench: Bench) -> None:
     choices=("fr_02",),
 )
 def junk(bench: Bench) -> None:
-    to_device = bench.encoder.to_device
-    in_frame = {"found": ACCEPTED, "lost": REJECTED}.get(bench.choice("fr_02"), EITHER)
+    in_frame = _wanted(bench, "fr_02")
     probe = Probe(bench)
     probe.begin()
     long_junk = bytes(bench.random.choice(b"\x00\x11\x16\xaa\xf0") for _ in range(_LONG_JUNK_BYTES))
@@ -92,10 +110,10 @@ def junk(bench: Bench) -> None:
     for own in (*_JUNK_FRAMES, b"\x12\x34\x55", long_junk):
         with bench.step(f"{len(own)} bytes before it, the last one {own[-1]:02X}"):
             wanted = after_half if own[-1] == 0x55 else ACCEPTED
-            probe.offer(split(to_device, own) + probe.frames(), wanted)
+            probe.offer(bench.encoder.frames(own) + probe.frames(), wanted)
     for own in _JUNK_IN_FRAME:
         with bench.step(f"{own.hex(' ').upper()} in its first frame"):
-            probe.offer(split(to_device, own + probe.raw()), in_frame)
+            probe.offer(bench.encoder.frames(own + probe.raw()), in_frame)
     probe.check_stored()
 
 
@@ -108,7 +126,7 @@ def junk(bench: Bench) -> None:
     requires={DESTRUCTIVE},
 )
 def header_in_data(bench: Bench) -> None:
-    payloads = dict(treacherous_payloads(bench))
+    payloads = dict(_treacherous_payloads(bench))
     probe = Probe(bench, b"".join(payloads.values()))
     probe.begin()
     for name in payloads:
@@ -127,18 +145,17 @@ def header_in_data(bench: Bench) -> None:
     choices=("fr_04",),
 )
 def wrong_tail(bench: Bench) -> None:
-    to_device = bench.encoder.to_device
-    behind = {"rescanned": ACCEPTED, "dropped": REJECTED}.get(bench.choice("fr_04"), EITHER)
+    behind = _wanted(bench, "fr_04")
     probe = Probe(bench)
     probe.begin()
     for tail in _WRONG_TAILS:
         with bench.step(f"packet that ends with {tail:02X}"):
-            probe.discard(split(to_device, probe.raw()[:-1] + bytes((tail,))))
-    query = stream(bench.encoder.query_version())
+            probe.discard(bench.encoder.frames(probe.raw()[:-1] + bytes((tail,))))
+    query = joined(bench.encoder.query_version())
     for tail in (0x00, 0x55):
         with bench.step(f"query that ends with {tail:02X}, packet in the same frame"):
             broken = query[:-1] + bytes((tail,))
-            probe.offer(split(to_device, broken + probe.raw()), behind)
+            probe.offer(bench.encoder.frames(broken + probe.raw()), behind)
     probe.check_stored()
 
 
@@ -155,13 +172,13 @@ def broken_off(bench: Bench) -> None:
     probe = Probe(bench)
     probe.begin()
     at_once = []
-    for name, raw in messages_broken_off(bench):
+    for name, raw in _messages_broken_off(bench):
         with bench.step(name):
-            bench.send(split(bench.encoder.to_device, raw))
+            bench.send(bench.encoder.frames(raw))
             bench.wait(probe.settle_s())
             probe.plain()
         with bench.step(f"{name}, a packet at once"):
-            frames = split(bench.encoder.to_device, raw) + probe.frames()
+            frames = bench.encoder.frames(raw) + probe.frames()
             if probe.offer(frames, EITHER):
                 at_once.append(name)
     bench.info(f"the packet that followed at once was taken after: {', '.join(at_once) or 'none'}")
@@ -180,10 +197,11 @@ def wrong_length(bench: Bench) -> None:
     probe = Probe(bench)
     probe.begin()
     probe.plain()
-    for index in range(len(wrong_lengths(bench, probe.raw()))):
-        name, raw = wrong_lengths(bench, probe.raw())[index]
+    for name, length, make in _WRONG_LENGTHS:
         with bench.step(name):
-            probe.discard(split(bench.encoder.to_device, raw))
+            body = bytes((WRITE, length)) + make(probe.raw()[6:-5])
+            crc = message_crc(bench.encoder.to_device, body)
+            probe.discard(bench.encoder.frames(_HEADER + body + crc + b"\xf0"))
     probe.check_stored()
 
 
@@ -197,35 +215,32 @@ def wrong_length(bench: Bench) -> None:
     choices=("fr_07", "up_04_burst"),
 )
 def padded(bench: Bench) -> None:
-    choice = {"ignored": ACCEPTED}.get(bench.choice("fr_07"), bench.choice("fr_07"))
-    probe = Probe(bench, bench.filler(1))
+    choice, probe = _wanted(bench, "fr_07"), Probe(bench, bench.filler(1))
     for index, filler in enumerate(_PADDINGS):
         with bench.step(f"update command padded with {filler:02X}"):
             # In the midst of a transfer where the device starts over, which takes no pause (UP-08).
             if index and bench.choice("up_08") != "starts_over":
                 bench.leave_transfer()
-            update = pad(bench.encoder.update(len(probe.image)), filler)
-            probe.enter(update, choice, reset=not index)
+            update = bench.encoder.update(len(probe.image))
+            probe.enter(_pad(update, filler), choice, reset=not index)
             probe.plain()
     image = bench.good_image
     with bench.step("end of transfer padded with 00"):
         bench.leave_transfer()
         bench.update(len(image))
         bench.packets(image)
-        sent = bench.send(pad(bench.encoder.end(), 0x00))
+        sent = bench.send(_pad(bench.encoder.end(), 0x00))
         within_s = bench.limit("complete_s")
         if choice != ACCEPTED:  # what follows needs a transfer that still lasts (TX-12)
             within_s = min(within_s, bench.limit("pause_s") / 2)
         heard = bench.wait_for(Kind.COMPLETE, within_s=within_s)
-        bench.check(
-            is_as(choice, heard is not None), f"end of transfer {choice}", heard or "nothing"
-        )
+        ok = is_as(choice, heard is not None)
+        bench.check(ok, f"end of transfer {choice}", heard or "nothing")
         if heard is None:
             bench.end_transfer()
         else:
             bench.measure("end of transfer to complete", heard.at - sent.left_at)
-        bench.check_application(image)
-        bench.check_stored(image)
+        bench.check_image(image)
 
 
 @case(
@@ -239,15 +254,13 @@ def padded(bench: Bench) -> None:
     choices=("tx_02", "up_04_burst"),
 )
 def back_to_back(bench: Bench) -> None:
-    words = bench.encoder
-    probe = Probe(bench)
+    query, probe = bench.encoder.query_version(), Probe(bench)
     with bench.step("query, then update command"):
-        query = words.query_version()
-        probe.enter(query + words.update(len(probe.image)), ACCEPTED)
+        probe.enter(query + bench.encoder.update(len(probe.image)), ACCEPTED)
     for count in (1, 2, 3):
         with bench.step(f"{count} times a query, then a packet"):
             # Whether a bootloader answers a query is CO-04.
-            frames = count * words.query_version() + probe.frames()
+            frames = count * query + probe.frames()
             probe.offer(frames, ACCEPTED, ignoring=(Kind.FEEDBACK, Kind.OTHER))
     with bench.step("the last packet again, then the next one"):
         bench.forget()
@@ -255,10 +268,10 @@ def back_to_back(bench: Bench) -> None:
         bench.send(probe.previous() + frames)
         number = probe.number
         if bench.choice("tx_02") == "nak_next":
-            bench.expect(Kind.NAK, within_s=bench.limit("ack_s"), number=number)
+            bench.expect(Kind.NAK, number=number)
         else:
-            bench.expect(Kind.ACK, within_s=bench.limit("ack_s"), number=number - 1)
-        bench.expect(Kind.ACK, within_s=bench.limit("ack_s"), number=number)
+            bench.expect(Kind.ACK, number=number - 1)
+        bench.expect(Kind.ACK, number=number)
 
 
 @case(
@@ -272,7 +285,7 @@ def back_to_back(bench: Bench) -> None:
 def no_payload(bench: Bench) -> None:
     probe = Probe(bench)
     probe.begin()
-    for name, stranger in strangers(bench.encoder.to_device):
+    for name, stranger in _strangers(bench.encoder.to_device):
         with bench.step(f"{name} between all frames"):
             try:
                 bench.send([stranger])
@@ -293,23 +306,96 @@ def no_payload(bench: Bench) -> None:
     requires={DESTRUCTIVE},
 )
 def unknown(bench: Bench) -> None:
-    words = bench.encoder
+    encoder = bench.encoder
     probe = Probe(bench)
-    update = words.update_text + struct.pack("<I", len(probe.image))
+    update = encoder.update_text + struct.pack("<I", len(probe.image))
     with bench.step("while it announces itself"):
-        modes = [words.message(mode, UPDATE, update) for mode in _UNKNOWN_MODES]
+        modes = [encoder.message(mode, UPDATE, update) for mode in _UNKNOWN_MODES]
         commands = [_of_command(bench, command) for command in _UNKNOWN_COMMANDS[:-1]]
         probe.enter_past(*modes, *commands)
     for mode in _UNKNOWN_MODES:
         with bench.step(f"packet of mode {mode:02X}"):
-            data = probe.raw()[6:-5]
-            probe.discard(words.message(mode, PACKET, data))
+            probe.discard(encoder.message(mode, PACKET, probe.raw()[6:-5]))
     for command in _UNKNOWN_COMMANDS:
         with bench.step(f"command {command:04X}"):
             probe.discard(_of_command(bench, command))
     probe.check_stored()
 
 
+def _wanted(bench: Bench, key: str) -> str:
+    """What a choice of the profile means for the message that it is about."""
+    choice = bench.choice(key)
+    means = {"found": ACCEPTED, "rescanned": ACCEPTED, "ignored": ACCEPTED}
+    return means.get(choice, REJECTED if choice in ("lost", "dropped") else choice)
+
+
 def _of_command(bench: Bench, command: int) -> list[RawFrame]:
     """A write of that command, with as many zeros as it says."""
     return bench.encoder.message(WRITE, command, bytes(command & 0xFF))
+
+
+# -- stimuli --------------------------------------------------------------------------------------
+
+
+def _split_by_chance(bench: Bench, raw: bytes) -> Iterator[RawFrame]:
+    """The bytes in frames of 1 to 8 bytes, by the seed."""
+    at = 0
+    while at < len(raw):
+        size = bench.random.randint(1, _FRAME_BYTES)
+        yield RawFrame(bench.encoder.to_device, raw[at : at + size])
+        at += size
+
+
+def _pad(frames: list[RawFrame], filler: int) -> list[RawFrame]:
+    """The frames, the last one filled up to 8 bytes."""
+    last = frames[-1]
+    return [*frames[:-1], last._replace(data=last.data.ljust(_FRAME_BYTES, bytes((filler,))))]
+
+
+def _treacherous_payloads(bench: Bench) -> Iterator[tuple[str, bytes]]:
+    """Data that looks like the beginning or the end of messages, whatever the frame boundaries."""
+    encoder, to_device = bench.encoder, bench.encoder.to_device
+    yield "55 AA all over", _HEADER * (PACKET_BYTES // 2)
+    yield "55 AA all over, odd", (b"\x00" + _HEADER * PACKET_BYTES)[:PACKET_BYTES]
+    yield "F0 all over", b"\xf0" * PACKET_BYTES
+    yield "F0, then 55 AA", b"\xf0\x55\xaa\xf0" * (PACKET_BYTES // 4)
+    whole = {
+        "end of transfer": joined(encoder.end()),
+        "update command": joined(encoder.update(PACKET_BYTES)),
+        "reset": joined(encoder.reset()),
+        "head of a packet": build(to_device, WRITE, PACKET, bytes(5 + PACKET_BYTES))[:16],
+        "head of the longest message": b"\x55\xaa\x16\xff\x77\xfd",
+    }
+    # Data begins at byte 11 of a packet: the sixth byte of it is the first one of a frame.
+    for name, raw in whole.items():
+        for offset in (5, 3):
+            where = "at a frame's start" if offset == 5 else "across frames"
+            block = bytes(offset) + raw.ljust(24, b"\x00")
+            yield f"{name} {where}", block.ljust(64, b"\x00") + block.ljust(64, b"\xf0")
+
+
+def _messages_broken_off(bench: Bench) -> Iterator[tuple[str, bytes]]:
+    """Messages, by name, that end before their length is used up."""
+    encoder = bench.encoder
+    packet = joined(encoder.packet(1, 1, bytes(range(PACKET_BYTES))))
+    query = build(encoder.to_device, READ, QUERY_VERSION)
+    yield "length 255, two bytes follow", b"\x55\xaa\x16\xff\x77\xfd\x01\x02"
+    yield "packet cut off behind frame 1", packet[:8]
+    yield "packet cut off behind frame 9", packet[:72]
+    yield "packet cut off behind frame 17", packet[:136]
+    yield "update command cut off behind frame 1", joined(encoder.update(PACKET_BYTES))[:8]
+    longer = bytes((READ, 3, QUERY_VERSION >> 8, 1))
+    yield "length greater by one", _HEADER + longer + query[-5:]
+
+
+def _strangers(to_device: int) -> Iterator[tuple[str, RawFrame]]:
+    """Frames with the device's id that carry no payload, by name."""
+    yield "a frame of 0 bytes", RawFrame(to_device, b"")
+    yield "a remote frame", RawFrame(to_device, b"", is_remote=True)
+    yield "an extended frame", RawFrame(to_device, b"\x12" * 8, is_extended=True)
+    yield "an extended frame with a header", RawFrame(to_device, _HEADER, is_extended=True)
+    yield (
+        "an extended frame of the same first 11 bits",
+        RawFrame(to_device << 18, b"\x12" * 8, is_extended=True),
+    )
+    yield "an error frame", RawFrame(to_device, bytes(8), is_error=True)

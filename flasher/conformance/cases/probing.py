@@ -4,7 +4,7 @@ its next packet is acknowledged shows what the device made of the bytes before.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from flasher.conformance.bench import Bench
@@ -14,8 +14,8 @@ from flasher.conformance.wire import (
     RawFrame,
     Received,
     describe,
+    joined,
     packet_count,
-    packet_payload,
 )
 
 ACCEPTED: Final = "accepted"
@@ -28,11 +28,6 @@ _PACKETS: Final = 48
 _REST: Final = bytes(5)
 _QUIET_S: Final = 0.05
 """Behind an ACK, for what else is said to the same bytes (R10)."""
-
-
-def stream(frames: Iterable[RawFrame]) -> bytes:
-    """The bytes that frames carry."""
-    return b"".join(frame.data for frame in frames)
 
 
 def is_as(wanted: str, taken: bool) -> bool:  # noqa: FBT001
@@ -113,19 +108,15 @@ class Probe:
             self._bench.leave_transfer()
             self._bench.update(len(self.image))
             self.number = 1
-        return self._packet(self.number)
+        return self._bench.encoder.packet_of(self.image, self.number)
 
     def raw(self) -> bytes:
         """The next packet, header to tail."""
-        return stream(self.frames())
+        return joined(self.frames())
 
     def previous(self) -> list[RawFrame]:
         """The packet that was stored last; there has to be one."""
-        return self._packet(self.number - 1)
-
-    def _packet(self, number: int) -> list[RawFrame]:
-        total = packet_count(len(self.image))
-        return self._bench.encoder.packet(number, total, packet_payload(self.image, number))
+        return self._bench.encoder.packet_of(self.image, self.number - 1)
 
     # -- stimuli ----------------------------------------------------------------------------------
 

@@ -4,26 +4,23 @@ reachable again.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.pw_cuts import (
-    FAR_PACKET,
-    PACKET_FRAMES,
-    Cut,
-    cuts_at_frames,
-    name_of,
-)
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, POWER, case
-from flasher.conformance.wire import (
-    PACKET_BYTES,
-    Kind,
-    Received,
-    packet_count,
-    version_in,
-)
+from flasher.conformance.wire import PACKET_BYTES, Kind, Received, packet_count, version_in
 
+_PACKET_FRAMES: Final = 18
+"""CAN frames of one packet."""
+_ALL_PACKETS: Final = 8
+"""Up to so many packets, an upgrade is cut at each of its frames."""
+_BETWEEN_MAX: Final = 6
+"""Beyond, so many of those between the first and the last one are cut, at a frame by the seed."""
+_FAR_PACKET: Final = 64
+"""Beyond it a cut costs so much time on a real bus that only some are made."""
+_FEW_FRAMES: Final = (1, 9, 17, 18)
 _OFF_S: Final = 0.3
 _SHARES: Final = (0.0, 0.5, 1.0)
 """Before a flash operation, in its middle, and when it is over."""
@@ -31,8 +28,17 @@ _OPERATIONS_MAX: Final = 24
 """Operations of one upgrade that are cut; a large image has more, which are alike."""
 
 
+class _Cut(NamedTuple):
+    """Power is cut after so many frames of a message: the `packet` of that number (from 1), or,
+    with packet 0, the update command; the number of packets plus one is the end.
+    """
+
+    packet: int
+    frames: int
+
+
 @dataclass
-class _World:
+class _Upgrade:
     """The images of a case and how far the upgrade went that was cut."""
 
     old: bytes
@@ -59,21 +65,21 @@ class _World:
     limit_s=7200.0,
 )
 def cuts(bench: Bench) -> None:
-    world = _world(bench)
-    _say_what_is_not_judged(bench, world)
+    upgrade = _upgrade(bench)
+    _say_what_is_not_judged(bench, upgrade)
     for frames in range(1, len(bench.encoder.reset()) + 1):
         with bench.step(f"after frame {frames} of reset"):
             bench.send(bench.encoder.reset()[:frames])
             _cut(bench)
-            _check_after_cut(bench, world)
-    total = packet_count(len(world.new))
-    for cut in cuts_at_frames(bench, world.new):
-        with bench.step(name_of(cut, total)):
-            _go_to(bench, world, cut)
+            _check_after_cut(bench, upgrade)
+    total = packet_count(len(upgrade.new))
+    for cut in _cuts_at_frames(bench, upgrade.new):
+        with bench.step(_name_of(cut, total)):
+            _go_to(bench, upgrade, cut)
             _cut(bench)
-            _check_after_cut(bench, world)
-    _cut_operations(bench, world)
-    _cut_after_ack(bench, world)
+            _check_after_cut(bench, upgrade)
+    _cut_operations(bench, upgrade)
+    _cut_after_ack(bench, upgrade)
     _check_upgrade(bench)
 
 
@@ -90,38 +96,68 @@ def cuts(bench: Bench) -> None:
     limit_s=3600.0,
 )
 def second_cut(bench: Bench) -> None:
-    world = _world(bench)
-    _say_what_is_not_judged(bench, world)
-    total = packet_count(len(world.new))
+    upgrade = _upgrade(bench)
+    _say_what_is_not_judged(bench, upgrade)
+    total = packet_count(len(upgrade.new))
     update, end = len(bench.encoder.update(1)), len(bench.encoder.end())
-    second = [Cut(0, 1), Cut(0, update), Cut(1, 9), Cut(1, PACKET_FRAMES)]
-    if total <= FAR_PACKET:
-        second += [Cut(total, PACKET_FRAMES), Cut(total + 1, end - 1), Cut(total + 1, end)]
+    second = [_Cut(0, 1), _Cut(0, update), _Cut(1, 9), _Cut(1, _PACKET_FRAMES)]
+    if total <= _FAR_PACKET:
+        second += [_Cut(total, _PACKET_FRAMES), _Cut(total + 1, end - 1), _Cut(total + 1, end)]
     for cut in second:
         with bench.step("first cut"):
-            _go_to(bench, world, Cut(1, 9))
+            _go_to(bench, upgrade, _Cut(1, 9))
             _cut(bench)
-            heard = bench.wait_for(Kind.BOOT_VERSION, within_s=bench.limit("first_version_s"))
-            bench.require_received(heard, Kind.BOOT_VERSION.value, bench.limit("first_version_s"))
-        with bench.step(f"second cut {name_of(cut, total)}"):
-            world.runs = False
-            _go_to(bench, world, cut)
+            bench.await_message(Kind.BOOT_VERSION)
+        with bench.step(f"second cut {_name_of(cut, total)}"):
+            upgrade.runs = False
+            _go_to(bench, upgrade, cut)
             _cut(bench)
-            _check_after_cut(bench, world)
+            _check_after_cut(bench, upgrade)
     _check_upgrade(bench)
+
+
+# -- the cuts -------------------------------------------------------------------------------------
+
+
+def _cuts_at_frames(bench: Bench, image: bytes) -> Iterator[_Cut]:
+    """Every frame of every message; of a large image's packets between the first and the last one
+    some, by chance.
+    """
+    for frames in range(1, len(bench.encoder.update(len(image))) + 1):
+        yield _Cut(0, frames)
+    total = packet_count(len(image))
+    for frames in range(1, _PACKET_FRAMES + 1):
+        yield _Cut(1, frames)
+    if total <= _ALL_PACKETS:
+        between = [_Cut(at, one) for at in range(2, total) for one in range(1, _PACKET_FRAMES + 1)]
+    else:
+        numbers = sorted(bench.random.sample(range(2, min(total, _FAR_PACKET)), _BETWEEN_MAX))
+        between = [_Cut(at, bench.random.randint(1, _PACKET_FRAMES)) for at in numbers]
+    yield from between
+    if total > 1:
+        for frames in _FEW_FRAMES if total > _FAR_PACKET else range(1, _PACKET_FRAMES + 1):
+            yield _Cut(total, frames)
+    for frames in range(1, len(bench.encoder.end()) + 1):
+        yield _Cut(total + 1, frames)
+
+
+def _name_of(cut: _Cut, total: int) -> str:
+    """The cut in words; `total` is the number of packets."""
+    what = {0: "the update command", total + 1: "end of transfer"}
+    return f"after frame {cut.frames} of {what.get(cut.packet, f'packet {cut.packet}')}"
 
 
 # -- the images -----------------------------------------------------------------------------------
 
 
-def _world(bench: Bench) -> _World:
+def _upgrade(bench: Bench) -> _Upgrade:
     """From the good image to another one where there is one, so that they can be told apart."""
     has_other = bench.subject.second_image is not None
-    return _World(bench.good_image, bench.second_image() if has_other else bench.good_image)
+    return _Upgrade(bench.good_image, bench.second_image() if has_other else bench.good_image)
 
 
-def _say_what_is_not_judged(bench: Bench, world: _World) -> None:
-    same = version_in(world.old) == version_in(world.new) or version_in(world.old) is None
+def _say_what_is_not_judged(bench: Bench, upgrade: _Upgrade) -> None:
+    same = version_in(upgrade.old) == version_in(upgrade.new) or version_in(upgrade.old) is None
     if not bench.subject.has_readback and (same or not bench.encoder.has_version_query):
         bench.unsupported(
             "what runs after a cut is a whole image",
@@ -132,32 +168,30 @@ def _say_what_is_not_judged(bench: Bench, world: _World) -> None:
 # -- an upgrade up to the cut ---------------------------------------------------------------------
 
 
-def _enter(bench: Bench, world: _World) -> None:
+def _enter(bench: Bench, upgrade: _Upgrade) -> None:
     """Request transfer, from the application or from a bootloader that waits for it."""
-    world.end_was_sent = False
-    if world.runs:
+    upgrade.end_was_sent = False
+    if upgrade.runs:
         bench.reset_to_bootloader()
-    bench.update(len(world.new))
-    world.runs = False
+    bench.update(len(upgrade.new))
+    upgrade.runs = False
 
 
-def _go_to(bench: Bench, world: _World, cut: Cut) -> None:
+def _go_to(bench: Bench, upgrade: _Upgrade, cut: _Cut) -> None:
     """The upgrade up to those frames."""
-    total, words = packet_count(len(world.new)), bench.encoder
+    total, encoder = packet_count(len(upgrade.new)), bench.encoder
     if not cut.packet:
-        if world.runs:
+        if upgrade.runs:
             bench.reset_to_bootloader()
-        bench.send(words.update(len(world.new))[: cut.frames])
+        bench.send(encoder.update(len(upgrade.new))[: cut.frames])
         return
-    _enter(bench, world)
-    bench.packets(world.new, 1, min(cut.packet - 1, total))
+    _enter(bench, upgrade)
+    bench.packets(upgrade.new, 1, min(cut.packet - 1, total))
     if cut.packet > total:
-        world.end_was_sent = True
-        bench.send(words.end()[: cut.frames])
+        upgrade.end_was_sent = True
+        bench.send(encoder.end()[: cut.frames])
     else:
-        part = world.new[(cut.packet - 1) * PACKET_BYTES :][:PACKET_BYTES]
-        frames = words.packet(cut.packet, total, part.ljust(PACKET_BYTES, b"\xff"))
-        bench.send(frames[: cut.frames])
+        bench.send(encoder.packet_of(upgrade.new, cut.packet)[: cut.frames])
 
 
 def _cut(bench: Bench) -> None:
@@ -172,33 +206,29 @@ def _check_upgrade(bench: Bench) -> None:
         bench.check_upgrade()
 
 
-def _check_after_cut(bench: Bench, world: _World, first: Received | None = None) -> None:
+def _check_after_cut(bench: Bench, upgrade: _Upgrade, first: Received | None = None) -> None:
     """The device announces itself (`first` was heard), or starts an application, but only a whole
     one.
     """
-    limit = bench.limit
-    within_s = limit("first_version_s")
-    if first is None:
-        first = bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
-    if first is None:
+    if first is None and bench.wait_for(Kind.BOOT_VERSION) is None:
         # That it should have announced itself is another case (RS-05).
-        world.runs = _check_whole(bench, world)
-        bench.require(world.runs, Kind.BOOT_VERSION.value, "neither that nor an application")
+        upgrade.runs = _check_whole(bench, upgrade)
+        bench.require(upgrade.runs, Kind.BOOT_VERSION.value, "neither that nor an application")
         return
-    spacing_s = limit("version_spacing_s") + limit("version_spacing_tolerance_s")
+    spacing_s = bench.limit("version_spacing_s") + bench.limit("version_spacing_tolerance_s")
     heard = bench.collect(bench.host.burst_s + 2 * spacing_s)
     announced = 1 + sum(one.kind is Kind.BOOT_VERSION for one in heard)
     # More than a burst: it has nothing to start.
-    world.runs = announced <= bench.number("versions") and _check_whole(bench, world)
-    if not world.runs:
-        bench.check(True, "no application is started", "none")  # noqa: FBT003
+    upgrade.runs = announced <= bench.number("versions") and _check_whole(bench, upgrade)
+    if not upgrade.runs:
+        bench.succeed("no application is started", "none")
 
 
-def _check_whole(bench: Bench, world: _World) -> bool:
+def _check_whole(bench: Bench, upgrade: _Upgrade) -> bool:
     """What runs is the old image, or the new one that was sent to its end; false when nothing
     runs.
     """
-    images = [world.old, world.new] if world.end_was_sent else [world.old]
+    images = [upgrade.old, upgrade.new] if upgrade.end_was_sent else [upgrade.old]
     if bench.encoder.has_version_query:
         version = bench.application_version(bench.limit("start_s"))
         if version is None:
@@ -214,15 +244,15 @@ def _check_whole(bench: Bench, world: _World) -> bool:
         images = [image for image in images if stored[: len(image)] == image]
         got = "a whole one" if images else "a mixture"
         bench.require(bool(images), "the flash holds a whole image", got)
-    if images == [world.new]:
-        world.turn()
+    if images == [upgrade.new]:
+        upgrade.turn()
     return True
 
 
 # -- in the flash ---------------------------------------------------------------------------------
 
 
-def _cut_operations(bench: Bench, world: _World) -> None:
+def _cut_operations(bench: Bench, upgrade: _Upgrade) -> None:
     """A cut before, in and after each operation, until an upgrade has no more of them."""
     if not bench.subject.has_timed_cuts:
         bench.unsupported(
@@ -233,55 +263,55 @@ def _cut_operations(bench: Bench, world: _World) -> None:
     for operation in range(_OPERATIONS_MAX):
         for share in _SHARES:
             with bench.step(f"flash operation {operation + 1}, {share:.0%} of it done"):
-                if world.runs:
+                if upgrade.runs:
                     bench.reset_to_bootloader()
-                world.end_was_sent = False
+                upgrade.end_was_sent = False
                 bench.subject.cut_in_operation(operation, share, _OFF_S)
-                version = _upgrade_until_cut(bench, world)
+                version = _upgrade_until_cut(bench, upgrade)
                 if not bench.subject.take_cut():
                     # Whole, and not cut: what it left is for EN-01 and EN-07 to judge.
-                    world.runs = bench.application_runs()
-                    world.turn()
+                    upgrade.runs = bench.application_runs()
+                    upgrade.turn()
                     return
-                _check_after_cut(bench, world, version)
+                _check_after_cut(bench, upgrade, version)
 
 
-def _upgrade_until_cut(bench: Bench, world: _World) -> Received | None:
+def _upgrade_until_cut(bench: Bench, upgrade: _Upgrade) -> Received | None:
     """Go on until the device announces itself again, and return that; None at the very end."""
     limit = bench.limit
     back_s = _OFF_S + limit("first_version_s")
     bench.forget()
-    sent = bench.send(bench.encoder.update(len(world.new)))
+    sent = bench.send(bench.encoder.update(len(upgrade.new)))
     heard = bench.host.request_or_version(sent.left_at, limit("erase_s") + back_s)
-    for number in range(1, packet_count(len(world.new)) + 1):
+    for number in range(1, packet_count(len(upgrade.new)) + 1):
         if heard is None or heard.kind is Kind.BOOT_VERSION:
             return heard
-        bench.send_packet(world.new, number)
+        bench.send_packet(upgrade.new, number)
         heard = bench.wait_for(Kind.ACK, Kind.BOOT_VERSION, within_s=limit("ack_s") + back_s)
     if heard is None or heard.kind is Kind.BOOT_VERSION:
         return heard
-    world.end_was_sent = True
+    upgrade.end_was_sent = True
     bench.send(bench.encoder.end())
     heard = bench.wait_for(Kind.COMPLETE, Kind.BOOT_VERSION, within_s=limit("complete_s") + back_s)
     return heard if heard is not None and heard.kind is Kind.BOOT_VERSION else None
 
 
-def _cut_after_ack(bench: Bench, world: _World) -> None:
+def _cut_after_ack(bench: Bench, upgrade: _Upgrade) -> None:
     """What the device says it has received correctly is not lost with the power (R10)."""
     written = 2 * PACKET_BYTES
     last = packet_count(written + bench.number("buffer_bytes"))
     with bench.step(f"after ACK {last}"):
-        if not bench.subject.has_readback or packet_count(len(world.new)) <= last:
+        if not bench.subject.has_readback or packet_count(len(upgrade.new)) <= last:
             why = f"it takes readback and {last + 1} packets"
             bench.unsupported("what was acknowledged is stored", why)
             return
-        _enter(bench, world)
-        bench.packets(world.new, 1, last)
+        _enter(bench, upgrade)
+        bench.packets(upgrade.new, 1, last)
         bench.power_off()
-        is_there = bench.subject.readback()[:written] == world.new[:written]
+        is_there = bench.subject.readback()[:written] == upgrade.new[:written]
         got = "they are" if is_there else "they are not"
         bench.check(is_there, "the first two packets are in the flash", got)
         bench.wait(_OFF_S)
         bench.forget()
         bench.power_on()
-        _check_after_cut(bench, world)
+        _check_after_cut(bench, upgrade)

@@ -26,7 +26,6 @@ from flasher.conformance.wire import (
     Received,
     describe,
     packet_count,
-    split,
 )
 
 _FLOOD_FRAMES: Final = 600
@@ -73,18 +72,20 @@ def endless(bench: Bench) -> None:
             bench.packet(image, number)
     with bench.step("in a pause of the transfer"):
         if bench.choice("tx_12") == "announces":
-            _drip_into_pause(bench)
+            limit_s = bench.limit("pause_s") + bench.limit("first_version_s")
+            heard = _drip_until(bench, Kind.BOOT_VERSION, limit_s, [])
+            bench.check(heard is not None, f"boot version within {limit_s:g} s", heard or "none")
         else:
             bench.finish(image, len(floods) + 1)
 
 
 def _floods(bench: Bench) -> dict[str, list[RawFrame]]:
-    words = bench.encoder
+    encoder = bench.encoder
     # As reads: an application has nothing to write.
-    long_message = words.message(READ, _UNKNOWN + 253, bytes(range(253)))
-    short_message = words.message(READ, _UNKNOWN)
-    heads = split(words.to_device, (_HEADS * 2) * _FLOOD_FRAMES)
-    endless_data = split(words.to_device, _HEADS + b"\x55\xaa" * (4 * _FLOOD_FRAMES - 2))
+    long_message = encoder.message(READ, _UNKNOWN + 253, bytes(range(253)))
+    short_message = encoder.message(READ, _UNKNOWN)
+    heads = encoder.frames((_HEADS * 2) * _FLOOD_FRAMES)
+    endless_data = encoder.frames(_HEADS + b"\x55\xaa" * (4 * _FLOOD_FRAMES - 2))
     return {
         "header after header": heads,
         "data without an end": endless_data,
@@ -103,18 +104,11 @@ def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
     if bench.encoder.has_version_query:
         limit_s = bench.limit("start_s")
         heard = _drip_until(bench, Kind.VERSION_INFORMATION, limit_s, bench.encoder.query_version())
-        bench.check(
-            heard is not None, f"an application that answers within {limit_s:g} s", heard or "none"
-        )
+        expected = f"an application that answers within {limit_s:g} s"
+        bench.check(heard is not None, expected, heard or "none")
         # Many were asked for: a late answer is none to what follows.
         bench.collect(bench.limit("silence_s"))
     bench.check_application()
-
-
-def _drip_into_pause(bench: Bench) -> None:
-    limit_s = bench.limit("pause_s") + bench.limit("first_version_s")
-    heard = _drip_until(bench, Kind.BOOT_VERSION, limit_s, [])
-    bench.check(heard is not None, f"boot version within {limit_s:g} s", heard or "none")
 
 
 def _drip_until(
@@ -122,8 +116,8 @@ def _drip_until(
 ) -> Received | None:
     """Useless messages and bytes, now and then, with `query` between, until `kind` is heard."""
     deadline = bench.now + within_s
-    words = bench.encoder
-    drops = cycle((words.message(READ, _UNKNOWN), split(words.to_device, _HEADS * 2)))
+    encoder = bench.encoder
+    drops = cycle((encoder.message(READ, _UNKNOWN), encoder.frames(_HEADS * 2)))
     heard: Received | None = None
     while heard is None and bench.now < deadline:
         # Quiet for long enough that the query is not taken for the rest of the bytes.
@@ -157,13 +151,12 @@ def noise(bench: Bench) -> None:
         bench.reset_to_bootloader()
         _make_noise(bench)
         bench.collect(bench.host.burst_s)
-        bench.check_application()
-        bench.check_stored(image)
+        bench.check_image(image)
     with bench.step("while it erases"):
         bench.reset_to_bootloader()
         bench.send(bench.encoder.update(len(image)))
         _make_noise(bench)
-        bench.wait_for(Kind.REQUEST, within_s=bench.limit("erase_s"))
+        bench.wait_for(Kind.REQUEST)
         done = _carry_on(bench, image, 0)
     for stored in (1, 3, packet_count(len(image))):
         with bench.step(f"after packet {stored}"):
@@ -174,28 +167,21 @@ def noise(bench: Bench) -> None:
             done = _carry_on(bench, image, stored)
     with bench.step("after complete"):
         _make_noise(bench)
-        bench.check_application(image)
-        bench.check_stored(image)
+        bench.check_image(image)
 
 
 def _carry_on(bench: Bench, image: bytes, stored: int) -> int:
     """The next step of a transfer, the end after the last packet. A device that was thrown off has
     to take a whole upgrade instead. Returns the packets stored, 0 without a transfer.
     """
-    limit = bench.limit
-    bench.collect(limit("ack_s") + limit("inter_frame_s"))
-    heard: Received | None
+    bench.collect(bench.limit("ack_s") + bench.limit("inter_frame_s"))
     if stored < packet_count(len(image)):
         bench.send_packet(image, stored + 1)
-        heard = bench.wait_for(
-            Kind.ACK, within_s=limit("ack_s"), unlike=lambda one: one.number != stored + 1
-        )
-        if heard is not None:
+        if bench.wait_for(Kind.ACK, unlike=lambda one: one.number != stored + 1) is not None:
             return stored + 1
     else:
         bench.send(bench.encoder.end())
-        heard = bench.wait_for(Kind.COMPLETE, within_s=limit("complete_s"))
-        if heard is not None:
+        if bench.wait_for(Kind.COMPLETE) is not None:
             return 0
     bench.info(f"the noise after packet {stored} ended the transfer")
     done = bench.upgrade(image, blind=bench.choice("up_08") == "starts_over")
@@ -206,13 +192,13 @@ def _carry_on(bench: Bench, image: bytes, stored: int) -> int:
 
 def _make_noise(bench: Bench) -> None:
     """Frames of any bytes, then messages of any content with a right CRC."""
-    chance, words = bench.random, bench.encoder
+    chance, encoder = bench.random, bench.encoder
     frames = []
     for _ in range(_WILD_FRAMES):
         data = chance.randbytes(chance.randrange(9))
         if not chance.randrange(4):
             data = (_HEADS[: chance.randrange(1, 5)] + data)[:8]
-        frames.append(RawFrame(words.to_device, data))
+        frames.append(RawFrame(encoder.to_device, data))
     bench.send(frames)
     bench.wait(bench.limit("inter_frame_s") + _DRIP_S if chance.randrange(2) else 0.0)
     bench.send([frame for _ in range(_WILD_MESSAGES) for frame in _wild_message(bench)])

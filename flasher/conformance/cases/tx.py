@@ -1,10 +1,10 @@
-"""TX: packets that are damaged or repeated, and very many of them. Those with a wrong head are in
-`tx_heads`, the ways out of a transfer in `tx_ways`.
+"""TX: the transfer. Packets that are damaged, repeated or have a wrong head, very many of them, and
+what becomes of a transfer in which nothing comes, or a reset.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Final
 
 from flasher.conformance.bench import Bench
@@ -14,12 +14,12 @@ from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
     PACKET_BYTES,
     Kind,
-    RawFrame,
     Received,
     describe,
+    inverted,
+    joined,
     packet_count,
     packet_payload,
-    split,
 )
 
 _PACKETS_MIN: Final = 7
@@ -34,6 +34,16 @@ _BUFFER_BYTES: Final = 4096
 _REPEATS: Final = 2
 _QUIET_S: Final = 0.1
 """A second answer to one packet would come within that time of the first one."""
+_NUMBER_MAX: Final = 0xFFFF
+_STORED: Final = 3
+"""Packets stored when packets with a wrong head come."""
+_START_BYTES: Final = (0x00, 0x02, 0x04, 0x10, 0x81, 0xFF)
+_BEGUN: Final = 3
+"""Packets of a transfer that is only begun."""
+_SHORT: Final = 0.5
+"""A pause that is no pause, as a part of limits.pause_s."""
+_LONG: Final = 1.5
+_JUST_NOT: Final = 0.9
 
 
 def transfer_image(bench: Bench) -> bytes:
@@ -46,7 +56,13 @@ def transfer_image(bench: Bench) -> bytes:
     return image
 
 
-def stops(bench: Bench, image: bytes, numbers: Iterable[int]) -> Iterator[int]:
+def answers(bench: Bench) -> list[Received]:
+    """What a packet is answered by: the first answer, and what follows it at once."""
+    first = bench.next_message(bench.limit("ack_s") + bench.limit("inter_frame_s"))
+    return [] if first is None else [first, *bench.collect(_QUIET_S)]
+
+
+def _stops(bench: Bench, image: bytes, numbers: Iterable[int]) -> Iterator[int]:
     """Transfer `image`, stopping before each of these packets: it is sent as it should be, and has
     to be accepted, when the case goes on. The whole ends with the application of the image.
     """
@@ -58,24 +74,12 @@ def stops(bench: Bench, image: bytes, numbers: Iterable[int]) -> Iterator[int]:
         with bench.step(f"packet {number} as it should be"):
             bench.send_packet(image, number)
             # Where a frame was lost a NAK may come as late as the next message (FR-05).
-            bench.expect(
-                Kind.ACK,
-                within_s=bench.limit("ack_s"),
-                number=number,
-                ignoring=(Kind.NAK,),
-            )
+            bench.expect(Kind.ACK, number=number, ignoring=(Kind.NAK,))
         done = number
     bench.finish(image, done + 1)
 
 
-def answers(bench: Bench) -> list[Received]:
-    """What a packet is answered by: the first answer, and what follows it at once."""
-    limit = bench.limit
-    first = bench.next_message(limit("ack_s") + limit("inter_frame_s"))
-    return [] if first is None else [first, *bench.collect(_QUIET_S)]
-
-
-def check_rejected(bench: Bench, wanted: int, named: int, *, is_plain: bool = True) -> None:
+def _check_rejected(bench: Bench, wanted: int, named: int, *, is_plain: bool = True) -> None:
     """A packet was rejected as tx_01 says: a NAK, or nothing. With `is_plain` false the device may
     have had reasons not to trust the number in it.
     """
@@ -83,38 +87,23 @@ def check_rejected(bench: Bench, wanted: int, named: int, *, is_plain: bool = Tr
     numbers = {wanted} if choice == "nak_expected" else {named}
     if not is_plain or choice == "either":
         numbers.add(wanted)
-    check_naks(bench, numbers, counts=nak_counts(choice))
+    _check_naks(bench, numbers, counts=_nak_counts(choice))
 
 
-def nak_counts(choice: str) -> tuple[int, ...]:
+def _nak_counts(choice: str) -> tuple[int, ...]:
     """How many NAKs a packet may get that has to be rejected, for a value of tx_01."""
     return {"silence": (0,), "either": (0, 1)}.get(choice, (1,))
 
 
-def check_repeated(bench: Bench, number: int, total: int) -> None:
-    """The packet stored last was answered once more, as tx_02 says."""
-    heard = answers(bench)
-    wanted = f"ACK {number}"
-    allowed = {wanted}
-    if bench.choice("tx_02") == "nak_next":
-        wanted = f"NAK {number + 1}"
-        # Behind the last packet there is no next one to ask for.
-        allowed = {wanted, f"ACK {number}", f"NAK {number}"} if number == total else {wanted}
-    bench.check(describe(heard) in allowed, f"{wanted} for the repeated packet", describe(heard))
-
-
-def check_naks(bench: Bench, numbers: Collection[int] | None, counts: Collection[int]) -> None:
+def _check_naks(bench: Bench, numbers: Collection[int] | None, counts: Collection[int]) -> None:
     """So many NAKs, with one of `numbers` (any for None), and nothing else."""
     heard = answers(bench)
-    right = [one for one in heard if _is_nak(one, numbers)]
+    naks = [one for one in heard if one.kind is Kind.NAK]
+    right = [one for one in naks if numbers is None or one.number in numbers]
     which = "" if numbers is None else " " + " or ".join(map(str, sorted(numbers)))
     expected = {0: "silence", 1: f"NAK{which}"}
     wanted = " or ".join(expected[count] for count in sorted(counts, reverse=True))
     bench.check(len(heard) == len(right) in counts, f"rejected: {wanted}", describe(heard))
-
-
-def _is_nak(heard: Received, numbers: Collection[int] | None) -> bool:
-    return heard.kind is Kind.NAK and (numbers is None or heard.number in numbers)
 
 
 # -- damage ---------------------------------------------------------------------------------------
@@ -133,35 +122,27 @@ def damaged(bench: Bench) -> None:
     image = transfer_image(bench)
     total = packet_count(len(image))
     lost = {3 + place: index for place, index in enumerate(_LOST_FRAMES)}
-    for number in stops(bench, image, (1, 2, *lost, total)):
+    for number in _stops(bench, image, (1, 2, *lost, total)):
         if number in lost:
             _lose_frame(bench, image, number, lost[number])
             continue
-        for step, named, frames in _damages(bench, image, number):
+        for step, named, raw in _damages(bench, image, number):
             with bench.step(f"packet {number}, {step}"):
-                bench.send(frames)
-                check_rejected(bench, number, named)
+                bench.send(bench.encoder.frames(raw))
+                _check_rejected(bench, number, named)
 
 
-def _damages(bench: Bench, image: bytes, number: int) -> Iterator[tuple[str, int, list[RawFrame]]]:
-    """Step, number in the packet, frames."""
-    total = packet_count(len(image))
+def _damages(bench: Bench, image: bytes, number: int) -> Iterator[tuple[str, int, bytes]]:
+    """Step, number in the packet, its bytes."""
     for named in (number, number + 1):
-        if named > total:
-            continue
-        raw = bytearray(_raw_packet(bench, image, named))
-        raw[_CRC_AT] = bytes(byte ^ 0xFF for byte in raw[_CRC_AT])
-        step = "wrong CRC" if named == number else "the next one came, with a wrong CRC"
-        yield step, named, split(bench.encoder.to_device, bytes(raw))
-    raw = bytearray(_raw_packet(bench, image, number))
+        if named <= packet_count(len(image)):
+            raw = bytearray(joined(bench.encoder.packet_of(image, named)))
+            raw[_CRC_AT] = inverted(raw[_CRC_AT])
+            step = "wrong CRC" if named == number else "the next one came, with a wrong CRC"
+            yield step, named, bytes(raw)
+    raw = bytearray(joined(bench.encoder.packet_of(image, number)))
     raw[_DATA_AT] ^= 0x10
-    yield "a wrong bit", number, split(bench.encoder.to_device, bytes(raw))
-
-
-def _raw_packet(bench: Bench, image: bytes, number: int) -> bytes:
-    payload = packet_payload(image, number)
-    frames = bench.encoder.packet(number, packet_count(len(image)), payload)
-    return b"".join(frame.data for frame in frames)
+    yield "a wrong bit", number, bytes(raw)
 
 
 def _lose_frame(bench: Bench, image: bytes, number: int, index: int) -> None:
@@ -170,9 +151,9 @@ def _lose_frame(bench: Bench, image: bytes, number: int, index: int) -> None:
     counts = {"either": (0, 1), "nak": (1,), "silence": (0,)}[choice] if index else (0, 1)
     trusts_it = bench.choice("tx_01") in ("nak_received", "either")
     with bench.step(f"packet {number} without its frame {index + 1}"):
-        frames = split(bench.encoder.to_device, _raw_packet(bench, image, number))
+        frames = bench.encoder.packet_of(image, number)
         bench.send(frames[:index] + frames[index + 1 :])
-        check_naks(bench, None if trusts_it and index <= _NUMBER_IN else {number}, counts)
+        _check_naks(bench, None if trusts_it and index <= _NUMBER_IN else {number}, counts)
 
 
 # -- repetitions ----------------------------------------------------------------------------------
@@ -188,7 +169,7 @@ def _lose_frame(bench: Bench, image: bytes, number: int, index: int) -> None:
     choices=("tx_02",),
 )
 def repeated(bench: Bench) -> None:
-    _repeat(bench, mask=0x00)
+    _repeat(bench, lambda payload: payload)
 
 
 @case(
@@ -201,11 +182,11 @@ def repeated(bench: Bench) -> None:
     choices=("tx_02",),
 )
 def other_data(bench: Bench) -> None:
-    _repeat(bench, mask=0xFF)
+    _repeat(bench, inverted)
 
 
-def _repeat(bench: Bench, mask: int) -> None:
-    """A transfer with repetitions whose data differ from the first copy's by `mask`."""
+def _repeat(bench: Bench, changed: Callable[[bytes], bytes]) -> None:
+    """A transfer with repetitions whose data are those of the first copy, `changed`."""
     image = transfer_image(bench)
     total = packet_count(len(image))
     bench.start_transfer(len(image))
@@ -213,12 +194,123 @@ def _repeat(bench: Bench, mask: int) -> None:
     for number in (1, 2, total):
         bench.packets(image, done + 1, number)
         done = number
-        payload = bytes(byte ^ mask for byte in packet_payload(image, number))
+        payload = changed(packet_payload(image, number))
         for copy in range(1, _REPEATS + 1):
             with bench.step(f"packet {number}, repetition {copy}"):
                 bench.send(bench.encoder.packet(number, total, payload))
-                check_repeated(bench, number, total)
+                _check_repeated(bench, number, total)
     bench.finish(image, total + 1)
+
+
+def _check_repeated(bench: Bench, number: int, total: int) -> None:
+    """The packet stored last was answered once more, as tx_02 says."""
+    heard = describe(answers(bench))
+    wanted = f"ACK {number}"
+    allowed = {wanted}
+    if bench.choice("tx_02") == "nak_next":
+        wanted = f"NAK {number + 1}"
+        # Behind the last packet there is no next one to ask for.
+        allowed = {wanted, f"ACK {number}", f"NAK {number}"} if number == total else {wanted}
+    bench.check(heard in allowed, f"{wanted} for the repeated packet", heard)
+
+
+# -- wrong heads ----------------------------------------------------------------------------------
+
+
+@case(
+    "TX-03",
+    "packet numbers out of order",
+    clause="4.2, 4; R10",
+    stimulus="before packet 1, after packet 3 and after the last one: a number skipped, the last "
+    "one, 0, beyond the total, 65535; older ones, with right and with other data",
+    expectation="rejected (tx_01), the older ones as the profile says (tx_03); nothing of it is "
+    "stored",
+    requires={DESTRUCTIVE},
+    choices=("tx_01", "tx_03"),
+)
+def out_of_order(bench: Bench) -> None:
+    image = transfer_image(bench)
+    total = packet_count(len(image))
+    bench.start_transfer(len(image))
+    _send_wrong_numbers(bench, total, 0)
+    bench.packets(image, 1, _STORED)
+    _send_wrong_numbers(bench, total, _STORED)
+    for number in range(1, _STORED):
+        payload = packet_payload(image, number)
+        for what, data in (("the right", payload), ("other", inverted(payload))):
+            with bench.step(f"after packet {_STORED}, packet {number} with {what} data"):
+                bench.send(bench.encoder.packet(number, total, data))
+                _check_older(bench, number)
+    bench.packets(image, _STORED + 1)
+    _send_wrong_numbers(bench, total, total)
+    bench.finish(image, total + 1)
+
+
+def _send_wrong_numbers(bench: Bench, total: int, stored: int) -> None:
+    numbers = {stored + 2: True, total: True, 0: False, total + 1: True, _NUMBER_MAX: True}
+    for number, is_plain in numbers.items():
+        # The one stored last is a repetition (TX-02), and 65536 cannot be said.
+        if 0 < number == stored or number > _NUMBER_MAX:
+            continue
+        with bench.step(f"after packet {stored}, number {number}"):
+            bench.send(bench.encoder.packet(number, total, bytes(PACKET_BYTES)))
+            if stored < total:
+                _check_rejected(bench, stored + 1, number, is_plain=is_plain)
+            else:
+                # All is there: which number is wanted is nobody's business.
+                _check_naks(bench, None, _nak_counts(bench.choice("tx_01")))
+
+
+def _check_older(bench: Bench, number: int) -> None:
+    choice = bench.choice("tx_03")
+    if choice == "ack":
+        heard = describe(answers(bench))
+        bench.check(heard == f"ACK {number}", f"ACK {number}", heard)
+    else:
+        _check_naks(bench, {number, _STORED + 1}, (1,) if choice == "nak" else (0,))
+
+
+@case(
+    "TX-04",
+    "total that does not fit the size",
+    clause="4.1, A385",
+    stimulus="packet 1, 4 and the last one with a total that is 1 less, 1 more, 0, 65535 or "
+    "high byte first",
+    expectation="rejected (tx_01); accepted with the right total",
+    requires={DESTRUCTIVE},
+    choices=("tx_01",),
+)
+def wrong_total(bench: Bench) -> None:
+    image = transfer_image(bench)
+    total = packet_count(len(image))
+    swapped = int.from_bytes(total.to_bytes(2, "little"), "big")
+    wrong = dict.fromkeys((total - 1, total + 1, 0, _NUMBER_MAX, swapped))
+    wrong.pop(total, None)
+    for number in _stops(bench, image, (1, _STORED + 1, total)):
+        for named in wrong:
+            with bench.step(f"packet {number} of {named}"):
+                bench.send(bench.encoder.packet(number, named, packet_payload(image, number)))
+                _check_rejected(bench, number, number)
+
+
+@case(
+    "TX-06",
+    "wrong start byte",
+    clause="4.1, A385",
+    stimulus="packet 1, 4 and the last one beginning with 00, 02, 04, 10, 81 and FF",
+    expectation="rejected (tx_01); accepted with 01",
+    requires={DESTRUCTIVE},
+    choices=("tx_01",),
+)
+def wrong_start_byte(bench: Bench) -> None:
+    image = transfer_image(bench)
+    total = packet_count(len(image))
+    for number in _stops(bench, image, (1, _STORED + 1, total)):
+        payload = packet_payload(image, number)
+        for start in _START_BYTES:
+            with bench.step(f"packet {number} with {start:02X}"):
+                bench.send(bench.encoder.packet(number, total, payload, start=start))
+                _check_rejected(bench, number, number)
 
 
 # -- the ends of the range ------------------------------------------------------------------------
@@ -240,16 +332,15 @@ def many_packets(bench: Bench) -> None:
     image = bench.random.randbytes(size)
     total = packet_count(size)
     bench.start_transfer(size)
-    limit_s = bench.limit("ack_s")
     for number in range(1, total + 1):
         sent = bench.send_packet(image, number)
-        heard = bench.next_message(limit_s)
+        heard = bench.next_message(bench.limit("ack_s"))
         # One check for them all: 65535 are too many to read.
         if heard is None or (heard.kind, heard.number) != (Kind.ACK, number):
-            bench.require(False, f"ACK {number}", heard or "nothing")  # noqa: FBT003
+            bench.fail(f"ACK {number}", heard or "nothing")
             return
         bench.measure("packet to ACK", heard.at - sent.left_at)
-    bench.check(True, f"ACK 1 to {total}", "all of them")  # noqa: FBT003
+    bench.succeed(f"ACK 1 to {total}", "all of them")
     # Never ended, as nobody could start it; what may still be in a buffer is not looked at.
     buffer_bytes = max(_BUFFER_BYTES, bench.number("buffer_bytes"))
     if size > buffer_bytes:
@@ -274,13 +365,124 @@ def other_filler(bench: Bench) -> None:
         raise Unsupported("every good image is a whole number of packets: there is no filler")
     total = packet_count(len(image))
     rest = image[(total - 1) * PACKET_BYTES :]
-    payload = rest.ljust(PACKET_BYTES, b"\x00")
     bench.start_transfer(len(image))
     bench.packets(image, 1, total - 1)
-    bench.send(bench.encoder.packet(total, total, payload))
+    bench.send(bench.encoder.packet(total, total, rest.ljust(PACKET_BYTES, b"\x00")))
     if bench.choice("tx_08") == "ignored":
-        bench.expect(Kind.ACK, within_s=bench.limit("ack_s"), number=total)
+        bench.expect(Kind.ACK, number=total)
         bench.finish(image, total + 1)
     else:
-        check_rejected(bench, total, total)
+        _check_rejected(bench, total, total)
         bench.finish(image, total)
+
+
+# -- pauses and resets ----------------------------------------------------------------------------
+
+
+@case(
+    "TX-12",
+    "pause in a transfer",
+    clause="R12, R14",
+    stimulus="half of limits.pause_s before a packet; more than it before packet 1, amid the "
+    "packets and before the end",
+    expectation="announces again, or waits on (tx_12); reachable in both",
+    requires={DESTRUCTIVE, LONG},
+    choices=("tx_12",),
+)
+def pause(bench: Bench) -> None:
+    if bench.choice("tx_12") == "announces":
+        _announces(bench)
+    else:
+        _waits(bench)
+
+
+def _announces(bench: Bench) -> None:
+    image = bench.filler(_BEGUN)[:-1]
+    pause_s = bench.limit("pause_s")
+    bench.start_transfer(len(image))
+    with bench.step("a short pause"):
+        bench.wait(_SHORT * pause_s)
+        bench.packet(image, 1)
+    for stored in (1, _BEGUN, 0):
+        with bench.step(_place("a pause", stored)):
+            # The short pause left packet 1 stored, a long one ended all.
+            if stored != 1:
+                bench.update(len(image))
+            bench.packets(image, 2 if stored == 1 else 1, stored)
+            began_at = bench.now
+            within_s = pause_s + bench.limit("first_version_s")
+            heard = bench.expect(Kind.BOOT_VERSION, within_s=within_s)
+            bench.measure("pause to boot version", heard.at - began_at)
+    with bench.step("upgrade after the pauses"):
+        bench.update(len(bench.good_image))
+        bench.finish(bench.good_image)
+
+
+def _waits(bench: Bench) -> None:
+    image = transfer_image(bench)
+    total = packet_count(len(image))
+    pause_s = _LONG * bench.limit("pause_s")
+    bench.start_transfer(len(image))
+    done = 0
+    for stored in (0, 1, total):
+        bench.packets(image, done + 1, stored)
+        done = stored
+        with bench.step(_place("a pause", stored)):
+            bench.expect_silence(pause_s)
+    bench.finish(image, total + 1)
+    with bench.step("a new upgrade after a pause"):
+        starts_over = bench.choice("up_08") == "starts_over"
+        can_leave = bench.choice("tx_13") == "restarts" or bench.subject.has_power
+        if not (starts_over or can_leave):
+            bench.unsupported("a new upgrade", "only power ends a transfer of this product")
+            return
+        bench.start_transfer(len(image))
+        bench.expect_silence(pause_s)
+        if not starts_over:
+            bench.leave_transfer()
+        bench.update(len(image))
+        bench.finish(image)
+
+
+@case(
+    "TX-13",
+    "reset in a transfer",
+    clause="R18",
+    stimulus="reset before packet 1, amid the packets and before the end",
+    expectation="ignored, or restarts (tx_13); a new upgrade succeeds",
+    requires={DESTRUCTIVE},
+    choices=("tx_13",),
+)
+def reset(bench: Bench) -> None:
+    ignored = bench.choice("tx_13") == "ignored"
+    image = transfer_image(bench) if ignored else bench.filler(_BEGUN)[:-1]
+    total = packet_count(len(image))
+    within_s = bench.limit("first_version_s")
+    if bench.choice("tx_12") == "announces":
+        # Later than that, it is the pause that ends the transfer.
+        within_s = min(within_s, _JUST_NOT * bench.limit("pause_s"))
+    bench.start_transfer(len(image))
+    done = 0
+    for stored in (0, 1, total):
+        with bench.step(_place("reset", stored)):
+            if stored and not ignored:
+                bench.update(len(image))
+                done = 0
+            bench.packets(image, done + 1, stored)
+            done = stored
+            bench.send(bench.encoder.reset())
+            if ignored:
+                bench.expect_silence(why="silence, no restart")
+            else:
+                bench.expect(Kind.BOOT_VERSION, within_s=within_s, ignoring=(Kind.FEEDBACK,))
+    if ignored:
+        bench.finish(image, total + 1)
+    with bench.step("a new upgrade"):
+        if ignored:
+            bench.reset_to_bootloader()
+        bench.update(len(bench.good_image))
+        bench.finish(bench.good_image)
+
+
+def _place(what: str, stored: int) -> str:
+    return f"{what} after packet {stored}" if stored else f"{what} before packet 1"

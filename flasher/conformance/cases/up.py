@@ -14,7 +14,9 @@ from flasher.conformance.wire import (
     WRITE,
     Kind,
     RawFrame,
+    Received,
     describe,
+    inverted,
     packet_count,
 )
 
@@ -82,12 +84,7 @@ def without_reset(bench: Bench) -> None:
     for step, frames in stimuli.items():
         with bench.step(step):
             bench.send(frames)
-            heard = bench.collect(bench.limit("silence_s"))
-            feedbacks = [one for one in heard if one.kind is Kind.FEEDBACK]
-            allowed = {"either": (0, 1), "feedback": (1,), "silence": (0,)}[choice]
-            ok = len(feedbacks) == len(heard) and len(heard) in allowed
-            wanted = {"either": "general feedback or silence", "feedback": "general feedback"}
-            bench.check(ok, wanted.get(choice, choice), describe(heard))
+            _check_answer(bench, bench.collect(bench.limit("silence_s")), Kind.FEEDBACK, choice)
     bench.check_application()
     with bench.step("after a restart"):
         bench.reset_to_bootloader()
@@ -119,8 +116,7 @@ def window(bench: Bench) -> None:
     with bench.step("just before the window's end"):
         last_at = _enter_at(bench, count)
         frames = bench.encoder.update(len(image))
-        on_wire_s = _wire_s(bench, frames)
-        bench.send(frames, at=last_at + window_s - edge_s - on_wire_s)
+        bench.send(frames, at=last_at + window_s - edge_s - _wire_s(bench, frames))
         _expect_request(bench)
         bench.finish(image)
     with bench.step("just after the window's end"):
@@ -147,8 +143,7 @@ def repeated(bench: Bench) -> None:
         bench.send(update + update)
         _expect_request(bench)
         heard = bench.collect(quiet_s)
-        more = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
-        bench.check(not more, "one request transfer", describe(more))
+        bench.check_only(heard, Kind.BOOT_VERSION, why="one request transfer")
         bench.finish(image)
     with bench.step("before packet 1"):
         bench.start_transfer(len(image))
@@ -194,17 +189,15 @@ def in_transfer(bench: Bench) -> None:
     for step, size in (("same size", len(image)), ("one packet less", len(image) - PACKET_BYTES)):
         with bench.step(step):
             begun_size = size if starts_over else len(image)
-            begun = bytes(byte ^ 0xFF for byte in image[:begun_size]) if starts_over else image
+            begun = inverted(image[:begun_size]) if starts_over else image
             bench.start_transfer(begun_size)
             bench.packets(begun, 1, _FIRST_PACKETS)
             bench.send(bench.encoder.update(len(image) if starts_over else size))
             if starts_over:
-                bench.expect(Kind.REQUEST, within_s=bench.limit("erase_s"))
+                bench.expect(Kind.REQUEST)
                 bench.finish(image)
             else:
-                heard = bench.collect(bench.limit("silence_s"))
-                others = [one for one in heard if one.kind is not Kind.NAK]
-                bench.check(not others, "no request transfer", describe(others))
+                bench.expect_silence(ignoring=(Kind.NAK,), why="no request transfer")
                 bench.finish(image, _FIRST_PACKETS + 1)
 
 
@@ -231,7 +224,7 @@ def _offer_update(bench: Bench, choice: str) -> None:
 
 def _expect_request(bench: Bench) -> None:
     """Request transfer follows; boot versions that are still on their way do not count."""
-    bench.expect(Kind.REQUEST, within_s=bench.limit("erase_s"), ignoring=(Kind.BOOT_VERSION,))
+    bench.expect(Kind.REQUEST, ignoring=(Kind.BOOT_VERSION,))
 
 
 def _enter_at(bench: Bench, version: int) -> float:
@@ -249,31 +242,37 @@ def _wire_s(bench: Bench, frames: list[RawFrame]) -> float:
 
 
 def _wrong_updates(bench: Bench) -> Iterator[tuple[str, list[RawFrame]]]:
-    words, size = bench.encoder, len(bench.good_image)
-    payload = words.update_text + size.to_bytes(4, "little")
-    for other in words.others():
-        yield f"name {other.update_text.decode()}", words.update(size, other.update_text)
-    yield "name in small letters", words.update(size, words.update_text.lower())
-    yield "name of zeros", words.update(size, bytes(7))
-    yield "payload too short", words.message(WRITE, 0xA10A, payload[:-1])
-    yield "payload too long", words.message(WRITE, 0xA10C, payload + b"\0")
-    yield "as a read", words.message(READ, UPDATE, payload)
+    encoder, size = bench.encoder, len(bench.good_image)
+    payload = encoder.update_text + size.to_bytes(4, "little")
+    for other in encoder.others():
+        yield f"name {other.update_text.decode()}", encoder.update(size, other.update_text)
+    yield "name in small letters", encoder.update(size, encoder.update_text.lower())
+    yield "name of zeros", encoder.update(size, bytes(7))
+    yield "payload too short", encoder.message(WRITE, 0xA10A, payload[:-1])
+    yield "payload too long", encoder.message(WRITE, 0xA10C, payload + b"\0")
+    yield "as a read", encoder.message(READ, UPDATE, payload)
 
 
 def check_update_rejected(bench: Bench, step: str, frames: list[RawFrame]) -> None:
     """In the bootloader: no request transfer, an answer as up_02 says, and the old application
     starts as if nothing had been said.
     """
-    choice = bench.choice("up_02")
     with bench.step(step):
         bench.reset_to_bootloader()
         bench.send(frames)
         heard = bench.collect(bench.host.burst_s + bench.limit("silence_s"))
         answers = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
-        naks = [one for one in answers if one.kind is Kind.NAK]
-        allowed = {"either": (0, 1), "nak": (1,), "silence": (0,)}[choice]
-        ok = len(answers) == len(naks) and len(naks) in allowed
-        wanted = {"either": "NAK or silence", "nak": "NAK"}.get(choice, choice)
-        bench.check(ok, f"rejected by {wanted}", describe(answers))
-        bench.check_application()
-        bench.check_stored(bench.good_image)
+        _check_answer(bench, answers, Kind.NAK, bench.choice("up_02"), "rejected by ")
+        bench.check_image(bench.good_image)
+
+
+def _check_answer(
+    bench: Bench, answers: list[Received], kind: Kind, choice: str, prefix: str = ""
+) -> None:
+    """One message of `kind`, or none, as `choice` says ("silence", "either", or another word for
+    the message).
+    """
+    counts = {"silence": (0,), "either": (0, 1)}.get(choice, (1,))
+    wanted = {"silence": "silence", "either": f"{kind.value} or silence"}.get(choice, kind.value)
+    ok = len(answers) in counts and all(one.kind is kind for one in answers)
+    bench.check(ok, f"{prefix}{wanted}", describe(answers))
