@@ -117,16 +117,13 @@ class Place:
 
     @property
     def done(self) -> bool:
-        """It never is."""
         return False
 
     def receive(self, frame: Frame, now: float) -> None:
-        """A CAN frame arrived."""
         if self.device is not None:
             self.device.receive(frame, now)
 
     def tick(self, now: float) -> None:
-        """The time that `deadline` asked for has come."""
         if self._power_at is not None and now >= self._power_at:
             self._power_at = None
             if self.device is not None and not self.device.has_power:
@@ -135,26 +132,22 @@ class Place:
             self.device.tick(now)
 
     def deadline(self) -> float | None:
-        """When it next wants `tick`."""
         wanted = None if self.device is None else self.device.deadline()
         if self._power_at is None:
             return wanted
         return self._power_at if wanted is None else min(wanted, self._power_at)
 
     def next_frame(self, now: float) -> Frame | None:
-        """The next frame to send."""
         return None if self.device is None else self.device.next_frame(now)
 
     def frame_sent(self, now: float) -> None:
-        """It was accepted."""
         if self.device is not None:
             self.device.frame_sent(now)
 
     def cancel(self, now: float) -> None:
-        """Nothing to end."""
+        pass
 
     def take_events(self) -> Sequence[object]:
-        """What the device reports."""
         return () if self.device is None else self.device.take_events()
 
 
@@ -189,7 +182,10 @@ class VirtualSocket:
             return None
         self._next_at = None
         if self.serial:
-            self._leave(now)
+            self.serial = ""
+            for place in self.places.values():
+                place.take()
+            self._next_at = now + self._virtual.arrive_after_s
             return PresenceChanged(is_there=False, how="the virtual unit left", is_certain=True)
         if self._left == 0:
             return None
@@ -226,12 +222,6 @@ class VirtualSocket:
         """The verdict is known: somebody will take the unit out."""
         self._next_at = self.clock.now() + self._virtual.leave_after_s
 
-    def _leave(self, now: float) -> None:
-        self.serial = ""
-        for place in self.places.values():
-            place.take()
-        self._next_at = now + self._virtual.arrive_after_s
-
     # -- the power of the socket ------------------------------------------------------------------
 
     def begin_cycle(self) -> None:
@@ -247,11 +237,20 @@ def make_device(
     target: Target, dialect: Dialect, health: Health, release: Release, serial_number: str
 ) -> MockDevice:
     """A device as it comes to the end of the line, with an older application."""
+    usual = DeviceProfile()
+    hardware = usual.hardware_version
+    if health is Health.WRONG_HARDWARE:
+        hardware = OTHER_HARDWARE
+    elif not release.fits_hardware(hardware):
+        hardware = release.hardware_versions[0].replace("*", "20220512")[:15]
+    # Room for the image: a device with a smaller flash is made faster.
+    pages = -(-2 * release.size_bytes // usual.page_size_bytes) + 2
+    area_bytes = min(pages * usual.page_size_bytes, usual.application_area_bytes, IMAGE_MAX_SIZE)
     profile = DeviceProfile(
         dialect=dialect.name,  # type: ignore[arg-type]
         serial_number=serial_number,
-        hardware_version=_hardware(release, health),
-        application_area_bytes=_area_bytes(release.size_bytes),
+        hardware_version=hardware,
+        application_area_bytes=area_bytes,
     )
     if health is Health.SLOW:
         profile = replace(profile, program_time_s=SLOW_PROGRAM_S, erase_time_s=SLOW_ERASE_S)
@@ -259,19 +258,3 @@ def make_device(
         # Its product wants a checksum in the image, which this image does not have.
         profile = replace(profile, image_checksum="crc32")
     return MockDevice(target, bitrate_bps=dialect.bitrate_bps, profile=profile)
-
-
-def _hardware(release: Release, health: Health) -> str:
-    usual = DeviceProfile().hardware_version
-    if health is Health.WRONG_HARDWARE:
-        return OTHER_HARDWARE
-    if release.fits_hardware(usual):
-        return usual
-    return release.hardware_versions[0].replace("*", "20220512")[:15]
-
-
-def _area_bytes(size_bytes: int) -> int:
-    """Room for the image: a device with a smaller flash is made faster."""
-    page = DeviceProfile().page_size_bytes
-    pages = -(-2 * size_bytes // page) + 2
-    return min(pages * page, DeviceProfile().application_area_bytes, IMAGE_MAX_SIZE)

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from flasher.cli.station.records import certificate
 from flasher.protocol.spec import BMS
+from flasher.station.records.keys import Keeping
 from flasher.station.records.model import (
     Ending,
     Measurement,
@@ -26,7 +27,6 @@ from flasher.station.records.model import (
     StepState,
     Verified,
 )
-from flasher.station.records.signing import Keeping
 from flasher.station.records.store import Store
 from flasher.station.reports import make_report, plain
 from tests.station.factory import BMS_VERSION, HEAD, Bench, make_recipe, target_table

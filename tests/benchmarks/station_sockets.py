@@ -21,8 +21,8 @@ from flasher.station.config import MockUnits
 from flasher.station.events import RunEnded, RunStarted, StationEvent, StepEnded
 from flasher.station.messages import VirtualUnits, WorkerSetup
 from flasher.station.recipe_file import LoadedRecipe, load_recipe
+from flasher.station.records.keys import Keeping
 from flasher.station.records.model import RunState, StepName
-from flasher.station.records.signing import Keeping
 from flasher.station.records.store import Store
 from flasher.station.station import Station, StationOptions
 

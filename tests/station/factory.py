@@ -19,8 +19,8 @@ from flasher.image.image import Image
 from flasher.protocol.spec import BMS, WMC, Target
 from flasher.settings.manifest import release_of, to_toml
 from flasher.station.recipe_file import LoadedRecipe, load_checked
+from flasher.station.records.keys import Keeping
 from flasher.station.records.model import Claim, Ending, RunId, RunState, StepState, Verified
-from flasher.station.records.signing import Keeping
 from flasher.station.records.store import Store
 from tests.station.traces import run_messages, write_trace
 

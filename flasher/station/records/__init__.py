@@ -17,6 +17,7 @@ from flasher.station.records.errors import (
     StationBusyError,
     UnprovenError,
 )
+from flasher.station.records.keys import Keeping
 from flasher.station.records.model import (
     AttachmentFile,
     AuditEvent,
@@ -42,7 +43,6 @@ from flasher.station.records.model import (
     WriteId,
     WriteRecord,
 )
-from flasher.station.records.signing import Keeping
 from flasher.station.records.store import Store, SystemClock
 
 __all__ = [

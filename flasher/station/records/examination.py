@@ -16,7 +16,7 @@ from flasher.station.records.chain import NAMED, OWN, digests_of
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
 from flasher.station.records.files import FileStore
-from flasher.station.records.keys import Head, is_signed
+from flasher.station.records.keys import Head, Keeping, is_signed
 from flasher.station.records.model import (
     TRACE,
     AttachmentFile,
@@ -30,7 +30,6 @@ from flasher.station.records.model import (
 from flasher.station.records.proof import contradictions, hear
 from flasher.station.records.queries import details_of
 from flasher.station.records.rows import batches
-from flasher.station.records.signing import KeptPlace
 from flasher.station.records.triggers import differences, fingerprint_of
 from flasher.trace.reader import read_trace
 
@@ -40,10 +39,10 @@ _RUNS_NAMED: Final = 5
 class Examiner:
     """One examination of the records."""
 
-    def __init__(self, database: Database, files: FileStore, place: KeptPlace) -> None:
+    def __init__(self, database: Database, files: FileStore, keeping: Keeping) -> None:
         self._database = database
         self._files = files
-        self._place = place
+        self._keeping = keeping
         self._remarks: list[str] = []
         self._kept: list[KeptHeads] = []
         self._unkept: list[str] = []
@@ -105,7 +104,7 @@ class Examiner:
         records_id = connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
         found = fingerprint_of(connection)
         names = list(connection.execute(select(schema.station.c.name)).scalars())
-        kept_of = self._place.files(records_id, names)
+        kept_of = self._keeping.kept_heads(records_id, names)
         for name in dict.fromkeys([*names, *kept_of]):
             rows = connection.execute(
                 select(schema.audit)
@@ -188,11 +187,11 @@ class Examiner:
     ) -> Iterator[Problem]:
         """Hold a chain against the heads that are kept of it."""
         shown = printable(name)
-        place = printable(str(self._place.folder))
+        place = printable(str(self._keeping.heads_folder))
         if not kept:
             if hashes:
                 self._unkept.append(name)
-                if self._place.is_named:
+                if self._keeping.heads is not None:
                     yield Problem(f"heads of {shown}", f"none of these records is kept in {place}")
             return
         heads = [each for each in kept if isinstance(each, Head)]
@@ -217,7 +216,7 @@ class Examiner:
             )
         if held:
             numbers = [head.number for head in held]
-            path = self._place.folder
+            path = self._keeping.heads_folder
             self._kept.append(KeptHeads(name, path, min(numbers), max(numbers)))
 
     # -- runs -------------------------------------------------------------------------------------

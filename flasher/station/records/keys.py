@@ -39,18 +39,6 @@ _CONTEXT: Final = b"flasher station audit row "
 """What is signed says what it is, so that no signature can stand for something else."""
 
 
-def default_folder() -> Path:
-    """Where keys and heads are kept when the user names no place."""
-    return user_data_path("flasher", appauthor=False) / "station"
-
-
-def file_name(station: str, records_id: str, suffix: str) -> str:
-    """The name of a station's file for these records: unlike for unlike stations."""
-    plain = re.sub(r"[^A-Za-z0-9_-]", "_", station)[:40]
-    mark = hashlib.sha256(f"{records_id} {station}".encode()).hexdigest()[:12]
-    return f"{plain}-{mark}{suffix}"
-
-
 def fingerprint(public: str) -> str:
     """What a person compares: the first 16 digits of the hash of a public key, in groups."""
     digits = hashlib.sha256(bytes.fromhex(public)).hexdigest()[:16]
@@ -192,3 +180,51 @@ def _heads(lines: list[bytes]) -> Iterator[Head | int]:
             yield number
         else:
             yield head if isinstance(head.number, int) else number
+
+
+@dataclass(frozen=True)
+class Keeping:
+    """Where the signing key of a station is kept, and the heads of its chain; None: the place of
+    this user, and beside the key.
+    """
+
+    keys: Path | None = None
+    heads: Path | None = None
+
+    @property
+    def keys_folder(self) -> Path:
+        return self.keys or user_data_path("flasher", appauthor=False) / "station"
+
+    @property
+    def heads_folder(self) -> Path:
+        return self.heads or self.keys_folder
+
+    def key_file(self, station: str, records_id: str) -> Path:
+        """The file of a station's key for these records."""
+        return self.keys_folder / _file_name(station, records_id, ".key")
+
+    def heads_file(self, station: str, records_id: str) -> HeadsFile:
+        """The heads of one station's chain."""
+        return HeadsFile(self.heads_folder / _file_name(station, records_id, ".heads"))
+
+    def kept_heads(
+        self, records_id: str, stations: Iterable[str]
+    ) -> dict[str, tuple[Head | int, ...]]:
+        """The heads that are kept of these records, by station; also of stations that the records
+        do not name. Raises RecordError.
+        """
+        found = {name: self.heads_file(name, records_id).read() for name in stations}
+        if self.heads_folder.is_dir():
+            for path in sorted(self.heads_folder.glob("*.heads")):
+                heads = HeadsFile(path).read()
+                name = next((each.station for each in heads if isinstance(each, Head)), None)
+                if name is not None and path == self.heads_file(name, records_id).path:
+                    found[name] = heads
+        return {name: heads for name, heads in found.items() if heads}
+
+
+def _file_name(station: str, records_id: str, suffix: str) -> str:
+    """The name of a station's file for these records: unlike for unlike stations."""
+    plain = re.sub(r"[^A-Za-z0-9_-]", "_", station)[:40]
+    mark = hashlib.sha256(f"{records_id} {station}".encode()).hexdigest()[:12]
+    return f"{plain}-{mark}{suffix}"

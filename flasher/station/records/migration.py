@@ -22,9 +22,8 @@ from flasher.station.records import chain, schema
 from flasher.station.records.chain import CLAIM_PARTS, Trail, digests_of
 from flasher.station.records.database import Database, StationLock, copy_sqlite, locate
 from flasher.station.records.files import whole_file
-from flasher.station.records.keys import SigningKey, file_name
+from flasher.station.records.keys import Keeping, SigningKey
 from flasher.station.records.rows import batches
-from flasher.station.records.signing import Keeping, KeptPlace, key_folder
 from flasher.station.records.triggers import final_table, fingerprint_of, trigger_statements
 
 _OLD: Final = Table(
@@ -78,7 +77,7 @@ def migrate(
             lock.acquire()
         backup = _backup(location.file)
         records_id = uuid4().hex
-        path = key_folder(keeping) / file_name(station, records_id, ".key")
+        path = keeping.key_file(station, records_id)
         key = SigningKey.make(path)
         try:
             with database.writing() as connection:
@@ -87,7 +86,7 @@ def migrate(
         except BaseException:
             path.unlink(missing_ok=True)
             raise
-        KeptPlace.of(keeping).file(station, records_id).append(trail.heads)
+        keeping.heads_file(station, records_id).append(trail.heads)
     return Migrated(station, runs, backup, problems)
 
 

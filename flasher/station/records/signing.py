@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -25,59 +24,12 @@ from flasher.station.records.errors import (
 from flasher.station.records.keys import (
     Head,
     HeadsFile,
+    Keeping,
     SigningKey,
-    default_folder,
-    file_name,
     fingerprint,
 )
 from flasher.station.records.schema import SCHEMA_VERSION, schema_info
 from flasher.station.records.triggers import fingerprint_of
-
-
-@dataclass(frozen=True)
-class Keeping:
-    """Where the signing key of a station is kept, and the heads of its chain; None: the place of
-    this user, and beside the key.
-    """
-
-    keys: Path | None = None
-    heads: Path | None = None
-
-
-def key_folder(keeping: Keeping) -> Path:
-    """Where the key is kept."""
-    return keeping.keys or default_folder()
-
-
-@dataclass(frozen=True)
-class KeptPlace:
-    """The folder in which the heads of audit chains are kept."""
-
-    folder: Path
-    is_named: bool
-    """The user named it, so that the heads have to be there."""
-
-    @classmethod
-    def of(cls, keeping: Keeping) -> KeptPlace:
-        """The folder that was named, or the one of the keys."""
-        return cls(keeping.heads or key_folder(keeping), is_named=keeping.heads is not None)
-
-    def file(self, station: str, records_id: str) -> HeadsFile:
-        """The heads of one station's chain."""
-        return HeadsFile(self.folder / file_name(station, records_id, ".heads"))
-
-    def files(self, records_id: str, stations: Iterable[str]) -> dict[str, tuple[Head | int, ...]]:
-        """The heads that are kept of these records, by station; also of stations that the records
-        do not name. Raises RecordError.
-        """
-        found = {name: self.file(name, records_id).read() for name in stations}
-        if self.folder.is_dir():
-            for path in sorted(self.folder.glob("*.heads")):
-                heads = HeadsFile(path).read()
-                name = next((each.station for each in heads if isinstance(each, Head)), None)
-                if name is not None and path == self.file(name, records_id).path:
-                    found[name] = heads
-        return {name: heads for name, heads in found.items() if heads}
 
 
 class Signer:
@@ -93,11 +45,10 @@ class Signer:
         self._database = database
         self._station = station
         self._now = now
-        self._keys = key_folder(keeping)
-        self.place = KeptPlace.of(keeping)
+        self.keeping = keeping
         self._key: SigningKey | None = None
         self._unkept: list[Head] = []
-        self._keeping = Lock()
+        self._heads_lock = Lock()
 
     @cached_property
     def records_id(self) -> str:
@@ -108,7 +59,7 @@ class Signer:
     @property
     def key_file(self) -> Path:
         """Where the key of this station is kept."""
-        return self._keys / file_name(self._station, self.records_id, ".key")
+        return self.keeping.key_file(self._station, self.records_id)
 
     @property
     def public(self) -> str:
@@ -223,7 +174,7 @@ class Signer:
 
     def _keep_heads(self) -> None:
         """Also those of a commit before, which could not be kept then."""
-        with self._keeping:
+        with self._heads_lock:
             some = list(self._unkept)
             if some:
                 self.heads_file.append(some)
@@ -232,7 +183,7 @@ class Signer:
     @property
     def heads_file(self) -> HeadsFile:
         """Where the heads of this station's chain are kept."""
-        return self.place.file(self._station, self.records_id)
+        return self.keeping.heads_file(self._station, self.records_id)
 
     def _following(self) -> Path:
         return self.key_file.with_suffix(".new")

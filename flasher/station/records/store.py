@@ -42,6 +42,7 @@ from flasher.station.records.database import (
 from flasher.station.records.errors import NotFoundError, RuleBrokenError
 from flasher.station.records.examination import Examiner
 from flasher.station.records.files import FileStore
+from flasher.station.records.keys import Keeping
 from flasher.station.records.model import (
     OUTCOMES,
     AttachmentFile,
@@ -60,7 +61,7 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.queries import Records
 from flasher.station.records.rows import insert
-from flasher.station.records.signing import Keeping, Signer
+from flasher.station.records.signing import Signer
 
 _USUAL: Final = Keeping()
 _ONLY_FINITE = "a number that is no number cannot be recorded"
@@ -359,7 +360,7 @@ class Store:
 
         Raises RecordError when they cannot be read.
         """
-        return Examiner(self.database, self.files, self.signer.place).examine(runs)
+        return Examiner(self.database, self.files, self.signer.keeping).examine(runs)
 
     def release_clock(self, operator: str, reason: str) -> None:
         """Note that the clock is right, though records of a later time are there."""

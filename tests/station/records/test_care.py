@@ -11,9 +11,9 @@ from sqlalchemy import select
 
 from flasher.errors import UsageError
 from flasher.station.records.errors import RecordsDamagedError
+from flasher.station.records.keys import Keeping
 from flasher.station.records.model import AuditEvent, RunState, UnitState
 from flasher.station.records.schema import audit
-from flasher.station.records.signing import Keeping
 from flasher.station.records.store import Store
 from tests.station.factory import SERIAL, Bench
 

@@ -15,9 +15,8 @@ from typing import Any
 import pytest
 
 from flasher.station.records.chain import canonical, row_hash
-from flasher.station.records.keys import SigningKey
+from flasher.station.records.keys import Keeping, SigningKey
 from flasher.station.records.model import Problem, RunId, RunState
-from flasher.station.records.signing import Keeping
 from flasher.station.records.store import Store
 from tests.station.factory import BMS_VERSION, IMAGES, SERIAL, Bench
 from tests.station.traces import run_messages, write_trace

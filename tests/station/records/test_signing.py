@@ -21,10 +21,9 @@ from flasher.station.records.errors import (
     Refusal,
     SchemaVersionError,
 )
-from flasher.station.records.keys import HeadsFile, SigningKey
+from flasher.station.records.keys import HeadsFile, Keeping, SigningKey
 from flasher.station.records.migration import migrate
 from flasher.station.records.model import TORN_TRACE, TRACE, RunId, RunState
-from flasher.station.records.signing import Keeping
 from flasher.station.records.store import Store
 from tests.station.factory import SERIAL, Bench
 
