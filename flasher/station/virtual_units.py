@@ -38,6 +38,7 @@ SLOW_PROGRAM_S: Final = 0.01
 SLOW_ERASE_S: Final = 0.02
 _DIGITS: Final = re.compile(r"[0-9]+")
 _SERIALS_TRIED: Final = 2000
+_NUMBERS_TRIED: Final = 10_000
 
 
 class Health(StrEnum):
@@ -87,6 +88,22 @@ def _fits(rule: SerialNumber, serial: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def next_number(rule: SerialNumber, known: set[str]) -> int:
+    """The number behind that of the last virtual unit in `known` serial numbers."""
+    last, left = 0, set(known)
+    for number in range(1, _NUMBERS_TRIED):
+        try:
+            serial = next(serial_numbers(rule, number, 1))
+        except UsageError:
+            break
+        if serial in left:
+            left.remove(serial)
+            last = number
+        if not left:
+            break
+    return last + 1
 
 
 class Place:

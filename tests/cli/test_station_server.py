@@ -10,7 +10,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
-from flasher.cli.station import records as station_records
+from flasher.cli.station import place as station_place
 from flasher.errors import ExitCode
 from tests.cli.conftest import Flasher
 from tests.cli.station_threads import ThreadPort
@@ -140,7 +140,7 @@ def test_a_password_is_nowhere_in_what_is_said(
     place = f"127.0.0.1:{postgres.port}"
     if is_bug:
         wrong = RuntimeError(f"no {url.format(place=place)}")
-        monkeypatch.setattr(station_records, "records_of", lambda _: (_ for _ in ()).throw(wrong))
+        monkeypatch.setattr(station_place, "records_of", lambda _: (_ for _ in ()).throw(wrong))
     log = tmp_path / "log"
     words = ("--log-file", log, "-vv", "station", "report", "--files", tmp_path)
     for more in (("--database",), ("--json", "--database"), ("--database", "x")):

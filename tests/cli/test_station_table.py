@@ -17,10 +17,8 @@ from flasher.cli.documents import to_json
 from flasher.cli.output import Output
 from flasher.cli.station.board import Board
 from flasher.cli.station.documents import LINES
-from flasher.cli.station.keys import LineReader, Typing
-from flasher.cli.station.scans import ScanFile
-from flasher.cli.station.table import StationTable
-from flasher.cli.station.views import Table
+from flasher.cli.station.scans import LineReader, ScanFile, Typing
+from flasher.cli.station.views import Table, draw
 from flasher.errors import UsageError
 from flasher.station.events import (
     FiguresChanged,
@@ -75,7 +73,7 @@ def board_of(*more: StationEvent, sockets: int = 4) -> Board:
 def drawn(board: Board, *, width: int = 80, height: int = 24, typed: str = "") -> list[str]:
     console = Console(width=width, height=height, file=io.StringIO(), color_system=None)
     with console.capture() as capture:
-        console.print(StationTable(console).draw(board, typed))
+        console.print(draw(board, console, typed))
     return capture.get().splitlines()
 
 
@@ -122,7 +120,7 @@ def test_every_state_is_a_colour_and_a_word() -> None:
     for state in SocketState:
         board = board_of(SocketChanged("1", state, "W2"), sockets=1)
         with console.capture() as capture:
-            console.print(StationTable(console).draw(board))
+            console.print(draw(board, console))
         (row,) = [line for line in capture.get().splitlines() if "W2" in line]
         assert state.value in row
         plain[state] = row.partition(state.value)[0]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from flasher.cli.output import counted, duration
 from flasher.protocol.text import printable
 from flasher.station.events import (
     FiguresChanged,
@@ -169,3 +170,23 @@ class Board:
     def bad_units(self) -> tuple[RunEnded, ...]:
         """Units whose last run is no PASS."""
         return tuple(each for each in self.ended.values() if each.outcome is not RunState.PASS)
+
+
+def percent(share: float | None) -> str:
+    """A share of 1; never 100 % for a little less."""
+    if share is None:
+        return "-"
+    return f"{int(share * 1000) / 10:g} %"
+
+
+def figures_line(figures: Figures) -> str:
+    """The figures in one line."""
+    failed = figures.units - figures.passed
+    first = percent(figures.first_pass_share)
+    line = (
+        f"{counted(figures.units, 'unit')}: {figures.passed:,} passed, {failed:,} failed; "
+        f"yield {percent(figures.yield_share)}, first pass {first}"
+    )
+    if figures.duration_median_s is not None:
+        line += f"; median {duration(figures.duration_median_s)}"
+    return line

@@ -1,9 +1,11 @@
-"""`flasher station backup`, `verify`, `key`, `accept` and `migrate`: care for the records."""
+"""The care for records: `flasher station backup`, `verify`, `key`, `accept`, `migrate`, `roles`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing
+from datetime import UTC, datetime
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Final
 
@@ -15,42 +17,26 @@ from flasher.cli.station.documents import (
     KeptHeadsDocument,
     MigratedDocument,
     ProblemDocument,
+    RoleDocument,
     SigningKeyDocument,
+    StationRolesDocument,
     VerifiedRecordsDocument,
 )
-from flasher.cli.station.records import open_to_read, records_of
-from flasher.cli.station.setup import operator_of
+from flasher.cli.station.place import open_to_read, operator_of, records_of, the_station
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.text import printable
-from flasher.station.records import Examination, Problem, Store
+from flasher.station.records.database import locate, open_database
 from flasher.station.records.keys import fingerprint
-from flasher.station.records.migration import migrate
+from flasher.station.records.migration import migrate as migrate_records
+from flasher.station.records.model import Examination, Problem
+from flasher.station.records.roles import check_roles, grant_roles
+from flasher.station.records.store import Store
 
 ELSEWHERE: Final = "a head kept elsewhere"
 
 
-def run(options: SimpleNamespace, output: Output) -> int:
-    """Run the command; returns the exit code."""
-    if options.action == "migrate":
-        return _migrate(options, output)
-    if options.action in ("backup", "verify"):
-        with closing(open_to_read(options)) as store:
-            return (
-                _backup(options, output, store)
-                if options.action == "backup"
-                else _verify(output, store)
-            )
-    with closing(_open_as_station(options)) as store:
-        return (
-            _key(options, output, store)
-            if options.action == "key"
-            else _accept(options, output, store)
-        )
-
-
-def _open_as_station(options: SimpleNamespace) -> Store:
+def _open_as_station(options: SimpleNamespace, *, changes: bool) -> Store:
     """The records, as the one station that the options or the records name."""
-    changes = options.action == "accept" or options.rotate or options.lost
     place = records_of(options)
     name = place.station
     if name is None:
@@ -59,20 +45,10 @@ def _open_as_station(options: SimpleNamespace) -> Store:
     return place.open(name, create=False, read_only=not changes)
 
 
-def the_station(names: tuple[str, ...]) -> str:
-    """The only station of the records. Raises UsageError."""
-    if len(names) != 1:
-        found = ", ".join(map(printable, names)) or "none"
-        raise UsageError(
-            f"Which station is meant? The records know: {found}.",
-            remedy="Name its file with --sockets.",
-        )
-    return names[0]
-
-
-def _backup(options: SimpleNamespace, output: Output, store: Store) -> int:
-    check_writable(options.file, "FILE")
-    made = store.backup(options.file)
+def backup(options: SimpleNamespace, output: Output) -> int:
+    with closing(open_to_read(options)) as store:
+        check_writable(options.file, "FILE")
+        made = store.backup(options.file)
     output.result(f"{printable(str(made.path))}: {byte_count(made.size_bytes)}, checked")
     output.result(f"  sha256: {made.sha256}")
     output.result(f"  traces: {printable(made.path.name)}.files beside it")
@@ -85,8 +61,9 @@ def _backup(options: SimpleNamespace, output: Output, store: Store) -> int:
 # -- what was changed -----------------------------------------------------------------------------
 
 
-def _verify(output: Output, store: Store) -> int:
-    found = store.examine()
+def verify(options: SimpleNamespace, output: Output) -> int:
+    with closing(open_to_read(options)) as store:
+        found = store.examine()
     for line in _problem_lines(found.problems):
         output.result(printable(line))
     for line in found.remarks:
@@ -150,50 +127,51 @@ def _say_what_was_checked(found: Examination, output: Output) -> None:
 # -- the key and what a person answers for --------------------------------------------------------
 
 
-def _key(options: SimpleNamespace, output: Output, store: Store) -> int:
-    if options.lost:
-        if not options.reason:
-            raise UsageError("A lost key needs a reason.", remedy="Add --reason TEXT.")
-        store.replace_lost_key(operator_of(options), options.reason)
-    elif options.rotate:
-        store.rotate_key(operator_of(options))
-    signer = store.signer
-    shown = fingerprint(signer.public)
-    output.result(f"{printable(store.station)}: key {shown}")
-    output.result(f"  public: {signer.public}")
-    is_there = signer.key_file.exists()
-    where = printable(str(signer.key_file))
-    output.result(f"  file:   {where}" + ("" if is_there else " (NOT THERE)"))
-    output.result(f"  heads:  {printable(str(signer.heads_file.path))}")
+def key(options: SimpleNamespace, output: Output) -> int:
+    with closing(_open_as_station(options, changes=options.rotate or options.lost)) as store:
+        if options.lost:
+            if not options.reason:
+                raise UsageError("A lost key needs a reason.", remedy="Add --reason TEXT.")
+            store.replace_lost_key(operator_of(options), options.reason)
+        elif options.rotate:
+            store.rotate_key(operator_of(options))
+        signer = store.signer
+        public, file, heads = signer.public, signer.key_file, signer.heads_file.path
+    is_there = file.exists()
+    output.result(f"{printable(store.station)}: key {fingerprint(public)}")
+    output.result(f"  public: {public}")
+    output.result(f"  file:   {printable(str(file))}" + ("" if is_there else " (NOT THERE)"))
+    output.result(f"  heads:  {printable(str(heads))}")
     output.document(
         SigningKeyDocument(
             station=store.station,
-            fingerprint=shown,
-            public=signer.public,
-            file=str(signer.key_file),
+            fingerprint=fingerprint(public),
+            public=public,
+            file=str(file),
             is_there=is_there,
-            heads=str(signer.heads_file.path),
+            heads=str(heads),
         )
     )
     return ExitCode.OK
 
 
-def _accept(options: SimpleNamespace, output: Output, store: Store) -> int:
+def accept(options: SimpleNamespace, output: Output) -> int:
     operator = operator_of(options)
-    if options.what == "clock":
-        store.release_clock(operator, options.reason)
-        said = "the clock is released; the station may begin units from now on"
-    else:
-        lost = store.accept_restored(operator, options.reason)
-        said = f"the station goes on; {counted(lost, 'audit row')} of it given up as lost"
+    with closing(_open_as_station(options, changes=True)) as store:
+        if options.what == "clock":
+            store.release_clock(operator, options.reason)
+            said = "the clock is released; the station may begin units from now on"
+        else:
+            lost = store.accept_restored(operator, options.reason)
+            said = f"the station goes on; {counted(lost, 'audit row')} of it given up as lost"
     output.result(f"{printable(store.station)}: {said}")
     output.document(AcceptedDocument(station=store.station, what=options.what))
     return ExitCode.OK
 
 
-def _migrate(options: SimpleNamespace, output: Output) -> int:
+def migrate(options: SimpleNamespace, output: Output) -> int:
     place = records_of(options)
-    done = migrate(
+    done = migrate_records(
         place.url,
         folder=place.files,
         keeping=place.keeping,
@@ -210,3 +188,28 @@ def _migrate(options: SimpleNamespace, output: Output) -> int:
     )
     output.document(document, exit_code=code)
     return code
+
+
+# -- users of a server -----------------------------------------------------------------------------
+
+
+def roles(options: SimpleNamespace, output: Output) -> int:
+    """Records that are not there yet are made: a station that may not make tables needs them."""
+    place = records_of(options)
+    location = locate(place.url, Path())
+    check_roles(location, options.station_role, options.reader_role)
+    with closing(
+        open_database(location, datetime.now(UTC), lock_timeout_s=place.lock_timeout_s)
+    ) as database:
+        made = grant_roles(database, options.station_role, options.reader_role)
+    documents = [
+        RoleDocument(name=options.station_role, may="add", is_new=options.station_role in made),
+        RoleDocument(name=options.reader_role, may="read", is_new=options.reader_role in made),
+    ]
+    for role in documents:
+        new = ", new" if role["is_new"] else ""
+        output.result(f"{printable(role['name'])}: may {role['may']} records{new}")
+    for name in made:
+        output.progress(f"Give {printable(name)} a password: in psql, \\password {printable(name)}")
+    output.document(StationRolesDocument(records=location.shown, roles=documents))
+    return ExitCode.OK

@@ -20,7 +20,7 @@ from flasher.station.recipe import fill
 from flasher.station.recipe_file import LoadedRecipe, load_checked
 
 
-def run(options: SimpleNamespace, output: Output) -> int:
+def check(options: SimpleNamespace, output: Output) -> int:
     """Run the command; returns the exit code."""
     # The day is the plant's: it goes into what is written.
     day = datetime.now().astimezone().date()

@@ -64,16 +64,19 @@ def station() -> None:
     """
 
 
-def _carry_out(module: str, action: str, output: Output, options: dict[str, Any]) -> int:
-    """Run an action; returns the exit code. Raises UsageError without the extra."""
+def _carry_out(action: str, output: Output, options: dict[str, Any]) -> int:
+    """Run an action ("module.function"); returns the exit code. Raises UsageError without the
+    extra.
+    """
     missing = [name for name in _EXTRA if importlib.util.find_spec(name) is None]
     if missing:
         raise UsageError(
             f"The station needs packages that are not installed: {', '.join(missing)}.",
             remedy="In the checkout: pip install -c .ci/constraints.txt '.[station]'",
         )
-    run = importlib.import_module(f"flasher.cli.station.{module}").run
-    code: int = run(SimpleNamespace(action=action, **options), output)
+    module, _, name = action.partition(".")
+    run = getattr(importlib.import_module(f"flasher.cli.station.{module}"), name)
+    code: int = run(SimpleNamespace(**options), output)
     return code
 
 
@@ -150,7 +153,7 @@ _WRITTEN: Final = "what is written"
 @_path_option("--sockets", brief=True, help="the station's file, and its adapters, too")
 def check(output: Output, **options: Any) -> int:
     """Check everything about a recipe, before a shift."""
-    return _carry_out("check", "check", output, options)
+    return _carry_out("check.check", output, options)
 
 
 @station.action("run", epilog=_RUN_NOTES)
@@ -209,7 +212,7 @@ def check(output: Output, **options: Any) -> int:
 )
 def run(output: Output, **options: Any) -> int:
     """Flash unit after unit."""
-    return _carry_out("run", "run", output, options)
+    return _carry_out("run.run", output, options)
 
 
 @station.action("report")
@@ -234,7 +237,7 @@ def run(output: Output, **options: Any) -> int:
 @_records_options
 def report(output: Output, **options: Any) -> int:
     """Show units, yield, failures and times; write them to files; make certificates."""
-    return _carry_out("records", "report", output, options)
+    return _carry_out("records.report", output, options)
 
 
 @station.action("unit")
@@ -245,7 +248,7 @@ def report(output: Output, **options: Any) -> int:
 @_records_options
 def unit(output: Output, **options: Any) -> int:
     """Show the whole life of a unit, with its traces."""
-    return _carry_out("records", "unit", output, options)
+    return _carry_out("records.unit", output, options)
 
 
 @station.action("backup")
@@ -253,7 +256,7 @@ def unit(output: Output, **options: Any) -> int:
 @_records_options
 def backup(output: Output, **options: Any) -> int:
     """Copy the records while the station runs."""
-    return _carry_out("care", "backup", output, options)
+    return _carry_out("care.backup", output, options)
 
 
 @station.action("roles")
@@ -265,14 +268,14 @@ def roles(output: Output, **options: Any) -> int:
     stations, which adds records, and one which reads them. Neither can delete records, or change
     tables and triggers. Users and records that are not there yet are made.
     """
-    return _carry_out("roles", "roles", output, options)
+    return _carry_out("care.roles", output, options)
 
 
 @station.action("verify")
 @_records_options
 def verify(output: Output, **options: Any) -> int:
     """Tell whether the records were changed."""
-    return _carry_out("care", "verify", output, options)
+    return _carry_out("care.verify", output, options)
 
 
 @station.action("key")
@@ -285,7 +288,7 @@ def key(output: Output, **options: Any) -> int:
     """Show, or change, the key that signs the records."""
     if options["rotate"] and options["lost"]:
         raise UsageError("--rotate and --lost do not go together.", remedy="Leave one out.")
-    return _carry_out("care", "key", output, options)
+    return _carry_out("care.key", output, options)
 
 
 @station.action("accept")
@@ -300,11 +303,11 @@ def key(output: Output, **options: Any) -> int:
 @_records_options
 def accept(output: Output, **options: Any) -> int:
     """Let the station go on, and note who said so."""
-    return _carry_out("care", "accept", output, options)
+    return _carry_out("care.accept", output, options)
 
 
 @station.action("migrate")
 @_records_options
 def migrate(output: Output, **options: Any) -> int:
     """Bring records of an older flasher up to date; a backup is made first."""
-    return _carry_out("care", "migrate", output, options)
+    return _carry_out("care.migrate", output, options)

@@ -5,9 +5,9 @@ and may be asked while one runs.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,8 +16,9 @@ from urllib.parse import quote
 
 from flasher.cli.documents import plain_value
 from flasher.cli.files import check_writable, write_whole
-from flasher.cli.output import Output, counted
-from flasher.cli.station.commands import DEFAULT_RECORDS
+from flasher.cli.look.explain_text import story_lines
+from flasher.cli.output import Output, counted, duration
+from flasher.cli.station.board import figures_line
 from flasher.cli.station.documents import (
     StationReportDocument,
     UnitDocument,
@@ -25,117 +26,64 @@ from flasher.cli.station.documents import (
     figures_document,
     run_document,
 )
-from flasher.cli.station.text import figure_lines, unit_lines
+from flasher.cli.station.place import open_to_read
 from flasher.errors import ExitCode, FlasherError, UsageError
+from flasher.prose import prose
 from flasher.protocol.text import printable
-from flasher.station.config import load_config
-from flasher.station.records import (
+from flasher.station.records.errors import RecordError, UnprovenError
+from flasher.station.records.model import (
+    TORN_TRACE,
+    TRACE,
     AttachmentFile,
     Examination,
-    Keeping,
-    RecordError,
+    Figures,
+    RunDetails,
     RunFilter,
     RunId,
     RunState,
-    Store,
+    StepRecord,
     UnitLife,
-    UnprovenError,
+    WriteRecord,
 )
-from flasher.station.records.database import DEFAULT_LOCK_TIMEOUT_S
-from flasher.station.records.model import TORN_TRACE, TRACE
+from flasher.station.records.store import Store
 from flasher.station.reports import Report, make_report
 from flasher.trace.source import explain_path
 from flasher.trace.story import Story
 
-_READER: Final = "report"
-"""Who reads is no station: it claims no unit."""
-
-
-def run(options: SimpleNamespace, output: Output) -> int:
-    """Run the command; returns the exit code."""
-    action = {"report": _report, "unit": _unit}[options.action]
-    with closing(open_to_read(options)) as store:
-        return action(options, output, store)
-
-
-@dataclass(frozen=True)
-class RecordsPlace:
-    """Where the options say that the records are, and what belongs to them."""
-
-    url: str
-    """A file, or an SQLAlchemy URL."""
-    files: Path | None
-    lock_timeout_s: float
-    keeping: Keeping
-    station: str | None
-    """The station's name, where the options name its file."""
-
-    def open(self, station: str, *, create: bool = True, read_only: bool = False) -> Store:
-        """The records as a station opens them. Raises UsageError, RecordError."""
-        return Store.open(
-            self.url,
-            station=station,
-            folder=self.files,
-            lock_timeout_s=self.lock_timeout_s,
-            create=create,
-            read_only=read_only,
-            keeping=self.keeping,
-        )
-
-
-def records_of(options: SimpleNamespace) -> RecordsPlace:
-    """Where the options say that the records are. Raises UsageError."""
-    config = load_config(options.sockets) if options.sockets is not None else None
-    database, files, keys, heads = options.database, options.files, options.keys, options.heads
-    if config is None:
-        return RecordsPlace(
-            database or DEFAULT_RECORDS, files, DEFAULT_LOCK_TIMEOUT_S, Keeping(keys, heads), None
-        )
-    if database is None:
-        database, files = config.records, files or _path(config.files)
-    keeping = Keeping(keys or _path(config.keys), heads or _path(config.heads))
-    return RecordsPlace(database, files, config.lock_timeout_s, keeping, config.name)
-
-
-def _path(text: str) -> Path | None:
-    return Path(text) if text else None
-
-
-def open_to_read(options: SimpleNamespace) -> Store:
-    """The records as they are: nothing of them is changed. Raises UsageError, RecordError."""
-    return records_of(options).open(_READER, read_only=True)
+_NO_VERDICT: Final = (RunState.ERROR, RunState.ABORTED, RunState.INTERRUPTED)
 
 
 # -- many runs ------------------------------------------------------------------------------------
 
 
-def _report(options: SimpleNamespace, output: Output, store: Store) -> int:
-    wanted: dict[str, tuple[Path | None, Callable[[Report], str]]] = {
-        "--csv": (options.csv, Report.to_csv),
-        "--json-report": (options.json_report, _report_json),
-        "--junit": (options.junit, Report.to_junit),
-    }
-    for option, (path, _) in wanted.items():
-        if path is not None:
-            check_writable(path, option)
-    report = make_report(store.read, _filter(options))
-    for line in figure_lines(report.figures):
-        output.result(line)
-    for option, (path, make) in wanted.items():
-        if path is not None:
-            write_whole(path, make(report).encode("utf-8"), option)
-            output.progress(f"written: {printable(str(path))}")
-    code = ExitCode.OK
-    if options.certificates is not None and _certificates(
-        options.certificates, report, store, output
-    ):
-        code = ExitCode.VERIFICATION
-    document = StationReportDocument(
-        figures=figures_document(report.figures),
-        runs=[run_document(row) for row in report.runs],
-    )
-    output.document(document, exit_code=code)
-    return code
+def report(options: SimpleNamespace, output: Output) -> int:
+    with closing(open_to_read(options)) as store:
+        wanted: dict[str, tuple[Path | None, Callable[[Report], str]]] = {
+            "--csv": (options.csv, Report.to_csv),
+            "--json-report": (options.json_report, _report_json),
+            "--junit": (options.junit, Report.to_junit),
+        }
+        for option, (path, _) in wanted.items():
+            if path is not None:
+                check_writable(path, option)
+        made = make_report(store.read, _filter(options))
+        for line in figure_lines(made.figures):
+            output.result(line)
+        for option, (path, make) in wanted.items():
+            if path is not None:
+                write_whole(path, make(made).encode("utf-8"), option)
+                output.progress(f"written: {printable(str(path))}")
+        code = ExitCode.OK
+        if options.certificates is not None and _certificates(
+            options.certificates, made, store, output
+        ):
+            code = ExitCode.VERIFICATION
+        document = StationReportDocument(
+            figures=figures_document(made.figures),
+            runs=[run_document(row) for row in made.runs],
+        )
+        output.document(document, exit_code=code)
+        return code
 
 
 def _report_json(report: Report) -> str:
@@ -220,25 +168,28 @@ def certificate(store: Store, life: UnitLife, examined: Examination | None = Non
 # -- one unit -------------------------------------------------------------------------------------
 
 
-def _unit(options: SimpleNamespace, output: Output, store: Store) -> int:
-    if options.certificate is not None:
-        check_writable(options.certificate, "--certificate")
-    life = store.read.unit(options.serial, options.part)
-    told: dict[RunId, list[str | Story]] = {}
-    traces = []
-    for details in life.runs:
-        for file in details.attachments:
-            if file.kind in (TRACE, TORN_TRACE):
-                found = explained(store, file)
-                told.setdefault(details.run.run_id, []).append(found)
-                traces.append(_trace_document(details.run.run_id, file, found, full=options.story))
-    for line in unit_lines(life, told, full=options.story):
-        output.result(line)
-    if options.certificate is not None:
-        write_whole(options.certificate, certificate(store, life), "--certificate")
-        output.progress(f"page: {printable(str(options.certificate))}")
-    output.document(UnitDocument(unit=plain_value(life), traces=traces))
-    return ExitCode.OK
+def unit(options: SimpleNamespace, output: Output) -> int:
+    with closing(open_to_read(options)) as store:
+        if options.certificate is not None:
+            check_writable(options.certificate, "--certificate")
+        life = store.read.unit(options.serial, options.part)
+        told: dict[RunId, list[str | Story]] = {}
+        traces = []
+        for details in life.runs:
+            for file in details.attachments:
+                if file.kind in (TRACE, TORN_TRACE):
+                    found = explained(store, file)
+                    told.setdefault(details.run.run_id, []).append(found)
+                    traces.append(
+                        _trace_document(details.run.run_id, file, found, full=options.story)
+                    )
+        for line in unit_lines(life, told, full=options.story):
+            output.result(line)
+        if options.certificate is not None:
+            write_whole(options.certificate, certificate(store, life), "--certificate")
+            output.progress(f"page: {printable(str(options.certificate))}")
+        output.document(UnitDocument(unit=plain_value(life), traces=traces))
+        return ExitCode.OK
 
 
 def explained(store: Store, file: AttachmentFile) -> Story | str:
@@ -268,3 +219,96 @@ def _trace_document(
         text=found.verdict.text,
         story=plain_value(found) if full else None,
     )
+
+
+# -- in words -------------------------------------------------------------------------------------
+
+
+def figure_lines(figures: Figures) -> Iterator[str]:
+    """The figures of a report."""
+    yield figures_line(figures)
+    open_runs = {state: figures.by_state.get(state.value, 0) for state in _NO_VERDICT}
+    words = [f"{count:,} {state.value}" for state, count in open_runs.items() if count]
+    yield f"  runs:     {figures.runs:,}" + (f", of them {', '.join(words)}" if words else "")
+    if figures.virtual_runs:
+        yield f"  VIRTUAL:  {counted(figures.virtual_runs, 'run')} of virtual units, no products"
+    if figures.duration_longest_s is not None:
+        yield f"  longest:  {duration(figures.duration_longest_s)} of those that passed"
+    for code, count in figures.failures.items():
+        yield f"  {count:7,}  {printable(code)}"
+
+
+def unit_lines(
+    life: UnitLife, told: Mapping[RunId, Sequence[Story | str]], *, full: bool
+) -> Iterator[str]:
+    """A unit's whole life; `told` are the stories of each run's traces, or why there is none."""
+    nature = ", a VIRTUAL unit, no product" if life.is_virtual else ""
+    yield printable(f"{life.serial}, part {life.part}: {life.state.value}{nature}")
+    for details in life.runs:
+        yield ""
+        yield from _run_lines(details)
+        for story in told.get(details.run.run_id, ()):
+            yield from _story_lines(story, full=full)
+
+
+def _run_lines(details: RunDetails) -> Iterator[str]:
+    run = details.run
+    took = "" if run.duration_s is None else f" after {duration(run.duration_s)}"
+    code = "" if run.state is RunState.PASS else f" {run.code}"
+    begun = f"{run.begun_at:%Y-%m-%d %H:%M:%S} UTC"
+    kind = f"virtual {run.kind.value}" if run.is_virtual else run.kind.value
+    yield f"run {run.run_id}, {begun}, {kind}: {run.state.value}{code}{took}"
+    if run.text:
+        yield f"  {printable(run.text)}"
+    if run.reason:
+        yield f"  reason:   {printable(run.reason)}"
+    where = f"{run.station}, socket {run.socket}, operator {run.operator}"
+    yield printable(f"  where:    {where}" + (f", lot {run.lot}" if run.lot else ""))
+    yield printable(f"  recipe:   {run.recipe}, revision {run.recipe_revision}")
+    for target in details.targets:
+        reached = "not verified" if target.reached is None else target.reached.words
+        version = target.version or "no version named"
+        yield printable(f"  {target.target.upper() + ':':<9} {target.image}, {version}: {reached}")
+    for write in details.writes:
+        yield _write_line(write)
+    for step in details.steps:
+        yield from _step_lines(step)
+
+
+def _write_line(write: WriteRecord) -> str:
+    if write.verified_at is None:
+        end = "not confirmed"
+    elif write.read_back is None:
+        end = "confirmed, not read back"
+    elif write.read_back == write.value:
+        end = "read back"
+    else:
+        end = f"read back: {write.read_back}"
+    return printable(f"  written:  {write.target.upper()} {write.what}: {write.value} ({end})")
+
+
+def _step_lines(step: StepRecord) -> Iterator[str]:
+    tries = f", try {step.try_number}" if step.try_number > 1 else ""
+    said = f"  {step.code}: {step.text}" if step.code else ""
+    name = f"{step.name}{tries}"
+    yield printable(
+        f"  step:     {name:<14} {step.state.value:<7} {duration(step.duration_s)}{said}"
+    )
+    for each in step.measurements:
+        value = each.text if each.value is None else f"{each.value:g} {each.unit}".rstrip()
+        outside = "" if each.is_within else ": outside of its limits"
+        yield printable(f"              {each.name}: {value}{outside}")
+
+
+def _story_lines(story: Story | str, *, full: bool) -> Iterator[str]:
+    if isinstance(story, str):
+        yield f"  trace:    {printable(story)}"
+        return
+    if full:
+        yield from (f"  | {line}".rstrip() for line in story_lines(story))
+        return
+    frames = f"{counted(story.frames, 'frame')} in {duration(story.duration_s)}"
+    yield f"  trace:    {frames}: {prose(story.verdict.cause)}"
+    yield f"            {story.verdict.text}"
+    if story.verdict.likely:
+        yield f"            likely cause: {story.verdict.likely}"

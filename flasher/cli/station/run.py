@@ -6,14 +6,16 @@ from __future__ import annotations
 
 import os
 import sys
+import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from datetime import datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Final
 
 from flasher.cli.output import Output
+from flasher.cli.station.board import figures_line
 from flasher.cli.station.documents import (
     EndedUnitDocument,
     FiguresDocument,
@@ -21,30 +23,29 @@ from flasher.cli.station.documents import (
     StationRunDocument,
     figures_document,
 )
-from flasher.cli.station.keys import LineReader, Typing, keyboard
-from flasher.cli.station.scans import ScanFile, read_scans
-from flasher.cli.station.setup import (
-    Place,
-    find_place,
-    make_setups,
-    opened_records,
-    operator_of,
-)
-from flasher.cli.station.text import figures_line
+from flasher.cli.station.place import operator_of, records_of
+from flasher.cli.station.scans import LineReader, ScanFile, Typing, keyboard, read_scans
 from flasher.cli.station.views import JsonLines, Lines, Table, View
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import BusError, ExitCode, FlasherError, InterruptedByUserError, UsageError
 from flasher.protocol.text import printable
 from flasher.station import codes
+from flasher.station.adapters import Resolved, detect, resolve, worker_setups
+from flasher.station.config import MockUnits, StationConfig, load_config, mock_config
 from flasher.station.recipe_file import load_checked
-from flasher.station.records import RecordError, Store
+from flasher.station.records.errors import RecordError
+from flasher.station.records.keys import Keeping
+from flasher.station.records.store import Store
 from flasher.station.station import Station, StationOptions
 from flasher.station.supervisor import Launch, ProcessPort
+from flasher.station.virtual_units import next_number
 
 LAUNCH: Launch = ProcessPort
 """How a socket's process is made."""
 END_LIMIT_S: Final = 10.0
 """How long stopped runs have to say their end; what does not is INTERRUPTED at the next start."""
+_LEAVE_S: Final = 2.0
+"""A verdict on a virtual unit can be read so long."""
 
 
 def run(options: SimpleNamespace, output: Output) -> int:
@@ -54,13 +55,31 @@ def run(options: SimpleNamespace, output: Output) -> int:
         output.json_wanted = True
     scans = None if options.scans is None else read_scans(options.scans)
     recipe = load_checked(options.recipe, datetime.now().astimezone().date())
-    place = find_place(options)
-    with opened_records(options, place.config) as store:
-        session = _Session(options, output, place, store, _choose_view(options, output))
+    config, sockets = _find_sockets(options)
+    is_virtual = all(socket.bus is None for socket in sockets)
+    view: View = Table(output)
+    if output.json_wanted:
+        view = JsonLines(output)
+    elif options.lines or os.environ.get("TERM") == "dumb":
+        view = Lines(output)
+    with _opened_records(options, config) as store:
+        session = _Session(options, output, store, view, is_virtual=is_virtual)
+        first = 1
+        if is_virtual:  # numbers that these records do not know yet
+            rows, part = store.read.table(), recipe.recipe.part
+            known = {str(row["serial"]) for row in rows if row["part"] == part}
+            first = next_number(recipe.recipe.serial_number, known)
         session.station = Station(
             store,
             recipe,
-            make_setups(options, place, recipe, store),
+            worker_setups(
+                sockets,
+                recipe,
+                first_number=first,
+                units=options.units,
+                speed=options.mock_speed,
+                leave_after_s=_LEAVE_S,
+            ),
             operator=operator_of(options),
             lot=options.lot,
             on_event=session.view,
@@ -79,12 +98,53 @@ def run(options: SimpleNamespace, output: Output) -> int:
         return session.report()
 
 
-def _choose_view(options: SimpleNamespace, output: Output) -> View:
-    if output.json_wanted:
-        return JsonLines(output)
-    if options.lines or os.environ.get("TERM") == "dumb":
-        return Lines(output)
-    return Table(output)
+def _find_sockets(options: SimpleNamespace) -> tuple[StationConfig, tuple[Resolved, ...]]:
+    """The station that the options name, and its sockets with their adapters. Raises UsageError,
+    BusError for a missing adapter.
+    """
+    if (options.sockets is None) == (options.mock_sockets is None):
+        raise UsageError(
+            "A station needs either its sockets or virtual ones.",
+            remedy="Give --sockets FILE, or --mock-sockets N.",
+        )
+    if options.sockets is not None:
+        config = load_config(options.sockets)
+    else:
+        shares = {"bad": options.mock_bad, "slow": options.mock_slow, "dead": options.mock_dead}
+        if sum(shares.values()) > 1:
+            raise UsageError(
+                "--mock-bad, --mock-slow and --mock-dead are more than all units together.",
+                remedy="Their sum is 1 at the most.",
+            )
+        config = mock_config(options.mock_sockets, MockUnits(**shares, seed=options.mock_seed))
+    sockets = resolve(config.socket, detect(config.socket))
+    given = [name for name in ("units", "scan_by_hand") if getattr(options, name)]
+    if given and any(socket.bus is not None for socket in sockets):
+        raise UsageError(
+            f"--{given[0].replace('_', '-')} is for virtual units; this station has adapters.",
+            remedy="Leave it out.",
+        )
+    if options.units and options.scans is not None:
+        raise UsageError(
+            "--units and --scans both say when the station ends.", remedy="Leave one of them out."
+        )
+    return config, sockets
+
+
+@contextmanager
+def _opened_records(options: SimpleNamespace, config: StationConfig) -> Iterator[Store]:
+    """The records; those of virtual units without --database are gone afterwards.
+
+    Raises UsageError, RecordError.
+    """
+    if options.mock_sockets is None or options.database is not None:
+        with records_of(options).open(config.name) as store:
+            yield store
+        return
+    with tempfile.TemporaryDirectory(prefix="flasher-station-") as folder:
+        file, keeping = Path(folder) / "records.sqlite", Keeping(Path(folder) / "keys")
+        with Store.open(str(file), station=config.name, keeping=keeping) as store:
+            yield store
 
 
 class _Session:
@@ -93,11 +153,17 @@ class _Session:
     station: Station
 
     def __init__(
-        self, options: SimpleNamespace, output: Output, place: Place, store: Store, view: View
+        self,
+        options: SimpleNamespace,
+        output: Output,
+        store: Store,
+        view: View,
+        *,
+        is_virtual: bool,
     ) -> None:
         self.view = view
         self.file: ScanFile | None = None
-        self.scans_itself = place.is_virtual and options.scans is None and not options.scan_by_hand
+        self.scans_itself = is_virtual and options.scans is None and not options.scan_by_hand
         self._options = options
         self._output = output
         self._store = store

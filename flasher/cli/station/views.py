@@ -1,28 +1,65 @@
-"""How `flasher station run` shows what happens: a live table, a line a happening, JSON lines."""
+"""How `flasher station run` shows what happens: a live table, a line for each event, JSON lines.
+
+What comes from outside enters the table as `Text`, which is never read as markup. A state is a
+colour and a word. The columns do not depend on what stands in them, so nothing moves.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import textwrap
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import datetime
 from types import TracebackType
 from typing import Final, Self
 
-from rich.console import Console
+from rich.console import Console, Group, RenderableType
 from rich.live import Live
+from rich.table import Table as Grid
+from rich.text import Text
 
 from flasher.cli.documents import to_json
 from flasher.cli.output import Output
-from flasher.cli.station.board import Board
-from flasher.cli.station.table import StationTable
+from flasher.cli.station.board import Board, Row, figures_line
 from flasher.protocol.text import printable
 from flasher.station import events
-from flasher.station.events import SocketState, StationEvent
+from flasher.station.events import LineStopped, SocketState, StationEvent
 
+WIDE: Final = 140
+"""From this width on, what to do stands in the row; else below it."""
 REFRESH_S: Final = 0.1
 """Time between two refreshes of the table at the least."""
-_AT_ONCE: Final = frozenset({SocketState.SAVING})
+_STYLES: Final = {
+    SocketState.STARTING: "dim",
+    SocketState.EMPTY: "dim",
+    SocketState.SILENT: "dim",
+    SocketState.SCAN: "bold black on yellow",
+    SocketState.RUNNING: "bold cyan",
+    SocketState.SAVING: "bold blue",
+    SocketState.PASS: "bold white on green",
+    SocketState.FAIL: "bold white on red",
+    SocketState.RECHECK: "bold white on magenta",
+    SocketState.ERROR: "bold white on red",
+    SocketState.STOPPED: "bold white on red",
+}
+_LOUD: Final = frozenset(
+    {SocketState.FAIL, SocketState.RECHECK, SocketState.ERROR, SocketState.SCAN}
+)
+"""States in which somebody has to do something."""
+_STATE_WIDTH: Final = max(map(len, SocketState)) + 2
+_Column = tuple[int | None, int | None]
+_COLUMNS: Final[Sequence[_Column]] = ((None, 6), (None, _STATE_WIDTH), (6, None), (5, None))
+"""Share and width of the columns for socket, state, serial number and step."""
+_PROGRESS: Final[_Column] = (None, 13)
+_WHAT_TO_DO: Final[_Column] = (6, None)
+_HEAD_LINES: Final = 2
+"""Title and head."""
+_SAID_LINES: Final = 3
+"""For the answer to the last scan."""
+_HIGH: Final = 20
+"""Lower windows have one line for it."""
+_KEYS: Final = "Ctrl-C: no further unit; twice: stop now"
 
 
 class View:
@@ -78,11 +115,10 @@ class Table(View):
 
     def __init__(self, output: Output, now: Callable[[], float] = time.monotonic) -> None:
         super().__init__(output)
-        console = Console(markup=False, highlight=False, emoji=False)
         # No thread refreshes: the station's own turn does. On a screen of its own lines are
         # written over each other, without erasing them first: nothing flickers.
+        console = Console(markup=False, highlight=False, emoji=False)
         self._live = Live(console=console, screen=True, auto_refresh=False)
-        self._table = StationTable(console)
         self._now = now
         self._drawn_at = float("-inf")
 
@@ -103,14 +139,118 @@ class Table(View):
 
     def show(self, event: StationEvent) -> None:
         # The station is busy while it saves: what the row said last would stay for so long.
-        is_saving = isinstance(event, events.SocketChanged) and event.state in _AT_ONCE
+        is_saving = isinstance(event, events.SocketChanged) and event.state is SocketState.SAVING
         self.refresh(at_once=is_saving)
 
     def refresh(self, *, at_once: bool = False) -> None:
         if at_once or self._now() - self._drawn_at >= REFRESH_S:
             with contextlib.suppress(OSError):  # a terminal that is gone does not stop the line
-                self._live.update(self._table.draw(self.board, self.typed), refresh=True)
+                table = draw(self.board, self._live.console, self.typed)
+                self._live.update(table, refresh=True)
             self._drawn_at = self._now()
+
+
+# -- the table ------------------------------------------------------------------------------------
+
+
+def draw(board: Board, console: Console, typed: str | None = "") -> RenderableType:
+    """The board as it fits the console: one row a socket, where there is room for it a line below
+    with what to do, and totals at the foot. `typed` is what stands on the scan line so far, None:
+    nothing is typed.
+    """
+    width, height = console.size
+    foot = _foot(board, typed, width, height)
+    room = max(height - _HEAD_LINES - len(foot), 1)
+    rows = list(board.rows.values())
+    is_wide = width >= WIDE
+    is_double = not is_wide and 2 * len(rows) <= room
+    shown = rows if len(rows) <= room else rows[: room - 1]
+    # In a low window what to do stands where the progress would be.
+    more = (_PROGRESS, _WHAT_TO_DO) if is_wide else (_PROGRESS if is_double else _WHAT_TO_DO,)
+    columns = (*_COLUMNS, *more)
+    head = ("socket", "state", "serial number", "step", "    %    left", "")
+    lines: list[RenderableType] = [
+        _cut(board.title, "bold"),
+        _grid(head, columns, "underline"),
+    ]
+    for row in shown:
+        cells = _cells(row)
+        if not is_wide and not is_double and row.state in _LOUD and row.note:
+            cells[-1] = row.note
+        lines.append(_grid([*cells, row.note], columns))
+        if is_double:
+            lines.append(_cut(f"       {row.note}"))
+    if len(shown) < len(rows):
+        text = f"{len(rows) - len(shown)} more sockets: make the window higher"
+        lines.append(_cut(text, "dim"))
+    return Group(*lines, *foot)
+
+
+def _grid(cells: Iterable[str | Text], columns: Sequence[_Column], style: str = "") -> Grid:
+    """One line of the table."""
+    grid = Grid.grid(expand=True, padding=(0, 1, 0, 0))
+    for ratio, width in columns:
+        grid.add_column(ratio=ratio, width=width, no_wrap=True, overflow="ellipsis")
+    texts = [Text(cell) if isinstance(cell, str) else cell for cell in cells]
+    grid.add_row(*texts[: len(columns)], style=style)
+    return grid
+
+
+def _cells(row: Row) -> list[str | Text]:
+    is_done = row.is_virtual and row.state is SocketState.PASS
+    doing = row.code or row.step or ("virtual unit" if is_done else "")
+    percent = "" if row.share is None else f"{int(row.share * 100)} %"
+    left = ""
+    if row.left_s is not None:
+        whole = round(max(row.left_s, 0.0))
+        left = f"{whole} s" if whole < 100 else f"{whole // 60}:{whole % 60:02d}"
+    return [
+        row.socket,
+        Text(f" {row.state.value:<{_STATE_WIDTH - 1}}", style=_STYLES[row.state]),
+        Text(row.serial or row.borne, style="" if row.serial else "italic"),
+        Text(doing, style="bold" if row.code else ""),
+        f"{percent:>5} {left:>7}",
+    ]
+
+
+def _foot(board: Board, typed: str | None, width: int, height: int) -> list[Text]:
+    lines = [Text(), _cut("no unit yet"), Text()]
+    if board.figures is not None:
+        failures = board.figures.failures.items()
+        lines[1] = _cut(figures_line(board.figures), "bold")
+        lines[2] = _cut("  ".join(f"{printable(code)} {count:,}" for code, count in failures))
+    if board.stopped is not None:
+        room = max(2, height // 4)
+        lines += [
+            _cut(f" {text:<{width - 2}} ", "bold white on red")
+            for text in _stopped_lines(board.stopped, width - 2, room)
+        ]
+    said_lines = _SAID_LINES if height >= _HIGH else 1
+    said = textwrap.wrap(board.said, width)[:said_lines]
+    said += [""] * (said_lines - len(said))
+    lines += [_cut(line, "bold red" if board.is_refusal else "") for line in said]
+    if typed is not None:
+        lines.append(_cut(f"scan> {printable(typed)}_"))
+    return [*lines, _cut(_KEYS, "dim")]
+
+
+def _stopped_lines(stop: LineStopped, width: int, room: int) -> list[str]:
+    """Why the line stands and what to do; where there is no room for all, what to do is kept."""
+    remedy = printable(f"{stop.remedy} Then scan RESUME.")
+    reason = printable(f"LINE STOPPED  {stop.code}: {stop.reason}")
+    lines = textwrap.wrap(f"{reason} {remedy}", width)
+    if len(lines) <= room:
+        return lines
+    ends = textwrap.wrap(remedy, width)
+    begins = textwrap.wrap(reason, width, max_lines=max(room - len(ends), 1), placeholder=" ...")
+    return [*begins, *ends]
+
+
+def _cut(line: str, style: str = "") -> Text:
+    return Text(line, style=style, no_wrap=True, overflow="ellipsis")
+
+
+# -- lines ----------------------------------------------------------------------------------------
 
 
 def _words(event: StationEvent) -> Iterator[str]:

@@ -1,0 +1,87 @@
+"""Where the records are that the options name, and who works with them."""
+
+from __future__ import annotations
+
+import getpass
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Final
+
+from flasher.cli.station.commands import DEFAULT_RECORDS
+from flasher.errors import UsageError
+from flasher.protocol.text import printable
+from flasher.station.config import load_config
+from flasher.station.records.database import DEFAULT_LOCK_TIMEOUT_S
+from flasher.station.records.keys import Keeping
+from flasher.station.records.store import Store
+
+_READER: Final = "report"
+"""Who reads is no station: it claims no unit."""
+
+
+@dataclass(frozen=True)
+class RecordsPlace:
+    """Where the options say that the records are, and what belongs to them."""
+
+    url: str
+    """A file, or an SQLAlchemy URL."""
+    files: Path | None
+    lock_timeout_s: float
+    keeping: Keeping
+    station: str | None
+    """The station's name, where the options name its file."""
+
+    def open(self, station: str, *, create: bool = True, read_only: bool = False) -> Store:
+        """The records as a station opens them. Raises UsageError, RecordError."""
+        return Store.open(
+            self.url,
+            station=station,
+            folder=self.files,
+            lock_timeout_s=self.lock_timeout_s,
+            create=create,
+            read_only=read_only,
+            keeping=self.keeping,
+        )
+
+
+def records_of(options: SimpleNamespace) -> RecordsPlace:
+    """Where the options say that the records are. Raises UsageError."""
+    config = load_config(options.sockets) if options.sockets is not None else None
+    database, files, keys, heads = options.database, options.files, options.keys, options.heads
+    if config is None:
+        return RecordsPlace(
+            database or DEFAULT_RECORDS, files, DEFAULT_LOCK_TIMEOUT_S, Keeping(keys, heads), None
+        )
+    if database is None:
+        database, files = config.records, files or _path(config.files)
+    keeping = Keeping(keys or _path(config.keys), heads or _path(config.heads))
+    return RecordsPlace(database, files, config.lock_timeout_s, keeping, config.name)
+
+
+def _path(text: str) -> Path | None:
+    return Path(text) if text else None
+
+
+def open_to_read(options: SimpleNamespace) -> Store:
+    """The records as they are: nothing of them is changed. Raises UsageError, RecordError."""
+    return records_of(options).open(_READER, read_only=True)
+
+
+def the_station(names: tuple[str, ...]) -> str:
+    """The only station of the records. Raises UsageError."""
+    if len(names) != 1:
+        found = ", ".join(map(printable, names)) or "none"
+        raise UsageError(
+            f"Which station is meant? The records know: {found}.",
+            remedy="Name its file with --sockets.",
+        )
+    return names[0]
+
+
+def operator_of(options: SimpleNamespace) -> str:
+    """Who works here."""
+    try:
+        return str(options.operator or getpass.getuser())
+    except (OSError, KeyError):
+        return "operator"
