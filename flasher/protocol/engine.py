@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from math import inf
 from typing import NamedTuple, Protocol
 
 from flasher.protocol.bittime import frame_bits, message_bits
@@ -70,10 +71,11 @@ class Transmitter:
         self._frame_gap_s = frame_gap_s
         self._queue: deque[_Outgoing] = deque()
         self._sent_frames = 0
-        self._not_before = 0.0
-        self._quiet_until = float("-inf")
+        self._quiet_until = -inf
         self._message_began_at = 0.0
-        self.left_at = float("-inf")
+        self.due_at = inf
+        """When `next_frame` has something to give; infinite while nothing waits."""
+        self.left_at = -inf
         """When the last frame of the last message has left: accepted by the adapter plus its time
         on the wire (R12)."""
         self.left_tag: object = None
@@ -106,21 +108,24 @@ class Transmitter:
             wire_s = message_bits(frames) / self._bitrate_bps
         not_before = max(not_before, self._quiet_until)
         if not self._queue:
-            self._not_before = not_before
+            self.due_at = not_before
         self._queue.append(_Outgoing(frames, wire_s, not_before, tag))
 
     def drop_unstarted(self) -> None:
         """Forget the messages of which no frame was accepted yet."""
-        started = self._queue[0] if self._sent_frames else None
-        self._queue.clear()
-        if started is not None:
+        if self._sent_frames:
+            started = self._queue[0]
+            self._queue.clear()
             self._queue.append(started)
+        else:
+            self._queue.clear()
+            self.due_at = inf
 
     def hurry(self) -> None:
         """Send the rest of a message that is half sent without gaps: nothing comes after it."""
         self._frame_gap_s = 0.0
         if self._sent_frames:
-            self._not_before = 0.0
+            self.due_at = 0.0
 
     def abandon(self, quiet_until: float) -> None:
         """Forget everything, a message that is half sent included; what is queued from now on waits
@@ -129,34 +134,34 @@ class Transmitter:
         self._queue.clear()
         self._sent_frames = 0
         self._quiet_until = quiet_until
+        self.due_at = inf
 
     def deadline(self) -> float | None:
         """When `next_frame` has something to give; None when nothing waits."""
-        return self._not_before if self._queue else None
+        return None if self.due_at == inf else self.due_at
 
     def next_frame(self, now: float) -> Frame | None:
         """The next frame to send, or None while a gap lasts or nothing waits."""
-        if not self._queue or now < self._not_before:
+        if now < self.due_at:
             return None
         return self._queue[0].frames[self._sent_frames]
 
     def frame_sent(self, now: float) -> bool:
         """The adapter has accepted the frame; True when it was the last one of its message."""
-        message = self._queue[0]
+        frames = self._queue[0].frames
         if not self._sent_frames:
             self._message_began_at = max(now, self.left_at)
         self._sent_frames += 1
-        if self._sent_frames < len(message.frames):
+        if self._sent_frames < len(frames):
             if self._frame_gap_s:
-                self._not_before = now + self._frame_gap_s
+                self.due_at = now + self._frame_gap_s
             return False
-        self._queue.popleft()
+        message = self._queue.popleft()
         self._sent_frames = 0
         # An adapter may take a message at once and send it at the bus's pace, or take each frame
         # when it sends it: the later of the two tells when the last frame is gone.
-        last_frame_s = frame_bits(message.frames[-1]) / self._bitrate_bps
+        last_frame_s = frame_bits(frames[-1]) / self._bitrate_bps
         self.left_tag = message.tag
         self.left_at = max(self._message_began_at + message.wire_s, now + last_frame_s)
-        if self._queue:
-            self._not_before = self._queue[0].not_before
+        self.due_at = self._queue[0].not_before if self._queue else inf
         return True

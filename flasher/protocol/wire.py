@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
+from math import inf
 from typing import Final, NamedTuple
 
 from flasher.protocol.crc import crc32
@@ -110,7 +111,8 @@ class Reassembler:
         self._buffer = bytearray()
         self._junk = bytearray()
         self._needed = len(HEADER)
-        self._last_at = 0.0
+        self.due_at = inf
+        """When `tick` has to be called next; infinite while nothing is held."""
 
     @property
     def held_size(self) -> int:
@@ -119,21 +121,26 @@ class Reassembler:
 
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
         """Take the payload of one frame; returns what it completed, usually nothing."""
+        if not payload:
+            return _NOTHING
         self._buffer += payload
-        self._last_at = now
+        self.due_at = now + self._timeout_s
         if len(self._buffer) < self._needed:
             return _NOTHING
-        return self._scan()
+        found = self._scan()
+        if not self._buffer and not self._junk:
+            self.due_at = inf
+        return found
 
     def deadline(self) -> float | None:
         """When `tick` has to be called next; None while nothing is held."""
-        return self._last_at + self._timeout_s if self._buffer or self._junk else None
+        return None if self.due_at == inf else self.due_at
 
     def tick(self, now: float) -> Sequence[Message | Damage]:
         """Drop what has waited too long; returns what was found in it."""
-        deadline = self.deadline()
-        if deadline is None or now < deadline:
+        if now < self.due_at:
             return _NOTHING
+        self.due_at = inf
         found: list[Message | Damage] = []
         while self._buffer:
             if len(self._buffer) > len(HEADER):
@@ -151,6 +158,7 @@ class Reassembler:
         self._buffer.clear()
         self._junk.clear()
         self._needed = len(HEADER)
+        self.due_at = inf
 
     def _scan(self) -> list[Message | Damage]:
         found: list[Message | Damage] = []
