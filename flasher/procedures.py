@@ -7,7 +7,7 @@ for), and returns its result. `flasher.api` runs procedures: `Device` blocks mea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
@@ -28,25 +28,33 @@ from flasher.host.identity import Identity
 from flasher.host.items import Readable, find, readable
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import AGAIN
-from flasher.host.query import Query, Request
-from flasher.host.read import READ_MEMORY, MemoryRead
+from flasher.host.query import (
+    READ_MEMORY,
+    Queries,
+    Query,
+    Request,
+    check_range,
+    memory_requests,
+    piece_of,
+)
+from flasher.host.runner import Runner
 from flasher.host.session import Result, Session
 from flasher.host.survey import Survey
 from flasher.host.verify import (
     NOT_ASKED,
     Level,
-    MemoryCheck,
     Verdict,
     Verification,
-    VersionCheck,
     check_level,
     default_level,
+    memory_check,
+    version_check,
 )
 from flasher.host.write import WritePlan, Written, plan_write
 from flasher.image.image import Image
 from flasher.image.plan import Plan, make_plan
 from flasher.protocol.catalogue import BY_KEY, Item
-from flasher.protocol.contents import Reset
+from flasher.protocol.contents import Memory, Reset
 from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
@@ -158,9 +166,8 @@ class Procedures:
     def ask(self, request: Request) -> Procedure[Content]:
         """Ask one question. Raises NoAnswerError."""
         yield from self.listen_first()
-        query = self._query(request)
-        yield Run(query)
-        if query.cancelled and query.answer is None:
+        query = yield from self._asked(request)
+        if query.cancelled:
             raise _interrupted()
         if query.answer is None:
             raise _no_answer(query)
@@ -196,17 +203,17 @@ class Procedures:
         if READ_MEMORY.receiver is not self.target.node:
             node = self.target.node.name
             raise UsageError(f"The documents give no way to read memory of the {node}.")
-        reading = MemoryRead(
-            start, end, bitrate_bps=self.profile.dialect.bitrate_bps, timings=self.profile.timings
-        )
+        check_range(start, end)
         yield from self.listen_first()
+        reading = self._queries(memory_requests(start, end))
         yield Run(reading)
-        if reading.complete:
-            return reading.data
-        if reading.cancelled:
+        data = b"".join(piece_of(each) for each in reading.answers if isinstance(each, Memory))
+        if len(data) == end - start:
+            return data
+        if reading.is_cancelled:
             raise _interrupted()
         error = _no_answer(reading.queries[-1])
-        error.where = f"memory at 0x{start + len(reading.data):08X}"
+        error.where = f"memory at 0x{start + len(data):08X}"
         error.cause = "the address is outside of what the device shows, or it went away"
         raise error
 
@@ -240,15 +247,15 @@ class Procedures:
         for step in self.listen_first():
             assert isinstance(step, Run)  # noqa: S101  it listens
             yield replace(step, may_cancel=False)
-        query = self._query(Request(plan.writable.item, plan.content))
-        yield Run(query, may_cancel=False)
+        request = Request(plan.writable.item, plan.content)
+        query = yield from self._asked(request, may_cancel=False)
         written = Written(plan, before, query.answer is not None, None)
         if plan.writable.read_back is None:
             return written
         for _ in range(2):
             # An answer on a broadcast id may be one to somebody who asked before the write.
-            again = self._query(Request(plan.writable.read_back.item))
-            yield Run(again, may_cancel=False)
+            request = Request(plan.writable.read_back.item)
+            again = yield from self._asked(request, may_cancel=False)
             written = replace(written, read_back=again.answer)
             if not written.differences:
                 break
@@ -302,9 +309,18 @@ class Procedures:
             raise _interrupted()
         return survey
 
-    def _query(self, request: Request) -> Query:
-        bitrate_bps = self.profile.dialect.bitrate_bps
-        return Query(request, bitrate_bps=bitrate_bps, timings=self.profile.timings)
+    def _asked(self, request: Request, *, may_cancel: bool = True) -> Procedure[Query]:
+        queries = self._queries([request])
+        yield Run(queries, may_cancel=may_cancel)
+        return queries.queries[0]
+
+    def _queries(self, requests: Iterable[Request]) -> Queries:
+        return Queries(
+            requests,
+            bitrate_bps=self.profile.dialect.bitrate_bps,
+            timings=self.profile.timings,
+            stop_at_silence=True,
+        )
 
     # -- firmware --------------------------------------------------------------------------------
 
@@ -333,14 +349,18 @@ class Procedures:
         if level is Level.NONE:
             return NOT_ASKED
         yield from self.listen_first()
-        version = VersionCheck(plan, options)
-        yield Run(version)
-        verification = _known(version)
+        verification = yield from self.checked(version_check(plan, options))
         if level is Level.MEMORY and verification.ok:
-            memory = MemoryCheck(plan, options, verification.running_version)
-            yield Run(memory)
-            verification = _known(memory)
+            check = memory_check(plan, options, verification.running_version)
+            verification = yield from self.checked(check)
         return verification
+
+    def checked(self, check: Runner[Verification]) -> Procedure[Verification]:
+        """What a check found. Raises InterruptedByUserError when it did not come to its end."""
+        yield Run(check)
+        if check.result.verdict is Verdict.INTERRUPTED:
+            raise _interrupted()
+        return check.result
 
     def upgrade(
         self,
@@ -461,14 +481,6 @@ class Procedures:
 def _may_end(session: Session) -> Callable[[], bool]:
     """Whether a terminal that hangs up may end a session: as long as the device has its program."""
     return lambda: not session.has_begun_to_erase
-
-
-def _known(check: VersionCheck | MemoryCheck) -> Verification:
-    """What a check found. Raises InterruptedByUserError when it did not come to its end."""
-    found = check.verification
-    if found is None or found.verdict is Verdict.INTERRUPTED:
-        raise _interrupted()
-    return found
 
 
 def _say_what_is_left(error: FlasherError, session: Session) -> None:

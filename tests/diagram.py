@@ -8,10 +8,10 @@ writes them anew, into docs/upgrade.md and docs/states.md; a test holds both aga
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator
 from enum import Enum
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from flasher.host import table as host
 from flasher.host.table import Ending
@@ -24,9 +24,8 @@ _MARKED: Final = re.compile(
     r"(<!-- state diagram -->\n).*?(<!-- end of state diagram -->)", re.DOTALL
 )
 
-_QUIET: Final = {"NOTHING", "REPORT", "IMPOSSIBLE"}
+_QUIET: Final = {"ignore", "report", "NOTHING", "REPORT", "IMPOSSIBLE"}
 _EVERYWHERE: Final = {"CANCEL", "OUT_OF_TIME", "POWER_CUT", "SECOND_TOOL", "UNEXPECTED"}
-_NOT_IN_THE_OVERVIEW: Final = {"LINK_BACK", "LINK_BACK_UPDATING"}
 _GOOD: Final = {Ending.COMPLETED, Ending.CONFIRMED_BY_VERSION}
 
 _INTRODUCTION: Final = """\
@@ -39,31 +38,48 @@ end the upgrade; a mere query of it is reported, and no event of the table), for
 cut.
 """
 
-_Table = Mapping[Any, Mapping[Any, Any]]
+_Arrow = tuple[Enum, Enum, str, Enum | None]
+"""From a state, by an event, with the words of an action, to a state; None is the end."""
 
 
-def diagram(table: _Table, first: Enum, *, overview: bool = False) -> str:
-    """A Mermaid state diagram. An overview leaves the bad endings and the actions out."""
-    lines = ["```mermaid", "stateDiagram-v2"]
-    lines += [f'    state "{state.value}" as {state.name.lower()}' for state in table]
-    lines.append(f"    [*] --> {first.name.lower()}")
-    for state, row in table.items():
+def host_arrows(*, overview: bool = False) -> Iterator[_Arrow]:
+    """The arrows of the host's table; an overview has neither bad endings nor a lost adapter."""
+    for state, row in host.TABLE.items():
         for event, move in row.items():
-            is_bad = isinstance(move.action, Ending) and move.action not in _GOOD
-            if event.name in _EVERYWHERE or move.action.name in _QUIET:
+            if event.name in _EVERYWHERE or move.action in _QUIET:
                 continue
-            if overview and (is_bad or event.name in _NOT_IN_THE_OVERVIEW):
+            if overview and event is host.Event.LINK_BACK:
                 continue
-            label = event.value if overview else f"{event.value} / {_action(move.action)}"
-            arrow = f"{state.name.lower()} --> {move.state.name.lower()}"
-            lines.append(f"    {arrow} : {label.replace(':', ',')}")
-    if isinstance(first, host.State):
+            words = move.action.replace("_", " ")
+            for target in move.leads_to or (state,):
+                if isinstance(target, host.State):
+                    yield state, event, words, target
+                elif not overview or target in _GOOD:
+                    yield state, event, f"ends, {target.value}", None
+
+
+def device_arrows() -> Iterator[_Arrow]:
+    """The arrows of the device model's table."""
+    for state, row in device.TABLE.items():
+        for event, move in row.items():
+            if event.name not in _EVERYWHERE and move.action.name not in _QUIET:
+                yield state, event, move.action.value, move.state
+
+
+def diagram(arrows: Iterable[_Arrow], states: type[Enum], *, overview: bool = False) -> str:
+    """A Mermaid state diagram. An overview leaves the actions out."""
+    lines = ["```mermaid", "stateDiagram-v2"]
+    lines += [f'    state "{state.value}" as {state.name.lower()}' for state in states]
+    lines.append(f"    [*] --> {next(iter(states)).name.lower()}")
+    drawn: dict[str, None] = {}
+    for state, event, words, target in arrows:
+        label = event.value if overview else f"{event.value} / {words}"
+        to = "stopping" if target is None else target.name.lower()
+        drawn[f"    {state.name.lower()} --> {to} : {label.replace(':', ',')}"] = None
+    lines += drawn
+    if states is host.State:
         lines += ["    stopping --> done : the last message has left", "    done --> [*]"]
     return "\n".join([*lines, "```", ""])
-
-
-def _action(action: Enum) -> str:
-    return f"ends, {action.value}" if isinstance(action, Ending) else str(action.value)
 
 
 def states_document() -> str:
@@ -72,16 +88,16 @@ def states_document() -> str:
         [
             _INTRODUCTION,
             "## The host: `flasher/host/table.py`\n",
-            diagram(host.TABLE, host.State.RESETTING),
+            diagram(host_arrows(), host.State),
             "## The device model: `flasher/mock/table.py`\n",
-            diagram(device.TABLE, device.State.APPLICATION),
+            diagram(device_arrows(), device.State),
         ]
     )
 
 
 def upgrade_document(text: str) -> str:
     """docs/upgrade.md with its diagram drawn anew."""
-    overview = diagram(host.TABLE, host.State.RESETTING, overview=True)
+    overview = diagram(host_arrows(overview=True), host.State, overview=True)
     return _MARKED.sub(lambda match: f"{match[1]}{overview}{match[2]}", text)
 
 

@@ -19,6 +19,7 @@ from typing import Any, Final, NoReturn
 import can
 
 from flasher.bus.bit_rate import BitRate, bit_rate
+from flasher.bus.echoes import Echoes
 from flasher.bus.health import (
     LAYOUTS,
     ControllerState,
@@ -122,6 +123,7 @@ class CanLink:
         self.received_at: float | None = None
         """Of the frame that `receive` returned last (`StampingLink`)."""
         self._health = HealthKeeper(LAYOUTS.get(interface, Layout.UNKNOWN))
+        self._echoes = Echoes()
         self._send_options: dict[str, float] = {}
         if interface == "slcan":
             # The serial port would block for ever; elsewhere the option costs time or is ignored.
@@ -175,6 +177,7 @@ class CanLink:
                 self._pause()
             else:
                 self._health.sent += 1
+                self._echoes.sent(frame, time.monotonic())
                 return
 
     def receive(self, deadline: float) -> Frame | None:
@@ -219,6 +222,7 @@ class CanLink:
         self._waiting.clear()
         self._use(self._open_again())
         self._health.reset()
+        self._echoes.held_up(time.monotonic())
 
     @property
     def is_off(self) -> bool:
@@ -250,6 +254,8 @@ class CanLink:
             message.is_remote_frame,
             message.is_error_frame,
         )
+        if frame[0] in self._echoes.ids:
+            frame = self._echoes.mark(frame, time.monotonic())
         # What filters hide was received all the same; what an adapter reports passes them.
         self._health.hear(frame)
         if filtered or frame.is_error or self._bus is None:

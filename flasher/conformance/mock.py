@@ -92,7 +92,7 @@ class MockPort:
         is_echo = bool(self._pending) and frame is self._pending[0]
         if is_echo:
             self._pending.popleft()
-        return Arrival(RawFrame(*frame), at, is_echo)
+        return Arrival(RawFrame(*frame[:5]), at, is_echo)
 
     def _record(self, frame: Frame, at: float) -> Sequence[Frame]:
         """Take note of every frame on the wire, unless the adapter is off the bus."""

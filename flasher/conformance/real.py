@@ -77,9 +77,10 @@ class RealPort:
         """
         while (frame := self._link.receive(deadline)) is not None:
             at = self._moment()
+            frame = Frame(*frame[:5])  # whose it is, is judged here, and not by the link
             is_own = self._take_own(frame)
             if self.echoes or not is_own:
-                return Arrival(RawFrame(*frame), at, is_own)
+                return Arrival(RawFrame(*frame[:5]), at, is_own)
         return None
 
     def _moment(self) -> float:

@@ -1,20 +1,17 @@
 """Watches the whole bus while a session runs, for what no single dialogue would notice; pure.
 
-A second tool: a frame with the id on which only the tool speaks, and that is no echo of what was
-sent. Echoes come soon; an adapter that gives none, not all, or some of them twice is fine. A query
-(mode 11) is told from all other messages: it writes nothing.
+A second tool: a frame with the id on which only the tool speaks, and that is no echo of an own one.
+A query (mode 11) is told from all other messages: it writes nothing.
 The battery's SHUTDOWN: whatever the target is, its power goes with it.
 """
 
 from __future__ import annotations
 
-from collections import deque
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 from flasher import events
 from flasher.protocol import catalogue
 from flasher.protocol.contents import Shutdown
-from flasher.protocol.echoes import ECHO_FRAMES, Echoes
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import (
     COMMAND_SIZE,
@@ -28,9 +25,6 @@ from flasher.protocol.spec import (
 )
 from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Message, Reassembler
-
-DOUBLE_LIMIT_S: Final = 0.1
-"""A second copy of an echo (a network with two ways, a driver's own) comes right behind it."""
 
 
 class Foreign(NamedTuple):
@@ -51,28 +45,17 @@ class Guard:
 
     def __init__(self, target: Target, timings: Timings) -> None:
         self._own_id = target.request_id
-        self._echoes = Echoes()
-        self._echoed: deque[tuple[float, Frame]] = deque(maxlen=ECHO_FRAMES)
         battery_id = can_id(Node.BMS, None)
         self._battery = Reassembler(battery_id, timings.inter_frame_timeout_s)
         self._events: list[object] = []
         self.shutdown_heard = False
         """The battery has announced that it switches off."""
 
-    def sent(self, frame: Frame, now: float) -> None:
-        """A frame was handed to the adapter."""
-        if frame[0] == self._own_id:
-            self._echoes.sent(frame, now)
-
-    def link_back(self, now: float) -> None:
-        """The adapter was lost and works again: what it held may leave, and come back, only now."""
-        self._echoes.held_up(now)
-
     def see(self, frame: Frame, now: float) -> Foreign | None:
         """A frame was received; returns what it is when a second tool has sent it."""
         frame_id = frame[0]
         if frame_id == self._own_id:
-            return self._judge_own(frame, now)
+            return self._judge_own(frame)
         if frame_id == self._battery.can_id and frame.is_payload:
             for found in self._battery.feed(frame.data, now):
                 if isinstance(found, Message):
@@ -84,13 +67,8 @@ class Guard:
         taken, self._events = self._events, []
         return taken
 
-    def _judge_own(self, frame: Frame, now: float) -> Foreign | None:
-        if not frame.is_payload:
-            return None
-        if self._echoes.take(frame, now):
-            self._echoed.append((now, frame))
-            return None
-        if any(own == frame and now - at <= DOUBLE_LIMIT_S for at, own in self._echoed):
+    def _judge_own(self, frame: Frame) -> Foreign | None:
+        if frame.is_echo or not frame.is_payload:
             return None
         data = frame.data
         seen = f"frame {data.hex(' ')} with id 0x{frame.can_id:03X}, not sent by this tool"

@@ -1,31 +1,36 @@
-"""Asking a device for something and waiting for its answer (chapter 3), as engines.
+"""Asking a device for something and waiting for its answer (chapter 3).
 
-`Query` is one question: sent every 200 ms until the answer comes or 1 s has passed. A copy follows
-only when the one before has left, for a sleeping device acknowledges nothing and the first frames
-may do no more than wake it. `Queries` asks several questions, one after the other.
+A question is sent every 200 ms until the answer comes or 1 s has passed. A copy follows only when
+the one before has left, for a sleeping device acknowledges nothing and the first frames may do no
+more than wake it.
 
-A repeated question may be answered several times. A query that has its answer stays a moment longer
+A repeated question may be answered several times. One that has its answer stays a moment longer
 while answers to other copies may still come, so that none of them is taken for the answer to the
 next question: two writes are confirmed by the same words (R10 reads the upgrade the same way).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain, islice
+from math import inf
+from typing import Any, Final
 
 from flasher import events
+from flasher.errors import UsageError
+from flasher.host.runner import Came, Runner, Signal, Stage
 from flasher.protocol import catalogue
-from flasher.protocol.catalogue import Item
-from flasher.protocol.contents import Empty, Memory, ReadMemory
-from flasher.protocol.engine import Transmitter
+from flasher.protocol.catalogue import BY_KEY, Item
+from flasher.protocol.contents import MEMORY_PIECE_SIZE, Empty, Memory, ReadMemory
 from flasher.protocol.fields import Content
-from flasher.protocol.frame import Frame
-from flasher.protocol.spec import data_size
+from flasher.protocol.spec import BMS, data_size
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
-from flasher.protocol.wire import Damage, Message, Reassembler, encode, split
+from flasher.protocol.wire import Damage, Message, encode, split
 
-_EMPTY = Empty()
+ADDRESS_MAX: Final = 0xFFFF_FFFF
+READ_MEMORY: Final = BY_KEY[BMS.request_id, 0x4308]
+_EMPTY: Final = Empty()
 
 
 @dataclass(frozen=True)
@@ -60,170 +65,148 @@ class Request:
 
 
 class Query:
-    """One question, an engine (`flasher.protocol.engine`); it begins at its first `tick`.
+    """One question and how it went. `ask` asks it, and tells of it unless it is `quiet`.
 
     Raises ValueError when the content does not fit or nothing answers the message.
     """
 
-    def __init__(
-        self, request: Request, *, bitrate_bps: int, timings: Timings = DEFAULT_TIMINGS
-    ) -> None:
+    def __init__(self, request: Request, *, quiet: bool = False) -> None:
         self.request = request
+        self.quiet = quiet
         self.answer: Content | None = None
         """The answer's content; None until it came, and for ever if it does not."""
         self.tries = 0
         """How often the question was sent, or is being sent."""
         self.misfit: Message | None = None
         """The last message that has the answer's serial number but not its form."""
+        self.copies_left = 0
+        """Copies of the question that have left."""
+        self.answers = 0
+        """How often it was answered."""
+        self.is_settled = False
+        """Every copy that has left is answered."""
+        self.repeat_at = inf
+        self.ends_at = inf
         self.cancelled = False
-        self._answer_item = request.answer_item
+        """It was ended from outside before its answer came."""
+        self.answer_item = request.answer_item
         message = catalogue.encode(request.item, request.content)
-        self._frames = split(message.can_id, encode(message))
-        self._timings = timings
-        self._tx = Transmitter(bitrate_bps)
-        self._rx = Reassembler(self._answer_item.can_id, timings.inter_frame_timeout_s)
-        self._events: list[object] = []
-        self._begun = False
-        self._is_over = False
-        self._done = False
-        self._copies_left = 0
-        self._answers = 0
-        self._repeat_at: float | None = None
-        self._ends_at: float | None = None
+        self.frames = split(message.can_id, encode(message))
 
-    @property
-    def done(self) -> bool:
-        """True when there is nothing left to do."""
-        return self._done
-
-    def receive(self, frame: Frame, now: float) -> None:
-        """A CAN frame arrived."""
-        if frame.can_id == self._rx.can_id and frame.is_payload and not self._done:
-            for found in self._rx.feed(frame.data, now):
-                self._take(found, now)
-
-    def tick(self, now: float) -> None:
-        """The time that `deadline` asked for has come."""
-        if self._done:
-            return
-        if not self._begun:
-            self._begun = True
-            self._ends_at = now + self._timings.command_timeout_s
-            self._send()
-            return
-        for found in self._rx.tick(now):
-            self._take(found, now)
-        if self._ends_at is not None and now >= self._ends_at:
-            self._end(now)
-        elif self._repeat_at is not None and now >= self._repeat_at:
-            self._send()
-
-    def deadline(self) -> float | None:
-        """When `tick` or `next_frame` is wanted next; at once before the beginning."""
-        if self._done:
-            return None
-        if not self._begun:
-            return 0.0
-        times = (self._ends_at, self._repeat_at, self._tx.deadline(), self._rx.deadline())
-        return min((time for time in times if time is not None), default=None)
-
-    def next_frame(self, now: float) -> Frame | None:
-        """The next frame to send."""
-        return self._tx.next_frame(now)
-
-    def frame_sent(self, now: float) -> None:
-        """The adapter has accepted the frame."""
-        if not self._tx.frame_sent(now):
-            return
-        self._copies_left += 1
-        left_at = self._tx.left_at
-        if self._is_over:
-            self._end(now)
-        elif self.answer is not None:
-            self._ends_at = left_at + self._timings.quiet_after_repeat_s
-        else:
-            if self._copies_left == 1:
-                self._ends_at = left_at + self._timings.command_timeout_s
-            self._repeat_at = left_at + self._timings.command_repeat_s
-
-    def cancel(self, now: float) -> None:
-        """End at the next message boundary."""
-        if not self._done:
-            self._begun = True
-            self.cancelled = self.answer is None
-            self._end(now)
-
-    def take_events(self) -> Sequence[object]:
-        """What happened since the last call."""
-        taken, self._events = self._events, []
-        return taken
-
-    def _send(self) -> None:
-        self._repeat_at = None  # it starts when the message has left
-        self.tries += 1
-        self._tx.queue(self._frames)
-        if self.tries > 1:
-            title = self.request.item.title
-            self._events.append(events.MessageRepeated(title, "no answer came", self.tries))
-
-    def _take(self, found: Message | Damage, now: float) -> None:
-        if isinstance(found, Damage):
-            told = events.BytesDamaged(found.can_id, found.reason.value, found.data)
-            self._events.append(told)
-            return
-        if self._is_over:
-            return
-        expected = self._answer_item
-        if (found.mode, found.command) != (expected.mode, expected.command):
-            # The serial number is the command's first byte; the second is a size (2.2.1).
-            if found.command >> 8 == expected.command >> 8:
-                self.misfit = found
-            return
-        if data_size(found.command) != expected.content.SIZE_BYTES or not self._copies_left:
-            return  # before the question has left it is somebody else's answer
-        content = expected.content.from_data(found.data)
+    def is_answer(self, message: Message) -> bool:
+        """Take a message that came after the question had left; True when it is the answer."""
+        expected = self.answer_item
+        if (message.can_id, message.mode, message.command) != (
+            expected.can_id,
+            expected.mode,
+            expected.command,
+        ):
+            return False
+        if data_size(message.command) != expected.content.SIZE_BYTES:
+            return False
+        content = expected.content.from_data(message.data)
         if not self.request.is_answered_by(content):
-            return
-        self._answers += 1
+            return False
         if self.answer is None:
             self.answer = content
-            told_answer = events.QueryAnswered(self.request.item.title, content, self.tries)
-            self._events.append(told_answer)
-        self._settle(now)
+        return True
 
-    def _settle(self, now: float) -> None:
-        """The answer is there: wait for those that other copies may still bring."""
-        self._repeat_at = None
-        self._tx.drop_unstarted()
-        if self._tx.idle and self._answers >= self._copies_left:
-            self._end(now)
-        else:
-            self._ends_at = max(now, self._tx.left_at) + self._timings.quiet_after_repeat_s
-
-    def _end(self, now: float) -> None:
-        """Finish a message that is half sent, then be done."""
-        if not self._is_over:
-            self._is_over = True
-            self._repeat_at = self._ends_at = None
-            self._tx.drop_unstarted()
-            if self.answer is None and not self.cancelled:
-                told = events.QueryUnanswered(self.request.item.title, self.tries)
-                self._events.append(told)
-        if self._tx.idle:
-            self._done = True
-        elif self._ends_at is None:
-            # An adapter that takes nothing any more must not hold us up for ever.
-            self._ends_at = now + self._timings.command_timeout_s
-        elif now >= self._ends_at:
-            self._done = True
+    def note_misfit(self, message: Message) -> None:
+        """Keep a message that has the serial number of the answer, but another form."""
+        expected = self.answer_item
+        if message.can_id != expected.can_id:
+            return
+        if (message.mode, message.command) == (expected.mode, expected.command):
+            return
+        # The serial number is the command's first byte; the second is a size (2.2.1).
+        if message.command >> 8 == expected.command >> 8:
+            self.misfit = message
 
 
-class Queries:
-    """Several questions, one after the other; an engine of its own.
+def ask(run: Runner[Any], query: Query) -> Stage[Query]:
+    """Ask one question; the query says how it went. See the module for the times."""
+    title = query.request.item.title
+    run.tx.all_left(run.now)
+    run.listen(query.answer_item.can_id)
+    query.repeat_at = run.now
+    query.ends_at = run.now + run.timings.command_timeout_s
+    came: Came = Signal.TIME
+    while not query.is_settled:
+        match came:
+            case Signal.CANCEL:
+                query.cancelled = query.answer is None
+                break
+            case Signal.TIME if run.now >= query.ends_at:
+                break
+            case Signal.TIME if run.now >= query.repeat_at:
+                query.repeat_at = inf  # it starts when the message has left
+                query.tries += 1
+                run.send(query.frames)
+                if query.tries > 1 and not query.quiet:
+                    run.tell(events.MessageRepeated(title, "no answer came", query.tries))
+            case Signal.LEFT:
+                _copy_left(run, query)
+            case Message():
+                _take(run, query, came)
+            case Damage() if came.can_id == query.answer_item.can_id and not query.quiet:
+                run.tell_damage(came)
+        if not query.is_settled:
+            came = yield min(query.ends_at, query.repeat_at)
+    if query.answer is None and not query.cancelled and not query.quiet:
+        run.tell(events.QueryUnanswered(title, query.tries))
+    yield from run.finish_message()
+    return query
+
+
+def _copy_left(run: Runner[Any], query: Query) -> None:
+    timings, left_at = run.timings, run.tx.left_at
+    query.copies_left += 1
+    if query.answer is not None:
+        query.ends_at = left_at + timings.quiet_after_repeat_s
+        return
+    if query.copies_left == 1:
+        query.ends_at = left_at + timings.command_timeout_s
+    query.repeat_at = left_at + timings.command_repeat_s
+
+
+def _take(run: Runner[Any], query: Query, message: Message) -> None:
+    """Look at a message; an answer is waited on with those that other copies may still bring."""
+    query.note_misfit(message)
+    # Before the question has left it is somebody else's answer.
+    if not query.copies_left or not query.is_answer(message):
+        return
+    query.answers += 1
+    if query.answers == 1 and query.answer is not None and not query.quiet:
+        title = query.request.item.title
+        run.tell(events.QueryAnswered(title, query.answer, query.tries))
+    query.repeat_at = inf
+    run.tx.drop_unstarted()
+    query.is_settled = run.tx.idle and query.answers >= query.copies_left
+    query.ends_at = max(run.now, run.tx.left_at) + run.timings.quiet_after_repeat_s
+
+
+def ask_all(
+    run: Runner[Any],
+    requests: Iterable[Request],
+    queries: list[Query],
+    *,
+    stop_at_silence: bool = False,
+) -> Stage[None]:
+    """Ask several questions, one after the other, and put them into `queries` as they begin.
 
     `requests` is taken from as needed, so it may be a generator. With `stop_at_silence` the first
     question without an answer is the last one.
     """
+    for request in requests:
+        query = Query(request)
+        queries.append(query)
+        yield from ask(run, query)
+        if run.is_cancelled or query.cancelled or (stop_at_silence and query.answer is None):
+            return
+
+
+class Queries(Runner[None]):
+    """Several questions as an engine; see `ask_all`."""
 
     def __init__(
         self,
@@ -235,83 +218,43 @@ class Queries:
     ) -> None:
         self.queries: list[Query] = []
         """Those that were begun, in order."""
-        self._requests = iter(requests)
-        self._bitrate_bps = bitrate_bps
-        self._timings = timings
-        self._stop_at_silence = stop_at_silence
-        self._events: list[object] = []
-        self._current: Query | None = None
-        self._next()
+        iterator = iter(requests)
+        first = list(islice(iterator, 1))
+        super().__init__(
+            lambda run: ask_all(
+                run, chain(first, iterator), self.queries, stop_at_silence=stop_at_silence
+            ),
+            bitrate_bps=bitrate_bps,
+            timings=timings,
+        )
+        self.done = not first
 
     @property
     def answers(self) -> list[Content | None]:
         """One for each question begun, in order."""
         return [query.answer for query in self.queries]
 
-    @property
-    def cancelled(self) -> bool:
-        """True when it was ended from outside before its end."""
-        return any(query.cancelled for query in self.queries)
 
-    @property
-    def done(self) -> bool:
-        """True when nothing is left to ask."""
-        return self._current is None
+# -- memory (0x4308) ------------------------------------------------------------------------------
 
-    def receive(self, frame: Frame, now: float) -> None:
-        """A CAN frame arrived."""
-        if self._current is not None:
-            self._current.receive(frame, now)
-            self._go_on()
 
-    def tick(self, now: float) -> None:
-        """The time that `deadline` asked for has come."""
-        if self._current is not None:
-            self._current.tick(now)
-            self._go_on()
+def memory_requests(start: int, end: int) -> Iterator[Request]:
+    """The questions for the bytes from `start` up to `end`, `end` exclusive (R5); each is for 128
+    bytes at the most.
+    """
+    for at in range(start, end, MEMORY_PIECE_SIZE):
+        yield Request(READ_MEMORY, ReadMemory(at, min(at + MEMORY_PIECE_SIZE, end)))
 
-    def deadline(self) -> float | None:
-        """When `tick` or `next_frame` is wanted next."""
-        return None if self._current is None else self._current.deadline()
 
-    def next_frame(self, now: float) -> Frame | None:
-        """The next frame to send."""
-        return None if self._current is None else self._current.next_frame(now)
+def piece_of(answer: Memory) -> bytes:
+    """The bytes that an answer gives, without the filler behind them (R5)."""
+    return answer.content[: answer.end - answer.start]
 
-    def frame_sent(self, now: float) -> None:
-        """The adapter has accepted the frame."""
-        if self._current is not None:
-            self._current.frame_sent(now)
-            self._go_on()
 
-    def cancel(self, now: float) -> None:
-        """End at the next message boundary; nothing more is asked."""
-        self._requests = iter(())
-        if self._current is not None:
-            self._current.cancel(now)
-            self._go_on()
-
-    def take_events(self) -> Sequence[object]:
-        """What happened since the last call."""
-        if self._current is not None:
-            self._events += self._current.take_events()
-        taken, self._events = self._events, []
-        return taken
-
-    def _go_on(self) -> None:
-        current = self._current
-        if current is None or not current.done:
-            return
-        self._events += current.take_events()
-        if self._stop_at_silence and current.answer is None:
-            self._current = None
-        else:
-            self._next()
-
-    def _next(self) -> None:
-        request = next(self._requests, None)
-        if request is None:
-            self._current = None
-            return
-        self._current = Query(request, bitrate_bps=self._bitrate_bps, timings=self._timings)
-        self.queries.append(self._current)
+def check_range(start: int, end: int) -> None:
+    """Raises UsageError for a range of addresses that the message cannot say."""
+    if not 0 <= start < end <= ADDRESS_MAX:
+        raise UsageError(
+            f"0x{start:08X} to 0x{end:08X} is no range of memory to read.",
+            remedy=f"The end is exclusive, above the start, 0x{ADDRESS_MAX:08X} at the most.",
+        )

@@ -8,11 +8,12 @@ on may have nothing to say.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
-from flasher.host.query import Queries, Query, Request
+from flasher.host.query import Query, Request, ask_all
+from flasher.host.runner import Came, Runner, Signal, Stage, watched
 from flasher.protocol import catalogue, messages
 from flasher.protocol.contents import Fault, Faults
 from flasher.protocol.fields import Content
@@ -20,7 +21,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import MOTINOVA, WELLING, Command, Dialect, Node, can_id
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
-from flasher.protocol.wire import Damage, Message, Reassembler
+from flasher.protocol.wire import Damage, Message
 
 _SENDERS: Final = {can_id(node, to): node for node in Node for to in (None, *Node)}
 """Who sends under each CAN id of the documents."""
@@ -47,7 +48,7 @@ class Heard:
     """Titles of messages that the dialect which was asked for does not have."""
 
 
-class Survey:
+class Survey(Runner[None]):
     """Hears for `listen_s`, then asks `requests`, unless another tool was heard: a question in the
     midst of its upgrade would look like a second tool to it. An engine; `heard` is there at any
     time.
@@ -63,30 +64,23 @@ class Survey:
         timings: Timings = DEFAULT_TIMINGS,
     ) -> None:
         self.heard: dict[Node, Heard] = {}
-        self._faults: Faults | None = None
+        self.queries: list[Query] = []
+        """The questions that were asked, in order."""
         self.foreign_frames = 0
         """Frames under ids that the documents do not give."""
         self.cancelled = False
+        """It ended before it had listened, or in a question."""
         self.other_tool_heard = False
         """Somebody else spoke as CDL while it listened, so that nothing was asked."""
-        self._listen_s = listen_s
+        self._faults: Faults | None = None
         self._dialect = dialect
-        self._timings = timings
-        self._reassemblers: dict[int, Reassembler] = {}
-        self._offered: Frame | None = None
-        self._own: Counter[Frame] = Counter()
-        """Frames of ours that may still come back: some adapters hear themselves."""
-        self._listen_until: float | None = None
-        self._began = False
-        self._queries = Queries(
-            self._while_worth_it(requests), bitrate_bps=bitrate_bps, timings=timings
+        self._ids: set[int] = set()
+        super().__init__(
+            lambda run: self._listen_and_ask(run, listen_s, requests),
+            bitrate_bps=bitrate_bps,
+            timings=timings,
         )
-
-    @property
-    def queries(self) -> Sequence[Query]:
-        """The questions that were asked, in order."""
-        was_asked = self._has_listened and not self.other_tool_heard
-        return self._queries.queries if was_asked else ()
+        self.watch = self._count
 
     @property
     def faults(self) -> Faults | None:
@@ -108,71 +102,23 @@ class Survey:
                 return WELLING, f"the WMC sent {item.title!r}, which the other dialect has not"
         return None, "what was heard is the same in both dialects"
 
-    # -- the engine interface ---------------------------------------------------------------------
+    # -- listening and asking ---------------------------------------------------------------------
 
-    @property
-    def done(self) -> bool:
-        """True when it has listened and every question is over."""
-        return self.cancelled or (self._has_listened and self._queries.done)
-
-    def receive(self, frame: Frame, now: float) -> None:
-        """A CAN frame arrived."""
-        self._hear(frame, now)
-        if self._has_listened:
-            self._queries.receive(frame, now)
-
-    def tick(self, now: float) -> None:
-        """The time that `deadline` asked for has come."""
-        if not self._began:
-            self._began = True
-            self._listen_until = now + self._listen_s
-        for reassembler in list(self._reassemblers.values()):
-            for found in reassembler.tick(now):
-                self._take(reassembler.can_id, found)
-        if self._listen_until is not None and now >= self._listen_until:
-            self._listen_until = None
-            self.other_tool_heard = Node.CDL in self.heard
-            if self.other_tool_heard:
-                self._queries.cancel(now)
-        if self._has_listened:
-            self._queries.tick(now)
-
-    def deadline(self) -> float | None:
-        """When `tick` or `next_frame` is wanted next; at once before the beginning."""
-        if self.done:
-            return None
-        if not self._began:
-            return 0.0
-        times = [r.deadline() for r in self._reassemblers.values()]
-        times.append(self._queries.deadline() if self._has_listened else self._listen_until)
-        return min((time for time in times if time is not None), default=None)
-
-    def next_frame(self, now: float) -> Frame | None:
-        """The next frame to send; nothing while it listens."""
-        self._offered = self._queries.next_frame(now) if self._has_listened else None
-        return self._offered
-
-    def frame_sent(self, now: float) -> None:
-        """The adapter has accepted the frame."""
-        if self._offered is not None:
-            self._own[self._offered] += 1
-        self._queries.frame_sent(now)
-
-    def cancel(self, now: float) -> None:
-        """End at the next message boundary."""
-        self._queries.cancel(now)
-        self.cancelled = not self._has_listened or self._queries.cancelled
-        self._began, self._listen_until = True, None
-
-    def take_events(self) -> Sequence[object]:
-        """What happened since the last call."""
-        return self._queries.take_events() if self._has_listened else ()
-
-    # -- hearing ----------------------------------------------------------------------------------
-
-    @property
-    def _has_listened(self) -> bool:
-        return self._began and self._listen_until is None
+    def _listen_and_ask(
+        self, run: Runner[None], listen_s: float, requests: Iterable[Request]
+    ) -> Stage[None]:
+        until = run.now + listen_s
+        while run.now < until:
+            came = yield until
+            self._take(came)
+            if came is Signal.CANCEL:
+                self.cancelled = True
+                return
+        self.other_tool_heard = Node.CDL in self.heard
+        if not self.other_tool_heard:
+            asking = ask_all(run, self._while_worth_it(requests), self.queries)
+            yield from watched(asking, self._take)
+            self.cancelled = any(query.cancelled for query in self.queries)
 
     def _while_worth_it(self, requests: Iterable[Request]) -> Iterable[Request]:
         """The questions, until a device is silent to so many that it seems not to be there."""
@@ -182,25 +128,27 @@ class Survey:
                 return
             yield request
 
-    def _hear(self, frame: Frame, now: float) -> None:
-        if self._own.get(frame):
-            self._own[frame] -= 1
-            return
+    def _count(self, frame: Frame) -> bool:
+        """Every frame belongs to its sender; its messages are heard from now on."""
+        if frame.is_echo:
+            return True
         node = _SENDERS.get(frame.can_id)
         if node is None or not frame.is_payload:
             self.foreign_frames += 1
-            return
+            return True
         heard = self.heard.setdefault(node, Heard(node))
         heard.frames += 1
-        reassembler = self._reassemblers.get(frame.can_id)
-        if reassembler is None:
-            reassembler = Reassembler(frame.can_id, self._timings.inter_frame_timeout_s)
-            self._reassemblers[frame.can_id] = reassembler
-        for found in reassembler.feed(frame.data, now):
-            self._take(frame.can_id, found)
+        if frame.can_id not in self._ids:
+            self._ids.add(frame.can_id)
+            self.hear_too(frame.can_id)
+        return False
 
-    def _take(self, from_id: int, found: Message | Damage) -> None:
-        heard = self.heard[_SENDERS[from_id]]
+    def _take(self, came: Came) -> Came:
+        if not isinstance(came, Signal) and came.can_id in self._ids:
+            self._note(self.heard[_SENDERS[came.can_id]], came)
+        return came
+
+    def _note(self, heard: Heard, found: Message | Damage) -> None:
         if isinstance(found, Damage):
             heard.damaged += 1
             return

@@ -1,385 +1,836 @@
-"""The upgrade of appendix 3 as the tool sees it: a pure machine (see `flasher.protocol.engine`).
+"""The upgrade of appendix 3 as the tool sees it: a stage of `flasher.host.runner`; pure.
 
-How to read it: frames become messages (`incoming`), messages and expired timers become an event
-(`classify`), `table.TABLE` says which action follows, and the actions are the short methods below.
-The classification holds the readings, the table the flow, `outgoing` what is sent, `situation` what
-is known; here is only how they go together, and when a timer starts.
+How to read it: a message, an expired timer or the user's word becomes an event, `table.TABLE` names
+the action, and the actions are the methods below, in the order of the states. An action holds the
+guards and the readings that go with its event (R2, R6, R10, R11, R16, R18, R26), goes to one of the
+states that the table allows it, and sends what follows. A timer starts when a message has left.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from math import inf
-from typing import ClassVar, Final
+from typing import Any, Final
 
+from flasher import events
 from flasher.events import Phase
-from flasher.host.classify import Classifier
-from flasher.host.conclude import conclude, detail_of
-from flasher.host.incoming import IncomingMessages
-from flasher.host.journal import Journal, Received
-from flasher.host.options import UpgradeOptions, overall_timeout_s
-from flasher.host.outcome import DeviceLeft, Outcome, standing
-from flasher.host.outgoing import Outgoing, OutgoingMessages, answer_wait_s
-from flasher.host.situation import Situation
-from flasher.host.table import TABLE, Action, Ending, Event, State
+from flasher.host.options import UpgradeOptions, firmware_version, overall_timeout_s
+from flasher.host.outcome import DeviceLeft, Outcome, Statistics, standing
+from flasher.host.runner import Came, Runner, Signal, Stage
+from flasher.host.table import TABLE, TIMERS, Ending, Event, Reason, State
 from flasher.image.plan import Plan
-from flasher.protocol.engine import Transmitter
-from flasher.protocol.frame import Frame
-from flasher.protocol.messages import BootVersion
-from flasher.protocol.spec import BOOT_VERSION_BURST
-from flasher.protocol.wire import Damage, Message
+from flasher.protocol import catalogue
+from flasher.protocol.fields import Content
+from flasher.protocol.messages import (
+    Ack,
+    BootVersion,
+    Complete,
+    EndOfTransfer,
+    GeneralFeedback,
+    Malformed,
+    Nak,
+    RequestTransfer,
+    Row,
+    Unknown,
+    UpdateCommand,
+    decode,
+)
+from flasher.protocol.spec import BOOT_VERSION_BURST, Command, Mode
+from flasher.protocol.text import boot_version_number, printable
+from flasher.protocol.wire import Damage, Message, encode, split
 
-_ACKNOWLEDGED: Final = frozenset({Event.PACKET_DONE, Event.LAST_PACKET_DONE})
-_BEGINNINGS: Final = frozenset({Action.SEND_UPDATE, Action.START_OVER})
+Received = Row | Malformed | Unknown | Content | None
+"""The message behind an event; None for a timer or the user's word."""
+
+_EVENTS: Final[dict[type, Event]] = {
+    Ack: Event.ACK,
+    Nak: Event.NAK,
+    BootVersion: Event.BOOT_VERSION,
+    RequestTransfer: Event.REQUEST,
+    Complete: Event.COMPLETE,
+    GeneralFeedback: Event.FEEDBACK,
+}
+"""The events of messages; all others are unexpected."""
+_PHASES: Final = {
+    State.RESETTING: Phase.RESET,
+    State.AWAITING_BOOT: Phase.BOOT,
+    State.AWAITING_REQUEST: Phase.UPDATE,
+    State.TRANSFERRING: Phase.TRANSFER,
+    State.SETTLING: Phase.TRANSFER,
+    State.ENDING: Phase.END,
+    State.CONFIRMING: Phase.CONFIRM,
+}
+"""Phases that people are told, by state; the other states leave the phase as it is."""
+_RESUMED: Final = frozenset({State.TRANSFERRING, State.SETTLING, State.ENDING, State.CONFIRMING})
+"""States that go on where they stood when a lost adapter is back."""
 _WELL_BEYOND: Final = 1.5
 """Silence after a message that was cut short, as a multiple of the time after which its receiver
 drops it (R12)."""
-_NEW_ATTEMPTS: Final = frozenset({Action.START_OVER, Action.BEGIN_AGAIN})
-_RESUMED: Final = frozenset({State.TRANSFERRING, State.SETTLING, State.ENDING, State.CONFIRMING})
-"""States that go on where they stood when a lost adapter is back."""
+_LEFT_SO: Final = {
+    Ending.COMPLETED: DeviceLeft.NEW,
+    Ending.CONFIRMED_BY_VERSION: DeviceLeft.NEW,
+    Ending.REFUSED: DeviceLeft.NO_APPLICATION,
+    Ending.RESTARTED: DeviceLeft.NO_APPLICATION,
+}
+"""Endings that by themselves say what the device has."""
 
 
-class Upgrade:
-    """One upgrade of one device with one plan. Begins with the first `tick`: with a reset, or, when
-    the device was `heard` to announce its boot version already, with the answer to that.
+class LinkBack(Exception):  # noqa: N818  it is good news
+    """The adapter was lost and works again."""
+
+
+class SecondTool(Exception):  # noqa: N818  what it is about, for who catches it
+    """Somebody else sends what only the tool may send; `seen` says what was seen."""
+
+    def __init__(self, seen: str) -> None:
+        super().__init__(seen)
+        self.seen = seen
+
+
+@dataclass
+class _Attempt:
+    """What is known of one attempt; times in seconds on the runner's clock."""
+
+    feedback_came: bool = False
+    """The reset was answered: an application runs."""
+    boot: BootVersion | None = None
+    """The first boot version."""
+    first_update_left_at: float | None = None
+    request_at: float = 0.0
+
+    packet: int = 0
+    """The number of the packet in work, from 1 on."""
+    tries: int = 0
+    """How often it was begun to be sent."""
+    copies_unanswered: int = 0
+    """Copies of it that have left and were not answered."""
+    accepted: bool = False
+    """One of its copies was acknowledged."""
+
+    end_tries: int = 0
+    end_copies_left: int = 0
+    end_naks: int = 0
+    announced_at: float | None = None
+    """When the first of the boot versions came that follow each other since end of transfer."""
+    announced_last_at: float = 0.0
+    running_version: str | None = None
+
+
+class UpgradeStage:
+    """One upgrade of one device with one plan. Begins with a reset, or, when the device was `heard`
+    to announce its boot version already, with the answer to that.
     """
 
-    def __init__(self, plan: Plan, options: UpgradeOptions | None = None) -> None:
+    def __init__(self, run: Runner[Any], plan: Plan, options: UpgradeOptions) -> None:
+        self._run = run
+        self._tx = run.tx
         self._plan = plan
-        self._options = options or UpgradeOptions()
-        self._timings = self._options.timings
-        self._classifier = Classifier(plan, self._options)
-        self._incoming = IncomingMessages(plan, self._options)
-        self._outgoing = OutgoingMessages(plan, self._options)
-        self._tx = Transmitter(plan.bitrate_bps, self._options.frame_gap_s)
+        self._options = options
+        self._timings = options.timings
+        request = options.version_request_for(plan.target)
+        self._version_item = None if request is None else request.answer_item
+        minimum = options.minimum_boot_version
+        self._minimum_boot = None if minimum is None else boot_version_number(minimum)
+        self._actions = {
+            move.action: getattr(self, f"_{move.action}")
+            for row in TABLE.values()
+            for move in row.values()
+        }
         self.heard: Message | None = None
         """A boot version that was received before the beginning."""
-        self.deadline_at: float | None = None
-        """The overall deadline; None until it begins, which computes it from the options."""
-        self._at = Situation(self._tx)
-        if self._options.at_power_up:
-            self._at.phase = Phase.BOOT
-        self._journal = Journal()
-        self._began_at: float | None = None
-        self._timer_at: float | None = None
+        self.state = State.RESETTING
+        """The row of the table that is in force."""
+        self._state_since = 0.0
+        self._phase = Phase.BOOT if options.at_power_up else Phase.RESET
+        self._timer_at = inf
+        self._deadline_at = inf
+        self._began_at = 0.0
         self._ending: tuple[Ending, str] | None = None
         self._outcome: Outcome | None = None
 
-    # -- the engine interface -------------------------------------------------------------------
+        # What outlives an attempt.
+        self._at = _Attempt()
+        self._attempt = 1
+        self._heard_at = -inf
+        """When the device was heard last, or could not be heard as the adapter was away."""
+        self._update_left_at = -inf
+        """When the last update command left."""
+        self._silence_was_answered = False
+        """An update command was sent into the silence of a device (R26)."""
+        self._last_boot: BootVersion | None = None
+        self._erased = False
+        """Request transfer came: the old application is gone."""
+        self._failed_packet: int | None = None
+        """The packet that ended an earlier attempt."""
+        self._nak_next_seen = False
+        """A repeated packet n was answered with NAK n+1, and that was not taken for an ACK."""
+
+        self._acknowledged = 0
+        self._repetitions = 0
+        self._naks = 0
+        self._timeouts = 0
+        self._transfer_s: float | None = None
+
+    # -- how it stands ---------------------------------------------------------------------------
 
     @property
-    def done(self) -> bool:
-        """True when the outcome is known and the last message begun has left."""
-        return self._outcome is not None
+    def standing(self) -> str:
+        """Phase, packet and attempt in words."""
+        return standing(self._phase, self._packet, self._plan.total_packets, self._attempt)
 
     @property
-    def outcome(self) -> Outcome:
-        """How it ended. Raises RuntimeError while it has not."""
-        if self._outcome is None:
-            raise RuntimeError("the upgrade has not ended yet")
-        return self._outcome
+    def _packet(self) -> int | None:
+        return self._at.packet if self._phase is Phase.TRANSFER else None
 
     @property
-    def state(self) -> State:
-        """The row of the table that is in force."""
-        return self._at.state
+    def _was_told_to_update(self) -> bool:
+        """True when an update command has left: the device may have erased its application."""
+        return self._update_left_at > -inf
+
+    @property
+    def has_begun_to_erase(self) -> bool:
+        """True once an update command is sent, or being sent."""
+        is_leaving = self.state is State.AWAITING_REQUEST and self._tx.begun
+        return self._was_told_to_update or is_leaving
+
+    @property
+    def device_left(self) -> DeviceLeft:
+        """The state that the device would be left in if nothing more were sent."""
+        if self._at.end_copies_left:
+            return DeviceLeft.UNKNOWN
+        if self._erased:
+            return DeviceLeft.NO_APPLICATION
+        return DeviceLeft.PERHAPS_ERASED if self._was_told_to_update else DeviceLeft.UNTOUCHED
 
     @property
     def may_begin_again(self) -> bool:
         """True when an attempt is left, or none is needed to go on after the adapter was lost."""
         return (
-            self._at.attempt < self._options.attempts
+            not self._is_last_attempt
             or self._ending is not None
-            or self._at.state in _RESUMED
-            or self._classifier.link_back(self._at) is Event.LINK_BACK_UPDATING
+            or self.state in _RESUMED
+            or self._is_updating
         )
 
     @property
-    def has_begun_to_erase(self) -> bool:
-        """True once an update command is sent, or being sent."""
+    def _is_updating(self) -> bool:
         at = self._at
-        is_leaving = at.state is State.AWAITING_REQUEST and self._tx.begun
-        return at.update_left or is_leaving
+        return self.state is State.AWAITING_REQUEST and at.first_update_left_at is not None
 
     @property
-    def device_left(self) -> DeviceLeft:
-        """The state that the device would be left in if nothing more were sent."""
-        return self._at.device_left
+    def _is_last_attempt(self) -> bool:
+        return self._attempt >= self._options.attempts
 
     @property
-    def standing(self) -> str:
-        """Phase, packet and attempt in words."""
-        at = self._at
-        return standing(at.phase, at.packet, self._plan.total_packets, at.attempt)
+    def _is_last_try(self) -> bool:
+        return self._at.tries >= self._timings.packet_tries
 
-    def receive(self, frame: Frame, now: float) -> None:
-        """A CAN frame arrived."""
-        for found in self._incoming.feed(frame, self._at.state, now):
-            self._take(found, now)
+    # -- the stage -------------------------------------------------------------------------------
 
-    def tick(self, now: float) -> None:
-        """The time that `deadline` asked for has come."""
-        if self._began_at is None:
-            self._begin(now)
-            return
-        for found in self._incoming.tick(now):
-            self._take(found, now)
-        if self._ending is not None:
-            return
-        if self.deadline_at is not None and now >= self.deadline_at:
-            self._dispatch(Event.OUT_OF_TIME, now)
-        elif self._timer_at is not None and now >= self._timer_at:
-            self._timer_at = None
-            event = self._classifier.timer(self._at, now)
-            self._journal.expired(event)
-            self._dispatch(event, now)
-
-    def deadline(self) -> float | None:
-        """When `tick` or `next_frame` is wanted next; at once before the beginning."""
-        if self._began_at is None:
-            return 0.0
-        if self.done:
-            return None
-        earliest = inf
-        for time in (
-            None if self._ending is not None else self.deadline_at,
-            self._timer_at,
-            self._tx.deadline(),
-            *self._incoming.deadlines(),
-        ):
-            if time is not None and time < earliest:
-                earliest = time
-        return None if earliest == inf else earliest
-
-    def next_frame(self, now: float) -> Frame | None:
-        """The next frame to send."""
-        return self._tx.next_frame(now)
-
-    def frame_sent(self, now: float) -> None:
-        """The adapter has accepted the frame."""
-        if self._tx.frame_sent(now):
-            self._message_left(now)
-
-    def cancel(self, now: float) -> None:
-        """End at the next message boundary."""
-        if self._began_at is None:
-            self._began_at = now
-        if self._ending is None:
-            self._dispatch(Event.CANCEL, now)
-
-    def link_back(self, now: float) -> None:
-        """The adapter was lost and works again. What was half sent is abandoned."""
-        if self._began_at is None:
-            return
-        self._tx.abandon(now + self._timings.inter_frame_timeout_s * _WELL_BEYOND)
-        self._at.heard_at = now  # nobody knows what it said meanwhile
-        if self._ending is not None:
-            self._finish(now)
-        elif self._waits_for_power_up:
-            self._await_boot(now, Event.LINK_BACK, None)
+    def stage(self, deadline_at: float | None = None) -> Stage[Outcome]:
+        """Run it to its end. `deadline_at` is the overall deadline; None computes it."""
+        self._began_at = self._state_since = self._run.now
+        if deadline_at is None:
+            deadline_at = self._run.now + overall_timeout_s(self._plan, self._options)
+        self._deadline_at = deadline_at
+        self._run.listen_always(self._plan.target.answer_id)
+        if self._options.at_power_up or self.heard is not None:
+            self.state, self._phase = State.AWAITING_BOOT, Phase.BOOT
+        self._run.tell(events.PhaseEntered(self._phase, self._attempt))
+        if self.state is State.RESETTING:
+            self._send_reset()
         else:
-            self._dispatch(self._classifier.link_back(self._at), now)
+            self._wait_for_boot()
+        if self.heard is not None:
+            self._take(self.heard)
+        while self._outcome is None:
+            is_stopping = self._ending is not None
+            try:
+                came = yield None if is_stopping else min(self._timer_at, self._deadline_at)
+            except LinkBack:
+                self._tx.abandon(self._run.now + self._timings.inter_frame_timeout_s * _WELL_BEYOND)
+                self._heard_at = self._run.now  # nobody knows what it said meanwhile
+                self._dispatch(Event.LINK_BACK)
+            except SecondTool as heard:
+                # Not one frame more is sent, not even the rest of a message.
+                self._tx.abandon(self._run.now)
+                self._second_tool = heard.seen
+                self._dispatch(Event.SECOND_TOOL)
+            else:
+                self._take(came)
+        return self._outcome
+
+    def _take(self, came: Came) -> None:
+        if self._ending is not None:
+            if came is Signal.LEFT:
+                self._message_left()
+                self._finish()
+            return
+        match came:
+            case Signal.LEFT:
+                self._message_left()
+            case Signal.TIME if self._run.now >= self._deadline_at:
+                self._dispatch(Event.OUT_OF_TIME)
+            case Signal.TIME:
+                self._timer_at = inf
+                self._dispatch(TIMERS[self.state])
+            case Signal.CANCEL:
+                self._dispatch(Event.CANCEL)
+            case Damage():
+                self._run.tell_damage(came)
+            case Message():
+                self._message(came)
+
+    def _message(self, message: Message) -> None:
+        self._heard_at = self._run.now
+        item = self._version_item
+        if item is not None and message[:3] == (item.can_id, item.mode, item.command):
+            self._dispatch(Event.VERSION, item.content.from_data(message.data))
+            return
+        row = decode(message)
+        event = _EVENTS.get(type(row), Event.UNEXPECTED)
+        if event is Event.FEEDBACK:
+            self._at.feedback_came = True
+        elif event is Event.NAK:
+            self._naks += 1
+        self._dispatch(event, row)
+
+    def _dispatch(self, event: Event, row: Received = None) -> None:
+        if self._ending is not None:
+            self._finish()
+            return
+        before = self.state
+        move = TABLE[before].get(event)
+        if move is None:
+            raise RuntimeError(f"{event} cannot happen in {before}")
+        self._actions[move.action](row)
+        led_to = self._led_to
+        if led_to is not before and led_to not in move.leads_to:
+            raise RuntimeError(f"{event} led from {before} to {led_to}")
 
     @property
-    def _waits_for_power_up(self) -> bool:
-        """True while nothing may be sent: the device has not announced itself yet."""
-        at = self._at
-        waits = self._options.at_power_up and at.state is State.AWAITING_BOOT
-        return waits and not at.update_left
+    def _led_to(self) -> State | Ending:
+        return self.state if self._ending is None else self._ending[0]
 
-    def second_tool(self, seen: str, now: float) -> None:
-        """Somebody else sends what only the tool may send: end at once, and send nothing more, not
-        even the rest of a message. `seen` says what was seen.
-        """
-        if self.done:
+    def _go(self, state: State) -> None:
+        """Another state begins, perhaps another phase with it."""
+        if state is self.state:
             return
-        self._tx.abandon(now)
-        if self._ending is not None:
-            self._finish(now)
-            return
-        self._at.second_tool = seen
-        self._dispatch(Event.SECOND_TOOL, now)
+        self.state, self._state_since = state, self._run.now
+        self._timer_at = inf
+        phase = _PHASES[state]
+        if phase is not self._phase:
+            self._phase = phase
+            self._run.tell(events.PhaseEntered(phase, self._attempt))
 
-    def take_events(self) -> Sequence[object]:
-        """What happened since the last call."""
-        return self._journal.take()
+    # -- what is sent, and the timers that start when it has left ---------------------------------
 
-    # -- the table ------------------------------------------------------------------------------
+    def _send(self, row: Row, not_before: float = 0.0) -> None:
+        request_id = self._plan.target.request_id
+        frames = split(request_id, encode(row.to_message(request_id)))
+        self._timer_at = inf
+        self._run.send(frames, not_before=not_before, tag=row.COMMAND)
 
-    def _take(self, found: Message | Damage, now: float) -> None:
-        if self._ending is not None:
-            return
-        if isinstance(found, Damage):
-            self._journal.damaged(found)
-            return
-        row = self._incoming.decode(found)
-        self._at.heard_at = now
-        self._journal.received(row)
-        self._dispatch(self._classifier.message(row, self._at, now), now, row)
+    def _send_reset(self) -> None:
+        """What makes the application restart into the bootloader; a product may have its own."""
+        options, request_id = self._options, self._plan.target.request_id
+        reset = Message(request_id, Mode.WRITE, options.reset_command, options.reset_data)
+        self._timer_at = inf
+        self._run.send(split(request_id, encode(reset)), tag=Command.RESET)
 
-    def _dispatch(self, event: Event, now: float, row: Received = None) -> None:
-        action, state = TABLE[self._at.state][event]
-        if action in _NEW_ATTEMPTS:
-            failed = self._at.number if event is Event.PACKET_GIVEN_UP else None
-            self._at = self._at.next_attempt(failed)
-            self._journal.attempt(self._at.attempt, event)
-        if isinstance(row, BootVersion) and action in _BEGINNINGS and self._at.boot is None:
-            self._at.boot = self._at.last_boot = row
-            self._journal.boot_seen(row, self._options.minimum_boot_version)
-        if event in _ACKNOWLEDGED:
-            self._journal.packet_done(self._at, self._plan.total_packets, now)
-        if state is not self._at.state:
-            self._enter(state, now)
-        if isinstance(action, Ending):
-            self._end(action, detail_of(action, row, self._plan, self._at), now)
-        elif action is Action.IMPOSSIBLE:
-            raise RuntimeError(f"{event} cannot happen in {self._at.state}")
-        else:
-            self._ACTIONS[action](self, now, event, row)
+    def _send_update(self) -> None:
+        self._tx.drop_unstarted()
+        size_bytes = self._plan.image.size_bytes
+        not_before = self._update_left_at + self._timings.update_spacing_s
+        self._send(UpdateCommand(self._plan.target.update_text, size_bytes), not_before)
 
-    def _enter(self, state: State, now: float) -> None:
-        self._timer_at = None
-        if self._at.enter(state, now):
-            self._journal.phase(self._at.phase, self._at.attempt)
+    def _send_packet(self) -> None:
+        at, plan = self._at, self._plan
+        at.tries += 1
+        self._timer_at = inf
+        self._run.send(
+            plan.packet_frames(at.packet),
+            wire_s=plan.packet_wire_s(at.packet),
+            not_before=self._after_packet_gap(),
+            tag=Command.PACKET,
+        )
 
-    # -- timers that start when a message has left -----------------------------------------------
+    def _after_packet_gap(self) -> float:
+        gap_s = self._options.packet_gap_s
+        return self._run.now + gap_s if gap_s else 0.0
 
-    def _message_left(self, now: float) -> None:
-        command, left_at = self._tx.left_tag, self._tx.left_at
-        self._at.message_left(command, left_at)
-        if self._at.state is State.STOPPING:
-            self._finish(now)
-            return
-        wait_s = answer_wait_s(command, self._at, self._options)
+    def _message_left(self) -> None:
+        at, timings, left_at = self._at, self._timings, self._tx.left_at
+        wait_s: float | None = None
+        match self._tx.left_tag, self.state:
+            case Command.PACKET, state:
+                at.copies_unanswered += 1
+                if state is State.TRANSFERRING:
+                    wait_s = timings.ack_timeout_s
+                elif state is State.SETTLING:
+                    wait_s = timings.quiet_after_repeat_s
+            case Command.UPDATE, state:
+                self._update_left_at = left_at
+                if at.first_update_left_at is None:
+                    at.first_update_left_at = left_at
+                if state is State.AWAITING_REQUEST:
+                    wait_s = timings.request_transfer_timeout_s
+            case Command.END_OF_TRANSFER, state:
+                at.end_copies_left += 1
+                if state is State.ENDING and at.announced_at is None:
+                    wait_s = timings.complete_timeout_s
+            case (Command.RESET, State.RESETTING) | (Command.READ_VERSION, State.CONFIRMING):
+                wait_s = timings.command_repeat_s
+            case Command.RESET, State.AWAITING_BOOT:
+                wait_s = self._options.boot_timeout_s
         if wait_s is not None:
             self._timer_at = left_at + wait_s
 
-    # -- actions ----------------------------------------------------------------------------------
+    # -- actions: anywhere -----------------------------------------------------------------------
 
-    def _begin(self, now: float) -> None:
-        self._began_at = self._at.state_since = now
-        if self.deadline_at is None:
-            self.deadline_at = now + overall_timeout_s(self._plan, self._options)
-        if self._options.at_power_up or self.heard is not None:
-            self._at.enter(State.AWAITING_BOOT, now)
-        self._journal.phase(self._at.phase, self._at.attempt)
-        if self._at.state is State.RESETTING:
-            self._send_reset(now, Event.RESET_DUE, None)
-            return
-        self._await_boot(now, Event.RESET_UNANSWERED, None)
-        if self.heard is not None:
-            self._take(self.heard, now)
+    def _ignore(self, row: Received) -> None:
+        pass
 
-    def _nothing(self, now: float, event: Event, row: Received) -> None:
-        """Ignored by the table."""
+    def _report(self, row: Received, what: str = Event.UNEXPECTED.value) -> None:
+        """Tell of something that came where it has no place."""
+        match row:
+            case Malformed(message, problem):
+                what = f"message {message.command:04X} from {message.can_id:03X} ignored: {problem}"
+            case Unknown(message):
+                what = f"unknown message {message.command:04X} from {message.can_id:03X} ignored"
+            case BootVersion(name, version):
+                what += f": {printable(name)} {printable(version)}"
+            case Ack(number) | Nak(number):
+                what += f": {type(row).__name__.upper()} {number}"
+        self._run.tell(events.Reported(what))
 
-    def _report(self, now: float, event: Event, row: Received) -> None:
-        self._journal.reported(event, row)
+    def _begin_again(self, row: Received, reason: Reason = Reason.LINK_BACK) -> None:
+        """Another attempt, from the reset on."""
+        self._next_attempt(reason)
+        self._go(State.RESETTING)
+        self._send_reset()
 
-    def _send_reset(self, now: float, event: Event, row: Received) -> None:
-        self._send(self._outgoing.reset())
+    def _start_over(self, row: Received, reason: Reason) -> None:
+        """Another attempt, with a bootloader that is there: from the update command on."""
+        self._next_attempt(reason)
+        if isinstance(row, BootVersion):
+            self._note_boot(row)
+        self._go(State.AWAITING_REQUEST)
+        self._send_update()
 
-    def _await_boot(self, now: float, event: Event, row: Received) -> None:
+    def _next_attempt(self, reason: Reason) -> None:
+        if reason is Reason.PACKET_GIVEN_UP:
+            self._failed_packet = self._at.packet
+        self._at = _Attempt()
+        self._attempt += 1
+        self._run.tell(events.AttemptStarted(self._attempt, reason.value))
+
+    def _repeated(self, what: str, reason: Reason, tries: int) -> None:
+        self._repetitions += 1
+        self._run.tell(events.MessageRepeated(what, reason.value, tries))
+
+    def _restarted(self, row: BootVersion | RequestTransfer, reason: Reason) -> None:
+        """The device has lost what it had received."""
+        if self._is_last_attempt:
+            self._end(Ending.RESTARTED, row)
+        else:
+            self._start_over(row, reason)
+
+    # -- actions: up to the update command --------------------------------------------------------
+
+    def _repeat_reset(self, row: Received) -> None:
+        if self._run.now - self._state_since >= self._timings.command_timeout_s:
+            self._await_boot(row)
+        else:
+            self._send_reset()
+
+    def _await_boot(self, row: Received) -> None:
+        self._go(State.AWAITING_BOOT)
+        self._wait_for_boot()
+
+    def _wait_for_boot(self) -> None:
         self._tx.drop_unstarted()
-        self._timer_at = max(now, self._tx.left_at) + self._options.boot_timeout_s
+        wait_s = self._options.boot_timeout_s
+        self._timer_at = max(self._run.now, self._tx.left_at) + wait_s
         if self._options.at_power_up and self.heard is None:
-            self._journal.power_cycle(self._options.boot_timeout_s)
+            self._run.tell(events.PowerCycleAwaited(wait_s))
 
-    def _await_erase(self, now: float, event: Event, row: Received) -> None:
-        self._timer_at = self._at.silent_since + self._timings.request_transfer_timeout_s
+    def _wait_or_begin_again(self, row: Received) -> None:
+        """Nothing is sent to a device that has not announced itself at power-up."""
+        if self._options.at_power_up and not self._was_told_to_update:
+            self._wait_for_boot()
+        else:
+            self._begin_again(row)
 
-    def _await_request(self, now: float, event: Event, row: Received) -> None:
-        self._timer_at = self._at.update_left_at + self._timings.request_transfer_timeout_s
+    def _answer_boot(self, boot: BootVersion) -> None:
+        number = boot_version_number(boot.version)
+        minimum = self._minimum_boot
+        if self._is_foreign(boot):
+            self._end(Ending.WRONG_DEVICE, boot)
+        elif minimum is not None and (number is None or number < minimum):
+            self._end(Ending.BOOT_TOO_OLD, boot)
+        else:
+            self._note_boot(boot)
+            self._go(State.AWAITING_REQUEST)
+            self._send_update()
 
-    def _send_update(self, now: float, event: Event, row: Received) -> None:
+    def _is_foreign(self, boot: BootVersion) -> bool:
+        if self._options.allow_boot_name:
+            return False
+        return boot.name != self._plan.target.boot_name or not boot.is_version
+
+    def _note_boot(self, boot: BootVersion) -> None:
+        """Tell the first boot version of the attempt."""
+        if self._at.boot is not None:
+            return
+        self._at.boot = self._last_boot = boot
+        version, minimum = printable(boot.version), self._options.minimum_boot_version
+        self._run.tell(events.BootVersionSeen(printable(boot.name), version))
+        if minimum is not None:
+            text = f"the bootloader {version} is not older than {minimum}, as the manifest asks"
+            self._run.tell(events.CheckMade("boot-version", "passed", text))
+
+    def _miss_boot(self, row: Received) -> None:
+        """No boot version came; a device that was told to update is not left alone (R26)."""
+        if self._was_told_to_update and not self._is_last_attempt:
+            silent_since = max(self._heard_at, self._update_left_at)
+            erased_at = silent_since + self._timings.request_transfer_timeout_s
+            if self._at.feedback_came or self._silence_was_answered:
+                self._begin_again(row, Reason.BOOT_GIVEN_UP)
+            elif self._run.now < erased_at:
+                self._timer_at = erased_at
+            else:
+                # It may sit in a session that never ends and knows no reset: once, and only here,
+                # an update command goes into silence.
+                self._silence_was_answered = True
+                self._start_over(row, Reason.BOOT_SILENT)
+        elif self._failed_packet is not None:
+            self._end(Ending.PACKET_FAILED, row)
+        elif self._options.at_power_up:
+            self._end(Ending.NO_ANNOUNCEMENT, row)
+        else:
+            self._end(Ending.NO_BOOT_VERSION, row)
+
+    def _answer_boot_again(self, boot: BootVersion) -> None:
+        """After an update command was sent, before request transfer (R2)."""
+        now, timings, at = self._run.now, self._timings, self._at
+        first_at = at.first_update_left_at
+        if self._is_foreign(boot):
+            self._end(Ending.WRONG_DEVICE, boot)
+        elif at.boot is not None and boot != at.boot:
+            self._end(Ending.TWO_DEVICES, boot)
+        elif not self._tx.idle or now - self._update_left_at < timings.update_spacing_s:
+            pass  # too soon to be an answer to the update command
+        elif first_at is not None and now - first_at > timings.request_transfer_timeout_s:
+            self._end(Ending.UNHEARING, boot)
+        else:
+            self._note_boot(boot)
+            self._send_update()
+
+    def _miss_request(self, row: Received) -> None:
+        if not self._is_last_attempt:
+            self._begin_again(row, Reason.REQUEST_GIVEN_UP)
+        elif self._failed_packet is not None and self._at.boot is None:
+            self._end(Ending.PACKET_FAILED, row)
+        else:
+            self._end(Ending.NO_REQUEST, row)
+
+    def _await_request_or_begin_again(self, row: Received) -> None:
+        if self._is_updating:
+            timeout_s = self._timings.request_transfer_timeout_s
+            self._timer_at = self._update_left_at + timeout_s
+        else:
+            self._begin_again(row)
+
+    def _send_first_packet(self, row: Received) -> None:
+        if self._at.first_update_left_at is None:
+            self._report(row)  # it answers another update command: a late copy
+            return
+        self._go(State.TRANSFERRING)
         self._tx.drop_unstarted()
-        not_before = self._at.update_left_at + self._timings.update_spacing_s
-        self._send(self._outgoing.update(), not_before)
+        self._at.request_at, self._erased = self._run.now, True
+        self._next_packet(1)
 
-    def _send_first_packet(self, now: float, event: Event, row: Received) -> None:
-        self._tx.drop_unstarted()
-        self._at.requested(now)
-        self._at.next_packet(1)
-        self._send_packet(now)
+    # -- actions: the transfer --------------------------------------------------------------------
 
-    def _send_next_packet(self, now: float, event: Event, row: Received) -> None:
-        self._at.next_packet(self._at.number + 1)
-        self._send_packet(now)
+    def _next_packet(self, number: int) -> None:
+        at = self._at
+        at.packet, at.tries = number, 0
+        at.copies_unanswered, at.accepted = 0, False
+        self._send_packet()
 
-    def _repeat_packet(self, now: float, event: Event, row: Received) -> None:
-        self._send_packet(now)
-        self._journal.repeated(f"packet {self._at.number}", event, self._at.tries)
+    def _take_answer(self, answer: Ack | Nak) -> None:
+        """Find out which copy it answers (R10)."""
+        at, accepts = self._at, isinstance(answer, Ack)
+        if answer.number > at.packet:
+            # "I want n+1": some bootloaders answer a repeated n so.
+            is_next = answer.number == at.packet + 1 and not accepts and at.tries > 1
+            if not (is_next and self._options.nak_next_is_ack):
+                self._nak_next_seen = self._nak_next_seen or is_next
+                self._report(answer, "ACK or NAK for another packet")
+                return
+            accepts = True
+        is_sending = self._tx.due_at < inf
+        first_copy_is_out = at.tries > 1 or not is_sending
+        is_stale = answer.number < at.packet or (
+            # It answers a copy that is answered already, or none at all.
+            not at.copies_unanswered and not (accepts and first_copy_is_out)
+        )
+        if is_stale:
+            if self.state is State.SETTLING:
+                self._await_quiet(answer)
+            return
+        at.copies_unanswered = max(0, at.copies_unanswered - 1)
+        at.accepted = at.accepted or accepts
+        if at.copies_unanswered or is_sending:
+            self._await_quiet(answer)
+        else:
+            self._settle(answer)
 
-    def _send_packet(self, now: float) -> None:
-        self._at.tries += 1
-        self._send(self._outgoing.packet(self._at.number), self._after_packet_gap(now))
+    def _settle(self, row: Received) -> None:
+        """Every copy of the packet is answered, or will not be any more."""
+        at, total = self._at, self._plan.total_packets
+        if not at.accepted:
+            self._repeat_packet(row, Reason.PACKET_REFUSED)
+            return
+        self._acknowledged = at.packet
+        self._tx.all_left(self._run.now)
+        self._run.tell(events.PacketAcknowledged(at.packet, total, at.tries))
+        if at.packet < total:
+            self._go(State.TRANSFERRING)
+            self._next_packet(at.packet + 1)
+            return
+        self._transfer_s = self._run.now - at.request_at
+        self._go(State.ENDING)
+        at.end_tries += 1
+        self._send(EndOfTransfer(), self._after_packet_gap())
 
-    def _await_quiet(self, now: float, event: Event, row: Received) -> None:
+    def _miss_answer(self, row: Received) -> None:
+        self._timeouts += 1
+        self._repeat_packet(row, Reason.PACKET_UNANSWERED)
+
+    def _repeat_packet(self, row: Received, reason: Reason) -> None:
+        """Send it once more, as long as it has a try left."""
+        if self._is_last_try:
+            self._packet_lost(row)
+            return
+        self._go(State.TRANSFERRING)
+        self._send_packet()
+        self._repeated(f"packet {self._at.packet}", reason, self._at.tries)
+
+    def _packet_lost(self, row: Received) -> None:
+        if self._is_last_attempt:
+            self._end(Ending.PACKET_FAILED, row)
+        else:
+            self._begin_again(row, Reason.PACKET_GIVEN_UP)
+
+    def _resend_packet(self, row: Received) -> None:
+        self._send_packet()
+        self._repeated(f"packet {self._at.packet}", Reason.LINK_BACK, self._at.tries)
+
+    def _await_quiet(self, row: Received) -> None:
+        self._go(State.SETTLING)
         # While a copy is still leaving, the time starts when it has (see _message_left).
         if self._tx.idle:
-            self._timer_at = max(now, self._tx.left_at) + self._timings.quiet_after_repeat_s
+            quiet_s = self._timings.quiet_after_repeat_s
+            self._timer_at = max(self._run.now, self._tx.left_at) + quiet_s
 
-    def _send_end(self, now: float, event: Event, row: Received) -> None:
+    def _take_late_request(self, row: RequestTransfer) -> None:
+        """Request transfer during the transfer (R16)."""
+        if self._at.packet > 1 or self._at.accepted:
+            self._restarted(row, Reason.REQUEST_LATE)
+        elif not self._tx.idle:
+            self._await_quiet(row)
+        elif self._is_last_try:
+            self._packet_lost(row)
+        elif self.state is State.SETTLING:
+            self._await_quiet(row)
+        else:
+            self._repeat_packet(row, Reason.REQUEST_AGAIN)
+
+    def _take_boot_in_transfer(self, boot: BootVersion) -> None:
+        """A leftover of the announcements, or the device has restarted (R11)."""
+        if self._run.now - self._at.request_at <= self._timings.leftover_boot_version_s:
+            self._report(boot, "leftover boot version")
+        elif self._is_foreign(boot):
+            self._end(Ending.WRONG_DEVICE, boot)
+        else:
+            self._restarted(boot, Reason.RESTARTED)
+
+    # -- actions: after the last packet -----------------------------------------------------------
+
+    def _take_end_nak(self, nak: Nak) -> None:
+        """Once more at the first one; its number does not matter (R6)."""
+        at = self._at
+        if at.end_copies_left <= at.end_naks:
+            return  # it answers a packet
+        at.end_naks += 1
+        if at.end_naks > 1:
+            self._end(Ending.REFUSED, nak)
+            return
+        self._run.listen()
+        self._go(State.ENDING)
+        self._repeat_end(Reason.END_REFUSED)
+
+    def _repeat_end(self, reason: Reason) -> None:
         self._at.end_tries += 1
-        self._send(self._outgoing.end(), self._after_packet_gap(now))
+        self._repeated("end of transfer", reason, self._at.end_tries)
+        self._send(EndOfTransfer())
 
-    def _repeat_end(self, now: float, event: Event, row: Received) -> None:
-        self._at.end_tries += 1
-        self._journal.repeated("end of transfer", event, self._at.end_tries)
-        self._send(self._outgoing.end())
+    def _resend_end(self, row: Received) -> None:
+        self._repeat_end(Reason.LINK_BACK)
 
-    def _await_burst_end(self, now: float, event: Event, row: Received) -> None:
-        self._tx.drop_unstarted()
-        self._timer_at = now + BOOT_VERSION_BURST * self._timings.boot_version_spacing_s
-        self._report(now, event, row)
+    def _miss_end(self, row: Received) -> None:
+        is_announcing = self._at.announced_at is not None
+        self._timeouts += not is_announcing
+        if not is_announcing and self._at.end_tries < self._timings.end_tries:
+            self._repeat_end(Reason.END_UNANSWERED)
+        elif self._version_item is None:
+            self._end(Ending.UNCONFIRMED, row)
+        else:
+            self._go(State.CONFIRMING)
+            self._run.listen(self._version_item.can_id)
+            self._query_version(row)
 
-    def _query_version(self, now: float, event: Event, row: Received) -> None:
-        self._send(self._outgoing.version_query())
+    def _complete(self, row: Received) -> None:
+        was_told = self._at.end_copies_left > 0
+        self._end(Ending.COMPLETED if was_told else Ending.BROKEN_PROTOCOL, row)
 
-    def _send(self, message: Outgoing, not_before: float = 0.0) -> None:
-        self._timer_at = None  # it starts when the message has left
-        frames, command, wire_s = message
-        self._tx.queue(frames, wire_s=wire_s, not_before=not_before, tag=command)
+    def _take_boot_after_end(self, boot: BootVersion) -> None:
+        """A burst is the new application starting; a device that announces on did not accept.
 
-    def _after_packet_gap(self, now: float) -> float:
-        gap_s = self._options.packet_gap_s
-        return now + gap_s if gap_s else 0.0
+        Judged by time, not by count: a doubled frame must not erase a good image.
+        """
+        at, now, spacing_s = self._at, self._run.now, self._timings.boot_version_spacing_s
+        if not at.end_copies_left and not self._tx.begun:
+            # It announces itself before it can have heard of the end.
+            self._restarted(boot, Reason.RESTARTED)
+            return
+        if at.announced_at is None or now - at.announced_last_at > BOOT_VERSION_BURST * spacing_s:
+            at.announced_at = now
+        at.announced_last_at = now
+        if now - at.announced_at >= self._timings.announcing_on_s:
+            self._run.listen()
+            self._restarted(boot, Reason.RESTARTED)
+        elif self.state is State.ENDING:
+            self._tx.drop_unstarted()
+            self._timer_at = now + BOOT_VERSION_BURST * spacing_s
+            self._report(boot, "boot version after end of transfer")
 
-    # -- the end ----------------------------------------------------------------------------------
+    def _query_version(self, row: Received) -> None:
+        request = self._options.version_request_for(self._plan.target)
+        if request is None:
+            raise RuntimeError("the table asks for a version that nobody can be asked for")
+        query = catalogue.encode(request.item, request.content)
+        self._timer_at = inf
+        self._run.send(split(query.can_id, encode(query)), tag=Command.READ_VERSION)
 
-    def _end(self, ending: Ending, detail: str, now: float) -> None:
+    def _miss_version(self, row: Received) -> None:
+        asked_s = self._run.now - self._state_since
+        if asked_s >= self._timings.application_start_timeout_s:
+            self._end(Ending.UNCONFIRMED, row)
+        else:
+            self._query_version(row)
+
+    def _judge_version(self, answer: Content) -> None:
+        running, expected = firmware_version(answer), self._plan.image.version
+        self._at.running_version = running
+        if expected is None:
+            self._end(Ending.UNCONFIRMED, answer)
+        elif running == expected:
+            self._end(Ending.CONFIRMED_BY_VERSION, answer)
+        else:
+            self._end(Ending.OTHER_VERSION, answer, f"{running} instead of {expected}")
+
+    # -- the end ---------------------------------------------------------------------------------
+
+    def _end_broken(self, row: Received) -> None:
+        self._end(Ending.BROKEN_PROTOCOL, row)
+
+    def _end_for_second_tool(self, row: Received) -> None:
+        self._end(Ending.SECOND_TOOL, row, self._second_tool)
+
+    def _end_out_of_time(self, row: Received) -> None:
+        self._end(Ending.OUT_OF_TIME, row)
+
+    def _end_cancelled(self, row: Received) -> None:
+        self._end(Ending.CANCELLED, row)
+
+    def _end(self, ending: Ending, row: Received, detail: str = "") -> None:
+        """End as soon as a message that is half sent has left; device text is escaped."""
+        if isinstance(row, BootVersion):
+            detail = f"boot version {printable(row.name)!r} {printable(row.version)!r}"
+        elif ending is Ending.PACKET_FAILED and self._nak_next_seen:
+            detail = "it answers NAK n+1 to a repeated n; --nak-next-is-ack takes that for an ACK"
+        elif ending is Ending.PACKET_FAILED and self._phase is not Phase.TRANSFER:
+            detail = "and no boot version came after it"
         self._ending = (ending, detail)
-        self._timer_at = None
+        self.state = State.STOPPING
         self._tx.drop_unstarted()
         self._tx.hurry()
         if self._tx.idle:
-            self._finish(now)
+            self._finish()
 
-    def _finish(self, now: float) -> None:
+    def _finish(self) -> None:
         if self._ending is None:
             raise RuntimeError("stopping without an ending")
         ending, detail = self._ending
-        self._at.state = State.DONE
-        duration_s = now - (self._began_at or 0.0)
-        statistics = self._journal.statistics(self._at.attempt, duration_s)
-        self._outcome = conclude(ending, detail, self._plan, self._at, statistics)
+        self.state = State.DONE
+        phase, packet, boot = self._phase, self._packet, self._last_boot
+        if ending is Ending.PACKET_FAILED and packet is None:
+            # It failed in an earlier attempt, and the device did not come back for this one.
+            phase, packet = Phase.TRANSFER, self._failed_packet
+        self._outcome = Outcome(
+            ending=ending,
+            phase=phase,
+            device_left=_LEFT_SO.get(ending, self.device_left),
+            target=self._plan.target,
+            total_packets=self._plan.total_packets,
+            packet=packet,
+            boot_version=printable(f"{boot.name} {boot.version}") if boot else None,
+            running_version=self._at.running_version,
+            statistics=Statistics(
+                attempts=self._attempt,
+                packets_acknowledged=self._acknowledged,
+                repetitions=self._repetitions,
+                naks=self._naks,
+                timeouts=self._timeouts,
+                duration_s=self._run.now - self._began_at,
+                transfer_s=self._transfer_s,
+            ),
+            detail=detail,
+        )
 
-    _ACTIONS: ClassVar[Mapping[Action, Callable[[Upgrade, float, Event, Received], None]]] = {
-        Action.NOTHING: _nothing,
-        Action.REPORT: _report,
-        Action.SEND_RESET: _send_reset,
-        Action.AWAIT_BOOT: _await_boot,
-        Action.AWAIT_ERASE: _await_erase,
-        Action.AWAIT_REQUEST: _await_request,
-        Action.SEND_UPDATE: _send_update,
-        Action.START_OVER: _send_update,
-        Action.BEGIN_AGAIN: _send_reset,
-        Action.SEND_FIRST_PACKET: _send_first_packet,
-        Action.SEND_NEXT_PACKET: _send_next_packet,
-        Action.REPEAT_PACKET: _repeat_packet,
-        Action.AWAIT_QUIET: _await_quiet,
-        Action.SEND_END: _send_end,
-        Action.REPEAT_END: _repeat_end,
-        Action.AWAIT_BURST_END: _await_burst_end,
-        Action.QUERY_VERSION: _query_version,
-    }
+
+class Upgrade(Runner[Outcome]):
+    """One upgrade alone as an engine: nobody is asked before, nothing is verified after."""
+
+    def __init__(self, plan: Plan, options: UpgradeOptions | None = None) -> None:
+        chosen = options or UpgradeOptions()
+        super().__init__(
+            lambda _run: self._upgrade.stage(),
+            bitrate_bps=plan.bitrate_bps,
+            timings=chosen.timings,
+            frame_gap_s=chosen.frame_gap_s,
+        )
+        self._upgrade = UpgradeStage(self, plan, chosen)
+
+    @property
+    def outcome(self) -> Outcome:
+        """How it ended. Raises RuntimeError while it has not."""
+        return self.result
+
+    @property
+    def state(self) -> State:
+        """The row of the table that is in force."""
+        return self._upgrade.state
+
+    def link_back(self, now: float) -> None:
+        """The adapter was lost and works again."""
+        self.now = now
+        self.interrupt(LinkBack())
+
+    def second_tool(self, seen: str, now: float) -> None:
+        """Somebody else sends what only the tool may send; `seen` says what was seen."""
+        self.now = now
+        self.interrupt(SecondTool(seen))

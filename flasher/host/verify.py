@@ -1,15 +1,14 @@
-"""What "verified" means after an upgrade, and the machines that find it out.
+"""What "verified" means after an upgrade, and the stages that find it out.
 
 `version`: the new application answers, and names the version that the image names. `memory`: every
-byte of the image is read back. Both are machines like all others; `session` runs them.
+byte of the image is read back.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final
+from typing import Any, Final
 
 from flasher import events
 from flasher.errors import (
@@ -21,15 +20,10 @@ from flasher.errors import (
 )
 from flasher.host.options import UpgradeOptions, firmware_version
 from flasher.host.outcome import DeviceLeft
-from flasher.host.query import Query, Request
-from flasher.host.read import READ_MEMORY, memory_requests, piece_of
+from flasher.host.query import READ_MEMORY, Query, ask, memory_requests, piece_of
+from flasher.host.runner import Runner, Stage
 from flasher.image.plan import Plan
-from flasher.protocol.contents import (
-    MEMORY_PIECE_SIZE,
-    Memory,
-)
-from flasher.protocol.fields import Content
-from flasher.protocol.frame import Frame
+from flasher.protocol.contents import Memory, ReadMemory
 from flasher.protocol.spec import Target
 
 
@@ -150,169 +144,75 @@ def check_level(plan: Plan, level: Level, options: UpgradeOptions | None = None)
         )
 
 
-class Check:
-    """A machine that asks one query after another until it knows its verdict; an engine."""
-
-    def __init__(self, plan: Plan, options: UpgradeOptions) -> None:
-        self._plan = plan
-        self._options = options
-        self._timings = options.timings
-        self._began_at: float | None = None
-        self._query: Query | None = None
-        self._events: list[object] = []
-        self._cancelled = False
-        self.verification: Verification | None = None
-
-    # -- what the two checks differ in -----------------------------------------------------------
-
-    level = Level.NONE
-
-    def _first(self) -> Request:
-        raise NotImplementedError
-
-    def _judge(self, answer: Content | None, now: float) -> Request | None:
-        """The next request, or None after `_conclude`."""
-        raise NotImplementedError
-
-    def _conclude(self, verdict: Verdict, version: str | None = None, detail: str = "") -> None:
-        self.verification = Verification(self.level, verdict, version, detail)
-
-    # -- the engine interface --------------------------------------------------------------------
-
-    @property
-    def done(self) -> bool:
-        """True when the verdict is known."""
-        return self.verification is not None
-
-    def receive(self, frame: Frame, now: float) -> None:
-        """A CAN frame arrived."""
-        if self._query is not None:
-            self._query.receive(frame, now)
-            self._go_on(now)
-
-    def tick(self, now: float) -> None:
-        """The time that `deadline` asked for has come."""
-        if self._began_at is None:
-            self._began_at = now
-            self._ask(self._first())
-        if self._query is not None:
-            self._query.tick(now)
-            self._go_on(now)
-
-    def deadline(self) -> float | None:
-        """When it next wants `tick`; at once before the beginning."""
-        if self._query is None:
-            return 0.0 if not self.done else None
-        return self._query.deadline()
-
-    def next_frame(self, now: float) -> Frame | None:
-        """The next frame to send."""
-        return None if self._query is None else self._query.next_frame(now)
-
-    def frame_sent(self, now: float) -> None:
-        """The adapter has accepted it."""
-        if self._query is not None:
-            self._query.frame_sent(now)
-            self._go_on(now)
-
-    def cancel(self, now: float) -> None:
-        """End at the next message boundary."""
-        self._cancelled = True
-        if self._query is None:
-            self._conclude(Verdict.INTERRUPTED)
-        else:
-            self._query.cancel(now)
-            self._go_on(now)
-
-    def take_events(self) -> Sequence[object]:
-        """What happened since the last call."""
-        taken, self._events = self._events, []
-        return taken
-
-    def _ask(self, request: Request) -> None:
-        self._query = Query(request, bitrate_bps=self._plan.bitrate_bps, timings=self._timings)
-
-    def _go_on(self, now: float) -> None:
-        query = self._query
-        if query is None or not query.done:
-            return
-        self._query = None
-        if self._cancelled and query.answer is None:
-            self._conclude(Verdict.INTERRUPTED)
-            return
-        following = self._judge(query.answer, now)
-        if following is None:
-            return
-        if self._cancelled:
-            self._conclude(Verdict.INTERRUPTED)
-            return
-        self._ask(following)
-        self.tick(now)
+def version_check(plan: Plan, options: UpgradeOptions) -> Runner[Verification]:
+    """An engine that waits for the new application and asks for its version."""
+    return Runner(
+        lambda run: check_version(run, plan, options),
+        bitrate_bps=plan.bitrate_bps,
+        timings=options.timings,
+    )
 
 
-class VersionCheck(Check):
-    """Waits for the new application and asks for its version."""
-
-    level = Level.VERSION
-
-    def _first(self) -> Request:
-        request = self._options.version_request_for(self._plan.target)
-        if request is None:
-            raise ValueError("nobody knows how to ask this target for its version")
-        return request
-
-    def _judge(self, answer: Content | None, now: float) -> Request | None:
-        if answer is None:
-            began_at = now if self._began_at is None else self._began_at
-            if now - began_at < self._timings.application_start_timeout_s:
-                return self._first()
-            self._conclude(Verdict.NO_ANSWER)
-            return None
-        version = firmware_version(answer)
-        expected = self._plan.image.version
-        if expected is None:
-            self._conclude(Verdict.VERSION_UNJUDGED, version)
-        elif version == expected:
-            self._conclude(Verdict.VERSION_RIGHT, version)
-        else:
-            self._conclude(Verdict.VERSION_OTHER, version, f"{version} instead of {expected}")
-        return None
+def memory_check(
+    plan: Plan, options: UpgradeOptions, running_version: str | None
+) -> Runner[Verification]:
+    """An engine that reads the whole image back. Raises ValueError for one without a base."""
+    if plan.image.base is None:
+        raise ValueError("an image without a base cannot be read back")
+    return Runner(
+        lambda run: check_memory(run, plan, running_version),
+        bitrate_bps=plan.bitrate_bps,
+        timings=options.timings,
+    )
 
 
-class MemoryCheck(Check):
-    """Reads the whole image back and compares it. The image needs a base."""
+def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stage[Verification]:
+    """Wait for the new application and ask for its version. Raises ValueError when nobody knows how
+    to ask this target.
+    """
+    request = options.version_request_for(plan.target)
+    if request is None:
+        raise ValueError("nobody knows how to ask this target for its version")
+    give_up_at = run.now + run.timings.application_start_timeout_s
+    while True:
+        query = yield from ask(run, Query(request, quiet=True))
+        if query.answer is not None:
+            break
+        if run.is_cancelled:
+            return Verification(Level.VERSION, Verdict.INTERRUPTED)
+        if run.now >= give_up_at:
+            return Verification(Level.VERSION, Verdict.NO_ANSWER)
+    version = firmware_version(query.answer)
+    expected = plan.image.version
+    if expected is None:
+        return Verification(Level.VERSION, Verdict.VERSION_UNJUDGED, version)
+    if version == expected:
+        return Verification(Level.VERSION, Verdict.VERSION_RIGHT, version)
+    detail = f"{version} instead of {expected}"
+    return Verification(Level.VERSION, Verdict.VERSION_OTHER, version, detail)
 
-    level = Level.MEMORY
 
-    def __init__(self, plan: Plan, options: UpgradeOptions, running_version: str | None) -> None:
-        super().__init__(plan, options)
-        if plan.image.base is None:
-            raise ValueError("an image without a base cannot be read back")
-        self._base = plan.image.base
-        self._offset = 0
-        self._running_version = running_version
+def check_memory(run: Runner[Any], plan: Plan, running_version: str | None) -> Stage[Verification]:
+    """Read the whole image back and compare it. The image has a base."""
+    data, base = plan.image.data, plan.image.base or 0
 
-    def _first(self) -> Request:
-        end = self._base + self._plan.image.size_bytes
-        return next(memory_requests(self._base + self._offset, end))
+    def found(verdict: Verdict, detail: str = "") -> Verification:
+        return Verification(Level.MEMORY, verdict, running_version, detail)
 
-    def _judge(self, answer: Content | None, now: float) -> Request | None:
-        data = self._plan.image.data
-        where = f"at 0x{self._base + self._offset:08X}"
-        if not isinstance(answer, Memory):
-            self._conclude(Verdict.NO_ANSWER, self._running_version, f"to a memory read {where}")
-            return None
-        expected = data[self._offset : self._offset + MEMORY_PIECE_SIZE]
-        got = piece_of(answer)
+    for request in memory_requests(base, base + len(data)):
+        query = yield from ask(run, Query(request, quiet=True))
+        if query.answer is None and run.is_cancelled:
+            return Verification(Level.MEMORY, Verdict.INTERRUPTED)
+        assert isinstance(request.content, ReadMemory)  # noqa: S101  as memory_requests makes them
+        start, end = request.content.start, request.content.end
+        if not isinstance(query.answer, Memory):
+            return found(Verdict.NO_ANSWER, f"to a memory read at 0x{start:08X}")
+        expected, got = data[start - base : end - base], piece_of(query.answer)
         if got != expected:
             at = next(index for index, byte in enumerate(expected) if got[index] != byte)
-            address = self._base + self._offset + at
-            detail = f"first at 0x{address:08X}: {got[at]:02X} instead of {expected[at]:02X}"
-            self._conclude(Verdict.MEMORY_OTHER, self._running_version, detail)
-            return None
-        self._offset += len(expected)
-        self._events.append(events.MemoryRead(self._offset, len(data)))
-        if self._offset >= len(data):
-            self._conclude(Verdict.MEMORY_RIGHT, self._running_version)
-            return None
-        return self._first()
+            detail = f"first at 0x{start + at:08X}: {got[at]:02X} instead of {expected[at]:02X}"
+            return found(Verdict.MEMORY_OTHER, detail)
+        run.tell(events.MemoryRead(end - base, len(data)))
+        if run.is_cancelled and end - base < len(data):
+            return Verification(Level.MEMORY, Verdict.INTERRUPTED)
+    return found(Verdict.MEMORY_RIGHT)

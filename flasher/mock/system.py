@@ -14,7 +14,6 @@ from flasher.mock.machine import Machine, Unit
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.talkers import Talker
-from flasher.protocol.echoes import Echoes
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, TARGETS, WELLING, Dialect, Node, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
@@ -72,8 +71,6 @@ class System:
         self._battery = self.members[Node.BMS]
         self._turns = list(self.members.values())
         self._sending: Machine | None = None
-        self._echoes = Echoes()
-        """The members have heard each other's frames when an adapter gives them back."""
 
     # -- the bicycle ------------------------------------------------------------------------------
 
@@ -111,8 +108,8 @@ class System:
 
     def receive(self, frame: Frame, now: float) -> None:
         """A frame arrived from outside, or is the adapter's echo of one of its own."""
-        if self._echoes.take(frame, now):
-            return
+        if frame.is_echo:
+            return  # the members have heard it already
         for member in self._turns:
             member.receive(frame, now)
 
@@ -148,7 +145,6 @@ class System:
         if sender is None or frame is None:
             return
         sender.frame_sent(now)
-        self._echoes.sent(frame, now)
         self._turns.remove(sender)
         for member in self._turns:
             member.receive(frame, now)

@@ -127,6 +127,12 @@ class Transmitter:
         if self._sent_frames:
             self.due_at = 0.0
 
+    def all_left(self, now: float) -> None:
+        """What was sent has left by `now`, since it was answered: a bus in one computer is faster
+        than the bit rate says.
+        """
+        self.left_at = min(self.left_at, now)
+
     def abandon(self, quiet_until: float) -> None:
         """Forget everything, a message that is half sent included; what is queued from now on waits
         until `quiet_until`, so that the receiver drops the half (R12).

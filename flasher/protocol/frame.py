@@ -16,10 +16,12 @@ class Frame(NamedTuple):
     is_extended: bool = False
     is_remote: bool = False
     is_error: bool = False
+    is_echo: bool = False
+    """It is one's own, given back by the adapter when it had left; the link marks it."""
 
     @property
     def is_payload(self) -> bool:
         """True for a classic data frame with at least one byte: the only kind that carries the
         protocol.
         """
-        return not (self.is_extended or self.is_remote or self.is_error) and bool(self.data)
+        return not (self[2] or self[3] or self[4]) and bool(self[1])

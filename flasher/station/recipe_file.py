@@ -20,7 +20,7 @@ from flasher.errors import Fault, FlasherError, UsageError
 from flasher.files import TOML_MAX_SIZE, opened, read
 from flasher.host.identity import judge_bytes
 from flasher.host.items import Readable, find, meaningful_fields, readable
-from flasher.host.read import READ_MEMORY
+from flasher.host.query import READ_MEMORY
 from flasher.host.write import WritePlan, plan_write
 from flasher.image.image import Image
 from flasher.image.load import FILE_MAX_SIZE, load

@@ -17,7 +17,7 @@ from flasher.host.identity import Finding, judge_device
 from flasher.host.options import firmware_version
 from flasher.host.outcome import DeviceLeft
 from flasher.host.session import Result
-from flasher.host.verify import Level, MemoryCheck, Verdict
+from flasher.host.verify import Level, Verdict, memory_check
 from flasher.host.write import WritePlan
 from flasher.protocol.fields import Content
 from flasher.station import codes
@@ -349,14 +349,12 @@ class UnitSteps:
             if isinstance(event, events.MemoryRead):
                 self._progress(event.read_bytes / event.total_bytes)
 
-        check = MemoryCheck(target.plan, target.options(), running)
+        check = memory_check(target.plan, target.options(), running)
         target.run(check, hear)
-        found = check.verification
-        if found is None or not found.ok:
-            verdict = Verdict.INTERRUPTED if found is None else found.verdict
-            detail = "" if found is None else found.detail
-            code = _OF_VERDICT.get(verdict, codes.MEMORY_DIFFERS)
-            raise StepFailedError(code, f"{name}: {verdict.value} {detail}".strip())
+        found = check.result
+        if not found.ok:
+            code = _OF_VERDICT.get(found.verdict, codes.MEMORY_DIFFERS)
+            raise StepFailedError(code, f"{name}: {found.verdict.value} {found.detail}".strip())
         return Verified.MEMORY
 
     def _completed(self, target: UnitTarget) -> Verified:

@@ -12,7 +12,7 @@ from typing import Final
 from flasher.api import Connection, release_checked, release_options
 from flasher.driver import Tap
 from flasher.errors import InterruptedByUserError, NoAnswerError
-from flasher.host.identify import Identify
+from flasher.host.identify import identify
 from flasher.host.identity import Seen
 from flasher.host.items import Readable, meaningful_fields
 from flasher.host.options import UpgradeOptions
@@ -107,9 +107,10 @@ class UnitTarget:
         return self._identify_once()
 
     def _identify_once(self) -> Identified:
-        asked = Identify(self.plan, self.options())
+        asking = identify(self.plan, self.options())
         before = self.watcher.announcements
-        self.run(asked)
+        self.run(asking)
+        asked = asking.result
         announced = asked.heard is not None or self.watcher.announcements > before
         return Identified(asked.seen, announced, len(asked.answers))
 

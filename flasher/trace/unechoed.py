@@ -7,7 +7,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from flasher.protocol.echoes import Echoes
 from flasher.protocol.frame import Frame
 
 
@@ -18,19 +17,14 @@ class _Tap(Protocol):
 
 
 class Unechoed:
-    """A driver's tap. `taps` is asked at each frame: more of them may come later. A second copy of
-    an echo goes through: nobody knows whose it is.
-    """
+    """A driver's tap. `taps` is asked at each frame: more of them may come later."""
 
     def __init__(self, taps: Callable[[], Sequence[_Tap]]) -> None:
         self._taps = taps
-        self._echoes = Echoes()
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         """Hand on one frame, unless it is an echo."""
-        if sent:
-            self._echoes.sent(frame, now)
-        elif self._echoes.take(frame, now):
+        if frame.is_echo:
             return
         for tap in self._taps():
             tap(frame, sent=sent, now=now)

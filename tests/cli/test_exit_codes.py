@@ -11,7 +11,7 @@ import pytest
 
 from flasher.bus.simulated import SimulatedLink
 from flasher.errors import ExitCode, TransmitBlockedError
-from flasher.host.upgrade import Upgrade
+from flasher.host.upgrade import UpgradeStage
 from flasher.protocol.frame import Frame
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.stage import IMAGE, SMALL, Speaker, Stage
@@ -59,7 +59,7 @@ def bug(scene: Scene) -> Words:
     def broken(*_arguments: object) -> None:
         raise ZeroDivisionError("injected")
 
-    scene.patch.setattr(Upgrade, "_send_packet", broken)
+    scene.patch.setattr(UpgradeStage, "_send_packet", broken)
     return scene.flash()
 
 

@@ -19,7 +19,7 @@ from flasher.cli.output import Output
 from flasher.cli.upgrade.progress import Progress, because
 from flasher.errors import BusError, ExitCode
 from flasher.events import Phase
-from flasher.host.table import TABLE, Action, Event
+from flasher.host.table import Reason
 from flasher.image.image import Image
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.processes import FLASHER, clean_environment
@@ -277,7 +277,7 @@ def test_verbosity_decides_how_much_is_said(
     show(
         Output(verbosity=verbosity),
         *acknowledged(1, 2),
-        events.MessageRepeated("packet 3", Event.PACKET_REFUSED.value, 2),
+        events.MessageRepeated("packet 3", Reason.PACKET_REFUSED.value, 2),
         events.Reported("odd"),
         events.BytesDamaged(0x725, "bad CRC", b"\x01"),
         object(),
@@ -288,13 +288,7 @@ def test_verbosity_decides_how_much_is_said(
 
 
 def test_everything_that_is_sent_again_has_a_sentence() -> None:
-    again = {Action.START_OVER, Action.BEGIN_AGAIN, Action.REPEAT_PACKET, Action.REPEAT_END}
-    reasons = {
-        event.value
-        for row in TABLE.values()
-        for event, transition in row.items()
-        if transition.action in again
-    }
+    reasons = {reason.value for reason in Reason}
     assert len(reasons) >= 9
     assert {reason for reason in reasons if because(reason, "packet 3") == reason} == set()
 

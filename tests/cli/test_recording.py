@@ -215,7 +215,7 @@ def test_the_echoes_of_an_adapter_are_in_neither_trace_nor_bundle_nor_figures(
             for tap in record.taps:
                 tap(frame, sent=is_own, now=now)
                 if is_own:
-                    tap(frame, sent=False, now=now + 0.0001)
+                    tap(frame._replace(is_echo=True), sent=False, now=now + 0.0001)
         link = record.link_report()
         record.failed(NoAnswerError("x"))
     assert link is not None

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from flasher import events
-from flasher.host.guard import DOUBLE_LIMIT_S, Foreign, Guard
-from flasher.protocol.echoes import ECHO_LIMIT_S
+from flasher.bus.echoes import DOUBLE_LIMIT_S, ECHO_LIMIT_S, Echoes
+from flasher.host.guard import Foreign, Guard
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
@@ -16,15 +16,26 @@ OWN = [Frame(0x752, bytes([number] * 8)) for number in range(18)]
 OTHER = Frame(0x752, bytes.fromhex("55AA160742055245"))
 
 
-def guard(target: Target = BMS) -> Guard:
-    return Guard(target, DEFAULT_TIMINGS)
+class MarkedGuard(Guard):
+    """A guard behind a link that marks the echoes of what it has sent."""
+
+    def __init__(self, target: Target) -> None:
+        super().__init__(target, DEFAULT_TIMINGS)
+        self.link = Echoes()
+
+    def see(self, frame: Frame, now: float) -> Foreign | None:
+        return super().see(self.link.mark(frame, now), now)
 
 
-def sent(frames: list[Frame]) -> Guard:
-    """A guard that knows of these frames, sent at 0.5 ms intervals from 1.0 on."""
+def guard(target: Target = BMS) -> MarkedGuard:
+    return MarkedGuard(target)
+
+
+def sent(frames: list[Frame]) -> MarkedGuard:
+    """A guard whose link knows of these frames, sent at 0.5 ms intervals from 1.0 on."""
     made = guard()
     for number, frame in enumerate(frames):
-        made.sent(frame, 1.0 + number * 0.0005)
+        made.link.sent(frame, 1.0 + number * 0.0005)
     return made
 
 
@@ -51,7 +62,7 @@ def test_echoes_that_come_twice_are_nobody() -> None:
 def test_the_same_frame_sent_again_has_its_own_echo() -> None:
     made = guard()
     for time in (1.0, 1.2, 1.4):
-        made.sent(OWN[0], time)
+        made.link.sent(OWN[0], time)
         assert made.see(OWN[0], time + 0.001) is None
 
 
@@ -70,21 +81,21 @@ def test_nothing_sent_at_all_and_somebody_speaks() -> None:
 @pytest.mark.parametrize("late_s", [ECHO_LIMIT_S + 0.01, 60.0])
 def test_what_was_sent_long_ago_is_no_echo_any_more(late_s: float) -> None:
     made = guard()
-    made.sent(OWN[0], 1.0)
+    made.link.sent(OWN[0], 1.0)
     assert made.see(OWN[0], 1.0 + late_s) is not None
 
 
 def test_what_an_adapter_held_while_it_was_off_the_bus_is_an_echo_when_it_is_back() -> None:
     """A kernel's queue keeps the frames, and sends them when the controller has restarted."""
     made = sent(OWN)
-    made.link_back(3.0)
+    made.link.held_up(3.0)
     assert all(made.see(frame, 3.1) is None for frame in OWN)
     assert made.see(OWN[0], 3.3) is not None
 
 
 def test_a_second_copy_counts_as_an_echo_for_a_moment_only() -> None:
     made = guard()
-    made.sent(OWN[0], 1.0)
+    made.link.sent(OWN[0], 1.0)
     assert made.see(OWN[0], 1.001) is None
     assert made.see(OWN[0], 1.001 + DOUBLE_LIMIT_S / 2) is None
     assert made.see(OWN[0], 1.002 + DOUBLE_LIMIT_S) is not None

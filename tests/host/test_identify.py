@@ -7,6 +7,7 @@ import pytest
 from flasher.host.identify import LISTEN_FIRST_S, LISTENS_ON_S, Identify
 from flasher.host.options import UpgradeOptions
 from flasher.host.query import Request
+from flasher.host.runner import Runner
 from flasher.image.plan import plan
 from flasher.protocol import catalogue
 from flasher.protocol.bittime import frame_bits
@@ -33,7 +34,9 @@ class Asked:
 
     def __init__(self, target: Target = BMS, options: UpgradeOptions | None = None) -> None:
         planned = plan(image_of(300), target, WELLING.bitrate_bps)
-        self.engine = Identify(planned, options or UpgradeOptions())
+        chosen = options or UpgradeOptions()
+        self.told = Identify(planned, chosen)
+        self.engine = Runner(self.told.stage, bitrate_bps=planned.bitrate_bps)
         self.now = 10.0 - LISTEN_FIRST_S
         self.commands: list[int] = []
         self._wire = Reassembler(target.request_id, 1.0)
@@ -83,11 +86,11 @@ def test_a_battery_is_asked_for_its_version_and_its_state_and_no_more() -> None:
     asked.run(asked.now + LISTENS_ON_S)
     assert asked.engine.done
     assert asked.commands == [0x3300, 0x3400]
-    assert asked.engine.seen.version == version()
-    assert asked.engine.seen.running == BATTERY
-    assert asked.engine.seen.hardware_version == "V1r2r0_20220512"
-    assert asked.engine.seen.firmware_version == "V1r0r0_20220512"
-    assert asked.engine.answers == [version()]
+    assert asked.told.seen.version == version()
+    assert asked.told.seen.running == BATTERY
+    assert asked.told.seen.hardware_version == "V1r2r0_20220512"
+    assert asked.told.seen.firmware_version == "V1r0r0_20220512"
+    assert asked.told.answers == [version()]
 
 
 @pytest.mark.parametrize("target", [WMC, OBC])
@@ -97,14 +100,14 @@ def test_who_has_no_query_is_not_asked(target: Target) -> None:
     asked.run(10.0)
     assert asked.engine.done
     assert asked.engine.next_frame(10.0) is None
-    assert asked.engine.seen.version is None
+    assert asked.told.seen.version is None
 
 
 def test_a_products_own_query_is_asked_too() -> None:
     """Here with the battery's own rows, sent to another target."""
     own = Request(catalogue.BY_KEY[(0x752, 0x3300)])
     asked = Asked(WMC, UpgradeOptions(version_request=own))
-    assert asked.engine.asks
+    assert asked.told.asks
 
 
 def test_silence_ends_it_after_a_second_and_the_rest_is_not_asked() -> None:
@@ -112,9 +115,9 @@ def test_silence_ends_it_after_a_second_and_the_rest_is_not_asked() -> None:
     asked.run(20.0)
     assert asked.engine.done
     assert set(asked.commands) == {0x3300}
-    assert asked.engine.seen.version is None
-    assert asked.engine.heard is None
-    assert not asked.engine.cancelled
+    assert asked.told.seen.version is None
+    assert asked.told.heard is None
+    assert not asked.told.cancelled
 
 
 def test_an_announcement_ends_it_at_once() -> None:
@@ -122,7 +125,7 @@ def test_an_announcement_ends_it_at_once() -> None:
     asked.run(10.1)
     asked.hear(answer_frames(BootVersion("BMS", "V1.2.3")))
     assert asked.engine.done
-    assert asked.engine.heard is not None
+    assert asked.told.heard is not None
     assert asked.engine.next_frame(asked.now) is None
 
 
@@ -132,7 +135,7 @@ def test_an_announcement_while_it_listens_first_is_kept_until_it_has_listened() 
     assert asked.engine.deadline() is not None
     asked.run(10.0)
     assert asked.engine.done
-    assert asked.engine.heard is not None
+    assert asked.told.heard is not None
     assert asked.commands == []
 
 
@@ -159,9 +162,9 @@ def test_different_answers_are_kept_apart_and_equal_ones_are_one(other: Content)
     asked.run(10.01)
     asked.say(VERSION, version())
     asked.say(VERSION, version())
-    assert len(asked.engine.answers) == 1
+    assert len(asked.told.answers) == 1
     asked.say(VERSION, other)
-    assert asked.engine.answers == [version(), other]
+    assert asked.told.answers == [version(), other]
 
 
 def test_other_frames_on_its_ids_are_nothing() -> None:
@@ -170,11 +173,11 @@ def test_other_frames_on_its_ids_are_nothing() -> None:
     for can_id in (0x720, 0x725):
         asked.hear([Frame(can_id, b"\x05"), Frame(can_id, b"", is_remote=True)])
         asked.hear([Frame(can_id, b"\x55\xaa\x0c", is_extended=True)])
-    assert asked.engine.answers == []
-    assert asked.engine.heard is None
+    assert asked.told.answers == []
+    assert asked.told.heard is None
     asked.now = 10.2
     asked.say(VERSION, version())
-    assert asked.engine.answers == [version()]
+    assert asked.told.answers == [version()]
 
 
 def test_it_ends_at_the_end_of_the_message_when_it_is_cancelled() -> None:
@@ -184,7 +187,7 @@ def test_it_ends_at_the_end_of_the_message_when_it_is_cancelled() -> None:
     asked.engine.next_frame(asked.now)
     asked.engine.frame_sent(asked.now)
     asked.engine.cancel(asked.now)
-    assert asked.engine.cancelled
+    assert asked.told.cancelled
     assert not asked.engine.done
     asked.flush()
     asked.engine.tick(asked.now)

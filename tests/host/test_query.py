@@ -31,12 +31,17 @@ def frames(can_id: int, mode: int, command: int, data: bytes) -> list[Frame]:
 class Bench:
     """Drives an engine on virtual time and keeps what it sent, frame by frame with its time."""
 
-    def __init__(self, engine: Query | Queries, *, accepts: bool = True) -> None:
+    def __init__(self, engine: Queries, *, accepts: bool = True) -> None:
         self.engine = engine
         self.accepts = accepts
         self.now = 0.0
         self.sent: list[tuple[float, Frame]] = []
         self.events: list[object] = []
+
+    @property
+    def query(self) -> Query:
+        """The question that is asked."""
+        return self.engine.queries[-1]
 
     def run(self, until: float) -> None:
         """Let time pass."""
@@ -73,7 +78,7 @@ class Bench:
 
 def ask(item: Item = READ_VERSION, content: Content | None = None) -> Bench:
     request = Request(item) if content is None else Request(item, content)
-    return Bench(Query(request, bitrate_bps=RATE))
+    return Bench(Queries([request], bitrate_bps=RATE))
 
 
 # -- sending ---------------------------------------------------------------------------------------
@@ -96,8 +101,7 @@ def test_an_unanswered_question_is_repeated_every_200_ms_and_given_up_after_one_
     gaps = [later - earlier for earlier, later in itertools.pairwise(starts)]
     assert all(0.2 < gap < 0.202 for gap in gaps)  # it is timed from where the copy has left
     assert bench.over()
-    assert isinstance(bench.engine, Query)
-    assert bench.engine.answer is None
+    assert bench.query.answer is None
     assert bench.events[-1] == events.QueryUnanswered("read version information", 5)
 
 
@@ -113,8 +117,7 @@ def test_while_the_bus_takes_nothing_no_second_copy_is_made_and_it_still_ends() 
     bench = ask()
     bench.accepts = False
     bench.run(0.9)
-    assert isinstance(bench.engine, Query)
-    assert bench.engine.tries == 1
+    assert bench.query.tries == 1
     assert not bench.over()
     bench.run(1.1)
     assert bench.over()
@@ -130,8 +133,7 @@ def test_a_copy_that_waited_long_is_answered_in_a_full_second_after_it_left() ->
     assert not bench.over()
     assert bench.starts()[0] == pytest.approx(0.9, abs=0.02)
     bench.say(0x720, 0x0C, 0x1540, VERSION)
-    assert isinstance(bench.engine, Query)
-    assert isinstance(bench.engine.answer, contents.VersionInformation)
+    assert isinstance(bench.query.answer, contents.VersionInformation)
 
 
 def test_a_message_that_is_half_sent_at_the_end_is_finished_first() -> None:
@@ -162,9 +164,8 @@ def test_the_answer_ends_it_at_once() -> None:
     bench = ask()
     bench.run(0.05)
     bench.say(0x720, 0x0C, 0x1540, VERSION)
-    assert isinstance(bench.engine, Query)
     assert bench.over()
-    answer = bench.engine.answer
+    answer = bench.query.answer
     assert isinstance(answer, contents.VersionInformation)
     assert str(answer.serial_number) == "W2605001"
     assert bench.events == [events.QueryAnswered("read version information", answer, 1)]
@@ -188,8 +189,7 @@ def test_what_is_not_the_answer_is_not_taken_for_it(
     bench.run(0.05)
     bench.say(can_id, mode, command, data)
     bench.run(3.0)
-    assert isinstance(bench.engine, Query)
-    assert bench.engine.answer is None
+    assert bench.query.answer is None
     assert len(bench.starts()) == 5
 
 
@@ -197,9 +197,8 @@ def test_an_answer_of_another_length_is_kept_as_a_misfit() -> None:
     bench = ask()
     bench.run(0.05)
     bench.say(0x720, 0x0C, 0x1530, VERSION[:0x30])
-    assert isinstance(bench.engine, Query)
-    assert bench.engine.misfit is not None
-    assert (bench.engine.misfit.command, len(bench.engine.misfit.data)) == (0x1530, 48)
+    assert bench.query.misfit is not None
+    assert (bench.query.misfit.command, len(bench.query.misfit.data)) == (0x1530, 48)
 
 
 def test_a_damaged_answer_is_reported_and_the_question_repeated() -> None:
@@ -220,8 +219,7 @@ def test_an_answer_before_the_question_has_left_is_somebody_elses() -> None:
     bench.accepts = False
     bench.run(0.05)
     bench.say(0x720, 0x0C, 0x1540, VERSION)
-    assert isinstance(bench.engine, Query)
-    assert bench.engine.answer is None
+    assert bench.query.answer is None
 
 
 def test_a_memory_answer_counts_for_the_addresses_asked_only() -> None:
@@ -231,23 +229,21 @@ def test_a_memory_answer_counts_for_the_addresses_asked_only() -> None:
     bench.say(0x725, 0x0C, 0x5688, bytes.fromhex("80100000 00110000") + bytes(128))
     assert not bench.over()
     bench.say(0x725, 0x0C, 0x5688, bytes.fromhex("00100000 80100000") + b"\x11" * 128)
-    assert isinstance(bench.engine, Query)
-    assert isinstance(bench.engine.answer, contents.Memory)
-    assert bench.engine.answer.content == b"\x11" * 128
+    assert isinstance(bench.query.answer, contents.Memory)
+    assert bench.query.answer.content == b"\x11" * 128
 
 
 def test_the_caller_may_refuse_an_answer() -> None:
     request = Request(READ_RUNNING, accepts=lambda answer: answer.data()[0] != RUNNING[0])
-    bench = Bench(Query(request, bitrate_bps=RATE))
+    bench = Bench(Queries([request], bitrate_bps=RATE))
     bench.run(0.05)
     bench.say(0x720, 0x0C, 0x1010, RUNNING)
-    assert isinstance(bench.engine, Query)
-    assert bench.engine.answer is None
+    assert bench.query.answer is None
 
 
 def test_a_message_that_nothing_answers_cannot_be_asked() -> None:
     with pytest.raises(ValueError, match="no answer"):
-        Query(Request(BY_KEY[0x720, 0x1204]), bitrate_bps=RATE)
+        Queries([Request(BY_KEY[0x720, 0x1204])], bitrate_bps=RATE).tick(0.0)
 
 
 # -- repeated questions, and several ---------------------------------------------------------------
@@ -258,19 +254,18 @@ def write(text: bytes) -> Request:
 
 
 def test_after_a_repetition_it_waits_for_the_answers_to_both_copies() -> None:
-    bench = Bench(Query(write(b"ONE."), bitrate_bps=RATE))
+    bench = Bench(Queries([write(b"ONE.")], bitrate_bps=RATE))
     bench.run(0.25)
     assert len(bench.starts()) == 2
     bench.say(0x725, 0x0C, 0x5503, b"ACK")
-    assert isinstance(bench.engine, Query)
-    assert bench.engine.answer is not None
+    assert bench.query.answer is not None
     assert not bench.over()
     bench.say(0x725, 0x0C, 0x5503, b"ACK")
     assert bench.over()
 
 
 def test_it_waits_for_a_second_answer_50_ms_only() -> None:
-    bench = Bench(Query(write(b"ONE."), bitrate_bps=RATE))
+    bench = Bench(Queries([write(b"ONE.")], bitrate_bps=RATE))
     bench.run(0.25)
     bench.say(0x725, 0x0C, 0x5503, b"ACK")
     bench.run(0.29)
@@ -328,14 +323,14 @@ def test_cancelled_it_ends_and_asks_nothing_more() -> None:
     bench.run(0.05)
     engine.cancel(0.05)
     assert engine.done
-    assert engine.cancelled
+    assert engine.queries[-1].cancelled
     assert len(engine.queries) == 1
     bench.run(2.0)
     assert len(bench.starts()) == 1
 
 
 def test_cancelled_in_the_middle_of_a_message_it_finishes_that() -> None:
-    engine = Query(Request(READ_VERSION), bitrate_bps=RATE)
+    engine = Queries([Request(READ_VERSION)], bitrate_bps=RATE)
     bench = Bench(engine)
     engine.tick(0.0)
     engine.frame_sent(0.0)
@@ -343,7 +338,7 @@ def test_cancelled_in_the_middle_of_a_message_it_finishes_that() -> None:
     assert not bench.over()
     engine.frame_sent(0.001)
     assert bench.over()
-    assert engine.cancelled
+    assert engine.queries[-1].cancelled
 
 
 def test_nothing_to_ask_is_done_from_the_start() -> None:

@@ -112,7 +112,7 @@ def test_a_tool_that_is_heard_while_listening_is_not_disturbed_by_questions() ->
     assert engine.next_frame(1.0) is None
     assert engine.done
     assert engine.other_tool_heard
-    assert engine.queries == ()
+    assert engine.queries == []
 
 
 def test_damage_is_counted_and_nothing_is_made_of_it() -> None:
@@ -143,7 +143,7 @@ def test_the_echo_of_an_own_frame_is_no_other_tool_but_a_second_one_is() -> None
     frame = engine.next_frame(0.0)
     assert frame is not None
     engine.frame_sent(0.0)
-    engine.receive(frame, 0.001)
+    engine.receive(frame._replace(is_echo=True), 0.001)
     assert engine.heard == {}
     engine.receive(frame, 0.002)
     assert set(engine.heard) == {Node.CDL}

@@ -8,10 +8,10 @@ from flasher import events
 from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
-from flasher.host.query import Queries, Query, Request
+from flasher.host.query import Queries, Request
 from flasher.host.session import Session
 from flasher.host.table import State
-from flasher.host.verify import Level, MemoryCheck, VersionCheck
+from flasher.host.verify import Level, memory_check, version_check
 from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.protocol.catalogue import BY_KEY
@@ -59,13 +59,13 @@ def test_a_deadline_in_the_middle_of_a_message_lets_it_end() -> None:
 
 
 def test_a_query_that_is_done_does_nothing_more() -> None:
-    query = Query(VERSION, bitrate_bps=WELLING.bitrate_bps)
+    query = Queries([VERSION], bitrate_bps=WELLING.bitrate_bps)
     query.cancel(0.0)
     query.cancel(1.0)
     query.tick(2.0)
     query.receive(Frame(0x720, b"\x55\xaa"), 3.0)
     assert query.done
-    assert query.cancelled
+    assert query.queries[0].cancelled
     assert query.deadline() is None
     assert query.next_frame(4.0) is None
 
@@ -84,7 +84,7 @@ def test_queries_that_are_done_do_nothing_more() -> None:
 
 
 def test_a_check_that_is_done_does_nothing_more() -> None:
-    check = VersionCheck(PLAN, UpgradeOptions())
+    check = version_check(PLAN, UpgradeOptions())
     check.tick(0.0)
     check.cancel(0.0)
     check.tick(1.0)
@@ -118,7 +118,7 @@ def test_a_session_says_where_it_stands_in_the_upgrade_and_in_the_check() -> Non
 
 
 def test_a_memory_check_that_is_cancelled_between_two_pieces_asks_no_more() -> None:
-    check = MemoryCheck(PLAN, UpgradeOptions(), None)
+    check = memory_check(PLAN, UpgradeOptions(), None)
     check.tick(0.0)
     while check.next_frame(0.0) is not None:
         check.frame_sent(0.0)
@@ -127,11 +127,10 @@ def test_a_memory_check_that_is_cancelled_between_two_pieces_asks_no_more() -> N
     for frame in split(0x725, encode(Message(0x725, 0x0C, 0x5688, piece))):
         check.receive(frame, 0.02)
     assert check.done
-    assert check.verification is not None
-    assert not check.verification.ok
+    assert not check.result.ok
 
 
 def test_a_version_check_needs_somebody_to_ask() -> None:
     other = plan(Image.from_bytes(bytes(10)), WMC, WELLING.bitrate_bps)
     with pytest.raises(ValueError, match="nobody knows"):
-        VersionCheck(other, UpgradeOptions()).tick(0.0)
+        version_check(other, UpgradeOptions()).tick(0.0)

@@ -13,13 +13,15 @@ from flasher.bus.simulated import Disturbance, SimulatedBus
 from flasher.driver import drive
 from flasher.errors import ExitCode
 from flasher.host.options import UpgradeOptions
+from flasher.host.runner import Runner
 from flasher.host.session import Result, Session
 from flasher.host.verify import (
     Level,
-    MemoryCheck,
     Verdict,
-    VersionCheck,
+    Verification,
+    memory_check,
     possible_levels,
+    version_check,
 )
 from flasher.image.image import Image
 from flasher.image.plan import Plan, plan
@@ -140,7 +142,7 @@ def test_the_result_cannot_be_read_before_there_is_one() -> None:
 class Application:
     """Lets time pass for a check and answers what it asks."""
 
-    def __init__(self, check: VersionCheck | MemoryCheck) -> None:
+    def __init__(self, check: Runner[Verification]) -> None:
         self.check = check
         self.now = 50.0
         self.asked: list[Content] = []
@@ -186,12 +188,11 @@ def read_all(application: Application, data: bytes = BYTES) -> None:
 
 
 def test_the_memory_is_read_piece_by_piece_and_compared() -> None:
-    check = MemoryCheck(planned(), UpgradeOptions(), NEW)
+    check = memory_check(planned(), UpgradeOptions(), NEW)
     application = Application(check)
     read_all(application)
-    assert check.verification is not None
-    assert check.verification.verdict is Verdict.MEMORY_RIGHT
-    assert check.verification.running_version == NEW
+    assert check.result.verdict is Verdict.MEMORY_RIGHT
+    assert check.result.running_version == NEW
     ends = [question.end for question in application.asked if isinstance(question, ReadMemory)]
     assert ends == [BASE + 128, BASE + 256, BASE + len(BYTES)]
     progress = check.take_events()
@@ -202,19 +203,18 @@ def test_the_first_difference_is_named() -> None:
     other = bytearray(BYTES)
     other[200] ^= 0xFF
     other[250] ^= 0xFF
-    check = MemoryCheck(planned(), UpgradeOptions(), NEW)
+    check = memory_check(planned(), UpgradeOptions(), NEW)
     read_all(Application(check), bytes(other))
-    assert check.verification is not None
-    assert check.verification.verdict is Verdict.MEMORY_OTHER
+    assert check.result.verdict is Verdict.MEMORY_OTHER
     where = f"0x{BASE + 200:08X}: {other[200]:02X} instead of {BYTES[200]:02X}"
-    assert where in check.verification.detail
-    error = check.verification.error(BMS)
+    assert where in check.result.detail
+    error = check.result.error(BMS)
     assert error is not None
     assert error.exit_code == ExitCode.VERIFICATION
 
 
 def test_an_answer_for_another_address_is_not_taken() -> None:
-    check = MemoryCheck(planned(), UpgradeOptions(), NEW)
+    check = memory_check(planned(), UpgradeOptions(), NEW)
     application = Application(check)
     question = application.next_question()
     assert isinstance(question, ReadMemory)
@@ -222,48 +222,44 @@ def test_an_answer_for_another_address_is_not_taken() -> None:
     assert not check.done
     application.answer(MEMORY, memory(question))
     read_all(application)
-    verification = check.verification
-    assert verification is not None
+    verification = check.result
     assert verification.ok
 
 
 def test_memory_that_is_not_given_ends_in_bounded_time() -> None:
-    check = MemoryCheck(planned(), UpgradeOptions(), NEW)
+    check = memory_check(planned(), UpgradeOptions(), NEW)
     application = Application(check)
     while application.next_question() is not None:
         pass
-    assert check.verification is not None
-    assert check.verification.verdict is Verdict.NO_ANSWER
-    assert f"0x{BASE:08X}" in check.verification.detail
+    assert check.result.verdict is Verdict.NO_ANSWER
+    assert f"0x{BASE:08X}" in check.result.detail
     assert application.now < 50.0 + 2.0
 
 
 def test_an_image_without_a_base_cannot_be_read_back() -> None:
     with pytest.raises(ValueError, match="base"):
-        MemoryCheck(planned(Image.from_bytes(BYTES)), UpgradeOptions(), None)
+        memory_check(planned(Image.from_bytes(BYTES)), UpgradeOptions(), None)
 
 
 def test_an_application_that_starts_slowly_is_waited_for() -> None:
-    check = VersionCheck(planned(), UpgradeOptions())
+    check = version_check(planned(), UpgradeOptions())
     application = Application(check)
     while application.now < 53.0:
         assert application.next_question() is not None
     texts = [Text(encode_text(text, 16)) for text in ("BM36", "W1", "V1r0r0_20200101", NEW)]
     application.answer(VERSION, VersionInformation(*texts))
     application.next_question()
-    assert check.verification is not None
-    assert check.verification.verdict is Verdict.VERSION_RIGHT
+    assert check.result.verdict is Verdict.VERSION_RIGHT
 
 
 @pytest.mark.parametrize("asked", [True, False])
 def test_cancelling_a_check_says_that_the_upgrade_was_complete(*, asked: bool) -> None:
-    check = VersionCheck(planned(), UpgradeOptions())
+    check = version_check(planned(), UpgradeOptions())
     application = Application(check)
     if asked:
         application.next_question()
     check.cancel(application.now)
-    assert check.verification is not None
-    error = check.verification.error(BMS)
+    error = check.result.error(BMS)
     assert error is not None
     assert error.exit_code == ExitCode.INTERRUPTED
     assert "completed, but" in str(error)
@@ -271,7 +267,7 @@ def test_cancelling_a_check_says_that_the_upgrade_was_complete(*, asked: bool) -
 
 
 def test_frames_before_the_beginning_and_after_the_end_are_nothing_to_a_check() -> None:
-    check = VersionCheck(planned(), UpgradeOptions())
+    check = version_check(planned(), UpgradeOptions())
     check.receive(Frame(0x720, b"\x55\xaa"), 0.0)
     assert check.next_frame(0.0) is None
     check.cancel(0.0)

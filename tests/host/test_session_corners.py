@@ -12,11 +12,9 @@ from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.identity import Check, Identity, Seen, Verdict, judge_device
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import before_the_start
-from flasher.host.outgoing import OutgoingMessages
-from flasher.host.result import Result
-from flasher.host.session import Session
+from flasher.host.session import Result, Session
 from flasher.host.table import Ending, State
-from flasher.host.upgrade import Upgrade
+from flasher.host.upgrade import Upgrade, UpgradeStage
 from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.protocol.fields import Content, Text, TextField, field
@@ -98,15 +96,15 @@ def test_a_session_without_identity_asks_nobody_and_checks_nothing() -> None:
 
 def test_what_others_get_is_no_matter_of_the_guard() -> None:
     guard = Guard(BMS, DEFAULT_TIMINGS)
-    guard.sent(Frame(0x751, b"\x55\xaa"), 0.0)
     assert guard.see(Frame(0x751, b"\x55\xaa"), 0.0) is None
     assert guard.see(Frame(0x752, b"\x55\xaa"), 0.0) is not None
 
 
 def test_a_target_without_a_version_query_cannot_be_asked() -> None:
-    messages = OutgoingMessages(plan(IMAGE, WMC, WELLING.bitrate_bps), UpgradeOptions())
+    planned = plan(IMAGE, WMC, WELLING.bitrate_bps)
+    stage = UpgradeStage(Upgrade(planned), planned, UpgradeOptions())
     with pytest.raises(RuntimeError, match="nobody can be asked"):
-        messages.version_query()
+        stage._query_version(None)
 
 
 @dataclass(frozen=True)

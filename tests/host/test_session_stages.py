@@ -9,6 +9,7 @@ from dataclasses import replace
 import pytest
 
 from flasher import events
+from flasher.bus.echoes import Echoes
 from flasher.bus.health import LinkHealth
 from flasher.bus.simulated import SimulatedLink
 from flasher.errors import BusError, ExitCode
@@ -168,10 +169,12 @@ class Echoing:
         self._link, self._clock = link, stage.clock
         self._copies, self._delay_s = copies, delay_s
         self._echoes: deque[tuple[float, Frame]] = deque()
+        self._marks = Echoes()
         self._count = 0
 
     def send(self, frame: Frame) -> None:
         self._link.send(frame)
+        self._marks.sent(frame, self._clock.now())
         self._count += 1
         at = self._clock.now() + self._delay_s
         self._echoes.extend([(at, frame)] * self._copies(self._count))
@@ -180,7 +183,7 @@ class Echoing:
         until = min(deadline, self._echoes[0][0]) if self._echoes else deadline
         frame = self._link.receive(until)
         if frame is None and self._echoes and self._echoes[0][0] <= self._clock.now():
-            return self._echoes.popleft()[1]
+            return self._marks.mark(self._echoes.popleft()[1], self._clock.now())
         return frame
 
     def drain(self) -> int:

@@ -206,7 +206,7 @@ class _Echoed(System):
         frame = self.next_frame(now)
         super().frame_sent(now)
         if frame is not None:
-            self.receive(frame, now)
+            self.receive(frame._replace(is_echo=True), now)
 
 
 @pytest.mark.parametrize("dialect", DIALECTS)

@@ -39,7 +39,7 @@ def test_extended_remote_and_error_frames_stay_what_they_are(tmp_path: Path) -> 
         record(Frame(0x720, b"", is_remote=True), sent=False, now=0.1)
         record(Frame(0, bytes(8), is_error=True), sent=False, now=0.2)
     frames = [frame for _, frame in read_trace(path)]
-    assert [frame[2:] for frame in frames] == [
+    assert [frame[2:5] for frame in frames] == [
         (True, False, False),
         (False, True, False),
         (False, False, True),

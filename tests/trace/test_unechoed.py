@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from flasher.protocol.echoes import ECHO_LIMIT_S
+from flasher.bus.echoes import ECHO_LIMIT_S, Echoes
 from flasher.protocol.frame import Frame
 from flasher.trace.ring import FlightRecorder
 from flasher.trace.unechoed import Unechoed
@@ -12,10 +12,12 @@ ANSWER = Frame(0x725, b"\x02")
 
 
 def recorded(*frames: tuple[float, bool, Frame]) -> list[tuple[float, bool, Frame]]:
-    flight = FlightRecorder()
+    flight, link = FlightRecorder(), Echoes()
     tap = Unechoed(lambda: [flight])
     for now, sent, frame in frames:
-        tap(frame, sent=sent, now=now)
+        if sent:
+            link.sent(frame, now)
+        tap(frame if sent else link.mark(frame, now), sent=sent, now=now)
     return [(entry.at_s, entry.sent, entry.frame) for entry in flight]
 
 
@@ -25,7 +27,7 @@ def test_an_echo_is_left_out_and_everything_else_stays() -> None:
 
 
 def test_each_sent_frame_has_one_echo_a_further_copy_is_somebody_elses() -> None:
-    sent, copy = (1.0, True, OWN), (1.2, False, OWN)
+    sent, copy = (1.0, True, OWN), (1.3, False, OWN)
     assert recorded(sent, (1.1, False, OWN), copy) == [sent, copy]
     twice = [sent, (1.05, True, OWN)]
     assert recorded(*twice, (1.1, False, OWN), (1.2, False, OWN)) == twice

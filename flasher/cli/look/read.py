@@ -22,7 +22,7 @@ from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode, NoAnswerError, UsageError
 from flasher.events import QueryAnswered
 from flasher.host.items import find, meaningful_fields, readable
-from flasher.host.read import check_range, piece_of
+from flasher.host.query import check_range, piece_of
 from flasher.protocol.contents import Memory
 from flasher.protocol.fields import label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target

@@ -10,7 +10,7 @@ from typing import Any, Final, Self
 from flasher import events
 from flasher.cli.output import Output
 from flasher.cli.terminal import painted
-from flasher.host.table import Event
+from flasher.host.table import Reason
 from flasher.image.plan import Plan
 from flasher.prose import prose, prose_of
 from flasher.protocol.spec import PACKET_DATA_SIZE
@@ -36,18 +36,18 @@ SHOWN: Final = frozenset(
 
 
 _BECAUSE: Final = {
-    Event.PACKET_REFUSED.value: "the device refused {what}",
-    Event.PACKET_UNANSWERED.value: "the device did not answer {what} in time",
-    Event.PACKET_GIVEN_UP.value: "the device did not take a packet, however often it was sent",
-    Event.REQUEST_AGAIN.value: "the device requested the transfer once more",
-    Event.REQUEST_LATE.value: "the device requested the transfer anew in the middle of it",
-    Event.BOOT_RESTARTED.value: "the device restarted",
-    Event.BOOT_GIVEN_UP.value: "the device did not announce its bootloader",
-    Event.BOOT_SILENT.value: "the device neither answered the reset nor announced its bootloader",
-    Event.REQUEST_GIVEN_UP.value: "the device did not request the transfer in time",
-    Event.END_NAK.value: "the device refused the {what}",
-    Event.END_UNANSWERED.value: "the device did not answer the {what} in time",
-    Event.LINK_BACK.value: "the adapter was away for a while",
+    Reason.PACKET_REFUSED.value: "the device refused {what}",
+    Reason.PACKET_UNANSWERED.value: "the device did not answer {what} in time",
+    Reason.PACKET_GIVEN_UP.value: "the device did not take a packet, however often it was sent",
+    Reason.REQUEST_AGAIN.value: "the device requested the transfer once more",
+    Reason.REQUEST_LATE.value: "the device requested the transfer anew in the middle of it",
+    Reason.RESTARTED.value: "the device restarted",
+    Reason.BOOT_GIVEN_UP.value: "the device did not announce its bootloader",
+    Reason.BOOT_SILENT.value: "the device neither answered the reset nor announced its bootloader",
+    Reason.REQUEST_GIVEN_UP.value: "the device did not request the transfer in time",
+    Reason.END_REFUSED.value: "the device refused the {what}",
+    Reason.END_UNANSWERED.value: "the device did not answer the {what} in time",
+    Reason.LINK_BACK.value: "the adapter was away for a while",
 }
 """Why something is sent again, for people, by the engine's name for it."""
 

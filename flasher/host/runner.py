@@ -1,0 +1,231 @@
+"""Runs what the host does with a device: stages that wait for the wire or for a time; pure.
+
+A stage is a generator. It yields until when it waits (None: for ever), and is sent what came:
+
+    def ask_for_version(run: Runner) -> Stage[Message | None]:
+        run.listen(0x720)
+        run.send(frames)
+        came = yield run.now + 1.0
+        return came if isinstance(came, Message) else None
+
+Stages go together by `yield from`. `Runner` is the engine (`flasher.protocol.engine`) around the
+outermost one: the only place where frames become messages and a deadline is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from enum import Enum
+from math import inf
+from typing import Generic, TypeVar
+
+from flasher.events import BytesDamaged
+from flasher.protocol.engine import Transmitter
+from flasher.protocol.frame import Frame
+from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
+from flasher.protocol.wire import Damage, Message, Reassembler
+
+
+class Signal(Enum):
+    """What a stage is sent beside messages and damage."""
+
+    TIME = "the time that it waited for has come"
+    LEFT = "the last frame of a message has left"
+    CANCEL = "it is to end at the next message boundary"
+
+
+T = TypeVar("T")
+Came = Message | Damage | Signal
+Stage = Generator[float | None, Came, T]
+
+
+class Runner(Generic[T]):
+    """An engine that runs one stage from its first `tick` to its result."""
+
+    def __init__(
+        self,
+        stage: Callable[[Runner[T]], Stage[T]],
+        *,
+        bitrate_bps: int,
+        timings: Timings = DEFAULT_TIMINGS,
+        frame_gap_s: float = 0.0,
+    ) -> None:
+        self.timings = timings
+        self.bitrate_bps = bitrate_bps
+        self.tx = Transmitter(bitrate_bps, frame_gap_s)
+        self.next_frame: Callable[[float], Frame | None] = self.tx.next_frame
+        """The next frame to send."""
+        self.now = 0.0
+        """The time of what happens."""
+        self.is_cancelled = False
+        """It was asked to end before its end."""
+        self.limit_at = inf
+        """When it is cancelled if it has not ended."""
+        self.watch: Callable[[Frame], bool] | None = None
+        """Sees every frame; what it returns True for is not heard by the stage."""
+        self._make_stage = stage
+        self._stage: Stage[T] | None = None
+        self._wake_at = 0.0  # at once
+        self._always: dict[int, Reassembler] = {}
+        self._listening: dict[int, Reassembler] = {}
+        self._events: list[object] = []
+        self._result: T | None = None
+        self.done = False
+
+    @property
+    def result(self) -> T:
+        """What the stage came to. Raises RuntimeError while it goes on."""
+        if not self.done:
+            raise RuntimeError("it has not ended yet")
+        return self._result  # type: ignore[return-value]  # it is T when it is done
+
+    # -- for the stage ---------------------------------------------------------------------------
+
+    def listen(self, *can_ids: int) -> None:
+        """Hear messages on these ids from now on, and on no other but those of `listen_always`."""
+        fresh = {can_id: self._reassembler(can_id) for can_id in can_ids}
+        self._listening = fresh | self._always
+
+    def listen_always(self, *can_ids: int) -> None:
+        """Hear messages on these ids until this is called again."""
+        self._always = {can_id: self._reassembler(can_id) for can_id in can_ids}
+        self._listening = dict(self._always)
+
+    def hear_too(self, can_id: int) -> None:
+        """Hear messages on one more id."""
+        self._always[can_id] = self._listening[can_id] = self._reassembler(can_id)
+
+    def _reassembler(self, can_id: int) -> Reassembler:
+        return Reassembler(can_id, self.timings.inter_frame_timeout_s)
+
+    def send(
+        self,
+        frames: Sequence[Frame],
+        *,
+        wire_s: float | None = None,
+        not_before: float = 0.0,
+        tag: object = None,
+    ) -> None:
+        """Send a message; `Signal.LEFT` tells when it has left (`tx.left_at`, `tx.left_tag`)."""
+        self.tx.queue(frames, wire_s=wire_s, not_before=not_before, tag=tag)
+
+    def tell(self, event: object) -> None:
+        """Report an event."""
+        self._events.append(event)
+
+    def tell_damage(self, damage: Damage) -> None:
+        """Report bytes that made no message."""
+        self._events.append(BytesDamaged(damage.can_id, damage.reason.value, damage.data))
+
+    def finish_message(self) -> Stage[None]:
+        """Let a message that is half sent go to its end. An adapter that takes nothing any more
+        does not hold it up for ever.
+        """
+        self.tx.drop_unstarted()
+        give_up_at = self.now + self.timings.command_timeout_s
+        while not self.tx.idle and self.now < give_up_at:
+            yield give_up_at
+
+    # -- the engine interface --------------------------------------------------------------------
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if self.done:
+            return
+        self.now = now
+        if self.watch is not None and self.watch(frame):
+            return
+        reassembler = self._listening.get(frame[0])
+        if reassembler is None or not frame.is_payload:
+            return
+        for found in reassembler.feed(frame[1], now):
+            self._resume(found)
+
+    def tick(self, now: float) -> None:
+        self.now = now
+        if self.done:
+            return
+        if self._stage is None:
+            self._begin()
+            return
+        for reassembler in tuple(self._listening.values()):
+            if now >= reassembler.due_at:
+                for found in reassembler.tick(now):
+                    self._resume(found)
+        if now >= self.limit_at:
+            self.cancel(now)
+        elif now >= self._wake_at:
+            self._resume(Signal.TIME)
+
+    def deadline(self) -> float | None:
+        if self.done:
+            return None
+        due_at = min(self._wake_at, self.tx.due_at, self.limit_at)
+        for reassembler in self._listening.values():
+            due_at = min(due_at, reassembler.due_at)
+        return None if due_at == inf else due_at
+
+    def frame_sent(self, now: float) -> None:
+        if self.done:
+            return
+        self.now = now
+        if self.tx.frame_sent(now):
+            self._resume(Signal.LEFT)
+
+    def cancel(self, now: float) -> None:
+        self.now = now
+        self.is_cancelled = True
+        self.limit_at = inf
+        if not self.done and self._stage is None:
+            self._begin()
+        self._resume(Signal.CANCEL)
+
+    def take_events(self) -> Sequence[object]:
+        if not self._events:
+            return []
+        taken, self._events = self._events, []
+        return taken
+
+    def interrupt(self, interruption: Exception) -> None:
+        """Raise an exception in the stage, where it waits."""
+        if self._stage is not None and not self.done:
+            try:
+                self._wait(self._stage.throw(interruption))
+            except StopIteration as end:
+                self._end(end.value)
+
+    def _begin(self) -> None:
+        self._stage = self._make_stage(self)
+        try:
+            self._wait(next(self._stage))
+        except StopIteration as end:
+            self._end(end.value)
+
+    def _resume(self, came: Came) -> None:
+        if self.done or self._stage is None:
+            return
+        try:
+            until = self._stage.send(came)
+        except StopIteration as end:
+            self._end(end.value)
+        else:
+            self._wake_at = inf if until is None else until
+
+    def _wait(self, until: float | None) -> None:
+        self._wake_at = inf if until is None else until
+
+    def _end(self, result: T) -> None:
+        self._result = result
+        self.done = True
+        self._listening = {}
+        self.tx.abandon(self.now)
+
+
+def watched(stage: Stage[T], look: Callable[[Came], Came]) -> Stage[T]:
+    """A stage whose signals are looked at first; what `look` returns is what it is sent."""
+    try:
+        until = next(stage)
+        while True:
+            until = stage.send(look((yield until)))
+    except StopIteration as end:
+        result: T = end.value
+        return result
