@@ -12,7 +12,8 @@ from typing import Final
 
 import click
 
-from flasher.cli.framework import Entry, Session, program, usage_error
+from flasher.cli.framework import Entry, Program, Session, usage_error
+from flasher.cli.help import STYLE
 from flasher.cli.logs import Logs
 from flasher.cli.output import SAID, Output
 from flasher.cli.terminal import prepare_streams
@@ -92,14 +93,6 @@ examples:
 
 `flasher COMMAND -h` tells what a command needs most, `flasher COMMAND --help` everything.
 """
-_HELP_STYLE: Final = {
-    "theme": "default-slim",
-    "max_width": 100,
-    "text_markup": None,
-    "commands_panel_title": "actions",
-    "default_string": "(default {})",
-    "required_long_string": "(required)",
-}
 _COMPLETE: Final = "_FLASHER_COMPLETE"
 """Set by a shell that completes a command line."""
 _LOG: Final = logging.getLogger("flasher.cli")
@@ -125,7 +118,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(session: Session, words: list[str]) -> int:
     colours = None if os.environ.get("NO_COLOR") else "auto"
-    style = {**_HELP_STYLE, "color_system": colours}
+    style = {**STYLE, "color_system": colours}
     try:
         with flasher.make_context("flasher", words, obj=session, rich_help_config=style) as ctx:
             return int(flasher.invoke(ctx))
@@ -169,7 +162,8 @@ def _unfinished(output: Output) -> str:
     )
 
 
-@program(entries=_PURPOSES, epilog=_EPILOG)
+@click.group(cls=Program, entries=_PURPOSES, epilog=_EPILOG)
+@click.pass_context
 def flasher(ctx: click.Context) -> int:
     """Upgrade the firmware of Welling mid-drive e-bike systems over CAN, and look at what they say.
     Plays the CAN dongle (CDL) on any adapter that python-can drives, or on a built-in device model

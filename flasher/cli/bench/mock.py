@@ -100,56 +100,34 @@ def _examples() -> str:
 @command(epilog=_examples(), exit_codes=(ExitCode.BUS,))
 @target_option(required=False)
 @option(
-    _SAVE_IMAGE,
-    metavar="FILE",
-    type=values.FilePath("bin", gives=Path),
-    panel="device model",
-    brief=True,
-    help="write each image that was received completely",
-)
+    _SAVE_IMAGE, metavar="FILE", type=values.FilePath("bin", gives=Path), panel="device model",
+    brief=True, help="write each image that was received completely",
+)  # fmt: skip
 @option(
-    "--no-app",
-    is_flag=True,
-    panel="device model",
-    brief=True,
+    "--no-app", is_flag=True, panel="device model", brief=True,
     help="start without a valid application (R14)",
-)
+)  # fmt: skip
 @option(
-    "--set",
-    "choices",
-    multiple=True,
-    metavar="KEY=VALUE",
-    panel="device model",
-    brief=True,
+    "--set", "choices", multiple=True, metavar="KEY=VALUE", panel="device model", brief=True,
     shell_complete=values.offers(_settings),
     help="set a choice of the device; may be repeated, see below",
-)
+)  # fmt: skip
 @option(
-    "--system",
-    is_flag=True,
-    panel="device model",
+    "--system", is_flag=True, panel="device model",
     help="serve as a whole bicycle; what is printed is about the target",
-)
+)  # fmt: skip
 @option(
-    "--variant",
-    metavar="NAME",
-    panel="device model",
-    shell_complete=values.offers(_variants),
+    "--variant", metavar="NAME", panel="device model", shell_complete=values.offers(_variants),
     help="serve as a device that is wrong in one thing, see --list-variants",
-)
+)  # fmt: skip
 @option(
-    "--list-variants",
-    is_flag=True,
-    panel="device model",
+    "--list-variants", is_flag=True, panel="device model",
     help="list what --variant takes, with the clause that each violates, and end",
-)
+)  # fmt: skip
 @option(
-    "--upgrades",
-    type=values.count,
-    metavar="N",
-    panel="device model",
+    "--upgrades", type=values.count, metavar="N", panel="device model",
     help="end after N complete upgrades, when the tool asks no more",
-)
+)  # fmt: skip
 @bus_options(mock=None)
 def mock(
     output: Output,

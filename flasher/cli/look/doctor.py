@@ -106,13 +106,9 @@ _COLOURS: Final = {
 
 @command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS, ExitCode.INTERRUPTED))
 @option(
-    "--listen",
-    type=values.seconds,
-    default=LISTEN_S,
-    metavar="S",
-    brief=True,
+    "--listen", type=values.seconds, default=LISTEN_S, metavar="S", brief=True,
     help="listen for so many seconds",
-)
+)  # fmt: skip
 @bus_options()
 def doctor(output: Output, bus: Bus, *, listen: float) -> int:
     """Look at the adapters, the chosen one, its bus and the traffic."""

@@ -42,42 +42,27 @@ Exit code 0 whenever the trace can be read, whatever the verdict is.
 
 @command(epilog=_EXAMPLES, exit_codes=(ExitCode.INTERRUPTED,))
 @argument(
-    "trace",
-    metavar="TRACE",
-    required=False,
+    "trace", metavar="TRACE", required=False,
     type=values.FilePath(*values.TRACE_SUFFIXES, gives=Path),
     help="a recorded trace (.asc .blf .log ...), or the folder of a bundle",
-)
+)  # fmt: skip
 @option(_LAST, is_flag=True, brief=True, help="the bundle that the latest failed command has left")
 @option(
-    "-b",
-    "--bitrate",
-    type=values.count,
-    metavar="BPS",
+    "-b", "--bitrate", type=values.count, metavar="BPS",
     help="bit rate of the bus that was recorded (default: the dialect's)",
-)
+)  # fmt: skip
 @option(
-    "--all",
-    "everything",
-    is_flag=True,
-    panel="how to show it",
-    brief=True,
+    "--all", "everything", is_flag=True, panel="how to show it", brief=True,
     help="every message on a line of its own, packets too",
-)
+)  # fmt: skip
 @option(
-    "--packets",
-    is_flag=True,
-    panel="how to show it",
+    "--packets", is_flag=True, panel="how to show it",
     help="a table of all packets with their answer times",
-)
+)  # fmt: skip
 @option(
-    _HTML,
-    type=values.FilePath("html", gives=Path),
-    metavar="FILE",
-    panel="how to show it",
-    brief=True,
-    help="write the story as one self-contained page as well",
-)
+    _HTML, type=values.FilePath("html", gives=Path), metavar="FILE", panel="how to show it",
+    brief=True, help="write the story as one self-contained page as well",
+)  # fmt: skip
 def explain(
     output: Output,
     *,

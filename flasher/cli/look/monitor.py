@@ -52,64 +52,40 @@ LINES: Final = (SeenLine, FrameLine)
 
 @command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS,))
 @argument(
-    "trace",
-    metavar="TRACE",
-    required=False,
-    type=values.FilePath(*values.TRACE_SUFFIXES),
+    "trace", metavar="TRACE", required=False, type=values.FilePath(*values.TRACE_SUFFIXES),
     help="a recorded trace (.asc .blf .log ...), no bus",
-)
+)  # fmt: skip
 @target_option(required=False)
 @option(
-    "--node",
-    "nodes",
-    multiple=True,
-    type=values.node,
-    metavar="wmc|bms|obc|hmi|cdl",
-    brief=True,
-    panel="what to show (default: everything)",
-    shell_complete=values.offers(values.node_names),
+    "--node", "nodes", multiple=True, type=values.node, metavar="wmc|bms|obc|hmi|cdl", brief=True,
+    panel="what to show (default: everything)", shell_complete=values.offers(values.node_names),
     help="only what this node sends or is sent; may be repeated",
-)
+)  # fmt: skip
 @option(
-    "--message",
-    "messages",
-    multiple=True,
-    metavar="WORDS",
-    brief=True,
+    "--message", "messages", multiple=True, metavar="WORDS", brief=True,
     panel="what to show (default: everything)",
     help="only messages with these words in their title; may be repeated",
-)
+)  # fmt: skip
 @option(
-    "--errors",
-    is_flag=True,
-    panel="what to show (default: everything)",
+    "--errors", is_flag=True, panel="what to show (default: everything)",
     help="only trouble: damaged, malformed and unknown messages, error frames, NAK, faults",
-)
+)  # fmt: skip
 @option(
-    "--lines",
-    is_flag=True,
-    panel="how to show it",
-    brief=True,
+    "--lines", is_flag=True, panel="how to show it", brief=True,
     help="one line a message, on a terminal too",
-)
+)  # fmt: skip
 @option(
-    "--table",
-    is_flag=True,
-    panel="how to show it",
+    "--table", is_flag=True, panel="how to show it",
     help="a table, elsewhere than on a terminal too: at the end",
-)
+)  # fmt: skip
 @option("--raw", is_flag=True, panel="how to show it", help="also every frame as it came (lines)")
 @option(
     "--count", type=values.count, metavar="N", panel="how to show it", help="end after N messages"
-)
+)  # fmt: skip
 @option(
-    "--duration",
-    type=values.seconds,
-    metavar="S",
-    panel="how to show it",
-    brief=True,
+    "--duration", type=values.seconds, metavar="S", panel="how to show it", brief=True,
     help="end after S seconds",
-)
+)  # fmt: skip
 @bus_options(mock="watch a device model in this process")
 def monitor(
     output: Output,

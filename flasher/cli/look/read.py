@@ -80,25 +80,16 @@ def _items(ctx: click.Context) -> list[str]:
 
 @command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.INTERRUPTED))
 @argument(
-    "item",
-    required=False,
-    metavar="ITEM",
-    shell_complete=values.offers(_items),
+    "item", required=False, metavar="ITEM", shell_complete=values.offers(_items),
     help="what to read; see --list",
-)
+)  # fmt: skip
 @argument("bounds", nargs=-1, metavar="[START END]", help="for memory: which")
 @target_option(required=False)
 @option("--list", "is_list", is_flag=True, panel="read", brief=True, help="list the items and stop")
 @option(
-    "-o",
-    _OUTPUT,
-    "file",
-    metavar="FILE",
-    type=values.FilePath(gives=Path),
-    panel="read",
-    brief=True,
-    help="write memory to this file",
-)
+    "-o", _OUTPUT, "file", metavar="FILE", type=values.FilePath(gives=Path), panel="read",
+    brief=True, help="write memory to this file",
+)  # fmt: skip
 @option("--format", type=click.Choice(("hex", "bin")), panel="read", help="format of FILE")
 @bus_options()
 @recording_options

@@ -86,24 +86,19 @@ def _items(ctx: click.Context) -> list[str]:
     ),
 )  # fmt: skip
 @argument(
-    "item",
-    required=False,
-    metavar="ITEM",
-    shell_complete=values.offers(_items),
+    "item", required=False, metavar="ITEM", shell_complete=values.offers(_items),
     help="what to write; see --list",
-)
+)  # fmt: skip
 @argument("new", nargs=-1, metavar="VALUE...", help="one for each of its fields")
 @target_option(required=False)
 @option(
     "--list", "is_list", is_flag=True, panel="write", brief=True, help="list the items and stop"
-)
+)  # fmt: skip
 @option("-y", "--yes", is_flag=True, panel="write", brief=True, help="do not ask")
 @option(
-    "--manufacturer",
-    is_flag=True,
-    panel="write",
+    "--manufacturer", is_flag=True, panel="write",
     help="write what the document reserves for the manufacturer",
-)
+)  # fmt: skip
 @bus_options()
 @recording_options
 def write(

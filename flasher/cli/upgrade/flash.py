@@ -228,11 +228,9 @@ _upgrade_options: Final = option_set(
 @image_options
 @_upgrade_options
 @option(
-    "--skip-same-version",
-    is_flag=True,
-    panel="upgrade",
+    "--skip-same-version", is_flag=True, panel="upgrade",
     help="leave a device alone that already runs the image's version: exit code 11",
-)
+)  # fmt: skip
 @bus_options(mock="upgrade a device model in this process", speed=values.speed)
 @recording_options
 def flash(
@@ -259,13 +257,9 @@ def flash(
 @image_options
 @_upgrade_options
 @option(
-    "--wait",
-    type=values.seconds,
-    metavar="S",
-    panel="upgrade",
-    brief=True,
+    "--wait", type=values.seconds, metavar="S", panel="upgrade", brief=True,
     help=f"seconds to wait for the announcement (default {DEFAULT_POWER_UP_TIMEOUT_S:g})",
-)
+)  # fmt: skip
 @bus_options(mock="upgrade a device model in this process", speed=values.speed)
 @recording_options
 def rescue(

@@ -132,15 +132,9 @@ def _stated(name: str, key: str, metavar: str, text: str, *, is_list: bool = Fal
     is_list=True,
 )
 @option(
-    "-o",
-    "--output",
-    "file",
-    metavar="FILE",
-    type=values.FilePath("toml"),
-    panel="manifest",
-    brief=True,
-    help="(default: beside IMAGE, IMAGE.toml)",
-)
+    "-o", "--output", "file", metavar="FILE", type=values.FilePath("toml"), panel="manifest",
+    brief=True, help="(default: beside IMAGE, IMAGE.toml)",
+)  # fmt: skip
 @option("--force", "overwrite", is_flag=True, panel="manifest", help="write over an older manifest")
 def create(
     output: Output,
@@ -211,13 +205,9 @@ def _warnings(image: Image, target: Target) -> list[str]:
 @image_options
 @target_option(required=False)
 @option(
-    "--manifest",
-    "file",
-    metavar="FILE",
-    type=values.FilePath("toml"),
-    brief=True,
+    "--manifest", "file", metavar="FILE", type=values.FilePath("toml"), brief=True,
     help="(default: beside IMAGE, IMAGE.toml)",
-)
+)  # fmt: skip
 def check(output: Output, image: ImageOptions, target: Target | None, *, file: str | None) -> int:
     """Hold the bytes that would be sent against the release manifest."""
     loaded = image.load()
