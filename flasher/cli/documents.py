@@ -168,6 +168,17 @@ def to_json(event: object) -> dict[str, Any]:
     return {"event": type(event).__name__, **_fields(event)}
 
 
+def content_document(content: Content) -> dict[str, FieldValue]:
+    """A content as JSON: field names with their units, texts escaped, bytes in hexadecimal, flags
+    by name. Reserved bytes are left out, so that the keys do not depend on the answer.
+    """
+    from flasher.host.items import meaningful_fields  # noqa: PLC0415  rarely needed
+    from flasher.trace.decoder import content_fields  # noqa: PLC0415
+
+    names = {name for name, _ in meaningful_fields(type(content))}
+    return {shown.name: shown.value for shown in content_fields(content) if shown.name in names}
+
+
 def _fields(value: Any) -> dict[str, Any]:
     return {
         field.name: plain_value(getattr(value, field.name)) for field in dataclasses.fields(value)
@@ -186,8 +197,6 @@ def plain_value(value: Any) -> Any:
         case datetime():
             return value.isoformat()
         case Content():
-            from flasher.cli.look.content_text import content_document  # noqa: PLC0415  rarely needed
-
             return content_document(value)
         case dict():
             return {str(key): plain_value(each) for key, each in value.items()}

@@ -14,11 +14,11 @@ import json
 import logging
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final, Literal, NamedTuple, TextIO
 
 from flasher.cli.documents import SCHEMA_VERSION, ErrorDocument, to_json
-from flasher.cli.terminal import painted, takes_colour, unpainted, wrapped
+from flasher.cli.terminal import columns, painted, takes_colour, unpainted, wrapped
 from flasher.errors import ExitCode, FlasherError, UsageError
 
 _LOG: Final = logging.getLogger("flasher.cli")
@@ -77,6 +77,12 @@ class Output:
         if not self.json_wanted:
             _LOG.info("%s", unpainted(text), extra=SAID)
             _print_stdout(wrapped(text, sys.stdout))
+
+    def table(self, rows: Iterable[Sequence[str]], *, indent: int = 0) -> None:
+        """Rows of the result, in columns."""
+        if not self.json_wanted:
+            for line in columns(rows, indent=indent):
+                self.result(line)
 
     def print_help(self, text: str) -> None:
         """Help, laid out for the window; it is printed when JSON is wanted too."""

@@ -8,9 +8,12 @@ import os
 import re
 import sys
 import textwrap
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final, TextIO
 
+_NO_WINDOW: Final = 10_000
+"""Columns where nothing is wrapped."""
 COLOURS: Final = {"green": 32, "yellow": 33, "red": 31}
 _SUBSTITUTES: Final = {"°": "deg", "…": "~"}
 """What stands for a character that the encoding of a stream does not have."""
@@ -52,6 +55,38 @@ def _substitute(error: UnicodeError) -> tuple[str, int]:
     return "".join(escaped), error.end
 
 
+def columns(rows: Iterable[Sequence[str]], *, indent: int = 0, first: int = 0) -> list[str]:
+    """Rows in columns, two blanks apart, as lines for stdout: a last cell that is too long for the
+    window is wrapped in its column. The first column is `first` wide at least.
+    """
+    from rich.console import Console  # noqa: PLC0415  not every command has a table
+    from rich.table import Table  # noqa: PLC0415
+    from rich.text import Text  # noqa: PLC0415
+
+    table = Table.grid(padding=(0, 2))
+    for row in rows:
+        while len(table.columns) < len(row):
+            table.add_column(no_wrap=True, min_width=0 if table.columns else first)
+        table.add_row(*map(Text, row))
+    if table.columns:
+        table.columns[-1].no_wrap = False
+    width = window_width(sys.stdout) or _NO_WINDOW
+    console = Console(file=io.StringIO(), width=max(width - indent, 1), color_system=None)
+    with console.capture() as captured:
+        console.print(table, crop=False)
+    return [" " * indent + line.rstrip() for line in captured.get().splitlines()]
+
+
+def window_width(stream: TextIO) -> int | None:
+    """Columns of the window that a stream leads to; None where there is none."""
+    if not stream.isatty():
+        return None
+    try:
+        return os.get_terminal_size(stream.fileno()).columns
+    except OSError:
+        return None
+
+
 def takes_colour(stream: TextIO) -> bool:
     """True for a terminal, unless NO_COLOR is set."""
     return stream.isatty() and not os.environ.get("NO_COLOR")
@@ -69,11 +104,8 @@ def unpainted(text: str) -> str:
 
 def wrapped(text: str, stream: TextIO) -> str:
     """Text for a terminal wrapped at its width, never inside a word; elsewhere as it is."""
-    if not stream.isatty():
-        return text
-    try:
-        width = os.get_terminal_size(stream.fileno()).columns
-    except OSError:
+    width = window_width(stream)
+    if width is None:
         return text
     return "\n".join(part for line in text.split("\n") for part in wrap_line(line, width))
 

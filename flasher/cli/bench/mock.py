@@ -219,9 +219,7 @@ def _served(
 
 
 def _list_variants(output: Output) -> None:
-    width = max(map(len, VARIANTS))
-    for variant in VARIANTS.values():
-        output.result(f"{variant.name:<{width}}  {variant.clause}  {variant.summary}")
+    output.table((each.name, each.clause, each.summary) for each in VARIANTS.values())
     documents = [
         VariantDocument(
             name=variant.name,

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Final, TypedDict
 
-from flasher.cli.documents import FieldValue, HeardDocument
+from flasher.cli.documents import FieldValue, HeardDocument, content_document
 from flasher.cli.framework import command
-from flasher.cli.look.content_text import content_document, content_lines, row_line
-from flasher.cli.look.survey_text import heard_document, heard_lines
+from flasher.cli.look.content import content_lines, heard_document, heard_lines, rows_lines
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
@@ -102,11 +101,11 @@ def _lines(found: DeviceInfo) -> list[str]:
         if reading.answer is not None:
             lines += ["", _title(reading), *content_lines(reading.answer)]
     faults = found.survey.faults
-    lines += ["", "faults", *(content_lines(faults) if faults else [_no_faults(found.dialect)])]
+    lines += ["", "faults", *(content_lines(faults) if faults else _no_faults(found.dialect))]
     missing = [reading for reading in found.readings if reading.answer is None]
     if missing:
         lines += ["", "not answered"]
-        lines += [row_line(_title(reading), _why(reading)) for reading in missing]
+        lines += rows_lines([(_title(reading), _why(reading)) for reading in missing])
     heard = found.survey.heard[found.target.node]
     if heard.boot_version:
         lines += ["", f"its bootloader announced itself meanwhile: {heard.boot_version}"]
@@ -119,11 +118,11 @@ def _title(reading: Reading) -> str:
     return reading.name.replace("-", " ")
 
 
-def _no_faults(dialect: Dialect) -> str:
+def _no_faults(dialect: Dialect) -> list[str]:
     """A fault is heard, not asked for: how long to wait for one only one document says."""
     is_periodic = dialect is WELLING
     proviso = "" if is_periodic else "; how often they are sent is not documented: see monitor"
-    return row_line("faults", f"none heard{proviso}")
+    return rows_lines([("faults", f"none heard{proviso}")])
 
 
 def _why(reading: Reading) -> str:

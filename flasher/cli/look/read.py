@@ -11,10 +11,10 @@ import click
 
 from flasher.api import as_dialect
 from flasher.cli import values
-from flasher.cli.documents import FieldValue
+from flasher.cli.documents import FieldValue, content_document
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import argument, command, option
-from flasher.cli.look.content_text import content_document, content_lines
+from flasher.cli.look.content import content_lines
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
@@ -247,19 +247,18 @@ class _MemoryProgress:
 
 
 def _list(target: Target, dialect: Dialect, output: Output) -> int:
-    items = readable(target, dialect)
-    document: dict[str, list[str]] = {}
-    for name, entry in items.items():
-        fields = [
-            (field, codec)
+    items = {
+        name: {
+            field: label(field, codec)
             for field, codec in meaningful_fields(entry.content)
             if entry.field in ("", field)
-        ]
-        document[name] = [field for field, _ in fields]
-        output.result(f"{name:<24} {', '.join(label(*field) for field in fields)}")
+        }
+        for name, entry in readable(target, dialect).items()
+    }
     if items:
-        output.result(f"{MEMORY:<24} START END [-o FILE]")
+        rows = [(name, ", ".join(labels.values())) for name, labels in items.items()]
+        output.table([*rows, (MEMORY, "START END [-o FILE]")])
     else:
         output.result(f"The documents give the tool nothing to read from the {target.node.name}.")
-    output.document(ReadableDocument(items=document))
+    output.document(ReadableDocument(items={name: list(labels) for name, labels in items.items()}))
     return ExitCode.OK

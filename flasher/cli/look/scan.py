@@ -7,7 +7,7 @@ from typing import Final, Literal, TypedDict
 from flasher.bus.bit_rate import BitRate
 from flasher.cli.documents import HeardDocument
 from flasher.cli.framework import command
-from flasher.cli.look.survey_text import heard_document, heard_lines
+from flasher.cli.look.content import heard_document, heard_lines
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output, counted
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options

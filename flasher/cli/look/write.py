@@ -194,10 +194,14 @@ def _agrees(plan: WritePlan) -> bool:
 
 def _list(target: Target, dialect: Dialect, output: Output) -> int:
     items = writable(target, dialect)
-    for name, entry in items.items():
-        values = " ".join(label(n, codec).upper().replace(" ", "_") for n, codec in entry.fields)
-        only = "  (manufacturer only)" if entry.item.manufacturer_only else ""
-        output.result(f"{name:<24} {values}{only}")
+    output.table(
+        (
+            name,
+            " ".join(label(n, codec).upper().replace(" ", "_") for n, codec in entry.fields),
+            "(manufacturer only)" if entry.item.manufacturer_only else "",
+        )
+        for name, entry in items.items()
+    )
     if not items:
         output.result(f"The documents give the tool nothing to write to the {target.node.name}.")
     document = {

@@ -98,11 +98,10 @@ def check(output: Output, *, file: str) -> int:
 def show(output: Output, target: Target, *, dialect_name: str, profile: str | None) -> int:
     """Show every value with its source."""
     holds = load_profile(profile, target, as_dialect(dialect_name))
-    rows = [(name, _shown(name, value)) for name, value in holds.values()]
-    widths = [max(len(row[column]) for row in rows) for column in (0, 1)]
-    for name, shown in rows:
-        source = printable(holds.sources[name])
-        output.result(f"{name:<{widths[0]}}  {shown:<{widths[1]}}  {source}")
+    output.table(
+        (name, _shown(name, value), printable(holds.sources[name]))
+        for name, value in holds.values()
+    )
     document: ProfileDocument = {
         "target": holds.target.name,
         "dialect": holds.dialect.name,

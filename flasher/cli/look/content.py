@@ -1,0 +1,65 @@
+"""Contents of messages, and what was heard of a node, in words and as JSON. What a field's value
+looks like is told by `flasher.trace.decoder`, the same for a query's answer and for live traffic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Final
+
+from flasher.cli.documents import HeardDocument, content_document
+from flasher.cli.output import counted
+from flasher.cli.terminal import columns
+from flasher.host.survey import Heard
+from flasher.protocol.fields import Content
+from flasher.trace.decoder import NOT_IN_DIALECT, content_fields
+
+LABEL_WIDTH: Final = 33
+"""Of the labels at least, so that the values of several tables stand below each other."""
+_SHOWN_AT_MOST: Final = 40
+"""Kinds of message listed: a babbling node must not fill the screen."""
+
+
+def rows_lines(rows: list[tuple[str, str]]) -> list[str]:
+    """Labels with their values."""
+    return columns(rows, indent=2, first=LABEL_WIDTH)
+
+
+def content_rows(content: Content, field: str = "") -> Iterator[tuple[str, str]]:
+    """Label and value with unit of every field, or of one by its name, safe to show."""
+    for shown in content_fields(content):
+        if field in ("", shown.name):
+            yield shown.label, f"{shown.text} {shown.unit}".rstrip()
+
+
+def content_lines(content: Content, field: str = "") -> list[str]:
+    """The fields of a content, or one of them, one a line."""
+    return rows_lines(list(content_rows(content, field)))
+
+
+def heard_lines(heard: Heard, *, contents: bool = False) -> list[str]:
+    """What one node sent, one kind of message a line, with its last content on request."""
+    rows = [("bootloader", heard.boot_version)] if heard.boot_version else []
+    for title, times in sorted(heard.messages.items())[:_SHOWN_AT_MOST]:
+        mark = f" {NOT_IN_DIALECT}" if title in heard.not_in_dialect else ""
+        rows.append((title, (f"{times} times" if times > 1 else "once") + mark))
+        if contents and title in heard.last:
+            rows += [(f"  {label}", value) for label, value in content_rows(heard.last[title])]
+    left_out = len(heard.messages) - _SHOWN_AT_MOST
+    if left_out > 0:
+        rows.append((f"and {counted(left_out, 'kind')} of message more", ""))
+    if heard.damaged:
+        rows.append(("bytes that made no message", f"{heard.damaged} times"))
+    return rows_lines(rows or [(f"{counted(heard.frames, 'frame')} that made no message", "")])
+
+
+def heard_document(heard: Heard) -> HeardDocument:
+    """The same as JSON."""
+    return {
+        "frames": heard.frames,
+        "messages": dict(sorted(heard.messages.items())),
+        "last": {title: content_document(content) for title, content in heard.last.items()},
+        "damaged": heard.damaged,
+        "boot_version": heard.boot_version or None,
+        "not_in_dialect": sorted(heard.not_in_dialect),
+    }
