@@ -14,7 +14,7 @@ from typing import Final, TextIO
 
 _NO_WINDOW: Final = 10_000
 """Columns where nothing is wrapped."""
-COLOURS: Final = {"green": 32, "yellow": 33, "red": 31}
+COLOURS: Final = {"green": 32, "yellow": 33, "red": 31, "cyan": 36}
 _SUBSTITUTES: Final = {"°": "deg", "…": "~"}
 """What stands for a character that the encoding of a stream does not have."""
 _SUBSTITUTED: Final = "flasher-substitutes"

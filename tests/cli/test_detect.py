@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from flasher.cli.look import detect_child
+from flasher.cli.look import detect
 from flasher.cli.look.detect import Detection, Found
 
 # Stands for the process that asks: the answer of each back end goes by its name.
@@ -86,7 +86,7 @@ def test_the_real_process_answers_for_python_cans_back_ends(
         return [{"interface": name, "channel": 0, "config": object()}]
 
     monkeypatch.setattr("can.detect_available_configs", answer)
-    detect_child.main(["kvaser", "vector"])
+    detect.say_detected(["kvaser", "vector"])
     lines = sorted(capsys.readouterr().out.splitlines())
     assert lines == [
         'detected: {"interface": "kvaser", "channels": [{"channel": 0}], "error": ""}',

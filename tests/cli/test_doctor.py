@@ -18,9 +18,8 @@ from flasher.bus.inspect_interface import Interface, Unseen
 from flasher.bus.simulated import SimulatedLink
 from flasher.cli.look import doctor
 from flasher.cli.look.detect import Detected, Found
-from flasher.cli.look.doctor_traffic import Traffic
-from flasher.cli.look.examination import bus_words
-from flasher.cli.look.findings import Finding, Severity
+from flasher.cli.look.doctor import bus_words
+from flasher.cli.look.findings import Finding, Severity, Traffic
 from flasher.errors import ExitCode
 from flasher.protocol.bittime import fixed_bits
 from flasher.protocol.frame import Frame
@@ -206,7 +205,7 @@ class Doctor:
         self.is_interrupted = False
         self.opened: list[dict[str, Any]] = []
         self.inbox: list[can.Message | Exception | None] = []
-        monkeypatch.setattr("flasher.cli.look.examination.Detection", self._detection)
+        monkeypatch.setattr("flasher.cli.look.doctor.Detection", self._detection)
         monkeypatch.setattr("can.Bus", self._open)
         monkeypatch.setattr("can.util.CONFIG_FILES", [])
         for name in ("flasher.bus.inspect_interface", "flasher.bus.adapter"):

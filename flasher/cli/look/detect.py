@@ -1,11 +1,18 @@
-"""Which adapters python-can detects, in bounded time, whatever its back ends do meanwhile."""
+"""Which adapters python-can detects, in bounded time, whatever its back ends do meanwhile.
+
+Vendors' libraries hang, print and crash: they do it in another process, `python -m
+flasher.cli.look.detect NAME...`, which is ended in time. It asks every back end in a thread of its
+own, and says each answer at once.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import json
+import os
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,11 +20,13 @@ from typing import Any, Final
 
 LIMIT_S: Final = 4.5
 """For everything together. The slowest honest back end (socketcand) listens for 4 s."""
-MARK: Final = "detected: "
+_MARK: Final = "detected: "
 """Begins the lines that are answers; libraries say what they like."""
+_LIFE_S: Final = 30.0
+"""A process whose parent was killed ends itself after this."""
 _SLICE_S: Final = 0.2
 """Between two looks whether the user wants to stop."""
-_COMMAND: Final = (sys.executable, "-m", "flasher.cli.look.detect_child")
+_COMMAND: Final = (sys.executable, "-m", "flasher.cli.look.detect")
 _NO_HARDWARE: Final = frozenset({"virtual", "udp_multicast"})
 """Interfaces that are always there and reach no bus."""
 
@@ -136,13 +145,53 @@ class Detection:
 
 def _take(said: str, detected: Detected, unanswered: set[str]) -> None:
     for line in said.splitlines():
-        if not line.startswith(MARK):
+        if not line.startswith(_MARK):
             continue
         with contextlib.suppress(ValueError, LookupError, TypeError):
-            answer = json.loads(line.removeprefix(MARK))
+            answer = json.loads(line.removeprefix(_MARK))
             name = str(answer["interface"])
             if answer["error"]:
                 detected.failed[name] = str(answer["error"])
             for channel in answer["channels"]:
                 detected.found.append(Found(name, str(channel.pop("channel", "")), channel))
             unanswered.discard(name)
+
+
+# -- the other process -----------------------------------------------------------------------------
+
+
+def say_detected(names: Sequence[str]) -> None:
+    """Ask these interfaces and say what they answer, a line each."""
+    threads = [threading.Thread(target=_ask, args=(name,), daemon=True) for name in names]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
+def _ask(name: str) -> None:
+    answer: dict[str, Any] = {"interface": name, "channels": [], "error": ""}
+    try:
+        import can  # noqa: PLC0415  needed in the other process only
+
+        answer["channels"] = [_simple(config) for config in can.detect_available_configs(name)]
+    except BaseException as error:  # noqa: BLE001  whatever a vendor's library does
+        answer["error"] = f"{type(error).__name__}: {error}"
+    sys.stdout.write(f"{_MARK}{json.dumps(answer)}\n")
+    sys.stdout.flush()
+
+
+def _simple(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What JSON holds of a configuration: some have objects of their library in it."""
+    return {
+        key: value
+        for key, value in config.items()
+        if isinstance(value, str | int | float) and key != "interface"
+    }
+
+
+if __name__ == "__main__":
+    watchdog = threading.Timer(_LIFE_S, os._exit, (1,))
+    watchdog.daemon = True
+    watchdog.start()
+    say_detected(sys.argv[1:])
