@@ -26,7 +26,6 @@ from flasher.cli.options import (
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording, recording_options
 from flasher.cli.stop import stop_on_signal
-from flasher.cli.upgrade.plan_text import image_lines, plan_document, plan_lines, vector_lines
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.text import (
     DryRunDocument,
@@ -35,9 +34,13 @@ from flasher.cli.upgrade.text import (
     check_line,
     dry_run_document,
     failed,
+    image_lines,
     link_lines,
+    plan_document,
+    plan_lines,
     summary_lines,
     upgrade_document,
+    vector_lines,
     verdict_of,
 )
 from flasher.errors import ExitCode, FlasherError

@@ -18,15 +18,15 @@ from flasher.cli.options import (
     target_option,
 )
 from flasher.cli.output import Output
-from flasher.cli.upgrade.manifest_text import ManifestBesideDocument, beside_line, manifest_beside
-from flasher.cli.upgrade.plan_text import (
+from flasher.cli.upgrade.manifest import ManifestBesideDocument, beside_line, manifest_beside
+from flasher.cli.upgrade.text import (
+    check_line,
     image_document,
     image_lines,
     plan_document,
     plan_lines,
     vector_lines,
 )
-from flasher.cli.upgrade.text import check_line
 from flasher.errors import ExitCode, FlasherError
 from flasher.host.identity import Check, judge_bytes
 from flasher.image.cortexm import vector_table
