@@ -64,7 +64,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "conformance profile": conformance_profile.load_profile,
     "recipe": load_recipe,
     "station": load_config,
-    "scans": lambda path: read_scans(str(path)),
+    "scans": read_scans,
     "report": diff.read_run,
     "trace": explained,
 }

@@ -160,42 +160,25 @@ def check(output: Output, **options: Any) -> int:
 @_path_option("--recipe", required=True, help="what is done to each unit")
 @option("--operator", metavar="NAME", brief=True, help="who works here (default: the login)")
 @option("--lot", default="", metavar="NAME", show_default=False, help="the lot of the units")
-@option(
-    "--scans",
-    type=values.FilePath(),
-    metavar="FILE",
-    help="labels in the order of the units; it ends behind the last",
-)
+@_path_option("--scans", help="labels in the order of the units; it ends behind the last")
 @option("--lines", is_flag=True, help="a line for each happening, on a terminal too")
 @_records_options
 @option(
-    "--mix-virtual",
-    is_flag=True,
-    panel="records",
+    "--mix-virtual", is_flag=True, panel="records",
     help="let real and virtual units share the records (no serial number is both)",
-)
+)  # fmt: skip
 @option(
-    "--mock-sockets",
-    type=values.count,
-    metavar="N",
-    panel=_VIRTUAL,
-    brief=True,
+    "--mock-sockets", type=values.count, metavar="N", panel=_VIRTUAL, brief=True,
     help="N sockets with virtual units",
-)
+)  # fmt: skip
 @option(
-    "--units",
-    type=values.count,
-    metavar="N",
-    panel=_VIRTUAL,
-    brief=True,
+    "--units", type=values.count, metavar="N", panel=_VIRTUAL, brief=True,
     help="end after N virtual units",
-)
+)  # fmt: skip
 @option(
-    "--scan-by-hand",
-    is_flag=True,
-    panel=_VIRTUAL,
+    "--scan-by-hand", is_flag=True, panel=_VIRTUAL,
     help="their labels are shown, and have to be typed",
-)
+)  # fmt: skip
 @_mock_share_option("bad", 0.15, "refuse the image, or have the wrong hardware")
 @_mock_share_option("slow", 0.1, "take longer")
 @_mock_share_option("dead", 0.05, "never answer")
@@ -203,13 +186,9 @@ def check(output: Output, **options: Any) -> int:
     "--mock-seed", type=values.number, default="2", metavar="N", panel=_VIRTUAL, help="other ones"
 )
 @option(
-    "--mock-speed",
-    type=values.speed,
-    default=1.0,
-    metavar="X",
-    panel=_VIRTUAL,
+    "--mock-speed", type=values.speed, default=1.0, metavar="X", panel=_VIRTUAL,
     help="times as fast as a real bus; 0 takes no time",
-)
+)  # fmt: skip
 def run(output: Output, **options: Any) -> int:
     """Flash unit after unit."""
     return _carry_out("run.run", output, options)
@@ -221,12 +200,9 @@ def run(output: Output, **options: Any) -> int:
 @option("--part", metavar="NAME", panel=_WHICH, help="of this part")
 @option("--serial", metavar="SERIAL", panel=_WHICH, help="of the unit with this serial number")
 @option(
-    "--since",
-    metavar="TIME",
-    panel=_WHICH,
-    brief=True,
+    "--since", metavar="TIME", panel=_WHICH, brief=True,
     help="begun then or later: 2026-05-17, or 2026-05-17T06:00",
-)
+)  # fmt: skip
 @option("--until", metavar="TIME", panel=_WHICH, brief=True, help="begun before")
 @_path_option("--csv", panel=_WRITTEN, brief=True, help="one row a run")
 @_path_option("--json-report", panel=_WRITTEN, help="figures and runs")

@@ -14,6 +14,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any, Final, TextIO
 
 from flasher.errors import UsageError
@@ -35,9 +36,9 @@ FILE_MAX_SIZE: Final = 4 * 1024 * 1024
 OPTION: Final = "--scans"
 
 
-def read_scans(path: str) -> list[str]:
+def read_scans(path: Path) -> list[str]:
     """The scans of a file; empty lines and those that begin with # are none. Raises UsageError."""
-    shown = printable(path)
+    shown = printable(str(path))
     raw = read(path, FILE_MAX_SIZE, what="file of scans")
     try:
         text = raw.decode("utf-8-sig")
