@@ -1,4 +1,4 @@
-"""What a running station tells: frozen dataclasses, in the order in which things happened.
+"""The events of a running station: frozen dataclasses, in the order in which they happened.
 
 A view (a table on a terminal, JSON lines, a web page) needs nothing else. `RunEnded` is the one
 event that says PASS, and it leaves only after the outcome is in the records, on disk.
@@ -41,7 +41,7 @@ class SocketState(StrEnum):
     ERROR = "ERROR"
     """The socket cannot work: adapter, process, or a record that is not saved."""
     STOPPED = "STOPPED"
-    """The line stands; `LineStopped` said why."""
+    """The line is stopped; `LineStopped` gave the reason."""
 
     @property
     def is_verdict(self) -> bool:
@@ -51,7 +51,7 @@ class SocketState(StrEnum):
 
 @dataclass(frozen=True)
 class Timed:
-    """What all events have."""
+    """Base of all events."""
 
     at: str = field(default="", kw_only=True, compare=False)
     """UTC, as 2026-05-17T09:00:00.123Z; given when the event leaves the station."""
@@ -75,7 +75,7 @@ class StationStarted(Timed):
 
 @dataclass(frozen=True)
 class SocketChanged(Timed):
-    """A socket shows another state, or another text beside it."""
+    """The state of a socket changed, or the text beside it."""
 
     socket: str
     state: SocketState
@@ -95,14 +95,14 @@ class UnitArrived(Timed):
 
 @dataclass(frozen=True)
 class UnitRemoved(Timed):
-    """Nothing was heard from the unit for long enough: it is out."""
+    """The unit is out: nothing was heard from it for the time set."""
 
     socket: str
 
 
 @dataclass(frozen=True)
 class ScanAccepted(Timed):
-    """What was scanned is understood: a label, or a command (`flasher.station.scans`)."""
+    """A scan was accepted: a label, or a command (`flasher.station.scans`)."""
 
     text: str
     meaning: str
@@ -112,7 +112,7 @@ class ScanAccepted(Timed):
 
 @dataclass(frozen=True)
 class ScanRefused(Timed):
-    """What was scanned changes nothing. `code` is a stable word, `remedy` one action."""
+    """A scan was refused and changed nothing. `code` is a stable word, `remedy` one action."""
 
     text: str
     code: str
@@ -123,7 +123,7 @@ class ScanRefused(Timed):
 
 @dataclass(frozen=True)
 class OperatorPrompted(Timed):
-    """Somebody has to do something now, as to switch the unit off and on; within `limit_s`."""
+    """The operator has to act within `limit_s`, for example switch the unit off and on."""
 
     socket: str
     text: str
@@ -132,7 +132,7 @@ class OperatorPrompted(Timed):
 
 @dataclass(frozen=True)
 class RunStarted(Timed):
-    """A unit is claimed; the run is in the records."""
+    """A run was claimed and is in the records."""
 
     socket: str
     serial: str
@@ -155,7 +155,7 @@ class StepStarted(Timed):
 
 @dataclass(frozen=True)
 class Progressed(Timed):
-    """How far the step is: `share` from 0 to 1; `left_s` is None where nobody can tell."""
+    """Progress of a step: `share` from 0 to 1; `left_s` is None when unknown."""
 
     socket: str
     serial: str
@@ -182,7 +182,7 @@ class StepEnded(Timed):
 
 @dataclass(frozen=True)
 class RunEnded(Timed):
-    """A run is over **and its outcome is on disk**. `action` is what the operator does now."""
+    """A run has ended **and its outcome is on disk**. `action` tells the operator what to do."""
 
     socket: str
     serial: str
@@ -201,7 +201,7 @@ class RunEnded(Timed):
 
 @dataclass(frozen=True)
 class RecordNotSaved(Timed):
-    """The outcome is not on disk: nothing may be shown green. It is tried again on RESUME."""
+    """The outcome could not be saved: PASS must not be shown. RESUME tries again."""
 
     socket: str
     serial: str
@@ -212,7 +212,7 @@ class RecordNotSaved(Timed):
 
 @dataclass(frozen=True)
 class LineStopped(Timed):
-    """No unit is begun any more until RESUME; runs that go on are ended properly."""
+    """No run is started until RESUME; active runs are completed."""
 
     code: str
     reason: str
@@ -221,7 +221,7 @@ class LineStopped(Timed):
 
 @dataclass(frozen=True)
 class LineResumed(Timed):
-    """What stopped the line is over."""
+    """The line goes on after RESUME."""
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,13 @@
-"""The line of a station as a pure machine: which label runs in which socket, and what is shown.
+"""The line of a station as a pure state machine: which label belongs to which socket, which runs
+are started, and what each socket shows.
 
     scans, units that come and go, what a socket's process said, what is saved, the time
         -> Line ->
-    events for whoever looks on, claims, aborts, and lines of the audit trail
+    events, claims, aborts, and entries of the audit trail
 
-It opens nothing and reads no clock: times are seconds on the station's monotonic clock. The shell
-around it (`flasher.station.station`) carries its effects out and tells it what came of them. The
-rule by which labels get their sockets stands in `flasher.station.scans`.
+It does no I/O and reads no clock: times are seconds on the station's monotonic clock. `Station`
+carries out its effects and feeds back their results. The rule that assigns labels to sockets is in
+`flasher.station.scans`.
 """
 
 from __future__ import annotations
@@ -53,27 +54,27 @@ from flasher.station.socket import Binding, LastRun, Occupancy, Phase, Socket
 ARRIVAL_LIMIT_S: Final = 20.0
 SCAN_LIMIT_S: Final = 120.0
 CARD_LIMIT_S: Final = 15.0
-"""A card and its label are scanned one after the other: what comes later is another unit's."""
+"""The label has to follow the card of its socket within this time."""
 SHORT_OUTAGE_S: Final = 3.0
-"""Nobody swaps a unit in less, the time in which a process is started again."""
+"""A restart of the process takes less; a unit cannot be swapped in this time."""
 REACH_S: Final = 2.0
-"""Nobody reads a prompt and connects a unit in less: one that is heard sooner was there before."""
+"""A unit that is heard sooner after the prompt was in the socket before."""
 IDENTIFY_S: Final = 3.0
-"""A unit that was just switched on tells its serial number in less, if it has an application."""
+"""A unit with an application reports its serial number within this time after power-on."""
 _RESUME: Final = Word.RESUME.value.lower()
 
 
-# -- what the line is told, and what it wants done ------------------------------------------------
+# -- inputs and effects ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Claimed:
-    """The records have the run that was asked for; the process of the socket works on it."""
+    """The claim is in the records; the process of the socket works on the run."""
 
 
 @dataclass(frozen=True)
 class NotClaimed:
-    """The records refuse it. `code` is a stable word; with `stops_line` nothing else may begin."""
+    """The records refused the claim. `code` is a stable word; `stops_line` stops the line."""
 
     code: str
     reason: str
@@ -83,12 +84,12 @@ class NotClaimed:
 
 @dataclass(frozen=True)
 class Ended:
-    """The process of the socket said how the run ended; nothing of it is on disk."""
+    """The process reported the end of the run; the outcome is not on disk yet."""
 
 
 @dataclass(frozen=True)
 class Saved:
-    """How the run ended is on disk. `action` is what the operator does now."""
+    """The outcome of the run is on disk. `action` tells the operator what to do."""
 
     outcome: RunState
     action: str
@@ -96,7 +97,7 @@ class Saved:
 
 @dataclass(frozen=True)
 class NotSaved:
-    """Something of the socket's run is not on disk."""
+    """A part of the run could not be saved."""
 
     reason: str
     remedy: str
@@ -109,7 +110,7 @@ SocketInput = (
 
 @dataclass(frozen=True)
 class ClaimRun:
-    """Ask the records for a run of this unit; `Claimed`, `NotClaimed` or `NotSaved` answers."""
+    """Claim a run in the records; answered by `Claimed`, `NotClaimed` or `NotSaved`."""
 
     socket: str
     serial: str
@@ -120,7 +121,7 @@ class ClaimRun:
 
 @dataclass(frozen=True)
 class SaveAgain:
-    """Try once more to save how the runs of these sockets ended; then call `Line.resumed`."""
+    """Save the outcomes of these sockets again; then call `Line.resumed`."""
 
     sockets: tuple[str, ...]
 
@@ -134,14 +135,14 @@ class AbortRun:
 
 @dataclass(frozen=True)
 class Tell:
-    """An event for whoever looks on."""
+    """Publish an event."""
 
     event: StationEvent
 
 
 @dataclass(frozen=True)
 class Audit:
-    """Something that a person did, for the audit trail."""
+    """Add an action of a person to the audit trail."""
 
     what: AuditEvent
     data: Mapping[str, str]
@@ -158,11 +159,11 @@ CheckSerial = Callable[[str], object]
 
 
 class Line:
-    """All sockets and the scans. After each call, `take` has the effects, in their order.
+    """All sockets and the scans. After each call, `take` returns the effects, in their order.
 
-    `arrival_limit_s`: so long a label with a scanned socket waits until its unit is heard; then its
-    run begins all the same, and says what is wrong. `scan_limit_s`: a label whose unit does not
-    come, or a socket without its label, is forgotten after it.
+    `arrival_limit_s`: a label with a scanned socket waits this long for its unit; then the run
+    starts all the same and reports the fault. `scan_limit_s`: after this time a label without its
+    unit, or a socket without its label, is forgotten.
     """
 
     def __init__(
@@ -180,7 +181,7 @@ class Line:
         self.operator = operator
         self.lot = lot
         self.stopped: LineStopped | None = None
-        """Why the line stands."""
+        """Why the line is stopped; None while it runs."""
         self.is_closing = False
         """No further run is begun."""
         self._check_serial = check_serial
@@ -193,22 +194,22 @@ class Line:
         self._chosen: Socket | None = None
         """The socket whose card was scanned, and that waits for its label."""
         self._is_choice_refused = False
-        """A card was scanned in vain: the label behind it must not go to another socket."""
+        """The last card was refused: the label that follows must not go to another socket."""
         self._forget_at_s: float | None = None
         self._reason = ""
         """Given by REASON, for the next label."""
         self._reasons: dict[str, str] = {}
-        """Of labels: sockets that begin in between must not take each other's."""
+        """Reasons by label, so that a run that starts in between does not take another one's."""
 
     def take(self) -> list[Effect]:
-        """What is to be done now; asked again after each effect that was answered."""
+        """The effects since the last call; call again after feeding back a result."""
         effects, self._effects = self._effects, []
         return effects
 
     # -- the table of a socket --------------------------------------------------------------------
 
     def feed(self, name: str, what: SocketInput, now: float) -> None:
-        """Something happened in a socket. A pair that the table lacks cannot happen (KeyError)."""
+        """Handle an input of a socket. A pair missing in the table is a bug (KeyError)."""
         socket = self.sockets[name]
         self._TABLE[socket.phase][type(what)](self, socket, what, now)
         self._go_on(now)
@@ -233,7 +234,7 @@ class Line:
             socket.occupancy = Occupancy.UNKNOWN
 
     def _unit(self, socket: Socket, what: PresenceChanged, now: float) -> None:
-        """A unit is heard, says who it is, or is heard no more."""
+        """A unit is heard, reports its serial number, or is not heard any more."""
         if not what.is_there:
             self._silent(socket, is_certain=what.is_certain)
             return
@@ -322,7 +323,7 @@ class Line:
             socket.last = replace(socket.last, outcome=what.outcome, action=what.action)
 
     def _not_saved(self, socket: Socket, what: NotSaved, _now: float) -> None:
-        """A part of a run, or its end: nothing of it can pass, and no other unit is begun."""
+        """A part of a run is not saved: it cannot pass, and no other run is started."""
         if socket.phase is Phase.SAVE:
             socket.note = what.reason
         self.stop(codes.RECORD_NOT_SAVED.name, what.reason, what.remedy)
@@ -501,7 +502,7 @@ class Line:
         self._effects.append(SaveAgain(tuple(unsaved)))
 
     def resumed(self, now: float, *, all_saved: bool) -> None:
-        """What came of `SaveAgain`: the line goes on, or stands where it stood."""
+        """Result of `SaveAgain`: the line goes on, or stays stopped."""
         word = Word.RESUME.value
         if all_saved:
             self.stopped = None
@@ -516,7 +517,7 @@ class Line:
     # -- the time, and what is due ----------------------------------------------------------------
 
     def tick(self, now: float) -> None:
-        """Time has passed."""
+        """Handle the timeouts."""
         if self._forget_at_s is not None and now >= self._forget_at_s:
             if self._label:
                 reason = "No card of a socket was scanned for it."
@@ -532,7 +533,7 @@ class Line:
         self._go_on(now)
 
     def _go_on(self, now: float) -> None:
-        """Begin what is due, then show what has changed."""
+        """Start the runs that are due, then report the sockets that changed."""
         for socket in self.sockets.values():
             if self.stopped is None and not self.is_closing and socket.is_due(now):
                 serial, socket.label, socket.begin_at_s = socket.label, "", None
@@ -547,7 +548,7 @@ class Line:
                 self._tell(SocketChanged(socket.name, state, serial, text))
 
     def _bind(self, socket: Socket, serial: str, why: Binding, now: float) -> None:
-        """The label is the one of the unit in this socket, or of the one that comes into it."""
+        """Assign the label to the unit in this socket, or to the one that will arrive."""
         if self._reason:
             self._reasons[serial], self._reason = self._reason, ""
         was_here = serial in (socket.interrupted, socket.last.serial if socket.last else "")
@@ -574,7 +575,7 @@ class Line:
         self._label, self._chosen, self._forget_at_s = "", None, None
 
     def stop(self, code: str, reason: str, remedy: str) -> None:
-        """Begin no unit until RESUME. Labels are forgotten: units may be swapped meanwhile."""
+        """Start no run until RESUME. Labels are dropped, since units may be swapped meanwhile."""
         if self.stopped is not None:
             return
         self.stopped = LineStopped(code, reason, remedy)
@@ -609,7 +610,7 @@ class Line:
         self._effects.append(Audit(what, data))
 
     def _scan_borne(self, socket: Socket, label: str, now: float) -> None:
-        """Scan the label that a virtual unit bears, as an operator would with the socket's card."""
+        """Assign the label of a virtual unit, as an operator does with card and label."""
         try:
             self._check_label(label)
         except Refused as refused:
@@ -638,7 +639,7 @@ class Line:
             Saved: _saved,
         },
     }
-    """What happens in a socket, by where its run is."""
+    """Handlers by phase of the socket and type of the input."""
     _COMMANDS: ClassVar[Mapping[Word, Callable[[Line, str, float], Socket | None]]] = {
         Word.SOCKET: _take_socket,
         Word.CANCEL: _cancel,
@@ -649,4 +650,4 @@ class Line:
         Word.REASON: _give_reason,
         Word.RESUME: _resume,
     }
-    """What a card does."""
+    """Handlers of the commands."""

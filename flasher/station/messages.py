@@ -1,4 +1,4 @@
-"""What a station and the process of a socket say to each other; all of it can be pickled."""
+"""Messages between a station and the processes of its sockets; all of them can be pickled."""
 
 from __future__ import annotations
 
@@ -29,9 +29,7 @@ Texts = Mapping[str, str]
 
 @dataclass(frozen=True)
 class RunOrder:
-    """A run that is claimed. What was `before` comes from the records of this unit's last runs,
-    as far as they ended without a verdict.
-    """
+    """A claimed run. The `..._before` fields come from the records of the unit's earlier runs."""
 
     run_id: RunId
     kind: RunKind
@@ -67,7 +65,7 @@ class StepReport:
 
 @dataclass(frozen=True)
 class RunResult:
-    """What a run came to, before it is saved."""
+    """Outcome of a run, not saved yet."""
 
     outcome: RunState
     code: str
@@ -77,18 +75,18 @@ class RunResult:
 
 
 class JournalError(FlasherError):
-    """An act could not be noted on disk: it must not be done."""
+    """A write could not be recorded: it must not be done."""
 
 
 class Journal(Protocol):
-    """Notes that are on disk when a method returns. All raise JournalError when they are not."""
+    """Records on disk when a method returns; each method raises JournalError when not."""
 
     def intent(self, target: str, what: str, value: str) -> WriteId:
-        """Before an act that cannot be taken back."""
+        """Before a write to the device."""
         ...
 
     def verified(self, write_id: WriteId, read_back: str | None) -> None:
-        """After it; None where nothing could be read back."""
+        """After it; `read_back` is None when nothing could be read back."""
         ...
 
     def step(self, report: StepReport) -> None:
@@ -111,7 +109,7 @@ def flash_value(version: str, sha256: str) -> str:
 
 @dataclass(frozen=True)
 class VirtualUnits:
-    """What virtual units a socket meets, and with which serial numbers."""
+    """Virtual units of a socket, and their serial numbers."""
 
     units: MockUnits
     first_number: int = 1
@@ -191,19 +189,19 @@ class Ready:
 
 @dataclass(frozen=True)
 class Beat:
-    """It is alive; said at least every second."""
+    """Heartbeat."""
 
 
 @dataclass(frozen=True)
 class AdapterDown:
-    """The adapter failed; it is tried again and again."""
+    """The adapter failed, or the process is gone; it is opened again."""
 
     reason: str
 
 
 @dataclass(frozen=True)
 class PresenceChanged:
-    """A unit came or went, or said who it is. Said again after each run and each opening."""
+    """A unit came or went, or reported its serial number; sent again after each run and opening."""
 
     is_there: bool
     how: str = ""
@@ -217,7 +215,7 @@ class PresenceChanged:
 
 @dataclass(frozen=True)
 class Intent:
-    """Note an act before it is done."""
+    """Record a write before it is done."""
 
     target: str
     what: str
@@ -226,7 +224,7 @@ class Intent:
 
 @dataclass(frozen=True)
 class Done:
-    """Note that it is done."""
+    """Record that it is done."""
 
     write_id: WriteId
     read_back: str | None
@@ -234,7 +232,7 @@ class Done:
 
 @dataclass(frozen=True)
 class Ask:
-    """Put this on disk, then reply; the process does nothing meanwhile."""
+    """Save this and reply; the process waits for the reply."""
 
     number: int
     what: Intent | Done | StepReport
@@ -250,7 +248,7 @@ class TraceFile:
 
 @dataclass(frozen=True)
 class Finished:
-    """The run is over; nothing of its outcome is on disk yet."""
+    """The run has ended; the outcome is not on disk yet."""
 
     result: RunResult
     trace: TraceFile | None
@@ -259,11 +257,11 @@ class Finished:
 
 @dataclass(frozen=True)
 class CannotWork:
-    """It ends, because it cannot do its work: a recipe that changed, a setting that is wrong."""
+    """The process ends and must not be restarted: the recipe changed, or a setting is wrong."""
 
     reason: str
 
 
 RunEvent = StepStarted | Progressed | OperatorPrompted
-"""What goes on in a run; nothing depends on it. The station adds the socket."""
+"""Progress of a run, for display only. The station adds the socket."""
 FromWorker = Ready | Beat | AdapterDown | PresenceChanged | Ask | RunEvent | Finished | CannotWork

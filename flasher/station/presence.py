@@ -162,7 +162,7 @@ class Presence:
         return frames
 
     def change(self, now: float) -> PresenceChanged | None:
-        """What changed since it was asked last."""
+        """The change since the last call; None without one."""
         if self._began_at is None:
             self._began_at = now
         heard = self._heard_at is not None and now - self._heard_at < self._silence_s

@@ -1,5 +1,5 @@
-"""A run on its way from the records and back: what earlier runs of the unit mean for it, and how
-its outcome gets on disk.
+"""A run on the side of the station: what earlier runs of the unit mean for it, and how its outcome
+is saved.
 
 Saving may be tried again after every failure, from any point; nothing is shown before it is done.
 """
@@ -36,7 +36,7 @@ from flasher.station.unit_checks import BEFORE
 
 @dataclass
 class ActiveRun:
-    """A run that is claimed and not yet in the records with its end."""
+    """A claimed run whose outcome is not saved yet."""
 
     claim: Claim
     trace: Path
@@ -86,7 +86,7 @@ def _judged(run: ActiveRun) -> RunResult:
 
 
 def _attach(store: Store, run: ActiveRun) -> None:
-    """The trace, by its hash; a trace that is not the one which was closed is none."""
+    """Store the trace, and check that it is the one that the process closed."""
     trace = run.finished.trace if run.finished is not None else None
     if trace is None:
         if run.trace.exists():

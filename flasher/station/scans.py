@@ -1,4 +1,4 @@
-"""What an operator scans: labels of units, and commands, which are barcodes on a card.
+"""Scans of the operator: labels of units, and commands, which are barcodes on a card.
 
 SOCKET A      the unit is, or will be, in socket A; for the label before or after it
 CANCEL        forget the label and the socket that wait
@@ -17,7 +17,7 @@ scanned alone belongs to
 - the socket that the station names, when the unit comes there afterwards. It names only one of
   which it knows that nothing is in it.
 
-In all other cases a person says it, by the card of the socket.
+In all other cases the operator scans the card of the socket.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ class Command:
 
 @dataclass(frozen=True)
 class NotUnderstood:
-    """It is neither; `why` says so."""
+    """Neither a label nor a command; `why` is the reason."""
 
     why: str
 
 
 def understand(text: str) -> Label | Command | NotUnderstood:
-    """What was scanned. Whether a label is one of the recipe is not looked at."""
+    """Parse a scan. Whether a label fits the recipe is checked later."""
     scanned = text.strip()
     if not scanned:
         return NotUnderstood("Nothing was scanned.")
@@ -111,7 +111,7 @@ class Refused(Exception):  # noqa: N818  a scan that changes nothing
 
 
 def place(sockets: Sockets, serial: str) -> tuple[Socket, Binding] | None:
-    """The socket of a label that was scanned alone; None where a person has to say it.
+    """The socket of a label that was scanned alone; None when the operator has to scan its card.
 
     Raises Refused.
     """
@@ -166,7 +166,7 @@ def _why_only(only: Socket, serial: str) -> Binding:
 
 
 def _where_it_is(sockets: Sockets, serial: str) -> Socket | None:
-    """The socket in which this very unit is heard."""
+    """The idle socket whose unit reports this serial number."""
     idle = [e for e in sockets.values() if e.can_work and e.phase is Phase.REST]
     said = [each for each in idle if each.is_there and each.own == serial]
     return said[0] if len(said) == 1 else None

@@ -1,4 +1,4 @@
-"""What a station knows of one socket: its process, the unit in it, its label and its last run.
+"""State of one socket: its process, the unit in it, its label and its last run.
 
 A unit is known by what is heard of it. One that falls silent may sleep, and is not taken for one
 that was removed, unless it would tell its serial number when it is heard again.
@@ -35,7 +35,7 @@ class Phase(Enum):
 
 
 class Occupancy(Enum):
-    """What is known of a unit in the socket."""
+    """Whether a unit is in the socket."""
 
     UNKNOWN = "nothing is known since its process began"
     THERE = "it is heard"
@@ -44,7 +44,7 @@ class Occupancy(Enum):
 
 
 class Binding(Enum):
-    """Why a label is the one of the unit in a socket."""
+    """How a label was assigned to a socket."""
 
     NAMED = "the station named the socket: the unit has to arrive there, from now on"
     SAID = "a person scanned the socket's card with it, or the unit itself says so"
@@ -67,7 +67,7 @@ class LastRun:
 
 @dataclass
 class Socket:
-    """A socket as the line knows it. Only `Line` changes it."""
+    """A socket; only `Line` changes it."""
 
     name: str
     is_virtual: bool = False
@@ -99,7 +99,7 @@ class Socket:
     interrupted: str = ""
     """The unit of a run that a dead station left in this socket."""
     note: str = ""
-    """What is wrong with the label that was scanned last, or with the save."""
+    """What is wrong with the last label, or with saving."""
     out_since_s: float = 0.0
     """Since when it is out of service."""
     shown: Shown | None = None
@@ -132,7 +132,7 @@ class Socket:
 
     @property
     def verdict(self) -> LastRun | None:
-        """The last run, as long as its unit is believed to be in the socket."""
+        """The last run, while its unit is assumed to be in the socket."""
         last = self.last
         if last is None or last.outcome is None or self.occupancy is Occupancy.EMPTY:
             return None
@@ -140,7 +140,7 @@ class Socket:
 
     @property
     def holds(self) -> LastRun | None:
-        """The last run, while its unit is still heard, or nothing speaks against it yet."""
+        """The last run, while its unit is heard or not known to be gone."""
         return None if self.occupancy is Occupancy.SILENT else self.verdict
 
     @property
@@ -151,7 +151,7 @@ class Socket:
 
     @property
     def is_starting(self) -> bool:
-        """True while nobody can say whether a unit is in it."""
+        """True while it is unknown whether a unit is in it."""
         if self.phase is not Phase.REST or self.verdict is not None:
             return False
         is_listening = self.sees_units and self.occupancy is Occupancy.UNKNOWN
@@ -189,7 +189,7 @@ class Socket:
         return False
 
     def _forget_note(self) -> None:
-        """What was wrong with its label was said of the unit that was there."""
+        """Clear the note: it was about the unit that was there before."""
         if self.phase is Phase.REST:
             self.note = ""
 
@@ -205,18 +205,18 @@ class Socket:
         return before is Occupancy.THERE
 
     def let_go(self) -> str:
-        """The label is not the one of this socket any more; returns it."""
+        """Remove the label from this socket; returns it."""
         label, self.label, self.begin_at_s = self.label, "", None
         if label and self.occupancy is Occupancy.EMPTY:
             self.occupancy = Occupancy.SILENT  # its unit may have been put in, and sleep
         return label
 
     def is_of_another(self, label: str) -> bool:
-        """True when the unit that is heard says that it is another one than the label's."""
+        """True when the unit reports another serial number than the label."""
         return self.is_there and self.is_own_known and self.own != label
 
     def is_due(self, now: float) -> bool:
-        """True when the unit of its label is there, as far as that can be known."""
+        """True when the unit of its label is there, as far as known."""
         is_free = self.can_work and self.phase is Phase.REST and not self.is_chosen
         if not (self.label and is_free):
             return False
@@ -242,7 +242,7 @@ class Socket:
         return f"Put {shown} into socket {self.name}."
 
     def view(self, stopped: LineStopped | None, *, is_only: bool) -> Shown:
-        """What it shows; `stopped`: why the line stands; `is_only`: the station has no other."""
+        """What it shows; `stopped` is why the line is stopped, `is_only`: there is no other one."""
         if self.is_running:
             return SocketState.RUNNING, self.serial, ""
         if self.phase is Phase.SAVE:

@@ -262,7 +262,7 @@ class Station:
         return self.clock.monotonic_s()
 
     def tell(self, event: StationEvent) -> None:
-        """An event leaves."""
+        """Publish an event with its time."""
         try:
             at = self.clock.utc().isoformat(timespec="milliseconds").replace("+00:00", "Z")
             self._on_event(replace(event, at=at))
@@ -274,7 +274,7 @@ class Station:
         self._carry_out()
 
     def _carry_out(self) -> None:
-        """Do what the line wants done, and tell it what came of it, until it wants nothing."""
+        """Carry out the effects of the line and feed back their results, until there are none."""
         while effects := self.line.take():
             for effect in effects:
                 match effect:
@@ -391,7 +391,7 @@ class Station:
     # -- while a run goes on ----------------------------------------------------------------------
 
     def _answer(self, socket: str, number: int, what: Intent | Done | StepReport) -> None:
-        """Put something on disk, then let the process go on."""
+        """Save something for the process, then reply."""
         run = self._going(socket)
         if run is None:
             reply = Reply(number, error="The run is not one of this station.")
@@ -448,7 +448,7 @@ class Station:
     # -- its end ----------------------------------------------------------------------------------
 
     def _end(self, socket: str, finished: Finished) -> None:
-        """The process said how the run ended: save it, then show it."""
+        """The run has ended: save the outcome, then publish it."""
         run = self._going(socket)
         if run is None:
             return
@@ -467,7 +467,7 @@ class Station:
         self._end(socket, Finished(RunResult(code.outcome, code.name, text, duration_s), None))
 
     def _save(self, socket: str) -> bool:
-        """Save the end of a run, and show it when it is on disk; False when it is not."""
+        """Save the outcome of a run and publish it; False when it is not saved."""
         run = self._runs[socket]
         claim = run.claim
         try:

@@ -1,6 +1,4 @@
-"""Starts, watches and restarts the processes of the sockets. One that dies or hangs is replaced;
-the others do not notice.
-"""
+"""Starts, watches and restarts the processes of the sockets, independently of each other."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Units that are not there: they come into a socket, are good, slow, bad or dead, and leave again.
+"""Virtual units: they come into a socket, are good, slow, bad or dead, and leave again.
 
 For training, demonstration and tests. Each socket has a simulated bus of its own at the pace of a
 real one; what is decided about a unit follows from seed and serial number.
@@ -107,7 +107,7 @@ def next_number(rule: SerialNumber, known: set[str]) -> int:
 
 
 class Place:
-    """Where one target of a unit sits: an engine, which is a device or nothing."""
+    """The connector of one target on the bus: an engine, with or without a device behind it."""
 
     def __init__(self) -> None:
         self.device: MockDevice | None = None

@@ -82,11 +82,11 @@ class Channel(Protocol):
 
 
 class StationGoneError(Exception):
-    """The pipe is broken: nobody would record what is done now."""
+    """The pipe to the station is broken: nothing can be recorded any more."""
 
 
 class StationPipe:
-    """The pipe, with beats, and what arrived out of its time."""
+    """The pipe to the station: sends heartbeats, and keeps messages until they are asked for."""
 
     def __init__(self, channel: Channel, now: Callable[[], float]) -> None:
         self._channel = channel
@@ -109,12 +109,12 @@ class StationPipe:
             raise StationGoneError from error
 
     def tell(self, event: RunEvent) -> None:
-        """Tell what goes on; a dead station is noticed elsewhere, between two messages."""
+        """Send progress; a dead station is detected by `look`."""
         with suppress(StationGoneError):
             self.send(event)
 
     def look(self, wait_s: float = 0.0) -> None:
-        """Take in what the station said, and tell it that this process is alive."""
+        """Receive what waits, and send a heartbeat when one is due."""
         now = self._now()
         self._looked_at = now
         if now - self._beat_at >= BEAT_S and not self.is_gone:
@@ -165,7 +165,7 @@ class StationPipe:
 
 
 class PipeJournal:
-    """A `Journal` kept by the station."""
+    """A `Journal` that the station writes."""
 
     def __init__(self, pipe: StationPipe, limit_s: float) -> None:
         self._pipe = pipe
@@ -220,7 +220,7 @@ class Worker:
         self._is_down = False
         """The adapter failed."""
         self._is_blocked = False
-        """Its queue holds what nobody takes."""
+        """Its transmit queue is full."""
         self._reopen_at = 0.0
 
     def work(self) -> None:

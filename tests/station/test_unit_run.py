@@ -14,7 +14,7 @@ from flasher.settings.manifest import release_of, to_toml
 from flasher.station.codes import CODES, OF_ENDING
 from flasher.station.events import OperatorPrompted, Progressed
 from flasher.station.records.model import RunKind, RunState, StepName, StepState, Verified
-from flasher.station.records.proof import hear
+from flasher.station.records.proof import traces_of_targets
 from flasher.trace.reader import read_trace
 from flasher.trace.recorder import Recorder
 from flasher.trace.source import explain_path
@@ -67,7 +67,7 @@ def test_the_trace_of_a_good_unit_tells_all_of_it_and_its_restart_is_no_upgrade(
     story = explain_path(tmp_path / "run.log")
     assert story.verdict.cause is Cause.COMPLETED
     assert len(story.upgrades) == 1
-    heard = hear(["bms"], read_trace(tmp_path / "run.log"))["bms"]
+    heard = traces_of_targets(["bms"], read_trace(tmp_path / "run.log"))["bms"]
     assert heard.sent_sha256 == IMAGES[BMS].sha256
     assert heard.is_complete
     assert (heard.version, heard.serial, heard.written_serial) == (BMS_VERSION, SERIAL, SERIAL)

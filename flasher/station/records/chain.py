@@ -35,9 +35,9 @@ KEY_ROTATED: Final = "key rotated"
 KEY_LOST: Final = "key lost"
 """Signed with the new key, since the one before is gone."""
 CLOCK: Final = "clock"
-"""A person has said that the clock is right, though records of a later time are there."""
+"""An operator confirmed the clock, although records of a later time exist."""
 RESTORED: Final = "restored"
-"""A person has said that the records are an older copy, and what they lack is lost."""
+"""An operator accepted an older copy of the records; the missing rows are lost."""
 ENDINGS: Final = (FINISHED, INTERRUPTED, MIGRATED_RUN)
 """Rows that vouch for a run as it ended."""
 _KEYS: Final = (BEGUN, KEY_ROTATED, KEY_LOST)
@@ -83,7 +83,7 @@ class Trail:
 
 
 def canonical(data: Any) -> str:
-    """One text for equal data."""
+    """JSON in a canonical form: equal data gives the same text."""
     return json.dumps(data, sort_keys=True, separators=(",", ":"), ensure_ascii=True, default=repr)
 
 
@@ -93,7 +93,7 @@ def digest(data: Any) -> str:
 
 
 def data_of(text: str) -> dict[str, Any]:
-    """What `canonical` wrote; empty for what is nothing of it."""
+    """Parse what `canonical` wrote; empty when it is something else."""
     try:
         found = json.loads(text)
     except ValueError:

@@ -1,5 +1,5 @@
-"""Whether a unit may be run now: every rule is looked at in the transaction that begins the run,
-so that two sockets cannot both find the last place of a lot free.
+"""Checks whether a unit may be run. All rules are checked in the transaction that starts the run,
+so that two sockets cannot both take the last place of a lot.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from flasher.station.records.rows import insert, named
 from flasher.station.records.schema import recipe, run, socket, station, unit
 
 CLOCK_TOLERANCE: Final = timedelta(minutes=5)
-"""A clock that is set by the network goes back a little now and then."""
+"""Network time may set the clock back a little."""
 
 
 @dataclass(frozen=True)
 class Order:
-    """What is asked of the records at a scan."""
+    """A run to be claimed."""
 
     serial: str
     socket: str

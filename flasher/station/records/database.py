@@ -1,4 +1,4 @@
-"""Opens the database so that what is committed is on disk, and checks that it is what it must be.
+"""Opens the database with durable commits, and checks its settings and schema version.
 
 SQLite's safety is a matter of settings: each is set on every connection, and read back before the
 connection is used. A setting that does not hold (a network disk without WAL) is refused.
@@ -109,7 +109,7 @@ def locate(url: str, folder: Path | None = None) -> Location:
 
 
 def _no_database(url: str) -> UsageError:
-    """Nobody knows which part of the text would have been a password: only its begin is shown."""
+    """Shows the beginning only: any part of the text may be a password."""
     begin, scheme, _ = url.partition("://")
     return UsageError(
         f"{printable(begin + scheme)[:40]}... names no place for records.",
@@ -169,7 +169,7 @@ class Database:
                 yield connection
 
     def _check_place(self, connection: Connection, *, has_log: bool = False) -> None:
-        """An open file can be moved or deleted: SQLite writes on, and nobody finds it again.
+        """Detects that the open file was moved or deleted: SQLite would go on writing to it.
 
         Raises RecordsMovedError.
         """

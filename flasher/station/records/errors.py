@@ -1,4 +1,4 @@
-"""Every way in which saving or reading the records can fail, and the one place that maps them.
+"""The errors of reading and saving records, and the mapping of foreign errors to them.
 
 Whoever gets a `RecordError` from an operation that writes must not show PASS: nothing was saved.
 """

@@ -27,7 +27,7 @@ from flasher.station.records.model import (
     RunId,
     RunState,
 )
-from flasher.station.records.proof import contradictions, hear
+from flasher.station.records.proof import contradictions, traces_of_targets
 from flasher.station.records.queries import details_of
 from flasher.station.records.rows import batches
 from flasher.station.records.triggers import differences, fingerprint_of
@@ -291,7 +291,9 @@ class Examiner:
             return
         try:
             with self._files.named(traces[0]) as path:
-                heard = hear((target.target for target in details.targets), read_trace(path))
+                heard = traces_of_targets(
+                    (target.target for target in details.targets), read_trace(path)
+                )
         except (UsageError, RecordError) as error:
             what = f"its trace cannot be read: {error.cause or error.what}"
             yield Problem(where, what, (run.run_id,))

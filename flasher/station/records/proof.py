@@ -1,4 +1,4 @@
-"""A PASS against its own bus trace: what was sent, what the device answered, and which unit it was.
+"""Checks a PASS against its own bus trace: what was sent, what was answered, and by which unit.
 
 The trace is written by another process than the records, frame by frame; here it is read again from
 its bytes alone, by nothing that took part in the run.
@@ -28,8 +28,8 @@ SERIAL: Final = "serial-number"
 
 
 @dataclass
-class Heard:
-    """What a trace tells of one target."""
+class TraceOfTarget:
+    """What a trace shows of one target."""
 
     target: Target
     packets: dict[int, bytes] = field(default_factory=dict)
@@ -93,13 +93,15 @@ class Heard:
         return any(version.encode("ascii", "replace") in data for data in self.answers)
 
 
-def hear(targets: Iterable[str], frames: Iterable[tuple[float, Frame]]) -> dict[str, Heard]:
-    """What a trace tells of these targets."""
-    heard = {name: Heard(TARGETS[name]) for name in targets if name in TARGETS}
+def traces_of_targets(
+    targets: Iterable[str], frames: Iterable[tuple[float, Frame]]
+) -> dict[str, TraceOfTarget]:
+    """What a trace shows of these targets."""
+    traces = {name: TraceOfTarget(TARGETS[name]) for name in targets if name in TARGETS}
     timeout_s = DEFAULT_TIMINGS.inter_frame_timeout_s
     streams = {
         of_id: (Reassembler(of_id, timeout_s), each)
-        for each in heard.values()
+        for each in traces.values()
         for of_id in (each.target.request_id, *_ids_of(each.target.node))
     }
     for at_s, frame in frames:
@@ -110,7 +112,7 @@ def hear(targets: Iterable[str], frames: Iterable[tuple[float, Frame]]) -> dict[
         for message in found:
             if isinstance(message, Message):
                 each.take(message)
-    return heard
+    return traces
 
 
 def _ids_of(node: Node) -> list[int]:
@@ -118,12 +120,12 @@ def _ids_of(node: Node) -> list[int]:
     return [can_id(node, receiver) for receiver in (None, *Node) if receiver is not node]
 
 
-def contradictions(details: RunDetails, heard: dict[str, Heard]) -> Iterator[str]:
-    """In what the trace of a PASS says something else than the records; nothing when it agrees."""
+def contradictions(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Iterator[str]:
+    """Where the trace of a PASS contradicts the records."""
     run = details.run
     flashed = {write.target for write in details.writes if write.what == FLASH}
     for target in details.targets:
-        said = heard.get(target.target)
+        said = traces.get(target.target)
         if said is None:
             yield f"there is no device {printable(target.target)}"
             continue
@@ -136,7 +138,7 @@ def contradictions(details: RunDetails, heard: dict[str, Heard]) -> Iterator[str
         if said.serial and said.serial != run.serial:
             yield f"it is of the unit {printable(said.serial)}, not of {printable(run.serial)}"
     for write in details.writes:
-        said = heard.get(write.target)
+        said = traces.get(write.target)
         if write.what == SERIAL and said is not None:
             if said.written_serial != run.serial:
                 yield f"the serial number {printable(run.serial)} is not written in it"
@@ -144,7 +146,7 @@ def contradictions(details: RunDetails, heard: dict[str, Heard]) -> Iterator[str
                 yield f"the serial number {printable(run.serial)} is not read back in it"
 
 
-def _image(target: TargetRecord, said: Heard) -> Iterator[str]:
+def _image(target: TargetRecord, said: TraceOfTarget) -> Iterator[str]:
     if said.sent_sha256 is None:
         yield f"it holds no whole transfer to the {target.target}"
     elif said.sent_sha256 != target.image_sha256:

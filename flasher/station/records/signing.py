@@ -1,4 +1,4 @@
-"""Writes that the audit chain vouches for: signed with the station's key, and their heads kept."""
+"""Transactions with entries in the audit chain: signed with the station's key, their heads kept."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Signer:
 
     @cached_property
     def records_id(self) -> str:
-        """What tells these records from others."""
+        """Identifies these records and every copy of them."""
         with self._database.reading() as connection:
             return str(connection.execute(select(schema_info.c.records_id)).scalar_one())
 
@@ -173,7 +173,7 @@ class Signer:
         self._key = loaded
 
     def _keep_heads(self) -> None:
-        """Also those of a commit before, which could not be kept then."""
+        """Append the heads of this commit, and of earlier ones that could not be kept."""
         with self._heads_lock:
             some = list(self._unkept)
             if some:

@@ -356,7 +356,7 @@ class Store:
         return make_backup(self.database, self.files, path)
 
     def examine(self, runs: Collection[RunId] | None = None) -> Examination:
-        """What holds of the records and what does not, with the reasons; of these runs, or of all.
+        """Examine the records; of the runs these, or all.
 
         Raises RecordError when they cannot be read.
         """

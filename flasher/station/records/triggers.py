@@ -1,5 +1,5 @@
 # ruff: noqa: S608  all of this SQL is written here, no value comes from outside
-"""Rules over several rows, as triggers of the database, so that no program can get around them.
+"""Rules over several rows, as triggers of the database: they hold for every program.
 
 The conditions are written once, in SQL that SQLite and PostgreSQL share; only the frame around them
 differs. The fingerprint tells later whether a rule was taken away or made weaker.
@@ -290,7 +290,7 @@ def fingerprint_of(connection: Connection) -> dict[str, str]:
 
 
 def differences(stated: Mapping[str, str], found: Mapping[str, str]) -> Iterator[tuple[str, str]]:
-    """What is not as it was stated: its name, and what is wrong with it."""
+    """The differences of two fingerprints: name, and what was done to it."""
     for name in sorted(stated.keys() | found.keys()):
         if name not in found:
             yield name, "it was taken away"
