@@ -12,13 +12,7 @@ from enum import Enum, IntEnum
 from typing import Any, Final
 
 from flasher.report.junit import JUnitCase, JUnitResult, JUnitSuite, junit_xml
-from flasher.station.records.model import (
-    Figures,
-    RunFilter,
-    RunKind,
-    RunState,
-    utc_text,
-)
+from flasher.station.records.model import Figures, RunFilter, RunKind, RunState, utc_text
 from flasher.station.records.queries import Records
 
 SCHEMA_VERSION: Final = 1

@@ -13,14 +13,7 @@ from flasher.driver import Tap
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, WELLING, Target
-from flasher.station.messages import (
-    JournalError,
-    RunEvent,
-    RunOrder,
-    RunResult,
-    StepReport,
-    Texts,
-)
+from flasher.station.messages import JournalError, RunEvent, RunOrder, RunResult, StepReport, Texts
 from flasher.station.power import PowerControl
 from flasher.station.records.model import RunId, RunKind, StepName, StepState, WriteId
 from flasher.station.unit_run import UnitRun

@@ -14,13 +14,7 @@ from sqlalchemy import Connection, text
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.records.database import Database, Location
-from flasher.station.records.schema import (
-    device_write,
-    metadata,
-    run,
-    run_target,
-    schema_info,
-)
+from flasher.station.records.schema import device_write, metadata, run, run_target, schema_info
 
 _ENDED_LATER: Final = (run, run_target, device_write)
 """Their rows are completed while a run goes on; triggers hold what may change in them."""

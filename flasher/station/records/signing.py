@@ -21,13 +21,7 @@ from flasher.station.records.errors import (
     RecordError,
     RecordsCutError,
 )
-from flasher.station.records.keys import (
-    Head,
-    HeadsFile,
-    Keeping,
-    SigningKey,
-    fingerprint,
-)
+from flasher.station.records.keys import Head, HeadsFile, Keeping, SigningKey, fingerprint
 from flasher.station.records.schema import SCHEMA_VERSION, schema_info
 from flasher.station.records.triggers import fingerprint_of
 
