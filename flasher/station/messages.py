@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Final, Protocol
 
 from flasher.errors import FlasherError
 from flasher.station.config import MockUnits
@@ -21,6 +21,8 @@ from flasher.station.records.model import (
     Verified,
     WriteId,
 )
+
+REPLY_LIMIT_S: Final = 60.0
 
 # -- a run --------------------------------------------------------------------------------------
 
@@ -140,7 +142,7 @@ class WorkerSetup:
     """A unit of which nothing was heard for so long is out."""
     probe_s: float = 0.5
     """How often a unit is asked whether it is there."""
-    reply_limit_s: float = 60.0
+    reply_limit_s: float = REPLY_LIMIT_S
     """How long it waits until the station has something on disk."""
 
 

@@ -18,7 +18,7 @@ import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -28,6 +28,7 @@ from flasher.log import log_event
 from flasher.protocol.text import printable
 from flasher.station import codes
 from flasher.station.messages import (
+    REPLY_LIMIT_S,
     Abort,
     AdapterDown,
     Ask,
@@ -58,6 +59,7 @@ from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import VirtualSocket
 from flasher.trace.recorder import Recorder
 
+_REOPEN_S: Final = 1.0
 BEAT_S: Final = 0.5
 """How often it says that it is alive."""
 IDLE_S: Final = 0.05
@@ -88,9 +90,13 @@ class StationGoneError(Exception):
 class StationPipe:
     """The pipe to the station: sends heartbeats, and keeps messages until they are asked for."""
 
-    def __init__(self, channel: Channel, now: Callable[[], float]) -> None:
+    def __init__(
+        self, channel: Channel, now: Callable[[], float], reply_limit_s: float = REPLY_LIMIT_S
+    ) -> None:
         self._channel = channel
         self._now = now
+        self._reply_limit_s = reply_limit_s
+        self._asked = 0
         self._looked_at = float("-inf")
         self._beat_at = float("-inf")
         self._begin: Begin | None = None
@@ -141,16 +147,35 @@ class StationPipe:
             self.is_aborted = False
         return begin
 
-    def await_reply(self, number: int, limit_s: float) -> Reply:
-        """The reply to an `Ask`. Raises StationGoneError, JournalError after the limit."""
-        give_up_at = self._now() + limit_s
-        while number not in self._replies:
+    # -- the `Journal` of a run, which the station writes ------------------------------------------
+
+    def intent(self, target: str, what: str, value: str) -> WriteId:
+        write_id = self._ask(Intent(target, what, value)).write_id
+        if write_id is None:
+            raise JournalError("The station did not say what it saved.")
+        return write_id
+
+    def verified(self, write_id: WriteId, read_back: str | None) -> None:
+        self._ask(Done(write_id, read_back))
+
+    def step(self, report: StepReport) -> None:
+        self._ask(report)
+
+    def _ask(self, what: Intent | Done | StepReport) -> Reply:
+        """Wait until it is saved. Raises StationGoneError; JournalError when it is not."""
+        self._asked += 1
+        self.send(Ask(self._asked, what))
+        give_up_at = self._now() + self._reply_limit_s
+        while self._asked not in self._replies:
             if self.is_gone:
                 raise StationGoneError
             if self._now() >= give_up_at:
-                raise JournalError(f"The station did not save within {limit_s:g} s.")
+                raise JournalError(f"The station did not save within {self._reply_limit_s:g} s.")
             self.look(IDLE_S)
-        return self._replies.pop(number)
+        reply = self._replies.pop(self._asked)
+        if reply.error:
+            raise JournalError(reply.error)
+        return reply
 
     def _take(self, message: ToWorker) -> None:
         match message:
@@ -162,41 +187,6 @@ class StationPipe:
                 self.is_aborted = True
             case Quit():
                 self.is_over = True
-
-
-class PipeJournal:
-    """A `Journal` that the station writes."""
-
-    def __init__(self, pipe: StationPipe, limit_s: float) -> None:
-        self._pipe = pipe
-        self._limit_s = limit_s
-        self._number = 0
-
-    def intent(self, target: str, what: str, value: str) -> WriteId:
-        """Before an act that cannot be taken back."""
-        write_id = self._ask(Intent(target, what, value)).write_id
-        if write_id is None:
-            raise JournalError("The station did not say what it saved.")
-        return write_id
-
-    def verified(self, write_id: WriteId, read_back: str | None) -> None:
-        """After it."""
-        self._ask(Done(write_id, read_back))
-
-    def step(self, report: StepReport) -> None:
-        """A try of a step ended."""
-        self._ask(report)
-
-    def _ask(self, what: Intent | Done | StepReport) -> Reply:
-        self._number += 1
-        self._pipe.send(Ask(self._number, what))
-        reply = self._pipe.await_reply(self._number, self._limit_s)
-        if reply.error:
-            raise JournalError(reply.error)
-        return reply
-
-
-_REOPEN_S: Final = 1.0
 
 
 class Worker:
@@ -215,7 +205,6 @@ class Worker:
         self._connection = connection
         self._virtual = virtual
         self._power: PowerControl | None = PowerCommand(setup.power) if setup.power else virtual
-        self._journal = PipeJournal(pipe, setup.reply_limit_s)
         self._presence = Presence(recipe.targets, silence_s=setup.silence_s, probe_s=setup.probe_s)
         self._is_down = False
         """The adapter failed."""
@@ -262,14 +251,10 @@ class Worker:
         except BusError as error:
             self._is_down = True
             self._pipe.send(AdapterDown(error.what))
-        change = self._change()
+        virtual = self._virtual
+        change = self._presence.change(clock.now()) if virtual is None else virtual.step()
         if change is not None:
             self._pipe.send(change)
-
-    def _change(self) -> PresenceChanged | None:
-        if self._virtual is not None:
-            return self._virtual.step()
-        return self._presence.change(self._connection.clock.now())
 
     def _reopen(self) -> None:
         now = time.monotonic()
@@ -292,13 +277,12 @@ class Worker:
     def _run(self, begin: Begin) -> None:
         recorder: Recorder | None = None
         try:
-            with ExitStack() as stack:
-                recorder = stack.enter_context(Recorder(begin.trace))
+            with Recorder(begin.trace) as recorder:
                 result = UnitRun(
                     begin.order,
                     self._recipe,
                     self._connection,
-                    self._journal,
+                    self._pipe,
                     taps=(recorder,),
                     tell=self._pipe.tell,
                     cancelled=self._pipe.is_stopped,
@@ -311,7 +295,10 @@ class Worker:
         except Exception as error:  # noqa: BLE001  a bug must not cost the socket its process
             log_event(error)
             result = _error_result(codes.INTERNAL, f"{type(error).__name__}: {error}")
-        trace = self._close_trace(begin.trace, recorder)
+        trace = None
+        if recorder is not None and recorder.failure is None:
+            with suppress(OSError):
+                trace = pack(begin.trace)
         if trace is None and result.outcome is RunState.PASS:
             result = _error_result(codes.TRACE_NOT_SAVED, "The trace of the bus is not complete.")
         self._pipe.send(Finished(result, trace))
@@ -321,16 +308,6 @@ class Worker:
         with suppress(BusError):
             self._connection.link.drain()
         self._presence.begin()
-
-    @staticmethod
-    def _close_trace(path: Path, recorder: Recorder | None) -> TraceFile | None:
-        """The closed trace, packed; None when it is not complete."""
-        if recorder is None or recorder.failure is not None:
-            return None
-        try:
-            return pack(path)
-        except OSError:
-            return None
 
 
 def pack(path: Path) -> TraceFile:
@@ -380,7 +357,7 @@ def worker_main(channel: Channel, setup: WorkerSetup) -> None:
     for name in ("SIGINT", "SIGHUP"):  # Windows has no SIGHUP
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
-    pipe = StationPipe(channel, time.monotonic)
+    pipe = StationPipe(channel, time.monotonic, setup.reply_limit_s)
     with suppress(StationGoneError):
         try:
             recipe = load_same(setup)

@@ -39,7 +39,7 @@ from flasher.station.messages import (
 )
 from flasher.station.records.model import RunId, RunKind, RunState, WriteId
 from flasher.station.virtual_units import VirtualSocket
-from flasher.station.worker import PipeJournal, StationPipe, Worker, load_same
+from flasher.station.worker import StationPipe, Worker, load_same
 from tests.station.factory import DAY, USUAL, make_recipe
 from tests.station.unit_bench import WRITES
 
@@ -189,9 +189,9 @@ def test_a_station_that_does_not_save_in_time_is_not_waited_for() -> None:
         now[0] += 1.0
         return now[0]
 
-    pipe = StationPipe(FakeChannel(lambda _channel, _message: None), clock)
+    pipe = StationPipe(FakeChannel(lambda _channel, _message: None), clock, 30.0)
     with pytest.raises(JournalError, match="did not save within 30 s"):
-        PipeJournal(pipe, 30.0).intent("bms", "flash", "V1")
+        pipe.intent("bms", "flash", "V1")
 
 
 def test_another_recipe_than_the_stations_is_refused(tmp_path: Path) -> None:
