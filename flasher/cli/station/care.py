@@ -6,11 +6,11 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Final
 
 from flasher.cli.files import check_writable
 from flasher.cli.output import Output, byte_count, counted
+from flasher.cli.station.commands import RecordsOptions
 from flasher.cli.station.documents import (
     AcceptedDocument,
     BackupDocument,
@@ -35,20 +35,20 @@ from flasher.station.records.store import Store
 ELSEWHERE: Final = "a head kept elsewhere"
 
 
-def _open_as_station(options: SimpleNamespace, *, changes: bool) -> Store:
+def _open_as_station(records: RecordsOptions, *, changes: bool) -> Store:
     """The records, as the one station that the options or the records name."""
-    place = records_of(options)
+    place = records_of(records)
     name = place.station
     if name is None:
-        with closing(open_to_read(options)) as store:
+        with closing(open_to_read(records)) as store:
             name = the_station(store.read.stations())
     return place.open(name, create=False, read_only=not changes)
 
 
-def backup(options: SimpleNamespace, output: Output) -> int:
-    with closing(open_to_read(options)) as store:
-        check_writable(options.file, "FILE")
-        made = store.backup(options.file)
+def backup(output: Output, records: RecordsOptions, file: Path) -> int:
+    with closing(open_to_read(records)) as store:
+        check_writable(file, "FILE")
+        made = store.backup(file)
     output.result(f"{printable(str(made.path))}: {byte_count(made.size_bytes)}, checked")
     output.result(f"  sha256: {made.sha256}")
     output.result(f"  traces: {printable(made.path.name)}.files beside it")
@@ -61,8 +61,8 @@ def backup(options: SimpleNamespace, output: Output) -> int:
 # -- what was changed -----------------------------------------------------------------------------
 
 
-def verify(options: SimpleNamespace, output: Output) -> int:
-    with closing(open_to_read(options)) as store:
+def verify(output: Output, records: RecordsOptions) -> int:
+    with closing(open_to_read(records)) as store:
         found = store.examine()
     for line in _problem_lines(found.problems):
         output.result(printable(line))
@@ -127,14 +127,22 @@ def _say_what_was_checked(found: Examination, output: Output) -> None:
 # -- the key and what a person answers for --------------------------------------------------------
 
 
-def key(options: SimpleNamespace, output: Output) -> int:
-    with closing(_open_as_station(options, changes=options.rotate or options.lost)) as store:
-        if options.lost:
-            if not options.reason:
+def key(
+    output: Output,
+    records: RecordsOptions,
+    operator: str | None,
+    reason: str | None,
+    *,
+    rotate: bool,
+    lost: bool,
+) -> int:
+    with closing(_open_as_station(records, changes=rotate or lost)) as store:
+        if lost:
+            if not reason:
                 raise UsageError("A lost key needs a reason.", remedy="Add --reason TEXT.")
-            store.replace_lost_key(operator_of(options), options.reason)
-        elif options.rotate:
-            store.rotate_key(operator_of(options))
+            store.replace_lost_key(operator_of(operator), reason)
+        elif rotate:
+            store.rotate_key(operator_of(operator))
         signer = store.signer
         public, file, heads = signer.public, signer.key_file, signer.heads_file.path
     is_there = file.exists()
@@ -155,22 +163,24 @@ def key(options: SimpleNamespace, output: Output) -> int:
     return ExitCode.OK
 
 
-def accept(options: SimpleNamespace, output: Output) -> int:
-    operator = operator_of(options)
-    with closing(_open_as_station(options, changes=True)) as store:
-        if options.what == "clock":
-            store.release_clock(operator, options.reason)
+def accept(
+    output: Output, records: RecordsOptions, what: str, operator: str | None, reason: str
+) -> int:
+    who = operator_of(operator)
+    with closing(_open_as_station(records, changes=True)) as store:
+        if what == "clock":
+            store.release_clock(who, reason)
             said = "the clock is released; the station may begin units from now on"
         else:
-            lost = store.accept_restored(operator, options.reason)
+            lost = store.accept_restored(who, reason)
             said = f"the station goes on; {counted(lost, 'audit row')} of it given up as lost"
     output.result(f"{printable(store.station)}: {said}")
-    output.document(AcceptedDocument(station=store.station, what=options.what))
+    output.document(AcceptedDocument(station=store.station, what=what))
     return ExitCode.OK
 
 
-def migrate(options: SimpleNamespace, output: Output) -> int:
-    place = records_of(options)
+def migrate(output: Output, records: RecordsOptions) -> int:
+    place = records_of(records)
     done = migrate_records(
         place.url,
         folder=place.files,
@@ -193,18 +203,18 @@ def migrate(options: SimpleNamespace, output: Output) -> int:
 # -- users of a server -----------------------------------------------------------------------------
 
 
-def roles(options: SimpleNamespace, output: Output) -> int:
+def roles(output: Output, records: RecordsOptions, station_role: str, reader_role: str) -> int:
     """Records that are not there yet are made: a station that may not make tables needs them."""
-    place = records_of(options)
+    place = records_of(records)
     location = locate(place.url, Path())
-    check_roles(location, options.station_role, options.reader_role)
+    check_roles(location, station_role, reader_role)
     with closing(
         open_database(location, datetime.now(UTC), lock_timeout_s=place.lock_timeout_s)
     ) as database:
-        made = grant_roles(database, options.station_role, options.reader_role)
+        made = grant_roles(database, station_role, reader_role)
     documents = [
-        RoleDocument(name=options.station_role, may="add", is_new=options.station_role in made),
-        RoleDocument(name=options.reader_role, may="read", is_new=options.reader_role in made),
+        RoleDocument(name=station_role, may="add", is_new=station_role in made),
+        RoleDocument(name=reader_role, may="read", is_new=reader_role in made),
     ]
     for role in documents:
         new = ", new" if role["is_new"] else ""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from datetime import date, datetime
-from types import SimpleNamespace
+from pathlib import Path
 
 from flasher.cli.output import Output, byte_count
 from flasher.cli.station.documents import (
@@ -20,12 +20,12 @@ from flasher.station.recipe import fill
 from flasher.station.recipe_file import LoadedRecipe, load_checked
 
 
-def check(options: SimpleNamespace, output: Output) -> int:
+def check(output: Output, path: Path, station_file: Path | None) -> int:
     """Run the command; returns the exit code."""
     # The day is the plant's: it goes into what is written.
     day = datetime.now().astimezone().date()
     try:
-        recipe = load_checked(options.recipe, day)
+        recipe = load_checked(path, day)
     except UsageError as error:
         if not error.faults:
             raise
@@ -39,7 +39,7 @@ def check(options: SimpleNamespace, output: Output) -> int:
         return error.exit_code
     for line in _lines(recipe, day):
         output.result(line)
-    sockets = {} if options.sockets is None else adapters_of(options)
+    sockets = {} if station_file is None else _adapters_of(station_file)
     for name, adapter in sockets.items():
         output.result(f"socket {printable(name)}: {printable(adapter)}")
     output.result("nothing speaks against it")
@@ -47,9 +47,9 @@ def check(options: SimpleNamespace, output: Output) -> int:
     return ExitCode.OK
 
 
-def adapters_of(options: SimpleNamespace) -> dict[str, str]:
-    """The adapter of each socket of --sockets. Raises UsageError, BusError."""
-    sockets = load_config(options.sockets).socket
+def _adapters_of(station_file: Path) -> dict[str, str]:
+    """The adapter of each socket of a station. Raises UsageError, BusError."""
+    sockets = load_config(station_file).socket
     return {each.config.name: _adapter(each) for each in resolve(sockets, detect(sockets))}
 
 

@@ -6,20 +6,19 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
-from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any, Final
 
 import click
 
 from flasher.cli import values
-from flasher.cli.framework import Decorator, argument, group, option
+from flasher.cli.framework import Decorator, argument, group, option, option_set
 from flasher.cli.output import Output
 from flasher.errors import ExitCode, UsageError
 
 DEFAULT_RECORDS: Final = "records.sqlite"
-_EXTRA: Final = ("cryptography", "platformdirs", "pydantic", "sqlalchemy")
+_EXTRA: Final = ("cryptography", "sqlalchemy", "stdnum")
 """Packages of the extra."""
 _EXAMPLES: Final = """\
 examples:
@@ -64,7 +63,7 @@ def station() -> None:
     """
 
 
-def _carry_out(action: str, output: Output, options: dict[str, Any]) -> int:
+def _call(action: str, *args: object, **named: object) -> int:
     """Run an action ("module.function"); returns the exit code. Raises UsageError without the
     extra.
     """
@@ -76,7 +75,7 @@ def _carry_out(action: str, output: Output, options: dict[str, Any]) -> int:
         )
     module, _, name = action.partition(".")
     run = getattr(importlib.import_module(f"flasher.cli.station.{module}"), name)
-    code: int = run(SimpleNamespace(**options), output)
+    code: int = run(*args, **named)
     return code
 
 
@@ -89,7 +88,20 @@ def _path_option(*names: str, **more: Any) -> Decorator:
     return option(*names, type=of, metavar=metavar, **more)
 
 
-_RECORDS: Final = (
+@dataclass(frozen=True)
+class RecordsOptions:
+    """Where the records are."""
+
+    database: str | None
+    files: Path | None
+    keys: Path | None
+    heads: Path | None
+    sockets: Path | None
+
+
+_records_options: Final = option_set(
+    "records",
+    RecordsOptions,
     option(
         "--database", metavar="FILE|URL", panel="records", brief=True,
         help="the records: an SQLite file or postgresql://USER@HOST/NAME (default: of --sockets, "
@@ -110,12 +122,6 @@ _RECORDS: Final = (
     ),
     _path_option("--sockets", panel="records", brief=True, help="the station's file (TOML)"),
 )  # fmt: skip
-
-
-def _records_options(function: Callable[..., int]) -> Callable[..., int]:
-    for each in reversed(_RECORDS):
-        function = each(function)
-    return function
 
 
 _operator_option: Final = option(
@@ -151,69 +157,114 @@ _WRITTEN: Final = "what is written"
 @station.action("check")
 @argument("recipe", type=values.FilePath("toml", gives=Path), metavar="RECIPE", help="the recipe")
 @_path_option("--sockets", brief=True, help="the station's file, and its adapters, too")
-def check(output: Output, **options: Any) -> int:
+def check(output: Output, recipe: Path, sockets: Path | None) -> int:
     """Check everything about a recipe, before a shift."""
-    return _carry_out("check.check", output, options)
+    return _call("check.check", output, recipe, sockets)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """How a station is run."""
+
+    recipe: Path
+    operator: str | None
+    lot: str
+    scans: Path | None
+    lines: bool
+    mix_virtual: bool
+    mock_sockets: int | None
+    units: int | None
+    scan_by_hand: bool
+    mock_bad: float
+    mock_slow: float
+    mock_dead: float
+    mock_seed: int
+    mock_speed: float
 
 
 @station.action("run", epilog=_RUN_NOTES)
-@_path_option("--recipe", required=True, help="what is done to each unit")
-@option("--operator", metavar="NAME", brief=True, help="who works here (default: the login)")
-@option("--lot", default="", metavar="NAME", show_default=False, help="the lot of the units")
-@_path_option("--scans", help="labels in the order of the units; it ends behind the last")
-@option("--lines", is_flag=True, help="a line for each happening, on a terminal too")
+@option_set(
+    "options",
+    RunOptions,
+    _path_option("--recipe", required=True, help="what is done to each unit"),
+    option("--operator", metavar="NAME", brief=True, help="who works here (default: the login)"),
+    option("--lot", default="", metavar="NAME", show_default=False, help="the lot of the units"),
+    _path_option("--scans", help="labels in the order of the units; it ends behind the last"),
+    option("--lines", is_flag=True, help="a line for each happening, on a terminal too"),
+    option(
+        "--mix-virtual", is_flag=True, panel="records",
+        help="let real and virtual units share the records (no serial number is both)",
+    ),
+    option(
+        "--mock-sockets", type=values.count, metavar="N", panel=_VIRTUAL, brief=True,
+        help="N sockets with virtual units",
+    ),
+    option(
+        "--units", type=values.count, metavar="N", panel=_VIRTUAL, brief=True,
+        help="end after N virtual units",
+    ),
+    option(
+        "--scan-by-hand", is_flag=True, panel=_VIRTUAL,
+        help="their labels are shown, and have to be typed",
+    ),
+    _mock_share_option("bad", 0.15, "refuse the image, or have the wrong hardware"),
+    _mock_share_option("slow", 0.1, "take longer"),
+    _mock_share_option("dead", 0.05, "never answer"),
+    option(
+        "--mock-seed", type=values.number, default="2", metavar="N", panel=_VIRTUAL,
+        help="other ones",
+    ),
+    option(
+        "--mock-speed", type=values.speed, default=1.0, metavar="X", panel=_VIRTUAL,
+        help="times as fast as a real bus; 0 takes no time",
+    ),
+)  # fmt: skip
 @_records_options
-@option(
-    "--mix-virtual", is_flag=True, panel="records",
-    help="let real and virtual units share the records (no serial number is both)",
-)  # fmt: skip
-@option(
-    "--mock-sockets", type=values.count, metavar="N", panel=_VIRTUAL, brief=True,
-    help="N sockets with virtual units",
-)  # fmt: skip
-@option(
-    "--units", type=values.count, metavar="N", panel=_VIRTUAL, brief=True,
-    help="end after N virtual units",
-)  # fmt: skip
-@option(
-    "--scan-by-hand", is_flag=True, panel=_VIRTUAL,
-    help="their labels are shown, and have to be typed",
-)  # fmt: skip
-@_mock_share_option("bad", 0.15, "refuse the image, or have the wrong hardware")
-@_mock_share_option("slow", 0.1, "take longer")
-@_mock_share_option("dead", 0.05, "never answer")
-@option(
-    "--mock-seed", type=values.number, default="2", metavar="N", panel=_VIRTUAL, help="other ones"
-)
-@option(
-    "--mock-speed", type=values.speed, default=1.0, metavar="X", panel=_VIRTUAL,
-    help="times as fast as a real bus; 0 takes no time",
-)  # fmt: skip
-def run(output: Output, **options: Any) -> int:
+def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
     """Flash unit after unit."""
-    return _carry_out("run.run", output, options)
+    return _call("run.run", output, options, records)
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """Which runs are reported, and what is written."""
+
+    lot: str | None
+    recipe: str | None
+    part: str | None
+    serial: str | None
+    since: str | None
+    until: str | None
+    csv: Path | None
+    json_report: Path | None
+    junit: Path | None
+    certificates: Path | None
 
 
 @station.action("report")
-@option("--lot", metavar="NAME", panel=_WHICH, brief=True, help="of this lot")
-@option("--recipe", metavar="NAME", panel=_WHICH, help="by the recipe of this name")
-@option("--part", metavar="NAME", panel=_WHICH, help="of this part")
-@option("--serial", metavar="SERIAL", panel=_WHICH, help="of the unit with this serial number")
-@option(
-    "--since", metavar="TIME", panel=_WHICH, brief=True,
-    help="begun then or later: 2026-05-17, or 2026-05-17T06:00",
+@option_set(
+    "options",
+    ReportOptions,
+    option("--lot", metavar="NAME", panel=_WHICH, brief=True, help="of this lot"),
+    option("--recipe", metavar="NAME", panel=_WHICH, help="by the recipe of this name"),
+    option("--part", metavar="NAME", panel=_WHICH, help="of this part"),
+    option("--serial", metavar="SERIAL", panel=_WHICH, help="of the unit with this serial number"),
+    option(
+        "--since", metavar="TIME", panel=_WHICH, brief=True,
+        help="begun then or later: 2026-05-17, or 2026-05-17T06:00",
+    ),
+    option("--until", metavar="TIME", panel=_WHICH, brief=True, help="begun before"),
+    _path_option("--csv", panel=_WRITTEN, brief=True, help="one row a run"),
+    _path_option("--json-report", panel=_WRITTEN, help="figures and runs"),
+    _path_option("--junit", panel=_WRITTEN, help="one test case a run"),
+    _path_option(
+        "--certificates", metavar="DIR", panel=_WRITTEN, help="a page to print for each unit (HTML)"
+    ),
 )  # fmt: skip
-@option("--until", metavar="TIME", panel=_WHICH, brief=True, help="begun before")
-@_path_option("--csv", panel=_WRITTEN, brief=True, help="one row a run")
-@_path_option("--json-report", panel=_WRITTEN, help="figures and runs")
-@_path_option("--junit", panel=_WRITTEN, help="one test case a run")
-@_path_option(
-    "--certificates", metavar="DIR", panel=_WRITTEN, help="a page to print for each unit (HTML)"
-)
 @_records_options
-def report(output: Output, **options: Any) -> int:
+def report(output: Output, options: ReportOptions, records: RecordsOptions) -> int:
     """Show units, yield, failures and times; write them to files; make certificates."""
-    return _carry_out("records.report", output, options)
+    return _call("records.report", output, options, records)
 
 
 @station.action("unit")
@@ -222,36 +273,44 @@ def report(output: Output, **options: Any) -> int:
 @option("--story", is_flag=True, brief=True, help="each trace explained in full")
 @_path_option("--certificate", help="write its page to print (HTML)")
 @_records_options
-def unit(output: Output, **options: Any) -> int:
+def unit(
+    output: Output,
+    serial: str,
+    part: str | None,
+    *,
+    story: bool,
+    certificate: Path | None,
+    records: RecordsOptions,
+) -> int:
     """Show the whole life of a unit, with its traces."""
-    return _carry_out("records.unit", output, options)
+    return _call("records.unit", output, records, serial, part, certificate, full=story)
 
 
 @station.action("backup")
 @argument("file", type=values.FilePath(gives=Path), metavar="FILE", help="where the copy goes")
 @_records_options
-def backup(output: Output, **options: Any) -> int:
+def backup(output: Output, file: Path, records: RecordsOptions) -> int:
     """Copy the records while the station runs."""
-    return _carry_out("care.backup", output, options)
+    return _call("care.backup", output, records, file)
 
 
 @station.action("roles")
 @option("--station-role", metavar="NAME", default="flasher_station", help="it adds records")
 @option("--reader-role", metavar="NAME", default="flasher_reader", help="it reads them")
 @_records_options
-def roles(output: Output, **options: Any) -> int:
+def roles(output: Output, station_role: str, reader_role: str, records: RecordsOptions) -> int:
     """Give two users of a PostgreSQL server their rights, by the owner of the database: one for
     stations, which adds records, and one which reads them. Neither can delete records, or change
     tables and triggers. Users and records that are not there yet are made.
     """
-    return _carry_out("care.roles", output, options)
+    return _call("care.roles", output, records, station_role, reader_role)
 
 
 @station.action("verify")
 @_records_options
-def verify(output: Output, **options: Any) -> int:
+def verify(output: Output, records: RecordsOptions) -> int:
     """Tell whether the records were changed."""
-    return _carry_out("care.verify", output, options)
+    return _call("care.verify", output, records)
 
 
 @station.action("key")
@@ -260,11 +319,19 @@ def verify(output: Output, **options: Any) -> int:
 @_operator_option
 @_reason_option(required=False)
 @_records_options
-def key(output: Output, **options: Any) -> int:
+def key(
+    output: Output,
+    *,
+    rotate: bool,
+    lost: bool,
+    operator: str | None,
+    reason: str | None,
+    records: RecordsOptions,
+) -> int:
     """Show, or change, the key that signs the records."""
-    if options["rotate"] and options["lost"]:
+    if rotate and lost:
         raise UsageError("--rotate and --lost do not go together.", remedy="Leave one out.")
-    return _carry_out("care.key", output, options)
+    return _call("care.key", output, records, operator, reason, rotate=rotate, lost=lost)
 
 
 @station.action("accept")
@@ -277,13 +344,15 @@ def key(output: Output, **options: Any) -> int:
 @_operator_option
 @_reason_option(required=True)
 @_records_options
-def accept(output: Output, **options: Any) -> int:
+def accept(
+    output: Output, what: str, operator: str | None, reason: str, records: RecordsOptions
+) -> int:
     """Let the station go on, and note who said so."""
-    return _carry_out("care.accept", output, options)
+    return _call("care.accept", output, records, what, operator, reason)
 
 
 @station.action("migrate")
 @_records_options
-def migrate(output: Output, **options: Any) -> int:
+def migrate(output: Output, records: RecordsOptions) -> int:
     """Bring records of an older flasher up to date; a backup is made first."""
-    return _carry_out("care.migrate", output, options)
+    return _call("care.migrate", output, records)

@@ -5,10 +5,9 @@ from __future__ import annotations
 import getpass
 from dataclasses import dataclass
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Final
 
-from flasher.cli.station.commands import DEFAULT_RECORDS
+from flasher.cli.station.commands import DEFAULT_RECORDS, RecordsOptions
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.config import load_config
@@ -45,7 +44,7 @@ class RecordsPlace:
         )
 
 
-def records_of(options: SimpleNamespace) -> RecordsPlace:
+def records_of(options: RecordsOptions) -> RecordsPlace:
     """Where the options say that the records are. Raises UsageError."""
     config = load_config(options.sockets) if options.sockets is not None else None
     database, files, keys, heads = options.database, options.files, options.keys, options.heads
@@ -63,7 +62,7 @@ def _path(text: str) -> Path | None:
     return Path(text) if text else None
 
 
-def open_to_read(options: SimpleNamespace) -> Store:
+def open_to_read(options: RecordsOptions) -> Store:
     """The records as they are: nothing of them is changed. Raises UsageError, RecordError."""
     return records_of(options).open(_READER, read_only=True)
 
@@ -79,9 +78,9 @@ def the_station(names: tuple[str, ...]) -> str:
     return names[0]
 
 
-def operator_of(options: SimpleNamespace) -> str:
+def operator_of(named: str | None) -> str:
     """Who works here."""
     try:
-        return str(options.operator or getpass.getuser())
+        return named or getpass.getuser()
     except (OSError, KeyError):
         return "operator"

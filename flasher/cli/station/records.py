@@ -10,7 +10,6 @@ from contextlib import closing
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Final
 from urllib.parse import quote
 
@@ -19,6 +18,7 @@ from flasher.cli.files import check_writable, write_whole
 from flasher.cli.look.explain_text import story_lines
 from flasher.cli.output import Output, counted, duration
 from flasher.cli.station.board import figures_line
+from flasher.cli.station.commands import RecordsOptions, ReportOptions
 from flasher.cli.station.documents import (
     StationReportDocument,
     UnitDocument,
@@ -56,8 +56,8 @@ _NO_VERDICT: Final = (RunState.ERROR, RunState.ABORTED, RunState.INTERRUPTED)
 # -- many runs ------------------------------------------------------------------------------------
 
 
-def report(options: SimpleNamespace, output: Output) -> int:
-    with closing(open_to_read(options)) as store:
+def report(output: Output, options: ReportOptions, records: RecordsOptions) -> int:
+    with closing(open_to_read(records)) as store:
         wanted: dict[str, tuple[Path | None, Callable[[Report], str]]] = {
             "--csv": (options.csv, Report.to_csv),
             "--json-report": (options.json_report, _report_json),
@@ -90,7 +90,7 @@ def _report_json(report: Report) -> str:
     return json.dumps(report.to_dict(), indent=1) + "\n"
 
 
-def _filter(options: SimpleNamespace) -> RunFilter:
+def _filter(options: ReportOptions) -> RunFilter:
     return RunFilter(
         lot=options.lot,
         recipe=options.recipe,
@@ -168,11 +168,19 @@ def certificate(store: Store, life: UnitLife, examined: Examination | None = Non
 # -- one unit -------------------------------------------------------------------------------------
 
 
-def unit(options: SimpleNamespace, output: Output) -> int:
-    with closing(open_to_read(options)) as store:
-        if options.certificate is not None:
-            check_writable(options.certificate, "--certificate")
-        life = store.read.unit(options.serial, options.part)
+def unit(
+    output: Output,
+    records: RecordsOptions,
+    serial: str,
+    part: str | None,
+    page: Path | None,
+    *,
+    full: bool,
+) -> int:
+    with closing(open_to_read(records)) as store:
+        if page is not None:
+            check_writable(page, "--certificate")
+        life = store.read.unit(serial, part)
         told: dict[RunId, list[str | Story]] = {}
         traces = []
         for details in life.runs:
@@ -180,14 +188,12 @@ def unit(options: SimpleNamespace, output: Output) -> int:
                 if file.kind in (TRACE, TORN_TRACE):
                     found = explained(store, file)
                     told.setdefault(details.run.run_id, []).append(found)
-                    traces.append(
-                        _trace_document(details.run.run_id, file, found, full=options.story)
-                    )
-        for line in unit_lines(life, told, full=options.story):
+                    traces.append(_trace_document(details.run.run_id, file, found, full=full))
+        for line in unit_lines(life, told, full=full):
             output.result(line)
-        if options.certificate is not None:
-            write_whole(options.certificate, certificate(store, life), "--certificate")
-            output.progress(f"page: {printable(str(options.certificate))}")
+        if page is not None:
+            write_whole(page, certificate(store, life), "--certificate")
+            output.progress(f"page: {printable(str(page))}")
         output.document(UnitDocument(unit=plain_value(life), traces=traces))
         return ExitCode.OK
 

@@ -11,11 +11,11 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Final
 
 from flasher.cli.output import Output
 from flasher.cli.station.board import figures_line
+from flasher.cli.station.commands import RecordsOptions, RunOptions
 from flasher.cli.station.documents import (
     EndedUnitDocument,
     FiguresDocument,
@@ -48,22 +48,23 @@ _LEAVE_S: Final = 2.0
 """A verdict on a virtual unit can be read so long."""
 
 
-def run(options: SimpleNamespace, output: Output) -> int:
+def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
     """Run the command; returns the exit code. Without a terminal it speaks JSON."""
     is_terminal = sys.stdout.isatty()
     if not (is_terminal or options.lines):
         output.json_wanted = True
     scans = None if options.scans is None else read_scans(options.scans)
     recipe = load_checked(options.recipe, datetime.now().astimezone().date())
-    config, sockets = _find_sockets(options)
+    config, sockets = _find_sockets(options, records.sockets)
     is_virtual = all(socket.bus is None for socket in sockets)
     view: View = Table(output)
     if output.json_wanted:
         view = JsonLines(output)
     elif options.lines or os.environ.get("TERM") == "dumb":
         view = Lines(output)
-    with _opened_records(options, config) as store:
+    with _opened_records(options, records, config) as store:
         session = _Session(options, output, store, view, is_virtual=is_virtual)
+        session.is_temporary = _is_temporary(options, records)
         first = 1
         if is_virtual:  # numbers that these records do not know yet
             rows, part = store.read.table(), recipe.recipe.part
@@ -80,7 +81,7 @@ def run(options: SimpleNamespace, output: Output) -> int:
                 speed=options.mock_speed,
                 leave_after_s=_LEAVE_S,
             ),
-            operator=operator_of(options),
+            operator=operator_of(options.operator),
             lot=options.lot,
             on_event=session.view,
             options=StationOptions(
@@ -98,18 +99,15 @@ def run(options: SimpleNamespace, output: Output) -> int:
         return session.report()
 
 
-def _find_sockets(options: SimpleNamespace) -> tuple[StationConfig, tuple[Resolved, ...]]:
+def _find_sockets(
+    options: RunOptions, file: Path | None
+) -> tuple[StationConfig, tuple[Resolved, ...]]:
     """The station that the options name, and its sockets with their adapters. Raises UsageError,
     BusError for a missing adapter.
     """
-    if (options.sockets is None) == (options.mock_sockets is None):
-        raise UsageError(
-            "A station needs either its sockets or virtual ones.",
-            remedy="Give --sockets FILE, or --mock-sockets N.",
-        )
-    if options.sockets is not None:
-        config = load_config(options.sockets)
-    else:
+    if file is not None and options.mock_sockets is None:
+        config = load_config(file)
+    elif file is None and options.mock_sockets is not None:
         shares = {"bad": options.mock_bad, "slow": options.mock_slow, "dead": options.mock_dead}
         if sum(shares.values()) > 1:
             raise UsageError(
@@ -117,6 +115,11 @@ def _find_sockets(options: SimpleNamespace) -> tuple[StationConfig, tuple[Resolv
                 remedy="Their sum is 1 at the most.",
             )
         config = mock_config(options.mock_sockets, MockUnits(**shares, seed=options.mock_seed))
+    else:
+        raise UsageError(
+            "A station needs either its sockets or virtual ones.",
+            remedy="Give --sockets FILE, or --mock-sockets N.",
+        )
     sockets = resolve(config.socket, detect(config.socket))
     given = [name for name in ("units", "scan_by_hand") if getattr(options, name)]
     if given and any(socket.bus is not None for socket in sockets):
@@ -131,14 +134,21 @@ def _find_sockets(options: SimpleNamespace) -> tuple[StationConfig, tuple[Resolv
     return config, sockets
 
 
+def _is_temporary(options: RunOptions, records: RecordsOptions) -> bool:
+    """True for virtual units without --database."""
+    return options.mock_sockets is not None and records.database is None
+
+
 @contextmanager
-def _opened_records(options: SimpleNamespace, config: StationConfig) -> Iterator[Store]:
+def _opened_records(
+    options: RunOptions, records: RecordsOptions, config: StationConfig
+) -> Iterator[Store]:
     """The records; those of virtual units without --database are gone afterwards.
 
     Raises UsageError, RecordError.
     """
-    if options.mock_sockets is None or options.database is not None:
-        with records_of(options).open(config.name) as store:
+    if not _is_temporary(options, records):
+        with records_of(records).open(config.name) as store:
             yield store
         return
     with tempfile.TemporaryDirectory(prefix="flasher-station-") as folder:
@@ -154,7 +164,7 @@ class _Session:
 
     def __init__(
         self,
-        options: SimpleNamespace,
+        options: RunOptions,
         output: Output,
         store: Store,
         view: View,
@@ -173,7 +183,8 @@ class _Session:
         self._is_used_up = False
         self._is_stopped = False
         self._failure: FlasherError | None = None
-        self._is_temporary = options.mock_sockets is not None and options.database is None
+        self.is_temporary = False
+        """The records are gone afterwards."""
 
     # -- at work ----------------------------------------------------------------------------------
 
@@ -315,7 +326,7 @@ class _Session:
         for label in self._not_done():
             last = next(each for each in reversed(board.refused) if each.text == label)
             yield printable(f"{'refused':<8} {label}: {last.code}: {last.reason} {last.remedy}")
-        if not self._is_temporary:
+        if not self.is_temporary:
             yield f"records: {self._store.database.location.shown}"
 
     def _figures(self) -> FiguresDocument | None:
@@ -331,7 +342,7 @@ class _Session:
             station=self._store.station,
             recipe=recipe.name,
             revision=recipe.revision,
-            records="" if self._is_temporary else str(location.file or Path(location.shown)),
+            records="" if self.is_temporary else str(location.file or Path(location.shown)),
             is_complete=self._is_used_up,
             figures=self._figures(),
             units=[
