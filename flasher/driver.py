@@ -151,11 +151,12 @@ def _hear(
     """Hand on a frame and all that wait behind it: what is sent next must not look like the cause
     of what had come before.
     """
+    now_of, hear, receive = clock.now, engine.receive, link.receive
     for _ in range(_CATCH_UP_FRAMES):
         if frame is None:
             return
-        now = clock.now()
+        now = now_of()
         for tap in taps:
             tap(frame, sent=False, now=now)
-        engine.receive(frame, now)
-        frame = link.receive(_AT_ONCE)
+        hear(frame, now)
+        frame = receive(_AT_ONCE)

@@ -156,13 +156,11 @@ class CanLink:
         all the same, and lose them.
         """
         give_up_at: float | None = None
-        if self.is_off:
+        if self._health.state is ControllerState.BUS_OFF:
             raise bus_off_error(str(self), "The adapter failed while sending: it is bus-off.")
         while True:
             # A back end may alter a message: never the same object twice.
-            message = can.Message(
-                arbitration_id=frame.can_id, data=frame.data, is_extended_id=False
-            )
+            message = can.Message(arbitration_id=frame[0], data=frame[1], is_extended_id=False)
             try:
                 self._send_raw(message, **self._send_options)
             except _FAILURES as error:
@@ -186,7 +184,7 @@ class CanLink:
             waited, self.received_at = self._waiting.popleft()
             return waited
         remaining_s = deadline - time.monotonic()
-        frame = self._receive_once(max(remaining_s, 0.0))
+        frame = self._receive_once(max(0.0, remaining_s))
         # A filtered or foreign frame ends a wait early.
         while frame is None and (remaining_s := deadline - time.monotonic()) > 0:
             frame = self._receive_once(remaining_s)
@@ -246,19 +244,24 @@ class CanLink:
             raise self._failure("receiving", error) from error
         if message is None or message.is_fd:
             return None
-        self.received_at = self._moment_of(message)
+        if self.stamp_source:
+            self.received_at = _moment_of(message)
+        can_id = message.arbitration_id
         frame = Frame(
-            message.arbitration_id,
+            can_id,
             bytes(message.data),
             message.is_extended_id,
             message.is_remote_frame,
             message.is_error_frame,
         )
-        if frame[0] in self._echoes.ids:
+        if can_id in self._echoes.ids:
             frame = self._echoes.mark(frame, time.monotonic())
         # What filters hide was received all the same; what an adapter reports passes them.
-        self._health.hear(frame)
-        if filtered or frame.is_error or self._bus is None:
+        if message.is_error_frame:
+            self._health.hear(frame)
+            return frame
+        self._health.received += 1
+        if filtered or self._bus is None:
             return frame
         is_wanted = self._bus._matches_filters(message)  # noqa: SLF001  as recv() does
         return frame if is_wanted else None
@@ -268,13 +271,6 @@ class CanLink:
         frame = self._receive_once(_FULL_QUEUE_PAUSE_S)
         if frame is not None:
             self._waiting.append((frame, self.received_at))
-
-    def _moment_of(self, message: can.Message) -> float | None:
-        """The kernel's stamp on the monotonic clock, by how long ago it was."""
-        if not self.stamp_source:
-            return None
-        age_s = time.time() - message.timestamp
-        return time.monotonic() - age_s if 0.0 <= age_s <= _STAMP_AGE_MAX_S else None
 
     def _is_queue_full(self, error: Exception) -> bool:
         code = getattr(error, "error_code", None)
@@ -302,6 +298,12 @@ class CanLink:
             "termination), or other traffic takes the whole bus",
             remedy="Check that the device has power and that the bit rate is right.",
         )
+
+
+def _moment_of(message: can.Message) -> float | None:
+    """The kernel's stamp on the monotonic clock, by how long ago it was."""
+    age_s = time.time() - message.timestamp
+    return time.monotonic() - age_s if 0.0 <= age_s <= _STAMP_AGE_MAX_S else None
 
 
 def _is_foreign_datagram(error: Exception) -> bool:

@@ -209,13 +209,14 @@ class SimulatedBus:
         ends_at = self._sending_ends_at
         frames = self._disturbance(frame, ends_at) if self._disturbance else (frame,)
         for carried in frames:
-            now = self.clock.now()
+            now = ends_at  # a device is as exact as the wire, however late the clock woke
             for device in self._devices:
                 if device is not sender:
                     device.engine.receive(carried, now)
             for host in self._hosts:
                 if host is not sender and self.faults.takes_part:
                     host.inbox.append(carried)
+        self._serve_devices(ends_at)
 
 
 class SimulatedLink:

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from enum import Enum
 from math import inf
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 from flasher.events import BytesDamaged
 from flasher.protocol.engine import Transmitter
@@ -55,6 +55,9 @@ class Runner(Generic[T]):
         self.tx = Transmitter(bitrate_bps, frame_gap_s)
         self.next_frame: Callable[[float], Frame | None] = self.tx.next_frame
         """The next frame to send."""
+        self.frame_sent: Callable[[float], Any] = self.tx.frame_sent
+        """The adapter has accepted it."""
+        self.tx.on_left = self._message_left
         self.now = 0.0
         """The time of what happens."""
         self.is_cancelled = False
@@ -164,12 +167,9 @@ class Runner(Generic[T]):
             due_at = min(due_at, reassembler.due_at)
         return None if due_at == inf else due_at
 
-    def frame_sent(self, now: float) -> None:
-        if self.done:
-            return
+    def _message_left(self, now: float) -> None:
         self.now = now
-        if self.tx.frame_sent(now):
-            self._resume(Signal.LEFT)
+        self._resume(Signal.LEFT)
 
     def cancel(self, now: float) -> None:
         self.now = now

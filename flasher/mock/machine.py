@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from math import inf
 from typing import ClassVar, Final
 
 from flasher.events import BytesDamaged, DeviceReported
@@ -69,19 +70,21 @@ class Machine(ABC):
 
     def receive(self, frame: Frame, now: float) -> None:
         """A CAN frame arrived. Only payload on the ids that concern this device is looked at."""
-        self._rejoin_bus(now)
+        if self._off_bus_until is not None:
+            self._rejoin_bus(now)
         if self._is_cancelled or self._is_deaf or self._off_bus_until is not None:
             return
         if self._runs_application:
             self.application.heard(now)
-        reassembler = self._reassemblers.get(frame.can_id)
+        can_id = frame[0]
+        reassembler = self._reassemblers.get(can_id)
         if reassembler is None or not frame.is_payload:
             return
-        completed = reassembler.feed(frame.data, now)
-        if reassembler.deadline() is None:
-            self._half_received.pop(frame.can_id, None)
+        completed = reassembler.feed(frame[1], now)
+        if reassembler.due_at == inf:
+            self._half_received.pop(can_id, None)
         else:
-            self._half_received[frame.can_id] = reassembler
+            self._half_received[can_id] = reassembler
         for found in completed:
             self._take(found, now)
 

@@ -7,7 +7,7 @@ clock. `Transmitter` is the part that all engines share: messages out, one frame
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from math import inf
 from typing import NamedTuple, Protocol
 
@@ -80,6 +80,8 @@ class Transmitter:
         on the wire (R12)."""
         self.left_tag: object = None
         """The tag of that message."""
+        self.on_left: Callable[[float], None] | None = None
+        """Called when the last frame of a message is accepted, with the time."""
 
     @property
     def idle(self) -> bool:
@@ -154,6 +156,8 @@ class Transmitter:
 
     def frame_sent(self, now: float) -> bool:
         """The adapter has accepted the frame; True when it was the last one of its message."""
+        if not self._queue:
+            return False
         frames = self._queue[0].frames
         if not self._sent_frames:
             self._message_began_at = max(now, self.left_at)
@@ -170,4 +174,6 @@ class Transmitter:
         self.left_tag = message.tag
         self.left_at = max(self._message_began_at + message.wire_s, now + last_frame_s)
         self.due_at = self._queue[0].not_before if self._queue else inf
+        if self.on_left is not None:
+            self.on_left(now)
         return True

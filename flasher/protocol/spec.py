@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum, IntEnum
+from functools import cached_property
 from typing import Final
 
 from flasher.errors import UsageError
@@ -135,12 +136,12 @@ class Target:
     def name(self) -> str:
         return self.node.name.lower()
 
-    @property
+    @cached_property
     def request_id(self) -> int:
         """CAN id of the tool's messages to this device."""
         return can_id(Node.CDL, self.node)
 
-    @property
+    @cached_property
     def answer_id(self) -> int:
         """CAN id of this device's messages to the tool."""
         return can_id(self.node, Node.CDL)

@@ -1,9 +1,12 @@
-"""Host overhead: whole packet-to-ACK cycles on python-can's `virtual` bus, and bare python-can's.
+"""Host overhead: whole packet-to-ACK cycles on python-can's `virtual` bus, beside two peers.
 
     python -m tests.benchmarks.packet_cycle [--packets N]
 
-The device model runs in another thread with flash times of zero. "bare" is what python-can alone
-takes on this machine, at the same time: 18 frames one way and 2 frames back, nothing else.
+The device model runs in another thread with flash times of zero. Peers, measured in the same run:
+"bare" is what python-can alone takes, 18 frames one way and 2 frames back, nothing else; "UDS" are
+udsoncan and can-isotp, moving blocks of 128 bytes by TransferData. "line time" is an upgrade on the
+simulated bus at the pace of a real one with a device of no delay: the exact time of all its bits as
+a share of the time that it took.
 """
 
 from __future__ import annotations
@@ -17,10 +20,14 @@ import time
 import uuid
 
 import can
+import isotp
+from udsoncan.client import Client
+from udsoncan.connections import PythonIsoTpConnection
 
 from flasher import events
 from flasher.bus.adapter import CanLink, open_adapter
-from flasher.bus.link import MonotonicClock
+from flasher.bus.link import MonotonicClock, PacedClock
+from flasher.bus.simulated import SimulatedBus
 from flasher.driver import drive
 from flasher.host.upgrade import Upgrade
 from flasher.image.image import Image
@@ -38,23 +45,24 @@ class Stopwatch:
     def __init__(self) -> None:
         self.cycles_s: list[float] = []
         self.turnarounds_s: list[float] = []
-        self._frames = 0
+        self.has_packets = False
+        """The transfer has begun."""
+        self._is_sending = False
         self._began = 0.0
         self._answered: float | None = None
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        moment = time.perf_counter()
         if sent:
-            if self._frames == 0:
+            if not self._is_sending:
+                self._is_sending = True
+                self._began = time.perf_counter()
                 if self._answered is not None:
-                    self.turnarounds_s.append(moment - self._answered)
-                self._began = moment
-            self._frames += 1
-        elif len(frame.data) < 8:
-            if self._frames == 18:
-                self.cycles_s.append(moment - self._began)
-            self._answered = moment
-            self._frames = 0
+                    self.turnarounds_s.append(self._began - self._answered)
+        elif len(frame[1]) < 8:
+            self._answered = time.perf_counter()
+            if self._is_sending and self.has_packets:
+                self.cycles_s.append(self._answered - self._began)
+            self._is_sending = False
 
 
 def upgrade(packets: int) -> tuple[Stopwatch, float]:
@@ -77,6 +85,7 @@ def upgrade(packets: int) -> tuple[Stopwatch, float]:
     def note(event: object) -> None:
         if isinstance(event, events.PacketAcknowledged):
             times.append(time.perf_counter())
+            stopwatch.has_packets = event.number < event.total
 
     gc.disable()
     drive(engine, links[0], MonotonicClock(), taps=[stopwatch], on_event=note)
@@ -122,6 +131,58 @@ def bare(packets: int) -> list[float]:
     return cycles
 
 
+def uds(blocks: int) -> list[float]:
+    """Blocks of 128 bytes by udsoncan and can-isotp, without separation times or flow control."""
+    channel = uuid.uuid4().hex
+    near, far = (can.Bus(interface="virtual", channel=channel) for _ in range(2))
+    notifiers = [can.Notifier(bus, []) for bus in (near, far)]
+    there = isotp.Address(isotp.AddressingMode.Normal_11bits, txid=0x752, rxid=0x725)
+    back = isotp.Address(isotp.AddressingMode.Normal_11bits, txid=0x725, rxid=0x752)
+    fast = {"stmin": 0, "blocksize": 0}
+    server = isotp.NotifierBasedCanStack(far, notifiers[1], address=back, params=fast)
+    stack = isotp.NotifierBasedCanStack(near, notifiers[0], address=there, params=fast)
+    finished = threading.Event()
+
+    def answer() -> None:
+        while not finished.is_set():
+            request = server.recv(block=True, timeout=0.1)
+            if request:
+                server.send(bytes((request[0] + 0x40, request[1])))
+
+    server.start()
+    thread = threading.Thread(target=answer)
+    thread.start()
+    cycles = []
+    with Client(PythonIsoTpConnection(stack), request_timeout=5) as client:
+        for number in range(blocks):
+            began = time.perf_counter()
+            client.transfer_data(number % 256, bytes(PACKET_DATA_SIZE))
+            cycles.append(time.perf_counter() - began)
+    finished.set()
+    thread.join()
+    server.stop()
+    for notifier in notifiers:
+        notifier.stop()
+    near.shutdown()
+    far.shutdown()
+    return cycles
+
+
+def line_share(packets: int) -> float:
+    """The exact line time of a transfer as a share of what it took at the pace of a real bus."""
+    clock = PacedClock()
+    bus = SimulatedBus(WELLING.bitrate_bps, clock)
+    profile = DeviceProfile(erase_time_s=0.0, program_time_s=0.0)
+    bus.attach(MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=profile))
+    size = packets * PACKET_DATA_SIZE
+    planned = plan(Image.from_bytes(random.Random(1).randbytes(size)), BMS, WELLING.bitrate_bps)
+    engine = Upgrade(planned)
+    drive(engine, bus.link(), clock)
+    transfer_s = engine.outcome.statistics.transfer_s
+    assert transfer_s is not None, engine.outcome.error()
+    return planned.transfer_wire_s / transfer_s
+
+
 def line(name: str, values_s: list[float]) -> str:
     """Median and p99 in milliseconds."""
     ordered = sorted(values_s)
@@ -141,7 +202,13 @@ def main() -> None:
     print(line("bare python-can, 18 frames and back", reference))
     print(line("packet to ACK", stopwatch.cycles_s))
     print(line("ACK received to next packet sent", stopwatch.turnarounds_s))
+    peer = uds(max(packets // 20, 50))
+    print(line("UDS, a block of 128 bytes", peer))
+    cycle_s, bare_s, uds_s = map(statistics.median, (stopwatch.cycles_s, reference, peer))
     print(f"{rate:,.0f} packets/s; bare python-can {1 / statistics.mean(reference):,.0f}/s")
+    print(f"packet to ACK is {cycle_s / bare_s:.2f} times bare python-can")
+    print(f"UDS takes {uds_s / cycle_s:.1f} times as long")
+    print(f"line time / duration {line_share(300):.4f}")
 
 
 if __name__ == "__main__":
