@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack, overload
 
 from flasher.driver import Tap, adrive, drive
 from flasher.errors import FlasherError
-from flasher.host.identity import Check, Finding, Identity, judge_image
+from flasher.host.identity import Check, CheckResult, Identity, judge_image
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft, Outcome, before_the_start
 from flasher.host.query import Request
@@ -694,7 +694,7 @@ def release_options(options: UpgradeOptions | None, release: Release | None) -> 
     return replace(chosen, minimum_boot_version=release.minimum_boot_version)
 
 
-def check_image(plan: Plan, identity: Identity) -> list[Finding]:
+def check_image(plan: Plan, identity: Identity) -> list[CheckResult]:
     """What an image and its manifest say of the target by themselves, without a device.
 
     Raises ImageError when it is hardly a program for the device, WrongDeviceError when they speak
@@ -708,7 +708,7 @@ def check_image(plan: Plan, identity: Identity) -> list[Finding]:
     return findings
 
 
-def refusal(plan: Plan, found: Finding) -> FlasherError | None:
+def refusal(plan: Plan, found: CheckResult) -> FlasherError | None:
     """The error for a finding that speaks against an upgrade; None for any other."""
     if found.ending is None:
         return None

@@ -24,7 +24,7 @@ from flasher.protocol.frame import Frame
 from flasher.report import chart, spread
 from flasher.report.base import Status, render_page
 from flasher.report.scale import duration_text
-from flasher.trace.decoder import Decoder, Seen
+from flasher.trace.decoder import BusEvent, Decoder
 from flasher.trace.figures import Distribution
 
 CHECKS_SHOWN: Final = 12
@@ -72,7 +72,7 @@ class Fact(NamedTuple):
 class TraceRow(NamedTuple):
     """A decoded message, and the text of its fields."""
 
-    seen: Seen
+    seen: BusEvent
     text: str
 
 
@@ -235,7 +235,7 @@ def _trace(result: CaseResult, *, is_bad: bool) -> tuple[Sequence[TraceRow], str
 def _decoded(entries: Sequence[TraceEntry]) -> list[TraceRow]:
     """What these frames say, in order; bytes that no message was made of too."""
     decoder = Decoder()
-    found: list[Seen] = []
+    found: list[BusEvent] = []
     for entry in entries:
         due = decoder.deadline()
         if due is not None and due <= entry.at_s:

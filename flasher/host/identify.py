@@ -14,7 +14,7 @@ from math import inf
 from typing import Any, Final
 
 from flasher.events import Phase, PhaseEntered
-from flasher.host.identity import Seen
+from flasher.host.identity import DeviceAnswers
 from flasher.host.options import UpgradeOptions
 from flasher.host.query import Query, Request, ask_all
 from flasher.host.runner import Came, Runner, Signal, Stage, watched
@@ -57,14 +57,14 @@ class Identify:
         return bool(self._requests)
 
     @property
-    def seen(self) -> Seen:
+    def seen(self) -> DeviceAnswers:
         """What the device told."""
         answers = [query.answer for query in self._queries]
         running = next((each for each in answers if isinstance(each, RunningInformation)), None)
         version = next(
             (each for each in answers if each and not isinstance(each, RunningInformation)), None
         )
-        return Seen(version, running)
+        return DeviceAnswers(version, running)
 
     def stage(self, run: Runner[Any]) -> Stage[Identify]:
         """Listen and ask; what came is in this object."""

@@ -64,7 +64,7 @@ _ENDINGS: Final[Mapping[Check, Ending]] = {
 """How a refused check ends the session, where it is not that the image does not belong there."""
 
 
-class Verdict(Enum):
+class CheckVerdict(Enum):
     """What a check found; the value is its name in events."""
 
     PASSED = "passed"
@@ -77,11 +77,11 @@ class Verdict(Enum):
     """Left alone on request."""
 
 
-class Finding(NamedTuple):
+class CheckResult(NamedTuple):
     """One check and what it found, in one sentence."""
 
     check: Check
-    verdict: Verdict
+    verdict: CheckVerdict
     text: str
     other_ways: str = ""
     """What waives it beside its option; continues the sentence that names that."""
@@ -96,7 +96,7 @@ class Finding(NamedTuple):
     @property
     def ending(self) -> Ending | None:
         """How it ends the session; None when it does not."""
-        if self.verdict not in (Verdict.REFUSED, Verdict.SKIPPED):
+        if self.verdict not in (CheckVerdict.REFUSED, CheckVerdict.SKIPPED):
             return None
         if self.is_unchecked:
             return Ending.UNCHECKED
@@ -132,24 +132,24 @@ class Identity:
         """True when there is a manifest of these very bytes."""
         return self.release is not None and self.release.sha256 == image.sha256
 
-    def refusal(self, check: Check, text: str, other_ways: str = "") -> Finding:
+    def refusal(self, check: Check, text: str, other_ways: str = "") -> CheckResult:
         """A finding against the upgrade, or that it is waived."""
-        verdict = Verdict.WAIVED if check in self.waived else Verdict.REFUSED
-        return Finding(check, verdict, text, other_ways)
+        verdict = CheckVerdict.WAIVED if check in self.waived else CheckVerdict.REFUSED
+        return CheckResult(check, verdict, text, other_ways)
 
-    def uncheckable(self, check: Check, text: str) -> Finding:
+    def uncheckable(self, check: Check, text: str) -> CheckResult:
         """A rule of the manifest that the device does not let be checked: as one that fails, but
         that --allow-hardware waives it.
         """
         if self.goes_on_unchecked:
-            return Finding(Check.HARDWARE, Verdict.UNKNOWN, f"{text}: goes on unchecked")
+            return CheckResult(Check.HARDWARE, CheckVerdict.UNKNOWN, f"{text}: goes on unchecked")
         if check in self.waived:
-            return Finding(check, Verdict.WAIVED, text)
+            return CheckResult(check, CheckVerdict.WAIVED, text)
         return self.refusal(Check.HARDWARE, text)._replace(is_unchecked=True)
 
 
 @dataclass(frozen=True)
-class Seen:
+class DeviceAnswers:
     """What the running application told; None where it did not answer or was not asked."""
 
     version: Content | None = None
@@ -175,7 +175,7 @@ def new_version(image: Image, release: Release | None) -> str | None:
 # -- the image by itself ----------------------------------------------------------------------
 
 
-def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Finding]:
+def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[CheckResult]:
     """What the image and its manifest say of the target, and whether it can be a program."""
     yield from judge_bytes(image, identity)
     problem = target_problem(image, identity.release, target)
@@ -184,13 +184,15 @@ def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Fi
         yield identity.refusal(Check.TARGET, problem)
     elif identity.release is not None or image.named_targets:
         source = "the manifest" if identity.release is not None else "a name inside the image"
-        yield Finding(Check.TARGET, Verdict.PASSED, f"by {source} the image is for the {wanted}")
+        yield CheckResult(
+            Check.TARGET, CheckVerdict.PASSED, f"by {source} the image is for the {wanted}"
+        )
     else:
         text = "no manifest, and the image names no device: nobody can tell whether it is for the "
-        yield Finding(Check.TARGET, Verdict.UNKNOWN, text + wanted)
+        yield CheckResult(Check.TARGET, CheckVerdict.UNKNOWN, text + wanted)
 
 
-def judge_bytes(image: Image, identity: Identity) -> Iterator[Finding]:
+def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
     """Whether the bytes can be a program for the device; nothing where they look like one."""
     found = doubt(image)
     if found is None:
@@ -198,10 +200,10 @@ def judge_bytes(image: Image, identity: Identity) -> Iterator[Finding]:
     text = f"the image {found.text}"
     if not found.is_certain and identity.cpu is not Cpu.CORTEX_M:
         text += ": the profile says that the processor is another"
-        yield Finding(Check.PLAUSIBLE, Verdict.UNKNOWN, text)
+        yield CheckResult(Check.PLAUSIBLE, CheckVerdict.UNKNOWN, text)
     elif not found.is_certain and identity.vouches_for(image):
         text += ": the manifest was made for these very bytes"
-        yield Finding(Check.PLAUSIBLE, Verdict.UNKNOWN, text)
+        yield CheckResult(Check.PLAUSIBLE, CheckVerdict.UNKNOWN, text)
     else:
         yield identity.refusal(Check.PLAUSIBLE, text, found.ways)
 
@@ -209,7 +211,9 @@ def judge_bytes(image: Image, identity: Identity) -> Iterator[Finding]:
 # -- the device -------------------------------------------------------------------------------
 
 
-def judge_device(image: Image, target: Target, identity: Identity, seen: Seen) -> Iterator[Finding]:
+def judge_device(
+    image: Image, target: Target, identity: Identity, seen: DeviceAnswers
+) -> Iterator[CheckResult]:
     """What the running application says of the image. `seen` is empty where it did not answer."""
     if seen.version is None:
         yield _untold(identity, target)
@@ -220,7 +224,7 @@ def judge_device(image: Image, target: Target, identity: Identity, seen: Seen) -
         yield from _state(identity, seen.running)
 
 
-def _untold(identity: Identity, target: Target) -> Finding:
+def _untold(identity: Identity, target: Target) -> CheckResult:
     """The application does not answer, or there is no question for its versions."""
     text = f"the {target.node.name}'s application does not tell its versions: "
     release = identity.release
@@ -228,28 +232,30 @@ def _untold(identity: Identity, target: Target) -> Finding:
     previous = release is not None and release.rules_previous
     if not hardware and not previous:
         text += "neither hardware nor downgrade can be checked"
-        return Finding(Check.HARDWARE, Verdict.UNKNOWN, text)
+        return CheckResult(Check.HARDWARE, CheckVerdict.UNKNOWN, text)
     rules = " and ".join(["hardware"] * hardware + ["the version that is replaced"] * previous)
     text += f"the manifest's rule on {rules} cannot be checked"
     return identity.uncheckable(Check.HARDWARE if hardware else Check.PREVIOUS, text)
 
 
-def _hardware(identity: Identity, hardware: str | None) -> Finding:
+def _hardware(identity: Identity, hardware: str | None) -> CheckResult:
     release = identity.release
     if release is None or not release.hardware_versions:
         text = "no manifest says which hardware the image fits"
-        return Finding(Check.HARDWARE, Verdict.UNKNOWN, text)
+        return CheckResult(Check.HARDWARE, CheckVerdict.UNKNOWN, text)
     fits = ", ".join(printable(each) for each in release.hardware_versions)
     if hardware is None:
         text = f"the device does not tell its hardware; the manifest lists {fits}"
         return identity.uncheckable(Check.HARDWARE, text)
     if release.fits_hardware(hardware):
-        return Finding(Check.HARDWARE, Verdict.PASSED, f"the manifest lists hardware {hardware}")
+        return CheckResult(
+            Check.HARDWARE, CheckVerdict.PASSED, f"the manifest lists hardware {hardware}"
+        )
     text = f"the device's hardware {hardware} is not in the manifest, which lists {fits}"
     return identity.refusal(Check.HARDWARE, text)
 
 
-def _versions(image: Image, identity: Identity, running: str) -> Iterator[Finding]:
+def _versions(image: Image, identity: Identity, running: str) -> Iterator[CheckResult]:
     """The running version against the new one, and against the manifest's rule."""
     release = identity.release
     if release is not None:
@@ -257,30 +263,30 @@ def _versions(image: Image, identity: Identity, running: str) -> Iterator[Findin
     new = new_version(image, release)
     if new is None:
         text = f"the image names no version to compare with the running {running}"
-        yield Finding(Check.DOWNGRADE, Verdict.UNKNOWN, text)
+        yield CheckResult(Check.DOWNGRADE, CheckVerdict.UNKNOWN, text)
         return
     if new == running:
-        skipped = Verdict.SKIPPED if identity.skip_same_version else Verdict.WARNED
-        yield Finding(Check.SAME_VERSION, skipped, f"the device already runs {running}")
+        skipped = CheckVerdict.SKIPPED if identity.skip_same_version else CheckVerdict.WARNED
+        yield CheckResult(Check.SAME_VERSION, skipped, f"the device already runs {running}")
         return
     before, after = FirmwareVersion.parse(running), FirmwareVersion.parse(new)
     if before is None or after is None:
         text = f"{running} and {new} cannot be compared: not both follow the naming rule"
-        yield Finding(Check.DOWNGRADE, Verdict.UNKNOWN, text)
+        yield CheckResult(Check.DOWNGRADE, CheckVerdict.UNKNOWN, text)
     elif after < before:
         yield identity.refusal(Check.DOWNGRADE, f"{new} is older than {running}, which runs now")
     else:
         text = f"{new} is newer than {running}, which runs now"
-        yield Finding(Check.DOWNGRADE, Verdict.PASSED, text)
+        yield CheckResult(Check.DOWNGRADE, CheckVerdict.PASSED, text)
 
 
-def _previous(release: Release, identity: Identity, running: str) -> Iterator[Finding]:
+def _previous(release: Release, identity: Identity, running: str) -> Iterator[CheckResult]:
     """The manifest's rule on the version that is replaced, where it has one."""
     if not release.rules_previous:
         return
     if release.fits_previous(running):
         text = f"the manifest lets {running} be replaced"
-        yield Finding(Check.PREVIOUS, Verdict.PASSED, text)
+        yield CheckResult(Check.PREVIOUS, CheckVerdict.PASSED, text)
     else:
         excluded = running in release.previous_except or release.previous_from is None
         rule = "excludes it" if excluded else f"replaces {release.previous_from} and newer"
@@ -288,11 +294,11 @@ def _previous(release: Release, identity: Identity, running: str) -> Iterator[Fi
         yield identity.refusal(Check.PREVIOUS, text)
 
 
-def _state(identity: Identity, running: RunningInformation) -> Iterator[Finding]:
+def _state(identity: Identity, running: RunningInformation) -> Iterator[CheckResult]:
     """Charge and current; a discharging current is negative (5.1)."""
     if running.mean_current_ma < -identity.in_use_ma:
         text = f"the battery gives {-running.mean_current_ma} mA, more than {identity.in_use_ma} mA"
         yield identity.refusal(Check.IN_USE, text)
     if running.state_of_charge_percent < identity.low_charge_percent:
         text = f"the battery is at {running.state_of_charge_percent} %: charge it first, if it can "
-        yield Finding(Check.CHARGE, Verdict.WARNED, text + "wait")
+        yield CheckResult(Check.CHARGE, CheckVerdict.WARNED, text + "wait")

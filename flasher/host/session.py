@@ -23,7 +23,7 @@ from flasher.errors import (
 from flasher.events import Phase
 from flasher.host.guard import Guard
 from flasher.host.identify import Identify
-from flasher.host.identity import Finding, Identity, Seen, judge_device, judge_image
+from flasher.host.identity import CheckResult, DeviceAnswers, Identity, judge_device, judge_image
 from flasher.host.options import UpgradeOptions, firmware_version, overall_timeout_s
 from flasher.host.outcome import DeviceLeft, Outcome, before_the_start
 from flasher.host.runner import Runner, Stage
@@ -171,7 +171,7 @@ class Session(Runner[Result]):
         if identity is not None:
             refused = self._judge(judge_image(self._plan.image, self._plan.target, identity))
             if refused is None and self._options.at_power_up:
-                refused = self._judge_device(identity, Seen())
+                refused = self._judge_device(identity, DeviceAnswers())
             if refused is not None:
                 return refused
         previous = None
@@ -220,10 +220,10 @@ class Session(Runner[Result]):
             return None
         return self._judge_device(self._identity, asked.seen)
 
-    def _judge_device(self, identity: Identity, seen: Seen) -> Result | None:
+    def _judge_device(self, identity: Identity, seen: DeviceAnswers) -> Result | None:
         return self._judge(judge_device(self._plan.image, self._plan.target, identity, seen))
 
-    def _judge(self, findings: Iterable[Finding]) -> Result | None:
+    def _judge(self, findings: Iterable[CheckResult]) -> Result | None:
         """Report what was found; what is refused ends the session."""
         refused = None
         for finding in findings:

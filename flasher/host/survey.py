@@ -31,7 +31,7 @@ _GIVE_UP_AFTER: Final = 3
 
 
 @dataclass
-class Heard:
+class NodeTraffic:
     """What was heard of one node."""
 
     node: Node
@@ -63,7 +63,7 @@ class Survey(Runner[None]):
         dialect: Dialect,
         timings: Timings = DEFAULT_TIMINGS,
     ) -> None:
-        self.heard: dict[Node, Heard] = {}
+        self.heard: dict[Node, NodeTraffic] = {}
         self.queries: list[Query] = []
         """The questions that were asked, in order."""
         self.foreign_frames = 0
@@ -136,7 +136,7 @@ class Survey(Runner[None]):
         if node is None or not frame.is_payload:
             self.foreign_frames += 1
             return True
-        heard = self.heard.setdefault(node, Heard(node))
+        heard = self.heard.setdefault(node, NodeTraffic(node))
         heard.frames += 1
         if frame.can_id not in self._ids:
             self._ids.add(frame.can_id)
@@ -148,7 +148,7 @@ class Survey(Runner[None]):
             self._note(self.heard[_SENDERS[came.can_id]], came)
         return came
 
-    def _note(self, heard: Heard, found: Message | Damage) -> None:
+    def _note(self, heard: NodeTraffic, found: Message | Damage) -> None:
         if isinstance(found, Damage):
             heard.damaged += 1
             return

@@ -68,7 +68,7 @@ BootText = Annotated[str, Form(f"a text of the form {BOOT_VERSION_FORM}", _boot_
 
 
 @dataclass(frozen=True)
-class Finding:
+class Comparison:
     """One statement of a manifest held against an image."""
 
     key: str
@@ -127,14 +127,14 @@ class Release:
         running, oldest = FirmwareVersion.parse(text), FirmwareVersion.parse(self.previous_from)
         return running is not None and oldest is not None and running >= oldest
 
-    def findings(self, image: Image) -> tuple[Finding, ...]:
+    def findings(self, image: Image) -> tuple[Comparison, ...]:
         """Every statement about the image, held against `image.data`."""
         names = image.named_targets
         return (
             _compared("size_bytes", str(self.size_bytes), str(image.size_bytes)),
             _compared("sha256", self.sha256, image.sha256),
             _compared("firmware_version", self.firmware_version, image.version),
-            Finding(
+            Comparison(
                 "target",
                 self.target.node.name,
                 names_of(names) or None,
@@ -159,9 +159,9 @@ class Release:
                 )
 
 
-def _compared(key: str, stated: str | None, found: str | None) -> Finding:
+def _compared(key: str, stated: str | None, found: str | None) -> Comparison:
     agrees = None if stated is None or found is None else stated == found
-    return Finding(key, stated, found, agrees)
+    return Comparison(key, stated, found, agrees)
 
 
 def target_problem(image: Image, release: Release | None, target: Target) -> str | None:

@@ -20,12 +20,12 @@ from flasher.report.scale import duration_text
 from flasher.trace.figures import Distribution
 from flasher.trace.story import (
     Cause,
-    Line,
     PacketRun,
     PacketStory,
     Step,
     StepKind,
     Story,
+    StoryLine,
     UpgradeStory,
 )
 
@@ -235,7 +235,7 @@ def _spreads(upgrade: UpgradeStory) -> Iterable[SpreadRow]:
 # -- steps as a sequence diagram ------------------------------------------------------------------
 
 
-def _drawn(lines: Sequence[Line], target: str, most: int) -> dict[str, list[sequence.Part]]:
+def _drawn(lines: Sequence[StoryLine], target: str, most: int) -> dict[str, list[sequence.Part]]:
     """The diagram of these steps for each width."""
     participants = _participants(lines, target)
     items = sequence.thinned([_item(line, participants) for line in lines], most)
@@ -244,7 +244,7 @@ def _drawn(lines: Sequence[Line], target: str, most: int) -> dict[str, list[sequ
     }
 
 
-def _participants(lines: Sequence[Line], target: str) -> list[str]:
+def _participants(lines: Sequence[StoryLine], target: str) -> list[str]:
     """The tool, the target, then whoever is named most; the rest are the others."""
     named = Counter(
         name
@@ -262,7 +262,7 @@ def _participants(lines: Sequence[Line], target: str) -> list[str]:
     return [*first, *others]
 
 
-def _item(line: Line, participants: Sequence[str]) -> sequence.Item:
+def _item(line: StoryLine, participants: Sequence[str]) -> sequence.Item:
     if isinstance(line, PacketRun):
         some = f"packet {line.first}" if line.count == 1 else f"packets {line.first} to {line.last}"
         return sequence.Item(

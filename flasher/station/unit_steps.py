@@ -13,7 +13,7 @@ from typing import Final
 
 from flasher import events
 from flasher.errors import NoAnswerError, VerificationError
-from flasher.host.identity import Finding, judge_device
+from flasher.host.identity import CheckResult, judge_device
 from flasher.host.options import firmware_version
 from flasher.host.outcome import DeviceLeft
 from flasher.host.session import Result
@@ -151,7 +151,7 @@ class UnitSteps:
             )
 
     def _check(self, measured: list[Measurement]) -> str:
-        findings: list[Finding] = []
+        findings: list[CheckResult] = []
         for target in self.targets:
             findings += self._judge(target, measured)
         if self._is_verify_only and any(each.version_request is None for each in self.targets):
@@ -164,7 +164,7 @@ class UnitSteps:
         check_measured(measured)
         return "; ".join(finding.text for finding in findings)
 
-    def _judge(self, target: UnitTarget, measured: list[Measurement]) -> list[Finding]:
+    def _judge(self, target: UnitTarget, measured: list[Measurement]) -> list[CheckResult]:
         """The manifest's rules and the recipe's. Raises StepFailedError."""
         loaded, seen = target.loaded, self._identified[target.name].seen
         findings = list(judge_device(target.image, loaded.target, target.identity, seen))

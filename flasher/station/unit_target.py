@@ -13,7 +13,7 @@ from flasher.api import Connection, release_checked, release_options
 from flasher.driver import Tap
 from flasher.errors import InterruptedByUserError, NoAnswerError
 from flasher.host.identify import identify
-from flasher.host.identity import Seen
+from flasher.host.identity import DeviceAnswers
 from flasher.host.items import Readable, meaningful_fields
 from flasher.host.options import UpgradeOptions
 from flasher.host.query import Request
@@ -45,7 +45,7 @@ class StepFailedError(Exception):
 class Identified:
     """What a device said of itself before the first write."""
 
-    seen: Seen
+    seen: DeviceAnswers
     is_in_bootloader: bool
     answers: int
     """Different version answers: two are two devices."""

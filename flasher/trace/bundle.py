@@ -25,7 +25,7 @@ from typing import Any, Final
 import can
 
 from flasher.protocol.text import printable
-from flasher.trace.decoder import Seen
+from flasher.trace.decoder import BusEvent
 from flasher.trace.pieces import Pieces, bits_of
 from flasher.trace.recorder import message_of
 from flasher.trace.ring import Entry, FlightRecorder
@@ -134,7 +134,7 @@ def transcript(recorder: FlightRecorder) -> Iterator[str]:
         yield _line(piece.seen, own.get(piece.seen.can_id, "in"))
 
 
-def _line(seen: Seen, direction: str) -> str:
+def _line(seen: BusEvent, direction: str) -> str:
     step = step_of(seen, seen.at)
     route = f"{step.sender} > {step.receiver}" if step.sender else ""
     said = ("! " if step.is_trouble else "") + step.title + (f": {step.text}" if step.text else "")

@@ -6,7 +6,7 @@ from typing import Final
 
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import Node
-from flasher.trace.decoder import Kind, Seen, route
+from flasher.trace.decoder import BusEvent, Kind, route
 from flasher.trace.story import BusFigures, Talker, TalkerKind
 
 MAX_TALKERS: Final = 100
@@ -57,7 +57,7 @@ class BusCounter:
             names = None if frame.is_extended else route(frame.can_id)
             self.is_alone = names is not None and names[0] == Node.CDL.name
 
-    def seen(self, seen: Seen) -> None:
+    def seen(self, seen: BusEvent) -> None:
         """Take note of what was no message."""
         self.damaged += seen.kind is Kind.DAMAGED
         self.malformed += seen.kind in (Kind.MALFORMED, Kind.UNKNOWN)

@@ -1,7 +1,7 @@
 """From CAN frames to what they say: every message of both documents, and everything else by name.
 
 `Decoder` takes the whole bus, whoever sends: one byte stream for each CAN id. What comes out is
-`Seen`, one a message, a damage or a frame that is not ours, with its fields both typed and as text
+`BusEvent`, one a message, a damage or a frame that is not ours, with its fields both typed and as text
 that is harmless on any screen. Pure: the time is an argument.
 """
 
@@ -49,7 +49,7 @@ class Field(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Seen:
+class BusEvent:
     """One thing seen on the bus at `at` seconds. `sender` and `receiver` are names of nodes,
     "all" for a broadcast, and empty where the id is of no node.
     """
@@ -132,10 +132,10 @@ class Decoder:
         self._holding: dict[int, Reassembler] = {}
         """The streams that hold the beginning of something: seldom more than two or three."""
 
-    def feed(self, frame: Frame, now: float) -> Iterator[Seen]:
+    def feed(self, frame: Frame, now: float) -> Iterator[BusEvent]:
         """What the frame completed, in order: usually nothing, sometimes more than one."""
         if frame.is_error:
-            yield Seen(now, Kind.ERROR_FRAME, frame.can_id, prose(Kind.ERROR_FRAME))
+            yield BusEvent(now, Kind.ERROR_FRAME, frame.can_id, prose(Kind.ERROR_FRAME))
             return
         stream = self._streams.get(frame.can_id)
         if stream is None or not frame.is_payload:
@@ -153,7 +153,7 @@ class Decoder:
         deadlines = (stream.deadline() for stream in self._holding.values())
         return min((at for at in deadlines if at is not None), default=None)
 
-    def tick(self, now: float) -> Iterator[Seen]:
+    def tick(self, now: float) -> Iterator[BusEvent]:
         """What was cut short: the rest of a message that did not come in time (R12)."""
         for key, stream in list(self._holding.items()):
             for found in stream.tick(now):
@@ -161,15 +161,15 @@ class Decoder:
             if not stream.held_size:
                 del self._holding[key]
 
-    def _describe(self, found: Message | Damage, now: float) -> Seen:
+    def _describe(self, found: Message | Damage, now: float) -> BusEvent:
         sender, receiver = _ROUTES[found.can_id]
         if isinstance(found, Damage):
             reason = Field("reason", found.reason.value, "reason", prose(found.reason))
             fields = (reason, _raw("bytes", found.data))
             title = prose(Kind.DAMAGED)
-            return Seen(now, Kind.DAMAGED, found.can_id, title, sender, receiver, fields=fields)
+            return BusEvent(now, Kind.DAMAGED, found.can_id, title, sender, receiver, fields=fields)
         kind, title, shown, alarm = _judge(found)
-        return Seen(
+        return BusEvent(
             now, kind, found.can_id, title, sender, receiver, found.command, shown, alarm,
             in_dialect=self._dialect is None or catalogue.has_message(self._dialect, found),
         )  # fmt: skip
@@ -255,7 +255,7 @@ def _undecoded(message: Message, problem: str = "") -> tuple[Field, ...]:
     return (_plain("problem", problem), *fields) if problem else fields
 
 
-def _foreign(frame: Frame, now: float) -> Seen:
+def _foreign(frame: Frame, now: float) -> BusEvent:
     fields = [_raw("data", frame.data)]
     if frame.is_extended:
         fields.insert(0, _plain("identifier", "29 bits"))
@@ -263,7 +263,7 @@ def _foreign(frame: Frame, now: float) -> Seen:
         fields.insert(0, _plain("frame", "remote request"))
     sender, receiver = ("", "") if frame.is_extended else _ROUTES.get(frame.can_id, ("", ""))
     title = prose(Kind.FOREIGN)
-    return Seen(now, Kind.FOREIGN, frame.can_id, title, sender, receiver, fields=tuple(fields))
+    return BusEvent(now, Kind.FOREIGN, frame.can_id, title, sender, receiver, fields=tuple(fields))
 
 
 def _plain(name: str, value: int | str) -> Field:

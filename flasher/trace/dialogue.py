@@ -13,7 +13,7 @@ from flasher.protocol.spec import Command, Target
 from flasher.protocol.text import find_firmware_version
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import DamageReason
-from flasher.trace.decoder import Kind, Seen
+from flasher.trace.decoder import BusEvent, Kind
 from flasher.trace.facts import Facts
 from flasher.trace.link import Transfer
 from flasher.trace.pieces import Piece
@@ -63,7 +63,7 @@ class Dialogue(Facts):
 
     # -- what is told to it ----------------------------------------------------------------------
 
-    def begins_another(self, seen: Seen) -> bool:
+    def begins_another(self, seen: BusEvent) -> bool:
         """True when a message of the tool belongs to the next upgrade, not to this one."""
         is_over = self.completed_at_s is not None or self.early_complete
         if seen.command == Command.RESET:
@@ -334,6 +334,6 @@ class Dialogue(Facts):
             )
 
 
-def values_of(seen: Seen) -> dict[str, Any]:
+def values_of(seen: BusEvent) -> dict[str, Any]:
     """The values of the fields by their names."""
     return {shown.name: shown.value for shown in seen.fields}

@@ -34,8 +34,8 @@ from flasher.trace.story import (
     Recorded,
     Step,
     Story,
+    TraceVerdict,
     UpgradeStory,
-    Verdict,
 )
 from flasher.trace.verdict import judge, remarks
 
@@ -299,7 +299,7 @@ class _Reading:
             return MOTINOVA.bitrate_bps
         return self._bitrate_bps
 
-    def _without_upgrade(self) -> Verdict:
+    def _without_upgrade(self) -> TraceVerdict:
         bus = self._bus
         if self._announcements:
             cause = Cause.QUERIES_ONLY
@@ -317,7 +317,7 @@ class _Reading:
         if bus.error_frames:
             text += f" Error frames: {bus.error_frames:,}."
         likely, remedy = explanation(cause)
-        return Verdict(cause, None, None, 0, text, likely, remedy)
+        return TraceVerdict(cause, None, None, 0, text, likely, remedy)
 
 
 def _ids_of(upgrades: tuple[UpgradeStory, ...]) -> frozenset[int]:
@@ -326,7 +326,7 @@ def _ids_of(upgrades: tuple[UpgradeStory, ...]) -> frozenset[int]:
     return frozenset(used for each in targets for used in (each.request_id, each.answer_id))
 
 
-def _chief(upgrades: tuple[UpgradeStory, ...]) -> Verdict | None:
+def _chief(upgrades: tuple[UpgradeStory, ...]) -> TraceVerdict | None:
     """The verdict that matters most: of the last upgrade of each target, the first bad one."""
     last = {upgrade.target: upgrade.verdict for upgrade in upgrades}
     verdicts = list(last.values())

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 from flasher.protocol.spec import Target
 from flasher.trace.records import Interleaving, PacketRecord
-from flasher.trace.story import Phase, PhaseSpan, Verdict
+from flasher.trace.story import Phase, PhaseSpan, TraceVerdict
 
 
 @dataclass
@@ -25,7 +25,7 @@ class Facts:
     phase_begin_s: float = 0.0
     spans: list[PhaseSpan] = field(default_factory=list)
     attempt: int = 1
-    earlier: Verdict | None = None
+    earlier: TraceVerdict | None = None
     """That of the attempt before, if it had come to the transfer."""
     is_answered: bool = False
     """The target said something intact."""

@@ -15,7 +15,7 @@ from typing import Final
 from flasher.protocol.bittime import fixed_bits, frame_bits
 from flasher.protocol.frame import Frame
 from flasher.protocol.timing import DEFAULT_TIMINGS
-from flasher.trace.decoder import Decoder, Kind, Seen
+from flasher.trace.decoder import BusEvent, Decoder, Kind
 
 _LONG_ID_BITS: Final = 20
 """What a 29-bit id adds to a frame: 18 id bits, SRR and r1."""
@@ -38,7 +38,7 @@ def bits_of(frame: Frame) -> int:
 class Piece:
     """One thing seen, with the first of its frames and the bits of all of them."""
 
-    seen: Seen
+    seen: BusEvent
     begin_s: float
     """Stamp of the first frame."""
     end_s: float
@@ -98,7 +98,7 @@ class Pieces:
             for seen in self._decoder.tick(due):
                 yield self._piece(seen, 0)
 
-    def _piece(self, seen: Seen, bits: int) -> Piece:
+    def _piece(self, seen: BusEvent, bits: int) -> Piece:
         held = None
         if seen.kind not in (Kind.FOREIGN, Kind.ERROR_FRAME):
             # A second piece out of the same frame begins and ends with it.

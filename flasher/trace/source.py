@@ -17,7 +17,7 @@ from flasher.trace.bundle import OLDER_TRACE, REPORT, TRACE
 from flasher.trace.explain import explain
 from flasher.trace.reader import read_trace
 from flasher.trace.recorder import ONE_TOOL_CHANNEL
-from flasher.trace.story import Cause, Recorded, Story, Verdict
+from flasher.trace.story import Cause, Recorded, Story, TraceVerdict
 
 _HEAD_SIZE: Final = 100
 
@@ -67,7 +67,7 @@ def _as_the_tool_ended(story: Story) -> Story:
     if recorded is None or recorded.exit_code is None:
         return story
 
-    def judged(verdict: Verdict) -> Verdict:
+    def judged(verdict: TraceVerdict) -> TraceVerdict:
         if verdict.cause is not Cause.RECORDING_ENDS:
             return verdict
         said = recorded.error.partition(" | ")[0]

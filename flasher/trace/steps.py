@@ -7,8 +7,8 @@ from dataclasses import replace
 from typing import Final
 
 from flasher.protocol.spec import Node
-from flasher.trace.decoder import Field, Kind, Seen
-from flasher.trace.story import Line, PacketRun, Step, StepKind
+from flasher.trace.decoder import BusEvent, Field, Kind
+from flasher.trace.story import PacketRun, Step, StepKind, StoryLine
 
 MAX_STEPS: Final = 1000
 """Lines that one list keeps: the first half of them and the last half."""
@@ -22,9 +22,9 @@ class StepList:
 
     def __init__(self, *, fold: bool = True, limit: int = MAX_STEPS) -> None:
         self._fold = fold
-        self._head: list[Line] = []
+        self._head: list[StoryLine] = []
         self._half = max(1, limit // 2)
-        self._tail: deque[Line] = deque(maxlen=self._half)
+        self._tail: deque[StoryLine] = deque(maxlen=self._half)
         self._taken = 0
         self._pending: tuple[int, float, Step] | None = None
         """A packet that waits for its ACK: number, begin, and its line if that does not come."""
@@ -73,12 +73,12 @@ class StepList:
         self._errors += 1
         self._errors_at = (self._errors_at[0], at_s)
 
-    def lines(self) -> tuple[Line, ...]:
+    def lines(self) -> tuple[StoryLine, ...]:
         """All that were kept."""
         self._flush()
         return (*self._head, *self._tail)
 
-    def _keep(self, line: Line) -> None:
+    def _keep(self, line: StoryLine) -> None:
         self._taken += 1
         if len(self._head) < self._half:
             self._head.append(line)
@@ -108,7 +108,7 @@ class StepList:
             self._keep(Step(begin_s, StepKind.ERROR_FRAMES, "", "", _ERRORS, text, is_trouble=True))
 
 
-def mark_unanswered(steps: StepList, device: str, *, is_over: bool) -> tuple[Line, ...]:
+def mark_unanswered(steps: StepList, device: str, *, is_over: bool) -> tuple[StoryLine, ...]:
     """The lines of an upgrade, in which what the tool said and the `device` left unanswered is
     trouble. `is_over`: nothing more came after the last one.
     """
@@ -131,7 +131,7 @@ def mark_unanswered(steps: StepList, device: str, *, is_over: bool) -> tuple[Lin
     return tuple(lines)
 
 
-def step_of(seen: Seen, at_s: float) -> Step:
+def step_of(seen: BusEvent, at_s: float) -> Step:
     """A thing seen as a line."""
     kind = StepKind.DAMAGED if seen.kind is Kind.DAMAGED else StepKind.MESSAGE
     width = None if seen.is_alarm else _VALUE_WIDTH  # no fault is left out

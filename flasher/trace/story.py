@@ -17,7 +17,7 @@ __all__ = [
     "BusFigures",
     "Cause",
     "Distribution",
-    "Line",
+    "StoryLine",
     "LinkReport",
     "PacketRun",
     "PacketStory",
@@ -30,7 +30,7 @@ __all__ = [
     "Talker",
     "TalkerKind",
     "UpgradeStory",
-    "Verdict",
+    "TraceVerdict",
 ]
 
 
@@ -86,7 +86,7 @@ class Cause(Enum):
 
 
 @dataclass(frozen=True)
-class Verdict:
+class TraceVerdict:
     """What went wrong (or right), where, most likely why, and what to do."""
 
     cause: Cause
@@ -155,7 +155,7 @@ class PacketRun:
         return self.last - self.first + 1
 
 
-Line = Step | PacketRun
+StoryLine = Step | PacketRun
 """What a list of steps holds, in the order of time."""
 
 
@@ -208,7 +208,7 @@ class UpgradeStory:
     phases: tuple[PhaseSpan, ...]
     packets: tuple[PacketStory, ...]
     """In the order of their first copies; attempts one after the other."""
-    steps: tuple[Line, ...]
+    steps: tuple[StoryLine, ...]
     steps_left_out: int
     """Steps beyond the number that is kept."""
     link: LinkReport | None
@@ -216,7 +216,7 @@ class UpgradeStory:
     remarks: tuple[str, ...]
     """What else was remarkable, whatever the verdict: restarts that were recovered from, error
     frames, queries in the middle, SHUTDOWN."""
-    verdict: Verdict
+    verdict: TraceVerdict
 
 
 class TalkerKind(Enum):
@@ -290,10 +290,10 @@ class Story:
     """In the order of their beginnings."""
     talkers: tuple[Talker, ...]
     """Most frames first."""
-    verdict: Verdict
+    verdict: TraceVerdict
     """That of the upgrade which matters most: the last one of each target, the first bad of these;
     or what the trace holds instead."""
-    steps: tuple[Line, ...]
+    steps: tuple[StoryLine, ...]
     """What was said outside of upgrades."""
     steps_left_out: int
     talkers_left_out: int = 0

@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 from flasher.prose import explanation
 from flasher.protocol.text import BOOT_VERSION_FORM
 from flasher.trace.facts import Facts
-from flasher.trace.story import Cause, Phase, Verdict
+from flasher.trace.story import Cause, Phase, TraceVerdict
 
 _SILENT_S: Final = 1.0
 """A tool that says nothing for so long, while it is its turn, has stopped."""
@@ -31,7 +31,7 @@ class _Found(NamedTuple):
     text: str
 
 
-def judge(upgrade: Facts, until_s: float, *, is_alone: bool) -> Verdict:
+def judge(upgrade: Facts, until_s: float, *, is_alone: bool) -> TraceVerdict:
     """The verdict. The trace is known to go on until `until_s`; `is_alone` when nobody but the tool
     was ever heard.
     """
@@ -53,7 +53,7 @@ def judge(upgrade: Facts, until_s: float, *, is_alone: bool) -> Verdict:
     packet = upgrade.current if upgrade.phase is Phase.TRANSFER else None
     likely, remedy = explanation(found.cause)
     names = {"node": upgrade.target.node.name, "boot_name": upgrade.target.boot_name}
-    return Verdict(
+    return TraceVerdict(
         cause=found.cause,
         phase=upgrade.phase,
         packet=None if packet is None else packet.number,

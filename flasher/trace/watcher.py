@@ -14,7 +14,7 @@ from typing import Final
 
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import Dialect
-from flasher.trace.decoder import Decoder, Kind, Seen
+from flasher.trace.decoder import BusEvent, Decoder, Kind
 
 RATE_WINDOW_S: Final = 5.0
 """Rates are counted over this time."""
@@ -28,7 +28,7 @@ _AT_ONCE: Final = float("-inf")
 
 
 @dataclass(frozen=True)
-class FrameSeen:
+class RawFrame:
     """A frame as it came, before what it says."""
 
     at: float
@@ -54,7 +54,7 @@ class Filter:
     words: tuple[str, ...] = ()
     trouble_only: bool = False
 
-    def accepts(self, seen: Seen) -> bool:
+    def accepts(self, seen: BusEvent) -> bool:
         """True when it is to be shown."""
         if self.nodes and not self.nodes & {seen.sender, seen.receiver}:
             return False
@@ -68,7 +68,7 @@ EVERYTHING: Final = Filter()
 
 
 class Watcher:
-    """The engine. Its events are `Seen`, `FrameSeen` with `raw`, `Pulse` with `pulse_s`.
+    """The engine. Its events are `BusEvent`, `RawFrame` with `raw`, `Pulse` with `pulse_s`.
 
     It is done after `count` things that the filter accepts, or after `duration_s` seconds from its
     first `tick`; without them it goes on until it is cancelled.
@@ -109,7 +109,7 @@ class Watcher:
             return
         self.frames += 1
         if self._raw:
-            self._events.append(FrameSeen(now, frame))
+            self._events.append(RawFrame(now, frame))
         self._take(self._decoder.feed(frame, now))
 
     def tick(self, now: float) -> None:
@@ -150,7 +150,7 @@ class Watcher:
         taken, self._events = self._events, []
         return taken
 
-    def _take(self, found: Iterable[Seen]) -> None:
+    def _take(self, found: Iterable[BusEvent]) -> None:
         for seen in found:
             if self._left != 0 and self._filter.accepts(seen):
                 self._events.append(seen)
@@ -193,10 +193,10 @@ def _pass_time(watcher: Watcher, until: float) -> None:
 
 
 @dataclass
-class Line:
+class MessageHistory:
     """The latest message of one kind, and its history."""
 
-    seen: Seen
+    seen: BusEvent
     count: int = 0
     first_at: float = 0.0
     changed_at: dict[str, float] = field(default_factory=dict)
@@ -228,17 +228,17 @@ class Board:
     """
 
     def __init__(self) -> None:
-        self._lines: dict[Key, Line] = {}
+        self._lines: dict[Key, MessageHistory] = {}
 
     def __len__(self) -> int:
         return len(self._lines)
 
-    def add(self, seen: Seen) -> frozenset[str]:
+    def add(self, seen: BusEvent) -> frozenset[str]:
         """Take note; returns the names of the fields that differ from the last time."""
         key = _key(seen)
         line = self._lines.get(key)
         if line is None:
-            line = self._lines[key] = Line(seen, first_at=seen.at)
+            line = self._lines[key] = MessageHistory(seen, first_at=seen.at)
             changed = frozenset[str]()
         else:
             before = {shown.name: shown.value for shown in line.seen.fields}
@@ -253,13 +253,13 @@ class Board:
         line.changed_at.update(dict.fromkeys(changed, seen.at))
         return changed
 
-    def lines(self) -> Iterator[Line]:
+    def lines(self) -> Iterator[MessageHistory]:
         """Every line, in order."""
         for key in sorted(self._lines):
             yield self._lines[key]
 
 
-def _key(seen: Seen) -> Key:
+def _key(seen: BusEvent) -> Key:
     if seen.kind is Kind.MESSAGE and seen.command is not None:
         return seen.can_id, "", seen.command
     if seen.kind in (Kind.FOREIGN, Kind.ERROR_FRAME):

@@ -19,7 +19,7 @@ from rich.console import Console, ConsoleDimensions
 from flasher.cli.look.monitor_table import BoardView
 from flasher.errors import ExitCode
 from flasher.protocol.frame import Frame
-from flasher.trace.decoder import Seen
+from flasher.trace.decoder import BusEvent
 from flasher.trace.recorder import Recorder
 from flasher.trace.watcher import Board, Watcher, replay
 from tests.cli.conftest import Flasher
@@ -241,7 +241,7 @@ def board_of(*messages: Iterable[Frame]) -> Board:
     board = Board()
 
     def add(event: object) -> None:
-        if isinstance(event, Seen):
+        if isinstance(event, BusEvent):
             board.add(event)
 
     frames = [(number / 2, frame) for number, each in enumerate(messages) for frame in each]

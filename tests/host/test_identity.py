@@ -10,10 +10,10 @@ import pytest
 from flasher.host.identity import (
     WAIVABLE,
     Check,
-    Finding,
+    CheckResult,
+    CheckVerdict,
+    DeviceAnswers,
     Identity,
-    Seen,
-    Verdict,
     judge_device,
     judge_image,
 )
@@ -37,29 +37,29 @@ def release(**stated: object) -> Release:
     return replace(release_of(IMAGE, BMS), **stated)  # type: ignore[arg-type]
 
 
-def seen(firmware: str = OLD, hardware: str = "V1r2r0_20220512") -> Seen:
+def seen(firmware: str = OLD, hardware: str = "V1r2r0_20220512") -> DeviceAnswers:
     texts = ("BM36", "W1", hardware, firmware)
-    return Seen(VersionInformation(*(Text(encode_text(text, 16)) for text in texts)))
+    return DeviceAnswers(VersionInformation(*(Text(encode_text(text, 16)) for text in texts)))
 
 
-def verdicts(findings: Iterable[Finding]) -> list[tuple[Check, Verdict]]:
+def verdicts(findings: Iterable[CheckResult]) -> list[tuple[Check, CheckVerdict]]:
     return [(found.check, found.verdict) for found in findings]
 
 
 @pytest.mark.parametrize(
     ("image", "stated", "verdict"),
     [
-        (NAMELESS, None, Verdict.UNKNOWN),
-        (IMAGE, {}, Verdict.PASSED),
-        (IMAGE, {"target": WMC}, Verdict.REFUSED),
-        (Image.from_bytes(VECTORS + b"\0BMS_UPD\0"), None, Verdict.PASSED),
-        (Image.from_bytes(VECTORS + b"\0OBC_UPD\0"), None, Verdict.REFUSED),
-        (Image.from_bytes(VECTORS + b"\0OBC_UPD\0"), {}, Verdict.REFUSED),
-        (Image.from_bytes(VECTORS + b"\0OBC_UPD\0BMS_UPD\0"), None, Verdict.PASSED),
+        (NAMELESS, None, CheckVerdict.UNKNOWN),
+        (IMAGE, {}, CheckVerdict.PASSED),
+        (IMAGE, {"target": WMC}, CheckVerdict.REFUSED),
+        (Image.from_bytes(VECTORS + b"\0BMS_UPD\0"), None, CheckVerdict.PASSED),
+        (Image.from_bytes(VECTORS + b"\0OBC_UPD\0"), None, CheckVerdict.REFUSED),
+        (Image.from_bytes(VECTORS + b"\0OBC_UPD\0"), {}, CheckVerdict.REFUSED),
+        (Image.from_bytes(VECTORS + b"\0OBC_UPD\0BMS_UPD\0"), None, CheckVerdict.PASSED),
     ],
 )
 def test_the_target_of_an_image(
-    image: Image, stated: dict[str, object] | None, verdict: Verdict
+    image: Image, stated: dict[str, object] | None, verdict: CheckVerdict
 ) -> None:
     identity = Identity(None if stated is None else release(**stated))
     assert verdicts(judge_image(image, BMS, identity)) == [(Check.TARGET, verdict)]
@@ -69,14 +69,14 @@ HARDWARE, DOWNGRADE, SAME, PREVIOUS = (
     Check.HARDWARE, Check.DOWNGRADE, Check.SAME_VERSION, Check.PREVIOUS,
 )  # fmt: skip
 PASSED, UNKNOWN, REFUSED, WARNED = (
-    Verdict.PASSED, Verdict.UNKNOWN, Verdict.REFUSED, Verdict.WARNED,
+    CheckVerdict.PASSED, CheckVerdict.UNKNOWN, CheckVerdict.REFUSED, CheckVerdict.WARNED,
 )  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("stated", "device", "expected"),
     [
-        (None, Seen(), {HARDWARE: UNKNOWN}),
+        (None, DeviceAnswers(), {HARDWARE: UNKNOWN}),
         (None, seen(), {HARDWARE: UNKNOWN, DOWNGRADE: PASSED}),
         (None, seen(NEW), {HARDWARE: UNKNOWN, SAME: WARNED}),
         (None, seen("V3r0r0_20260301"), {HARDWARE: UNKNOWN, DOWNGRADE: REFUSED}),
@@ -97,14 +97,14 @@ PASSED, UNKNOWN, REFUSED, WARNED = (
     ],
 )  # fmt: skip
 def test_what_the_device_says_of_the_image(
-    stated: dict[str, object] | None, device: Seen, expected: dict[Check, Verdict]
+    stated: dict[str, object] | None, device: DeviceAnswers, expected: dict[Check, CheckVerdict]
 ) -> None:
     identity = Identity(None if stated is None else release(**stated))
     assert dict(verdicts(judge_device(IMAGE, BMS, identity, device))) == expected
 
 
 def test_a_device_that_tells_no_version_cannot_be_compared_and_that_is_said() -> None:
-    found = list(judge_device(IMAGE, OBC, Identity(), Seen()))
+    found = list(judge_device(IMAGE, OBC, Identity(), DeviceAnswers()))
     assert len(found) == 1
     assert "the OBC's application does not tell its versions" in found[0].text
 
@@ -122,7 +122,9 @@ def test_a_device_that_tells_no_version_cannot_be_compared_and_that_is_said() ->
          {Check.IN_USE: REFUSED, Check.CHARGE: WARNED}),
     ],
 )  # fmt: skip
-def test_the_state_of_the_battery(change: dict[str, int], expected: dict[Check, Verdict]) -> None:
+def test_the_state_of_the_battery(
+    change: dict[str, int], expected: dict[Check, CheckVerdict]
+) -> None:
     device = replace(seen(), running=replace(BATTERY, **change))  # type: ignore[arg-type]
     found = dict(verdicts(judge_device(IMAGE, BMS, Identity(), device)))
     assert {check: found[check] for check in (Check.IN_USE, Check.CHARGE) if check in found} == (
@@ -146,7 +148,7 @@ def test_each_check_that_refuses_can_be_waived_and_no_other() -> None:
 
 def test_the_same_version_is_skipped_on_request_only() -> None:
     found = dict(verdicts(judge_device(IMAGE, BMS, Identity(skip_same_version=True), seen(NEW))))
-    assert found[Check.SAME_VERSION] is Verdict.SKIPPED
+    assert found[Check.SAME_VERSION] is CheckVerdict.SKIPPED
 
 
 def test_what_a_device_tells_is_shown_escaped() -> None:
@@ -156,7 +158,7 @@ def test_what_a_device_tells_is_shown_escaped() -> None:
         b"\x1b[31mred\x07.".ljust(16),
         b"V\x1b[2J.".ljust(16),
     )
-    device = Seen(VersionInformation(*map(Text, texts)))
+    device = DeviceAnswers(VersionInformation(*map(Text, texts)))
     said = [
         found.text
         for found in judge_device(IMAGE, BMS, Identity(release(hardware_versions=("V1*",))), device)

@@ -9,7 +9,7 @@ import pytest
 from flasher.errors import ExitCode
 from flasher.host.guard import Guard
 from flasher.host.identify import LISTEN_FIRST_S
-from flasher.host.identity import Check, Identity, Seen, Verdict, judge_device
+from flasher.host.identity import Check, CheckVerdict, DeviceAnswers, Identity, judge_device
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import before_the_start
 from flasher.host.session import Result, Session
@@ -116,10 +116,10 @@ class OnlyFirmware(Content):
 
 def test_a_device_that_does_not_tell_its_hardware_is_refused_as_one_that_does_not_fit() -> None:
     release = release_of(IMAGE, BMS, hardware_versions=["V1r2r0_*"])
-    told = Seen(OnlyFirmware(Text(encode_text("V1r0r0_20220512", 16))))
+    told = DeviceAnswers(OnlyFirmware(Text(encode_text("V1r0r0_20220512", 16))))
     findings = list(judge_device(IMAGE, BMS, Identity(release), told))
     hardware = next(found for found in findings if found.check is Check.HARDWARE)
-    assert hardware.verdict is Verdict.REFUSED
+    assert hardware.verdict is CheckVerdict.REFUSED
     assert "does not tell its hardware" in hardware.text
     assert hardware.ending is Ending.UNCHECKED
 

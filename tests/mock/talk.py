@@ -16,7 +16,7 @@ READ, WRITE, REPORT = 0x11, 0x16, 0x0C
 _BLOCKED_STEP_S = 0.01
 
 
-class Heard(NamedTuple):
+class Answer(NamedTuple):
     """A whole message that came out, with the time of its last frame."""
 
     at_s: float
@@ -34,7 +34,7 @@ class Talk:
         self.now = START_S
         self.accepts_frames = True
         self.events: list[object] = []
-        self._heard: list[Heard] = []
+        self._heard: list[Answer] = []
         self._partial: dict[int, bytes] = {}
 
     def run(self, duration_s: float) -> None:
@@ -55,7 +55,7 @@ class Talk:
             self.engine.receive(Frame(can_id, payload), self.now)
         self._collect()
 
-    def ask(self, can_id: int, mode: int, command: int, data: bytes = b"") -> list[Heard]:
+    def ask(self, can_id: int, mode: int, command: int, data: bytes = b"") -> list[Answer]:
         """A message arrives; what is said to it at once."""
         self.take()
         self.put(can_id, mode, command, data)
@@ -66,7 +66,7 @@ class Talk:
         (heard,) = self.ask(can_id, READ, command)
         return heard.data
 
-    def take(self) -> list[Heard]:
+    def take(self) -> list[Answer]:
         """Whole messages since the last call."""
         self._collect()
         heard, self._heard = self._heard, []
@@ -88,5 +88,5 @@ class Talk:
             assert len(wire) == wire[3] + 9
             assert intact(frame.can_id, wire)
             command = int.from_bytes(wire[4:6], "big")
-            self._heard.append(Heard(self.now, frame.can_id, wire[2], command, wire[6:-5]))
+            self._heard.append(Answer(self.now, frame.can_id, wire[2], command, wire[6:-5]))
         self.events += self.engine.take_events()

@@ -13,7 +13,7 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.table import State
 from flasher.protocol.spec import BMS, OBC, WMC, Target
-from tests.mock.talk import READ, REPORT, START_S, WRITE, Heard, Talk
+from tests.mock.talk import READ, REPORT, START_S, WRITE, Answer, Talk
 
 DIALECTS = ["welling", "motinova"]
 
@@ -74,7 +74,7 @@ WRITES = {
     "model 4010": (0x4010, b"BM48.           ", 0x3300, slice(0, 16)),
     "serial number 4110": (0x4110, b"W2605999.       ", 0x3300, slice(16, 32)),
 }
-FEEDBACK = Heard(START_S, 0x725, REPORT, 0x5503, b"ACK")
+FEEDBACK = Answer(START_S, 0x725, REPORT, 0x5503, b"ACK")
 
 
 # -- queries --------------------------------------------------------------------------------------
@@ -87,7 +87,7 @@ def test_every_query_gets_the_answer_of_the_document_on_its_id(
 ) -> None:
     asked_on, asked, answered_on, answer, data = query
     talk = battery(dialect=dialect)
-    assert talk.ask(asked_on, READ, asked) == [Heard(START_S, answered_on, REPORT, answer, data)]
+    assert talk.ask(asked_on, READ, asked) == [Answer(START_S, answered_on, REPORT, answer, data)]
 
 
 @pytest.mark.parametrize("query", HMI_QUERIES.values(), ids=HMI_QUERIES)
@@ -95,7 +95,7 @@ def test_queries_of_the_hmi_are_answered_in_its_own_dialect_only(
     query: tuple[int, int, int, int, bytes],
 ) -> None:
     asked_on, asked, answered_on, answer, data = query
-    expected = [Heard(START_S, answered_on, REPORT, answer, data)]
+    expected = [Answer(START_S, answered_on, REPORT, answer, data)]
     assert battery(dialect="motinova").ask(asked_on, READ, asked) == expected
     assert battery(dialect="welling").ask(asked_on, READ, asked) == []
 
@@ -103,7 +103,7 @@ def test_queries_of_the_hmi_are_answered_in_its_own_dialect_only(
 @pytest.mark.parametrize("dialect", DIALECTS)
 def test_the_handshake_is_answered_to_the_wmc_alone(dialect: str) -> None:
     talk = battery(dialect=dialect)
-    expected = [Heard(START_S, 0x721, REPORT, 0x3005, b"READY")]
+    expected = [Answer(START_S, 0x721, REPORT, 0x3005, b"READY")]
     assert talk.ask(0x712, READ, 0x3009, b"HANDSHAKE") == expected
     assert talk.ask(0x712, READ, 0x3009, b"HANDSHAKY") == []
 
@@ -273,7 +273,7 @@ def test_only_the_tool_may_write(can_id: int) -> None:
 # -- memory ---------------------------------------------------------------------------------------
 
 
-def memory(talk: Talk, start: int, end: int) -> list[Heard]:
+def memory(talk: Talk, start: int, end: int) -> list[Answer]:
     return talk.ask(0x752, READ, 0x4308, struct.pack("<II", start, end))
 
 

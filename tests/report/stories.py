@@ -9,17 +9,17 @@ from flasher.trace.figures import Distribution, LinkReport
 from flasher.trace.story import (
     BusFigures,
     Cause,
-    Line,
     PacketRun,
     PacketStory,
     PhaseSpan,
     Step,
     StepKind,
     Story,
+    StoryLine,
     Talker,
     TalkerKind,
+    TraceVerdict,
     UpgradeStory,
-    Verdict,
 )
 
 CYCLE_S = 0.0104
@@ -45,7 +45,7 @@ def good_packet(number: int, attempt: int = 1, begin_s: float = TALK_AT_S) -> Pa
     return PacketStory(number, attempt, 1, 0, sent_s, sent_s + took_s, took_s)
 
 
-def opening(begin_s: float = 0.0) -> list[Line]:
+def opening(begin_s: float = 0.0) -> list[StoryLine]:
     return [
         says(begin_s + 0.002, "CDL>BMS", "reset"),
         says(begin_s + 0.004, "BMS>CDL", "general feedback"),
@@ -84,7 +84,7 @@ def upgrade(count: int = 613, target: str = "BMS") -> UpgradeStory:
     """An upgrade without trouble."""
     packets = tuple(good_packet(number) for number in range(1, count + 1))
     end_s = TALK_AT_S + CYCLE_S * (count + 1) + 0.1
-    steps: list[Line] = [
+    steps: list[StoryLine] = [
         *opening(),
         PacketRun(1, count, TALK_AT_S, end_s - 0.1),
         says(end_s - 0.09, "CDL>BMS", "end of transfer"),
@@ -105,7 +105,7 @@ def upgrade(count: int = 613, target: str = "BMS") -> UpgradeStory:
         steps_left_out=0,
         link=link_of(packets),
         remarks=(),
-        verdict=Verdict(
+        verdict=TraceVerdict(
             Cause.COMPLETED, Phase.END, None, 1, "The BMS confirmed it; V1r0r4_20220512 runs."
         ),
     )
@@ -120,7 +120,7 @@ def troubled_upgrade() -> UpgradeStory:
         tries, naks, took_s = fixed.get(packet.number, (1, 0, packet.answer_s))
         packets.append(replace(packet, tries=tries, naks=naks, answer_s=took_s))
     packets.append(PacketStory(311, 1, 5, 1, 3.6, None, None))
-    steps: list[Line] = [
+    steps: list[StoryLine] = [
         *opening(),
         PacketRun(1, 39, 0.35, 0.77),
         says(0.78, "BMS>CDL", "NAK", "number 40", trouble=True),
@@ -150,7 +150,7 @@ def troubled_upgrade() -> UpgradeStory:
         link=link_of(tuple(packets)),
         phases=(*phases(3.7)[:3], PhaseSpan(Phase.TRANSFER, 1, 0.35, 9.9)),
         remarks=("12 error frames around 4.200 s", "the battery announced SHUTDOWN at 4.100 s"),
-        verdict=Verdict(
+        verdict=TraceVerdict(
             Cause.SHUTDOWN,
             Phase.TRANSFER,
             311,
@@ -171,11 +171,11 @@ def talkers() -> tuple[Talker, ...]:
 
 def story(*upgrades: UpgradeStory, source: str = "upgrade.asc") -> Story:
     """A trace of these upgrades; without one, of some queries."""
-    steps: tuple[Line, ...] = ()
+    steps: tuple[StoryLine, ...] = ()
     if upgrades:
         verdict = upgrades[0].verdict
     else:
-        verdict = Verdict(
+        verdict = TraceVerdict(
             Cause.QUERIES_ONLY, None, None, 0, "Nobody upgraded anything: 2 queries were answered."
         )
         steps = (
@@ -203,7 +203,7 @@ def story(*upgrades: UpgradeStory, source: str = "upgrade.asc") -> Story:
 
 def empty_story() -> Story:
     """A trace with no frame in it."""
-    nothing = Verdict(Cause.EMPTY, None, None, 0, "There is no frame in this trace.")
+    nothing = TraceVerdict(Cause.EMPTY, None, None, 0, "There is no frame in this trace.")
     bus = BusFigures(0.0, 0, None, None, 0, 0, 0, 0.0, 0.0)
     return Story("empty.log", "log", None, 0.0, 250_000, 0, bus, (), (), nothing, (), 0)
 
@@ -225,7 +225,7 @@ HOSTILE = (
 def hostile_story(text: str) -> Story:
     """Every text that could come from outside is `text`."""
     bad = upgrade(3, target=text)
-    verdict = Verdict(Cause.REFUSED, Phase.END, 3, 2, text, text, text)
+    verdict = TraceVerdict(Cause.REFUSED, Phase.END, 3, 2, text, text, text)
     steps = tuple(
         Step(float(at), kind, sender, receiver, text, text, is_trouble)
         for at, (kind, sender, receiver, is_trouble) in enumerate(

@@ -10,22 +10,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flasher.protocol.frame import Frame
-from flasher.trace.decoder import Decoder, Kind, Seen, message_titles
+from flasher.trace.decoder import BusEvent, Decoder, Kind, message_titles
 from tests.peers.wording import READ, REPORT, WORDINGS, WRITE, literal
 from tests.trace import traffic
 
 
-def decoded(frames: Iterable[Frame]) -> list[Seen]:
+def decoded(frames: Iterable[Frame]) -> list[BusEvent]:
     decoder = Decoder()
     return [seen for frame in frames for seen in decoder.feed(frame, 1.0)]
 
 
-def only(frames: Iterable[Frame]) -> Seen:
+def only(frames: Iterable[Frame]) -> BusEvent:
     (seen,) = decoded(frames)
     return seen
 
 
-def texts(seen: Seen) -> dict[str, str]:
+def texts(seen: BusEvent) -> dict[str, str]:
     return {shown.label: f"{shown.text} {shown.unit}".rstrip() for shown in seen.fields}
 
 

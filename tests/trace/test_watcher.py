@@ -10,8 +10,8 @@ from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.driver import drive
 from flasher.protocol.frame import Frame
-from flasher.trace.decoder import Kind, Seen
-from flasher.trace.watcher import Board, Filter, FrameSeen, Line, Pulse, Watcher, replay
+from flasher.trace.decoder import BusEvent, Kind
+from flasher.trace.watcher import Board, Filter, MessageHistory, Pulse, RawFrame, Watcher, replay
 from tests.trace import traffic
 
 
@@ -26,7 +26,7 @@ def replayed(watcher: Watcher, frames: Iterable[tuple[float, Frame]]) -> list[ob
 
 
 def titles(events: Iterable[object]) -> list[str]:
-    return [event.title for event in events if isinstance(event, Seen)]
+    return [event.title for event in events if isinstance(event, BusEvent)]
 
 
 MIXED = [
@@ -68,24 +68,24 @@ def test_it_ends_after_its_time() -> None:
 
 def test_raw_frames_come_before_what_they_say() -> None:
     events = replayed(Watcher(raw=True), at(0.0, traffic.reset()))
-    assert [type(event) for event in events] == [FrameSeen, FrameSeen, Seen]
+    assert [type(event) for event in events] == [RawFrame, RawFrame, BusEvent]
 
 
 def test_a_message_that_a_trace_cuts_short_is_told_at_its_end() -> None:
     events = replayed(Watcher(), at(5.0, traffic.running()[:2]))
-    assert [event.kind for event in events if isinstance(event, Seen)] == [Kind.DAMAGED]
+    assert [event.kind for event in events if isinstance(event, BusEvent)] == [Kind.DAMAGED]
 
 
 def test_a_late_frame_does_not_complete_a_message() -> None:
     first, *rest = traffic.handshake()
     events = replayed(Watcher(), [*at(0.0, [first]), *at(10.0, rest)])
-    kinds = [event.kind for event in events if isinstance(event, Seen)]
+    kinds = [event.kind for event in events if isinstance(event, BusEvent)]
     assert kinds == [Kind.DAMAGED, Kind.DAMAGED]
 
 
 def test_times_that_run_backwards_stand_still() -> None:
     events = replayed(Watcher(), [*at(9.0, traffic.reset()), *at(3.0, traffic.handshake())])
-    assert [event.at for event in events if isinstance(event, Seen)] == [9.0, 9.0]
+    assert [event.at for event in events if isinstance(event, BusEvent)] == [9.0, 9.0]
 
 
 def test_years_between_two_frames_take_no_time() -> None:
@@ -127,7 +127,7 @@ def test_cancelling_ends_it_at_once() -> None:
 
 def board_of(frames: Iterable[tuple[float, Frame]]) -> tuple[Board, list[frozenset[str]]]:
     board = Board()
-    changes = [board.add(e) for e in replayed(Watcher(), frames) if isinstance(e, Seen)]
+    changes = [board.add(e) for e in replayed(Watcher(), frames) if isinstance(e, BusEvent)]
     return board, changes
 
 
@@ -178,8 +178,8 @@ def test_two_messages_at_the_same_time_have_no_rate() -> None:
 def test_a_babbling_bus_does_not_fill_the_memory() -> None:
     board = Board()
     for number in range(1000):
-        board.add(Seen(0.0, Kind.FOREIGN, number, "foreign frame"))
-        board.add(Seen(0.0, Kind.UNKNOWN, 0x720, "unknown message", command=number))
+        board.add(BusEvent(0.0, Kind.FOREIGN, number, "foreign frame"))
+        board.add(BusEvent(0.0, Kind.UNKNOWN, 0x720, "unknown message", command=number))
     assert len(board) == 2
 
 
@@ -188,7 +188,7 @@ def test_lines_come_in_the_order_of_ids_with_foreign_frames_last() -> None:
               *at(0.2, traffic.running())]  # fmt: skip
     board, _ = board_of(frames)
 
-    def title(line: Line) -> str:
+    def title(line: MessageHistory) -> str:
         return line.seen.title
 
     assert list(map(title, board.lines())) == ["running information", "reset", "foreign frame"]

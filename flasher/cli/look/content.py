@@ -10,7 +10,7 @@ from typing import Final
 from flasher.cli.documents import HeardDocument, content_document
 from flasher.cli.output import counted
 from flasher.cli.terminal import columns
-from flasher.host.survey import Heard
+from flasher.host.survey import NodeTraffic
 from flasher.protocol.fields import Content
 from flasher.trace.decoder import NOT_IN_DIALECT, content_fields
 
@@ -37,7 +37,7 @@ def content_lines(content: Content, field: str = "") -> list[str]:
     return rows_lines(list(content_rows(content, field)))
 
 
-def heard_lines(heard: Heard, *, contents: bool = False) -> list[str]:
+def heard_lines(heard: NodeTraffic, *, contents: bool = False) -> list[str]:
     """What one node sent, one kind of message a line, with its last content on request."""
     rows = [("bootloader", heard.boot_version)] if heard.boot_version else []
     for title, times in sorted(heard.messages.items())[:_SHOWN_AT_MOST]:
@@ -53,7 +53,7 @@ def heard_lines(heard: Heard, *, contents: bool = False) -> list[str]:
     return rows_lines(rows or [(f"{counted(heard.frames, 'frame')} that made no message", "")])
 
 
-def heard_document(heard: Heard) -> HeardDocument:
+def heard_document(heard: NodeTraffic) -> HeardDocument:
     """The same as JSON."""
     return {
         "frames": heard.frames,

@@ -11,14 +11,14 @@ from flasher.prose import prose
 from flasher.trace.story import (
     BusFigures,
     Distribution,
-    Line,
     LinkReport,
     PacketRun,
     PacketStory,
     Story,
+    StoryLine,
     Talker,
+    TraceVerdict,
     UpgradeStory,
-    Verdict,
 )
 
 _TALKERS_SHOWN: Final = 12
@@ -50,7 +50,7 @@ def _head(story: Story) -> str:
     return f"{story.source}: {counted(story.frames, 'frame')} in {duration(story.duration_s)}{at}"
 
 
-def _verdict_lines(verdict: Verdict, indent: str = "") -> Iterator[str]:
+def _verdict_lines(verdict: TraceVerdict, indent: str = "") -> Iterator[str]:
     where = [] if verdict.phase is None else [prose(verdict.phase)]
     where += [f"packet {verdict.packet}"] if verdict.packet else []
     where += [f"attempt {verdict.attempt}"] if verdict.attempt > 1 else []
@@ -104,7 +104,7 @@ def _row(name: str, text: str, total: int | None) -> str:
     return f"  {name}:         {text}" + ("" if total is None else f", {counted(total, 'packet')}")
 
 
-def _step_lines(steps: tuple[Line, ...], left_out: int, indent: str = "") -> Iterator[str]:
+def _step_lines(steps: tuple[StoryLine, ...], left_out: int, indent: str = "") -> Iterator[str]:
     half = len(steps) // 2
     for index, line in enumerate(steps):
         if left_out and index == half:
@@ -112,7 +112,7 @@ def _step_lines(steps: tuple[Line, ...], left_out: int, indent: str = "") -> Ite
         yield f"{indent}  {_step_text(line)}"
 
 
-def _step_text(line: Line) -> str:
+def _step_text(line: StoryLine) -> str:
     if isinstance(line, PacketRun):
         which = f"packets {line.first} to {line.last}" if line.count > 1 else f"packet {line.first}"
         took = f"{line.end_s - line.begin_s:.3f} s"

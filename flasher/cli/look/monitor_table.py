@@ -16,7 +16,7 @@ from rich.text import Text
 
 from flasher.cli.look.monitor_views import route
 from flasher.trace.decoder import NOT_IN_DIALECT, Field
-from flasher.trace.watcher import Board, Line
+from flasher.trace.watcher import Board, MessageHistory
 
 WIDE: Final = 116
 """Terminals with fewer columns get a table without who, to whom, and the count."""
@@ -47,7 +47,7 @@ class BoardView:
         table = self._table(lines, now, title, size.height - len(faults))
         return Group(*(Text(line, style=_TROUBLE, no_wrap=True) for line in faults), table)
 
-    def _table(self, lines: list[Line], now: float, title: str, height: int) -> Table:
+    def _table(self, lines: list[MessageHistory], now: float, title: str, height: int) -> Table:
         size = self._console.size
         wide = size.width >= WIDE
         room = max(height - _FRAME_LINES, 1)
@@ -63,7 +63,7 @@ class BoardView:
         return view
 
 
-def _fault_lines(lines: list[Line], width: int, room: int) -> list[str]:
+def _fault_lines(lines: list[MessageHistory], width: int, room: int) -> list[str]:
     """All faults that are set, over the whole width, since the columns of a table cut them. Those
     that have no room are counted.
     """
@@ -87,7 +87,7 @@ def _longest(text: str) -> str:
     return text if len(text) <= _VALUE_MAX else f"{text[:_VALUE_MAX].rstrip()} ..."
 
 
-def _by_field(lines: list[Line], now: float, title: str, *, wide: bool) -> Table:
+def _by_field(lines: list[MessageHistory], now: float, title: str, *, wide: bool) -> Table:
     table = _table(title, wide=wide)
     _column(table, "field", ratio=5)
     _column(table, "value", ratio=5, right=True, folds=True)
@@ -105,7 +105,7 @@ def _by_field(lines: list[Line], now: float, title: str, *, wide: bool) -> Table
     return table
 
 
-def _by_message(lines: list[Line], now: float, title: str, *, wide: bool) -> Table:
+def _by_message(lines: list[MessageHistory], now: float, title: str, *, wide: bool) -> Table:
     table = _table(title, wide=wide)
     _column(table, "fields", ratio=6)
     _figures(table, wide=wide)
@@ -156,7 +156,7 @@ def _column(
     )
 
 
-def _head(line: Line, *, wide: bool) -> list[Text]:
+def _head(line: MessageHistory, *, wide: bool) -> list[Text]:
     seen = line.seen
     style = _TROUBLE if seen.is_trouble else ""
     cells = [Text(f"{seen.can_id:03X}"), Text(seen.title, style=style)]
@@ -165,7 +165,7 @@ def _head(line: Line, *, wide: bool) -> list[Text]:
     return cells
 
 
-def _tail(line: Line, now: float, *, wide: bool) -> list[Text]:
+def _tail(line: MessageHistory, now: float, *, wide: bool) -> list[Text]:
     rate = line.rate_hz(now)
     cells = [Text("-" if rate is None else f"{rate:.1f}")]
     if wide:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, Self, TypedDict
 from flasher.cli.documents import FieldValue
 from flasher.cli.output import Output, counted
 from flasher.protocol.frame import Frame
-from flasher.trace.decoder import Field, Kind, Seen
-from flasher.trace.watcher import Board, FrameSeen, Pulse
+from flasher.trace.decoder import BusEvent, Field, Kind
+from flasher.trace.watcher import Board, Pulse, RawFrame
 
 if TYPE_CHECKING:  # rich is loaded only where a table is shown
     from rich.console import RenderableType
@@ -56,7 +56,7 @@ class FrameLine(TypedDict):
     error: bool
 
 
-def route(seen: Seen) -> str:
+def route(seen: BusEvent) -> str:
     """Who to whom; empty for an id of no node."""
     return f"{seen.sender} > {seen.receiver}" if seen.sender else ""
 
@@ -89,11 +89,11 @@ class View:
     def __call__(self, event: object) -> None:
         """Show one event."""
         match event:
-            case Seen():
+            case BusEvent():
                 self.messages += 1
                 self.troubles += event.is_trouble
                 self.show(event, self.since(event.at), self.board.add(event))
-            case FrameSeen(at, frame):
+            case RawFrame(at, frame):
                 self.show_frame(frame, self.since(at))
             case Pulse(at):
                 self.refresh(at)
@@ -104,7 +104,7 @@ class View:
             self._origin = at
         return at - self._origin
 
-    def show(self, seen: Seen, at_s: float, changed: frozenset[str]) -> None:
+    def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
         """A message, a damage, a foreign frame."""
 
     def show_frame(self, frame: Frame, at_s: float) -> None:
@@ -117,7 +117,7 @@ class View:
 class Lines(View):
     """One line, or one JSON document, for each."""
 
-    def show(self, seen: Seen, at_s: float, changed: frozenset[str]) -> None:
+    def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
         self.output.result(_line(seen, at_s, changed, cut=self.output.verbosity < 1))
         self.output.line(_document(seen, at_s, changed))
 
@@ -170,7 +170,7 @@ class Table(View):
         if kind is None:
             self._console.print(self._view_now())
 
-    def show(self, seen: Seen, at_s: float, changed: frozenset[str]) -> None:
+    def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
         self._last_at = seen.at
 
     def refresh(self, now: float) -> None:
@@ -184,7 +184,7 @@ class Table(View):
         return self._view.draw(self.board, self._last_at, title)
 
 
-def _line(seen: Seen, at_s: float, changed: frozenset[str], *, cut: bool) -> str:
+def _line(seen: BusEvent, at_s: float, changed: frozenset[str], *, cut: bool) -> str:
     """Time, id, sender to receiver, title, fields with units."""
     cut = cut and not seen.is_alarm  # no fault is left out
     said = ", ".join(_field_text(shown, shown.name in changed, cut=cut) for shown in seen.fields)
@@ -200,7 +200,7 @@ def _field_text(shown: Field, is_changed: bool, *, cut: bool) -> str:  # noqa: F
     return f"{'*' if is_changed else ''}{shown.label} {text} {shown.unit}".rstrip()
 
 
-def _document(seen: Seen, at_s: float, changed: frozenset[str]) -> SeenLine:
+def _document(seen: BusEvent, at_s: float, changed: frozenset[str]) -> SeenLine:
     return {
         "event": "Seen",
         "at_s": round(at_s, 6),

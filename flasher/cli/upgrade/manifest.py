@@ -22,7 +22,7 @@ from flasher.cli.output import Output
 from flasher.errors import ExitCode, FlasherError, ImageError, UsageError
 from flasher.image.image import Image
 from flasher.image.plausible import check_plausible
-from flasher.image.release import Finding, Release, check_target, names_of
+from flasher.image.release import Comparison, Release, check_target, names_of
 from flasher.protocol.spec import TARGETS, Target
 from flasher.protocol.text import BOOT_VERSION_FORM, FIRMWARE_VERSION_FORM, printable
 from flasher.settings.manifest import (
@@ -322,7 +322,7 @@ def checks_of(release: Release, image: Image, target: Target | None) -> list[Sta
     asked = None if target is None else target.node.name
     stated = release.target.node.name
     agrees = None if asked is None else asked == stated
-    checks.append(_held(Finding("requested_target", stated, asked, agrees), "the command line"))
+    checks.append(_held(Comparison("requested_target", stated, asked, agrees), "the command line"))
     rows = stated_rows(release)
     for key in (*_FOR_A_DEVICE, "previous_except"):
         if key in rows:
@@ -333,7 +333,7 @@ def checks_of(release: Release, image: Image, target: Target | None) -> list[Sta
     return checks
 
 
-def _held(finding: Finding, other: str) -> StatementDocument:
+def _held(finding: Comparison, other: str) -> StatementDocument:
     """A finding; `other` is what the manifest is held against."""
     stated, found = finding.stated, finding.found
     if finding.agrees is None:

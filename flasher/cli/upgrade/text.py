@@ -15,7 +15,7 @@ from flasher.cli.documents import (
 from flasher.cli.output import Verdict, byte_count, counted, duration
 from flasher.errors import FlasherError, InterruptedByUserError
 from flasher.events import CheckMade
-from flasher.host.identity import Verdict as Judgement
+from flasher.host.identity import CheckVerdict
 from flasher.host.options import UpgradeOptions, gaps_s
 from flasher.host.outcome import DeviceLeft, Outcome
 from flasher.host.session import Result
@@ -37,7 +37,7 @@ class CheckDocument(TypedDict):
     """Something that was checked before the first write."""
 
     check: str
-    verdict: Annotated[str, Judgement]
+    verdict: Annotated[str, CheckVerdict]
     text: str
 
 
