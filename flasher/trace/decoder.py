@@ -1,8 +1,8 @@
 """From CAN frames to what they say: every message of both documents, and everything else by name.
 
-`Decoder` takes the whole bus, whoever sends: one byte stream for each CAN id. What comes out is
-`BusEvent`, one a message, a damage or a frame that is not ours, with its fields both typed and as text
-that is harmless on any screen. Pure: the time is an argument.
+`Decoder` takes the whole bus, whoever sends: one byte stream for each CAN id. It gives a `BusEvent`
+for each message, each stretch of damaged bytes and each foreign frame, with its fields both typed
+and as text that is safe on any screen. Pure: the time is an argument.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from flasher.protocol.wire import Damage, Message, Reassembler
 
 
 class Kind(Enum):
-    """What was seen."""
+    """What a `BusEvent` is."""
 
     MESSAGE = "message"
     UNKNOWN = "unknown"
@@ -50,7 +50,7 @@ class Field(NamedTuple):
 
 @dataclass(frozen=True)
 class BusEvent:
-    """One thing seen on the bus at `at` seconds. `sender` and `receiver` are names of nodes,
+    """What happened on the bus at `at` seconds. `sender` and `receiver` are names of nodes,
     "all" for a broadcast, and empty where the id is of no node.
     """
 
