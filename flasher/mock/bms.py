@@ -211,7 +211,10 @@ class BmsApplication(Application):
         if isinstance(content, contents.ReadMemory):
             return self._read_memory(content)
         kept = self.kept.get(answer.title)
-        return self._readers[answer.content](now) if kept is None else kept
+        if kept is not None:
+            return kept
+        reader = self._readers.get(answer.content)
+        return None if reader is None else reader(now)
 
     def _read_memory(self, wanted: contents.ReadMemory) -> Content | None:
         """The memory asked for; nothing where there is none, and for more than fits (R5)."""
