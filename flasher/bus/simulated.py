@@ -77,6 +77,9 @@ class SimulatedBus:
         self._devices: list[_Device] = []
         self._sending: tuple[_Node, Frame] | None = None
         self._sending_ends_at = 0.0
+        self._delivered_at: float | None = None
+        """When a frame was delivered to which nobody has answered yet: devices are as exact as the
+        wire, however late the clock woke."""
         self.faults = AdapterFaults()
         """What befalls the host's adapter; see `unplug`, `bus_off` and `nobody_acknowledges`."""
 
@@ -127,7 +130,8 @@ class SimulatedBus:
     def advance(self, limit: float) -> None:
         """Let time pass up to the next thing that happens, `limit` at the latest."""
         self._report_faults()
-        self._serve_devices(self.clock.now())
+        now, self._delivered_at = self._delivered_at, None
+        self._serve_devices(self.clock.now() if now is None else now)
         self._arbitrate()
         moment = limit
         if (due := self.faults.deadline()) is not None and due < moment:
@@ -205,18 +209,18 @@ class SimulatedBus:
 
     def _deliver(self, sender: _Node, frame: Frame) -> None:
         self._sending = None
+        self._delivered_at = self._sending_ends_at
         self.frames_carried += 1
         ends_at = self._sending_ends_at
         frames = self._disturbance(frame, ends_at) if self._disturbance else (frame,)
         for carried in frames:
-            now = ends_at  # a device is as exact as the wire, however late the clock woke
+            now = ends_at
             for device in self._devices:
                 if device is not sender:
                     device.engine.receive(carried, now)
             for host in self._hosts:
                 if host is not sender and self.faults.takes_part:
                     host.inbox.append(carried)
-        self._serve_devices(ends_at)
 
 
 class SimulatedLink:
