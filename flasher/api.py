@@ -104,7 +104,7 @@ class Connection:
     clock: Clock
     name: str
     bit_rate: BitRate | None = None
-    """What the bus runs at, and where that comes from; None where nobody told."""
+    """What the bus runs at, and where that comes from; None where that is not known."""
 
     def device(
         self,
@@ -166,8 +166,8 @@ def connect(
     `bus` are python-can's own keywords (`interface`, `channel`, `bitrate`, ...); its configuration
     files and CAN_* variables hold too. The bit rate is the dialect's unless `bus` itself names
     another one. Meanwhile no other program of this user may speak as the tool on this adapter:
-    `holder` is what it is told; None is for who never does so (a device model, a monitor). Raises
-    UsageError or BusError.
+    `holder` names this program to them; None does not lock the adapter, for programs that never
+    speak as the tool (a device model, a monitor). Raises UsageError or BusError.
     """
     from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can
     from flasher.bus.link import MonotonicClock  # noqa: PLC0415

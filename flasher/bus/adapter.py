@@ -116,7 +116,7 @@ class CanLink:
         self._name = f"{interface} {channel}".strip()
         self._open_again = open_again
         self.bit_rate: BitRate | None = None
-        """What the bus was opened with; None where nobody told."""
+        """What the bus was opened with; None where that is not known."""
         self._waiting: deque[tuple[Frame, float | None]] = deque()
         is_stamped = interface in _KERNEL_STAMPS and platform.system() == "Linux"
         self.stamp_source = "kernel" if is_stamped else ""

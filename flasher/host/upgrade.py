@@ -79,7 +79,7 @@ class LinkBack(Exception):  # noqa: N818  it is good news
     """The adapter was lost and works again."""
 
 
-class SecondTool(Exception):  # noqa: N818  what it is about, for who catches it
+class SecondTool(Exception):  # noqa: N818  the name says what it is about
     """Somebody else sends what only the tool may send; `seen` says what was seen."""
 
     def __init__(self, seen: str) -> None:

@@ -38,7 +38,7 @@ class Image:
     data: bytes = field(repr=False)
     """The very bytes to be sent; gaps are filled."""
     base: int | None
-    """Address of `data[0]`; None for a raw binary whose base nobody told."""
+    """Address of `data[0]`; None for a raw binary whose base is not known."""
     format: str
     """The format that the file was read as, in words: "Intel HEX", "raw binary", ..."""
     source: str
