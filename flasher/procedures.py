@@ -53,6 +53,7 @@ from flasher.host.verify import (
 from flasher.host.write import WritePlan, Written, plan_write
 from flasher.image.image import Image
 from flasher.image.plan import Plan, make_plan
+from flasher.prose import prose
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import Memory, Reset
 from flasher.protocol.engine import Engine
@@ -485,7 +486,7 @@ def _may_end(session: Session) -> Callable[[], bool]:
 
 def _say_what_is_left(error: FlasherError, session: Session) -> None:
     left = session.device_left
-    error.remedy = f"{error.remedy} State of the device: {left.value}.".lstrip()
+    error.remedy = f"{error.remedy} State of the device: {prose(left)}.".lstrip()
     error.needs_rescue = left.needs_rescue
 
 

@@ -10,6 +10,52 @@ from enum import Enum
 from typing import Final, NamedTuple
 
 _TEXTS: Final[dict[str, dict[str, str]]] = {
+    "Ending": {
+        "completed": "the device confirmed the complete image",
+        "confirmed_by_version": "the final answer was lost, the new application answers its "
+        "version",
+        "unconfirmed": "everything was sent and acknowledged, the final answer never came",
+        "other_version": "another version answers than the one that was sent",
+        "refused": "the device refused the image at the end",
+        "no_boot_version": "no boot version came",
+        "no_announcement": "it did not announce itself",
+        "no_request": "no request transfer came",
+        "unhearing": "the bootloader announces itself but does not take the update command",
+        "wrong_device": "another device answers",
+        "boot_too_old": "its bootloader is older than the image needs",
+        "two_devices": "two devices answer on the same id",
+        "not_for_device": "the image is not meant for this device",
+        "implausible": "not plausible as firmware",
+        "unchecked": "it cannot be checked whether the image is meant for this device",
+        "in_use": "the vehicle is in use",
+        "up_to_date": "the device already runs this version",
+        "second_tool": "a second tool speaks on the bus",
+        "packet_failed": "a packet was not acknowledged",
+        "restarted": "the device restarted too often",
+        "broken_protocol": "the device completed before it was told that the transfer had ended",
+        "out_of_time": "the overall deadline passed",
+        "cancelled": "cancelled by the user",
+    },
+    "DeviceLeft": {
+        "untouched": "this run erased nothing: the device is as it was before",
+        "perhaps_erased": "it was told to erase its application and did not say whether it has: "
+        "flash it again, or see after a power cycle what it runs",
+        "no_application": "its application is erased or half written: it stays in its "
+        "bootloader until an image is flashed completely",
+        "unknown": "it has every byte of the image; whether it runs it is not known",
+        "new": "it has the new image",
+    },
+    "Verdict": {
+        "not_asked": "not asked for",
+        "version_right": "the application runs and names the version of the image",
+        "version_unjudged": "the application runs; the image names no version to compare with",
+        "memory_right": "every byte read back is the image's",
+        "version_other": "the application runs another version than the image names",
+        "no_answer": "the application does not answer",
+        "memory_other": "the memory differs from the image",
+        "second_tool": "a second tool speaks on the bus",
+        "interrupted": "interrupted by the user",
+    },
     "Phase": {
         "listen": "listening for another tool",
         "identify": "asking the device who it is",

@@ -16,6 +16,7 @@ from typing import Final
 from flasher.host import table as host
 from flasher.host.table import Ending
 from flasher.mock import table as device
+from flasher.prose import prose
 
 _ROOT: Final = Path(__file__).parents[1]
 UPGRADE: Final = _ROOT / "docs" / "upgrade.md"
@@ -55,7 +56,7 @@ def host_arrows(*, overview: bool = False) -> Iterator[_Arrow]:
                 if isinstance(target, host.State):
                     yield state, event, words, target
                 elif not overview or target in _GOOD:
-                    yield state, event, f"ends, {target.value}", None
+                    yield state, event, f"ends, {prose(target)}", None
 
 
 def device_arrows() -> Iterator[_Arrow]:

@@ -9,6 +9,9 @@ import pytest
 from flasher import prose
 from flasher.bus.health import ControllerState
 from flasher.events import Phase
+from flasher.host.outcome import DeviceLeft
+from flasher.host.table import Ending
+from flasher.host.verify import Verdict
 from flasher.protocol.wire import DamageReason
 from flasher.trace import decoder
 from flasher.trace.story import Cause, TalkerKind
@@ -17,8 +20,11 @@ TOLD: tuple[type[Enum], ...] = (
     Cause,
     ControllerState,
     DamageReason,
+    DeviceLeft,
+    Ending,
     Phase,
     TalkerKind,
+    Verdict,
     decoder.Kind,
 )
 

@@ -1,53 +1,98 @@
-"""What `--json` prints, as types: the parts that commands share, and events as JSON.
+"""What `--json` prints: types of documents, and how their values become JSON.
 
-A command's own documents are TypedDicts of its module, listed there as `DOCUMENTS` (and as `LINES`
-what it prints meanwhile). `flasher.cli.output` puts them into the `Envelope`, `flasher.cli.schema`
-makes a JSON Schema of all of it. A class behind the type in `Annotated` says more than the type: an
-enumeration stands for its names in lower case, a dataclass for its fields.
+A command's own documents are frozen dataclasses of its module, listed there as `DOCUMENTS` (and as
+`LINES` what it prints meanwhile). `flasher.cli.output` puts them into the `Envelope`,
+`flasher.cli.schema` makes a JSON Schema of all of it.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from datetime import datetime
-from enum import Enum, IntEnum
-from typing import Annotated, Any, Final, TypedDict
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final, cast
 
-from flasher.errors import ExitCode
-from flasher.events import Phase
+from flasher.errors import ExitCode, Fault
+from flasher.events import Phase, QueryAnswered
 from flasher.host.outcome import DeviceLeft, Statistics
 from flasher.host.table import Ending
-from flasher.host.verify import Level, Verdict
+from flasher.image.cortexm import VectorTable
 from flasher.protocol.fields import Content
 
-SCHEMA_VERSION: Final = 1
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
+
+SCHEMA_VERSION: Final = 2
 """Counts up when a field of any document changes its meaning or goes away; not for a new one."""
 
 FieldValue = str | int | list[int] | list[str] | None
 """A value of a message: bytes are in hexadecimal, flags are a list of names."""
 
 
+@cache
+def adapter(kind: Any) -> TypeAdapter[Any]:
+    """Writes and describes values of a type: enumerations as their words, bytes in hexadecimal. A
+    field `from_` is the key `from`.
+    """
+    from pydantic import ConfigDict, TypeAdapter, with_config  # noqa: PLC0415  for JSON only
+
+    config = ConfigDict(
+        ser_json_bytes="hex",
+        use_attribute_docstrings=True,
+        alias_generator=lambda name: name.rstrip("_"),
+        serialize_by_alias=True,
+    )
+    if dataclasses.is_dataclass(kind) or hasattr(kind, "__total__"):
+        described: Any = with_config(config)(cast("Any", kind))
+        return TypeAdapter(described)
+    return TypeAdapter(kind, config=config)
+
+
+def as_json(document: object) -> Any:
+    """A document, an event or a part of one as JSON holds it."""
+    kind: Any = type(document)
+    return adapter(kind).dump_python(document, mode="json")
+
+
+def content_document(content: Content) -> dict[str, FieldValue]:
+    """A content as JSON: field names with their units, texts escaped, bytes in hexadecimal, flags
+    by name. Reserved bytes are left out, so that the keys do not depend on the answer.
+    """
+    from flasher.host.items import meaningful_fields  # noqa: PLC0415  rarely needed
+    from flasher.trace.decoder import content_fields  # noqa: PLC0415
+
+    names = {name for name, _ in meaningful_fields(type(content))}
+    return {shown.name: shown.value for shown in content_fields(content) if shown.name in names}
+
+
+def to_json(event: object) -> dict[str, Any]:
+    """An event of flasher.events as JSON: the name of its class as `event`, and its fields."""
+    name = type(event).__name__
+    if isinstance(event, QueryAnswered):
+        event = dataclasses.replace(event, content=content_document(cast("Content", event.content)))
+    return {"event": name, **as_json(event)}
+
+
 # -- around every document -------------------------------------------------------------------------
 
 
-class LineEnvelope(TypedDict):
-    """What every line has. Those before the document have the key `event` too."""
+@dataclass(frozen=True)
+class Envelope:
+    """What the document of a command has, which is the last line; lines before it have `schema` and
+    `event`.
+    """
 
     schema: int
     """Version of this schema."""
-
-
-class Envelope(LineEnvelope):
-    """What the document of a command has, which is the last line."""
-
     command: str | None
     """The command that ran; null when none was named."""
     ok: bool
     """True when the exit code is 0."""
-    exit_code: Annotated[int, ExitCode]
+    exit_code: ExitCode
 
 
-class ErrorDocument(TypedDict):
+@dataclass(frozen=True)
+class ErrorDocument:
     """What went wrong. Texts may be empty, but for `kind` and `what`."""
 
     kind: str
@@ -58,29 +103,23 @@ class ErrorDocument(TypedDict):
     remedy: str
     command: str
     """The command that repairs what was left."""
+    faults: tuple[Fault, ...]
+    """Everything that is wrong with a file, where the error is about one."""
 
 
 # -- images and plans ------------------------------------------------------------------------------
 
 
-class SegmentDocument(TypedDict):
+@dataclass(frozen=True)
+class SegmentDocument:
     """A run of bytes of the file."""
 
     start: int
     size_bytes: int
 
 
-class VectorTableDocument(TypedDict):
-    """The first two words of the image, and what speaks against a Cortex-M application."""
-
-    stack_pointer: int
-    reset_vector: int
-    plausible: bool
-    problems: list[str]
-    notes: list[str]
-
-
-class ImageDocument(TypedDict):
+@dataclass(frozen=True)
+class ImageDocument:
     """What is in the file, and of it the bytes to be sent."""
 
     source: str
@@ -96,10 +135,11 @@ class ImageDocument(TypedDict):
     """The targets that texts inside name."""
     sha256: str
     """Of the bytes to be sent, in hexadecimal."""
-    vector_table: VectorTableDocument | None
+    vector_table: VectorTable | None
 
 
-class PlanDocument(TypedDict):
+@dataclass(frozen=True)
+class PlanDocument:
     """What would be sent to whom, and how long that takes on the bus."""
 
     target: str
@@ -117,32 +157,25 @@ class PlanDocument(TypedDict):
 # -- upgrades --------------------------------------------------------------------------------------
 
 
-class OutcomeDocument(TypedDict):
+@dataclass(frozen=True)
+class OutcomeDocument:
     """How an upgrade ended."""
 
-    ending: Annotated[str, Ending]
-    phase: Annotated[str, Phase]
+    ending: Ending
+    phase: Phase
     packet: int | None
-    device_left: Annotated[str, DeviceLeft]
+    device_left: DeviceLeft
     boot_version: str | None
     running_version: str | None
     detail: str
-    statistics: Annotated[dict[str, Any], Statistics]
-
-
-class VerificationDocument(TypedDict):
-    """What the verification after an upgrade found."""
-
-    level: Annotated[str, Level]
-    verdict: Annotated[str, Verdict]
-    running_version: str | None
-    detail: str
+    statistics: Statistics
 
 
 # -- surveys ---------------------------------------------------------------------------------------
 
 
-class HeardDocument(TypedDict):
+@dataclass(frozen=True)
+class HeardDocument:
     """What was heard of one node."""
 
     frames: int
@@ -155,54 +188,3 @@ class HeardDocument(TypedDict):
     boot_version: str | None
     not_in_dialect: list[str]
     """Kinds of message that the document of --dialect does not have."""
-
-
-# -- events ----------------------------------------------------------------------------------------
-
-
-def to_json(event: object) -> dict[str, Any]:
-    """An event of flasher.events as JSON: the name of its class as `event`, and its fields.
-
-    Raises TypeError for what is no dataclass.
-    """
-    return {"event": type(event).__name__, **_fields(event)}
-
-
-def content_document(content: Content) -> dict[str, FieldValue]:
-    """A content as JSON: field names with their units, texts escaped, bytes in hexadecimal, flags
-    by name. Reserved bytes are left out, so that the keys do not depend on the answer.
-    """
-    from flasher.host.items import meaningful_fields  # noqa: PLC0415  rarely needed
-    from flasher.trace.decoder import content_fields  # noqa: PLC0415
-
-    names = {name for name, _ in meaningful_fields(type(content))}
-    return {shown.name: shown.value for shown in content_fields(content) if shown.name in names}
-
-
-def _fields(value: Any) -> dict[str, Any]:
-    return {
-        field.name: plain_value(getattr(value, field.name)) for field in dataclasses.fields(value)
-    }
-
-
-def plain_value(value: Any) -> Any:
-    """A value as JSON holds it: enumerations by name in lower case, bytes in hexadecimal."""
-    match value:
-        case IntEnum():
-            return int(value)
-        case Enum():
-            return value.name.lower()
-        case bytes():
-            return value.hex()
-        case datetime():
-            return value.isoformat()
-        case Content():
-            return content_document(value)
-        case dict():
-            return {str(key): plain_value(each) for key, each in value.items()}
-        case tuple() | list():
-            return [plain_value(each) for each in value]
-        case _ if dataclasses.is_dataclass(value):
-            return _fields(value)
-        case _:
-            return value

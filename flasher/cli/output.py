@@ -15,9 +15,9 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Final, Literal, NamedTuple, TextIO
+from typing import Final, Literal, NamedTuple, TextIO
 
-from flasher.cli.documents import SCHEMA_VERSION, ErrorDocument, to_json
+from flasher.cli.documents import SCHEMA_VERSION, Envelope, ErrorDocument, as_json, to_json
 from flasher.cli.terminal import columns, painted, takes_colour, unpainted, wrapped
 from flasher.errors import ExitCode, FlasherError, UsageError
 
@@ -88,27 +88,27 @@ class Output:
         """Help, laid out for the window; it is printed when JSON is wanted too."""
         _print_stdout("\n".join(line.rstrip() for line in text.rstrip().splitlines()))
 
-    def document(
-        self, document: Mapping[str, object], *, exit_code: ExitCode = ExitCode.OK
-    ) -> None:
-        """The one JSON document of a command, the last line of its output. `ok` and `exit_code` are
-        added, unless the document has them.
-        """
-        self.line(
-            {
-                "command": self.command,
-                "ok": exit_code == ExitCode.OK,
-                "exit_code": int(exit_code),
-                **document,
-            }
-        )
+    def document(self, document: object, *, exit_code: ExitCode = ExitCode.OK) -> None:
+        """The one JSON document of a command, the last line of its output, in its envelope."""
+        self._print_document(document, exit_code)
 
-    def line(self, line: Mapping[str, object]) -> None:
+    def _print_document(
+        self, document: object, exit_code: ExitCode, error: ErrorDocument | None = None
+    ) -> None:
+        if not self.json_wanted:
+            return
+        around = Envelope(SCHEMA_VERSION, self.command, exit_code == ExitCode.OK, exit_code)
+        known = {} if document is None else as_json(document)
+        failed = {} if error is None else {"error": as_json(error)}
+        self.line({**as_json(around), **known, **failed})
+
+    def line(self, line: object) -> None:
         """A line of JSON that a command prints before its document; silent when no JSON is wanted.
         It has the key `event`.
         """
         if self.json_wanted:
-            text = json.dumps({"schema": SCHEMA_VERSION, **line})
+            fields = line if isinstance(line, Mapping) else as_json(line)
+            text = json.dumps({"schema": SCHEMA_VERSION, **fields})
             _LOG.debug("%s", text, extra=SAID)
             _print_stdout(text)
 
@@ -138,8 +138,10 @@ class Output:
         say = self.result if is_good else self.error_line
         say(f"{word}  {verdict.text}")
 
-    def failure(self, error: FlasherError, **more: Any) -> None:
-        """An error as a person reads it, and as the JSON document of the command."""
+    def failure(self, error: FlasherError, known: object = None) -> None:
+        """An error as a person reads it, and as the JSON document of the command, with the document
+        of what was `known` by then.
+        """
         _LOG.error("error: %s", error, extra=SAID)
         head = painted("error:", "red") if self.colour else "error:"
         self.say(f"{head} {error}")
@@ -152,8 +154,9 @@ class Output:
             cause=error.cause,
             remedy=error.remedy,
             command=error.command,
+            faults=error.faults,
         )
-        self.document({**more, "error": said}, exit_code=error.exit_code)
+        self._print_document(known, error.exit_code, said)
 
 
 def _plain_stderr(text: str) -> None:

@@ -11,7 +11,6 @@ wrong here changes what the command says or its exit code.
 
 from __future__ import annotations
 
-import dataclasses
 import os
 import traceback
 from collections.abc import Iterator
@@ -23,6 +22,7 @@ from typing import Any, Final
 from platformdirs import user_state_path
 
 from flasher.api import Connection
+from flasher.cli.documents import as_json
 from flasher.cli.files import check_not_read
 from flasher.cli.framework import command_line, option, option_set, typed_values
 from flasher.cli.options import Bus
@@ -189,9 +189,9 @@ def _leave_bundle(
     folder = bundle_folder(options.bundle_dir)
     link = record.link_report()
     facts = {
-        **record.facts,
+        **{name: as_json(fact) for name, fact in record.facts.items()},
         "error": error and _error(error),
-        "link": link and dataclasses.asdict(link),
+        "link": link and as_json(link),
     }
     is_own = options.bundle_dir is None and not os.environ.get(BUNDLE_FOLDER)
     try:

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from typing import Annotated, Final, TypedDict
+from typing import Annotated, Final
+
+from typing_extensions import TypedDict
 
 from flasher.conformance.reports import ByResult, distribution
 from flasher.conformance.results import (

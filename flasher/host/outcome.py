@@ -33,17 +33,11 @@ from flasher.protocol.spec import Target
 class DeviceLeft(Enum):
     """The state in which the device was left, as far as the host can know."""
 
-    UNTOUCHED = "this run erased nothing: the device is as it was before"
-    PERHAPS_ERASED = (
-        "it was told to erase its application and did not say whether it has: flash it again, or "
-        "see after a power cycle what it runs"
-    )
-    NO_APPLICATION = (
-        "its application is erased or half written: it stays in its bootloader until an image is "
-        "flashed completely"
-    )
-    UNKNOWN = "it has every byte of the image; whether it runs it is not known"
-    NEW = "it has the new image"
+    UNTOUCHED = "untouched"
+    PERHAPS_ERASED = "perhaps_erased"
+    NO_APPLICATION = "no_application"
+    UNKNOWN = "unknown"
+    NEW = "new"
 
     @property
     def needs_rescue(self) -> bool:
@@ -117,7 +111,7 @@ class Outcome:
             if self.ending is Ending.OUT_OF_TIME
             else _EXPLANATIONS[self.ending]
         )
-        what = f"{self.target.node.name}: {self.ending.value}"
+        what = f"{self.target.node.name}: {prose(self.ending)}"
         if self.detail:
             what += f" ({self.detail})"
         names = {"node": self.target.node.name, "boot_name": self.target.boot_name}
@@ -125,7 +119,7 @@ class Outcome:
             f"{what}.",
             where=self.where,
             cause=cause.format(**names),
-            remedy=f"{remedy.format(**names)} State of the device: {self.device_left.value}.",
+            remedy=f"{remedy.format(**names)} State of the device: {prose(self.device_left)}.",
         )
         error.needs_rescue = self.device_left.needs_rescue
         return error

@@ -23,6 +23,7 @@ from flasher.host.outcome import DeviceLeft
 from flasher.host.query import READ_MEMORY, Query, ask, memory_requests, piece_of
 from flasher.host.runner import Runner, Stage
 from flasher.image.plan import Plan
+from flasher.prose import prose
 from flasher.protocol.contents import Memory, ReadMemory
 from flasher.protocol.spec import Target
 
@@ -36,20 +37,20 @@ class Level(Enum):
 
 
 class Verdict(Enum):
-    """What the verification found; the value completes "verification: ..."."""
+    """What the verification found."""
 
-    NOT_ASKED = "not asked for"
-    VERSION_RIGHT = "the application runs and names the version of the image"
-    VERSION_UNJUDGED = "the application runs; the image names no version to compare with"
-    MEMORY_RIGHT = "every byte read back is the image's"
-    VERSION_OTHER = "the application runs another version than the image names"
-    NO_ANSWER = "the application does not answer"
-    MEMORY_OTHER = "the memory differs from the image"
-    SECOND_TOOL = "a second tool speaks on the bus"
-    INTERRUPTED = "interrupted by the user"
+    NOT_ASKED = "not_asked"
+    VERSION_RIGHT = "version_right"
+    VERSION_UNJUDGED = "version_unjudged"
+    MEMORY_RIGHT = "memory_right"
+    VERSION_OTHER = "version_other"
+    NO_ANSWER = "no_answer"
+    MEMORY_OTHER = "memory_other"
+    SECOND_TOOL = "second_tool"
+    INTERRUPTED = "interrupted"
 
 
-_IT_HAS: Final = f"State of the device: {DeviceLeft.NEW.value}."
+_IT_HAS: Final = f"State of the device: {prose(DeviceLeft.NEW)}."
 GOOD: Final = frozenset(
     {Verdict.NOT_ASKED, Verdict.VERSION_RIGHT, Verdict.VERSION_UNJUDGED, Verdict.MEMORY_RIGHT}
 )
@@ -73,7 +74,7 @@ class Verification:
         """The error that stands for it; None when there is none."""
         if self.ok:
             return None
-        what = f"{target.node.name}: completed, but {self.verdict.value}"
+        what = f"{target.node.name}: completed, but {prose(self.verdict)}"
         what += f" ({self.detail})." if self.detail else "."
         if self.verdict is Verdict.INTERRUPTED:
             return InterruptedByUserError(

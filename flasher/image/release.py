@@ -61,6 +61,9 @@ def _boot_version(value: object) -> str:
 
 
 DeviceText = Annotated[str, Form("a text of printable ASCII", _text)]
+TargetName = Annotated[
+    Target, Form(f"one of {', '.join(TARGETS)}", _target, lambda target: target.name)
+]
 FirmwareText = Annotated[
     str, Form(f"a text of the form {FIRMWARE_VERSION_FORM}", _firmware_version)
 ]
@@ -86,7 +89,7 @@ class Release:
     cannot be applied to does not fit, since nobody knows that it would.
     """
 
-    target: Annotated[Target, Form(f"one of {', '.join(TARGETS)}", _target)]
+    target: TargetName
     """The device that the image is for."""
     firmware_version: FirmwareText | None = None
     """The version inside the image."""

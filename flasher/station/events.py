@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import StrEnum
 
+from flasher.form import LowerInJson
 from flasher.station.records.model import (
     Figures,
     RunId,
@@ -20,7 +21,7 @@ from flasher.station.records.model import (
 )
 
 
-class SocketState(StrEnum):
+class SocketState(LowerInJson, StrEnum):
     """What a socket shows; the word is for people."""
 
     STARTING = "STARTING"

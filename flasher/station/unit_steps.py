@@ -19,6 +19,7 @@ from flasher.host.outcome import DeviceLeft
 from flasher.host.session import Result
 from flasher.host.verify import Level, Verdict, memory_check
 from flasher.host.write import WritePlan
+from flasher.prose import prose
 from flasher.protocol.fields import Content
 from flasher.station import codes
 from flasher.station.messages import Journal, RunOrder, flash_value, write_key
@@ -212,7 +213,7 @@ class UnitSteps:
         measured.append(Measurement(f"{name} transfer", statistics.transfer_s or 0.0, "s"))
         self._journal.verified(write, result.running_version)
         self._flashed.add(name)
-        return f"{result.outcome.ending.value}; boot version {result.outcome.boot_version}"
+        return f"{prose(result.outcome.ending)}; boot version {result.outcome.boot_version}"
 
     def _upgrade(self, target: UnitTarget, *, at_power_up: bool) -> Result:
         """One upgrade to a good end. Raises StepFailedError."""
@@ -237,7 +238,7 @@ class UnitSteps:
             on_event=hear,
         )
         left = result.outcome.device_left
-        self.left_behind = f"State of the device: {left.value}." if left.needs_rescue else ""
+        self.left_behind = f"State of the device: {prose(left)}." if left.needs_rescue else ""
         if result.ok:
             return result
         target.check_cancelled()
@@ -354,7 +355,7 @@ class UnitSteps:
         found = check.result
         if not found.ok:
             code = _OF_VERDICT.get(found.verdict, codes.MEMORY_DIFFERS)
-            raise StepFailedError(code, f"{name}: {found.verdict.value} {found.detail}".strip())
+            raise StepFailedError(code, f"{name}: {prose(found.verdict)} {found.detail}".strip())
         return Verified.MEMORY
 
     def _completed(self, target: UnitTarget) -> Verified:

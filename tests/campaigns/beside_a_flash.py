@@ -21,6 +21,7 @@ from typing import Final
 
 from flasher import events
 from flasher.errors import ExitCode
+from flasher.prose import prose
 from flasher.protocol.frame import Frame
 from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment, run_flasher
 from tests.end_to_end.stage import SMALL, Speaker, Stage, image_of
@@ -109,7 +110,7 @@ def on_the_simulated_bus(
     counts["messages sent again"] += len(stage.seen(events.MessageRepeated))
     counts["attempts more"] += len(stage.seen(events.AttemptStarted))
     if not result.ok:
-        return f"{result.outcome.ending.value} ({result.outcome.where})"
+        return f"{prose(result.outcome.ending)} ({result.outcome.where})"
     return "" if stage.has == image.data else "the device has another image"
 
 

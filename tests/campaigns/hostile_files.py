@@ -21,7 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from flasher.cli.documents import plain_value
+from flasher.cli.documents import as_json
 from flasher.cli.look.explain_text import story_lines
 from flasher.cli.station.scans import read_scans
 from flasher.conformance import diff
@@ -53,7 +53,7 @@ def explained(path: Path) -> None:
     story = explain_path(path)
     for line in story_lines(story, packets=True):
         line.encode("ascii")
-    json.dumps(plain_value(story), allow_nan=False)
+    json.dumps(as_json(story), allow_nan=False)
     render(story)
 
 

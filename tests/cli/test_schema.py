@@ -216,7 +216,7 @@ def test_a_bug_is_a_document_too(
     "wrong",
     [
         {"exit_code": 17},
-        {"schema": 2},
+        {"schema": 1},
         {"command": "scan"},
         {"surplus": 1},
         {"plan": {}},

@@ -1,25 +1,34 @@
-"""How type hints become JSON Schema."""
+"""How types become JSON Schema, and values of them JSON."""
 
 from __future__ import annotations
 
-import dataclasses
-from enum import Enum, IntEnum
-from typing import Annotated, Any, Literal, NotRequired, TypedDict
+from dataclasses import dataclass
+from enum import Enum, IntEnum, StrEnum
+from typing import Literal
 
 import pytest
+from jsonschema import Draft202012Validator
+from pydantic import PydanticUserError
 
-from flasher.cli.schema import Definitions
+from flasher.cli.documents import as_json
+from flasher.cli.schema import schema_of
+from flasher.form import LowerInJson
 
 
 class Colour(Enum):
-    DARK_RED = "#800000"
+    DARK_RED = "dark_red"
+
+
+class State(LowerInJson, StrEnum):
+    PASS = "PASS"  # noqa: S105
+    FAIL = "FAIL"
 
 
 class Number(IntEnum):
     SEVEN = 7
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclass(frozen=True)
 class Point:
     """A place."""
 
@@ -28,50 +37,66 @@ class Point:
     name: str | None
 
 
-class Base(TypedDict):
-    """What both have."""
-
-    colour: Annotated[str, Colour]
-
-
-class Thing(Base):
+@dataclass(frozen=True)
+class Thing:
     """A thing."""
 
+    colour: Colour
+    state: State
+    number: Number
     points: list[Point]
     pair: tuple[int, str]
-    by_name: dict[str, Thing]
-    note: NotRequired[Literal["a", "b"]]
+    by_name: dict[str, Point]
+    from_: bytes
+    note: Literal["a", "b"] | None = None
 
 
-def test_a_typed_dict_becomes_a_closed_object_with_its_texts() -> None:
-    known = Definitions()
-    assert known.of(Thing) == {"$ref": "#/$defs/Thing"}
-    thing, point = known.found["Thing"], known.found["Point"]
-    assert thing["required"] == ["colour", "points", "pair", "by_name"]
-    assert thing["additionalProperties"] is False
-    assert thing["properties"]["colour"] == {"enum": ["dark_red"]}
-    assert thing["properties"]["note"] == {"enum": ["a", "b"]}
-    assert thing["properties"]["by_name"]["additionalProperties"] == {"$ref": "#/$defs/Thing"}
-    assert thing["properties"]["pair"]["prefixItems"] == [{"type": "integer"}, {"type": "string"}]
+THING = Thing(
+    Colour.DARK_RED,
+    State.PASS,
+    Number.SEVEN,
+    [Point(0.5, None)],
+    (1, "x"),
+    {"p": Point(1.0, "p")},
+    b"\x00\xff",
+)
+
+
+def test_a_dataclass_becomes_a_closed_object_with_its_texts() -> None:
+    schema = schema_of(Thing)
+    properties, point = schema["properties"], schema["$defs"]["Point"]
+    assert schema["required"] == list(properties)
+    assert schema["required"][-2:] == ["from", "note"], "what has a default is there too"
+    assert schema["additionalProperties"] is False
+    assert schema["$defs"]["Colour"]["enum"] == ["dark_red"]
+    assert schema["$defs"]["State"]["enum"] == ["pass", "fail"]
+    assert properties["note"]["anyOf"][0]["enum"] == ["a", "b"]
+    assert properties["by_name"]["additionalProperties"] == {"$ref": "#/$defs/Point"}
+    assert properties["pair"]["prefixItems"] == [{"type": "integer"}, {"type": "string"}]
     assert point["properties"]["x_m"] == {"type": "number", "description": "To the right."}
     assert point["properties"]["name"] == {"anyOf": [{"type": "string"}, {"type": "null"}]}
-    assert (thing["description"], point["description"]) == ("A thing.", "A place.")
+    assert (schema["description"], point["description"]) == ("A thing.", "A place.")
 
 
-def test_numbered_choices_are_their_numbers_where_they_are_numbers() -> None:
-    assert Definitions().of(Number) == {"enum": [7]}
-    assert Definitions().of(Annotated[int, Number]) == {"enum": [7]}
-    assert Definitions().of(Annotated[str, Number]) == {"enum": ["seven"]}
+def test_a_value_is_written_as_its_type_is_described() -> None:
+    written = as_json(THING)
+    Draft202012Validator(schema_of(Thing)).validate(written)
+    assert written == {
+        "colour": "dark_red",
+        "state": "pass",
+        "number": 7,
+        "points": [{"x_m": 0.5, "name": None}],
+        "pair": [1, "x"],
+        "by_name": {"p": {"x_m": 1.0, "name": "p"}},
+        "from": "00ff",
+        "note": None,
+    }
 
 
-@pytest.mark.parametrize("hint", [complex, type[int], "text"])
-def test_a_type_without_a_schema_is_named(hint: Any) -> None:
-    with pytest.raises(TypeError, match="has no JSON Schema"):
-        Definitions().of(hint)
+class Opaque:
+    """No type of a document."""
 
 
-def test_two_classes_of_one_name_are_refused() -> None:
-    known = Definitions()
-    known.of(Point)
-    with pytest.raises(TypeError, match="two classes"):
-        known.of(dataclasses.make_dataclass("Point", ["x"]))
+def test_a_type_without_a_schema_is_refused() -> None:
+    with pytest.raises(PydanticUserError, match="Opaque"):
+        schema_of(Opaque)

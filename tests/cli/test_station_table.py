@@ -337,7 +337,7 @@ def sample(hint: Any) -> Any:
 def test_every_event_is_as_described(event: Any) -> None:
     schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
     made = event(**{name: sample(hint) for name, hint in get_type_hints(event).items()})
-    line = {"schema": 1, **to_json(made)}
+    line = {"schema": 2, **to_json(made)}
     hold(schema, f"line.{event.__name__}", json.loads(json.dumps(line)))
 
 

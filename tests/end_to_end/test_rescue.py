@@ -299,7 +299,7 @@ def test_an_adapter_that_is_gone_while_the_version_is_asked_for_says_that_the_im
     with pytest.raises(BusError) as caught:
         stage.flash()
     assert "verifying by version" in caught.value.where
-    assert DeviceLeft.NEW.value in caught.value.remedy
+    assert prose(DeviceLeft.NEW) in caught.value.remedy
     assert not caught.value.needs_rescue
 
 

@@ -7,7 +7,7 @@ import random
 
 import pytest
 
-from flasher.cli.documents import plain_value
+from flasher.cli.documents import as_json
 from flasher.cli.look.explain_text import story_lines
 from flasher.protocol.bittime import message_bits
 from flasher.protocol.frame import Frame
@@ -47,7 +47,7 @@ def spoilt(chance: random.Random) -> list[tuple[float, Frame]]:
 def test_a_spoilt_trace_has_a_story(seed: int) -> None:
     story = explain(spoilt(random.Random(seed)), source="x")
     assert story.verdict.text
-    assert json.loads(json.dumps(plain_value(story)))["verdict"]["text"] == story.verdict.text
+    assert json.loads(json.dumps(as_json(story)))["verdict"]["text"] == story.verdict.text
     text = "\n".join(story_lines(story, packets=True))
     assert text.isascii()
     assert text.replace("\n", "").isprintable()

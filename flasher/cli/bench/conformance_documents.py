@@ -4,7 +4,9 @@ as one of them. The report itself is `flasher.conformance.json_report`.
 
 from __future__ import annotations
 
-from typing import Annotated, Final, TypedDict
+from typing import Annotated, Final
+
+from typing_extensions import TypedDict
 
 from flasher.conformance.diff import Change, Difference, Slowdown
 from flasher.conformance.json_report import ReportDocument, verdict_name

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final, TypedDict
+from typing import Final
 
 import click
 
@@ -53,14 +54,16 @@ SHOWN: Final = BY_DEVICE | {events.BytesDamaged}
 """The events that are printed: the log on stderr leaves them out."""
 
 
-class MockDocument(TypedDict):
+@dataclass(frozen=True)
+class MockDocument:
     """What the device model received."""
 
     images: int
     """Complete upgrades."""
 
 
-class VariantDocument(TypedDict):
+@dataclass(frozen=True)
+class VariantDocument:
     """A deliberately wrong device model."""
 
     name: str
@@ -73,7 +76,8 @@ class VariantDocument(TypedDict):
     """False when not even an undisturbed upgrade to an ordinary image ends well."""
 
 
-class VariantsDocument(TypedDict):
+@dataclass(frozen=True)
+class VariantsDocument:
     """What --variant takes."""
 
     variants: list[VariantDocument]

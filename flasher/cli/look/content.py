@@ -55,11 +55,11 @@ def heard_lines(heard: NodeTraffic, *, contents: bool = False) -> list[str]:
 
 def heard_document(heard: NodeTraffic) -> HeardDocument:
     """The same as JSON."""
-    return {
-        "frames": heard.frames,
-        "messages": dict(sorted(heard.messages.items())),
-        "last": {title: content_document(content) for title, content in heard.last.items()},
-        "damaged": heard.damaged,
-        "boot_version": heard.boot_version or None,
-        "not_in_dialect": sorted(heard.not_in_dialect),
-    }
+    return HeardDocument(
+        frames=heard.frames,
+        messages=dict(sorted(heard.messages.items())),
+        last={title: content_document(content) for title, content in heard.last.items()},
+        damaged=heard.damaged,
+        boot_version=heard.boot_version or None,
+        not_in_dialect=sorted(heard.not_in_dialect),
+    )

@@ -9,7 +9,8 @@ import contextlib
 import shlex
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Annotated, Any, Final, TypedDict
+from dataclasses import dataclass
+from typing import Any, Final
 
 from flasher import api
 from flasher.bus.health import ControllerState
@@ -59,33 +60,26 @@ not try other bit rates, and cannot see a device that speaks only when asked: fl
 """
 
 
-class FindingDocument(TypedDict):
-    """One thing that was looked at."""
-
-    severity: Annotated[str, Severity]
-    about: str
-    what: str
-    fix: list[str]
-    """Commands, or what to do by hand."""
-
-
-class AdapterDocument(TypedDict):
+@dataclass(frozen=True)
+class AdapterDocument:
     """An adapter that python-can detects."""
 
     interface: str
     channel: str
 
 
-class HealthDocument(TypedDict):
+@dataclass(frozen=True)
+class HealthDocument:
     """What the adapter tells about its controller."""
 
-    state: Annotated[str, ControllerState]
+    state: ControllerState
     tx_errors: int | None
     rx_errors: int | None
     error_frames: int
 
 
-class TrafficDocument(TypedDict):
+@dataclass(frozen=True)
+class TrafficDocument:
     """What was heard."""
 
     listened_s: float
@@ -99,10 +93,11 @@ class TrafficDocument(TypedDict):
     foreign_frames: int
 
 
-class DoctorDocument(TypedDict):
+@dataclass(frozen=True)
+class DoctorDocument:
     """The findings, and the figures behind them."""
 
-    findings: list[FindingDocument]
+    findings: list[Finding]
     adapters: list[AdapterDocument]
     bitrate_bps: int
     health: HealthDocument | None
@@ -143,7 +138,7 @@ def doctor(output: Output, bus: Bus, *, listen: float) -> int:
             examination.look_at_adapters(stopped)
     for line in lines(examination.findings, is_coloured=takes_colour(sys.stdout)):
         output.result(line)
-    worst = max(examination.findings, key=lambda finding: finding.severity.value)
+    worst = max(examination.findings, key=lambda finding: list(Severity).index(finding.severity))
     document = _document(examination)
     if worst.severity is not Severity.PROBLEM:
         output.document(document)
@@ -152,7 +147,7 @@ def doctor(output: Output, bus: Bus, *, listen: float) -> int:
         f"A problem was found. {worst.about}: {worst.what}.",
         remedy="; ".join(worst.fix),
     )
-    output.failure(error, **document)
+    output.failure(error, document)
     return error.exit_code
 
 
@@ -170,15 +165,7 @@ def lines(findings: Sequence[Finding], *, is_coloured: bool) -> list[str]:
 def _document(examination: Examination) -> DoctorDocument:
     heard = examination.listened
     return DoctorDocument(
-        findings=[
-            FindingDocument(
-                severity=each.severity.name.lower(),
-                about=each.about,
-                what=each.what,
-                fix=list(each.fix),
-            )
-            for each in examination.findings
-        ],
+        findings=examination.findings,
         adapters=[
             AdapterDocument(interface=found.interface, channel=printable(found.channel))
             for found in examination.detected.found
@@ -191,7 +178,7 @@ def _document(examination: Examination) -> DoctorDocument:
 
 def _health_document(heard: Listened) -> HealthDocument:
     return HealthDocument(
-        state=heard.health.state.name.lower(),
+        state=heard.health.state,
         tx_errors=heard.health.tx_errors,
         rx_errors=heard.health.rx_errors,
         error_frames=heard.traffic.error_frames,

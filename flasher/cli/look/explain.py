@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Final, TypedDict
+from typing import Final
 
 from flasher.cli import values
-from flasher.cli.documents import plain_value
 from flasher.cli.files import check_not_read, check_writable, write_whole
 from flasher.cli.framework import argument, command, option
 from flasher.cli.look.explain_text import story_lines
@@ -19,10 +19,11 @@ from flasher.protocol.text import printable
 from flasher.trace.story import Story
 
 
-class ExplainDocument(TypedDict):
+@dataclass(frozen=True)
+class ExplainDocument:
     """The story of a trace. Times in seconds since its first frame."""
 
-    story: Annotated[dict[str, Any], Story]
+    story: Story
 
 
 DOCUMENTS: Final = (ExplainDocument,)
@@ -97,7 +98,7 @@ def explain(
 
         write_whole(html, render(story).encode("utf-8"), _HTML)
         output.progress(f"page: {printable(str(html))}")
-    output.document(ExplainDocument(story=plain_value(story)))
+    output.document(ExplainDocument(story=story))
     return ExitCode.OK
 
 

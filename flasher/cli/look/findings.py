@@ -42,12 +42,12 @@ _MANY_ERRORS: Final = 0.1
 
 
 class Severity(Enum):
-    """How bad a finding is; a greater value is worse."""
+    """How bad a finding is, the worst last."""
 
-    OK = 0
-    NOTE = 1
-    WARNING = 2
-    PROBLEM = 3
+    OK = "ok"
+    NOTE = "note"
+    WARNING = "warning"
+    PROBLEM = "problem"
 
 
 @dataclass(frozen=True)

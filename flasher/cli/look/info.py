@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final, TypedDict
+from dataclasses import dataclass
+from typing import Final
 
 from flasher.cli.documents import FieldValue, HeardDocument, content_document
 from flasher.cli.framework import command
@@ -26,7 +27,8 @@ What the device does not answer is shown as such: an older one does not know eve
 """
 
 
-class InfoDocument(TypedDict):
+@dataclass(frozen=True)
+class InfoDocument:
     """What a device tells about itself."""
 
     target: str
@@ -64,7 +66,7 @@ def info(output: Output, target: Target, bus: Bus, recorded: RecordingOptions) -
             record.failed(_silent(found))
     if not found.is_there:
         error = _silent(found)
-        output.failure(error, **_document(found))
+        output.failure(error, _document(found))
         return error.exit_code
     for line in _lines(found):
         output.result(line)
@@ -136,17 +138,17 @@ def _why(reading: Reading) -> str:
 def _document(found: DeviceInfo) -> InfoDocument:
     faults = found.survey.faults
     heard = found.survey.heard.get(found.target.node)
-    return {
-        "target": found.target.name,
-        "dialect": found.dialect.name,
-        "can_be_asked": bool(found.readings),
-        "items": {
+    return InfoDocument(
+        target=found.target.name,
+        dialect=found.dialect.name,
+        can_be_asked=bool(found.readings),
+        items={
             reading.name: content_document(reading.answer) if reading.answer else None
             for reading in found.readings
         },
-        "unanswered": {
+        unanswered={
             reading.name: _why(reading) for reading in found.readings if reading.answer is None
         },
-        "faults": content_document(faults)["faults"] if faults else [],
-        "heard": heard_document(heard) if heard else None,
-    }
+        faults=content_document(faults)["faults"] if faults else [],
+        heard=heard_document(heard) if heard else None,
+    )

@@ -6,7 +6,8 @@ import os
 import sys
 from collections.abc import Iterable
 from contextlib import ExitStack
-from typing import Final, TypedDict
+from dataclasses import dataclass
+from typing import Final
 
 from flasher.cli import values
 from flasher.cli.framework import argument, command, option
@@ -37,7 +38,8 @@ message; `*` marks what changed since the same message before. Ctrl-C ends it wi
 """
 
 
-class MonitorDocument(TypedDict):
+@dataclass(frozen=True)
+class MonitorDocument:
     """How much was seen."""
 
     frames: int

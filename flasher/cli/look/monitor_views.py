@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Final, Literal, Self, TypedDict
+from typing import TYPE_CHECKING, Final, Literal, Self
 
 from flasher.cli.documents import FieldValue
 from flasher.cli.output import Output, counted
@@ -18,20 +19,19 @@ _VALUE_WIDTH: Final = 64
 """Longer values are cut in lines, unless -v is given."""
 
 
-_Route = TypedDict("_Route", {"from": str, "to": str})
-
-
-class SeenLine(_Route):
+@dataclass(frozen=True)
+class SeenLine:
     """A message, a damage or a foreign frame, decoded. `from` and `to` are nodes, "all", or empty
     for an id of no node.
     """
 
-    event: Literal["Seen"]
     at_s: float
     """Since the first of them."""
-    kind: Annotated[str, Kind]
+    kind: Kind
     can_id: int
     command: int | None
+    from_: str
+    to: str
     message: str
     """Its title in the documents."""
     trouble: bool
@@ -40,12 +40,13 @@ class SeenLine(_Route):
     """Fields that differ from the same message before."""
     in_dialect: bool
     """False for a message that the document of --dialect does not have."""
+    event: Literal["Seen"] = "Seen"
 
 
-class FrameLine(TypedDict):
+@dataclass(frozen=True)
+class FrameLine:
     """A CAN frame as it came (--raw)."""
 
-    event: Literal["Frame"]
     at_s: float
     kind: Literal["frame"]
     can_id: int
@@ -54,6 +55,7 @@ class FrameLine(TypedDict):
     extended: bool
     remote: bool
     error: bool
+    event: Literal["Frame"] = "Frame"
 
 
 def route(seen: BusEvent) -> str:
@@ -123,17 +125,17 @@ class Lines(View):
 
     def show_frame(self, frame: Frame, at_s: float) -> None:
         self.output.result(f"{at_s:10.3f}  {frame.can_id:03X}  {_frame_text(frame)}")
-        line: FrameLine = {
-            "event": "Frame",
-            "at_s": round(at_s, 6),
-            "kind": "frame",
-            "can_id": frame.can_id,
-            "data": frame.data.hex(),
-            "extended": frame.is_extended,
-            "remote": frame.is_remote,
-            "error": frame.is_error,
-        }
-        self.output.line(line)
+        self.output.line(
+            FrameLine(
+                at_s=round(at_s, 6),
+                kind="frame",
+                can_id=frame.can_id,
+                data=frame.data.hex(),
+                extended=frame.is_extended,
+                remote=frame.is_remote,
+                error=frame.is_error,
+            )
+        )
 
 
 class Table(View):
@@ -201,20 +203,19 @@ def _field_text(shown: Field, is_changed: bool, *, cut: bool) -> str:  # noqa: F
 
 
 def _document(seen: BusEvent, at_s: float, changed: frozenset[str]) -> SeenLine:
-    return {
-        "event": "Seen",
-        "at_s": round(at_s, 6),
-        "kind": seen.kind.name.lower(),
-        "can_id": seen.can_id,
-        "command": seen.command,
-        "from": seen.sender,
-        "to": seen.receiver,
-        "message": seen.title,
-        "trouble": seen.is_trouble,
-        "fields": {shown.name: shown.value for shown in seen.fields},
-        "changed": sorted(changed),
-        "in_dialect": seen.in_dialect,
-    }
+    return SeenLine(
+        at_s=round(at_s, 6),
+        kind=seen.kind,
+        can_id=seen.can_id,
+        command=seen.command,
+        from_=seen.sender,
+        to=seen.receiver,
+        message=seen.title,
+        trouble=seen.is_trouble,
+        fields={shown.name: shown.value for shown in seen.fields},
+        changed=sorted(changed),
+        in_dialect=seen.in_dialect,
+    )
 
 
 def _frame_text(frame: Frame) -> str:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import sys
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, NotRequired, Self, TypedDict
+from typing import Any, Final, Literal, Self
 
 import click
 
@@ -44,7 +45,8 @@ else raw binary) or --format. FILE is written whole or not at all.
 """
 
 
-class ItemDocument(TypedDict):
+@dataclass(frozen=True)
+class ItemDocument:
     """An item that was read."""
 
     target: str
@@ -52,18 +54,20 @@ class ItemDocument(TypedDict):
     fields: dict[str, FieldValue]
 
 
-class MemoryDocument(TypedDict):
+@dataclass(frozen=True)
+class MemoryDocument:
     """Memory that was read, `end` exclusive: `data` in hexadecimal, or the file it is in."""
 
     target: str
     start: int
     end: int
-    data: NotRequired[str]
-    file: NotRequired[str]
-    format: NotRequired[Literal["hex", "bin"]]
+    data: str | None = None
+    file: str | None = None
+    format: Literal["hex", "bin"] | None = None
 
 
-class ReadableDocument(TypedDict):
+@dataclass(frozen=True)
+class ReadableDocument:
     """The items that can be read, with the names of their fields."""
 
     items: dict[str, list[str]]
@@ -127,17 +131,16 @@ def read(
     if file is not None:
         check_writable(file, _OUTPUT)
     data = _read_memory(start, end, bus, recorded, output)
-    document: MemoryDocument = {"target": target.name, "start": start, "end": end}
     if file is not None:
         is_hex = format == "hex" or (format is None and file.suffix.lower() in _HEX_SUFFIXES)
         write_whole(file, _intel_hex(start, data) if is_hex else data, _OUTPUT)
         output.result(f"{byte_count(len(data))} from 0x{start:08X} in {printable(str(file))}")
-        document["file"] = str(file)
-        document["format"] = "hex" if is_hex else "bin"
+        name: Literal["hex", "bin"] = "hex" if is_hex else "bin"
+        document = MemoryDocument(target.name, start, end, file=str(file), format=name)
     else:
         for at in range(0, len(data), _DUMP_WIDTH):
             output.result(_dump_line(start + at, data[at : at + _DUMP_WIDTH]))
-        document["data"] = data.hex()
+        document = MemoryDocument(target.name, start, end, data=data.hex())
     output.document(document)
     return ExitCode.OK
 

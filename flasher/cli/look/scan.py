@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Final, Literal, TypedDict
+from dataclasses import dataclass
+from typing import Final, Literal
 
 from flasher.bus.bit_rate import BitRate
 from flasher.cli.documents import HeardDocument
@@ -28,7 +29,8 @@ listed may still be there: most devices speak only now and then.
 """
 
 
-class ScanDocument(TypedDict):
+@dataclass(frozen=True)
+class ScanDocument:
     """Who is on the bus."""
 
     bitrate_bps: int
@@ -68,7 +70,7 @@ def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOpt
     document = _bus_document(survey, rate, guessed, why)
     if not survey.heard:
         error = _silent(survey, bitrate_bps)
-        output.failure(error, **document)
+        output.failure(error, document)
         return error.exit_code
     for line in _lines(survey, rate, dialect, guessed, why):
         output.result(line)
@@ -118,12 +120,12 @@ def _lines(
 
 
 def _bus_document(survey: Survey, rate: BitRate, guessed: Dialect | None, why: str) -> ScanDocument:
-    return {
-        "bitrate_bps": rate.bps,
-        "bitrate_source": rate.source,
-        "bitrate_is_assumed": True,
-        "dialect": guessed.name if guessed else None,
-        "dialect_because": why,
-        "nodes": {node.name.lower(): heard_document(h) for node, h in survey.heard.items()},
-        "foreign_frames": survey.foreign_frames,
-    }
+    return ScanDocument(
+        bitrate_bps=rate.bps,
+        bitrate_source=rate.source,
+        bitrate_is_assumed=True,
+        dialect=guessed.name if guessed else None,
+        dialect_because=why,
+        nodes={node.name.lower(): heard_document(h) for node, h in survey.heard.items()},
+        foreign_frames=survey.foreign_frames,
+    )

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from typing import Final, Literal, TypedDict
+from dataclasses import dataclass
+from typing import Final, Literal
 
 import click
 
@@ -16,7 +17,7 @@ from flasher.cli.recording import RecordingOptions, recorded_connection, recordi
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode, InterruptedByUserError, UsageError
 from flasher.host.items import writable
-from flasher.host.write import FieldChange, WritePlan, Written, field_changes, plan_write
+from flasher.host.write import WritePlan, Written, field_changes, plan_write
 from flasher.protocol.fields import Content, label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target
 
@@ -33,7 +34,8 @@ code 10 when the write is not confirmed or reads back differently, 5 when the de
 """
 
 
-class ChangeDocument(TypedDict):
+@dataclass(frozen=True)
+class ChangeDocument:
     """A field of a write; null where a value is not known."""
 
     old: str | None
@@ -41,7 +43,8 @@ class ChangeDocument(TypedDict):
     read_back: str | None
 
 
-class WrittenDocument(TypedDict):
+@dataclass(frozen=True)
+class WrittenDocument:
     """How a write ended."""
 
     target: str
@@ -51,20 +54,23 @@ class WrittenDocument(TypedDict):
     fields: dict[str, ChangeDocument]
 
 
-class NotWrittenDocument(TypedDict):
+@dataclass(frozen=True)
+class NotWrittenDocument:
     """The write was not agreed to."""
 
     written: Literal[False]
 
 
-class WritableItem(TypedDict):
+@dataclass(frozen=True)
+class WritableItem:
     """What an item is made of."""
 
     fields: list[str]
     manufacturer_only: bool
 
 
-class WritableDocument(TypedDict):
+@dataclass(frozen=True)
+class WritableDocument:
     """The items that can be written."""
 
     items: dict[str, WritableItem]
@@ -134,7 +140,7 @@ def write(
         _show(plan, old, output)
         if not yes and not _agrees(plan):
             output.progress("nothing was written")
-            output.document({"written": False}, exit_code=ExitCode.INTERRUPTED)
+            output.document(NotWrittenDocument(written=False), exit_code=ExitCode.INTERRUPTED)
             return ExitCode.INTERRUPTED
         with stop_on_signal(lambda: output.error_line("the write ends first ...")):
             written = device.carry_out(plan, old)
@@ -153,7 +159,7 @@ def _show(plan: WritePlan, old: Content | None, output: Output) -> None:
 def _conclude(written: Written, output: Output) -> int:
     error = written.error()
     if error is not None:
-        output.failure(error, **_document(written))
+        output.failure(error, _document(written))
         return error.exit_code
     read_back = "read back right" if written.read_back else "there is no query to read it back"
     output.result(f"written: confirmed by the device, {read_back}")
@@ -162,16 +168,15 @@ def _conclude(written: Written, output: Output) -> int:
 
 
 def _document(written: Written) -> WrittenDocument:
-    return {
-        "target": written.plan.target.name,
-        "item": written.plan.writable.name,
-        "confirmed": written.is_confirmed,
-        "fields": {change.name.replace(" ", "_"): _change(change) for change in written.changes},
-    }
-
-
-def _change(change: FieldChange) -> ChangeDocument:
-    return {"old": change.old, "new": change.new, "read_back": change.read_back}
+    return WrittenDocument(
+        target=written.plan.target.name,
+        item=written.plan.writable.name,
+        confirmed=written.is_confirmed,
+        fields={
+            each.name.replace(" ", "_"): ChangeDocument(each.old, each.new, each.read_back)
+            for each in written.changes
+        },
+    )
 
 
 def _is_terminal() -> bool:

@@ -217,8 +217,8 @@ def roles(output: Output, records: RecordsOptions, station_role: str, reader_rol
         RoleDocument(name=reader_role, may="read", is_new=reader_role in made),
     ]
     for role in documents:
-        new = ", new" if role["is_new"] else ""
-        output.result(f"{printable(role['name'])}: may {role['may']} records{new}")
+        new = ", new" if role.is_new else ""
+        output.result(f"{printable(role.name)}: may {role.may} records{new}")
     for name in made:
         output.progress(f"Give {printable(name)} a password: in psql, \\password {printable(name)}")
     output.document(StationRolesDocument(records=location.shown, roles=documents))

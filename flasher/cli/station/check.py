@@ -9,6 +9,7 @@ from pathlib import Path
 from flasher.cli.output import Output, byte_count
 from flasher.cli.station.documents import (
     CheckedTargetDocument,
+    FindingsDocument,
     RecipeFindingDocument,
     StationCheckDocument,
 )
@@ -35,7 +36,7 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
             )
             for each in error.faults
         ]
-        output.failure(error, findings=findings)
+        output.failure(error, FindingsDocument(findings=findings))
         return error.exit_code
     for line in _lines(recipe, day):
         output.result(line)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Final, TypedDict, get_args
+from dataclasses import dataclass
+from typing import Any, Final, get_args
 
-from flasher.cli.documents import plain_value
 from flasher.station.events import StationEvent
 from flasher.station.records.model import Figures, RunKind, RunState, UnitLife
 from flasher.trace.story import Cause, Story
 
 
-class RecipeFindingDocument(TypedDict):
+@dataclass(frozen=True)
+class RecipeFindingDocument:
     """Something that speaks against a recipe."""
 
     where: str
@@ -19,7 +20,8 @@ class RecipeFindingDocument(TypedDict):
     remedy: str
 
 
-class CheckedTargetDocument(TypedDict):
+@dataclass(frozen=True)
+class CheckedTargetDocument:
     """A target of a recipe."""
 
     target: str
@@ -32,7 +34,8 @@ class CheckedTargetDocument(TypedDict):
     """How far it is verified, in words."""
 
 
-class StationCheckDocument(TypedDict):
+@dataclass(frozen=True)
+class StationCheckDocument:
     """A recipe that can be used."""
 
     recipe: str
@@ -44,13 +47,15 @@ class StationCheckDocument(TypedDict):
     """With --sockets: the adapter of each socket."""
 
 
-class FindingsDocument(TypedDict):
+@dataclass(frozen=True)
+class FindingsDocument:
     """Why a recipe cannot be used; beside the error."""
 
     findings: list[RecipeFindingDocument]
 
 
-class FiguresDocument(TypedDict):
+@dataclass(frozen=True)
+class FiguresDocument:
     """The figures of runs. Golden units count in none of them."""
 
     runs: int
@@ -72,13 +77,14 @@ class FiguresDocument(TypedDict):
     """Runs of virtual units among all of these: no products."""
 
 
-class EndedUnitDocument(TypedDict):
+@dataclass(frozen=True)
+class EndedUnitDocument:
     """How the last run of a unit ended, since the station began."""
 
     serial: str
     socket: str
     run_id: int
-    outcome: Annotated[str, RunState]
+    outcome: RunState
     code: str
     text: str
     action: str
@@ -88,7 +94,8 @@ class EndedUnitDocument(TypedDict):
     """It was a virtual unit: no product."""
 
 
-class RefusedScanDocument(TypedDict):
+@dataclass(frozen=True)
+class RefusedScanDocument:
     """A scan that changed nothing."""
 
     text: str
@@ -97,7 +104,8 @@ class RefusedScanDocument(TypedDict):
     remedy: str
 
 
-class StationRunDocument(TypedDict):
+@dataclass(frozen=True)
+class StationRunDocument:
     """What came of a station's work."""
 
     station: str
@@ -113,17 +121,18 @@ class StationRunDocument(TypedDict):
     refused: list[RefusedScanDocument]
 
 
-class ReportedRunDocument(TypedDict):
+@dataclass(frozen=True)
+class ReportedRunDocument:
     """A run. Times are in UTC."""
 
     run_id: int
     serial: str
     part: str
     lot: str | None
-    kind: Annotated[str, RunKind]
+    kind: RunKind
     is_virtual: bool
     """The unit was a virtual one: no product."""
-    state: Annotated[str, RunState]
+    state: RunState
     code: str
     text: str
     begun_at: str
@@ -141,33 +150,37 @@ class ReportedRunDocument(TypedDict):
     reason: str
 
 
-class StationReportDocument(TypedDict):
+@dataclass(frozen=True)
+class StationReportDocument:
     """Runs with their figures."""
 
     figures: FiguresDocument
     runs: list[ReportedRunDocument]
 
 
-class UnitTraceDocument(TypedDict):
+@dataclass(frozen=True)
+class UnitTraceDocument:
     """A trace of a run, explained."""
 
     run_id: int
     sha256: str
-    cause: Annotated[str, Cause] | None
+    cause: Cause | None
     """null when it cannot be read."""
     text: str
-    story: Annotated[dict[str, Any], Story] | None
+    story: Story | None
     """With --story."""
 
 
-class UnitDocument(TypedDict):
+@dataclass(frozen=True)
+class UnitDocument:
     """The whole life of a unit."""
 
-    unit: Annotated[dict[str, Any], UnitLife]
+    unit: UnitLife
     traces: list[UnitTraceDocument]
 
 
-class BackupDocument(TypedDict):
+@dataclass(frozen=True)
+class BackupDocument:
     """A copy of the records."""
 
     path: str
@@ -175,14 +188,16 @@ class BackupDocument(TypedDict):
     size_bytes: int
 
 
-class ProblemDocument(TypedDict):
+@dataclass(frozen=True)
+class ProblemDocument:
     """Something in the records that is not as it has to be."""
 
     where: str
     what: str
 
 
-class RoleDocument(TypedDict):
+@dataclass(frozen=True)
+class RoleDocument:
     """A user of the database server."""
 
     name: str
@@ -192,14 +207,16 @@ class RoleDocument(TypedDict):
     """It was made now, and has no password yet."""
 
 
-class StationRolesDocument(TypedDict):
+@dataclass(frozen=True)
+class StationRolesDocument:
     """Users that were given their rights."""
 
     records: str
     roles: list[RoleDocument]
 
 
-class KeptHeadsDocument(TypedDict):
+@dataclass(frozen=True)
+class KeptHeadsDocument:
     """What the audit trail of a station was held against."""
 
     station: str
@@ -209,7 +226,8 @@ class KeptHeadsDocument(TypedDict):
     last: int
 
 
-class VerifiedRecordsDocument(TypedDict):
+@dataclass(frozen=True)
+class VerifiedRecordsDocument:
     """What was found in the records, and what they could be held against."""
 
     problems: list[ProblemDocument]
@@ -223,7 +241,8 @@ class VerifiedRecordsDocument(TypedDict):
     """Every audit trail was held, from its first row, against heads that are kept elsewhere."""
 
 
-class SigningKeyDocument(TypedDict):
+@dataclass(frozen=True)
+class SigningKeyDocument:
     """The key that signs a station's audit trail."""
 
     station: str
@@ -237,14 +256,16 @@ class SigningKeyDocument(TypedDict):
     """Where the signed heads of the audit trail are kept."""
 
 
-class AcceptedDocument(TypedDict):
+@dataclass(frozen=True)
+class AcceptedDocument:
     """What a person let the station go on with."""
 
     station: str
     what: str
 
 
-class MigratedDocument(TypedDict):
+@dataclass(frozen=True)
+class MigratedDocument:
     """Records that were brought up to date."""
 
     station: str
@@ -289,8 +310,6 @@ def figures_document(figures: Figures) -> FiguresDocument:
 
 
 def run_document(row: Mapping[str, Any]) -> ReportedRunDocument:
-    """A row of `Records.table` as JSON: choices by name in lower case, as everywhere."""
+    """A row of `Records.table` as JSON."""
     choices = {"kind": RunKind(row["kind"]), "state": RunState(row["state"])}
-    document: Any = {**row, **{key: plain_value(value) for key, value in choices.items()}}
-    checked: ReportedRunDocument = document
-    return checked
+    return ReportedRunDocument(**{**row, **choices})

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
-from flasher.cli.documents import plain_value
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.look.explain_text import story_lines
 from flasher.cli.output import Output, counted, duration
@@ -194,7 +193,7 @@ def unit(
         if page is not None:
             write_whole(page, certificate(store, life), "--certificate")
             output.progress(f"page: {printable(str(page))}")
-        output.document(UnitDocument(unit=plain_value(life), traces=traces))
+        output.document(UnitDocument(unit=life, traces=traces))
         return ExitCode.OK
 
 
@@ -221,9 +220,9 @@ def _trace_document(
     return UnitTraceDocument(
         run_id=run_id,
         sha256=file.sha256,
-        cause=plain_value(found.verdict.cause),
+        cause=found.verdict.cause,
         text=found.verdict.text,
-        story=plain_value(found) if full else None,
+        story=found if full else None,
     )
 
 

@@ -282,7 +282,7 @@ class _Session:
             self._output.result(line)
         error = self._failure or self._line_error() or self._incomplete()
         if error is not None:
-            self._output.failure(error, **self._document())
+            self._output.failure(error, self._document())
             return error.exit_code
         self._output.document(self._document(), exit_code=code)
         return code
@@ -350,7 +350,7 @@ class _Session:
                     serial=each.serial,
                     socket=each.socket,
                     run_id=each.run_id,
-                    outcome=each.outcome.name.lower(),
+                    outcome=each.outcome,
                     code=each.code,
                     text=each.text,
                     action=each.action,

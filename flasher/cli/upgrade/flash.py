@@ -30,7 +30,6 @@ from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.text import (
     DryRunDocument,
     UpgradeDocument,
-    check_documents,
     check_line,
     dry_run_document,
     failed,
@@ -357,8 +356,8 @@ class _Upgrade:
                 raise
             link, error = record.link_report(), result.error()
             document = upgrade_document(plan, chosen, result, checks, link)
-            record.facts["outcome"] = document["outcome"]
-            record.facts["verification"] = document["verification"]
+            record.facts["outcome"] = document.outcome
+            record.facts["verification"] = document.verification
             if error is not None:
                 self._add_repair(error)
                 record.failed(error)
@@ -377,7 +376,7 @@ class _Upgrade:
             output.document(document, exit_code=result.exit_code)
         else:
             output.ending = lambda _error: verdict
-            output.failure(error, **document)
+            output.failure(error, document)
         return result.exit_code
 
     def _upgrade(
@@ -409,7 +408,7 @@ class _Upgrade:
             def on_event(event: object) -> None:
                 if isinstance(event, CheckMade):
                     checks.append(event)
-                    record.facts["checks"] = check_documents(checks)
+                    record.facts["checks"] = checks
                 output.event(event)
                 progress(event)
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import contextlib
-from typing import Final, TypedDict
+from dataclasses import dataclass
+from typing import Final
 
 from flasher import api
 from flasher.cli.documents import ImageDocument, PlanDocument
@@ -41,7 +42,8 @@ examples:
 """
 
 
-class ImageInfoDocument(TypedDict):
+@dataclass(frozen=True)
+class ImageInfoDocument:
     """What is in a file, what lies beside it, and what an upgrade would send."""
 
     image: ImageDocument
@@ -97,7 +99,7 @@ def image_info(
     for found in judge_bytes(loaded, identity):
         error = api.refusal(plan, found)
         if error is not None:
-            output.failure(error, **document)
+            output.failure(error, document)
             return error.exit_code
         output.result(check_line(found.event))
     output.document(document)

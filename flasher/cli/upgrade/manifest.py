@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, TypedDict
+from typing import Any, Final, Literal
 
 import click
 
 from flasher.cli import values
-from flasher.cli.documents import ErrorDocument
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import Decorator, group, option
 from flasher.cli.options import (
@@ -23,7 +23,7 @@ from flasher.errors import ExitCode, FlasherError, ImageError, UsageError
 from flasher.image.image import Image
 from flasher.image.plausible import check_plausible
 from flasher.image.release import Comparison, Release, check_target, names_of
-from flasher.protocol.spec import TARGETS, Target
+from flasher.protocol.spec import Target
 from flasher.protocol.text import BOOT_VERSION_FORM, FIRMWARE_VERSION_FORM, printable
 from flasher.settings.manifest import (
     STATEMENTS,
@@ -35,21 +35,8 @@ from flasher.settings.manifest import (
 )
 
 
-class ReleaseDocument(TypedDict):
-    """What a manifest states; null and empty where it states nothing."""
-
-    target: str
-    firmware_version: str | None
-    size_bytes: int
-    sha256: str
-    hardware_versions: list[str]
-    minimum_boot_version: str | None
-    previous_from: str | None
-    previous_except: list[str]
-    notes: str
-
-
-class StatementDocument(TypedDict):
+@dataclass(frozen=True)
+class StatementDocument:
     """One statement of a manifest, held against the image."""
 
     check: str
@@ -59,35 +46,27 @@ class StatementDocument(TypedDict):
     detail: str
 
 
-class ManifestCreateDocument(TypedDict):
+@dataclass(frozen=True)
+class ManifestCreateDocument:
     """Of `manifest create`."""
 
     image: str
     manifest: str
-    release: ReleaseDocument
+    release: Release
     warnings: list[str]
 
 
-class ManifestCheckDocument(TypedDict):
+@dataclass(frozen=True)
+class ManifestCheckDocument:
     """Of `manifest check`."""
 
     image: str
     manifest: str
-    release: ReleaseDocument
+    release: Release
     checks: list[StatementDocument]
 
 
-class ManifestRefusedDocument(TypedDict):
-    """Of `manifest check` when an image does not fit its manifest."""
-
-    error: ErrorDocument
-    image: str
-    manifest: str
-    release: ReleaseDocument
-    checks: list[StatementDocument]
-
-
-DOCUMENTS: Final = (ManifestCreateDocument, ManifestCheckDocument, ManifestRefusedDocument)
+DOCUMENTS: Final = (ManifestCreateDocument, ManifestCheckDocument)
 
 _EXAMPLES: Final = """\
 examples:
@@ -208,13 +187,7 @@ def create(
     write_whole(path, to_toml(release).encode("utf-8"), "-o")
     output.result(f"written: {printable(str(path))}")
     output.table(((f"{key}:", value) for key, value in stated_rows(release).items()), indent=2)
-    document: ManifestCreateDocument = {
-        "image": image.image,
-        "manifest": str(path),
-        "release": release_document(release),
-        "warnings": warnings,
-    }
-    output.document(document)
+    output.document(ManifestCreateDocument(image.image, str(path), release, warnings))
     return ExitCode.OK
 
 
@@ -267,20 +240,15 @@ def check(output: Output, image: ImageOptions, target: Target | None, *, file: s
         )
     checks = checks_of(release, loaded, target)
     output.result(f"{printable(release.source)}, held against {printable(image.image)}")
-    output.table(((f"{each['check']}:", each["detail"]) for each in checks), indent=2)
-    more: dict[str, Any] = {
-        "image": image.image,
-        "manifest": release.source,
-        "release": release_document(release),
-        "checks": checks,
-    }
+    output.table(((f"{each.check}:", each.detail) for each in checks), indent=2)
+    document = ManifestCheckDocument(image.image, release.source, release, checks)
     try:
         release.check_bytes(loaded)
         check_target(loaded, release, target or release.target)
     except FlasherError as error:
-        output.failure(error, **more)
+        output.failure(error, document)
         return error.exit_code
-    output.document(more)
+    output.document(document)
     return ExitCode.OK
 
 
@@ -299,21 +267,6 @@ def stated_rows(release: Release) -> dict[str, str]:
         elif value not in (None, ""):
             rows[key] = printable(str(value))
     return {key: value for key, value in rows.items() if value}
-
-
-def release_document(release: Release) -> ReleaseDocument:
-    """A release as JSON."""
-    return {
-        "target": release.target.name,
-        "firmware_version": release.firmware_version,
-        "size_bytes": release.size_bytes,
-        "sha256": release.sha256,
-        "hardware_versions": list(release.hardware_versions),
-        "minimum_boot_version": release.minimum_boot_version,
-        "previous_from": release.previous_from,
-        "previous_except": list(release.previous_except),
-        "notes": release.notes,
-    }
 
 
 def checks_of(release: Release, image: Image, target: Target | None) -> list[StatementDocument]:
@@ -343,34 +296,33 @@ def _held(finding: Comparison, other: str) -> StatementDocument:
             else f"{stated}: nothing to check against, {other} does not say it"
         )
         return _unchecked(finding.key, stated, detail, found)
-    return {
-        "check": finding.key,
-        "result": "agrees" if finding.agrees else "differs",
-        "stated": stated,
-        "found": found,
-        "detail": f"{stated}: agrees"
-        if finding.agrees
-        else f"{stated}: differs, {other} has {found}",
-    }
+    return StatementDocument(
+        check=finding.key,
+        result="agrees" if finding.agrees else "differs",
+        stated=stated,
+        found=found,
+        detail=f"{stated}: agrees" if finding.agrees else f"{stated}: differs, {other} has {found}",
+    )
 
 
 def _unchecked(
     key: str, stated: str | None, detail: str, found: str | None = None
 ) -> StatementDocument:
-    return {"check": key, "result": "unchecked", "stated": stated, "found": found, "detail": detail}
+    return StatementDocument(key, "unchecked", stated, found, detail)
 
 
 # -- image-info -----------------------------------------------------------------------------------
 
 
-class ManifestBesideDocument(TypedDict):
+@dataclass(frozen=True)
+class ManifestBesideDocument:
     """The manifest that lies beside an image; `problem` says why it does not hold."""
 
     file: str
     found: bool
     agrees: bool | None
     problem: str | None
-    release: ReleaseDocument | None
+    release: Release | None
 
 
 def manifest_beside(
@@ -391,22 +343,21 @@ def manifest_beside(
     else:
         problem = None
     found = release is not None or problem is not None
-    return {
-        "file": beside,
-        "found": found,
-        "agrees": problem is None if found else None,
-        "problem": problem,
-        "release": None if release is None else release_document(release),
-    }
+    return ManifestBesideDocument(
+        file=beside,
+        found=found,
+        agrees=problem is None if found else None,
+        problem=problem,
+        release=release,
+    )
 
 
 def beside_line(beside: ManifestBesideDocument) -> str:
     """The line of `image-info` for it."""
-    file = printable(beside["file"])
-    release = beside["release"]
-    if not beside["found"]:
+    file, release = printable(beside.file), beside.release
+    if not beside.found:
         return f"  release: no manifest beside it ({file})"
-    if release is None or not beside["agrees"]:
-        return f"  release: {file}: {beside['problem']}"
-    version = release["firmware_version"] or "without a version"
-    return f"  release: {file}: agrees, {TARGETS[release['target']].node.name} {version}"
+    if release is None or not beside.agrees:
+        return f"  release: {file}: {beside.problem}"
+    version = release.firmware_version or "without a version"
+    return f"  release: {file}: agrees, {release.target.node.name} {version}"

@@ -4,7 +4,8 @@ right.
 
 from __future__ import annotations
 
-from typing import Final, TypedDict
+from dataclasses import dataclass
+from typing import Final
 
 from flasher.api import as_dialect
 from flasher.cli.framework import argument, group
@@ -46,7 +47,8 @@ ProfileValue = str | bool | int | float | list[int] | None
 """Bytes are a list of their values, as in the file."""
 
 
-class SourcedValue(TypedDict):
+@dataclass(frozen=True)
+class SourcedValue:
     """A value of a profile and where it comes from."""
 
     value: ProfileValue
@@ -54,7 +56,8 @@ class SourcedValue(TypedDict):
     """"default", "document", or the path of a file."""
 
 
-class ProfileDocument(TypedDict):
+@dataclass(frozen=True)
+class ProfileDocument:
     """Every value that holds for a target; those of a table have its name before a point."""
 
     target: str
@@ -62,7 +65,8 @@ class ProfileDocument(TypedDict):
     values: dict[str, SourcedValue]
 
 
-class CheckedProfileDocument(TypedDict):
+@dataclass(frozen=True)
+class CheckedProfileDocument:
     """A profile that is right."""
 
     file: str
@@ -102,15 +106,10 @@ def show(output: Output, target: Target, *, dialect_name: str, profile: str | No
         (name, _shown(name, value), printable(holds.sources[name]))
         for name, value in holds.values()
     )
-    document: ProfileDocument = {
-        "target": holds.target.name,
-        "dialect": holds.dialect.name,
-        "values": {
-            name: {"value": _plain(value), "source": holds.sources[name]}
-            for name, value in holds.values()
-        },
+    shown = {
+        name: SourcedValue(_plain(value), holds.sources[name]) for name, value in holds.values()
     }
-    output.document(document)
+    output.document(ProfileDocument(holds.target.name, holds.dialect.name, shown))
     return ExitCode.OK
 
 

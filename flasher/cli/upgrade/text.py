@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterable
-from typing import Annotated, Final, NotRequired, TypedDict
+from dataclasses import dataclass, replace
+from typing import Final
 
 from flasher.cli.documents import (
     ImageDocument,
     OutcomeDocument,
     PlanDocument,
-    VerificationDocument,
+    SegmentDocument,
 )
 from flasher.cli.output import Verdict, byte_count, counted, duration
 from flasher.errors import FlasherError, InterruptedByUserError
 from flasher.events import CheckMade
-from flasher.host.identity import CheckVerdict
 from flasher.host.options import UpgradeOptions, gaps_s
 from flasher.host.outcome import DeviceLeft, Outcome
 from flasher.host.session import Result
@@ -26,6 +25,7 @@ from flasher.image.cortexm import VectorTable, vector_table
 from flasher.image.image import Image
 from flasher.image.plan import Plan
 from flasher.image.release import names_of
+from flasher.prose import prose
 from flasher.protocol.spec import DIALECTS
 from flasher.protocol.text import printable
 from flasher.trace.figures import Distribution, LinkReport
@@ -33,39 +33,33 @@ from flasher.trace.figures import Distribution, LinkReport
 _NO_QUERY = ": the document gives this target no query for it"
 
 
-class CheckDocument(TypedDict):
-    """Something that was checked before the first write."""
-
-    check: str
-    verdict: Annotated[str, CheckVerdict]
-    text: str
-
-
-class UpgradeDocument(TypedDict):
+@dataclass(frozen=True)
+class UpgradeDocument:
     """An upgrade. Transferred, completed and running are three claims: see `outcome` for the first
     two, `verification` for the third.
     """
 
     image: ImageDocument
     plan: PlanDocument
-    checks: list[CheckDocument]
+    checks: list[CheckMade]
     outcome: OutcomeDocument
-    verification: VerificationDocument
+    verification: Verification
     previous_version: str | None
     """What ran before; null where it could not be asked."""
     shutdown_heard: bool
     """The battery sent SHUTDOWN meanwhile."""
-    link: NotRequired[Annotated[dict[str, object], LinkReport]]
-    """Times on the line; missing when no packet was answered."""
+    link: LinkReport | None
+    """Times on the line; null when no packet was answered."""
 
 
-class DryRunDocument(TypedDict):
+@dataclass(frozen=True)
+class DryRunDocument:
     """The plan of an upgrade that was not carried out."""
 
     dry_run: bool
     image: ImageDocument
     plan: PlanDocument
-    checks: list[CheckDocument]
+    checks: list[CheckMade]
 
 
 # -- images and plans in words ---------------------------------------------------------------------
@@ -192,7 +186,7 @@ def summary_lines(result: Result, plan: Plan) -> list[str]:
         f"transferred:  {sent}, {duration(transfer_s)}{_rate(plan, transfer_s)}",
         f"              {faults}, {whole}",
         f"boot version: {outcome.boot_version}",
-        f"completed:    {outcome.ending.value}",
+        f"completed:    {prose(outcome.ending)}",
         f"running:      {_running(result)}",
     ]
 
@@ -220,7 +214,7 @@ def _running(result: Result) -> str:
     if verification.verdict is Verified.NOT_ASKED:
         no_query = "" if _has_query(result) else _NO_QUERY
         return result.running_version or f"not asked{no_query}"
-    return f"{result.running_version or 'unknown'} ({verification.verdict.value})"
+    return f"{result.running_version or 'unknown'} ({prose(verification.verdict)})"
 
 
 def _has_query(result: Result) -> bool:
@@ -243,41 +237,33 @@ def _rate(plan: Plan, transfer_s: float) -> str:
 
 def image_document(image: Image, table: VectorTable | None) -> ImageDocument:
     """The image as JSON."""
-    return {
-        "source": image.source,
-        "format": image.format,
-        "size_bytes": image.size_bytes,
-        "base": image.base,
-        "segments": [{"start": s.start, "size_bytes": s.size_bytes} for s in image.segments],
-        "filled_bytes": image.filled_bytes,
-        "version": image.version,
-        "named_targets": sorted(target.name for target in image.named_targets),
-        "sha256": image.sha256,
-        "vector_table": None
-        if table is None
-        else {
-            "stack_pointer": table.stack_pointer,
-            "reset_vector": table.reset_vector,
-            "plausible": table.plausible,
-            "problems": list(table.problems),
-            "notes": list(table.notes),
-        },
-    }
+    return ImageDocument(
+        source=image.source,
+        format=image.format,
+        size_bytes=image.size_bytes,
+        base=image.base,
+        segments=[SegmentDocument(s.start, s.size_bytes) for s in image.segments],
+        filled_bytes=image.filled_bytes,
+        version=image.version,
+        named_targets=sorted(target.name for target in image.named_targets),
+        sha256=image.sha256,
+        vector_table=table,
+    )
 
 
 def plan_document(plan: Plan, options: UpgradeOptions) -> PlanDocument:
     """The plan as JSON."""
-    return {
-        "target": plan.target.name,
-        "request_id": plan.target.request_id,
-        "answer_id": plan.target.answer_id,
-        "bitrate_bps": plan.bitrate_bps,
-        "packets": plan.total_packets,
-        "frames": plan.frames,
-        "bytes_on_wire": plan.bytes_on_wire,
-        "wire_s": round(plan.wire_s, 6),
-        "gaps_s": round(gaps_s(plan, options), 6),
-    }
+    return PlanDocument(
+        target=plan.target.name,
+        request_id=plan.target.request_id,
+        answer_id=plan.target.answer_id,
+        bitrate_bps=plan.bitrate_bps,
+        packets=plan.total_packets,
+        frames=plan.frames,
+        bytes_on_wire=plan.bytes_on_wire,
+        wire_s=round(plan.wire_s, 6),
+        gaps_s=round(gaps_s(plan, options), 6),
+    )
 
 
 def upgrade_document(
@@ -288,18 +274,16 @@ def upgrade_document(
     link: LinkReport | None,
 ) -> UpgradeDocument:
     """The document of an upgrade, good or bad."""
-    document = UpgradeDocument(
+    return UpgradeDocument(
         image=image_document(plan.image, vector_table(plan.image)),
         plan=plan_document(plan, options),
-        checks=check_documents(checks),
+        checks=list(checks),
         outcome=_outcome_document(result.outcome),
-        verification=_verification_document(result.verification, result.running_version),
+        verification=replace(result.verification, running_version=result.running_version),
         previous_version=result.previous_version,
         shutdown_heard=result.shutdown_heard,
+        link=link,
     )
-    if link is not None:
-        document["link"] = dataclasses.asdict(link)
-    return document
 
 
 def dry_run_document(
@@ -310,32 +294,18 @@ def dry_run_document(
         dry_run=True,
         image=image_document(plan.image, vector_table(plan.image)),
         plan=plan_document(plan, options),
-        checks=check_documents(checks),
+        checks=list(checks),
     )
-
-
-def check_documents(checks: Iterable[CheckMade]) -> list[CheckDocument]:
-    """The checks that were made, in order."""
-    return [CheckDocument(check=c.check, verdict=c.verdict, text=c.text) for c in checks]
 
 
 def _outcome_document(outcome: Outcome) -> OutcomeDocument:
     return OutcomeDocument(
-        ending=outcome.ending.name.lower(),
-        phase=outcome.phase.name.lower(),
+        ending=outcome.ending,
+        phase=outcome.phase,
         packet=outcome.packet,
-        device_left=outcome.device_left.name.lower(),
+        device_left=outcome.device_left,
         boot_version=outcome.boot_version,
         running_version=outcome.running_version,
         detail=outcome.detail,
-        statistics=dataclasses.asdict(outcome.statistics),
-    )
-
-
-def _verification_document(of: Verification, running: str | None) -> VerificationDocument:
-    return VerificationDocument(
-        level=of.level.value,
-        verdict=of.verdict.name.lower(),
-        running_version=running,
-        detail=of.detail,
+        statistics=outcome.statistics,
     )

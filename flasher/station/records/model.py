@@ -9,6 +9,8 @@ from enum import IntEnum, StrEnum
 from pathlib import Path
 from typing import Final, NewType, Protocol
 
+from flasher.form import LowerInJson
+
 RunId = NewType("RunId", int)
 WriteId = NewType("WriteId", int)
 
@@ -39,7 +41,7 @@ def utc_moment(text: str) -> datetime:
     return datetime.fromisoformat(text)
 
 
-class RunState(StrEnum):
+class RunState(LowerInJson, StrEnum):
     """Where a run is, or how it ended."""
 
     RUNNING = "RUNNING"
@@ -86,7 +88,7 @@ class AuditEvent(StrEnum):
     REFUSED_SCAN = "refused scan"
 
 
-class UnitState(StrEnum):
+class UnitState(LowerInJson, StrEnum):
     """What is known of a unit: derived from its last run."""
 
     NEW = "NEW"
@@ -135,7 +137,7 @@ class Verified(IntEnum):
         return ("completed, not read back", "version read back", "memory read back")[self]
 
 
-class StepState(StrEnum):
+class StepState(LowerInJson, StrEnum):
     """How one try of a step ended."""
 
     PASS = "PASS"  # noqa: S105
