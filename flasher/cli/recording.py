@@ -22,7 +22,6 @@ from typing import Any, Final
 from platformdirs import user_state_path
 
 from flasher.api import Connection
-from flasher.cli.documents import as_json
 from flasher.cli.files import check_not_read
 from flasher.cli.framework import command_line, option, option_set, typed_values
 from flasher.cli.options import Bus
@@ -189,9 +188,9 @@ def _leave_bundle(
     folder = bundle_folder(options.bundle_dir)
     link = record.link_report()
     facts = {
-        **{name: as_json(fact) for name, fact in record.facts.items()},
+        **record.facts,
         "error": error and _error(error),
-        "link": link and as_json(link),
+        "link": link,
     }
     is_own = options.bundle_dir is None and not os.environ.get(BUNDLE_FOLDER)
     try:

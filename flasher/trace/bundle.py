@@ -11,12 +11,14 @@ direction behind each frame.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import platform
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping
+from enum import Enum
 from importlib.metadata import PackageNotFoundError, version
 from itertools import count
 from pathlib import Path
@@ -53,7 +55,7 @@ def write_bundle(
     """Write a bundle into `folder`, which is made if it is not there; returns the bundle's path.
 
     It is named after `facts["target"]` and the time, and never overwrites anything. `facts` go into
-    report.json as they are; what JSON does not know becomes text. Raises OSError.
+    report.json: dataclasses with their fields, what JSON does not know as text. Raises OSError.
     """
     now = wall_clock()
     folder.mkdir(parents=True, exist_ok=True)
@@ -64,13 +66,20 @@ def write_bundle(
         with (part / TRANSCRIPT).open("w", encoding="utf-8") as file:
             file.writelines(f"{line}\n" for line in transcript(recorder))
         report = {**_circumstances(recorder, now), **facts}
-        text = json.dumps(report, indent=2, default=lambda value: printable(str(value)))
+        text = json.dumps(report, indent=2, default=_plain)
         (part / REPORT).write_text(f"{text}\n", encoding="utf-8")
         part.rename(path)
     except BaseException:
         shutil.rmtree(part, ignore_errors=True)
         raise
     return path
+
+
+def _plain(value: Any) -> Any:
+    """What JSON does not know. The validation library is not loaded where somebody waits."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return dataclasses.asdict(value)
+    return value.value if isinstance(value, Enum) else printable(str(value))
 
 
 def bundles(folder: Path) -> list[Path]:
