@@ -299,11 +299,17 @@ class Command(_OurCommand):
 class Group(_OurCommand, rich_click.RichGroup):  # type: ignore[misc]  # rich-click's own bases
     """A command that has actions (`flasher profile show`)."""
 
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """As they are declared: what is needed first comes first."""
+        return list(self.commands)
+
     def action(self, name: str, **more: Any) -> Callable[[Callable[..., int]], Command]:
         """Make an action of a function; its exit codes are the group's where none are given."""
 
         def make(function: Callable[..., int]) -> Command:
-            made = command(**({"exit_codes": self.exit_codes} | more))(function)
+            summary = (function.__doc__ or "").partition(".")[0]
+            more.setdefault("exit_codes", self.exit_codes)
+            made = command(short_help=" ".join(summary.split()), **more)(function)
             self.add_command(made, name)
             return made
 

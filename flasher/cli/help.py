@@ -89,7 +89,8 @@ class HelpedCommand(rich_click.RichCommand):
         """Examples; in the whole help exit codes, files and environment too."""
         sections = [(self.epilog or "").strip("\n")]
         if ctx.meta.get(BRIEF):
-            sections.append(f"every option: {ctx.command_path} --help")
+            examples = sections[0].partition("\n\n")[0]
+            sections = [examples, f"every option: {ctx.command_path} --help"]
         else:
             codes = sorted({*_ALWAYS, *self.exit_codes})
             # No blank inside, so that a meaning is not parted from its code.

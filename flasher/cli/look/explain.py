@@ -43,7 +43,7 @@ Exit code 0 whenever the trace can be read, whatever the verdict is.
 
 @command(epilog=_EXAMPLES, exit_codes=(ExitCode.INTERRUPTED,))
 @argument(
-    "trace", metavar="TRACE", required=False,
+    "trace", required=False,
     type=values.FilePath(*values.TRACE_SUFFIXES, gives=Path),
     help="a recorded trace (.asc .blf .log ...), or the folder of a bundle",
 )  # fmt: skip

@@ -54,7 +54,7 @@ LINES: Final = (SeenLine, FrameLine)
 
 @command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS,))
 @argument(
-    "trace", metavar="TRACE", required=False, type=values.FilePath(*values.TRACE_SUFFIXES),
+    "trace", required=False, type=values.FilePath(*values.TRACE_SUFFIXES),
     help="a recorded trace (.asc .blf .log ...), no bus",
 )  # fmt: skip
 @target_option(required=False)

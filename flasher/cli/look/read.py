@@ -84,10 +84,11 @@ def _items(ctx: click.Context) -> list[str]:
 
 @command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.INTERRUPTED))
 @argument(
-    "item", required=False, metavar="ITEM", shell_complete=values.offers(_items),
+    "item", required=False, shell_complete=values.offers(_items),
     help="what to read; see --list",
 )  # fmt: skip
-@argument("bounds", nargs=-1, metavar="[START END]", help="for memory: which")
+@argument("start", required=False, help="for memory: the first address")
+@argument("end", required=False, help="for memory: the address behind the last")
 @target_option(required=False)
 @option("--list", "is_list", is_flag=True, panel="read", brief=True, help="list the items and stop")
 @option(
@@ -104,7 +105,8 @@ def read(
     recorded: RecordingOptions,
     *,
     item: str | None,
-    bounds: tuple[str, ...],
+    start: str | None,
+    end: str | None,
     is_list: bool,
     file: Path | None,
     format: str | None,  # noqa: A002  the name of the option
@@ -118,29 +120,29 @@ def read(
     if item is None:
         raise UsageError("Nothing to read was named.", remedy="See flasher read --list.")
     if item.lower() != MEMORY:
-        if bounds or file or format:
+        if start or file or format:
             raise UsageError(
                 "START, END, --output and --format are for `flasher read memory` only."
             )
         return _read_item(item, target, bus, recorded, output)
-    start, end = _range(bounds)
+    first, behind = _range(start, end)
     if target is not BMS:
         raise UsageError(f"The documents give no way to read memory of the {target.node.name}.")
     if file is None and format:
         raise UsageError("--format needs --output FILE.")
     if file is not None:
         check_writable(file, _OUTPUT)
-    data = _read_memory(start, end, bus, recorded, output)
+    data = _read_memory(first, behind, bus, recorded, output)
     if file is not None:
         is_hex = format == "hex" or (format is None and file.suffix.lower() in _HEX_SUFFIXES)
-        write_whole(file, _intel_hex(start, data) if is_hex else data, _OUTPUT)
-        output.result(f"{byte_count(len(data))} from 0x{start:08X} in {printable(str(file))}")
+        write_whole(file, _intel_hex(first, data) if is_hex else data, _OUTPUT)
+        output.result(f"{byte_count(len(data))} from 0x{first:08X} in {printable(str(file))}")
         name: Literal["hex", "bin"] = "hex" if is_hex else "bin"
-        document = MemoryDocument(target.name, start, end, file=str(file), format=name)
+        document = MemoryDocument(target.name, first, behind, file=str(file), format=name)
     else:
         for at in range(0, len(data), _DUMP_WIDTH):
-            output.result(_dump_line(start + at, data[at : at + _DUMP_WIDTH]))
-        document = MemoryDocument(target.name, start, end, data=data.hex())
+            output.result(_dump_line(first + at, data[at : at + _DUMP_WIDTH]))
+        document = MemoryDocument(target.name, first, behind, data=data.hex())
     output.document(document)
     return ExitCode.OK
 
@@ -185,15 +187,15 @@ def _read_memory(
             raise
 
 
-def _range(bounds: tuple[str, ...]) -> tuple[int, int]:
-    if len(bounds) != 2:
+def _range(start: str | None, end: str | None) -> tuple[int, int]:
+    if start is None or end is None:
         raise UsageError("Reading memory takes START and END.", remedy="END is exclusive.")
     try:
-        start, end = (values.number(bound) for bound in bounds)
+        first, behind = values.number(start), values.number(end)
     except click.BadParameter as error:
         raise UsageError(f"{error.message}.") from error
-    check_range(start, end)
-    return start, end
+    check_range(first, behind)
+    return first, behind
 
 
 def _dump_line(address: int, data: bytes) -> str:

@@ -92,10 +92,10 @@ def _items(ctx: click.Context) -> list[str]:
     ),
 )  # fmt: skip
 @argument(
-    "item", required=False, metavar="ITEM", shell_complete=values.offers(_items),
+    "item", required=False, shell_complete=values.offers(_items),
     help="what to write; see --list",
 )  # fmt: skip
-@argument("new", nargs=-1, metavar="VALUE...", help="one for each of its fields")
+@argument("value", nargs=-1, help="one for each of its fields")
 @target_option(required=False)
 @option(
     "--list", "is_list", is_flag=True, panel="write", brief=True, help="list the items and stop"
@@ -114,7 +114,7 @@ def write(
     recorded: RecordingOptions,
     *,
     item: str | None,
-    new: tuple[str, ...],
+    value: tuple[str, ...],
     is_list: bool,
     yes: bool,
     manufacturer: bool,
@@ -127,7 +127,7 @@ def write(
         return _list(target, bus.dialect, output)
     if item is None:
         raise UsageError("Nothing to write was named.", remedy="See flasher write --list.")
-    plan = plan_write(item, list(new), target, dialect=bus.dialect, manufacturer=manufacturer)
+    plan = plan_write(item, list(value), target, dialect=bus.dialect, manufacturer=manufacturer)
     if not yes and not _is_terminal():
         raise UsageError(
             f"Writing {plan.writable.name} needs a confirmation, and there is no terminal to ask.",
