@@ -7,15 +7,17 @@ bus says enters as `Text`, which is never read as markup.
 from __future__ import annotations
 
 from textwrap import wrap
-from typing import Final
+from typing import Final, Self
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console, ConsoleDimensions, Group, RenderableType
+from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from flasher.cli.look.monitor_views import route
-from flasher.trace.decoder import NOT_IN_DIALECT, Field
+from flasher.cli.look.monitor_views import View, route
+from flasher.cli.output import Output, counted
+from flasher.trace.decoder import NOT_IN_DIALECT, BusEvent, Field
 from flasher.trace.watcher import Board, MessageHistory
 
 WIDE: Final = 116
@@ -25,6 +27,44 @@ _TROUBLE: Final = "red"
 _VALUE_MAX: Final = 160
 _FRAME_LINES: Final = 7
 """Lines around the rows: title, head, rule, two margins, what is left out, and the cursor."""
+
+
+class TableView(View):
+    """The board: refreshed in place, or printed once at the end."""
+
+    def __init__(self, output: Output, *, live: bool) -> None:
+        super().__init__(output)
+        self.is_live = live
+        self._console = Console(markup=False, highlight=False, emoji=False)
+        # No thread refreshes: the watcher's pulse does, between two frames. On a screen of its own
+        # lines are written over each other, without erasing them first: nothing flickers.
+        self._live = Live(console=self._console, screen=True, auto_refresh=False) if live else None
+        self._view = BoardView(self._console)
+        self._last_at = 0.0
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+        if kind is None:
+            self._console.print(self._view_now())
+
+    def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
+        self._last_at = seen.at
+
+    def refresh(self, now: float) -> None:
+        self._last_at = now
+        if self._live is not None:
+            self._live.update(self._view_now(), refresh=True)
+
+    def _view_now(self) -> RenderableType:
+        said = f"{self.since(self._last_at):.1f} s, {counted(self.messages, 'message')}"
+        title = f"{self.name}: {said}, {self.troubles:,} with trouble"
+        return self._view.draw(self.board, self._last_at, title)
 
 
 class BoardView:

@@ -1,19 +1,15 @@
-"""How `flasher monitor` shows what a watcher sees: line by line, as JSON lines, or as a table."""
+"""How `flasher monitor` shows what a watcher sees: line by line, or as JSON lines."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from types import TracebackType
-from typing import TYPE_CHECKING, Final, Literal, Self
+from typing import Final, Literal, Self
 
 from flasher.cli.documents import FieldValue
-from flasher.cli.output import Output, counted
+from flasher.cli.output import Output
 from flasher.protocol.frame import Frame
 from flasher.trace.decoder import BusEvent, Field, Kind
 from flasher.trace.watcher import Board, Pulse, RawFrame
-
-if TYPE_CHECKING:  # rich is loaded only where a table is shown
-    from rich.console import RenderableType
 
 _VALUE_WIDTH: Final = 64
 """Longer values are cut in lines, unless -v is given."""
@@ -80,12 +76,7 @@ class View:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         """Nothing is held."""
 
     def __call__(self, event: object) -> None:
@@ -136,54 +127,6 @@ class Lines(View):
                 error=frame.is_error,
             )
         )
-
-
-class Table(View):
-    """The board: refreshed in place, or printed once at the end."""
-
-    def __init__(self, output: Output, *, live: bool) -> None:
-        super().__init__(output)
-        self.is_live = live
-        from rich.console import Console  # noqa: PLC0415
-        from rich.live import Live  # noqa: PLC0415
-
-        self._console = Console(markup=False, highlight=False, emoji=False)
-        # No thread refreshes: the watcher's pulse does, between two frames. On a screen of its own
-        # lines are written over each other, without erasing them first: nothing flickers.
-        self._live = Live(console=self._console, screen=True, auto_refresh=False) if live else None
-        from flasher.cli.look.monitor_table import BoardView  # noqa: PLC0415  loads rich
-
-        self._view = BoardView(self._console)
-        self._last_at = 0.0
-
-    def __enter__(self) -> Self:
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        if self._live is not None:
-            self._live.stop()
-        if kind is None:
-            self._console.print(self._view_now())
-
-    def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
-        self._last_at = seen.at
-
-    def refresh(self, now: float) -> None:
-        self._last_at = now
-        if self._live is not None:
-            self._live.update(self._view_now(), refresh=True)
-
-    def _view_now(self) -> RenderableType:
-        said = f"{self.since(self._last_at):.1f} s, {counted(self.messages, 'message')}"
-        title = f"{self.name}: {said}, {self.troubles:,} with trouble"
-        return self._view.draw(self.board, self._last_at, title)
 
 
 def _line(seen: BusEvent, at_s: float, changed: frozenset[str], *, cut: bool) -> str:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import io
-import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, Literal, Self
+from typing import Final, Literal
 
 import click
 
 from flasher.api import as_dialect
 from flasher.cli import values
+from flasher.cli.bar import Bar
 from flasher.cli.documents import FieldValue, content_document
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import argument, command, option
@@ -172,15 +172,24 @@ def _read_item(
 def _read_memory(
     start: int, end: int, bus: Bus, recorded: RecordingOptions, output: Output
 ) -> bytes:
+    done = 0
+
+    def show(event: object) -> None:
+        nonlocal done
+        output.event(event)
+        if isinstance(event, QueryAnswered) and isinstance(event.content, Memory):
+            done += len(piece_of(event.content))
+            bar.move_to(done, end - start)
+
     with (
         recorded_connection(recorded, bus, output, BMS) as (connection, record),
         stop_on_signal() as stopped,
-        _MemoryProgress(end - start, output) as progress,
+        Bar(output, unit="B", unit_scale=True, desc=MEMORY) as bar,
     ):
         try:
             device = connection.device(BMS, dialect=bus.dialect)
             return device.read_memory(
-                start, end, taps=record.taps, on_event=progress, cancelled=stopped
+                start, end, taps=record.taps, on_event=show, cancelled=stopped
             )
         except NoAnswerError as error:
             error.remedy = f"{error.remedy} No file was written."
@@ -211,44 +220,6 @@ def _intel_hex(start: int, data: bytes) -> bytes:
     text = io.StringIO()
     image.write_hex_file(text)
     return text.getvalue().encode("ascii")
-
-
-class _MemoryProgress:
-    """A bar on a terminal, nothing elsewhere."""
-
-    def __init__(self, size_bytes: int, output: Output) -> None:
-        self._size_bytes = size_bytes
-        self._output = output
-        self._wants_bar = sys.stderr.isatty() and output.verbosity >= 0
-        self._bar: Any = None
-
-    def __enter__(self) -> Self:
-        if self._wants_bar:
-            from tqdm import tqdm  # noqa: PLC0415  only where a bar is shown
-
-            self._bar = tqdm(
-                total=self._size_bytes,
-                unit="B",
-                unit_scale=True,
-                desc=MEMORY,
-                file=sys.stderr,
-                dynamic_ncols=True,
-            )
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def __call__(self, event: object) -> None:
-        """Take an event of the reading."""
-        self._output.event(event)
-        if (
-            self._bar is not None
-            and isinstance(event, QueryAnswered)
-            and isinstance(event.content, Memory)
-        ):
-            self._bar.update(len(piece_of(event.content)))
 
 
 def _list(target: Target, dialect: Dialect, output: Output) -> int:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import sys
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Final, Self
 
 from flasher import events
+from flasher.cli.bar import Bar
 from flasher.cli.output import Output
 from flasher.cli.terminal import painted
 from flasher.host.table import Reason
@@ -33,8 +31,6 @@ SHOWN: Final = frozenset(
     }
 )
 """The events that have lines or a bar of their own here: the log on stderr leaves them out."""
-
-
 _BECAUSE: Final = {
     Reason.PACKET_REFUSED.value: "the device refused {what}",
     Reason.PACKET_UNANSWERED.value: "the device did not answer {what} in time",
@@ -61,99 +57,43 @@ class Progress:
     """Takes the events of an upgrade and shows them."""
 
     def __init__(self, plan: Plan, output: Output) -> None:
-        self._plan = plan
+        self._size_bytes = plan.image.size_bytes
         self._output = output
-        self._bar: Any = None
+        self._bar = Bar(output, unit="B", unit_scale=True, desc=plan.target.node.name)
         self._repetitions = 0
-        self._wants_bar = sys.stderr.isatty() and output.verbosity >= 0
 
     def __enter__(self) -> Self:
         self._output.shown_events = SHOWN
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._close_bar()
+    def __exit__(self, *_: object) -> None:
+        self._bar.close()
         self._output.shown_events = frozenset()
 
     def __call__(self, event: object) -> None:
-        """Show one event. A terminal that is gone does not end the upgrade."""
-        try:
-            self._show(event)
-        except OSError:
-            self._wants_bar = False
-            self._forget_bar()
-
-    def _show(self, event: object) -> None:
-        output = self._output
+        """Show one event."""
         match event:
-            case events.PacketAcknowledged(number, total, _):
-                self._move(number, total)
-            case events.PhaseEntered(phase, _):
-                if phase is not events.Phase.TRANSFER:
-                    self._close_bar()
-                output.progress(f"{prose(phase)} ...")
-            case events.AttemptStarted(attempt, reason):
-                self._close_bar()
-                output.progress(f"{because(reason)}: beginning again, attempt {attempt}")
-            case events.PowerCycleAwaited(limit_s):
-                self._prompt(limit_s)
-            case events.MessageRepeated(what, reason, tries):
-                self._repetitions += 1
-                text = f"{because(reason, what)}: sending {what} again, try {tries}"
-                output.progress(text, level=1)
-            case _ if warning := _warning(event):
-                self._close_bar()
-                output.error_line(f"warning: {warning}")
-            case _ if note := _note(event):
-                text, level = note
-                output.progress(text, level=level)
-
-    def _prompt(self, limit_s: float) -> None:
-        """What the user has to do now, so that it is seen."""
-        text = f"power-cycle the device now (waiting {limit_s:g} s)"
-        bold = painted(text, "yellow") if self._output.colour else text
-        self._output.error_line(f">>> {bold}")
-
-    def _move(self, number: int, total: int) -> None:
-        if not self._wants_bar:
-            return
-        if self._bar is None:
-            self._bar = self._open_bar()
-        size_bytes = self._plan.image.size_bytes
-        self._bar.update(min(number * PACKET_DATA_SIZE, size_bytes) - self._bar.n)
-        if self._repetitions:
-            self._bar.set_postfix_str(f"{self._repetitions} repeated", refresh=False)
-        if number == total:
-            self._close_bar()
-
-    def _open_bar(self) -> Any:
-        from tqdm import tqdm  # noqa: PLC0415  only where a bar is shown
-
-        bar = tqdm(
-            total=self._plan.image.size_bytes,
-            unit="B",
-            unit_scale=True,
-            desc=self._plan.target.node.name,
-            file=sys.stderr,
-            dynamic_ncols=True,
-        )
-        self._output.write_stderr = lambda text: bar.write(text, file=sys.stderr)
-        return bar
-
-    def _close_bar(self) -> None:
-        if self._bar is not None:
-            with contextlib.suppress(OSError):
+            case events.PacketAcknowledged(number, _, _):
+                note = f"{self._repetitions} repeated" if self._repetitions else ""
+                done = min(number * PACKET_DATA_SIZE, self._size_bytes)
+                self._bar.move_to(done, self._size_bytes, note=note)
+            case events.PhaseEntered(phase, _) if phase is not events.Phase.TRANSFER:
                 self._bar.close()
-            self._forget_bar()
-
-    def _forget_bar(self) -> None:
-        self._bar = None
-        self._output.restore_stderr()
+            case events.AttemptStarted():
+                self._bar.close()
+            case events.MessageRepeated():
+                self._repetitions += 1
+            case events.PowerCycleAwaited(limit_s):
+                # What the user has to do now, so that it is seen.
+                text = f"power-cycle the device now (waiting {limit_s:g} s)"
+                bold = painted(text, "yellow") if self._output.colour else text
+                self._output.error_line(f">>> {bold}")
+        if warning := _warning(event):
+            self._bar.close()
+            self._output.error_line(f"warning: {warning}")
+        elif line := _line(event):
+            text, level = line
+            self._output.progress(text, level=level)
 
 
 def _warning(event: object) -> str:
@@ -171,9 +111,15 @@ def _warning(event: object) -> str:
             return ""
 
 
-def _note(event: object) -> tuple[str, int] | None:
+def _line(event: object) -> tuple[str, int] | None:
     """A line and the level of verbosity that shows it; None for an event without a line."""
     match event:
+        case events.PhaseEntered(phase, _):
+            return f"{prose(phase)} ...", 0
+        case events.AttemptStarted(attempt, reason):
+            return f"{because(reason)}: beginning again, attempt {attempt}", 0
+        case events.MessageRepeated(what, reason, tries):
+            return f"{because(reason, what)}: sending {what} again, try {tries}", 1
         case events.BootVersionSeen(name, version):
             return f"boot version: {name} {version}", 0
         case events.CheckMade(_, verdict, text):
