@@ -30,7 +30,7 @@ from pydantic import Field, field_validator, model_validator
 from flasher.errors import UsageError
 from flasher.settings.reading import Reader, Table
 from flasher.station.recipe import ShortText
-from flasher.station.records.database import DEFAULT_LOCK_TIMEOUT_S
+from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 
 SOCKETS_MAX: Final = 64
 _SWITCH: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")

@@ -11,8 +11,8 @@ from flasher.cli.station.commands import DEFAULT_RECORDS, RecordsOptions
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.config import load_config
-from flasher.station.records.database import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.records.keys import Keeping
+from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
 from flasher.station.records.store import Store
 
 _READER: Final = "report"

@@ -47,8 +47,6 @@ from flasher.station.records.triggers import trigger_statements
 if TYPE_CHECKING:
     from flasher.station.records.server import ServerLock
 
-DEFAULT_LOCK_TIMEOUT_S: Final = 5.0
-"""How long a write waits for another program that holds the database."""
 _SYNCHRONOUS_FULL: Final = 2
 _IMMEDIATE: Final = "flasher_immediate"
 _POSTGRESQL: Final = "postgresql+psycopg"

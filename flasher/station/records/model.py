@@ -13,6 +13,8 @@ from flasher.form import LowerInJson
 
 RunId = NewType("RunId", int)
 WriteId = NewType("WriteId", int)
+DEFAULT_LOCK_TIMEOUT_S: Final = 5.0
+"""How long a write waits for another program that holds the database."""
 
 
 class Clock(Protocol):

@@ -33,7 +33,6 @@ from flasher.station.records import chain, schema
 from flasher.station.records.chain import Trail, digests_of
 from flasher.station.records.claims import Order, begin_run
 from flasher.station.records.database import (
-    DEFAULT_LOCK_TIMEOUT_S,
     Database,
     locate,
     make_backup,
@@ -44,6 +43,7 @@ from flasher.station.records.examination import Examiner
 from flasher.station.records.files import FileStore
 from flasher.station.records.keys import Keeping
 from flasher.station.records.model import (
+    DEFAULT_LOCK_TIMEOUT_S,
     OUTCOMES,
     AttachmentFile,
     AuditEvent,
