@@ -9,7 +9,7 @@ from datetime import datetime, timedelta
 from pathlib import PurePath
 from typing import Any, Final
 
-from sqlalchemy import Connection, func, select
+from sqlalchemy import func, select
 
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
@@ -81,225 +81,227 @@ class Order:
         return replace(self, lot=scan.lot)
 
 
-def begin_run(trail: Trail, order: Order, now: datetime, monotonic_s: float) -> Claim:
-    """Begin a run when every rule allows it. Raises ClaimRefusedError."""
-    connection = trail.connection
-    last = chain.latest(connection, trail.station)
-    if last is not None and now < utc_moment(last) - CLOCK_TOLERANCE:
-        # It would stand before the runs that were made.
-        raise ClaimRefusedError(
-            Refusal.CLOCK,
-            f"The clock says {utc_text(now)[:19]} UTC, but {trail.station} has records of"
-            f" {last[:19]} UTC.",
-            remedy="Set the clock of this computer. If the clock is right and that record is not:"
-            " end the station, then flasher station accept clock.",
-        )
-    unit_id = named(connection, schema.unit, part=order.part, serial=order.serial)
-    station_id = named(connection, schema.station, name=trail.station)
-    socket_id = named(connection, schema.socket, station_id=station_id, name=order.socket)
-    lot_id = None
-    if order.lot:
-        lot_id = named(connection, schema.lot, part=order.part, name=order.lot)
-    kind, before, count = _kind_of(connection, order, unit_id, socket_id, lot_id, now)
-    loaded = order.loaded
-    run_id = insert(
-        connection,
-        schema.run,
-        unit_id=unit_id,
-        socket_id=socket_id,
-        recipe_id=_recipe_id(trail, loaded, now),
-        lot_id=lot_id,
-        operator_id=named(connection, schema.operator, name=order.operator),
-        kind=kind.value,
-        is_virtual=order.is_virtual,
-        reason=order.reason,
-        state=RunState.RUNNING.value,
-        code="",
-        text="",
-        begun_at=utc_text(now),
-        begun_monotonic_s=monotonic_s,
-        verification_required=int(loaded.required),
-        allow_completed_not_read_back=loaded.recipe.allow_completed_not_read_back,
-    )
-    for position, target in enumerate(loaded.targets, 1):
-        artifact_id = named(
+class Claiming:
+    """The claim of one run, in the transaction of `trail`."""
+
+    def __init__(self, trail: Trail, order: Order, now: datetime) -> None:
+        """Raises ClaimRefusedError when the clock is behind the records."""
+        self._trail, self._order, self._now = trail, order, now
+        self._connection = connection = trail.connection
+        self._check_clock()
+        station_id = named(connection, schema.station, name=trail.station)
+        self._unit_id = named(connection, schema.unit, part=order.part, serial=order.serial)
+        self._socket_id = named(connection, schema.socket, station_id=station_id, name=order.socket)
+        self._lot_id: int | None = None
+        if order.lot:
+            self._lot_id = named(connection, schema.lot, part=order.part, name=order.lot)
+
+    def begin(self, monotonic_s: float) -> Claim:
+        """Begin the run when every rule allows it. Raises ClaimRefusedError."""
+        order, loaded, connection = self._order, self._order.loaded, self._connection
+        self._check_free()
+        self._check_nature()
+        before, count = self._unit_before()
+        kind = self._kind(before)
+        run_id = insert(
             connection,
-            schema.artifact,
-            target=target.name,
-            sha256=target.image.sha256,
-            name=PurePath(target.image.source).name,
-            version=target.version,
-            size_bytes=target.image.size_bytes,
+            run,
+            unit_id=self._unit_id,
+            socket_id=self._socket_id,
+            recipe_id=self._recipe_id(),
+            lot_id=self._lot_id,
+            operator_id=named(connection, schema.operator, name=order.operator),
+            kind=kind.value,
+            is_virtual=order.is_virtual,
+            reason=order.reason,
+            state=RunState.RUNNING.value,
+            code="",
+            text="",
+            begun_at=utc_text(self._now),
+            begun_monotonic_s=monotonic_s,
+            verification_required=int(loaded.required),
+            allow_completed_not_read_back=loaded.recipe.allow_completed_not_read_back,
         )
-        insert(
-            connection,
-            schema.run_target,
-            run_id=run_id,
-            artifact_id=artifact_id,
-            position=position,
-            target=target.name,
-            required=int(target.required),
-        )
-    digests = digests_of(connection, [run_id])[run_id]
-    data = {"serial": order.serial, "digests": {name: digests[name] for name in CLAIM_PARTS}}
-    trail.append(now, chain.CLAIMED, data, run_id)
-    return Claim(RunId(run_id), kind, order.serial, order.part, before, count)
+        for position, target in enumerate(loaded.targets, 1):
+            artifact_id = named(
+                connection,
+                schema.artifact,
+                target=target.name,
+                sha256=target.image.sha256,
+                name=PurePath(target.image.source).name,
+                version=target.version,
+                size_bytes=target.image.size_bytes,
+            )
+            insert(
+                connection,
+                schema.run_target,
+                run_id=run_id,
+                artifact_id=artifact_id,
+                position=position,
+                target=target.name,
+                required=int(target.required),
+            )
+        digests = digests_of(connection, [run_id])[run_id]
+        data = {"serial": order.serial, "digests": {name: digests[name] for name in CLAIM_PARTS}}
+        self._trail.append(self._now, chain.CLAIMED, data, run_id)
+        return Claim(RunId(run_id), kind, order.serial, order.part, before, count)
 
-
-def _recipe_id(trail: Trail, loaded: LoadedRecipe, now: datetime) -> int:
-    """The recipe's row; it holds the whole text, so that it can be read years later."""
-    query = select(recipe.c.id).where(recipe.c.sha256 == loaded.sha256)
-    found = trail.connection.execute(query).scalar_one_or_none()
-    if found is not None:
-        return int(found)
-    rule = loaded.recipe
-    facts = {"name": rule.name, "revision": rule.revision, "sha256": loaded.sha256}
-    trail.append(now, "recipe", facts)
-    return insert(
-        trail.connection,
-        recipe,
-        **facts,
-        part=rule.part,
-        content=loaded.content,
-        verification_required=int(loaded.required),
-        allow_completed_not_read_back=rule.allow_completed_not_read_back,
-    )
-
-
-def _kind_of(
-    connection: Connection,
-    order: Order,
-    unit_id: int,
-    socket_id: int,
-    lot_id: int | None,
-    now: datetime,
-) -> tuple[RunKind, UnitState, int]:
-    """What kind of run it would be, the unit's state and how many runs it had.
-
-    Raises ClaimRefusedError.
-    """
-    _check_free(connection, order, unit_id, socket_id)
-    _check_nature(connection, order, unit_id)
-    states = (
-        connection.execute(select(run.c.state).where(run.c.unit_id == unit_id).order_by(run.c.id))
-        .scalars()
-        .all()
-    )
-    before = UnitState.after(RunState(states[-1]) if states else None)
-    if order.is_golden:
-        return RunKind.GOLDEN, before, len(states)
-    _check_golden(connection, order, socket_id, now)
-    kind = _repeated(order) if before is UnitState.PASS else RunKind.PRODUCTION
-    if before is UnitState.RECHECK:
-        kind = RunKind.RECHECK
-    _check_lot(connection, order, unit_id, lot_id)
-    return kind, before, len(states)
-
-
-def _check_free(connection: Connection, order: Order, unit_id: int, socket_id: int) -> None:
-    running = (
-        select(run.c.unit_id, socket.c.name.label("socket_name"), station.c.name, unit.c.serial)
-        .join_from(run, socket)
-        .join(station)
-        .join(unit, run.c.unit_id == unit.c.id)
-        .where(run.c.state == RunState.RUNNING.value)
-    )
-    by_unit: Any = connection.execute(running.where(run.c.unit_id == unit_id)).first()
-    if by_unit is not None:
-        raise ClaimRefusedError(
-            Refusal.UNIT_RUNNING,
-            f"{order.serial} is running on socket {by_unit.socket_name} of {by_unit.name}.",
-            remedy="Wait for its end. If it is not there, check the label of this unit.",
-        )
-    by_socket: Any = connection.execute(running.where(run.c.socket_id == socket_id)).first()
-    if by_socket is not None:
-        raise ClaimRefusedError(
-            Refusal.SOCKET_BUSY,
-            f"Socket {order.socket} is busy with {by_socket.serial}.",
-            remedy="Wait for its end.",
+    def _recipe_id(self) -> int:
+        """The recipe's row; it holds the whole text, so that it can be read years later."""
+        loaded, rule = self._order.loaded, self._order.loaded.recipe
+        query = select(recipe.c.id).where(recipe.c.sha256 == loaded.sha256)
+        found = self._connection.execute(query).scalar_one_or_none()
+        if found is not None:
+            return int(found)
+        facts = {"name": rule.name, "revision": rule.revision, "sha256": loaded.sha256}
+        self._trail.append(self._now, "recipe", facts)
+        return insert(
+            self._connection,
+            recipe,
+            **facts,
+            part=rule.part,
+            content=loaded.content,
+            verification_required=int(loaded.required),
+            allow_completed_not_read_back=rule.allow_completed_not_read_back,
         )
 
+    # -- the rules --------------------------------------------------------------------------------
 
-def _check_nature(connection: Connection, order: Order, unit_id: int) -> None:
-    """A PASS of a virtual unit says nothing about a real one, and the other way round."""
-    others = select(run.c.id).where(run.c.unit_id == unit_id, run.c.is_virtual != order.is_virtual)
-    if connection.execute(others.limit(1)).first() is not None:
-        known = "real" if order.is_virtual else "virtual"
-        raise ClaimRefusedError(
-            Refusal.OTHER_NATURE,
-            f"{order.serial} is a {known} unit in these records.",
-            remedy="Keep records of virtual units apart, in a database of their own.",
+    def _check_clock(self) -> None:
+        """The run must not stand before those that were made."""
+        last = chain.latest(self._connection, self._trail.station)
+        if last is not None and self._now < utc_moment(last) - CLOCK_TOLERANCE:
+            raise ClaimRefusedError(
+                Refusal.CLOCK,
+                f"The clock says {utc_text(self._now)[:19]} UTC, but {self._trail.station} has"
+                f" records of {last[:19]} UTC.",
+                remedy="Set the clock of this computer. If the clock is right and that record is"
+                " not: end the station, then flasher station accept clock.",
+            )
+
+    def _check_free(self) -> None:
+        running = (
+            select(run.c.unit_id, socket.c.name.label("socket_name"), station.c.name, unit.c.serial)
+            .join_from(run, socket)
+            .join(station)
+            .join(unit, run.c.unit_id == unit.c.id)
+            .where(run.c.state == RunState.RUNNING.value)
         )
+        of_unit = running.where(run.c.unit_id == self._unit_id)
+        by_unit: Any = self._connection.execute(of_unit).first()
+        if by_unit is not None:
+            raise ClaimRefusedError(
+                Refusal.UNIT_RUNNING,
+                f"{self._order.serial} is running on socket {by_unit.socket_name} of"
+                f" {by_unit.name}.",
+                remedy="Wait for its end. If it is not there, check the label of this unit.",
+            )
+        on_socket = running.where(run.c.socket_id == self._socket_id)
+        by_socket: Any = self._connection.execute(on_socket).first()
+        if by_socket is not None:
+            raise ClaimRefusedError(
+                Refusal.SOCKET_BUSY,
+                f"Socket {self._order.socket} is busy with {by_socket.serial}.",
+                remedy="Wait for its end.",
+            )
 
-
-def _repeated(order: Order) -> RunKind:
-    """What is done with a unit that has passed."""
-    rule = order.loaded.recipe.duplicate
-    if rule is Duplicate.VERIFY_ONLY:
-        return RunKind.VERIFY_ONLY
-    if rule is Duplicate.BLOCK:
-        raise ClaimRefusedError(
-            Refusal.DUPLICATE,
-            f"{order.serial} has passed already.",
-            remedy="Check the label: another unit may carry the same number.",
+    def _check_nature(self) -> None:
+        """A PASS of a virtual unit says nothing about a real one, and the other way round."""
+        is_virtual = self._order.is_virtual
+        others = select(run.c.id).where(
+            run.c.unit_id == self._unit_id, run.c.is_virtual != is_virtual
         )
-    if not order.reason.strip():
-        raise ClaimRefusedError(
-            Refusal.REASON_NEEDED,
-            f"{order.serial} has passed already, and is done again only for a reason.",
-            remedy="Give the reason, then scan it again.",
+        if self._connection.execute(others.limit(1)).first() is not None:
+            known = "real" if is_virtual else "virtual"
+            raise ClaimRefusedError(
+                Refusal.OTHER_NATURE,
+                f"{self._order.serial} is a {known} unit in these records.",
+                remedy="Keep records of virtual units apart, in a database of their own.",
+            )
+
+    def _unit_before(self) -> tuple[UnitState, int]:
+        """The unit's state, and how many runs it had."""
+        query = select(run.c.state).where(run.c.unit_id == self._unit_id).order_by(run.c.id)
+        states = self._connection.execute(query).scalars().all()
+        return UnitState.after(RunState(states[-1]) if states else None), len(states)
+
+    def _kind(self, before: UnitState) -> RunKind:
+        """What kind of run it is. Raises ClaimRefusedError."""
+        if self._order.is_golden:
+            return RunKind.GOLDEN
+        self._check_golden()
+        kind = RunKind.PRODUCTION
+        if before is UnitState.PASS:
+            kind = self._repeated()
+        elif before is UnitState.RECHECK:
+            kind = RunKind.RECHECK
+        self._check_lot()
+        return kind
+
+    def _check_golden(self) -> None:
+        order, rule = self._order, self._order.loaded.recipe.golden
+        if rule is None:
+            return
+        query = (
+            select(func.max(run.c.ended_at))
+            .join_from(run, recipe)
+            .where(
+                run.c.socket_id == self._socket_id,
+                run.c.kind == RunKind.GOLDEN.value,
+                run.c.is_virtual == order.is_virtual,
+                run.c.state == RunState.PASS.value,
+                recipe.c.part == order.part,
+            )
         )
-    return RunKind.REFLASH
+        last = self._connection.execute(query).scalar_one()
+        if is_due(rule, utc_moment(last) if last else None, self._now.astimezone()):
+            raise ClaimRefusedError(
+                Refusal.GOLDEN_DUE,
+                f"A golden unit has to pass on socket {order.socket} first.",
+                remedy=f"Scan and connect one of: {', '.join(rule.serial_numbers)}.",
+            )
 
+    def _repeated(self) -> RunKind:
+        """What is done with a unit that has passed."""
+        order, rule = self._order, self._order.loaded.recipe.duplicate
+        if rule is Duplicate.VERIFY_ONLY:
+            return RunKind.VERIFY_ONLY
+        if rule is Duplicate.BLOCK:
+            raise ClaimRefusedError(
+                Refusal.DUPLICATE,
+                f"{order.serial} has passed already.",
+                remedy="Check the label: another unit may carry the same number.",
+            )
+        if not order.reason.strip():
+            raise ClaimRefusedError(
+                Refusal.REASON_NEEDED,
+                f"{order.serial} has passed already, and is done again only for a reason.",
+                remedy="Give the reason, then scan it again.",
+            )
+        return RunKind.REFLASH
 
-def _check_lot(connection: Connection, order: Order, unit_id: int, lot_id: int | None) -> None:
-    rule = order.loaded.recipe.lot
-    if lot_id is None:
-        if rule.required:
+    def _check_lot(self) -> None:
+        order, rule = self._order, self._order.loaded.recipe.lot
+        if self._lot_id is None and rule.required:
             raise ClaimRefusedError(
                 Refusal.LOT_NEEDED, "The unit has no lot.", remedy="Give the station the lot."
             )
-        return
-    if rule.quantity_max is None:
-        return
-    query = select(func.count(run.c.unit_id.distinct())).where(
-        run.c.lot_id == lot_id,
-        run.c.unit_id != unit_id,
-        run.c.is_virtual == order.is_virtual,
-        run.c.kind != RunKind.GOLDEN.value,
-        run.c.state.in_((RunState.RUNNING.value, RunState.PASS.value)),
-    )
-    used = connection.execute(query).scalar_one()
-    if used >= rule.quantity_max:
-        raise ClaimRefusedError(
-            Refusal.LOT_FULL,
-            f"Lot {order.lot} is full: {used} of {rule.quantity_max} units.",
-            remedy="Begin the next lot.",
-        )
-
-
-def _check_golden(connection: Connection, order: Order, socket_id: int, now: datetime) -> None:
-    rule = order.loaded.recipe.golden
-    if rule is None:
-        return
-    query = (
-        select(func.max(run.c.ended_at))
-        .join_from(run, recipe)
-        .where(
-            run.c.socket_id == socket_id,
-            run.c.kind == RunKind.GOLDEN.value,
+        if self._lot_id is None or rule.quantity_max is None:
+            return
+        query = select(func.count(run.c.unit_id.distinct())).where(
+            run.c.lot_id == self._lot_id,
+            run.c.unit_id != self._unit_id,
             run.c.is_virtual == order.is_virtual,
-            run.c.state == RunState.PASS.value,
-            recipe.c.part == order.part,
+            run.c.kind != RunKind.GOLDEN.value,
+            run.c.state.in_((RunState.RUNNING.value, RunState.PASS.value)),
         )
-    )
-    last = connection.execute(query).scalar_one()
-    if is_due(rule, utc_moment(last) if last else None, now.astimezone()):
-        raise ClaimRefusedError(
-            Refusal.GOLDEN_DUE,
-            f"A golden unit has to pass on socket {order.socket} first.",
-            remedy=f"Scan and connect one of: {', '.join(rule.serial_numbers)}.",
-        )
+        used = self._connection.execute(query).scalar_one()
+        if used >= rule.quantity_max:
+            raise ClaimRefusedError(
+                Refusal.LOT_FULL,
+                f"Lot {order.lot} is full: {used} of {rule.quantity_max} units.",
+                remedy="Begin the next lot.",
+            )
 
 
 def is_due(rule: Golden, last_pass: datetime | None, now: datetime) -> bool:

@@ -31,7 +31,7 @@ from sqlalchemy import func, select, update
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import Trail, digests_of
-from flasher.station.records.claims import Order, begin_run
+from flasher.station.records.claims import Claiming, Order
 from flasher.station.records.database import (
     Database,
     locate,
@@ -211,7 +211,7 @@ class Store:
         order = Order(serial, socket, recipe, operator, lot, reason, is_virtual).checked(now)
         # One claim at a time, of all stations: two must not find the last place of a lot free.
         with self.signer.writing("claims") as trail:
-            return begin_run(trail, order, now, self._clock.monotonic_s())
+            return Claiming(trail, order, now).begin(self._clock.monotonic_s())
 
     # -- while it runs ----------------------------------------------------------------------------
 
