@@ -195,7 +195,7 @@ class _Session:
         try:
             with ExitStack() as stack:
                 stopped = stack.enter_context(stop_on_signal(self._say_stop, self._stop_now))
-                stack.enter_context(self.view)
+                stack.enter_context(self.view.on_screen())
                 self._open_scans(stack)
                 self.station.run(until=lambda: self._is_over(is_stopped=stopped()))
         except KeyboardInterrupt:

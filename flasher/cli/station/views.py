@@ -6,13 +6,12 @@ colour and a word. The columns do not depend on what stands in them, so nothing 
 
 from __future__ import annotations
 
-import contextlib
 import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from datetime import datetime
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -71,16 +70,10 @@ class View:
         self.typed: str | None = None
         """What stands on the scan line; None where nobody can type."""
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        """Nothing is held."""
+    @contextmanager
+    def on_screen(self) -> Iterator[None]:
+        """Hold the screen while the block runs, where the view needs it."""
+        yield
 
     def __call__(self, event: StationEvent) -> None:
         """Show one event."""
@@ -122,20 +115,16 @@ class Table(View):
         self._now = now
         self._drawn_at = float("-inf")
 
-    def __enter__(self) -> Self:
+    @contextmanager
+    def on_screen(self) -> Iterator[None]:
         self._live.start()
         # Text on stderr would tear the table; what matters stands in it.
         self.output.write_stderr = lambda _text: None
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._live.stop()
-        self.output.restore_stderr()
+        try:
+            yield
+        finally:
+            self._live.stop()
+            self.output.restore_stderr()
 
     def show(self, event: StationEvent) -> None:
         # The station is busy while it saves: what the row said last would stay for so long.
@@ -144,7 +133,7 @@ class Table(View):
 
     def refresh(self, *, at_once: bool = False) -> None:
         if at_once or self._now() - self._drawn_at >= REFRESH_S:
-            with contextlib.suppress(OSError):  # a terminal that is gone does not stop the line
+            with suppress(OSError):  # a terminal that is gone does not stop the line
                 table = draw(self.board, self._live.console, self.typed)
                 self._live.update(table, refresh=True)
             self._drawn_at = self._now()
