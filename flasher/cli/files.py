@@ -1,4 +1,4 @@
-"""The one way in which commands write a file: whole or not at all."""
+"""How commands write a file: whole or not at all."""
 
 from __future__ import annotations
 
@@ -13,13 +13,12 @@ from flasher.errors import UsageError
 from flasher.protocol.text import printable
 
 _LINKS_MAX: Final = 40
-"""As many links in a row as the system follows."""
+"""Links in a row that the operating system follows."""
 
 
 def check_writable(path: Path, option: str, *, is_appended_to: bool = False) -> None:
-    """Raises UsageError where no file can come to be: better before the work than after it.
-    `option` is the one that named the file. A file is replaced, for which its folder has to be
-    writable, unless it `is_appended_to`.
+    """Check before the work that a file can be written. Raises UsageError with the `option` that
+    named the file. Unless it `is_appended_to` it will be replaced: its folder has to be writable.
     """
     if path.is_dir():
         raise _not_written(path, option, "it is a folder")
@@ -30,7 +29,7 @@ def check_writable(path: Path, option: str, *, is_appended_to: bool = False) -> 
 
 
 def _can_be_replaced(path: Path) -> bool:
-    """False for a folder in which this user can make no file; what is no regular file stays."""
+    """False where this user cannot create files in the folder; pipes and devices stay in place."""
     try:
         path = path.resolve(strict=False)
         is_special = path.exists() and not path.is_file()
@@ -40,8 +39,8 @@ def _can_be_replaced(path: Path) -> bool:
 
 
 def check_not_read(path: str | Path, option: str, others: Iterable[object]) -> None:
-    """Raises UsageError when the file that is going to be written is one of the `others`: values of
-    the command line, which may name what the command reads.
+    """Raises UsageError when the file to be written is one of the `others`: texts of the command
+    line that may name files which the command reads.
     """
     for other in others:
         if isinstance(other, str | Path) and _is_same(Path(path), Path(other)):
@@ -53,16 +52,15 @@ def check_not_read(path: str | Path, option: str, others: Iterable[object]) -> N
 
 
 def _is_same(path: Path, other: Path) -> bool:
-    """By what they lead to, where they exist; ValueError: a text that can be no file's name."""
+    """True when both names lead to one file."""
     with contextlib.suppress(OSError, ValueError):
         return path.samefile(other)
     return path.absolute() == other.absolute()
 
 
 def write_whole(path: Path, data: bytes, option: str) -> None:
-    """Write a file whole or not at all, where a link leads to, unless another user laid the link.
-    What is no regular file (a pipe, a device) is written into, not replaced. Raises UsageError,
-    with the `option` that named the file, when it cannot be written.
+    """Write a file whole or not at all. A link is followed, unless another user created it; a pipe
+    or device is written into, not replaced. Raises UsageError with the `option` that named it.
     """
     try:
         # Inside: a link that leads to itself cannot be resolved.
@@ -79,8 +77,8 @@ def write_whole(path: Path, data: bytes, option: str) -> None:
 
 
 def _check_links(path: Path, option: str) -> None:
-    """Raises UsageError for a link of another user: who may write into the folder (/tmp) could
-    have it lead to any file of this user. Links of the system are followed.
+    """Raises UsageError for a link of another user: in a shared folder (/tmp) it could lead to any
+    file of this user. Links of the system are followed.
     """
     for _ in range(_LINKS_MAX):
         if not path.is_symlink():

@@ -16,7 +16,7 @@ from flasher.cli.terminal import wrap_line
 from flasher.errors import ExitCode
 
 BRIEF: Final = "flasher.brief"
-"""Key in the meta data of a context: True while the short help is made."""
+"""Key in `Context.meta`: True while the short help is made."""
 STYLE: Final = {
     "theme": "default-slim",
     "max_width": 100,
@@ -25,7 +25,7 @@ STYLE: Final = {
     "default_string": "(default {})",
     "required_long_string": "(required)",
 }
-"""Of rich-click."""
+"""Settings of rich-click."""
 _WIDTH: Final = 100
 """Columns that examples take where there is no terminal."""
 _EXAMPLE: Final = re.compile(r"(\s+flasher .*?\S) {3,}(\S.*)")

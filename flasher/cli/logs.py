@@ -22,7 +22,7 @@ from flasher.protocol.text import printable
 LOG_FILE: Final = "--log-file"
 _PYTHON_CAN: Final = "can"
 _FORGOTTEN_BUS: Final = "was not properly shut down"
-"""What python-can says of a bus that it could not open: the failure itself was told."""
+"""A remark of python-can on a bus that it could not open, beside the error."""
 _NOWHERE: Final = logging.NullHandler()
 _NOTHING: Final = logging.CRITICAL + 1
 _ON_STDERR: Final = {
@@ -33,7 +33,7 @@ _ON_STDERR: Final = {
 }
 """Levels of flasher's and of python-can's records on stderr, for each verbosity."""
 _FILE_CAN_LEVEL: Final = logging.INFO
-"""Of python-can in the log file: at DEBUG it has records for each frame, which take time."""
+"""Level of python-can in the log file: at DEBUG it logs every frame, which is slow."""
 
 
 class Logs:

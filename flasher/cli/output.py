@@ -15,18 +15,21 @@ import logging
 import os
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Final, Literal, NamedTuple, TextIO
+from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TextIO
 
 from flasher.cli.documents import SCHEMA_VERSION, Envelope, ErrorDocument, as_json, to_json
 from flasher.cli.terminal import columns, painted, takes_colour, unpainted, wrapped
 from flasher.errors import ExitCode, FlasherError, UsageError
+
+if TYPE_CHECKING:
+    from flasher.trace.figures import Distribution
 
 _LOG: Final = logging.getLogger("flasher.cli")
 SAID: Final = {"said": True}
 """Marks log records of what was printed, so that -v does not print it twice."""
 
 
-class Verdict(NamedTuple):
+class ClosingLine(NamedTuple):
     """The end of a command in one line; it says in words what its colour says."""
 
     word: str
@@ -46,7 +49,7 @@ class Output:
         """Name of the command that runs; None before it is known."""
         self.shown_events: frozenset[type] = frozenset()
         """Events that the command prints itself while it runs: -v does not log them once more."""
-        self.ending: Callable[[FlasherError], Verdict] | None = None
+        self.ending: Callable[[FlasherError], ClosingLine] | None = None
         """What the last line says of an error, for a command that ends with a verdict."""
         self.write_stderr: Callable[[str], None] = _plain_stderr
         """Replaced while a progress bar is on the screen."""
@@ -128,7 +131,7 @@ class Output:
         _LOG.error("%s", unpainted(text), extra=SAID)
         self.say(text)
 
-    def verdict(self, verdict: Verdict) -> None:
+    def verdict(self, verdict: ClosingLine) -> None:
         """The last line of a command, in its colour: a result, or a line of stderr when it failed
         (also when JSON is wanted).
         """
@@ -207,3 +210,9 @@ def duration(seconds: float) -> str:
     if seconds < 120:
         return f"{seconds:.2f} s"
     return f"{int(seconds // 60)} min {int(seconds % 60):02d} s"
+
+
+def spread_ms(of: Distribution) -> str:
+    """Times in milliseconds: least, median, 95th and 99th percentile, most."""
+    times_s = (of.minimum_s, of.median_s, of.p95_s, of.p99_s, of.maximum_s)
+    return " / ".join(f"{each * 1000:.2f}" for each in times_s)

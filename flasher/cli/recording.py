@@ -51,10 +51,9 @@ _WITH_BUNDLE: Final = frozenset(
         ExitCode.INTERRUPTED,
     }
 )
-"""Failures on the bus or of flasher itself, and what was interrupted; wrong usage explains
-itself."""
+"""Ends that leave a bundle: failures on the bus, bugs, interruptions; not wrong usage."""
 _BUNDLES_KEPT: Final = 50
-"""In the folder that nobody chose."""
+"""Bundles in the default folder; older ones are deleted."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,9 @@ _HANGUP: signal.Signals | None = getattr(signal, "SIGHUP", None)  # not on Windo
 
 
 class Stop:
-    """What the user, or the loss of the terminal, asks for; `stop()` is True for either."""
+    """Whether the user (Ctrl-C, SIGTERM) or a lost terminal (SIGHUP) asks to stop. Calling it is
+    True for either.
+    """
 
     def __init__(self, on_first: Callable[[], None] | None) -> None:
         self._on_first = on_first

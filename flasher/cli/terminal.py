@@ -16,7 +16,7 @@ _NO_WINDOW: Final = 10_000
 """Columns where nothing is wrapped."""
 COLOURS: Final = {"green": 32, "yellow": 33, "red": 31, "cyan": 36}
 _SUBSTITUTES: Final = {"°": "deg", "…": "~"}
-"""What stands for a character that the encoding of a stream does not have."""
+"""Replacements for characters that an encoding lacks."""
 _SUBSTITUTED: Final = "flasher-substitutes"
 _REPLACED_ERRORS: Final = frozenset({"strict", "backslashreplace", "surrogateescape"})
 _COLOUR: Final = re.compile(r"\x1b\[[\d;]+m")
@@ -26,7 +26,7 @@ _COMMAND: Final = re.compile(r"\s*flasher ")
 """A command line is never wrapped: it has to be copied as it is."""
 _ENDS_WITH_COMMAND: Final = re.compile(r"(.*[:|]) (flasher [a-z-]+ .*)")
 _LABEL: Final = re.compile(r"\s*(?:\S+(?: \S+)*?\s{2,}|[A-Za-z][\w /-]{0,17}: +)?")
-"""What a line begins with, and what its continuations stand behind."""
+"""The beginning of a line that its continuations are indented to."""
 
 
 def prepare_streams() -> None:

@@ -19,7 +19,7 @@ IMAGE_SUFFIXES: Final = (
 )  # fmt: skip
 TRACE_SUFFIXES: Final = ("asc", "blf", "csv", "db", "log", "mf4", "trc", "gz")
 SLOWEST: Final = 0.1
-"""Of the mock's speeds."""
+"""Smallest speed of the mock, but for 0."""
 _NUMBER: Final = re.compile(r"(0[xX][0-9a-fA-F_]+|[0-9][0-9_]*)([kKmM]?)")
 _SUFFIXES: Final = {"": 1, "k": 1024, "m": 1024 * 1024}
 _KEY_VALUE: Final = re.compile(r"([A-Za-z_]\w*)=(.*)")
@@ -118,9 +118,7 @@ _NODES: Final = (*(each.name.lower() for each in Node), *TARGET_ALIASES)
 
 
 def offers(known: Callable[..., Iterable[str]]) -> Callable[..., list[str]]:
-    """What `shell_complete` of an option takes: the words that begin as typed.
-    `known` is called with the context.
-    """
+    """For `shell_complete`: those words of `known(context)` that begin as typed."""
 
     def complete(ctx: click.Context, _param: click.Parameter, incomplete: str) -> list[str]:
         return [word for word in known(ctx) if word.startswith(incomplete)]

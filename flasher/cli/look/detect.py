@@ -21,7 +21,7 @@ from typing import Any, Final
 LIMIT_S: Final = 4.5
 """For everything together. The slowest honest back end (socketcand) listens for 4 s."""
 _MARK: Final = "detected: "
-"""Begins the lines that are answers; libraries say what they like."""
+"""Begins the lines that are answers: vendors' libraries print too."""
 _LIFE_S: Final = 30.0
 """A process whose parent was killed ends itself after this."""
 _SLICE_S: Final = 0.2

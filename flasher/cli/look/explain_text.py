@@ -6,7 +6,7 @@ import time
 from collections.abc import Iterator
 from typing import Final
 
-from flasher.cli.output import byte_count, counted, duration
+from flasher.cli.output import byte_count, counted, duration, spread_ms
 from flasher.prose import prose
 from flasher.trace.story import (
     BusFigures,
@@ -149,15 +149,7 @@ def _link_lines(link: LinkReport) -> Iterator[str]:
 def _times(name: str, figures: Distribution | None) -> str:
     if figures is None:
         return f"    {name + ':':<12} nothing to measure"
-    values = (
-        figures.minimum_s,
-        figures.median_s,
-        figures.p95_s,
-        figures.p99_s,
-        figures.maximum_s,
-    )
-    text = " / ".join(f"{value * 1000:.2f}" for value in values)
-    return f"    {name + ':':<12} {text} ms (min / median / p95 / p99 / max)"
+    return f"    {name + ':':<12} {spread_ms(figures)} ms (min / median / p95 / p99 / max)"
 
 
 def _bus_lines(bus: BusFigures, bitrate_bps: int) -> Iterator[str]:

@@ -12,15 +12,14 @@ from flasher.cli.documents import (
     PlanDocument,
     SegmentDocument,
 )
-from flasher.cli.output import Verdict, byte_count, counted, duration
+from flasher.cli.output import ClosingLine, byte_count, counted, duration, spread_ms
 from flasher.errors import FlasherError, InterruptedByUserError
 from flasher.events import CheckMade
 from flasher.host.options import UpgradeOptions, gaps_s
 from flasher.host.outcome import DeviceLeft, Outcome
 from flasher.host.session import Result
 from flasher.host.table import Ending
-from flasher.host.verify import Level, Verification, possible_levels
-from flasher.host.verify import Verdict as Verified
+from flasher.host.verify import Level, Verdict, Verification, possible_levels
 from flasher.image.cortexm import VectorTable, vector_table
 from flasher.image.image import Image
 from flasher.image.plan import Plan
@@ -28,7 +27,7 @@ from flasher.image.release import names_of
 from flasher.prose import prose
 from flasher.protocol.spec import DIALECTS
 from flasher.protocol.text import printable
-from flasher.trace.figures import Distribution, LinkReport
+from flasher.trace.figures import LinkReport
 
 _NO_QUERY = ": the document gives this target no query for it"
 
@@ -129,8 +128,8 @@ _LEFT: Final = {
 }
 
 
-def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Verdict:
-    """The last line of an upgrade that was carried out, or was not needed."""
+def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> ClosingLine:
+    """The last line of an upgrade that was carried out or was not needed."""
     outcome, node = result.outcome, result.outcome.target.node.name
     took = f"  {took_s:.1f} s"
     error = result.error()
@@ -138,13 +137,13 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Ve
         left = "" if outcome.ok else f"; {_LEFT[outcome.device_left]}"
         return failed(error, left + took)
     if not result.ok:
-        return Verdict("NOTHING TO DO", f"{node}: {outcome.detail}{took}", "green")
+        return ClosingLine("NOTHING TO DO", f"{node}: {outcome.detail}{took}", "green")
     was = f", was {result.previous_version}" if result.previous_version else ""
     verification = result.verification
     remark = "memory read back" if verification.level is Level.MEMORY else "version read back"
-    if verification.verdict is Verified.NOT_ASKED and result.running_version is None:
+    if verification.verdict is Verdict.NOT_ASKED and result.running_version is None:
         remark = "not asked" if _has_query(result) else "no version query"
-    elif verification.verdict is Verified.VERSION_UNJUDGED:
+    elif verification.verdict is Verdict.VERSION_UNJUDGED:
         remark = "the image names no version to compare with"
     if outcome.ending is Ending.CONFIRMED_BY_VERSION:
         remark += ", but it did not say complete"
@@ -154,24 +153,24 @@ def verdict_of(result: Result, checks: Iterable[CheckMade], took_s: float) -> Ve
         text = f"{node} confirmed the image{was}; what runs is not known ({remark})"
     else:
         text = f"{node} runs {result.running_version}{was} ({remark})"
-    is_sure = verification.verdict in (Verified.VERSION_RIGHT, Verified.MEMORY_RIGHT)
+    is_sure = verification.verdict in (Verdict.VERSION_RIGHT, Verdict.MEMORY_RIGHT)
     is_sure &= outcome.ending is Ending.COMPLETED and not warnings and not result.shutdown_heard
-    return Verdict("OK", text + took, "green" if is_sure else "yellow")
+    return ClosingLine("OK", text + took, "green" if is_sure else "yellow")
 
 
 _LINE_MAX: Final = 120
-"""Of what failed: a remark in brackets stands in the error alone where it makes more of it."""
+"""Characters of what failed: in a longer text a remark in brackets is left out."""
 
 
-def failed(error: FlasherError, more: str = "") -> Verdict:
-    """The last line of an upgrade that was not. The error itself is told in full above it."""
+def failed(error: FlasherError, more: str = "") -> ClosingLine:
+    """The last line of an upgrade that failed; the error stands in full above it."""
     word = "STOPPED" if isinstance(error, InterruptedByUserError) else "FAILED"
     what = error.what.partition(" (" if more else ". ")[0].removesuffix(".")
     if len(what) > _LINE_MAX:
         what = what.partition(" (")[0]
     if error.needs_rescue and not more:
         more = "; it has no application now, or perhaps none"
-    return Verdict(word, what + more, "red")
+    return ClosingLine(word, what + more, "red")
 
 
 def summary_lines(result: Result, plan: Plan) -> list[str]:
@@ -194,7 +193,7 @@ def summary_lines(result: Result, plan: Plan) -> list[str]:
 def link_lines(report: LinkReport) -> list[str]:
     """How long each end took, as min / median / p95 / p99 / max."""
     return [
-        f"{end:<13} {_figures(figures)} ms {doing}"
+        f"{end:<13} {spread_ms(figures)} ms {doing}"
         for end, figures, doing in (
             ("device took:", report.device_answer, "to answer a packet"),
             ("host took:", report.host_turnaround, "to send the next (min/median/p95/p99/max)"),
@@ -203,15 +202,10 @@ def link_lines(report: LinkReport) -> list[str]:
     ]
 
 
-def _figures(of: Distribution) -> str:
-    times = (of.minimum_s, of.median_s, of.p95_s, of.p99_s, of.maximum_s)
-    return " / ".join(f"{each * 1000:.2f}" for each in times)
-
-
 def _running(result: Result) -> str:
     """What is known of the application that runs now, and how."""
     verification = result.verification
-    if verification.verdict is Verified.NOT_ASKED:
+    if verification.verdict is Verdict.NOT_ASKED:
         no_query = "" if _has_query(result) else _NO_QUERY
         return result.running_version or f"not asked{no_query}"
     return f"{result.running_version or 'unknown'} ({prose(verification.verdict)})"
