@@ -109,6 +109,10 @@ class Option(_Parameter, rich_click.RichOption):
         super().__init__(*args, **more)
         self.brief = brief or self.required
 
+    def get_error_hint(self, ctx: click.Context | None) -> str:
+        """As people write it."""
+        return "/".join(self.opts)
+
 
 class Argument(_Parameter, rich_click.RichArgument):
     """A positional argument."""
@@ -404,6 +408,9 @@ def usage_error(wrong: click.UsageError, command: str | None) -> UsageError:
     close = getattr(wrong, "possibilities", None)
     said = wrong.message if close else wrong.format_message()
     remedy = f"Did you mean {close[0]}? " if close else ""
+    if ctx is not None and isinstance(ctx.command, Group) and " command" in said:
+        said = said.replace("command", "action")
+        remedy = remedy or f"Actions are {', '.join(ctx.command.commands)}. "
     if ctx is not None and "extra argument" in said:
         remedy += "".join(
             f"{param.opts[-1]} takes one value, and may be repeated. "

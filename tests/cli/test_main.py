@@ -219,3 +219,24 @@ def test_wrong_usage_is_a_json_document_too(flasher: Flasher, words: tuple[str, 
     assert run.code == run.document["exit_code"] == ExitCode.USAGE
     assert run.document["error"]["kind"] == "UsageError"
     assert "Try `flasher flash --help`" in run.err
+
+
+@pytest.mark.parametrize(
+    ("words", "said", "remedy"),
+    [
+        (("flas",), "flasher: No such command 'flas'.", "Did you mean flash?"),
+        (("flash", "--verfy", "none"), "flasher flash: No such option '--verfy'.", "--verify"),
+        (("flash", "x.hex"), "flasher flash: Missing option -t/--target.", "Try `flasher flash"),
+        (("profile", "shw"), "flasher profile: No such action 'shw'.", "Did you mean show?"),
+        (("profile",), "flasher profile: Missing action.", "Actions are check, show."),
+        (("conformance", "--repeat", "0"), "Invalid value for --repeat", "Try `flasher conf"),
+    ],
+)
+def test_wrong_usage_says_what_is_wrong_and_what_was_meant(
+    flasher: Flasher, words: tuple[str, ...], said: str, remedy: str
+) -> None:
+    run = flasher(*words)
+    assert run.code == ExitCode.USAGE
+    assert said in run.err
+    assert remedy in run.err.partition("what to do: ")[2]
+    assert run.out == ""
