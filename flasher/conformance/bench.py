@@ -22,7 +22,7 @@ from flasher.conformance.wire import Encoder, Kind, Received, describe, packet_c
 
 
 class Bench:
-    """Made anew for every case, whose own limit is `limit_s`; never outlives it."""
+    """The bench of one case, which may take `limit_s`."""
 
     def __init__(
         self,
@@ -78,7 +78,7 @@ class Bench:
         return image
 
     def filler(self, packets: int) -> bytes:
-        """Bytes for a transfer that is never ended, so that nobody starts them; by the seed."""
+        """Random bytes, by the seed, for a transfer that is never ended."""
         return self.random.randbytes(packets * 128)
 
     # -- into a transfer --------------------------------------------------------------------------
@@ -90,14 +90,14 @@ class Bench:
         return self.await_message(Kind.BOOT_VERSION)
 
     def wait_to_be_heard(self) -> None:
-        """After the first boot version: until the device takes the update command. That is at once,
-        or when the burst is over (up_04_burst).
+        """After the first boot version, wait until the device takes the update command: not at all,
+        or until the burst is over (up_04_burst).
         """
         if self.choice("up_04_burst") != "accepted":
             self.wait_for_window()
 
     def wait_for_window(self) -> None:
-        """After the first boot version: until the middle of the window behind the last one."""
+        """After the first boot version, wait for the middle of the window behind the last one."""
         gaps = self.number("versions") - 1
         self.wait(gaps * self.limit("version_spacing_s") + self.limit("window_s") / 2)
         self.forget()
@@ -124,7 +124,7 @@ class Bench:
         return found
 
     def start_transfer(self, size_bytes: int) -> None:
-        """From the running application to request transfer."""
+        """Reset the running application and get request transfer."""
         self.reset_to_bootloader()
         self.update(size_bytes)
 
@@ -166,7 +166,7 @@ class Bench:
         self.measure("end of transfer to complete", heard.at - sent.left_at)
 
     def finish(self, image: bytes, first: int = 1) -> None:
-        """The rest of a transfer from packet `first` on, its end, and the application it starts."""
+        """Send the packets from `first` on and the end; the application of the image has to run."""
         self.packets(image, first)
         self.end_transfer()
         self.check_image(image)
@@ -221,17 +221,17 @@ class Bench:
         self.is_off = False
 
     def power_cycle(self, off_s: float = 0.5) -> None:
-        """Off, a pause, on; what was heard until then is forgotten. Raises Unsupported."""
+        """Switch off and, after `off_s`, on; earlier messages are discarded. Raises Unsupported."""
         self.power_off()
         self.wait(off_s)
         self.forget()
         self.power_on()
 
     def leave_transfer(self) -> None:
-        """Abandon a transfer and be at an announcing bootloader without an application: by reset or
-        a pause where the profile says that they end a transfer; where they do not, by power.
+        """Abandon a transfer, so that the bootloader announces itself without an application: by
+        reset or by a pause where the profile says that they end a transfer, else by power.
 
-        Raises Unsupported where nothing of it is there.
+        Raises Unsupported where none of these is possible.
         """
         self.forget()
         within_s = self.limit("first_version_s")
@@ -250,6 +250,6 @@ class Bench:
             self.await_message(Kind.BOOT_VERSION)
 
     def without_application(self) -> None:
-        """From the running application to an announcing bootloader that has none to start."""
+        """Erase the application, and let the bootloader announce itself."""
         self.start_transfer(len(self.good_image))
         self.leave_transfer()

@@ -6,12 +6,14 @@ counts with its worst verdict.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Final
 
-from flasher.conformance.json_report import SCHEMA_VERSION, verdict_name
+from pydantic import ValidationError
+
+from flasher.conformance.json_report import REPORT, SCHEMA_VERSION, ReportDocument
 from flasher.conformance.results import CaseVerdict, worst
 from flasher.errors import UsageError
 from flasher.files import JSON_MAX_SIZE, parse_json, read
@@ -22,50 +24,29 @@ THRESHOLD_PERCENT: Final = 10.0
 measurements may be off together."""
 _NOT_JUDGED: Final = frozenset({CaseVerdict.UNSUPPORTED, CaseVerdict.NOT_RUN})
 _RANKS: Final = {verdict: rank for rank, verdict in enumerate(CaseVerdict)} | {CaseVerdict.INFO: 0}
-_VERDICTS: Final = {verdict_name(verdict): verdict for verdict in CaseVerdict}
 _CONDITIONS: Final = ("target", "bitrate_bps", "seed", "timestamp_source", "profile_source")
 
 
 @dataclass(frozen=True)
-class Times:
-    """The times of one name, in seconds."""
+class VerdictChange:
+    """A case whose verdict is another one in the newer run."""
 
-    count: int
-    median_s: float
-    p95_s: float
-    uncertainty_s: float
-
-
-@dataclass(frozen=True)
-class Run:
-    """What is compared of a report."""
-
-    source: str
-    conditions: Mapping[str, str]
-    profile: Mapping[str, object]
-    titles: Mapping[str, str]
-    verdicts: Mapping[str, CaseVerdict]
-    reasons: Mapping[str, str]
-    times: Mapping[str, Times]
-
-
-class Change(NamedTuple):
-    """A case whose verdict is another one; `before` or `after` is None where it was not run."""
-
-    case_id: str
+    id: str
     title: str
     before: CaseVerdict | None
+    """None (null) where it was not judged."""
     after: CaseVerdict | None
     reason: str
     """What the newer run says of it."""
 
 
-class Slowdown(NamedTuple):
+@dataclass(frozen=True)
+class TimeChange:
     """A measured time that changed beyond the threshold."""
 
     name: str
     figure: str
-    """"median" or "p95"."""
+    """median or p95"""
     before_s: float
     after_s: float
 
@@ -77,19 +58,19 @@ class Slowdown(NamedTuple):
 
 @dataclass(frozen=True)
 class Difference:
-    """How the newer run differs from the older one."""
+    """Two runs compared."""
 
-    better: tuple[Change, ...] = ()
-    worse: tuple[Change, ...] = ()
-    new: tuple[Change, ...] = ()
-    gone: tuple[Change, ...] = ()
-    """Judged in the older run, and not in the newer one."""
-    slower: tuple[Slowdown, ...] = ()
-    faster: tuple[Slowdown, ...] = ()
-    unchanged: int = 0
-    threshold_percent: float = THRESHOLD_PERCENT
-    conditions: tuple[str, ...] = ()
-    """What else is not the same in both runs."""
+    threshold_percent: float
+    better: Sequence[VerdictChange]
+    worse: Sequence[VerdictChange]
+    new: Sequence[VerdictChange]
+    gone: Sequence[VerdictChange]
+    """Judged in the older run, not in the newer one."""
+    slower: Sequence[TimeChange]
+    faster: Sequence[TimeChange]
+    unchanged: int
+    conditions: Sequence[str]
+    """What else differs between the runs."""
 
     @property
     def is_worse(self) -> bool:
@@ -99,77 +80,101 @@ class Difference:
         )
 
 
-def read_run(path: Path) -> Run:
+def read_report(path: Path) -> ReportDocument:
     """Read a report. Raises UsageError for a file that cannot be read or is no report."""
-    shown = printable(str(path))
     raw = read(path, JSON_MAX_SIZE, what="report")
     try:
         document = parse_json(raw)
     except ValueError as error:
-        raise _no_report(
-            shown, f"it is no JSON that can be read ({printable(str(error))})"
-        ) from error
+        why = f"it is no JSON that can be read ({printable(str(error))})"
+        raise _no_report(path, why) from error
     if isinstance(document, dict) and isinstance(document.get("report"), dict):
         document = document["report"]  # what --json prints
     if not isinstance(document, dict) or "report_schema" not in document:
-        raise _no_report(shown, "it holds no conformance report")
+        raise _no_report(path, "it holds no conformance report")
     if document["report_schema"] != SCHEMA_VERSION:
-        raise _no_report(
-            shown,
-            f"its schema is version {printable(str(document['report_schema'])[:20])}, "
-            f"and this program reads {SCHEMA_VERSION}",
-        )
+        found = printable(str(document["report_schema"])[:20])
+        why = f"its schema is version {found}, and this program reads {SCHEMA_VERSION}"
+        raise _no_report(path, why)
     try:
-        return _run_of(document, shown)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise _no_report(shown, "a part of it is missing or wrong") from error
+        return REPORT.validate_python(document)
+    except ValidationError as error:
+        wrong = error.errors()[0]
+        place = ".".join(map(str, wrong["loc"]))
+        why = f"a part of it is missing or wrong ({printable(place)[:80]}: {wrong['msg']})"
+        raise _no_report(path, why) from error
 
 
-def compare(old: Run, new: Run, threshold_percent: float = THRESHOLD_PERCENT) -> Difference:
-    """What is different in `new`."""
-    better: list[Change] = []
-    worse: list[Change] = []
-    fresh: list[Change] = []
-    gone: list[Change] = []
-    unchanged = 0
-    for case_id in dict.fromkeys((*new.verdicts, *old.verdicts)):
-        before, after = _judged(old, case_id), _judged(new, case_id)
-        title = new.titles.get(case_id) or old.titles.get(case_id, "")
-        change = Change(case_id, title, before, after, new.reasons.get(case_id, ""))
-        if before is None and after is None:
-            continue
-        if before is None:
-            fresh.append(change)
-        elif after is None:
-            gone.append(change)
-        elif _RANKS[after] == _RANKS[before]:
-            unchanged += 1
-        else:
-            (worse if _RANKS[after] > _RANKS[before] else better).append(change)
-    moved = _moved(old, new, threshold_percent)
-    return Difference(
-        tuple(better),
-        tuple(worse),
-        tuple(fresh),
-        tuple(gone),
-        tuple(one for one in moved if one.after_s > one.before_s),
-        tuple(one for one in moved if one.after_s < one.before_s),
-        unchanged,
-        threshold_percent,
-        tuple(_other_conditions(old, new)),
+def _no_report(path: Path, why: str) -> UsageError:
+    return UsageError(
+        f"{printable(str(path))} is no report of the conformance suite: {why}.",
+        remedy="Compare files that `flasher conformance --json-report FILE` wrote.",
     )
 
 
-def _judged(run: Run, case_id: str) -> CaseVerdict | None:
-    status = run.verdicts.get(case_id)
-    return None if status in _NOT_JUDGED else status
+def compare(
+    old: ReportDocument, new: ReportDocument, threshold_percent: float = THRESHOLD_PERCENT
+) -> Difference:
+    """What is different in `new`."""
+    before, after = _verdicts(old), _verdicts(new)
+    titles = {case.id: case.title for case in (*old.cases, *new.cases)}
+    reasons = _reasons(new)
+    found: dict[str, list[VerdictChange]] = {"better": [], "worse": [], "new": [], "gone": []}
+    unchanged = 0
+    for case_id in dict.fromkeys((*after, *before)):
+        was, is_now = before.get(case_id), after.get(case_id)
+        if was is None:
+            kind = "new"
+        elif is_now is None:
+            kind = "gone"
+        elif _RANKS[is_now] == _RANKS[was]:
+            unchanged += 1
+            continue
+        else:
+            kind = "worse" if _RANKS[is_now] > _RANKS[was] else "better"
+        change = VerdictChange(
+            case_id, titles.get(case_id, ""), was, is_now, reasons.get(case_id, "")
+        )
+        found[kind].append(change)
+    moved = _moved(old, new, threshold_percent)
+    return Difference(
+        threshold_percent=threshold_percent,
+        better=found["better"],
+        worse=found["worse"],
+        new=found["new"],
+        gone=found["gone"],
+        slower=[one for one in moved if one.after_s > one.before_s],
+        faster=[one for one in moved if one.after_s < one.before_s],
+        unchanged=unchanged,
+        conditions=_other_conditions(old, new),
+    )
 
 
-def _moved(old: Run, new: Run, threshold_percent: float) -> list[Slowdown]:
+def _verdicts(report: ReportDocument) -> dict[str, CaseVerdict]:
+    """The worst verdict of every case that was judged."""
+    found: dict[str, list[CaseVerdict]] = {}
+    for result in report.results:
+        found.setdefault(result.id, []).append(result.status)
+    ranked = {case_id: worst(verdicts) for case_id, verdicts in found.items()}
+    return {case_id: each for case_id, each in ranked.items() if each not in _NOT_JUDGED}
+
+
+def _reasons(report: ReportDocument) -> dict[str, str]:
+    """What the first result of each case says that has something to say."""
+    found: dict[str, str] = {}
+    for result in report.results:
+        reason = str(result.findings[0]) if result.findings else result.note
+        if reason:
+            found.setdefault(result.id, reason)
+    return found
+
+
+def _moved(old: ReportDocument, new: ReportDocument, threshold_percent: float) -> list[TimeChange]:
     """Times of both runs whose median or 95th percentile is another one."""
     found = []
-    for name, after in new.times.items():
-        before = old.times.get(name)
+    by_name = {times.name: times for times in old.times}
+    for after in new.times:
+        before = by_name.get(after.name)
         if before is None:
             continue
         unsure_s = before.uncertainty_s + after.uncertainty_s
@@ -179,65 +184,19 @@ def _moved(old: Run, new: Run, threshold_percent: float) -> list[Slowdown]:
         ):
             grown_s = abs(is_s - was_s)
             if grown_s > unsure_s and grown_s > min(was_s, is_s) * threshold_percent / 100:
-                found.append(Slowdown(name, figure, was_s, is_s))
+                found.append(TimeChange(after.name, figure, was_s, is_s))
                 break
     return found
 
 
-def _other_conditions(old: Run, new: Run) -> list[str]:
-    found = [
-        f"{key}: {old.conditions[key]}, then {new.conditions[key]}"
-        for key in _CONDITIONS
-        if old.conditions[key] != new.conditions[key]
+def _other_conditions(old: ReportDocument, new: ReportDocument) -> list[str]:
+    pairs = [(key, getattr(old, key), getattr(new, key)) for key in _CONDITIONS]
+    pairs += [
+        (f"profile, {key[:60]}", old.profile.get(key), new.profile.get(key))
+        for key in dict.fromkeys((*old.profile, *new.profile))
     ]
-    for key in dict.fromkeys((*old.profile, *new.profile)):
-        before, after = old.profile.get(key), new.profile.get(key)
-        if before != after:
-            shown = (printable(str(value)[:60]) for value in (key, before, after))
-            found.append("profile, {}: {}, then {}".format(*shown))
-    return found
-
-
-def _run_of(document: dict[str, Any], source: str) -> Run:
-    verdicts: dict[str, list[CaseVerdict]] = {}
-    reasons: dict[str, str] = {}
-    for result in document["results"]:
-        case_id = _shown(result["id"])
-        status = _VERDICTS[result["status"]]
-        verdicts.setdefault(case_id, []).append(status)
-        findings = result["findings"]
-        if findings and case_id not in reasons:
-            step = f"{findings[0]['step']}: " if findings[0]["step"] else ""
-            reasons[case_id] = _shown(
-                f"{step}expected {findings[0]['expected']}; got {findings[0]['got']}"
-            )
-        elif result["note"]:
-            reasons.setdefault(case_id, _shown(result["note"]))
-    return Run(
-        source,
-        {key: _shown(document[key]) for key in _CONDITIONS},
-        dict(document["profile"]),
-        {_shown(case["id"]): _shown(case["title"]) for case in document["cases"]},
-        {case_id: worst(found) for case_id, found in verdicts.items()},
-        reasons,
-        {
-            _shown(one["name"]): Times(
-                int(one["count"]),
-                float(one["median_s"]),
-                float(one["p95_s"]),
-                float(one["uncertainty_s"]),
-            )
-            for one in document["times"]
-        },
-    )
-
-
-def _shown(text: object) -> str:
-    return printable(str(text))
-
-
-def _no_report(shown: str, why: str) -> UsageError:
-    return UsageError(
-        f"{shown} is no report of the conformance suite: {why}.",
-        remedy="Compare files that `flasher conformance --json-report FILE` wrote.",
-    )
+    return [
+        f"{printable(key)}: {printable(str(was)[:60])}, then {printable(str(is_now)[:60])}"
+        for key, was, is_now in pairs
+        if was != is_now
+    ]

@@ -23,7 +23,6 @@ from flasher.conformance.results import (
 from flasher.protocol.frame import Frame
 from flasher.report import chart, spread
 from flasher.report.base import Status, render_page
-from flasher.report.scale import duration_text
 from flasher.trace.decoder import BusEvent, Decoder
 from flasher.trace.figures import Distribution
 
@@ -62,13 +61,6 @@ _CHECK_COLOURS: Final = {
 """Outcomes with their colours, in the order in which checks are listed."""
 
 
-class Fact(NamedTuple):
-    """A line about the run or a case."""
-
-    name: str
-    text: str
-
-
 class TraceRow(NamedTuple):
     """A decoded message, and the text of its fields."""
 
@@ -83,8 +75,7 @@ class CaseView(NamedTuple):
     result: CaseResult
     title: str
     status: Status
-    facts: Sequence[Fact]
-    """Requirements, choices of the profile, seed, duration, and the like."""
+    trace_file: str
     replay: str
     checks: Sequence[tuple[Check, Status]]
     infos: Sequence[str]
@@ -123,31 +114,13 @@ def html_page(
         report=report,
         status=Status.GOOD if report.ok else Status.BAD,
         word="passed" if report.ok else "not passed",
-        facts_of_run=_facts(report, started_at),
+        started_at=started_at,
         groups=groups,
         troubled=[case for cases in groups.values() for case in cases if case.status is Status.BAD],
         traces_open=TRACES_OPEN,
         others={title: cases for title, cases in others.items() if cases},
         times=_times(report),
-        times_text=_times_text(report),
-        profile=[Fact(key, str(value)) for key, value in report.profile.items()],
     )
-
-
-def _facts(report: RunReport, started_at: str) -> Sequence[Fact]:
-    facts = [
-        Fact("target", f"{report.target}, at {report.bitrate_bps // 1000} kbit/s"),
-        Fact("started", started_at),
-        Fact("time on the bus", duration_text(report.duration_s)),
-        Fact("seed", report.seed + (", strict" if report.strict else "")),
-        Fact("good image at the end", report.final_image or "not flashed: no case was run"),
-    ]
-    if report.not_selected:
-        facts.append(Fact("not selected", f"{len(report.not_selected)} cases"))
-    if report.host_cases:
-        told = f"{len(report.host_cases)} cases of the catalogue are about the tool, not the device"
-        facts.append(Fact("no part of this", told))
-    return facts
 
 
 def _times(report: RunReport) -> Sequence[TimesView]:
@@ -164,16 +137,6 @@ def _times(report: RunReport) -> Sequence[TimesView]:
     return views
 
 
-def _times_text(report: RunReport) -> str:
-    source = f"Time stamps: {report.timestamp_source}"
-    if not report.uncertainty_s:
-        return f"{source}, exact."
-    return (
-        f"{source}; one of them may be off by {duration_text(report.uncertainty_s)}. A time that "
-        "is nearer to its limit than that is inconclusive."
-    )
-
-
 def _case(text: CaseText, result: CaseResult, replay: str, trace_file: str) -> CaseView:
     colour = _COLOURS[result.verdict]
     trace, trace_text = _trace(result, is_bad=colour is not Status.GOOD)
@@ -185,30 +148,13 @@ def _case(text: CaseText, result: CaseResult, replay: str, trace_file: str) -> C
         result,
         title=text.title + repeat,
         status=colour,
-        facts=_case_facts(text, result, trace_file),
+        trace_file=trace_file,
         replay=replay if colour in (Status.BAD, Status.WARNING) else "",
         checks=[(check, _CHECK_COLOURS[check.outcome]) for check in checks[:CHECKS_SHOWN]],
         infos=result.infos[:_INFOS_SHOWN],
         trace=trace,
         trace_text=trace_text,
     )
-
-
-def _case_facts(text: CaseText, result: CaseResult, trace_file: str) -> Sequence[Fact]:
-    facts = []
-    if text.requires:
-        facts.append(Fact("requirements", ", ".join(text.requires)))
-    if text.choices:
-        told = ", ".join(f"{key} = {value}" for key, value in text.choices.items())
-        facts.append(Fact("profile", told))
-    if text.deviation:
-        still = "; it passes all the same" if result.deviation_resolved else ""
-        facts.append(Fact("documented deviation", text.deviation + still))
-    if result.seed:
-        facts.append(Fact("seed, time", f"{result.seed}, {duration_text(result.duration_s)}"))
-    if trace_file:
-        facts.append(Fact("trace file", trace_file))
-    return facts
 
 
 # -- frames ---------------------------------------------------------------------------------------

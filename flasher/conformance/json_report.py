@@ -7,18 +7,21 @@ runs with one seed differ in nothing else. Frames are not in it, they go into tr
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from typing import Annotated, Final
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, Final
 
-from typing_extensions import TypedDict
+from pydantic import TypeAdapter
 
 from flasher.conformance.reports import ByResult, distribution
 from flasher.conformance.results import (
     CaseResult,
     CaseText,
     CaseVerdict,
+    Check,
     CheckOutcome,
     Measurement,
+    Rescue,
     RunReport,
 )
 
@@ -29,34 +32,8 @@ CHECKS_KEPT: Final = 50
 """Checks of one case that are told, those that did not pass; all are counted."""
 
 
-class TextDocument(TypedDict):
-    """A case of the catalogue, as far as the run is concerned with it."""
-
-    id: str
-    group: str
-    title: str
-    """For a case that cannot be run, the reason."""
-    clause: str
-    stimulus: str
-    expectation: str
-    requires: list[str]
-    choices: dict[str, str]
-    """Keys of the profile that it is judged by, with their values."""
-    deviation: str
-    """The profile's reason why the product differs; empty for none."""
-
-
-class CaseCheckDocument(TypedDict):
-    """One thing that was looked at and did not pass."""
-
-    step: str
-    outcome: Annotated[str, CheckOutcome]
-    expected: str
-    got: str
-    at_s: float
-
-
-class OutcomesDocument(TypedDict):
+@dataclass(frozen=True)
+class CheckCounts:
     """How many checks of a case ended how."""
 
     passed: int
@@ -65,14 +42,38 @@ class OutcomesDocument(TypedDict):
     unsupported: int
 
 
-class HistogramDocument(TypedDict):
+@dataclass(frozen=True)
+class ResultDocument:
+    """What came of one run of a case."""
+
+    id: str
+    repeat: int
+    status: CaseVerdict
+    seed: str
+    note: str
+    checks: CheckCounts
+    findings: Sequence[Check]
+    """The checks that did not pass, the first ones of many."""
+    infos: Sequence[str]
+    deviation_resolved: bool
+    """The profile documents a deviation, but the case passes."""
+    duration_s: float
+    replay: str
+    """The command that runs this case alone, with its seed; empty where there is none."""
+    trace_file: str
+    """Name of the file with its frames; empty without one."""
+
+
+@dataclass(frozen=True)
+class HistogramDocument:
     """How often values fell into bins of one width: as many counts as edges, less one."""
 
-    edges_s: list[float]
-    counts: list[int]
+    edges_s: Sequence[float]
+    counts: Sequence[int]
 
 
-class TimesDocument(TypedDict):
+@dataclass(frozen=True)
+class TimesDocument:
     """How the times of one name are spread. Percentiles are values that were measured."""
 
     name: str
@@ -87,35 +88,8 @@ class TimesDocument(TypedDict):
     histogram: HistogramDocument
 
 
-class ResultDocument(TypedDict):
-    """What came of one run of a case."""
-
-    id: str
-    repeat: int
-    status: Annotated[str, CaseVerdict]
-    seed: str
-    note: str
-    checks: OutcomesDocument
-    findings: list[CaseCheckDocument]
-    """The checks that did not pass, the first ones of many."""
-    infos: list[str]
-    deviation_resolved: bool
-    """The profile documents a deviation, but the case passes."""
-    duration_s: float
-    replay: str
-    """The command that runs this case alone, with its seed; empty where there is none."""
-    trace_file: str
-    """Name of the file with its frames; empty without one."""
-
-
-class RescueDocument(TypedDict):
-    """A case after which only power brought the device back."""
-
-    id: str
-    how: str
-
-
-class ReportDocument(TypedDict):
+@dataclass(frozen=True)
+class ReportDocument:
     """A run of the conformance suite."""
 
     report_schema: int
@@ -147,26 +121,21 @@ class ReportDocument(TypedDict):
     """"verified", or what came of the good image at the end."""
     counts: dict[str, int]
     """How many results have each status."""
-    cases: list[TextDocument]
-    results: list[ResultDocument]
-    rescues: list[RescueDocument]
-    times: list[TimesDocument]
-    not_selected: list[str]
-    host_cases: list[str]
+    cases: Sequence[CaseText]
+    results: Sequence[ResultDocument]
+    rescues: Sequence[Rescue]
+    times: Sequence[TimesDocument]
+    not_selected: Sequence[str]
+    host_cases: Sequence[str]
     """Cases of the catalogue about the tool, which are no part of this suite."""
 
 
-def verdict_name(verdict: CaseVerdict) -> str:
-    """A verdict as JSON has it."""
-    return verdict.name.lower()
+REPORT: Final = TypeAdapter(ReportDocument)
+"""Reads and writes the document. Raises pydantic.ValidationError for what is none."""
 
 
 def report_document(
-    report: RunReport,
-    *,
-    started_at: str,
-    replays: ByResult,
-    trace_files: ByResult,
+    report: RunReport, *, started_at: str, replays: ByResult, trace_files: ByResult
 ) -> ReportDocument:
     """The document of a run. `replays` and `trace_files` are by case id and repeat."""
     return ReportDocument(
@@ -188,30 +157,16 @@ def report_document(
         killed_by=report.killed_by,
         not_upgradable=report.not_upgradable,
         final_image=report.final_image,
-        counts={verdict_name(verdict): report.count(verdict) for verdict in CaseVerdict},
-        cases=[_text(text) for text in report.cases],
+        counts={verdict.value: report.count(verdict) for verdict in CaseVerdict},
+        cases=report.cases,
         results=[
             _result(result, replays.get(result.key, ""), trace_files.get(result.key, ""))
             for result in report.results
         ],
-        rescues=[RescueDocument(id=rescue.case_id, how=rescue.how) for rescue in report.rescues],
+        rescues=report.rescues,
         times=[_times(name, found) for name, found in report.times().items()],
-        not_selected=list(report.not_selected),
-        host_cases=list(report.host_cases),
-    )
-
-
-def _text(text: CaseText) -> TextDocument:
-    return TextDocument(
-        id=text.id,
-        group=text.group,
-        title=text.title,
-        clause=text.clause,
-        stimulus=text.stimulus,
-        expectation=text.expectation,
-        requires=list(text.requires),
-        choices=dict(text.choices),
-        deviation=text.deviation,
+        not_selected=report.not_selected,
+        host_cases=report.host_cases,
     )
 
 
@@ -220,26 +175,17 @@ def _result(result: CaseResult, replay: str, trace_file: str) -> ResultDocument:
     return ResultDocument(
         id=result.case_id,
         repeat=result.repeat,
-        status=verdict_name(result.verdict),
+        status=result.verdict,
         seed=result.seed,
         note=result.note,
-        checks=OutcomesDocument(
+        checks=CheckCounts(
             passed=result.count(CheckOutcome.PASS),
             failed=result.count(CheckOutcome.FAIL),
             inconclusive=result.count(CheckOutcome.INCONCLUSIVE),
             unsupported=result.count(CheckOutcome.UNSUPPORTED),
         ),
-        findings=[
-            CaseCheckDocument(
-                step=check.step,
-                outcome=check.outcome.name.lower(),
-                expected=check.expected,
-                got=check.got,
-                at_s=check.at_s,
-            )
-            for check in bad[:CHECKS_KEPT]
-        ],
-        infos=list(result.infos),
+        findings=bad[:CHECKS_KEPT],
+        infos=result.infos,
         deviation_resolved=result.deviation_resolved,
         duration_s=result.duration_s,
         replay=replay,
@@ -247,35 +193,34 @@ def _result(result: CaseResult, replay: str, trace_file: str) -> ResultDocument:
     )
 
 
-def _times(name: str, measurements: Iterable[Measurement]) -> TimesDocument:
-    found = list(measurements)
-    spread = distribution(found)
+def _times(name: str, found: Sequence[Measurement]) -> TimesDocument:
+    values_s = [one.value_s for one in found]
     return TimesDocument(
         name=name,
-        count=spread.count,
-        minimum_s=spread.minimum_s,
-        median_s=spread.median_s,
-        p95_s=spread.p95_s,
-        p99_s=spread.p99_s,
-        maximum_s=spread.maximum_s,
+        **asdict(distribution(found)),
         uncertainty_s=max(one.uncertainty_s for one in found),
-        histogram=_histogram([one.value_s for one in found]),
+        histogram=_histogram(values_s),
     )
 
 
-def _histogram(values: list[float]) -> HistogramDocument:
-    low, high = min(values), max(values)
-    width = (high - low) / BINS
-    if width <= 0:
-        return HistogramDocument(edges_s=[low, high], counts=[len(values)])
+def _histogram(values_s: Sequence[float]) -> HistogramDocument:
+    low_s, high_s = min(values_s), max(values_s)
+    width_s = (high_s - low_s) / BINS
+    if width_s <= 0:
+        return HistogramDocument(edges_s=[low_s, high_s], counts=[len(values_s)])
     counts = [0] * BINS
-    for value in values:
-        counts[min(BINS - 1, int((value - low) / width))] += 1
-    return HistogramDocument(
-        edges_s=[low + index * width for index in range(BINS)] + [high], counts=counts
-    )
+    for value_s in values_s:
+        counts[min(BINS - 1, int((value_s - low_s) / width_s))] += 1
+    edges_s = [low_s + index * width_s for index in range(BINS)] + [high_s]
+    return HistogramDocument(edges_s=edges_s, counts=counts)
+
+
+def to_json(document: ReportDocument) -> dict[str, Any]:
+    """The document in JSON's types."""
+    plain: dict[str, Any] = REPORT.dump_python(document, mode="json")
+    return plain
 
 
 def to_bytes(document: ReportDocument) -> bytes:
     """The document as a file, a key a line, so that two of them can be compared as text too."""
-    return (json.dumps(document, indent=1) + "\n").encode("ascii")
+    return (json.dumps(to_json(document), indent=1) + "\n").encode("ascii")

@@ -107,7 +107,7 @@ class PluginRun:
         self._begin()
         result = self._run.take(case)
         self.measurements.add(result.measurements)
-        told = f"{result.verdict.value}: {result.reason}"
+        told = f"{result.verdict.text}: {result.reason}"
         match result.verdict:
             case CaseVerdict.PASS | CaseVerdict.INFO:
                 return

@@ -84,14 +84,14 @@ class RealPort:
         return None
 
     def _moment(self) -> float:
-        """When the frame received last was there; never before the one in front of it."""
+        """The time of the frame received last; never before that of the frame before it."""
         stamped_at = None if self._stamps is None else self._stamps.received_at
         self._last_at = max(self._last_at, self.now() if stamped_at is None else stamped_at)
         return self._last_at
 
     def _take_own(self, frame: Frame) -> bool:
-        """True for a frame of our own that came back. Where all of them should, one that was lost
-        on the way does not keep those behind it from being known.
+        """True for an own frame that came back. With `echoes`, a lost echo does not hide the
+        following ones.
         """
         if self.echoes and frame in self._own:
             while self._own.popleft() != frame:

@@ -96,7 +96,7 @@ def _junit_case(text: CaseText, result: CaseResult, report: RunReport, replay: s
     ended = _JUNIT_RESULTS.get(result.verdict, JUnitResult.PASSED)
     if result.verdict is CaseVerdict.NOT_RUN and _was_wanted(report):
         ended = JUnitResult.SKIPPED
-    word = result.verdict.value
+    word = result.verdict.text
     message, kind, details = result.reason or word, word, ""
     if ended is JUnitResult.SKIPPED:
         message, kind = f"{word}: {message}", ""
@@ -120,7 +120,7 @@ def _junit_case(text: CaseText, result: CaseResult, report: RunReport, replay: s
 
 
 def _was_wanted(report: RunReport) -> bool:
-    """True when somebody ended the run, or its own limit did: nothing is wrong then."""
+    """True when the run was stopped on request or by its time limit, after some verdicts."""
     return not (report.adapter_failed or report.killed_by) and any(
         result.verdict is not CaseVerdict.NOT_RUN and result.checks for result in report.results
     )
@@ -137,7 +137,7 @@ def _details(text: CaseText, result: CaseResult, replay: str) -> str:
 
 
 def _junit_run(report: RunReport) -> list[JUnitCase]:
-    """The run itself as two cases, so that a broken one is not green."""
+    """The run itself as two test cases, so that an incomplete run does not pass."""
     broken = report.stopped or report.not_upgradable
     whole = JUnitResult.ERROR if broken else JUnitResult.PASSED
     if not report.final_image:

@@ -1,7 +1,7 @@
 """Brings the device to the known state: the good image's application runs.
 
-Gently first, by the protocol, then by power. Says what it took, so that a case that leaves a device
-unreachable is told from one that merely leaves an upgrade unfinished.
+The protocol is tried first, then a power cycle. Which one was needed tells a case that leaves the
+device unreachable from one that only leaves an upgrade unfinished.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ BY_POWER: Final = "power cycle, then upgrade"
 
 
 class Restored(NamedTuple):
-    """How it went: `how` is one of the texts above, empty when nothing helped for `reason`."""
+    """`how` is one of the texts above; empty, with a `reason`, when no way succeeded."""
 
     how: str
     reason: str = ""
@@ -98,7 +98,7 @@ def needs_power(profile: ConformanceProfile) -> bool:
 
 
 def _limit_s(subject: Subject, profile: ConformanceProfile) -> float:
-    """How long one way may take: all waits that it can have, and the transfer at a slow pace."""
+    """The time limit of one way: all its waits, and the transfer at a slow pace."""
     limit = profile.limit
     waits_s = 3 * sum(
         map(limit, ("first_version_s", "pause_s", "erase_s", "complete_s", "start_s"))
@@ -116,8 +116,8 @@ def _runs(bench: Bench) -> str:
 
 
 def _upgrade(bench: Bench) -> str:
-    """By the protocol: the gentle way first, so that a device is not blamed for what a reset in the
-    midst of a transfer (TX-13), or an update command there (UP-08), does to it.
+    """Upgrade by the protocol, in a way that does not depend on what a reset (TX-13) or an update
+    command (UP-08) does during a transfer.
     """
     blind = bench.choice("up_08") == "starts_over"
     reset = not blind or _may_run(bench)
@@ -129,7 +129,7 @@ def _upgrade(bench: Bench) -> str:
 
 
 def _may_run(bench: Bench) -> bool:
-    """True when an application runs, or when nobody can ask for it."""
+    """True when an application runs, or when the target has no query to find out."""
     return not bench.encoder.has_version_query or bench.application_version(_ASK_S) is not None
 
 

@@ -24,11 +24,16 @@ class CaseVerdict(Enum):
     """Failed, as the profile says that it does."""
     INCONCLUSIVE = "inconclusive"
     """The uncertainty of the measurement is greater than the margin."""
-    NOT_RUN = "not run"
+    NOT_RUN = "not_run"
     """The run stopped before it."""
     ERROR = "error"
     """The case itself went wrong: the suite or the adapter, not the device."""
     FAIL = "fail"
+
+    @property
+    def text(self) -> str:
+        """As reports name it."""
+        return self.value.replace("_", " ")
 
 
 class CheckOutcome(Enum):
@@ -81,6 +86,7 @@ class CaseText:
     id: str
     group: str
     title: str
+    """For a case that cannot be run, the reason."""
     clause: str = ""
     stimulus: str = ""
     expectation: str = ""
@@ -137,9 +143,9 @@ class CaseResult:
 
 @dataclass(frozen=True)
 class Rescue:
-    """A case after which the device was not reachable as it should be, and what brought it back."""
+    """A case after which only power brought the device back."""
 
-    case_id: str
+    id: str
     how: str
 
 
@@ -202,18 +208,20 @@ class RunReport:
         """The run in one line."""
         return count_text(self.results) or "no case"
 
-    def by_case(self) -> list[tuple[CaseText, list[CaseResult]]]:
-        """Every case with its results, in the order of the catalogue."""
+    def by_case(self) -> list[tuple[CaseText, CaseResult]]:
+        """Every result with its case, in the order of the catalogue."""
         return [
-            (text, [result for result in self.results if result.case_id == text.id])
+            (text, result)
             for text in self.cases
+            for result in self.results
+            if result.case_id == text.id
         ]
 
     def by_group(self) -> dict[str, list[tuple[CaseText, CaseResult]]]:
-        """Every result with its case, by group, in the order of the catalogue."""
+        """The same, by group."""
         found: dict[str, list[tuple[CaseText, CaseResult]]] = {}
-        for text, results in self.by_case():
-            found.setdefault(text.group, []).extend((text, result) for result in results)
+        for text, result in self.by_case():
+            found.setdefault(text.group, []).append((text, result))
         return found
 
     def times(self) -> dict[str, list[Measurement]]:
@@ -225,7 +233,7 @@ class RunReport:
         return found
 
     def remarks(self) -> list[str]:
-        """What a reader must know of how the run itself went; empty for one to its planned end."""
+        """Remarks about the run itself, such as an early end; empty for a regular one."""
         lines = []
         if self.stopped:
             lines.append(f"the run ended early: {self.stopped}")
@@ -236,7 +244,7 @@ class RunReport:
                 "the good image could not be flashed before the first case, so that cases about a "
                 f"running application had none: {self.not_upgradable}"
             )
-        lines += [f"after {rescue.case_id}: {rescue.how}" for rescue in self.rescues]
+        lines += [f"after {rescue.id}: {rescue.how}" for rescue in self.rescues]
         if self.resolved_deviations:
             named = ", ".join(dict.fromkeys(self.resolved_deviations))
             lines.append(f"deviations in the profile that are none any more: {named}")
@@ -252,7 +260,7 @@ def count_text(results: Iterable[CaseResult]) -> str:
     """How many results have each verdict, from the best to the worst; "" for none."""
     verdicts = [result.verdict for result in results]
     return ", ".join(
-        f"{verdicts.count(verdict)} {verdict.value}"
+        f"{verdicts.count(verdict)} {verdict.text}"
         for verdict in CaseVerdict
         if verdict in verdicts
     )
@@ -262,11 +270,11 @@ def count_text(results: Iterable[CaseResult]) -> str:
 
 
 class CaseEnded(Exception):  # noqa: N818  most of them are no errors
-    """Base of what ends a case before its last line; the text is the reason."""
+    """Base of the exceptions that end a case early; the text is the reason."""
 
 
 class CaseStopped(CaseEnded):
-    """A check failed, and what follows would judge nothing; the check is recorded."""
+    """A check failed that the rest of the case depends on; the check is recorded."""
 
 
 class Unsupported(CaseEnded):
@@ -282,4 +290,4 @@ class DeviceCrashed(CaseEnded):
 
 
 class RunStopped(CaseEnded):
-    """Somebody wants the run to end."""
+    """The run was asked to end."""

@@ -64,7 +64,7 @@ _PLAIN: Final = RunOptions()
 
 
 class RunObserver:
-    """Is told how a run goes on; this one does nothing with it."""
+    """Is told how a run goes on; to be subclassed, does nothing itself."""
 
     def run_began(self, count: int) -> None:
         """So many case runs follow."""
@@ -99,7 +99,7 @@ def run(
 
 
 class CaseEnd(NamedTuple):
-    """How a case ended; `stop` is why the whole run has to end with it, mostly empty."""
+    """How a case ended; `stop` is the reason when the whole run ends with it."""
 
     verdict: CaseVerdict
     note: str = ""
@@ -107,7 +107,7 @@ class CaseEnd(NamedTuple):
 
 
 def execute(case: Case, bench: Bench) -> CaseEnd:
-    """Run a case to its end, whatever that is; nothing that it does gets out of here."""
+    """Run a case to its end; raises nothing, whatever the case does."""
     try:
         case.run(bench)
     except CaseStopped:
@@ -308,8 +308,8 @@ class Run:
         return ""
 
     def _bring_back(self, *, flash: bool, at_first: bool) -> Restored:
-        """The known state; of a device that could not even be upgraded at first, to be reachable
-        is all that is asked. Raises BusError and RunStopped.
+        """Restore the known state; a device that could not be upgraded at first only has to be
+        reachable. Raises BusError and RunStopped.
         """
         subject, profile, stopped = self._subject, self._profile, self._asked_to_stop
         if self._not_upgradable:

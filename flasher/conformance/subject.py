@@ -1,4 +1,4 @@
-"""What the suite asks of a device under test and of the way to it; `mock` and `real` have both."""
+"""The interfaces of a device under test and of the bus to it; `mock` and `real` implement both."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Port(Protocol):
     """How far a time stamp may be off."""
 
     def now(self) -> float:
-        """Seconds that only go forward."""
+        """The time in seconds; it never goes back."""
 
     def send(self, frame: RawFrame) -> None:
         """Hand a frame over; returns when it is accepted."""
@@ -72,4 +72,4 @@ class Subject(Protocol):
         """
 
     def take_cut(self) -> bool:
-        """Whether the cut that was set last has happened; one that has not never will."""
+        """True when the cut that was set last has happened; one that has not is cancelled."""

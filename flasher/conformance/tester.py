@@ -1,6 +1,6 @@
-"""The tester: sends frames, puts the device's messages together, records every frame.
+"""The tester's side of the bus: sends frames, reassembles the device's messages, keeps a trace.
 
-Waiting is receiving until a time, and no wait goes beyond the case's own limit.
+Frames are received whenever time passes, and no wait goes beyond the time limit of the case.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ _LIMITS: Final = {
     Kind.VERSION_INFORMATION: "start_s",
 }
 _RECEIVED_LIMIT: Final = 50_000
-"""Messages that wait to be looked at; a babbling device fills no memory."""
+"""Messages that are kept: a babbling device must not fill the memory."""
 _ECHO_LIMIT_S: Final = 2.0
 """A frame that has not left by then is taken as sent: its echo was lost."""
 _FRAME_BITS: Final = 47
 """A frame without data and stuff bits, interframe space included."""
 _UPDATE_HEAD: Final = b"\x55\xaa" + bytes((WRITE, 2 + (UPDATE & 0xFF))) + UPDATE.to_bytes(2, "big")
 _POLL_S: Final = 0.2
-"""Longest single wait: the time after which a wish to stop is seen."""
+"""Longest single wait, so that a request to stop is noticed soon."""
 
 
 class FaultKind(Enum):
@@ -77,7 +77,7 @@ class Sent(NamedTuple):
 
 
 class BusTester:
-    """Frames out, messages in, on one `Port`, for one case that may take `limit_s`."""
+    """Sends and receives on one `Port`, for one case, which may take `limit_s`."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class BusTester:
         return self.now - self.began_at
 
     def wait(self, for_s: float) -> None:
-        """Let time pass; what is heard meanwhile waits to be looked at."""
+        """Let time pass; messages received meanwhile are kept for the calls below."""
         self.wait_until(self.now + for_s)
 
     def wait_until(self, moment: float) -> None:
@@ -155,7 +155,7 @@ class BusTester:
 
     @contextmanager
     def disturb(self, *faults: Fault) -> Iterator[None]:
-        """Let these faults happen inside the `with`; they count frames from its beginning."""
+        """Let these faults happen inside the `with`; frames are counted from its beginning."""
         self._faults = {(fault.incoming, fault.index): fault for fault in faults}
         self._fault_origin = (self.frames_sent, self.frames_received)
         try:
@@ -166,7 +166,7 @@ class BusTester:
     # -- receiving --------------------------------------------------------------------------------
 
     def next_message(self, within_s: float) -> Received | None:
-        """The next message that was heard, or None after `within_s`."""
+        """The next message, or None after `within_s`."""
         deadline = self.now + within_s
         while not self._received:
             if self.now >= deadline:
@@ -194,14 +194,14 @@ class BusTester:
         return self.profile.limit(_LIMITS[kind])
 
     def collect(self, for_s: float) -> list[Received]:
-        """All that is heard in the next `for_s`, and what still waited."""
+        """The messages of the next `for_s`, and those received before and not yet taken."""
         self.wait(for_s)
         found = list(self._received)
         self._received.clear()
         return found
 
     def forget(self) -> None:
-        """Forget what was heard so far and not looked at."""
+        """Discard the messages received so far and not yet taken."""
         self._received.clear()
 
     # -- trace ------------------------------------------------------------------------------------
@@ -219,7 +219,7 @@ class BusTester:
     # -- inside -----------------------------------------------------------------------------------
 
     def _pump(self, deadline: float) -> None:
-        """Take one frame, or let time pass up to `deadline` (or a little, to look around)."""
+        """Take one frame, or let time pass, up to `deadline` or for `_POLL_S`."""
         now = self.now
         if now >= self.ends_at:
             raise CaseLimitReached(
@@ -276,7 +276,7 @@ class BusTester:
         self._record(self.left_at, frame, sent=True)
 
     def _wait_for_echoes(self) -> None:
-        """Until the last frame has left: its echo is there, or its time on the wire is over."""
+        """Wait until the last frame has left: by its echo, or by its length on the wire."""
         if not self.port.echoes:
             self.wait_until(self.left_at)
             return

@@ -256,7 +256,7 @@ _KINDS: Final = {
 
 @dataclass(frozen=True)
 class Received:
-    """A message that was heard: what it is, and when its first and last frame arrived (seconds)."""
+    """A message from the device, with the times of its first and last frame in seconds."""
 
     kind: Kind
     first_at: float
@@ -302,8 +302,8 @@ class Received:
 
 
 class Decoder:
-    """Puts the device's messages together, id by id; other senders are not heard. Tolerant: what
-    is no message becomes `Kind.DAMAGED`.
+    """Reassembles the messages of the device, id by id; frames of other senders are ignored. Bytes
+    that are no message become `Kind.DAMAGED`.
 
     A message starts with a CAN frame (R19); what follows its tail in the last frame is padding.
     """

@@ -65,7 +65,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "recipe": load_recipe,
     "station": load_config,
     "scans": read_scans,
-    "report": diff.read_run,
+    "report": diff.read_report,
     "trace": explained,
 }
 

@@ -121,7 +121,7 @@ class Log(RunObserver):
         self.lines.append(f"begins {case.id} {repeat}")
 
     def case_ended(self, result: CaseResult) -> None:
-        self.lines.append(f"ends {result.case_id} {result.verdict.value}")
+        self.lines.append(f"ends {result.case_id} {result.verdict.text}")
 
 
 def run_case(

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from flasher.cli.bench.conformance_run import exit_code
+from flasher.cli.bench.conformance import exit_code
 from flasher.conformance.catalogue import Case, Selection
 from flasher.conformance.html_report import html_page
 from flasher.conformance.json_report import report_document, to_bytes

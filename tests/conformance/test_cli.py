@@ -6,22 +6,23 @@ import json
 import os
 import shlex
 import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from flasher.cli.bench.conformance_replay import replay_commands
-from flasher.cli.bench.conformance_run import exit_code
+from flasher.cli.bench.conformance import exit_code
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases import rs
 from flasher.conformance.catalogue import CASES, NOT_IMPLEMENTED, QUICK
-from flasher.conformance.mock import MockPort
-from flasher.conformance.profile import load_profile, profile_keys
+from flasher.conformance.mock import MockPort, MockSubject
+from flasher.conformance.profile import ConformanceProfile, load_profile, profile_keys
 from flasher.errors import BusError, ExitCode
 from tests.cli.conftest import SAMPLES, Flasher
 
 from . import profile_table
-from .bench import fails_once, passes_once, run_case
+from .bench import PROFILE, fails_once, passes_once, run_case
 
 MOCK = ("conformance", "-t", "bms", "--mock")
 WRONG = (*MOCK, "--variant", "announces-three-times", "--case", "RS-01", "--case", "RS-04")
@@ -52,17 +53,30 @@ def test_a_failure_has_one_line_with_expected_got_and_a_command_that_repeats_it(
     assert "RS-04" not in again.out
 
 
-def test_the_replay_of_a_repetition_repeats_up_to_it() -> None:
+def test_the_replay_has_what_is_about_the_bench_and_nothing_about_the_run(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    @contextmanager
+    def mock_instead(_options: object) -> Iterator[tuple[MockSubject, ConformanceProfile]]:
+        yield MockSubject(), PROFILE
+
+    monkeypatch.setattr("flasher.conformance.opening.open_bench", mock_instead)
+    monkeypatch.chdir(tmp_path)
     words = shlex.split(
-        "conformance -t bms --profile 'my p.toml' --case TX-01 TX-02 -i socketcan --see 9 --rep 3 "
-        "--json --html=a.html -v --strict --bus-kwargs a=1 --trace-dir t -c can0"
+        "conformance -t bms --profile 'my p.toml' --case RS-04 -i socketcan --seed 9 --repeat 2 "
+        "--json --html=a.html -v --strict --bus-kwargs a=1 --trace-dir t -c can0 --good-image ok"
     )
-    report = run_case(passes_once)
-    command = replay_commands(report, words)["FR-00", 1]
-    assert shlex.split(command) == shlex.split(
-        "flasher conformance -t bms --profile 'my p.toml' -i socketcan --strict --bus-kwargs a=1 "
-        "-c can0 --case FR-00 --seed 1"
+    results = flasher(*words).document["report"]["results"]
+    command = shlex.split(results[0]["replay"])
+    assert command[-4:] == ["--case", "RS-04", "--seed", "9"]
+    assert command[:2] == ["flasher", "conformance"]
+    assert sorted(command[2:-4]) == sorted(
+        shlex.split(
+            "-t bms --profile 'my p.toml' --good-image ok -i socketcan --strict --bus-kwargs a=1 "
+            "-c can0"
+        )
     )
+    assert results[1]["replay"] == f"{results[0]['replay']} --repeat 2"
 
 
 def test_the_list_shows_what_can_be_run_and_what_cannot(

@@ -126,7 +126,7 @@ def judged(kind: type[ScriptedDevice], cases: Sequence[str], **given: Value) -> 
     report = run(bench(device), profile, selection=Selection(cases=tuple(cases)))
     assert report.final_image == "verified"
     return {
-        result.case_id: f"{result.verdict.value}: {result.first_failure}"
+        result.case_id: f"{result.verdict.text}: {result.first_failure}"
         for result in report.results
         if result.verdict not in (CaseVerdict.PASS, CaseVerdict.UNSUPPORTED)
     }

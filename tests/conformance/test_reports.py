@@ -10,12 +10,12 @@ from typing import Any, Final
 import jsonschema
 import pytest
 
-from flasher.cli.bench.conformance_documents import ConformanceDocument
+from flasher.cli.bench.conformance import ConformanceDocument
 from flasher.cli.schema import schema_of
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.html_report import MESSAGES_BAD, html_page
-from flasher.conformance.json_report import BINS, CHECKS_KEPT, report_document, to_bytes
+from flasher.conformance.json_report import BINS, CHECKS_KEPT, report_document, to_bytes, to_json
 from flasher.conformance.mock import MockSubject, variant_maker
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.reports import candump, is_traced, junit_report, trace_file_name
@@ -88,12 +88,13 @@ def test_the_document_is_as_its_schema_says(make: Any) -> None:
 
 
 def test_the_document_tells_what_went_wrong_and_how_to_see_it_again() -> None:
-    made = report_document(
+    written = report_document(
         wrong_run(),
         started_at=AT,
         replays={("RS-01", 1): "flasher ..."},
         trace_files={("RS-01", 1): "RS-01.log"},
     )
+    made = to_json(written)
     assert not made["passed"]
     assert made["counts"]["fail"] == 1
     assert made["counts"]["unsupported"] == 1

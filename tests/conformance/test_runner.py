@@ -222,7 +222,7 @@ def test_a_device_that_only_a_power_cycle_brings_back_fails_the_case_and_the_run
     result = one(report, "FR-00")
     assert result.verdict is CaseVerdict.FAIL
     assert "power cycle" in (result.first_failure.got if result.first_failure else "")
-    assert [rescue.case_id for rescue in report.rescues] == ["FR-00"]
+    assert [rescue.id for rescue in report.rescues] == ["FR-00"]
     assert one(report, "RS-04").verdict is CaseVerdict.PASS
     assert report.final_image == "verified"
 

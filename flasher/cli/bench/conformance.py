@@ -1,32 +1,42 @@
 """`flasher conformance`: tests a bootloader against the protocol, case by case; compares two such
-runs; documents the profile. How a run goes stands in `conformance_run`.
+runs; documents the profile.
 """
 
 from __future__ import annotations
 
+import shlex
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
+
+import click
 
 from flasher.cli import values
-from flasher.cli.bench.conformance_documents import (
-    DOCUMENTS,
-    CaseListDocument,
-    ListedCaseDocument,
-    ProfileKeyDocument,
-    ProfileKeysDocument,
-    difference_document,
+from flasher.cli.bench.conformance_text import (
+    ListedCase,
+    difference_lines,
+    list_lines,
+    report_lines,
 )
-from flasher.cli.bench.conformance_text import difference_lines, list_lines
-from flasher.cli.framework import Decorator, argument, group, option
+from flasher.cli.files import check_writable, write_whole
+from flasher.cli.framework import argument, group, option, option_set, retyped
 from flasher.cli.options import Bus, adapter_options, allow_implausible_option, target_option
 from flasher.cli.output import Output
-from flasher.conformance.catalogue import GROUPS
-from flasher.conformance.diff import THRESHOLD_PERCENT, compare, read_run
+from flasher.cli.stop import stop_on_signal
+from flasher.conformance.catalogue import GROUPS, Selection
+from flasher.conformance.diff import THRESHOLD_PERCENT, Difference, compare, read_report
+from flasher.conformance.json_report import ReportDocument
 from flasher.conformance.real import HOST_UNCERTAINTY_S
-from flasher.errors import ExitCode
+from flasher.conformance.results import CaseVerdict, CheckOutcome, RunReport
+from flasher.errors import ExitCode, UsageError
+from flasher.protocol.spec import Target
+from flasher.protocol.text import printable
 
-__all__ = ["DOCUMENTS", "conformance"]
+if TYPE_CHECKING:
+    from flasher.conformance.opening import BenchOptions
+
 _EXAMPLES: Final = """\
 examples:
   flasher conformance -t bms --mock
@@ -42,26 +52,167 @@ Without power control the device is brought back by the protocol, and cases that
 reported as unsupported. Ctrl-C ends the run with a report of what was run, and puts the good image
 back; a second one ends at once.
 """
-FILES: Final = {
-    "junit": ("--junit", "JUnit XML, for CI servers"),
-    "json_report": ("--json-report", "the report as JSON, for `flasher conformance diff`"),
-    "html": ("--html", "the report as one self-contained page"),
-}
-"""Name in the options, option, help."""
-TRACE_DIR: Final = "--trace-dir"
-SEED: Final = "1"
+_TRACE_DIR: Final = "--trace-dir"
+_FILES: Final = {"junit": "--junit", "json_report": "--json-report", "html": "--html"}
+"""Files that are written: their names in the choices, and their options."""
+_RUN_OPTIONS: Final = frozenset(
+    {
+        *("--list", "--case", "--group", "--quick", "--seed", "--repeat", "--timeout"),
+        *("--junit", "--json-report", "--html", _TRACE_DIR),
+        *("--json", "--events", "--verbose", "--quiet", "--log-file"),
+    }
+)
+"""Options about the selection, the reports and the output; the others are about the bench."""
 
 
-def _report_option(name: str) -> Decorator:
-    flag, text = FILES[name]
-    return option(
-        flag, name, type=values.FilePath(gives=Path), metavar="FILE", panel="reports", help=text
-    )
+# -- documents -------------------------------------------------------------------------------------
 
 
-_set_option: Final = option(
-    "--set", "choices", multiple=True, metavar="KEY=VALUE", panel="without hardware",
+@dataclass(frozen=True)
+class ConformanceDocument:
+    """What came of a run."""
+
+    report: ReportDocument
+
+
+@dataclass(frozen=True)
+class CaseListDocument:
+    """The cases that are selected."""
+
+    cases: list[ListedCase]
+
+
+@dataclass(frozen=True)
+class ProfileKeyDocument:
+    """A key of the profile."""
+
+    key: str
+    """With the table that it stands in, as limits.ack_s."""
+    default: str | int | float
+    allowed: str
+    meaning: str
+
+
+@dataclass(frozen=True)
+class ProfileKeysDocument:
+    """What a profile may say."""
+
+    keys: list[ProfileKeyDocument]
+    toml: str
+    """A whole profile, as it is printed without --json."""
+
+
+DOCUMENTS: Final = (ConformanceDocument, CaseListDocument, Difference, ProfileKeysDocument)
+
+
+# -- a run -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Choices:
+    """The device under test, what is run, and the files that are written."""
+
+    target: Target | None
+    profile: str | None
+    good_image: str | None
+    second_image: str | None
+    allow_implausible: bool
+    power_cmd: str | None
+    readback_cmd: str | None
+    uncertainty: float
+    mock: bool
+    variant: str | None
+    choices: tuple[str, ...]
+    is_list: bool
+    cases: tuple[str, ...]
+    groups: tuple[str, ...]
+    quick: bool
+    seed: str
+    repeat: int
+    timeout: float | None
+    strict: bool
+    junit: Path | None
+    json_report: Path | None
+    html: Path | None
+    trace_dir: Path | None
+
+    @property
+    def selection(self) -> Selection:
+        """Which cases are meant."""
+        return Selection(self.cases, self.groups, quick=self.quick)
+
+
+_bench = partial(option, panel="device under test")
+_without_hardware = partial(option, panel="without hardware")
+_what = partial(option, panel="what is run, and how")
+_report = partial(option, metavar="FILE", type=values.FilePath(gives=Path), panel="reports")
+_image = partial(_bench, metavar="IMAGE", type=values.FilePath(*values.IMAGE_SUFFIXES))
+_set_option: Final = _without_hardware(
+    "--set", "choices", multiple=True, metavar="KEY=VALUE",
     help="set a choice of the model, see `flasher mock --help`; may be repeated",
+)  # fmt: skip
+_choices = option_set(
+    "chosen",
+    Choices,
+    target_option(required=False),
+    _bench(
+        "--profile", metavar="FILE", type=values.FilePath("toml"), brief=True,
+        help="the product's choices and limits (TOML)",
+    ),
+    _image("--good-image", brief=True, help="an image that runs on the device"),
+    _image("--second-image", help="another one, smaller, of another version"),
+    allow_implausible_option("device under test"),
+    _bench(
+        "--power-cmd", metavar="COMMAND",
+        help="command that switches the device, as 'relay 3 {on|off}'",
+    ),
+    _bench(
+        "--readback-cmd", metavar="COMMAND",
+        help="command that dumps the application area, as 'dump {file}'",
+    ),
+    _bench(
+        "--uncertainty", type=values.seconds, default=HOST_UNCERTAINTY_S, metavar="SECONDS",
+        help="how far the adapter's and the computer's times may be off",
+    ),
+    _without_hardware(
+        "--mock", is_flag=True, brief=True,
+        help="test the device model in this process; takes no time",
+    ),
+    _without_hardware(
+        "--variant", metavar="NAME",
+        help="one that is wrong, see `flasher mock --list-variants`",
+    ),
+    _set_option,
+    _what("--list", "is_list", is_flag=True, brief=True, help="list the cases, and end"),
+    _what(
+        "--case", "cases", multiple=True, type=str.upper, metavar="ID", brief=True,
+        help="run this case only, as TX-03; may be repeated",
+    ),
+    _what(
+        "--group", "groups", multiple=True, type=str.upper, metavar="G", brief=True,
+        help=f"run this group only: {' '.join(GROUPS)}; may be repeated",
+    ),
+    _what(
+        "--quick", is_flag=True, brief=True,
+        help="some of every group, in under a minute on a real bus",
+    ),
+    _what("--seed", default="1", metavar="SEED", help="decides all that is left to chance"),
+    _what("--repeat", type=values.count, default="1", metavar="N", help="run every case N times"),
+    _what(
+        "--timeout", type=values.seconds, metavar="SECONDS",
+        help="end the run after this time (default: every case has its own limit)",
+    ),
+    _what(
+        "--strict", is_flag=True,
+        help="a deviation of the profile that is none any more fails the run",
+    ),
+    _report("--junit", help="JUnit XML, for CI servers"),
+    _report("--json-report", help="the report as JSON, for `flasher conformance diff`"),
+    _report("--html", help="the report as one self-contained page"),
+    option(
+        _TRACE_DIR, type=values.FolderPath(), metavar="DIR", panel="reports",
+        help="folder for a trace file (candump) of each case that does not pass",
+    ),
 )  # fmt: skip
 
 
@@ -72,179 +223,190 @@ _set_option: Final = option(
     ),
     runs_alone=True,
 )  # fmt: skip
-@target_option(required=False)
-@option(
-    "--profile",
-    metavar="FILE",
-    type=values.FilePath("toml"),
-    panel="device under test",
-    brief=True,
-    help="the product's choices and limits (TOML)",
-)
-@option(
-    "--good-image",
-    metavar="IMAGE",
-    type=values.FilePath(*values.IMAGE_SUFFIXES),
-    panel="device under test",
-    brief=True,
-    help="an image that runs on the device",
-)
-@option(
-    "--second-image",
-    metavar="IMAGE",
-    type=values.FilePath(*values.IMAGE_SUFFIXES),
-    panel="device under test",
-    help="another one, smaller, of another version",
-)
-@allow_implausible_option("device under test")
-@option(
-    "--power-cmd",
-    metavar="COMMAND",
-    panel="device under test",
-    help="command that switches the device, as 'relay 3 {on|off}'",
-)
-@option(
-    "--readback-cmd",
-    metavar="COMMAND",
-    panel="device under test",
-    help="command that dumps the application area, as 'dump {file}'",
-)
-@option(
-    "--uncertainty",
-    type=values.seconds,
-    default=HOST_UNCERTAINTY_S,
-    metavar="SECONDS",
-    panel="device under test",
-    help="how far the adapter's and the computer's times may be off",
-)
-@option(
-    "--mock",
-    is_flag=True,
-    panel="without hardware",
-    brief=True,
-    help="test the device model in this process; takes no time",
-)
-@option(
-    "--variant",
-    metavar="NAME",
-    panel="without hardware",
-    help="one that is wrong, see `flasher mock --list-variants`",
-)
-@_set_option
-@option(
-    "--list",
-    "list",
-    is_flag=True,
-    panel="what is run, and how",
-    brief=True,
-    help="list the cases, and end",
-)
-@option(
-    "--case",
-    "cases",
-    multiple=True,
-    type=str.upper,
-    metavar="ID",
-    panel="what is run, and how",
-    brief=True,
-    help="run this case only, as TX-03; may be repeated",
-)
-@option(
-    "--group",
-    "groups",
-    multiple=True,
-    type=str.upper,
-    metavar="G",
-    panel="what is run, and how",
-    brief=True,
-    help=f"run this group only: {' '.join(GROUPS)}; may be repeated",
-)
-@option(
-    "--quick",
-    is_flag=True,
-    panel="what is run, and how",
-    brief=True,
-    help="some of every group, in under a minute on a real bus",
-)
-@option(
-    "--seed",
-    default=SEED,
-    metavar="SEED",
-    panel="what is run, and how",
-    help="decides all that is left to chance",
-)
-@option(
-    "--repeat",
-    type=values.count,
-    default="1",
-    metavar="N",
-    panel="what is run, and how",
-    help="run every case N times",
-)
-@option(
-    "--timeout",
-    type=values.seconds,
-    metavar="SECONDS",
-    panel="what is run, and how",
-    help="end the run after this time (default: every case has its own limit)",
-)
-@option(
-    "--strict",
-    is_flag=True,
-    panel="what is run, and how",
-    help="a deviation of the profile that is none any more fails the run",
-)
-@_report_option("junit")
-@_report_option("json_report")
-@_report_option("html")
-@option(
-    TRACE_DIR,
-    type=values.FolderPath(),
-    metavar="DIR",
-    panel="reports",
-    help="folder for a trace file (candump) of each case that does not pass",
-)
+@_choices
 @adapter_options
-def conformance(output: Output, bus: Bus, **chosen: Any) -> int:
+def conformance(output: Output, bus: Bus, chosen: Choices) -> int:
     """Test a bootloader against the protocol, case by case: on a device on a bench, or on the
     built-in device model. Every case begins with a device that runs the known-good image; at the
     end that image is flashed once more and verified. The device is erased and written many times.
     """
-    options = SimpleNamespace(bus=bus, mock=bus.mock, **chosen)
-    if options.list:
-        return _list(options, output)
-    from flasher.cli.bench.conformance_run import run_suite  # noqa: PLC0415  much is loaded
+    if chosen.is_list:
+        return _list(chosen.selection, output)
+    from flasher.cli.bench.conformance_progress import Progress  # noqa: PLC0415  much is loaded
+    from flasher.conformance.opening import open_bench  # noqa: PLC0415
+    from flasher.conformance.runner import RunOptions, run  # noqa: PLC0415
 
-    return run_suite(options, output)
+    bench = _checked_bench(chosen, bus)
+    stopping = lambda: output.progress(  # noqa: E731
+        "stopping: the device gets its good image back; press again to end at once"
+    )
+    started_at = datetime.now(UTC).isoformat(timespec="seconds")
+    with (
+        open_bench(bench) as (subject, profile),
+        stop_on_signal(stopping) as stopped,
+        Progress(output) as progress,
+    ):
+        report = run(
+            subject,
+            profile,
+            selection=chosen.selection,
+            options=RunOptions(chosen.seed, chosen.repeat, chosen.timeout, chosen.strict),
+            observer=progress,
+            stopped=stopped,
+        )
+        was_stopped = stopped()
+    code = exit_code(report, was_stopped=was_stopped)
+    _tell(report, chosen, output, started_at, code)
+    return code
 
 
-def _list(options: SimpleNamespace, output: Output) -> int:
-    from flasher.cli.bench.conformance_run import selection_of  # noqa: PLC0415
+def _checked_bench(chosen: Choices, bus: Bus) -> BenchOptions:
+    """The bench that the options describe; makes sure that all files can be written. Raises
+    UsageError.
+    """
+    from flasher.conformance.opening import BenchOptions, check_bench  # noqa: PLC0415
+    from flasher.conformance.real import PowerCommand, ReadbackCommand  # noqa: PLC0415
+
+    if chosen.target is None:
+        raise UsageError(
+            "flasher conformance: -t/--target is required.", remedy="Write -t wmc, bms or obc."
+        )
+    mock_only = {"--variant": chosen.variant, "--set": chosen.choices}
+    bench_only = {"--power-cmd": chosen.power_cmd, "--readback-cmd": chosen.readback_cmd}
+    for name, value in (bench_only if chosen.mock else mock_only).items():
+        if value:
+            raise UsageError(f"{name} works {'without' if chosen.mock else 'with'} --mock only.")
+    bench = BenchOptions(
+        target=chosen.target.name,
+        is_mock=chosen.mock,
+        variant=chosen.variant,
+        choices=chosen.choices,
+        profile=chosen.profile,
+        good_image=chosen.good_image,
+        second_image=chosen.second_image,
+        allow_implausible=chosen.allow_implausible,
+        bus=bus.config,
+        power=None if chosen.power_cmd is None else PowerCommand(chosen.power_cmd),
+        readback=None if chosen.readback_cmd is None else ReadbackCommand(chosen.readback_cmd),
+        uncertainty_s=chosen.uncertainty,
+    )
+    check_bench(bench)
+    for name, option_name in _FILES.items():
+        if getattr(chosen, name) is not None:
+            check_writable(getattr(chosen, name), option_name)
+    if chosen.trace_dir is not None:
+        try:
+            chosen.trace_dir.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            said = f"{printable(str(chosen.trace_dir))} cannot be made: {error.strerror}."
+            raise UsageError(said, where=_TRACE_DIR) from error
+    return bench
+
+
+def _tell(
+    report: RunReport, chosen: Choices, output: Output, started_at: str, code: ExitCode
+) -> None:
+    """Print the summary and write the files."""
+    from flasher.conformance.json_report import report_document, to_bytes  # noqa: PLC0415
+    from flasher.conformance.reports import (  # noqa: PLC0415
+        candump,
+        is_traced,
+        junit_report,
+        trace_file_name,
+    )
+
+    replays = replay_commands(report)
+    for line in report_lines(report, replays, verbose=output.verbosity > 0):
+        output.result(line)
+    traces = {}
+    if chosen.trace_dir is not None:
+        for result in filter(is_traced, report.results):
+            name = traces[result.key] = trace_file_name(result)
+            write_whole(chosen.trace_dir / name, candump(result.trace), _TRACE_DIR)
+    if traces:
+        output.progress(f"traces: {len(traces)} in {printable(str(chosen.trace_dir))}")
+    document = report_document(report, started_at=started_at, replays=replays, trace_files=traces)
+
+    def junit() -> bytes:
+        return junit_report(report, started_at=started_at, replays=replays)
+
+    def json_report() -> bytes:
+        return to_bytes(document)
+
+    def html() -> bytes:
+        from flasher.conformance.html_report import html_page  # noqa: PLC0415  loads jinja2
+
+        page = html_page(report, started_at=started_at, replays=replays, trace_files=traces)
+        return page.encode("utf-8")
+
+    for make in (junit, json_report, html):
+        path: Path | None = getattr(chosen, make.__name__)
+        if path is not None:
+            write_whole(path, make(), _FILES[make.__name__])
+            output.progress(f"{make.__name__.replace('_', ' ')}: {printable(str(path))}")
+    if code not in (ExitCode.OK, ExitCode.PARTIAL):
+        output.error_line(f"the run is not complete: {printable(report.stopped)}")
+    output.document(ConformanceDocument(document), exit_code=code)
+
+
+def replay_commands(report: RunReport) -> dict[tuple[str, int], str]:
+    """The command that runs each result's case again, on the same bench and with the same seed, by
+    case id and repeat.
+    """
+    ctx = click.get_current_context()
+    bench = ["flasher", *retyped(ctx, "conformance", without=_RUN_OPTIONS.__contains__)]
+    found = {}
+    for result in report.results:
+        words = [*bench, "--case", result.case_id, "--seed", report.seed]
+        if result.repeat > 1:
+            words += ["--repeat", str(result.repeat)]
+        found[result.key] = shlex.join(words)
+    return found
+
+
+def exit_code(report: RunReport, *, was_stopped: bool) -> ExitCode:
+    """The exit code of a run: interrupted, the adapter, a device that never answered, else whether
+    all cases passed.
+    """
+    if was_stopped and report.stopped:
+        return ExitCode.INTERRUPTED
+    if report.adapter_failed:
+        return ExitCode.BUS
+    was_judged = any(
+        check.outcome is not CheckOutcome.UNSUPPORTED
+        for result in report.results
+        for check in result.checks
+    )
+    if report.stopped and not was_judged and report.count(CaseVerdict.NOT_RUN):
+        return ExitCode.NO_ANSWER
+    return ExitCode.OK if report.ok else ExitCode.PARTIAL
+
+
+# -- the other actions -----------------------------------------------------------------------------
+
+
+def _list(selection: Selection, output: Output) -> int:
     from flasher.conformance import cases  # noqa: F401, PLC0415  registers the cases
     from flasher.conformance.catalogue import CASES, case_text  # noqa: PLC0415
     from flasher.conformance.profile import ConformanceProfile  # noqa: PLC0415
 
-    selection = selection_of(options)
     selection.check()
-    found = [case_text(case_id, ConformanceProfile()) for case_id in selection.chosen()]
+    texts = [case_text(case_id, ConformanceProfile()) for case_id in selection.chosen()]
+    found = [
+        ListedCase(
+            text.id,
+            text.group,
+            text.title,
+            text.clause,
+            text.requires,
+            tuple(text.choices),
+            can_be_run=text.id in CASES,
+        )
+        for text in texts
+    ]
     for line in list_lines(found):
         output.result(line)
-    output.document(
-        CaseListDocument(
-            cases=[
-                ListedCaseDocument(
-                    id=case.id,
-                    group=case.group,
-                    title=case.title,
-                    clause=case.clause,
-                    requires=list(case.requires),
-                    choices=list(case.choices),
-                    can_be_run=case.id in CASES,
-                )
-                for case in found
-            ]
-        )
-    )
+    output.document(CaseListDocument(found))
     return ExitCode.OK
 
 
@@ -252,25 +414,22 @@ def _list(options: SimpleNamespace, output: Output) -> int:
 @argument("old", type=values.FilePath("json", gives=Path), metavar="OLD", help="the older report")
 @argument("new", type=values.FilePath("json", gives=Path), metavar="NEW", help="the newer report")
 @option(
-    "--threshold",
-    type=values.seconds,
-    default=THRESHOLD_PERCENT,
-    metavar="PERCENT",
+    "--threshold", type=values.seconds, default=THRESHOLD_PERCENT, metavar="PERCENT",
     help="a time is slower when its median or p95 grew by more than this, and by more than its "
     "uncertainty",
-)
+)  # fmt: skip
 @option("--strict", is_flag=True, help="slower times and cases that are gone count as worse too")
 def diff(output: Output, *, old: Path, new: Path, threshold: float, strict: bool) -> int:
     """Compare two reports that --json-report wrote. Exit code 12 when a case got worse, or a new
     one fails.
     """
-    before, after = read_run(old), read_run(new)
-    found = compare(before, after, threshold)
-    for line in difference_lines(found, before, after):
+    found = compare(read_report(old), read_report(new), threshold)
+    output.result(f"{printable(str(old))}, then {printable(str(new))}")
+    for line in difference_lines(found):
         output.result(line)
     is_worse = found.is_worse or (strict and bool(found.slower or found.gone))
     code = ExitCode.PARTIAL if is_worse else ExitCode.OK
-    output.document(difference_document(found), exit_code=code)
+    output.document(found, exit_code=code)
     return code
 
 
@@ -279,28 +438,19 @@ def diff(output: Output, *, old: Path, new: Path, threshold: float, strict: bool
 @_set_option
 def profile(output: Output, *, mock: bool, choices: tuple[str, ...]) -> int:
     """Print a profile with every key explained."""
-    from flasher.conformance.profile import (  # noqa: PLC0415
-        ConformanceProfile,
-        profile_keys,
-    )
+    from flasher.conformance.profile import ConformanceProfile, profile_keys  # noqa: PLC0415
 
-    values_of = ConformanceProfile()
+    found = ConformanceProfile()
     if mock or choices:
         from flasher.conformance.mock import profile_of_mock  # noqa: PLC0415
         from flasher.conformance.opening import device_profile  # noqa: PLC0415
 
-        values_of = profile_of_mock(device_profile(list(choices)))
-    toml = values_of.to_toml()
+        found = profile_of_mock(device_profile(choices))
+    toml = found.to_toml()
     output.result(toml.strip("\n"))
-    output.document(
-        ProfileKeysDocument(
-            keys=[
-                ProfileKeyDocument(
-                    key=key.path, default=key.default, allowed=key.allowed, meaning=key.text
-                )
-                for key in profile_keys().values()
-            ],
-            toml=toml,
-        )
-    )
+    keys = [
+        ProfileKeyDocument(key=key.path, default=key.default, allowed=key.allowed, meaning=key.text)
+        for key in profile_keys().values()
+    ]
+    output.document(ProfileKeysDocument(keys=keys, toml=toml))
     return ExitCode.OK

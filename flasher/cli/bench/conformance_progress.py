@@ -64,7 +64,7 @@ class Progress(RunObserver):
             return
         self._ended += 1
         left = self._count - self._ended
-        line = f"{result.case_id} {result.verdict.value}"
+        line = f"{result.case_id} {result.verdict.text}"
         if result.verdict in _BAD:
             line += f": {result.reason}"
         is_news = self._bar is not None and result.verdict in _BAD

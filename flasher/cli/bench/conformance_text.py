@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import astuple, dataclass
 from typing import Final
 
 from flasher.cli.output import counted, duration
-from flasher.conformance.catalogue import CASES
-from flasher.conformance.diff import Change, Difference, Run, Slowdown
+from flasher.conformance.diff import Difference, VerdictChange
 from flasher.conformance.reports import ByResult, distribution, group_title
 from flasher.conformance.results import (
     FINAL_IMAGE_OK,
@@ -40,7 +40,7 @@ def report_lines(report: RunReport, replays: ByResult, *, verbose: bool = False)
 
     `verbose` tells every case and every failed check.
     """
-    yield _shown(
+    yield printable(
         f"{report.subject}, target {report.target}, profile: {report.profile_source}, "
         f"seed {report.seed}"
     )
@@ -50,15 +50,13 @@ def report_lines(report: RunReport, replays: ByResult, *, verbose: bool = False)
     if verbose:
         yield ""
         yield from (
-            _shown(f"{result.verdict.value:<12}  {text.id}  {text.title}")
-            for text, results in cases
-            for result in results
+            printable(f"{result.verdict.text:<12}  {text.id}  {text.title}")
+            for text, result in cases
         )
     for status in _TOLD:
         lines = [
             line
-            for text, results in cases
-            for result in results
+            for text, result in cases
             if result.verdict is status
             for line in _told(text, result, replays, verbose=verbose)
         ]
@@ -69,11 +67,11 @@ def report_lines(report: RunReport, replays: ByResult, *, verbose: bool = False)
     yield from _times(report, verbose=verbose)
     yield ""
     for line in report.remarks():
-        yield _shown(f"note: {line}")
+        yield printable(f"note: {line}")
     if report.final_image:
         verified = report.final_image == FINAL_IMAGE_OK
         said = "flashed and verified" if verified else report.final_image
-        yield _shown(f"good image at the end: {said}")
+        yield printable(f"good image at the end: {said}")
     verdict = "passed" if report.ok else "NOT PASSED"
     yield f"{verdict}: {report.headline}; {duration(report.duration_s)} on the bus"
 
@@ -92,13 +90,13 @@ def _told(text: CaseText, result: CaseResult, replays: ByResult, *, verbose: boo
     said = result.reason
     if result.verdict is CaseVerdict.DEVIATION:
         said = f"{said} (profile: {text.deviation})"
-    head = f"{result.verdict.value.upper()} {text.id}{repeat} {text.title} [{text.clause}]"
+    head = f"{result.verdict.text.upper()} {text.id}{repeat} {text.title} [{text.clause}]"
     replay = replays.get(result.key, "")
-    yield _shown(f"{head}: {_short(said)}") + (f" | replay: {replay}" if replay else "")
+    yield printable(f"{head}: {_short(said)}") + (f" | replay: {replay}" if replay else "")
     failed = [one for one in result.checks if one.outcome is CheckOutcome.FAIL]
     if verbose:
         for one in failed[1:]:
-            yield _shown(f"    also: {_short(str(one))}")
+            yield printable(f"    also: {_short(str(one))}")
     elif len(failed) > 1:
         yield f"    and {counted(len(failed) - 1, 'more failed check')}"
 
@@ -115,7 +113,7 @@ def _not_judged(report: RunReport) -> Iterator[str]:
         named = list(dict.fromkeys(case_ids))
         shown = " ".join(named[:_NOTES_SHOWN])
         more = f" and {len(named) - _NOTES_SHOWN} more" if len(named) > _NOTES_SHOWN else ""
-        yield _shown(f"{status.value}: {shown}{more}: {_short(why)}")
+        yield printable(f"{status.text}: {shown}{more}: {_short(why)}")
 
 
 def _why(result: CaseResult) -> str:
@@ -137,10 +135,8 @@ def _times(report: RunReport, *, verbose: bool) -> Iterator[str]:
         spread = distribution(measurements)
         if spread.count < 2 and not verbose and len(found) > _NOTES_SHOWN:
             continue
-        values = (
-            spread.minimum_s, spread.median_s, spread.p95_s, spread.p99_s, spread.maximum_s,
-        )  # fmt: skip
-        rows.append((_shown(name), f"{spread.count}", *(f"{value * _MS:.1f}" for value in values)))
+        count, *values_s = astuple(spread)
+        rows.append((printable(name), f"{count}", *(f"{value * _MS:.1f}" for value in values_s)))
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         cells = (f"{cell:>{width}}" for cell, width in zip(row[1:], widths[1:], strict=True))
@@ -150,38 +146,55 @@ def _times(report: RunReport, *, verbose: bool) -> Iterator[str]:
 # -- the list -------------------------------------------------------------------------------------
 
 
-def list_lines(cases: Sequence[CaseText]) -> Iterator[str]:
+@dataclass(frozen=True)
+class ListedCase:
+    """A case that --list shows."""
+
+    id: str
+    group: str
+    title: str
+    """For a case that cannot be run, the reason."""
+    clause: str
+    requires: tuple[str, ...]
+    choices: tuple[str, ...]
+    """Keys of the profile that it depends on."""
+    can_be_run: bool
+
+
+def list_lines(cases: Sequence[ListedCase]) -> Iterator[str]:
     """The catalogue, a line a case."""
-    width = max((len(case.title) for case in cases if case.id in CASES), default=0)
+    width = max((len(case.title) for case in cases if case.can_be_run), default=0)
     for case in cases:
-        if case.id not in CASES:
+        if not case.can_be_run:
             yield f"{case.id}  cannot be run: {case.title}"
             continue
         needs = f"  ({', '.join(case.requires)})" if case.requires else ""
         yield f"{case.id}  {case.title:<{width}}  {case.clause}{needs}"
-    can_be_run = sum(case.id in CASES for case in cases)
+    can_be_run = sum(case.can_be_run for case in cases)
     yield f"{counted(len(cases), 'case')}, {can_be_run} of them can be run"
 
 
 # -- two runs -------------------------------------------------------------------------------------
 
 
-def difference_lines(found: Difference, old: Run, new: Run) -> Iterator[str]:
+def difference_lines(found: Difference) -> Iterator[str]:
     """What a run has made better, worse and slower."""
-    yield f"{old.source}, then {new.source}"
-    for line in found.conditions:
-        yield f"not the same: {line}"
-    for title, changes in (
-        ("worse", found.worse),
-        ("better", found.better),
-        ("new", found.new),
-        ("gone", found.gone),
-    ):
+    for condition in found.conditions:
+        yield f"not the same: {condition}"
+    for kind in ("worse", "better", "new", "gone"):
+        changes: Sequence[VerdictChange] = getattr(found, kind)
         for change in changes:
-            yield f"{title:<6}  {_change(change)}"
-    for title, moved in (("slower", found.slower), ("faster", found.faster)):
-        for one in moved:
-            yield f"{title:<6}  {_moved(one)}"
+            before = "not judged" if change.before is None else change.before.text
+            after = "not judged" if change.after is None else change.after.text
+            why = f": {_short(change.reason)}" if change.reason else ""
+            said = f"{change.id} {_short(change.title)}: {before}, now {after}{why}"
+            yield printable(f"{kind:<6}  {said}")
+    for one in (*found.slower, *found.faster):
+        kind = "slower" if one.after_s > one.before_s else "faster"
+        yield printable(
+            f"{kind:<6}  {one.name}, {one.figure}: {one.before_s * _MS:.1f} ms, "
+            f"now {one.after_s * _MS:.1f} ms ({one.percent:+.0f} %)"
+        )
     yield (
         f"{len(found.worse)} worse, {len(found.better)} better, {len(found.new)} new, "
         f"{len(found.gone)} gone, {found.unchanged} unchanged; {len(found.slower)} slower and "
@@ -189,23 +202,5 @@ def difference_lines(found: Difference, old: Run, new: Run) -> Iterator[str]:
     )
 
 
-def _change(change: Change) -> str:
-    before = "not judged" if change.before is None else change.before.value
-    after = "not judged" if change.after is None else change.after.value
-    why = f": {_short(change.reason)}" if change.reason else ""
-    return f"{change.case_id} {_short(change.title)}: {before}, now {after}{why}"
-
-
-def _moved(one: Slowdown) -> str:
-    return (
-        f"{one.name}, {one.figure}: {one.before_s * _MS:.1f} ms, now {one.after_s * _MS:.1f} ms "
-        f"({one.percent:+.0f} %)"
-    )
-
-
 def _short(text: str) -> str:
     return text if len(text) <= _TEXT_LIMIT else text[: _TEXT_LIMIT - 3] + "..."
-
-
-def _shown(text: str) -> str:
-    return printable(text)

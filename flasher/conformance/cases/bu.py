@@ -38,7 +38,9 @@ _Disturb = Callable[[Bench, Sequence[RawFrame]], AbstractContextManager[Sent]]
 
 
 class _Trouble(NamedTuple):
-    """What befalls one message: `send` sends it, and what it yields is waited for inside."""
+    """A fault during one message: `send` is a context that sends the message; the answer is awaited
+    inside of it.
+    """
 
     name: str
     send: _Disturb
@@ -47,7 +49,7 @@ class _Trouble(NamedTuple):
 
 
 class _Troubles:
-    """What is still to happen to each of the tool's messages, in turn."""
+    """The faults that each message of the tool has still to meet, in turn."""
 
     def __init__(
         self, bench: Bench, image: bytes, make: Callable[[int], Iterator[_Trouble]]
@@ -62,14 +64,14 @@ class _Troubles:
 
     @property
     def rounds_max(self) -> int:
-        """More upgrades than that are never needed: each one takes a trouble of every message."""
+        """Upgrades that are enough: each of them takes one fault of every message."""
         return 1 + max(map(len, self.left.values()))
 
     def __bool__(self) -> bool:
         return any(self.left.values())
 
     def take(self, message: str) -> _Trouble:
-        """The next one; none is left when everything happened."""
+        """The next fault for that message; an undisturbed sending when none is left."""
         queue = self.left[message]
         return queue.popleft() if queue else _NO_TROUBLE
 
@@ -83,7 +85,7 @@ _NO_TROUBLE: Final = _Trouble("", _sent_well)
 
 
 def _faults_of(frames: int, delay_s: float) -> Iterator[Fault]:
-    """All that can happen to one of the frames of a message, and to those of its answer."""
+    """Every fault of the frames of a message, and of the frames of its answer."""
     for index in range(frames):
         yield Fault(FaultKind.DROP, index)
         yield Fault(FaultKind.DOUBLE, index)
@@ -96,7 +98,7 @@ def _faults_of(frames: int, delay_s: float) -> Iterator[Fault]:
 
 
 def _faulty(fault: Fault) -> _Disturb:
-    """A message in which, or in whose answer, this fault happens."""
+    """Send a message while this fault is set for it and its answer."""
 
     @contextmanager
     def send(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
@@ -107,7 +109,7 @@ def _faulty(fault: Fault) -> _Disturb:
 
 
 def _off_bus_after(after: int) -> _Disturb:
-    """A message in which the device's controller leaves the bus after so many frames."""
+    """Send a message; after `after` of its frames the device's controller goes off the bus."""
 
     @contextmanager
     def send(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
@@ -120,7 +122,7 @@ def _off_bus_after(after: int) -> _Disturb:
 
 @contextmanager
 def _off_bus_in_answer(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
-    """A message in whose answer the device's controller leaves the bus."""
+    """Send a message; the device's controller goes off the bus during its answer."""
     before = bench.tester.frames_received
     sent = bench.send(frames)
     give_up_at = bench.now + bench.limit("ack_s")
@@ -207,7 +209,7 @@ def same_id(bench: Bench) -> None:
 
 
 def _upgrade_in_trouble(bench: Bench, make: Callable[[int], Iterator[_Trouble]]) -> None:
-    """Upgrade again and again until everything has happened, once in each message at the most."""
+    """Repeat the upgrade until every fault has happened, one in each message at most."""
     image = bench.good_image
     troubles = _Troubles(bench, image, make)
     for _ in range(troubles.rounds_max):
@@ -220,8 +222,8 @@ def _upgrade_in_trouble(bench: Bench, make: Callable[[int], Iterator[_Trouble]])
 
 
 def _enter(bench: Bench, image: bytes, troubles: _Troubles) -> None:
-    """Reset and update command until request transfer. A device that hears only a part of them
-    announces, runs, erases or waits for packet 1: all right, as long as it gets there in the end.
+    """Send reset and update command until request transfer. A device that received only a part of
+    them may announce, run, erase or wait for packet 1; it has to request the transfer in the end.
     """
     limit = bench.limit
     names: list[str] = []
@@ -254,8 +256,8 @@ def _enter(bench: Bench, image: bytes, troubles: _Troubles) -> None:
 
 
 def _send_packets(bench: Bench, image: bytes, troubles: _Troubles) -> bool:
-    """All packets, each one in its own trouble and then undisturbed until it is acknowledged.
-    False when the device restarted: it said so, and the upgrade begins anew (R11).
+    """Send all packets, each one with its fault and then undisturbed until it is acknowledged.
+    False when the device announced a restart: the upgrade begins again (R11).
     """
     total, began_at = packet_count(len(image)), bench.now
     for number in range(1, total + 1):
@@ -275,8 +277,8 @@ def _send_packets(bench: Bench, image: bytes, troubles: _Troubles) -> bool:
 
 
 def _end(bench: Bench, image: bytes, troubles: _Troubles) -> bool:
-    """End of transfer, in one trouble after the other as long as it is not heard; false when the
-    device refused the image, twice and so explicitly (R6).
+    """End of transfer, with one fault after the other until it is answered; false when the device
+    refused the image explicitly, with two NAKs (R6).
     """
     names: list[str] = []
     heard: Received | None = None
@@ -302,7 +304,7 @@ def _end(bench: Bench, image: bytes, troubles: _Troubles) -> bool:
 
 
 def _say_as_device(bench: Bench) -> None:
-    """Whole answers, and the first frame of one, on the device's own id."""
+    """Send complete answers, and the first frame of one, on the device's own id."""
     answer = bench.encoder.answer
     for command, data in ((FEEDBACK, b"ACK"), (REQUEST, bytes(2)), (ACK, b"\x01\x00")):
         bench.send(answer(command, data))

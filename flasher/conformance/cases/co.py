@@ -1,7 +1,7 @@
 """CO: others on the bus. Load, a babbling node, the upgrade of another target, and the traffic of
 chapter 3.
 
-The suite is the others too: it puts their frames between its own.
+The suite sends the frames of the other nodes too, between its own.
 """
 
 from __future__ import annotations
@@ -192,12 +192,12 @@ def application_traffic(bench: Bench) -> None:
 
 
 def _under_load(frames: Sequence[RawFrame]) -> list[RawFrame]:
-    """Frames of the upgrade, each one behind nine of others."""
+    """Frames of the upgrade, nine frames of other nodes before each of them."""
     return [one for frame in frames for one in (*_FOREIGN, frame)]
 
 
 def _load(bench: Bench, for_s: float) -> None:
-    """Nine frames of others, then as much time as one takes, and so on."""
+    """Load the bus to 90 %: nine frames of other nodes, then a gap as long as one frame."""
     until = bench.now + for_s
     while bench.now < until:
         bench.send(_FOREIGN)
@@ -225,7 +225,7 @@ def _babble(bench: Bench) -> None:
 
 
 def _between(bench: Bench, own: Sequence[RawFrame], others: Sequence[RawFrame]) -> None:
-    """The frames of two messages in turn; the device's own message ends last."""
+    """Send the frames of two messages alternately; the device's own message ends last."""
     frames: list[RawFrame] = []
     for index in range(max(len(own), len(others))):
         frames += others[index : index + 1]
@@ -234,8 +234,8 @@ def _between(bench: Bench, own: Sequence[RawFrame], others: Sequence[RawFrame]) 
 
 
 def _check_packet_beside(bench: Bench, other: Encoder, image: bytes, number: int) -> None:
-    """A packet between the frames of the other target's, which has other bytes; then the other
-    target's next one alone.
+    """Send a packet between the frames of the other target's packet, which has other data; then the
+    other target's next packet alone.
     """
     total = packet_count(len(image))
     inverse = inverted(packet_payload(image, number))
@@ -254,7 +254,7 @@ def _check_packet_beside(bench: Bench, other: Encoder, image: bytes, number: int
 
 
 def _traffic(encoder: Encoder) -> Iterator[RawFrame]:
-    """All of it but what the device itself would say."""
+    """The messages of chapter 3, without those that the device itself sends."""
     for can_id, mode, command, data in _REPORTS:
         if can_id & 0x0F0 != encoder.to_all & 0x0F0:
             yield from split(can_id, build(can_id, mode, command, data))

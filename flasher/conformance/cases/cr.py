@@ -1,4 +1,4 @@
-"""CR: checksum. The stimuli stand in a transfer that is never ended (`probing`)."""
+"""CR: checksum. Most stimuli are sent in a transfer that is never ended (`probing`)."""
 
 from __future__ import annotations
 
@@ -232,11 +232,11 @@ class _Exact:
         return self._bench.encoder.frames(self._written[name])
 
     def hear(self, name: str, within_s: float) -> None:
-        """The next message is the written-out one; another ends the case."""
+        """Require that the next message is the written-out one."""
         self._judge(name, self._written[name], self._bench.next_message(within_s))
 
     def hear_first_nak(self, within_s: float) -> None:
-        """The same for NAK 1. Whether there is a NAK, and with which number, is TX-01."""
+        """Require the same of NAK 1. Whether a NAK comes, and with which number, is TX-01."""
         heard = self._bench.next_message(within_s)
         if (
             heard is None
@@ -289,7 +289,7 @@ class _Exact:
 
 
 def _calm_probe(bench: Bench) -> Probe:
-    """A probe of packets in which no two neighbours are nearly a header."""
+    """A probe whose data has no bytes that one flipped bit turns into a header."""
     return Probe(bench, bytes(bench.random.choice(_CALM) for _ in range(_CALM_BYTES)))
 
 
@@ -325,7 +325,7 @@ def _frame_faults() -> Iterator[Fault]:
 
 
 def _wrong_checksums(bench: Bench) -> Iterator[Damage]:
-    """Ways to get a CRC that is not the right one, each of a message that is right so far."""
+    """Changes that give a correct message another, wrong CRC."""
     encoder = bench.encoder
 
     def by(between: bytes) -> Callable[[bytes], bytes]:
@@ -351,10 +351,11 @@ def _wrong_checksums(bench: Bench) -> Iterator[Damage]:
 def _check_none_taken(
     bench: Bench, probe: Probe, damages: Sequence[Damage], *, framed: bool
 ) -> None:
-    """Send the next packet damaged in these ways; the first one that is acknowledged ends the case,
-    as something else is stored then than what follows is about.
+    """Send the next packet damaged in these ways. The first one that is acknowledged ends the case,
+    since the device then has stored other data than the following checks assume.
 
-    `framed` says that each is over with its last frame, so that the next one need not wait.
+    With `framed` each damaged packet ends with its last frame, so that the next one need not wait
+    for the inter-frame timeout.
     """
     choice = bench.choice("tx_01")
     answers = choice in ("nak_expected", "nak_received")

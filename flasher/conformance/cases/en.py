@@ -1,4 +1,4 @@
-"""EN: the end of a transfer, and what runs then."""
+"""EN: the end of a transfer, and the application that is started."""
 
 from __future__ import annotations
 
@@ -77,8 +77,8 @@ def end_early_and_twice(bench: Bench) -> None:
 
 
 def _goes_on(bench: Bench, image: bytes, stored: int) -> int:
-    """Packets more that are stored: 1 when the transfer goes on; otherwise as many as were, in a
-    new one.
+    """Send the next packet. Returns 1 when the transfer goes on; otherwise begins a new transfer,
+    up to the same packet, and returns 0.
     """
     bench.send_packet(image, stored + 1)
     heard = bench.wait_for(Kind.ACK, Kind.NAK, Kind.BOOT_VERSION)
@@ -175,8 +175,8 @@ def in_a_row(bench: Bench) -> None:
 
 
 def _enter_at_once(bench: Bench) -> None:
-    """To the bootloader from a device that may be just starting its application, which hears no
-    reset: it is repeated until something is heard (4.3).
+    """Reset a device that may just be starting its application and receive nothing: the reset is
+    repeated until something is received (4.3).
     """
     within_s = bench.limit("start_s") + bench.limit("first_version_s")
     deadline = bench.now + within_s

@@ -1,4 +1,4 @@
-"""FR: framing. Most stimuli stand in a transfer that is never ended (`probing`)."""
+"""FR: framing. Most stimuli are sent in a transfer that is never ended (`probing`)."""
 
 from __future__ import annotations
 
@@ -323,14 +323,14 @@ def unknown(bench: Bench) -> None:
 
 
 def _wanted(bench: Bench, key: str) -> str:
-    """What a choice of the profile means for the message that it is about."""
+    """Whether the message that a choice of the profile is about has to be accepted."""
     choice = bench.choice(key)
     means = {"found": ACCEPTED, "rescanned": ACCEPTED, "ignored": ACCEPTED}
     return means.get(choice, REJECTED if choice in ("lost", "dropped") else choice)
 
 
 def _of_command(bench: Bench, command: int) -> list[RawFrame]:
-    """A write of that command, with as many zeros as it says."""
+    """A write of that command; its data are zeros, as many as the command says."""
     return bench.encoder.message(WRITE, command, bytes(command & 0xFF))
 
 

@@ -1,5 +1,5 @@
-"""What the cases about framing, checksum and gaps share: a transfer that is never ended. Whether
-its next packet is acknowledged shows what the device made of the bytes before.
+"""A transfer that is never ended, for the cases about framing, checksum and gaps. Whether its next
+packet is acknowledged shows how the device took the bytes before it.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _QUIET_S: Final = 0.05
 
 
 def is_as(wanted: str, taken: bool) -> bool:  # noqa: FBT001
-    """Whether something that was taken, or not, is as one of the three texts above says."""
+    """True when a message that was taken, or not, complies with one of the three words above."""
     return wanted == EITHER or taken == (wanted == ACCEPTED)
 
 
@@ -97,7 +97,7 @@ class Probe:
         self.number, self._taken_at = 1, bench.now
 
     def settle_s(self) -> float:
-        """Surely longer than a bootloader waits for the rest of a message."""
+        """Longer than a bootloader waits for the rest of a message."""
         return 2 * self._bench.limit("inter_frame_s")
 
     # -- bytes ------------------------------------------------------------------------------------
@@ -202,7 +202,7 @@ class Probe:
         return heard.kind is Kind.ACK and heard.number == self.number
 
     def _answers(self) -> list[Received]:
-        """What is heard up to the ACK of the next packet and shortly behind it."""
+        """The messages up to the ACK of the next packet, and shortly after it."""
         bench = self._bench
         # Long enough, too, that nothing of it is left when the next packet comes.
         deadline = bench.now + max(bench.limit("ack_s"), self.settle_s())

@@ -1,5 +1,5 @@
-"""PW: power cuts. Whatever the moment, no mixture of two images is ever started, and the device is
-reachable again.
+"""PW: power cuts. At whatever moment the power is cut, the device is reachable afterwards and never
+starts a mixture of two images.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class _Cut(NamedTuple):
 
 @dataclass
 class _Upgrade:
-    """The images of a case and how far the upgrade went that was cut."""
+    """The images of a case, and how far the interrupted upgrade went."""
 
     old: bytes
     new: bytes
@@ -48,7 +48,7 @@ class _Upgrade:
     """True while an application runs, so that the way into the bootloader is a reset."""
 
     def turn(self) -> None:
-        """The new image runs; the next upgrade is back to the other one."""
+        """Swap the images: the new one runs, and the next upgrade is to the other one."""
         self.old, self.new = self.new, self.old
 
 
@@ -178,7 +178,7 @@ def _enter(bench: Bench, upgrade: _Upgrade) -> None:
 
 
 def _go_to(bench: Bench, upgrade: _Upgrade, cut: _Cut) -> None:
-    """The upgrade up to those frames."""
+    """Carry out the upgrade up to the cut."""
     total, encoder = packet_count(len(upgrade.new)), bench.encoder
     if not cut.packet:
         if upgrade.runs:
@@ -277,7 +277,7 @@ def _cut_operations(bench: Bench, upgrade: _Upgrade) -> None:
 
 
 def _upgrade_until_cut(bench: Bench, upgrade: _Upgrade) -> Received | None:
-    """Go on until the device announces itself again, and return that; None at the very end."""
+    """Upgrade until the device announces itself again; None when the upgrade was completed."""
     limit = bench.limit
     back_s = _OFF_S + limit("first_version_s")
     bench.forget()
@@ -297,7 +297,7 @@ def _upgrade_until_cut(bench: Bench, upgrade: _Upgrade) -> Received | None:
 
 
 def _cut_after_ack(bench: Bench, upgrade: _Upgrade) -> None:
-    """What the device says it has received correctly is not lost with the power (R10)."""
+    """Packets that the device acknowledged are still stored after a power cut (R10)."""
     written = 2 * PACKET_BYTES
     last = packet_count(written + bench.number("buffer_bytes"))
     with bench.step(f"after ACK {last}"):

@@ -138,8 +138,8 @@ def power_up(bench: Bench) -> None:
 
 
 def _check_announces_on(bench: Bench, wanted: int) -> None:
-    """So many boot versions more. How often they come is not said anywhere (R14), but a tool does
-    not wait longer for the next one than for the first.
+    """`wanted` more boot versions come. The document gives no period for them (R14); each one may
+    take as long as the first one.
     """
     heard = 0
     while heard < wanted and bench.wait_for(Kind.BOOT_VERSION) is not None:
@@ -169,7 +169,7 @@ def _check_burst(bench: Bench, first: Received) -> None:
 
 
 def _check_count(bench: Bench, count: int, expected: str) -> None:
-    """So many boot versions and nothing else until burst and window are over."""
+    """Exactly `count` boot versions, and nothing else, come until burst and window are over."""
     heard = bench.collect(bench.host.burst_s + bench.limit("first_version_s") / 4)
     bench.check(_versions(heard) == count, f"{expected}: {count}", describe(heard))
     bench.check_only(heard, Kind.BOOT_VERSION, Kind.FEEDBACK, why="nothing but boot versions")
@@ -180,7 +180,7 @@ def _versions(heard: list[Received]) -> int:
 
 
 def _check_ignored(bench: Bench, step: str, frames: list[RawFrame]) -> None:
-    """Whatever is answered (an application confirms every write), the device does not restart."""
+    """The device does not restart; it may answer (an application confirms every write)."""
     with bench.step(step):
         bench.send(frames)
         bench.expect_silence(

@@ -95,7 +95,7 @@ def _floods(bench: Bench) -> dict[str, list[RawFrame]]:
 
 
 def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
-    """Until the window is over, and on: the application has to start meanwhile."""
+    """Send useless data beyond the window; the application has to start all the same."""
     bench.reset_to_bootloader()
     ends_at = bench.now + bench.host.burst_s
     for _ in range(1 + int(bench.host.burst_s / (_FLOOD_FRAMES * 0.0004))):
@@ -114,7 +114,7 @@ def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:
 def _drip_until(
     bench: Bench, kind: Kind, within_s: float, query: list[RawFrame]
 ) -> Received | None:
-    """Useless messages and bytes, now and then, with `query` between, until `kind` is heard."""
+    """Send useless messages and bytes, `query` between them, until `kind` is received."""
     deadline = bench.now + within_s
     encoder = bench.encoder
     drops = cycle((encoder.message(READ, _UNKNOWN), encoder.frames(_HEADS * 2)))
@@ -171,8 +171,8 @@ def noise(bench: Bench) -> None:
 
 
 def _carry_on(bench: Bench, image: bytes, stored: int) -> int:
-    """The next step of a transfer, the end after the last packet. A device that was thrown off has
-    to take a whole upgrade instead. Returns the packets stored, 0 without a transfer.
+    """Send the next packet, or the end of transfer. A device that left the transfer has to take a
+    whole upgrade instead. Returns the packets stored, 0 without a transfer.
     """
     bench.collect(bench.limit("ack_s") + bench.limit("inter_frame_s"))
     if stored < packet_count(len(image)):
@@ -205,8 +205,8 @@ def _make_noise(bench: Bench) -> None:
 
 
 def _wild_message(bench: Bench) -> list[RawFrame]:
-    """Any mode, command and data; one that writes a setting becomes a read. That the data are right
-    for a reset, an update command, a packet or an end by chance is not worth a thought.
+    """Any mode, command and data; one that would write a setting becomes a read. That random data
+    make a correct reset, update command or packet is too unlikely to be excluded.
     """
     chance = bench.random
     if chance.randrange(2):
@@ -260,7 +260,7 @@ def outside(bench: Bench) -> None:
 
 
 def _number_sender(bench: Bench, total: int, marker: bytes) -> Callable[[int], None]:
-    """What sends packets with impossible numbers: none of them may be acknowledged."""
+    """A function that sends packets with impossible numbers, none of which may be acknowledged."""
     pages = packet_count(bench.number("application_bytes"))
     numbers = [
         (number, named)

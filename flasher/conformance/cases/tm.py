@@ -118,7 +118,7 @@ def _judge(bench: Bench) -> None:
 
 
 def _enter(bench: Bench) -> Received:
-    """Reset; returns the first boot version. What is measured here is judged at the end."""
+    """Reset the device; returns the first boot version. The times are judged at the end."""
     bench.forget()
     sent = bench.send(bench.encoder.reset())
     limit_s = _PATIENCE * bench.limit("first_version_s")
@@ -159,7 +159,7 @@ def _longest_frame_s(bench: Bench) -> float:
 
 
 def _widest_s(bench: Bench, since_s: float) -> float:
-    """The widest gap between the packet's frames, from end to end, as it came about."""
+    """The widest gap between the ends of the packet's frames, as it was on the bus."""
     sent = [entry.at_s for entry in bench.tester.trace if entry.sent and entry.at_s > since_s]
     sent = sent[:PACKET_FRAMES]
     return max(behind - before for before, behind in pairwise(sent))

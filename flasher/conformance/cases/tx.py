@@ -1,5 +1,5 @@
-"""TX: the transfer. Packets that are damaged, repeated or have a wrong head, very many of them, and
-what becomes of a transfer in which nothing comes, or a reset.
+"""TX: the transfer. Packets that are damaged, repeated or have a wrong head, the largest image, and
+pauses and resets during a transfer.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def transfer_image(bench: Bench) -> bytes:
 
 
 def answers(bench: Bench) -> list[Received]:
-    """What a packet is answered by: the first answer, and what follows it at once."""
+    """The answers to a packet: the first one, and those that follow it at once."""
     first = bench.next_message(bench.limit("ack_s") + bench.limit("inter_frame_s"))
     return [] if first is None else [first, *bench.collect(_QUIET_S)]
 
@@ -80,8 +80,8 @@ def _stops(bench: Bench, image: bytes, numbers: Iterable[int]) -> Iterator[int]:
 
 
 def _check_rejected(bench: Bench, wanted: int, named: int, *, is_plain: bool = True) -> None:
-    """A packet was rejected as tx_01 says: a NAK, or nothing. With `is_plain` false the device may
-    have had reasons not to trust the number in it.
+    """A packet was rejected as tx_01 says, by NAK or silence. With `is_plain` false the device may
+    answer with the wanted number whatever tx_01 says: the number in the packet is not credible.
     """
     choice = bench.choice("tx_01")
     numbers = {wanted} if choice == "nak_expected" else {named}
@@ -96,7 +96,7 @@ def _nak_counts(choice: str) -> tuple[int, ...]:
 
 
 def _check_naks(bench: Bench, numbers: Collection[int] | None, counts: Collection[int]) -> None:
-    """So many NAKs, with one of `numbers` (any for None), and nothing else."""
+    """One of `counts` NAKs came, with one of `numbers` (None: any), and nothing else."""
     heard = answers(bench)
     naks = [one for one in heard if one.kind is Kind.NAK]
     right = [one for one in naks if numbers is None or one.number in numbers]
