@@ -10,7 +10,7 @@ by step, check what the device answers, and end the case when it is wrong.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 
 from flasher.conformance.host import UPDATES_MAX, PatientHost
 from flasher.conformance.judge import Judge
@@ -170,6 +170,18 @@ class Bench:
         self.packets(image, first)
         self.end_transfer()
         self.check_image(image)
+
+    def transfer_in_parts(self, image: bytes, stops: Iterable[int]) -> Iterator[int]:
+        """Transfer `image` from the running application on, and yield after each of these packets
+        (0: before the first one); the whole ends with the application of the image.
+        """
+        self.start_transfer(len(image))
+        done = 0
+        for stored in stops:
+            self.packets(image, done + 1, stored)
+            done = stored
+            yield stored
+        self.finish(image, done + 1)
 
     def check_upgrade(self, image: bytes | None = None) -> None:
         """The device can be upgraded from where it is: to `image`, or to the good one."""

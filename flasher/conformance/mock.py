@@ -53,7 +53,9 @@ SECOND_IMAGE: Final = model_image("V1r9r0_20230517", 6 * 128)
 
 
 class MockPort:
-    """A way onto a simulated bus: exact end times of all frames, the own ones included."""
+    """A way onto a simulated bus, with exact end times of all frames, the own ones included. Its
+    methods raise DeviceCrashed too.
+    """
 
     echoes = True
     timestamp_source = "simulated bus"
@@ -67,18 +69,15 @@ class MockPort:
         self._pending: deque[Frame] = deque()
 
     def now(self) -> float:
-        """Virtual seconds."""
         return self.bus.clock.now()
 
     def send(self, frame: RawFrame) -> None:
-        """Queue a frame. Raises BusError for an adapter in trouble, DeviceCrashed."""
         made = Frame(*frame)
         self._pending.append(made)
         with _CRASHES:
             self._link.send(made)
 
     def receive(self, deadline: float) -> Arrival | None:
-        """Let time pass until there is a frame or `deadline` has come. Raises as `send`."""
         with _CRASHES:
             while not self._arrived:
                 if self.now() >= deadline:
@@ -147,7 +146,6 @@ class MockSubject:
             self.bus.attach(engine)
 
     def power(self, *, on: bool) -> None:
-        """Switch the device on or off now. Raises DeviceCrashed."""
         with _CRASHES:
             if on:
                 self.device.power_on(self.port.now())
@@ -155,21 +153,17 @@ class MockSubject:
                 self.device.power_cut(self.port.now())
 
     def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
-        """Cut the power in a flash operation to come, as `Subject` says."""
         self._injector.set(PowerCut(off_s), InOperation(operation, share))
 
     def take_cut(self) -> bool:
-        """True when the cut that was set has happened; none is set any more."""
         happened = not self._injector.is_set
         self._injector.clear()
         return happened
 
     def readback(self) -> bytes:
-        """The whole application area."""
         return self.device.readback()
 
     def bus_off(self, for_s: float) -> None:
-        """The device's controller leaves the bus for that long."""
         self.device.bus_off(self.port.now(), for_s)
 
 

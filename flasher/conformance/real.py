@@ -37,7 +37,9 @@ _READBACK_MAX_SIZE: Final = 64 * 1024 * 1024
 
 
 class RealPort:
-    """A link as the bench's port. `echoes` says that the adapter gives back what it sent."""
+    """A link as the bench's port; `echoes` says that the adapter gives back what it sent. Frames
+    have the time of the kernel or, where it gives none, of this process.
+    """
 
     def __init__(
         self,
@@ -60,7 +62,6 @@ class RealPort:
         self._own: deque[Frame] = deque(maxlen=_OWN_FRAMES)
 
     def now(self) -> float:
-        """Seconds on the link's clock."""
         return self._clock.now()
 
     def send(self, frame: RawFrame) -> None:
@@ -72,9 +73,6 @@ class RealPort:
         self._link.send(made)
 
     def receive(self, deadline: float) -> Arrival | None:
-        """The next frame with the time at which the kernel or, where that is not told, this process
-        had it.
-        """
         while (frame := self._link.receive(deadline)) is not None:
             at = self._moment()
             frame = Frame(*frame[:5])  # whose it is, is judged here, and not by the link
@@ -133,27 +131,22 @@ class RealSubject:
         self._readback = readback
 
     def power(self, *, on: bool) -> None:
-        """Switch the device. Raises Unsupported without control, BusError when it fails."""
         if self._power is None:
             raise Unsupported("the bench has no power control")
         self._power(on)
 
     def readback(self) -> bytes:
-        """The application area. Raises Unsupported without a way, BusError when it fails."""
         if self._readback is None:
             raise Unsupported("the bench has no readback")
         return self._readback()
 
     def bus_off(self, for_s: float) -> None:
-        """Not possible from outside. Raises Unsupported."""
         raise Unsupported("a real device cannot be made to go bus-off")
 
     def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
-        """Not possible from outside. Raises Unsupported."""
         raise Unsupported("nobody sees from outside when a flash operation is under way")
 
     def take_cut(self) -> bool:
-        """No cut was ever set."""
         return False
 
 

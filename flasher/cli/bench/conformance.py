@@ -232,7 +232,7 @@ def conformance(output: Output, bus: Bus, chosen: Choices) -> int:
     """
     if chosen.is_list:
         return _list(chosen.selection, output)
-    from flasher.cli.bench.conformance_progress import Progress  # noqa: PLC0415  much is loaded
+    from flasher.cli.bench.conformance_progress import progress  # noqa: PLC0415  much is loaded
     from flasher.conformance.opening import open_bench  # noqa: PLC0415
     from flasher.conformance.runner import RunOptions, run  # noqa: PLC0415
 
@@ -244,14 +244,14 @@ def conformance(output: Output, bus: Bus, chosen: Choices) -> int:
     with (
         open_bench(bench) as (subject, profile),
         stop_on_signal(stopping) as stopped,
-        Progress(output) as progress,
+        progress(output) as observer,
     ):
         report = run(
             subject,
             profile,
             selection=chosen.selection,
             options=RunOptions(chosen.seed, chosen.repeat, chosen.timeout, chosen.strict),
-            observer=progress,
+            observer=observer,
             stopped=stopped,
         )
         was_stopped = stopped()

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from types import TracebackType
-from typing import Any, Final, Self
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Final
 
 from flasher.cli.output import Output
 from flasher.conformance.catalogue import Case
@@ -18,7 +19,17 @@ _BAD: Final = (CaseVerdict.FAIL, CaseVerdict.ERROR)
 _BAR: Final = "{n_fmt}/{total_fmt} |{bar:20}| {elapsed} {desc}"
 
 
-class Progress(RunObserver):
+@contextmanager
+def progress(output: Output) -> Iterator[RunObserver]:
+    """An observer for one run; the terminal is as before at the end."""
+    shown = _Progress(output)
+    try:
+        yield shown
+    finally:
+        shown.close()
+
+
+class _Progress(RunObserver):
     """An observer that tells a person; on a terminal with a bar, elsewhere only with -v."""
 
     def __init__(self, output: Output) -> None:
@@ -27,17 +38,6 @@ class Progress(RunObserver):
         self._bar: Any = None
         self._count = 0
         self._ended = 0
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self._close_bar()
 
     def run_began(self, count: int) -> None:
         """So many case runs follow."""
@@ -80,9 +80,10 @@ class Progress(RunObserver):
             self._bar.set_description_str(printable(text))
         except OSError:  # the terminal is gone; the run goes on
             self._wants_bar = False
-            self._close_bar()
+            self.close()
 
-    def _close_bar(self) -> None:
+    def close(self) -> None:
+        """Take the bar away."""
         if self._bar is not None:
             with contextlib.suppress(OSError):
                 self._bar.close()

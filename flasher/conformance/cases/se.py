@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import cycle
 from typing import Final
 
@@ -245,36 +244,21 @@ def outside(bench: Bench) -> None:
     image = transfer_image(bench)
     total = packet_count(len(image))
     marker = bench.random.randbytes(PACKET_BYTES)
-    send_wild = _number_sender(bench, total, marker)
-    bench.start_transfer(len(image))
-    send_wild(0)
-    bench.packets(image, 1, 1)
-    send_wild(1)
-    bench.packets(image, 2)
-    send_wild(total)
-    bench.finish(image, total + 1)
-    if bench.subject.has_readback:
-        found = bench.subject.readback().find(marker)
-        got = "not there" if found < 0 else f"at offset {found}"
-        bench.check(found < 0, "none of the rejected data in the flash", got)
-
-
-def _number_sender(bench: Bench, total: int, marker: bytes) -> Callable[[int], None]:
-    """A function that sends packets with impossible numbers, none of which may be acknowledged."""
-    pages = packet_count(bench.number("application_bytes"))
+    beyond = (0, total + 1, packet_count(area) + 1, 0x8000, 0xFFFF)
     numbers = [
         (number, named)
-        for number in dict.fromkeys((0, total + 1, pages + 1, 0x8000, 0xFFFF))
-        for named in dict.fromkeys((total, number))
+        for number in dict.fromkeys(beyond)
         if number <= 0xFFFF and not 0 < number <= total
+        for named in dict.fromkeys((total, number))
     ]
-
-    def send(stored: int) -> None:
+    for stored in bench.transfer_in_parts(image, (0, 1, total)):
         for number, named in numbers:
             with bench.step(f"after packet {stored}, packet {number} of {named}"):
                 bench.send(bench.encoder.packet(number, named, marker))
                 heard = answers(bench)
-                others = [one for one in heard if one.kind is not Kind.NAK]
-                bench.check(not others, "NAK or silence", describe(heard))
-
-    return send
+                ok = all(one.kind is Kind.NAK for one in heard)
+                bench.check(ok, "NAK or silence", describe(heard))
+    if bench.subject.has_readback:
+        found = bench.subject.readback().find(marker)
+        got = "not there" if found < 0 else f"at offset {found}"
+        bench.check(found < 0, "none of the rejected data in the flash", got)

@@ -189,17 +189,12 @@ def _repeat(bench: Bench, changed: Callable[[bytes], bytes]) -> None:
     """A transfer with repetitions whose data are those of the first copy, `changed`."""
     image = transfer_image(bench)
     total = packet_count(len(image))
-    bench.start_transfer(len(image))
-    done = 0
-    for number in (1, 2, total):
-        bench.packets(image, done + 1, number)
-        done = number
+    for number in bench.transfer_in_parts(image, (1, 2, total)):
         payload = changed(packet_payload(image, number))
         for copy in range(1, _REPEATS + 1):
             with bench.step(f"packet {number}, repetition {copy}"):
                 bench.send(bench.encoder.packet(number, total, payload))
                 _check_repeated(bench, number, total)
-    bench.finish(image, total + 1)
 
 
 def _check_repeated(bench: Bench, number: int, total: int) -> None:
@@ -231,19 +226,14 @@ def _check_repeated(bench: Bench, number: int, total: int) -> None:
 def out_of_order(bench: Bench) -> None:
     image = transfer_image(bench)
     total = packet_count(len(image))
-    bench.start_transfer(len(image))
-    _send_wrong_numbers(bench, total, 0)
-    bench.packets(image, 1, _STORED)
-    _send_wrong_numbers(bench, total, _STORED)
-    for number in range(1, _STORED):
-        payload = packet_payload(image, number)
-        for what, data in (("the right", payload), ("other", inverted(payload))):
-            with bench.step(f"after packet {_STORED}, packet {number} with {what} data"):
-                bench.send(bench.encoder.packet(number, total, data))
-                _check_older(bench, number)
-    bench.packets(image, _STORED + 1)
-    _send_wrong_numbers(bench, total, total)
-    bench.finish(image, total + 1)
+    for stored in bench.transfer_in_parts(image, (0, _STORED, total)):
+        _send_wrong_numbers(bench, total, stored)
+        for number in range(1, _STORED) if stored == _STORED else ():
+            payload = packet_payload(image, number)
+            for what, data in (("the right", payload), ("other", inverted(payload))):
+                with bench.step(f"after packet {stored}, packet {number} with {what} data"):
+                    bench.send(bench.encoder.packet(number, total, data))
+                    _check_older(bench, number)
 
 
 def _send_wrong_numbers(bench: Bench, total: int, stored: int) -> None:
@@ -420,16 +410,10 @@ def _announces(bench: Bench) -> None:
 
 def _waits(bench: Bench) -> None:
     image = transfer_image(bench)
-    total = packet_count(len(image))
     pause_s = _LONG * bench.limit("pause_s")
-    bench.start_transfer(len(image))
-    done = 0
-    for stored in (0, 1, total):
-        bench.packets(image, done + 1, stored)
-        done = stored
+    for stored in bench.transfer_in_parts(image, (0, 1, packet_count(len(image)))):
         with bench.step(_place("a pause", stored)):
             bench.expect_silence(pause_s)
-    bench.finish(image, total + 1)
     with bench.step("a new upgrade after a pause"):
         starts_over = bench.choice("up_08") == "starts_over"
         can_leave = bench.choice("tx_13") == "restarts" or bench.subject.has_power
