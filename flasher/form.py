@@ -1,7 +1,8 @@
-"""What a type says of its values where bounds do not do: how to read one, and that in words.
+"""What a type says of its values beyond its name: the bounds of a number, the form of a text, the
+words of an enumeration.
 
-It stands in an annotation, as `Annotated[str, Form("64 hex digits", read_sha256)]`. Only who reads
-files (`flasher.settings`) needs the validation library.
+It stands in an annotation: `Annotated[int, Bounds(ge=1, le=100)]`, `Annotated[str, Form("64 hex
+digits", read_sha256)]`. The validation library is needed only by who reads or writes files.
 """
 
 from __future__ import annotations
@@ -43,6 +44,22 @@ class Form:
             return self.read(value)
         except TypeError as error:
             raise ValueError(str(error)) from error
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The range of a number: above `gt` or from `ge` on, up to `le`."""
+
+    ge: float | None = None
+    gt: float | None = None
+    le: float | None = None
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: Callable[[Any], CoreSchema]
+    ) -> CoreSchema:
+        schema: Any = handler(source)
+        given = {name: bound for name, bound in vars(self).items() if bound is not None}
+        return {**schema, **given}
 
 
 class LowerInJson:

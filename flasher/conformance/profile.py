@@ -21,13 +21,12 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Final, Literal
 
-from annotated_types import Interval
 from pydantic import AfterValidator, Field, model_validator
 
 from flasher.conformance.wire import IMAGE_BYTES_MAX, RESET, RESET_TEXT
 from flasher.errors import Fault, did_you_mean, printable
 from flasher.files import read_toml
-from flasher.form import Form
+from flasher.form import Bounds, Form
 from flasher.settings.reading import Key, Reader, Table
 
 DEVIATIONS: Final = "deviations"
@@ -55,7 +54,7 @@ def _check_deviations(deviations: dict[str, str]) -> dict[str, str]:
     return deviations
 
 
-Limit = Annotated[float, Interval(ge=0, le=3600)]
+Limit = Annotated[float, Bounds(ge=0, le=3600)]
 Ascii = Annotated[str, Form("a text in ASCII", _ascii)]
 
 
@@ -95,17 +94,17 @@ class Limits(Table):
 class DeviceFacts(Table):
     """Sizes and words of the product."""
 
-    application_bytes: Annotated[int, Interval(ge=1, le=0xFFFF_FFFF)] = IMAGE_BYTES_MAX
+    application_bytes: Annotated[int, Bounds(ge=1, le=0xFFFF_FFFF)] = IMAGE_BYTES_MAX
     """Size of the application area."""
-    largest_image_bytes: Annotated[int, Interval(ge=1, le=IMAGE_BYTES_MAX)] = IMAGE_BYTES_MAX
+    largest_image_bytes: Annotated[int, Bounds(ge=1, le=IMAGE_BYTES_MAX)] = IMAGE_BYTES_MAX
     """The largest image that is taken."""
-    reset_command: Annotated[int, Interval(ge=0, le=0xFFFF)] = RESET
+    reset_command: Annotated[int, Bounds(ge=0, le=0xFFFF)] = RESET
     """Command that restarts into the bootloader (R3)."""
     reset_data: Ascii = RESET_TEXT.decode()
     """Data of that command."""
-    versions: Annotated[int, Interval(ge=1, le=100)] = 4
+    versions: Annotated[int, Bounds(ge=1, le=100)] = 4
     """Boot versions in a burst."""
-    buffer_bytes: Annotated[int, Interval(ge=0, le=IMAGE_BYTES_MAX)] = 0
+    buffer_bytes: Annotated[int, Bounds(ge=0, le=IMAGE_BYTES_MAX)] = 0
     """What it has acknowledged and may not have written yet, until the end of transfer."""
 
     @model_validator(mode="after")

@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Annotated
 
-from annotated_types import Interval
-
 from flasher.errors import ImageError, WrongDeviceError
-from flasher.form import Form
+from flasher.form import Bounds, Form
 from flasher.image.image import Image
 from flasher.protocol.spec import IMAGE_MAX_SIZE, TARGETS, Target, find_target
 from flasher.protocol.text import (
@@ -93,7 +91,7 @@ class Release:
     """The device that the image is for."""
     firmware_version: FirmwareText | None = None
     """The version inside the image."""
-    size_bytes: Annotated[int, Interval(ge=1, le=IMAGE_MAX_SIZE)]
+    size_bytes: Annotated[int, Bounds(ge=1, le=IMAGE_MAX_SIZE)]
     """Bytes to be sent."""
     sha256: Annotated[str, Form("64 hex digits", _sha256)]
     """Of the bytes to be sent, lower-case hex digits."""

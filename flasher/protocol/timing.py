@@ -9,12 +9,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated
 
-from annotated_types import Interval
+from flasher.form import Bounds
 
-Timeout = Annotated[float, Interval(gt=0, le=3600)]
+Timeout = Annotated[float, Bounds(gt=0, le=3600)]
 """A timeout of zero would fail at once."""
-Pause = Annotated[float, Interval(ge=0, le=3600)]
-Tries = Annotated[int, Interval(ge=1, le=1000)]
+Pause = Annotated[float, Bounds(ge=0, le=3600)]
+Tries = Annotated[int, Bounds(ge=1, le=1000)]
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,11 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
-from annotated_types import Interval
 from platformdirs import user_config_path
 
 from flasher.errors import Fault, ImageError, UsageError
 from flasher.files import read_toml
-from flasher.form import Form
+from flasher.form import Bounds, Form
 from flasher.host.identity import Identity
 from flasher.host.options import PACKET_GAP_MAX_S, UpgradeOptions
 from flasher.host.query import Request
@@ -68,9 +67,9 @@ _TABLES: Final = ("timings", "application_area", "version_query")
 _DATA_MAX: Final = LENGTH_MAX - COMMAND_SIZE
 _DAY_S: Final = 24 * 3600
 
-Time = Annotated[float, Interval(gt=0, le=_DAY_S)]
-Number16 = Annotated[int, Interval(ge=0, le=0xFFFF)]
-Number32 = Annotated[int, Interval(ge=0, le=0xFFFF_FFFF)]
+Time = Annotated[float, Bounds(gt=0, le=_DAY_S)]
+Number16 = Annotated[int, Bounds(ge=0, le=0xFFFF)]
+Number32 = Annotated[int, Bounds(ge=0, le=0xFFFF_FFFF)]
 
 
 def _data(value: object) -> bytes:
@@ -102,7 +101,7 @@ class ApplicationArea:
 
     start: Number32
     """Address of the application."""
-    size_bytes: Annotated[int, Interval(ge=1, le=0xFFFF_FFFF)]
+    size_bytes: Annotated[int, Bounds(ge=1, le=0xFFFF_FFFF)]
     """Size of the application's area."""
 
     @property
@@ -119,13 +118,13 @@ class VersionQuery:
 
     command: Number16
     """Asks for the version."""
-    answer_id: Annotated[int, Interval(ge=0, le=0x7FF)]
+    answer_id: Annotated[int, Bounds(ge=0, le=0x7FF)]
     """CAN id of the answer."""
     answer_command: Number16
     """Command of the answer."""
-    offset: Annotated[int, Interval(ge=0, le=_DATA_MAX)]
+    offset: Annotated[int, Bounds(ge=0, le=_DATA_MAX)]
     """Where the text begins in the data."""
-    size_bytes: Annotated[int, Interval(ge=1, le=_DATA_MAX)]
+    size_bytes: Annotated[int, Bounds(ge=1, le=_DATA_MAX)]
     """Size of the text."""
 
     def request(self, target: Target) -> Request:
@@ -198,19 +197,17 @@ class Profile:
     """Overall deadline; without it one is computed from the plan."""
     power_up_timeout_s: Time = UpgradeOptions.power_up_timeout_s
     """Wait for a power cycle."""
-    adapter_return_s: Annotated[float, Interval(ge=0, le=3600)] = UpgradeOptions.adapter_return_s
+    adapter_return_s: Annotated[float, Bounds(ge=0, le=3600)] = UpgradeOptions.adapter_return_s
     """Wait for a lost adapter."""
     cpu: Cpu = Identity.cpu
     """The device's processor; other: no vector table is looked for in images."""
-    low_charge_percent: Annotated[int, Interval(ge=0, le=100)] = Identity.low_charge_percent
+    low_charge_percent: Annotated[int, Bounds(ge=0, le=100)] = Identity.low_charge_percent
     """Warn before an upgrade below this state of charge."""
-    in_use_ma: Annotated[int, Interval(ge=0, le=0x7FFF)] = Identity.in_use_ma
+    in_use_ma: Annotated[int, Bounds(ge=0, le=0x7FFF)] = Identity.in_use_ma
     """A discharge beyond this is a vehicle in use."""
-    frame_gap_s: Annotated[float, Interval(ge=0, le=1)] = UpgradeOptions.frame_gap_s
+    frame_gap_s: Annotated[float, Bounds(ge=0, le=1)] = UpgradeOptions.frame_gap_s
     """Silence between the frames of a message."""
-    packet_gap_s: Annotated[float, Interval(ge=0, le=PACKET_GAP_MAX_S)] = (
-        UpgradeOptions.packet_gap_s
-    )
+    packet_gap_s: Annotated[float, Bounds(ge=0, le=PACKET_GAP_MAX_S)] = UpgradeOptions.packet_gap_s
     """Silence before each packet."""
     nak_next_is_ack: bool = UpgradeOptions.nak_next_is_ack
     """NAK n+1 after a repeated packet n is ACK n (R10)."""
@@ -218,7 +215,7 @@ class Profile:
     """Restarts the application into the bootloader (R3)."""
     reset_data: Data = b"RESET"
     """The data of reset_command."""
-    image_limit_bytes: Annotated[int, Interval(ge=1, le=IMAGE_MAX_SIZE)] | None = None
+    image_limit_bytes: Annotated[int, Bounds(ge=1, le=IMAGE_MAX_SIZE)] | None = None
     """The largest image that the device takes."""
     application_area: ApplicationArea | None = None
     version_query: VersionQuery | None = None
