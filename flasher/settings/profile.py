@@ -366,10 +366,15 @@ class _File:
                 faults.append(Fault(key, what, remedy, f"[{key}] {what}"))
             else:
                 self.tables[target.name] = value
-                faults += _check_values(value, (key,))
-        faults += _check_values(self._common, ())
+                faults += self._check(value, (key,))
+        faults += self._check(self._common, ())
         if faults:
             raise reader().refusal(path, faults)
+
+    def _check(self, table: Mapping[str, Any], prefix: tuple[str, ...]) -> list[Fault]:
+        """What is wrong with the values that are there; others may stand in another table."""
+        names = {"target": "bms", "dialect": WELLING.name, "sources": {}}
+        return reader().check(table, prefix, is_whole=False, **names)[1]
 
     def profile(self, target: Target, dialect: Dialect) -> Profile:
         """What the file says of a target, over what holds without it."""
@@ -390,18 +395,6 @@ class _File:
             error.where = printable(str(self._path))
             raise
         return replace(profile, sources=_sources(profile, given, str(self._path)))
-
-
-def _check_values(table: Mapping[str, Any], prefix: tuple[str, ...]) -> list[Fault]:
-    """What is wrong with the values that are there; others may stand in another table."""
-    names = {"target": "bms", "dialect": WELLING.name, "sources": {}}
-    whole: dict[str, Any] = {
-        "application_area": {"start": 0, "size_bytes": 1},
-        "version_query": dict.fromkeys(("command", "answer_id", "answer_command", "offset"), 0)
-        | {"size_bytes": 1},
-    }
-    rest = {name: whole[name] for name in whole if isinstance(table.get(name), dict)}
-    return reader().check(_over(rest, table), prefix, **names)[1]
 
 
 def _over(base: Mapping[str, Any], values: Mapping[str, Any]) -> dict[str, Any]:

@@ -118,9 +118,16 @@ class Reader(Generic[Kind]):
         return value
 
     def check(
-        self, document: Mapping[str, Any], prefix: Location = (), **beside: Any
+        self,
+        document: Mapping[str, Any],
+        prefix: Location = (),
+        *,
+        is_whole: bool = True,
+        **beside: Any,
     ) -> tuple[Kind | None, list[Fault]]:
-        """What is in a document, or in the table `prefix` of one; and everything that is wrong."""
+        """What is in a document, or in the table `prefix` of one; and everything that is wrong.
+        Nothing is missed in what is not the whole.
+        """
         odd: list[Location] = []
         plain = _for_json(dict(document), (), odd)
         value = None
@@ -135,6 +142,7 @@ class Reader(Generic[Kind]):
             details += [
                 (each["type"], each["loc"], str(each.get("ctx", {}).get("error", each["msg"])))
                 for each in error.errors(include_url=False)
+                if is_whole or each["type"] != "missing"
             ]
         return value, self._faults(document, details, prefix)
 
