@@ -13,10 +13,6 @@ from flasher.cli.output import Output, byte_count, counted
 from flasher.cli.station.commands import RecordsOptions
 from flasher.cli.station.documents import (
     AcceptedDocument,
-    BackupDocument,
-    KeptHeadsDocument,
-    MigratedDocument,
-    ProblemDocument,
     RoleDocument,
     SigningKeyDocument,
     StationRolesDocument,
@@ -52,9 +48,7 @@ def backup(output: Output, records: RecordsOptions, file: Path) -> int:
     output.result(f"{printable(str(made.path))}: {byte_count(made.size_bytes)}, checked")
     output.result(f"  sha256: {made.sha256}")
     output.result(f"  traces: {printable(made.path.name)}.files beside it")
-    output.document(
-        BackupDocument(path=str(made.path), sha256=made.sha256, size_bytes=made.size_bytes)
-    )
+    output.document(made)
     return ExitCode.OK
 
 
@@ -74,15 +68,10 @@ def verify(output: Output, records: RecordsOptions) -> int:
         _say_what_was_checked(found, output)
     code = ExitCode.VERIFICATION if found.problems else ExitCode.OK
     document = VerifiedRecordsDocument(
-        problems=[ProblemDocument(where=each.where, what=each.what) for each in found.problems],
-        remarks=list(found.remarks),
-        kept=[
-            KeptHeadsDocument(
-                station=each.station, path=str(each.path), first=each.first, last=each.last
-            )
-            for each in found.kept
-        ],
-        unkept=list(found.unkept),
+        problems=found.problems,
+        remarks=found.remarks,
+        kept=found.kept,
+        unkept=found.unkept,
         traces=found.traces,
         is_checked_elsewhere=found.is_checked_elsewhere,
     )
@@ -193,10 +182,7 @@ def migrate(output: Output, records: RecordsOptions) -> int:
     for each in done.problems:
         output.result(f"  {printable(each)}")
     code = ExitCode.VERIFICATION if done.problems else ExitCode.OK
-    document = MigratedDocument(
-        station=done.station, runs=done.runs, backup=str(done.backup), problems=list(done.problems)
-    )
-    output.document(document, exit_code=code)
+    output.document(done, exit_code=code)
     return code
 
 

@@ -6,8 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, get_args
 
-from flasher.station.events import StationEvent
-from flasher.station.records.model import Figures, RunKind, RunState, UnitLife
+from flasher.station.events import RunEnded, ScanRefused, StationEvent
+from flasher.station.records.migration import Migrated
+from flasher.station.records.model import (
+    Backup,
+    Figures,
+    KeptHeads,
+    Problem,
+    RunKind,
+    RunState,
+    UnitLife,
+)
 from flasher.trace.story import Cause, Story
 
 
@@ -78,33 +87,6 @@ class FiguresDocument:
 
 
 @dataclass(frozen=True)
-class EndedUnitDocument:
-    """How the last run of a unit ended, since the station began."""
-
-    serial: str
-    socket: str
-    run_id: int
-    outcome: RunState
-    code: str
-    text: str
-    action: str
-    """What the operator does now."""
-    duration_s: float
-    is_virtual: bool
-    """It was a virtual unit: no product."""
-
-
-@dataclass(frozen=True)
-class RefusedScanDocument:
-    """A scan that changed nothing."""
-
-    text: str
-    code: str
-    reason: str
-    remedy: str
-
-
-@dataclass(frozen=True)
 class StationRunDocument:
     """What came of a station's work."""
 
@@ -117,8 +99,9 @@ class StationRunDocument:
     """False when it was ended before the scans, or the virtual units, were used up."""
     figures: FiguresDocument | None
     """null when they cannot be read."""
-    units: list[EndedUnitDocument]
-    refused: list[RefusedScanDocument]
+    units: list[RunEnded]
+    """How the last run of each ended."""
+    refused: list[ScanRefused]
 
 
 @dataclass(frozen=True)
@@ -180,23 +163,6 @@ class UnitDocument:
 
 
 @dataclass(frozen=True)
-class BackupDocument:
-    """A copy of the records."""
-
-    path: str
-    sha256: str
-    size_bytes: int
-
-
-@dataclass(frozen=True)
-class ProblemDocument:
-    """Something in the records that is not as it has to be."""
-
-    where: str
-    what: str
-
-
-@dataclass(frozen=True)
 class RoleDocument:
     """A user of the database server."""
 
@@ -216,24 +182,13 @@ class StationRolesDocument:
 
 
 @dataclass(frozen=True)
-class KeptHeadsDocument:
-    """What the audit trail of a station was held against."""
-
-    station: str
-    path: str
-    first: int
-    """Number of the first audit row of which a head is kept there."""
-    last: int
-
-
-@dataclass(frozen=True)
 class VerifiedRecordsDocument:
     """What was found in the records, and what they could be held against."""
 
-    problems: list[ProblemDocument]
-    remarks: list[str]
-    kept: list[KeptHeadsDocument]
-    unkept: list[str]
+    problems: tuple[Problem, ...]
+    remarks: tuple[str, ...]
+    kept: tuple[KeptHeads, ...]
+    unkept: tuple[str, ...]
     """Stations of which no heads are kept: older records would look the same."""
     traces: int
     """Runs that passed and were held against their own traces."""
@@ -264,29 +219,18 @@ class AcceptedDocument:
     what: str
 
 
-@dataclass(frozen=True)
-class MigratedDocument:
-    """Records that were brought up to date."""
-
-    station: str
-    runs: int
-    backup: str
-    problems: list[str]
-    """What was wrong with them before."""
-
-
 DOCUMENTS: Final = (
     StationCheckDocument,
     FindingsDocument,
     StationRunDocument,
     StationReportDocument,
     UnitDocument,
-    BackupDocument,
+    Backup,
     VerifiedRecordsDocument,
     StationRolesDocument,
     SigningKeyDocument,
     AcceptedDocument,
-    MigratedDocument,
+    Migrated,
 )
 LINES: Final[tuple[type, ...]] = get_args(StationEvent)
 """Every event of a station, as it happens."""

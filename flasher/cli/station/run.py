@@ -17,9 +17,7 @@ from flasher.cli.output import Output
 from flasher.cli.station.board import figures_line
 from flasher.cli.station.commands import RecordsOptions, RunOptions
 from flasher.cli.station.documents import (
-    EndedUnitDocument,
     FiguresDocument,
-    RefusedScanDocument,
     StationRunDocument,
     figures_document,
 )
@@ -345,26 +343,8 @@ class _Session:
             records="" if self.is_temporary else str(location.file or Path(location.shown)),
             is_complete=self._is_used_up,
             figures=self._figures(),
-            units=[
-                EndedUnitDocument(
-                    serial=each.serial,
-                    socket=each.socket,
-                    run_id=each.run_id,
-                    outcome=each.outcome,
-                    code=each.code,
-                    text=each.text,
-                    action=each.action,
-                    duration_s=each.duration_s,
-                    is_virtual=each.is_virtual,
-                )
-                for each in board.ended.values()
-            ],
-            refused=[
-                RefusedScanDocument(
-                    text=each.text, code=each.code, reason=each.reason, remedy=each.remedy
-                )
-                for each in board.refused
-            ],
+            units=list(board.ended.values()),
+            refused=list(board.refused),
         )
 
 
