@@ -42,7 +42,7 @@ def adapter(kind: Any) -> TypeAdapter[Any]:
         alias_generator=lambda name: name.rstrip("_"),
         serialize_by_alias=True,
     )
-    if dataclasses.is_dataclass(kind) or hasattr(kind, "__total__"):
+    if dataclasses.is_dataclass(kind):
         described: Any = with_config(config)(cast("Any", kind))
         return TypeAdapter(described)
     return TypeAdapter(kind, config=config)
