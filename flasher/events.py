@@ -100,7 +100,7 @@ class PacketAcknowledged:
 
 @dataclass(frozen=True)
 class MessageRepeated:
-    """A message is sent again; `what` names it, `reason` says why."""
+    """A message is sent again; `what` names it, `reason` says why, in one word."""
 
     what: str
     reason: str

@@ -10,7 +10,7 @@ from flasher import prose
 from flasher.bus.health import ControllerState
 from flasher.events import Phase
 from flasher.host.outcome import DeviceLeft
-from flasher.host.table import Ending
+from flasher.host.table import Ending, Reason
 from flasher.host.verify import Verdict
 from flasher.protocol.wire import DamageReason
 from flasher.trace import decoder
@@ -23,6 +23,7 @@ TOLD: tuple[type[Enum], ...] = (
     DeviceLeft,
     Ending,
     Phase,
+    Reason,
     TalkerKind,
     Verdict,
     decoder.Kind,

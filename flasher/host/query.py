@@ -20,6 +20,7 @@ from typing import Any, Final
 from flasher import events
 from flasher.errors import UsageError
 from flasher.host.runner import Came, Runner, Signal, Stage
+from flasher.host.table import Reason
 from flasher.protocol import catalogue
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import MEMORY_PIECE_SIZE, Empty, Memory, ReadMemory
@@ -143,7 +144,8 @@ def ask(run: Runner[Any], query: Query) -> Stage[Query]:
                 query.tries += 1
                 run.send(query.frames)
                 if query.tries > 1 and not query.quiet:
-                    run.tell(events.MessageRepeated(title, "no answer came", query.tries))
+                    why = Reason.QUERY_UNANSWERED.value
+                    run.tell(events.MessageRepeated(title, why, query.tries))
             case Signal.LEFT:
                 _copy_left(run, query)
             case Message():

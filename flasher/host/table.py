@@ -95,20 +95,30 @@ BEFORE_THE_START: Final = frozenset(
 
 
 class Reason(Enum):
-    """Why a message is sent again, or the upgrade begins again; the value is told in events."""
+    """Why a message is sent again, or the upgrade begins again."""
 
-    PACKET_REFUSED = "packet refused"
-    PACKET_UNANSWERED = "packet not answered"
-    PACKET_GIVEN_UP = "packet refused or not answered, no try left, an attempt left"
-    REQUEST_AGAIN = "request transfer before ACK 1"
-    REQUEST_LATE = "request transfer in the middle"
-    REQUEST_GIVEN_UP = "no request transfer in time, an attempt left"
-    RESTARTED = "boot version of a restarted device"
-    BOOT_GIVEN_UP = "no boot version of a device that was told to update, an attempt left"
-    BOOT_SILENT = "no boot version and no answer to the reset for the erase limit, an attempt left"
-    END_REFUSED = "first NAK after end of transfer"
-    END_UNANSWERED = "end of transfer not answered"
-    LINK_BACK = "the adapter was lost and is back"
+    PACKET_REFUSED = "packet_refused"
+    PACKET_UNANSWERED = "packet_unanswered"
+    PACKET_GIVEN_UP = "packet_given_up"
+    """Refused or not answered: no try left, an attempt left."""
+    REQUEST_AGAIN = "request_again"
+    """Request transfer before ACK 1."""
+    REQUEST_LATE = "request_late"
+    """Request transfer in the middle."""
+    REQUEST_GIVEN_UP = "request_given_up"
+    """No request transfer in time, an attempt left."""
+    RESTARTED = "restarted"
+    """Boot version of a restarted device."""
+    BOOT_GIVEN_UP = "boot_given_up"
+    """No boot version of a device that was told to update, an attempt left."""
+    BOOT_SILENT = "boot_silent"
+    """No boot version and no answer to the reset for the erase limit, an attempt left."""
+    END_REFUSED = "end_refused"
+    """First NAK after end of transfer."""
+    END_UNANSWERED = "end_unanswered"
+    LINK_BACK = "link_back"
+    """The adapter was lost and is back."""
+    QUERY_UNANSWERED = "query_unanswered"
 
 
 class Move(NamedTuple):

@@ -363,7 +363,7 @@ def test_a_packet_whose_tries_are_exhausted_begins_another_attempt_and_each_is_r
     assert stage.has == IMAGE.data
     started = stage.seen(events.AttemptStarted)
     assert [each.attempt for each in started] == [2, 3]
-    assert all("no try left" in each.reason for each in started)
+    assert all(each.reason == "packet_given_up" for each in started)
     phases = [(each.phase, each.attempt) for each in stage.seen(events.PhaseEntered)]
     assert [(Phase.RESET, n) for n in (1, 2, 3)] == [p for p in phases if p[0] is Phase.RESET]
     assert result.outcome.statistics.attempts == 3

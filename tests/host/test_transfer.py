@@ -39,7 +39,7 @@ def test_a_refused_packet_is_sent_again_at_once() -> None:
     assert again == first
     bench.say(Ack(2))
     assert bench.expect(Packet).number == 3
-    assert events.MessageRepeated("packet 2", "packet refused", 2) in bench.events
+    assert events.MessageRepeated("packet 2", "packet_refused", 2) in bench.events
 
 
 @pytest.mark.parametrize("naks", [1, 2, 3, 4])

@@ -8,7 +8,6 @@ from flasher import events
 from flasher.cli.bar import Bar
 from flasher.cli.output import Output
 from flasher.cli.terminal import painted
-from flasher.host.table import Reason
 from flasher.image.plan import Plan
 from flasher.prose import prose, prose_of
 from flasher.protocol.spec import PACKET_DATA_SIZE
@@ -31,26 +30,11 @@ SHOWN: Final = frozenset(
     }
 )
 """The events that have lines or a bar of their own here: the log on stderr leaves them out."""
-_BECAUSE: Final = {
-    Reason.PACKET_REFUSED.value: "the device refused {what}",
-    Reason.PACKET_UNANSWERED.value: "the device did not answer {what} in time",
-    Reason.PACKET_GIVEN_UP.value: "the device did not take a packet, however often it was sent",
-    Reason.REQUEST_AGAIN.value: "the device requested the transfer once more",
-    Reason.REQUEST_LATE.value: "the device requested the transfer anew in the middle of it",
-    Reason.RESTARTED.value: "the device restarted",
-    Reason.BOOT_GIVEN_UP.value: "the device did not announce its bootloader",
-    Reason.BOOT_SILENT.value: "the device neither answered the reset nor announced its bootloader",
-    Reason.REQUEST_GIVEN_UP.value: "the device did not request the transfer in time",
-    Reason.END_REFUSED.value: "the device refused the {what}",
-    Reason.END_UNANSWERED.value: "the device did not answer the {what} in time",
-    Reason.LINK_BACK.value: "the adapter was away for a while",
-}
-"""Why something is sent again, for people, by the engine's name for it."""
 
 
 def because(reason: str, what: str = "") -> str:
     """The sentence for a reason of `MessageRepeated` and `AttemptStarted`."""
-    return _BECAUSE.get(reason, "{reason}").format(what=what, reason=reason)
+    return prose_of("Reason", reason).replace("{what}", what)
 
 
 class Progress:
