@@ -34,25 +34,25 @@ _REPORTS_AT_ONCE: Final = 4
 
 # -- what befalls the messages ---------------------------------------------------------------------
 
-_Disturb = Callable[[Bench, Sequence[RawFrame]], AbstractContextManager[Sent]]
+_Sending = Callable[[Bench, Sequence[RawFrame]], AbstractContextManager[Sent]]
 
 
-class _Trouble(NamedTuple):
+class _Disturbance(NamedTuple):
     """A fault during one message: `send` is a context that sends the message; the answer is awaited
     inside of it.
     """
 
     name: str
-    send: _Disturb
+    send: _Sending
     hits_answer: bool = False
     """True when the message itself arrives, so that the device goes on."""
 
 
-class _Troubles:
+class _Disturbances:
     """The faults that each message of the tool has still to meet, in turn."""
 
     def __init__(
-        self, bench: Bench, image: bytes, make: Callable[[int], Iterator[_Trouble]]
+        self, bench: Bench, image: bytes, make: Callable[[int], Iterator[_Disturbance]]
     ) -> None:
         encoder = bench.encoder
         self.left: Final = {
@@ -70,10 +70,10 @@ class _Troubles:
     def __bool__(self) -> bool:
         return any(self.left.values())
 
-    def take(self, message: str) -> _Trouble:
+    def take(self, message: str) -> _Disturbance:
         """The next fault for that message; an undisturbed sending when none is left."""
         queue = self.left[message]
-        return queue.popleft() if queue else _NO_TROUBLE
+        return queue.popleft() if queue else _UNDISTURBED
 
 
 @contextmanager
@@ -81,7 +81,7 @@ def _sent_well(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
     yield bench.send(frames)
 
 
-_NO_TROUBLE: Final = _Trouble("", _sent_well)
+_UNDISTURBED: Final = _Disturbance("", _sent_well)
 
 
 def _faults_of(frames: int, delay_s: float) -> Iterator[Fault]:
@@ -97,7 +97,7 @@ def _faults_of(frames: int, delay_s: float) -> Iterator[Fault]:
             yield Fault(kind, index, incoming=True)
 
 
-def _faulty(fault: Fault) -> _Disturb:
+def _faulty(fault: Fault) -> _Sending:
     """Send a message while this fault is set for it and its answer."""
 
     @contextmanager
@@ -108,7 +108,7 @@ def _faulty(fault: Fault) -> _Disturb:
     return send
 
 
-def _off_bus_after(after: int) -> _Disturb:
+def _off_bus_after(after: int) -> _Sending:
     """Send a message; after `after` of its frames the device's controller goes off the bus."""
 
     @contextmanager
@@ -148,11 +148,11 @@ def _off_bus_in_answer(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sen
 def disturbed_frames(bench: Bench) -> None:
     delay_s = 1.5 * bench.limit("inter_frame_s")
 
-    def troubles(frames: int) -> Iterator[_Trouble]:
+    def disturbances(frames: int) -> Iterator[_Disturbance]:
         for fault in _faults_of(frames, delay_s):
-            yield _Trouble(str(fault), _faulty(fault), fault.incoming)
+            yield _Disturbance(str(fault), _faulty(fault), fault.incoming)
 
-    _upgrade_in_trouble(bench, troubles)
+    _upgrade_disturbed(bench, disturbances)
 
 
 @case(
@@ -166,13 +166,15 @@ def disturbed_frames(bench: Bench) -> None:
     limit_s=1800.0,
 )
 def bus_off(bench: Bench) -> None:
-    def troubles(frames: int) -> Iterator[_Trouble]:
+    def disturbances(frames: int) -> Iterator[_Disturbance]:
         for after in range(frames + 1):
             name = f"bus-off after {after} of {frames} frames"
-            yield _Trouble(name, _off_bus_after(after), hits_answer=after == frames)
-        yield _Trouble("bus-off in the middle of the answer", _off_bus_in_answer, hits_answer=True)
+            yield _Disturbance(name, _off_bus_after(after), hits_answer=after == frames)
+        yield _Disturbance(
+            "bus-off in the middle of the answer", _off_bus_in_answer, hits_answer=True
+        )
 
-    _upgrade_in_trouble(bench, troubles)
+    _upgrade_disturbed(bench, disturbances)
 
 
 @case(
@@ -208,20 +210,22 @@ def same_id(bench: Bench) -> None:
 # -- an upgrade in which something happens to every message --------------------------------------
 
 
-def _upgrade_in_trouble(bench: Bench, make: Callable[[int], Iterator[_Trouble]]) -> None:
+def _upgrade_disturbed(bench: Bench, make: Callable[[int], Iterator[_Disturbance]]) -> None:
     """Repeat the upgrade until every fault has happened, one in each message at most."""
     image = bench.good_image
-    troubles = _Troubles(bench, image, make)
-    for _ in range(troubles.rounds_max):
-        if not troubles:
+    disturbances = _Disturbances(bench, image, make)
+    for _ in range(disturbances.rounds_max):
+        if not disturbances:
             break
-        _enter(bench, image, troubles)
-        if _send_packets(bench, image, troubles) and _end(bench, image, troubles):
+        _enter(bench, image, disturbances)
+        if _send_packets(bench, image, disturbances) and _end(bench, image, disturbances):
             bench.check_image(image)
-    bench.check(not troubles, "the upgrades come to their end", "the device restarts in each one")
+    bench.check(
+        not disturbances, "the upgrades come to their end", "the device restarts in each one"
+    )
 
 
-def _enter(bench: Bench, image: bytes, troubles: _Troubles) -> None:
+def _enter(bench: Bench, image: bytes, disturbances: _Disturbances) -> None:
     """Send reset and update command until request transfer. A device that received only a part of
     them may announce, run, erase or wait for packet 1; it has to request the transfer in the end.
     """
@@ -231,15 +235,15 @@ def _enter(bench: Bench, image: bytes, troubles: _Troubles) -> None:
     message = "reset"
     bench.forget()
     for _ in range(_ENTRIES_MAX):
-        trouble = troubles.take(message)
-        names += [f"{message}, {trouble.name}"] if trouble.name else []
+        disturbance = disturbances.take(message)
+        names += [f"{message}, {disturbance.name}"] if disturbance.name else []
         if message == "reset":
-            within_s = limit("feedback_s") if trouble.name else limit("first_version_s")
-            with trouble.send(bench, bench.encoder.reset()):
+            within_s = limit("feedback_s") if disturbance.name else limit("first_version_s")
+            with disturbance.send(bench, bench.encoder.reset()):
                 heard = bench.wait_for(Kind.BOOT_VERSION, Kind.REQUEST, within_s=within_s)
         else:
-            within_s = bench.host.burst_s if trouble.name else limit("erase_s")
-            with trouble.send(bench, bench.encoder.update(len(image))) as sent:
+            within_s = bench.host.burst_s if disturbance.name else limit("erase_s")
+            with disturbance.send(bench, bench.encoder.update(len(image))) as sent:
                 heard = bench.host.request_or_version(sent.left_at, within_s)
             # It is not known that the bootloader was left: request transfer may be lost (UP-05).
             if heard is None and not (
@@ -255,28 +259,28 @@ def _enter(bench: Bench, image: bytes, troubles: _Troubles) -> None:
         bench.require(is_there, Kind.REQUEST.value, heard or "nothing in many tries")
 
 
-def _send_packets(bench: Bench, image: bytes, troubles: _Troubles) -> bool:
+def _send_packets(bench: Bench, image: bytes, disturbances: _Disturbances) -> bool:
     """Send all packets, each one with its fault and then undisturbed until it is acknowledged.
     False when the device announced a restart: the upgrade begins again (R11).
     """
     total, began_at = packet_count(len(image)), bench.now
     for number in range(1, total + 1):
-        trouble = troubles.take("packet")
-        with bench.step(f"packet {number}, {trouble.name}" if trouble.name else "packets"):
-            with trouble.send(bench, bench.encoder.packet_of(image, number)):
+        disturbance = disturbances.take("packet")
+        with bench.step(f"packet {number}, {disturbance.name}" if disturbance.name else "packets"):
+            with disturbance.send(bench, bench.encoder.packet_of(image, number)):
                 heard = bench.wait_for(Kind.ACK, Kind.NAK)
             last = ""
             if heard is None or heard.kind is not Kind.ACK or heard.number != number:
                 last = bench.host.insist_on_packet(image, number, began_at)
             if last.startswith(Kind.BOOT_VERSION.value):
-                bench.info(f"the device restarts: {trouble.name}")
+                bench.info(f"the device restarts: {disturbance.name}")
                 return False
-            if trouble.name or last:
+            if disturbance.name or last:
                 bench.require(not last, f"ACK {number} in the end", last or "it")
     return True
 
 
-def _end(bench: Bench, image: bytes, troubles: _Troubles) -> bool:
+def _end(bench: Bench, image: bytes, disturbances: _Disturbances) -> bool:
     """End of transfer, with one fault after the other until it is answered; false when the device
     refused the image explicitly, with two NAKs (R6).
     """
@@ -284,12 +288,12 @@ def _end(bench: Bench, image: bytes, troubles: _Troubles) -> bool:
     heard: Received | None = None
     # Before the device takes the silence for a pause in the transfer (TX-12).
     give_up_at = bench.now + bench.limit("pause_s") / 2
-    while heard is None and bench.now < give_up_at and troubles.left["end of transfer"]:
-        trouble = troubles.take("end of transfer")
-        names.append(trouble.name)
-        with trouble.send(bench, bench.encoder.end()):
+    while heard is None and bench.now < give_up_at and disturbances.left["end of transfer"]:
+        disturbance = disturbances.take("end of transfer")
+        names.append(disturbance.name)
+        with disturbance.send(bench, bench.encoder.end()):
             heard = bench.wait_for(Kind.COMPLETE, Kind.NAK, within_s=bench.limit("silence_s"))
-        if trouble.hits_answer:
+        if disturbance.hits_answer:
             break
     if heard is not None and heard.kind is Kind.COMPLETE:
         return True

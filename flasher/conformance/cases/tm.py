@@ -91,30 +91,23 @@ def times(bench: Bench) -> None:
         bench.update(len(image))
         _measure_packets(bench, image)
         sent = bench.send(bench.encoder.end())
-        limit_s = _PATIENCE * bench.limit("complete_s")
-        heard = bench.wait_for(Kind.COMPLETE, within_s=limit_s)
-        found = bench.require_received(heard, Kind.COMPLETE.value, limit_s)
-        bench.measure(_COMPLETE, found.at - sent.left_at)
+        within_s = _PATIENCE * bench.limit("complete_s")
+        heard = bench.await_message(Kind.COMPLETE, within_s=within_s)
+        bench.measure(_COMPLETE, heard.at - sent.left_at)
     for turn in range(_RESETS):
         # Whether it starts each time is EN-01 and RS-03; what is measured by then is judged.
         if not bench.application_runs():
             break
         with bench.step(f"reset {turn + 1}"):
             _measure_burst(bench)
-    _judge(bench)
-
-
-def _judge(bench: Bench) -> None:
-    limit = bench.limit
+    check, limit = bench.judge.check_measured, bench.limit
     spacing_s, tolerance_s = limit("version_spacing_s"), limit("version_spacing_tolerance_s")
-    bench.judge.check_measured(_FIRST, high_s=limit("first_version_s"))
+    check(_FIRST, high_s=limit("first_version_s"))
     if bench.number("versions") > 1:
-        bench.judge.check_measured(
-            _SPACING, low_s=spacing_s - tolerance_s, high_s=spacing_s + tolerance_s
-        )
-    bench.judge.check_measured(_REQUEST, high_s=limit("erase_s"))
-    bench.judge.check_measured(_ANSWER, high_s=limit("ack_s"))
-    bench.judge.check_measured(_COMPLETE, high_s=limit("complete_s"))
+        check(_SPACING, low_s=spacing_s - tolerance_s, high_s=spacing_s + tolerance_s)
+    check(_REQUEST, high_s=limit("erase_s"))
+    check(_ANSWER, high_s=limit("ack_s"))
+    check(_COMPLETE, high_s=limit("complete_s"))
 
 
 def _enter(bench: Bench) -> Received:
