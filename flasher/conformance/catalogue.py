@@ -8,13 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from enum import Enum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
-from flasher.conformance.bench import Bench
-from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import CaseText
 from flasher.conformance.subject import Subject
 from flasher.errors import UsageError, did_you_mean
+
+if TYPE_CHECKING:  # the profile needs the validation library, which the list of groups does not
+    from flasher.conformance.bench import Bench
+    from flasher.conformance.profile import ConformanceProfile
 
 GROUPS: Final = {
     "FR": "framing",
@@ -83,7 +85,7 @@ DESTRUCTIVE: Final = Requirement.DESTRUCTIVE
 LONG: Final = Requirement.LONG
 POWER: Final = Requirement.POWER
 TIMING: Final = Requirement.TIMING
-CaseScript = Callable[[Bench], None]
+CaseScript = Callable[["Bench"], None]
 
 
 @dataclass(frozen=True)

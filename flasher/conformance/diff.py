@@ -11,9 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from pydantic import ValidationError
-
-from flasher.conformance.json_report import REPORT, SCHEMA_VERSION, ReportDocument
+from flasher.conformance.json_report import SCHEMA_VERSION, ReportDocument, adapter
 from flasher.conformance.results import CaseVerdict, worst
 from flasher.errors import UsageError
 from flasher.files import JSON_MAX_SIZE, parse_json, read
@@ -82,6 +80,8 @@ class Difference:
 
 def read_report(path: Path) -> ReportDocument:
     """Read a report. Raises UsageError for a file that cannot be read or is no report."""
+    from pydantic import ValidationError  # noqa: PLC0415  slow
+
     raw = read(path, JSON_MAX_SIZE, what="report")
     try:
         document = parse_json(raw)
@@ -97,7 +97,7 @@ def read_report(path: Path) -> ReportDocument:
         why = f"its schema is version {found}, and this program reads {SCHEMA_VERSION}"
         raise _no_report(path, why)
     try:
-        return REPORT.validate_python(document)
+        return adapter().validate_python(document)
     except ValidationError as error:
         wrong = error.errors()[0]
         place = ".".join(map(str, wrong["loc"]))

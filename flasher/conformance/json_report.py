@@ -9,9 +9,8 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Final
-
-from pydantic import TypeAdapter
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
 
 from flasher.conformance.reports import ByResult, distribution
 from flasher.conformance.results import (
@@ -24,6 +23,9 @@ from flasher.conformance.results import (
     Rescue,
     RunReport,
 )
+
+if TYPE_CHECKING:
+    from pydantic import TypeAdapter
 
 SCHEMA_VERSION: Final = 1
 """Counts up when a field changes its meaning or goes away; not for a new one."""
@@ -130,8 +132,12 @@ class ReportDocument:
     """Cases of the catalogue about the tool, which are no part of this suite."""
 
 
-REPORT: Final = TypeAdapter(ReportDocument)
-"""Reads and writes the document. Raises pydantic.ValidationError for what is none."""
+@cache
+def adapter() -> TypeAdapter[ReportDocument]:
+    """Reads and writes the document. Raises pydantic.ValidationError for what is none."""
+    from pydantic import TypeAdapter  # noqa: PLC0415  slow
+
+    return TypeAdapter(ReportDocument)
 
 
 def report_document(
@@ -217,7 +223,7 @@ def _histogram(values_s: Sequence[float]) -> HistogramDocument:
 
 def to_json(document: ReportDocument) -> dict[str, Any]:
     """The document in JSON's types."""
-    plain: dict[str, Any] = REPORT.dump_python(document, mode="json")
+    plain: dict[str, Any] = adapter().dump_python(document, mode="json")
     return plain
 
 

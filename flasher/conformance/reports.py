@@ -8,8 +8,6 @@ import io
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-import can
-
 from flasher.conformance.catalogue import GROUPS
 from flasher.conformance.results import (
     FINAL_IMAGE_OK,
@@ -24,7 +22,6 @@ from flasher.conformance.results import (
 from flasher.protocol.frame import Frame
 from flasher.report.junit import JUnitCase, JUnitResult, JUnitSuite, junit_xml
 from flasher.trace.figures import Distribution
-from flasher.trace.recorder import ONE_TOOL_CHANNEL, message_of
 
 TRACED: Final = frozenset(
     {CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.INCONCLUSIVE, CaseVerdict.DEVIATION}
@@ -169,6 +166,10 @@ def is_traced(result: CaseResult) -> bool:
 
 def candump(trace: Iterable[TraceEntry]) -> bytes:
     """Frames as a log; times count from the beginning of the case, what the suite sent is `T`."""
+    import can  # noqa: PLC0415  slow
+
+    from flasher.trace.recorder import ONE_TOOL_CHANNEL, message_of  # noqa: PLC0415
+
     text = io.StringIO()
     # By its channel `flasher explain` knows it again: one tool, whatever it sends.
     writer = can.CanutilsLogWriter(text, channel=ONE_TOOL_CHANNEL)
