@@ -1,4 +1,4 @@
-"""What a running station is like now, made of its events alone: what every view of it shows."""
+"""The state of a running station, built from its events: the content of every view."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Board:
     """Sockets that will not work any more, with the reason."""
 
     def apply(self, event: StationEvent) -> None:
-        """Take one event in."""
+        """Apply one event."""
         match event:
             case StationStarted(_, recipe, revision, part, sockets):
                 self.title = printable(f"{event.station}: {recipe}, revision {revision}, {part}")
@@ -158,7 +158,7 @@ class Board:
 
     @property
     def virtual_words(self) -> str:
-        """That what passes here is no product; empty for a station of adapters."""
+        """Says that no products come out of this station; empty when all sockets have adapters."""
         if not self.virtual_sockets:
             return ""
         if len(self.virtual_sockets) == len(self.rows):

@@ -1,6 +1,4 @@
-"""`flasher station report` and `unit`: what the records say. They need no station, change nothing,
-and may be asked while one runs.
-"""
+"""`flasher station report` and `unit`: read the records, also while a station runs."""
 
 from __future__ import annotations
 

@@ -1,6 +1,4 @@
-"""`flasher station run`: scans in, units flashed, a view of it; ends by itself when the scans are
-used up.
-"""
+"""`flasher station run`: runs a station with a view, until its scans are used up."""
 
 from __future__ import annotations
 
@@ -273,7 +271,7 @@ class _Session:
     # -- its end ----------------------------------------------------------------------------------
 
     def report(self) -> int:
-        """Say what came of it; the exit code."""
+        """Print the summary; returns the exit code."""
         board = self.view.board
         code = ExitCode.PARTIAL if board.bad_units or self._not_done() else ExitCode.OK
         for line in self._summary():
@@ -286,7 +284,7 @@ class _Session:
         return code
 
     def _line_error(self) -> FlasherError | None:
-        """Why the line stood at the end."""
+        """The error for a line that was stopped at the end."""
         stopped = self.view.board.stopped
         if stopped is None:
             return None
@@ -295,7 +293,7 @@ class _Session:
         return kind(f"The line was stopped: {stopped.reason}", remedy=stopped.remedy)
 
     def _incomplete(self) -> FlasherError | None:
-        """A list that was not worked off to its end; a shift just ends."""
+        """The error for a list of scans that was not finished; a shift has no such end."""
         is_list = self.file is not None or bool(self._options.units)
         if not is_list or self._is_used_up:
             return None

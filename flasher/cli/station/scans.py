@@ -1,6 +1,6 @@
 """Where scans come from while a station runs: keys on a terminal (a scanner is a keyboard), the
-lines of a pipe, or a file that is worked off as a patient operator would: each label when a unit
-waits for it. Keys and lines are read by a thread, which only hands texts on.
+lines of a pipe, or a file, of which each label is submitted when a unit waits for it. Keys and lines
+are read by a thread, which only hands texts on.
 """
 
 from __future__ import annotations
@@ -139,14 +139,14 @@ class ScanFile:
 
 
 class Typing:
-    """Puts keys together to lines. `text` is what stands there so far."""
+    """Builds lines from keys. `text` is the unfinished line."""
 
     def __init__(self, submit: Submit) -> None:
         self.text = ""
         self._submit = submit
 
     def feed(self, keys: str) -> None:
-        """Keys came."""
+        """Handle keys."""
         for key in _ESCAPES.sub("", keys):
             if key in "\r\n":
                 line, self.text = self.text, ""

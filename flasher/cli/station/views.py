@@ -62,7 +62,7 @@ _KEYS: Final = "Ctrl-C: no further unit; twice: stop now"
 
 
 class View:
-    """Takes the station's events into the board, and shows them."""
+    """Applies the events of the station to the board, and shows them."""
 
     def __init__(self, output: Output) -> None:
         self.output = output
@@ -81,10 +81,10 @@ class View:
         self.show(event)
 
     def show(self, event: StationEvent) -> None:
-        """An event that the board has taken in already."""
+        """Show an event that the board has applied."""
 
     def refresh(self, *, at_once: bool = False) -> None:
-        """A moment has passed; `at_once` waits for no other one."""
+        """Draw again, if the last time is long enough ago or `at_once`."""
 
 
 class JsonLines(View):
@@ -95,7 +95,7 @@ class JsonLines(View):
 
 
 class Lines(View):
-    """A line for what a person has to know."""
+    """A line of text for each event that the operator has to know."""
 
     def show(self, event: StationEvent) -> None:
         for line in _words(event):
