@@ -1,6 +1,6 @@
 """Where scans come from while a station runs: keys on a terminal (a scanner is a keyboard), the
-lines of a pipe, or a file, of which each label is submitted when a unit waits for it. Keys and lines
-are read by a thread, which only hands texts on.
+lines of a pipe, or a file, of which each label is submitted when a unit waits for it. Keys and
+lines are read by a thread, which only hands texts on.
 """
 
 from __future__ import annotations
