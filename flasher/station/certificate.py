@@ -97,7 +97,6 @@ def _run_status(details: RunDetails) -> Status:
 
 
 def _limits(each: Measurement) -> str:
-    """The limits in words."""
     if each.value is None:
         return each.expected if each.expected is not None else "any"
     bounds = [

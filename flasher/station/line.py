@@ -517,7 +517,6 @@ class Line:
     # -- the time, and what is due ----------------------------------------------------------------
 
     def tick(self, now: float) -> None:
-        """Handle the timeouts."""
         if self._forget_at_s is not None and now >= self._forget_at_s:
             if self._label:
                 reason = "No card of a socket was scanned for it."
@@ -587,7 +586,6 @@ class Line:
             self._drop_label(socket, "The line was stopped.", "when it goes on")
 
     def _is_serial(self, text: str) -> bool:
-        """True for a serial number of this recipe."""
         try:
             self._check_serial(text)
         except ValueError:

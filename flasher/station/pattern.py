@@ -1,4 +1,4 @@
-"""Patterns of serial numbers: regular expressions that cannot take long.
+"""Serial numbers: patterns that cannot take long, and check digits by python-stdnum.
 
 A recipe comes from outside, and a pattern such as `(A+)+` can take a regular expression years. So a
 pattern is a part of Python's language in which the work is bounded before it is used: characters,
@@ -10,8 +10,12 @@ the choices, and at most `WAYS_MAX`.
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Final
+
+from stdnum import ean, luhn
+from stdnum.iso7064 import mod_11_2, mod_11_10, mod_37_2, mod_37_36, mod_97_10
 
 TEXT_MAX: Final = 64
 """Longest serial number in characters."""
@@ -113,3 +117,25 @@ def _choices(token: re.Match[str]) -> int:
     if not low <= high <= TEXT_MAX:
         raise ValueError(f"a count {token['count']} is not possible, {TEXT_MAX} is the most")
     return high - low + 1
+
+
+def _check(form: str, is_right: Callable[[str], bool]) -> Callable[[str], bool]:
+    """A check of texts of this form; stdnum's own take more than their standards allow."""
+    return lambda text: re.fullmatch(form, text) is not None and is_right(text)
+
+
+def _gtin(text: str) -> bool:
+    """Of any length: stdnum's `is_valid` knows no SSCC."""
+    return bool(ean.calc_check_digit(text[:-1]) == text[-1])
+
+
+CHECKS: Final = {
+    "luhn": _check("[0-9]{2,}", luhn.is_valid),
+    "gtin": _check("[0-9]{2,}", _gtin),
+    "mod11-2": _check("[0-9]{2,}[0-9X]", mod_11_2.is_valid),
+    "mod11-10": _check("[0-9]{2,}", mod_11_10.is_valid),
+    "mod37-2": _check("[0-9A-Z]{2,}[0-9A-Z*]", mod_37_2.is_valid),
+    "mod37-36": _check("[0-9A-Z]{2,}", mod_37_36.is_valid),
+    "mod97-10": _check("[0-9A-Z]{3,}", mod_97_10.is_valid),
+}
+"""Each takes the whole text, check characters included; texts of another form are not valid."""

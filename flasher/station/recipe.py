@@ -37,8 +37,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from flasher.protocol.spec import TARGETS, Target, find_target
 from flasher.settings.reading import Reader, Table
-from flasher.station import checkdigit
-from flasher.station.pattern import TEXT_MAX, pattern_of
+from flasher.station.pattern import CHECKS, TEXT_MAX, pattern_of
 from flasher.station.records.model import StepName, Verified
 
 _TIME_MAX_S: Final = 3600.0
@@ -95,8 +94,8 @@ class SerialNumber(Table):
     @field_validator("check_digit")
     @classmethod
     def _check_method(cls, value: str) -> str:
-        if value and value not in checkdigit.CHECKS:
-            raise ValueError(f"it is one of {', '.join(checkdigit.CHECKS)}")
+        if value and value not in CHECKS:
+            raise ValueError(f"it is one of {', '.join(CHECKS)}")
         return value
 
     @model_validator(mode="after")
@@ -117,7 +116,7 @@ class SerialNumber(Table):
         if groups is None:
             raise ValueError(f"{serial!a:.80} does not fit the pattern {self.pattern}")
         checked = groups[self.check_group] if self.check_group else serial
-        if self.check_digit and not checkdigit.CHECKS[self.check_digit](checked):
+        if self.check_digit and not CHECKS[self.check_digit](checked):
             raise ValueError(f"the check digit ({self.check_digit}) of {serial!a:.80} is wrong")
         if self.number_group:
             text = groups[self.number_group]

@@ -127,7 +127,7 @@ def _worse(result: RunResult, code: Code, text: str) -> RunResult:
 
 
 def _forget_spooled(run: ActiveRun) -> None:
-    """The records have their own copy."""
+    """Delete the spooled trace: the records have their own copy."""
     paths: list[Path] = [run.trace]
     if run.finished is not None and run.finished.trace is not None:
         paths.append(run.finished.trace.path)

@@ -127,7 +127,7 @@ class Socket:
 
     @property
     def state(self) -> SocketState:
-        """What was told last."""
+        """The state that was reported last."""
         return SocketState.STARTING if self.shown is None else self.shown[0]
 
     @property

@@ -346,7 +346,7 @@ class Station:
     # -- beginning --------------------------------------------------------------------------------
 
     def _claim(self, order: line.ClaimRun) -> line.SocketInput:
-        """Have the run in the records, on disk."""
+        """Claim the run in the records."""
         socket, part = self.line.sockets[order.socket], self.recipe.recipe.part
         try:
             lives = self.store.read.units(order.serial)

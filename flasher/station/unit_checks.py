@@ -62,7 +62,7 @@ def wanted_text(plan: WritePlan) -> str:
 
 
 def said_of(name: str, found: Identified) -> list[Measurement]:
-    """What a device told of itself, as measurements without limits."""
+    """What a device reported of itself, as measurements without limits."""
     version = found.seen.version
     words = ("model", "serial_number", "hardware_version", "firmware_version")
     texts = {word: getattr(version, word, None) for word in words}
@@ -74,7 +74,7 @@ def said_of(name: str, found: Identified) -> list[Measurement]:
 
 
 def state_words(target: UnitTarget, found: Identified) -> str:
-    """What a device is doing."""
+    """The state of a device in words."""
     if found.is_in_bootloader:
         return f"in its bootloader {target.watcher.version}".strip()
     if found.seen.version is None:

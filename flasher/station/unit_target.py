@@ -52,7 +52,7 @@ class Identified:
 
     @property
     def serial_number(self) -> str:
-        """Its own; empty where it does not say it."""
+        """The one that it reports; empty without one."""
         return str(getattr(self.seen.version, "serial_number", ""))
 
 
@@ -115,7 +115,7 @@ class UnitTarget:
         return Identified(asked.seen, announced, len(asked.answers))
 
     def is_silent(self, found: Identified) -> bool:
-        """It could have answered, and did not."""
+        """True when it could have answered, and did not."""
         asked = self.version_request is not None
         return asked and found.seen.version is None and not found.is_in_bootloader
 
@@ -173,6 +173,5 @@ class UnitTarget:
             raise InterruptedByUserError("The run is to end.")
 
     def run(self, engine: Engine, on_event: Callable[[object], None] | None = None) -> None:
-        """Run an engine of the station on the connection."""
         self.device.run(engine, on_event=on_event)
         self.check_cancelled()

@@ -121,11 +121,9 @@ class Place:
         device.power_on(now)
 
     def take(self) -> None:
-        """Take it out."""
         self.device = self._power_at = None
 
     def cycle(self, now: float) -> None:
-        """Switch off and, after a while, on."""
         if self.device is not None and self.device.has_power:
             self.device.power_cut(now)
         self._power_at = now + POWER_OFF_S
@@ -236,13 +234,12 @@ class VirtualSocket:
         return label
 
     def run_ended(self) -> None:
-        """The verdict is known: somebody will take the unit out."""
+        """The run has ended: the unit leaves after a while."""
         self._next_at = self.clock.now() + self._virtual.leave_after_s
 
     # -- the power of the socket ------------------------------------------------------------------
 
     def begin_cycle(self) -> None:
-        """Switch the unit off and on."""
         for place in self.places.values():
             place.cycle(self.clock.now())
 

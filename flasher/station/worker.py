@@ -213,7 +213,7 @@ class Worker:
         self._reopen_at = 0.0
 
     def work(self) -> None:
-        """Until the station ends it or is gone."""
+        """Work until the station ends the process or is gone."""
         sees = self._virtual is not None or self._presence.sees_units
         self._pipe.send(Ready(self._connection.name, sees))
         if self._virtual is not None:
@@ -352,7 +352,7 @@ def load_same(setup: WorkerSetup) -> LoadedRecipe:
 
 
 def worker_main(channel: Channel, setup: WorkerSetup) -> None:
-    """The whole life of the process."""
+    """Main function of the process."""
     # Ctrl-C and a closed terminal are the station's business: it tells its processes what to do.
     for name in ("SIGINT", "SIGHUP"):  # Windows has no SIGHUP
         if hasattr(signal, name):

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flasher.station.checkdigit import CHECKS
-from flasher.station.pattern import TEXT_MAX, WAYS_MAX, Pattern
+from flasher.station.pattern import CHECKS, TEXT_MAX, WAYS_MAX, Pattern
 from flasher.station.recipe import Scan, check_template, fill, uses_lot
 from tests.loops import each
 

@@ -78,7 +78,6 @@ class Board:
     """Sockets that will not work any more, with the reason."""
 
     def apply(self, event: StationEvent) -> None:
-        """Apply one event."""
         match event:
             case StationStarted(_, recipe, revision, part, sockets):
                 self.title = printable(f"{event.station}: {recipe}, revision {revision}, {part}")
@@ -180,7 +179,6 @@ def percent(share: float | None) -> str:
 
 
 def figures_line(figures: Figures) -> str:
-    """The figures in one line."""
     failed = figures.units - figures.passed
     first = percent(figures.first_pass_share)
     line = (

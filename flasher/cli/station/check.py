@@ -22,7 +22,6 @@ from flasher.station.recipe_file import LoadedRecipe, load_checked
 
 
 def check(output: Output, path: Path, station_file: Path | None) -> int:
-    """Run the command; returns the exit code."""
     # The day is the plant's: it goes into what is written.
     day = datetime.now().astimezone().date()
     try:

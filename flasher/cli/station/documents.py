@@ -237,7 +237,6 @@ LINES: Final[tuple[type, ...]] = get_args(StationEvent)
 
 
 def figures_document(figures: Figures) -> FiguresDocument:
-    """The figures as JSON."""
     return FiguresDocument(
         runs=figures.runs,
         units=figures.units,

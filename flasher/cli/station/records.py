@@ -228,7 +228,6 @@ def _trace_document(
 
 
 def figure_lines(figures: Figures) -> Iterator[str]:
-    """The figures of a report."""
     yield figures_line(figures)
     open_runs = {state: figures.by_state.get(state.value, 0) for state in _NO_VERDICT}
     words = [f"{count:,} {state.value}" for state, count in open_runs.items() if count]

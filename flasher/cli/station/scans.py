@@ -146,7 +146,6 @@ class Typing:
         self._submit = submit
 
     def feed(self, keys: str) -> None:
-        """Handle keys."""
         for key in _ESCAPES.sub("", keys):
             if key in "\r\n":
                 line, self.text = self.text, ""
@@ -173,7 +172,6 @@ class LineReader:
         threading.Thread(target=self.read, name="scans", daemon=True).start()
 
     def read(self) -> None:
-        """Read to the end."""
         try:
             for line in self._stream:
                 if line.strip():

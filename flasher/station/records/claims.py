@@ -48,7 +48,6 @@ class Order:
 
     @property
     def part(self) -> str:
-        """The product."""
         return self.loaded.recipe.part
 
     @property
@@ -262,7 +261,7 @@ class Claiming:
             )
 
     def _repeated(self) -> RunKind:
-        """What is done with a unit that has passed."""
+        """The kind of run for a unit that has passed."""
         order, rule = self._order, self._order.loaded.recipe.duplicate
         if rule is Duplicate.VERIFY_ONLY:
             return RunKind.VERIFY_ONLY

@@ -128,7 +128,6 @@ class Database:
 
     @property
     def backend(self) -> str:
-        """The name of the back end: sqlite, postgresql, ..."""
         return self.engine.dialect.name
 
     @contextmanager
@@ -195,7 +194,6 @@ class Database:
         return StationLock(station, self.location.folder)
 
     def close(self) -> None:
-        """Close all connections."""
         self.engine.dispose()
 
     def _engine(self) -> Engine:
@@ -270,7 +268,6 @@ class StationLock:
                 ) from error
 
     def release(self) -> None:
-        """Let another process be the station."""
         self._lock.release(force=True)
 
 

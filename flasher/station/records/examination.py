@@ -56,7 +56,7 @@ class Examiner:
         self._nameless = 0
 
     def examine(self, runs: Collection[RunId] | None = None) -> Examination:
-        """Look at everything, and of the runs at these or at all."""
+        """Examine everything; of the runs these, or all."""
         with self._database.reading() as connection:
             problems = tuple(self._problems(connection, runs))
         if self._nameless:
@@ -185,7 +185,7 @@ class Examiner:
         hashes: Mapping[int, str],
         restored: Mapping[int, range],
     ) -> Iterator[Problem]:
-        """Hold a chain against the heads that are kept of it."""
+        """Compare a chain with its kept heads."""
         shown = printable(name)
         place = printable(str(self._keeping.heads_folder))
         if not kept:
@@ -243,7 +243,7 @@ class Examiner:
             yield Problem(where, what, (run_id,))
 
     def _runs(self, connection: Connection, run_ids: list[int]) -> Iterator[Problem]:
-        """What the runs are, and their attachments."""
+        """Check that the runs can be read, and their attachments."""
         try:
             found = tuple(details_of(connection, schema.run.c.id.in_(run_ids)))
         except ValidationError as error:
@@ -283,7 +283,7 @@ class Examiner:
             yield from self._trace(details, traces)
 
     def _trace(self, details: RunDetails, traces: list[AttachmentFile]) -> Iterator[Problem]:
-        """Hold a PASS against its own trace."""
+        """Check a PASS against its own trace."""
         run = details.run
         where = f"run {run.run_id}, PASS of {printable(run.serial)}"
         if not traces:
@@ -322,7 +322,7 @@ def _counting(
 def _contradictions(
     name: str, records_id: str, event: str, data: Mapping[str, Any]
 ) -> Iterator[str]:
-    """In what an intact row does not fit these records."""
+    """Where an intact row does not fit these records."""
     if event == chain.BEGUN and data.get("records") != records_id:
         yield "the chain is that of other records"
     if event == chain.BEGUN and data.get("station") != name:

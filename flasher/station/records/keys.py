@@ -200,11 +200,9 @@ class Keeping:
         return self.heads or self.keys_folder
 
     def key_file(self, station: str, records_id: str) -> Path:
-        """The file of a station's key for these records."""
         return self.keys_folder / _file_name(station, records_id, ".key")
 
     def heads_file(self, station: str, records_id: str) -> HeadsFile:
-        """The heads of one station's chain."""
         return HeadsFile(self.heads_folder / _file_name(station, records_id, ".heads"))
 
     def kept_heads(

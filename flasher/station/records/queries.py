@@ -88,7 +88,6 @@ class Records:
         return found[0]
 
     def figures(self, chosen: RunFilter = _EVERYTHING) -> Figures:
-        """The figures of a filter."""
         run = schema.run.c
         duration_s = run.ended_monotonic_s - run.begun_monotonic_s
         query = _joined(run.unit_id, run.state, run.code, duration_s, run.is_virtual)
@@ -97,7 +96,6 @@ class Records:
             return _figures_of(connection.execute(query.order_by(run.id)))
 
     def stations(self) -> tuple[str, ...]:
-        """The names of all stations."""
         with self._database.reading() as connection:
             query = select(schema.station.c.name).order_by(schema.station.c.id)
             return tuple(connection.execute(query).scalars())

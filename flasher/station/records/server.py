@@ -119,7 +119,6 @@ class ServerLock:
         return True
 
     def release(self) -> None:
-        """Let another process be the station."""
         with self._mutex:
             session, self._session, self.is_held = self._session, None, False
             if session is not None:

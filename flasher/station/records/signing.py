@@ -52,7 +52,6 @@ class Signer:
 
     @property
     def key_file(self) -> Path:
-        """Where the key of this station is kept."""
         return self.keeping.key_file(self._station, self.records_id)
 
     @property
@@ -176,7 +175,6 @@ class Signer:
 
     @property
     def heads_file(self) -> HeadsFile:
-        """Where the heads of this station's chain are kept."""
         return self.keeping.heads_file(self._station, self.records_id)
 
     def _following(self) -> Path:

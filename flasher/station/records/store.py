@@ -70,11 +70,9 @@ class SystemClock:
     """The computer's own clocks."""
 
     def utc(self) -> datetime:
-        """Now, in UTC."""
         return datetime.now(UTC)
 
     def monotonic_s(self) -> float:
-        """Seconds since some start."""
         return time.monotonic()
 
 
@@ -368,7 +366,6 @@ class Store:
         return self.signer.accept_restored(operator, reason)
 
     def rotate_key(self, operator: str) -> None:
-        """Sign with a new key from now on."""
         self.become_station()
         self.signer.rotate(operator)
 
