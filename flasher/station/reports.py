@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
-from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
-from enum import Enum, IntEnum
 from typing import Any, Final
 
 from flasher.report.junit import JUnitCase, JUnitResult, JUnitSuite, junit_xml
@@ -38,8 +35,11 @@ class Report:
         }
         return {
             "schema": SCHEMA_VERSION,
-            "filter": plain(self.chosen),
-            "figures": plain(self.figures) | shares,
+            "filter": {
+                name: utc_text(value) if isinstance(value, datetime) else value
+                for name, value in asdict(self.chosen).items()
+            },
+            "figures": asdict(self.figures) | shares,
             "runs": self.runs,
         }
 
@@ -67,25 +67,6 @@ class Report:
 def make_report(records: Records, chosen: RunFilter) -> Report:
     """The report of a filter. Raises RecordError."""
     return Report(chosen, records.figures(chosen), records.table(chosen))
-
-
-def plain(value: Any) -> Any:
-    """A record in JSON's types."""
-    if isinstance(value, datetime):
-        return utc_text(value)
-    if isinstance(value, IntEnum):
-        return value.name.lower()
-    if isinstance(value, Enum):
-        return value.value
-    if dataclasses.is_dataclass(value):
-        return {
-            field.name: plain(getattr(value, field.name)) for field in dataclasses.fields(value)
-        }
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [plain(item) for item in value]
-    return value
 
 
 def _cell(value: object) -> str:

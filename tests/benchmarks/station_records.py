@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from flasher.cli.documents import as_json
 from flasher.cli.station.records import certificate
 from flasher.protocol.spec import BMS
 from flasher.station.records.keys import Keeping
@@ -28,7 +29,7 @@ from flasher.station.records.model import (
     Verified,
 )
 from flasher.station.records.store import Store
-from flasher.station.reports import make_report, plain
+from flasher.station.reports import make_report
 from tests.station.factory import BMS_VERSION, HEAD, Bench, make_recipe, target_table
 
 SERIAL_NUMBER = """
@@ -118,7 +119,7 @@ def measure(folder: Path, runs: int) -> None:
         timed("report of all as CSV", lambda: make_report(records, RunFilter()).to_csv())
         timed("report of all as JSON document", lambda: make_report(records, RunFilter()).to_dict())
         timed("report of all as JUnit", lambda: make_report(records, RunFilter()).to_junit())
-        timed("one unit", lambda: plain(records.unit("W0000017")))
+        timed("one unit", lambda: as_json(records.unit("W0000017")))
         timed("certificate", lambda: certificate(store, records.unit("W0000017")))
         timed("backup", lambda: store.backup(folder / "backup.sqlite"))
         began = time.perf_counter()

@@ -12,6 +12,7 @@ from xml.etree import ElementTree as Xml
 
 import pytest
 
+from flasher.cli.documents import as_json
 from flasher.errors import UsageError
 from flasher.station.certificate import render_certificate
 from flasher.station.records.model import (
@@ -21,8 +22,9 @@ from flasher.station.records.model import (
     StepState,
     UnitLife,
     UnitState,
+    Verified,
 )
-from flasher.station.reports import Report, make_report, plain
+from flasher.station.reports import Report, make_report
 from tests.station.factory import SERIAL, USUAL, Bench
 
 HOSTILE = "<script>alert(1)</script>\u202e\x07"
@@ -122,10 +124,10 @@ def test_a_report_of_a_filter_names_it(plant: Bench) -> None:
 
 
 def test_the_life_of_a_unit_is_a_document(plant: Bench) -> None:
-    document = json.loads(json.dumps(plain(plant.store.read.unit("W2605003"))))
-    assert document["state"] == "PASS"
-    assert [run["run"]["state"] for run in document["runs"]] == ["FAIL", "PASS"]
-    assert document["runs"][1]["targets"][0]["reached"] == "version"
+    document = json.loads(json.dumps(as_json(plant.store.read.unit("W2605003"))))
+    assert document["state"] == "pass"
+    assert [run["run"]["state"] for run in document["runs"]] == ["fail", "pass"]
+    assert document["runs"][1]["targets"][0]["reached"] == Verified.VERSION
     assert document["runs"][1]["writes"][0]["what"] == "flash"
 
 
