@@ -170,7 +170,7 @@ class Reader(Generic[Kind]):
     def _faults(
         self, document: Mapping[str, Any], details: Sequence[Detail], prefix: Location
     ) -> list[Fault]:
-        unknown: list[Fault] = []
+        unknown: dict[Location, list[str]] = {}
         missing: dict[Location, list[str]] = {}
         wrong: dict[str, Fault] = {}
         places = [location for kind, location, _ in details if kind != "too_short"]
@@ -181,7 +181,7 @@ class Reader(Generic[Kind]):
             if kind == "missing":
                 missing.setdefault(location[:-1], []).append(str(location[-1]))
             elif kind in _UNKNOWN or location[-1:] == ("[key]",):
-                unknown.append(self._unknown(at, prefix))
+                unknown.setdefault(at[:-1], []).append(str(at[-1]))
             else:
                 fault = self._wrong(kind, at, value, said, prefix)
                 wrong.setdefault(fault.place, fault)
@@ -190,24 +190,28 @@ class Reader(Generic[Kind]):
             for at, names in missing.items()
         ]
         # An unknown key first: it may be why another one is missing.
-        return [*unknown, *lacking, *wrong.values()]
+        strange = [each for at, keys in unknown.items() for each in self._unknown(at, keys, prefix)]
+        return [*strange, *lacking, *wrong.values()]
 
-    def _unknown(self, location: Location, prefix: Location) -> Fault:
-        table, key = (*prefix, *location[:-1]), str(location[-1])
+    def _unknown(self, location: Location, keys: list[str], prefix: Location) -> Iterator[Fault]:
+        """Unknown keys of one table; those that it knows are told with the first of them."""
+        table = (*prefix, *location)
         names = [
             *(() if table else self._also),
-            *(name for name in self._root.at(location[:-1]).names if name not in self._beside),
+            *(name for name in self._root.at(location).names if name not in self._beside),
         ]
         spelled = {path.rpartition(".")[2]: place_of((*prefix, path)) for path in self.keys}
         spelled |= {name: name for name in names}
-        return Fault(
-            place_of((*table, key)),
-            "unknown key.",
-            did_you_mean(key.lower(), spelled, spelled.__getitem__)
-            + f"Known are: {', '.join(names)}.",
-            f"The {self._what} has an unknown key {key!a:.60}"
-            + (f" in [{place_of(table)}]." if table else "."),
-        )
+        where = f" in [{place_of(table)}]" if table else ""
+        for key in keys:
+            close = did_you_mean(key.lower(), spelled, spelled.__getitem__)
+            known = f"Known are: {', '.join(names)}." if key == keys[0] else ""
+            yield Fault(
+                place_of((*table, key)),
+                "unknown key.",
+                (close + known).strip(),
+                f"The {self._what} has an unknown key {key!a:.60}{where}.",
+            )
 
     def _wrong(
         self, kind: str, location: Location, value: object, said: str, prefix: Location

@@ -2,7 +2,7 @@
 
 Frozen dataclasses and nothing else. All times named `..._s` are seconds since the first frame of
 the trace. Every text is safe to show in a terminal; a page still has to escape it for HTML.
-`dataclasses.asdict` with the enums replaced by their names is the JSON form (`story_document`).
+JSON is made of them by `flasher.cli.documents.as_json`.
 """
 
 from __future__ import annotations
