@@ -1,6 +1,6 @@
 """Runs commands of flasher, each in a process of its own, and tells what each of them cost.
 
-`python tests/hostile/child.py` reads [[folder, words], ...] as JSON from stdin. For each it writes
+`python -m tests.hostile.child` reads [[folder, words], ...] as JSON from stdin. For each it writes
 [exit code, stdout, stderr, seconds of processor time, megabytes at the peak]. Processes are made by
 forks: what it takes to start Python is neither paid nor counted each time.
 """
