@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 import subprocess
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -28,12 +29,19 @@ def test_a_host_that_is_killed_at_any_packet_is_repaired_by_the_same_command(
     bus: tuple[str, ...],
     tmp_path: Path,
 ) -> None:
+    """A sample of `python -m tests.campaigns.two_processes`: the first packet, and the last but
+    one.
+    """
+    kill_and_repair(bus, tmp_path, (1, PACKETS - 1))
+
+
+def kill_and_repair(bus: tuple[str, ...], tmp_path: Path, numbers: Iterable[int]) -> None:
     """One device lives through all of it; each time it is left without an application."""
     (tmp_path / "image.bin").write_bytes(IMAGE)
     serving = ("-t", "bms", "--set", PAUSE_S, "--save-image", "out.bin", "-v", *bus)
     flash = ("flash", "-t", "bms", *bus, "image.bin")
     with MockProcess(*serving, folder=tmp_path) as mock:
-        for number in (1, PACKETS // 2, PACKETS - 1):
+        for number in numbers:
             kill_at(number, (*flash, *SLOW), tmp_path)
             (tmp_path / "out.bin").unlink(missing_ok=True)
             done = run_flasher(*flash, folder=tmp_path)

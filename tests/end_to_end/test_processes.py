@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import socket
+import subprocess
 from contextlib import closing
 from pathlib import Path
 
@@ -26,7 +27,7 @@ def free_port() -> int:
 
 @pytest.fixture(scope="module")
 def bus() -> tuple[str, ...]:
-    """Bus arguments with a port of their own; `hop_limit=0` keeps the frames on this machine."""
+    """Arguments of a bus that other processes hear."""
     port = free_port()
     try:
         probe = can.Bus(
@@ -42,6 +43,11 @@ def bus() -> tuple[str, ...]:
             pytest.skip(f"multicast cannot be sent here: {error}")
     if heard is None:
         pytest.skip("multicast does not come back on this machine")
+    return bus_words(port)
+
+
+def bus_words(port: int) -> tuple[str, ...]:
+    """Bus arguments with a port of their own; `hop_limit=0` keeps the frames on this machine."""
     options = ("--bus-kwargs", "hop_limit=0", "--bus-kwargs", f"port={port}")
     return ("-i", "udp_multicast", "-c", GROUP, *options)
 
@@ -59,12 +65,20 @@ def test_images_of_every_edge_size_arrive_byte_for_byte_at_one_mock(
         assert mock.end() == 0
 
 
-def test_300_kib_arrive_byte_for_byte(bus: tuple[str, ...], tmp_path: Path) -> None:
+def test_more_than_64_kib_arrive_byte_for_byte(bus: tuple[str, ...], tmp_path: Path) -> None:
+    """A sample of `python -m tests.campaigns.two_processes`, which sends 300 KiB."""
+    done = long_upgrade(bus, tmp_path, 65 * 1024)
+    assert "66,560 bytes in 520 packets" in done.stdout
+
+
+def long_upgrade(
+    bus: tuple[str, ...], folder: Path, size_bytes: int
+) -> subprocess.CompletedProcess[str]:
     """The mock's flash takes no time here: a packet would last 1 ms longer."""
     fast = ("--set", "program_time_s=0", "--set", "erase_time_s=0")
-    image = VECTORS + random.Random(12).randbytes(300 * 1024 - 16)
+    image = VECTORS + random.Random(12).randbytes(size_bytes - len(VECTORS))
     serving = ("-t", "bms", "--save-image", "out.bin", "--upgrades", "1", *fast, *bus)
-    with MockProcess(*serving, folder=tmp_path) as mock:
-        done = transfer(mock, tmp_path, image, *bus)
-        assert "307,200 bytes in 2,400 packets" in done.stdout
+    with MockProcess(*serving, folder=folder) as mock:
+        done = transfer(mock, folder, image, *bus)
         assert mock.end() == 0
+    return done

@@ -1,7 +1,8 @@
 """The station, and the process of a socket, are killed for real while an operator works: what was
 shown is true of the units, and every unit gets through.
 
-The whole campaign is a command: `python -m tests.campaigns.station_kill --times 60 [--postgres]`.
+The whole campaign is a command, and so are the records on a server:
+`python -m tests.campaigns.station_kill --times 60 [--postgres]`.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ import pytest
 
 from tests.campaigns.scripted_units import bus_of, free_port
 from tests.campaigns.station_kill import campaign
-from tests.station.postgres import Server
 
 
 @pytest.fixture(autouse=True)
@@ -29,17 +29,11 @@ def multicast() -> None:
 
 
 @pytest.mark.timeout(240)
-@pytest.mark.parametrize("back_end", ["sqlite", "postgresql"])
 def test_after_kills_all_that_was_shown_is_true_and_every_unit_gets_through(
-    tmp_path: Path, request: pytest.FixtureRequest, back_end: str
+    tmp_path: Path,
 ) -> None:
-    records = "records.sqlite"
-    if back_end == "postgresql":
-        server: Server = request.getfixturevalue("postgres")
-        records = server.url(server.database())
-    with campaign(tmp_path, seed=1, records=records, image_bytes=1500) as made:
-        if back_end == "sqlite":
-            made.kill_once(worker=True)
+    with campaign(tmp_path, seed=1, image_bytes=1500) as made:
+        made.kill_once(worker=True)
         made.kill_once(worker=False)
         made.in_peace()
     assert made.problems == []
