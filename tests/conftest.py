@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import pytest
 
-from flasher.cli.recording import BUNDLE_FOLDER
-from tests.station.postgres import Server, find_programs, running_server
+if TYPE_CHECKING:
+    from tests.station.postgres import Server
 
 POSTGRES_REQUIRED = "FLASHER_TEST_POSTGRES"
 """With this variable a missing server is an error, not a reason to skip."""
@@ -17,6 +18,8 @@ POSTGRES_REQUIRED = "FLASHER_TEST_POSTGRES"
 @pytest.fixture(autouse=True, scope="session")
 def files_elsewhere(tmp_path_factory: pytest.TempPathFactory) -> None:
     """For processes that a test starts too."""
+    from flasher.cli.recording import BUNDLE_FOLDER  # noqa: PLC0415  not where tests are handed out
+
     os.environ[BUNDLE_FOLDER] = str(tmp_path_factory.mktemp("bundles"))
     # Signing keys of stations.
     os.environ["XDG_DATA_HOME"] = str(tmp_path_factory.mktemp("data"))
@@ -34,6 +37,8 @@ def pytest_xdist_auto_num_workers() -> int:
 @pytest.fixture(scope="session")
 def postgres() -> Iterator[Server]:
     """A PostgreSQL server; each process of the tests has its own."""
+    from tests.station.postgres import find_programs, running_server  # noqa: PLC0415  as above
+
     programs = find_programs()
     if programs is None:
         why = "PostgreSQL is not installed (Debian: apt-get install postgresql)"

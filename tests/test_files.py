@@ -54,6 +54,16 @@ def test_a_recording_may_grow_and_not_shrink(tmp_path: Path) -> None:
         shorten(path)
 
 
+def test_a_file_of_exactly_the_largest_size_is_read_and_one_byte_more_is_not(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "app.bin"
+    path.write_bytes(b"12345678")
+    assert read(path, 8) == b"12345678"
+    with pytest.raises(UsageError, match="too large: 8 bytes, where at most 7 are read"):
+        read(path, 7)
+
+
 def test_a_pipe_in_the_place_of_the_file_is_not_waited_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

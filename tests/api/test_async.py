@@ -11,8 +11,8 @@ import flasher
 from flasher import events
 from flasher.errors import NoAnswerError, WrongDeviceError
 from flasher.protocol import contents
+from tests.api.battery import ANSWERS, Battery, wire_to
 from tests.firmware import VECTORS
-from tests.service.battery import ANSWERS, Battery, wire_to
 
 IMAGE = flasher.Image.from_bytes(VECTORS + random.Random(7).randbytes(1000))
 

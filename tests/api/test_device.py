@@ -10,8 +10,8 @@ import pytest
 import flasher
 from flasher import contents
 from flasher.errors import InterruptedByUserError, NoAnswerError, UsageError
+from tests.api.battery import Battery, wire_to
 from tests.firmware import VECTORS
-from tests.service.battery import Battery, wire_to
 
 IMAGE = flasher.Image.from_bytes(VECTORS + random.Random(3).randbytes(500))
 

@@ -23,9 +23,9 @@ from flasher.cli.look.findings import Finding, Severity, Traffic
 from flasher.errors import ExitCode
 from flasher.protocol.bittime import fixed_bits
 from flasher.protocol.frame import Frame
+from tests.api.battery import ANSWERS, Battery, wire_to
 from tests.bus.test_adapter import FakeBus, error_message, message
 from tests.cli.conftest import Flasher, Run
-from tests.service.battery import ANSWERS, Battery, wire_to
 
 MOCK = ("--mock", "--mock-speed", "0")
 SILENT = frozenset(ANSWERS)

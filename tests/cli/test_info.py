@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from flasher.errors import ExitCode
+from tests.api.battery import ANSWERS, RUNNING, Battery, opened
 from tests.cli.conftest import Flasher
-from tests.service.battery import ANSWERS, RUNNING, Battery, opened
 
 MOCK = ("--mock", "--mock-speed", "0")
 

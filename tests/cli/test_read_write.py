@@ -11,8 +11,8 @@ import pytest
 from intelhex import IntelHex
 
 from flasher.errors import ExitCode
+from tests.api.battery import ANSWERS, Battery, opened
 from tests.cli.conftest import Flasher
-from tests.service.battery import ANSWERS, Battery, opened
 
 MOCK = ("--mock", "--mock-speed", "0")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from flasher.errors import ExitCode
+from tests.api.battery import ANSWERS, Battery, opened
 from tests.cli.conftest import Flasher
-from tests.service.battery import ANSWERS, Battery, opened
 
 MOCK = ("--mock", "--mock-speed", "0")
 SILENT = frozenset(ANSWERS)

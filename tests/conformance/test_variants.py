@@ -11,7 +11,8 @@ from tests.loops import each
 from tests.variant_matrix import Row, groups_passed, listed_rows, row_of
 
 LISTED = listed_rows()
-SAMPLE = [list(VARIANTS)[0], *list(VARIANTS)[4:-1:8], list(VARIANTS)[-1]]
+_NAMES = list(VARIANTS)
+SAMPLE = [_NAMES[0], *_NAMES[4:-1:8], _NAMES[-1]]
 """The gate judges every variant; the tests of the cases judge some of each clause."""
 
 

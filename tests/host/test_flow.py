@@ -26,6 +26,7 @@ from flasher.protocol.messages import (
     UpdateCommand,
 )
 from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Target
+from flasher.protocol.timing import Timings
 from tests.host.bench import BOOT, Bench, answer_frames, image_of
 
 
@@ -410,3 +411,33 @@ def test_the_default_deadline_grows_with_the_image() -> None:
     large = default_timeout_s(plan(image_of(128 * 1000), BMS, 250_000), UpgradeOptions())
     assert small < 90
     assert large > small + 3 * 990 * 0.5
+
+
+def test_the_default_deadline_is_every_wait_at_its_limit() -> None:
+    timings = Timings(
+        command_timeout_s=1.0,
+        boot_version_timeout_s=20.0,
+        request_transfer_timeout_s=300.0,
+        ack_timeout_s=4_000.0,
+        complete_timeout_s=50_000.0,
+        end_tries=3,
+        application_start_timeout_s=600_000.0,
+    )
+    gaps = {"frame_gap_s": 0.0625, "packet_gap_s": 8.0}
+    options = UpgradeOptions(timings=timings, attempts=5, adapter_return_s=7e6, **gaps)
+    made = plan(image_of(300), BMS, 250_000)
+    # Each of the 3 packets has 18 frames; reset has 2, the update command 3, end of transfer 2.
+    frame_gaps_s = 0.0625 * (3 * 17 + 1 + 2 + 1)
+    packet_gaps_s = 8.0 * 4
+    attempt_s = 1.0 + 20.0 + 300.0 + 3 * 4_000.0 + made.wire_s + frame_gaps_s + packet_gaps_s
+    end_s = 3 * 50_000.0 + 600_000.0
+    expected_s = 5 * attempt_s + 4 * 7e6 + end_s
+    assert default_timeout_s(made, options) == pytest.approx(expected_s, abs=1e-3)
+
+
+def test_the_packets_acknowledged_are_counted_from_the_first_one() -> None:
+    for acknowledged in (0, 1, 2):
+        bench = Bench(300, options=UpgradeOptions(timeout_s=2.0))
+        bench.to_packet(acknowledged + 1)
+        bench.wait(2.0)
+        assert bench.outcome.statistics.packets_acknowledged == acknowledged

@@ -23,6 +23,7 @@ from flasher.protocol.messages import (
     Row,
     UpdateCommand,
 )
+from flasher.protocol.spec import FRAMES_PER_PACKET
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from tests.host.bench import BOOT, Bench, answer_frames
 
@@ -180,6 +181,47 @@ def test_after_a_repetition_50_ms_of_quiet_are_enough() -> None:
     assert bench.expect(Packet).number == 2
     waited_s = bench.sent[-1][0] - answered_at
     assert 0.05 < waited_s < 0.065
+
+
+def test_quiet_after_a_copy_that_was_answered_while_it_left_begins_at_its_end() -> None:
+    bench = Bench()
+    bench.to_packet(1)
+    at_frame: list[int] = []
+
+    def ack_in_the_middle(frames: int) -> None:
+        at_frame.append(frames)
+        if len(at_frame) == 9:
+            for frame in answer_frames(Ack(1)):
+                bench.engine.receive(frame, bench.now)
+
+    bench.on_frame = ack_in_the_middle
+    assert bench.expect(Packet).number == 1
+    left_at = bench.sent[-1][0]
+    assert bench.expect(Packet, within_s=1.0).number == 2
+    assert 0.05 < bench.sent[-1][0] - left_at < 0.065
+
+
+def test_an_answer_is_waited_for_from_the_moment_in_which_the_packet_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """And not from the one in which a busy computer hears that it has."""
+    bench = Bench()
+    bench.to_request()
+    told = bench.engine.frame_sent
+    left_at: list[float] = []
+
+    def hear_late(at: float) -> None:
+        told(at)
+        left_at.append(bench.now)
+        if len(left_at) == FRAMES_PER_PACKET:
+            bench.now += 0.3
+
+    monkeypatch.setattr(bench.engine, "frame_sent", hear_late)
+    bench.say(RequestTransfer())
+    assert bench.expect(Packet).number == 1
+    assert bench.expect(Packet).number == 1
+    copy_took_s = left_at[-1] - left_at[FRAMES_PER_PACKET]
+    assert 0.5 < left_at[-1] - left_at[FRAMES_PER_PACKET - 1] < 0.51 + copy_took_s
 
 
 def test_a_late_answer_does_not_double_the_packets_that_follow() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from flasher.errors import ImageError
-from flasher.image.cortexm import check_starts_inside, vector_table
+from flasher.image.cortexm import VectorTable, check_starts_inside, vector_table
 from flasher.image.image import Image
 from flasher.image.load import load
 
@@ -163,3 +163,31 @@ def test_no_more_than_four_further_programs_are_named() -> None:
     table = vector_table(merged(6))
     assert table is not None
     assert table.notes[0].count("0x") == 4
+
+
+@pytest.mark.parametrize("nothing", [0, 0xFFFF_FFFF])
+@pytest.mark.parametrize("base", [BASE, None])
+def test_a_vector_that_is_empty_lies_nowhere(nothing: int, base: int | None) -> None:
+    """Zero, or erased: it counts in no distance of the vectors from each other."""
+    table = vector_table(image(STACK, BASE + 5, nothing, nothing, base=base))
+    assert table is not None
+    assert table.plausible
+    assert not table.problems
+
+
+def test_of_an_image_that_is_no_program_no_more_is_said_than_that() -> None:
+    """Neither that its base is odd, nor that another program stands in it, nor how to judge it."""
+    inner = (STACK, BASE + 0x301, BASE + 0x303, BASE + 0x305)
+    words = (0, BASE + 5, *(0,) * 126, *inner)
+    for base in (BASE, BASE + 4, None):
+        table = vector_table(image(*words, base=base))
+        assert table is not None
+        assert table.problems == ("the first word, 0x00000000, is no stack pointer of a Cortex-M",)
+        assert table.notes == ()
+    (note,) = known(vector_table(image(STACK, *words[1:]))).notes
+    assert f"0x{BASE + 512:08X}" in note
+
+
+def known(table: VectorTable | None) -> VectorTable:
+    assert table is not None
+    return table

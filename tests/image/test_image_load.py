@@ -332,6 +332,18 @@ def test_a_text_or_elf_file_of_absurd_size_is_not_read(tmp_path: Path) -> None:
         load(path)
 
 
+def test_a_text_file_of_exactly_the_largest_size_is_read_and_one_byte_more_is_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = (SAMPLES / "wmc.hex").read_bytes()
+    path = write(tmp_path, "app.hex", data)
+    monkeypatch.setattr("flasher.image.load.FILE_MAX_SIZE", len(data))
+    assert load(path).data == load(SAMPLES / "wmc.hex").data
+    path = write(tmp_path, "app.hex", data + b"\n")
+    with pytest.raises(ImageError, match="too large for an Intel HEX file"):
+        load(path)
+
+
 def test_the_largest_binary_is_loaded_and_one_byte_more_is_not(tmp_path: Path) -> None:
     path = write(tmp_path, "app.bin", b"\x01")
     os.truncate(path, IMAGE_MAX_SIZE)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+from array import array
 from pathlib import Path
 
 import pytest
@@ -142,6 +143,13 @@ def test_an_empty_and_a_too_large_image_are_refused() -> None:
         plan(Image.from_bytes(b""), BMS, BITRATE_BPS)
     with pytest.raises(ImageError, match="65535 packets"):
         plan(Image.from_bytes(bytes(IMAGE_MAX_SIZE + 1)), BMS, BITRATE_BPS)
+
+
+def test_an_image_of_exactly_the_largest_size_is_planned(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The bits of 65,535 packets take a second.
+    monkeypatch.setattr("flasher.image.plan._packet_bits", lambda *_: array("H", [2_200]))
+    result = plan(Image.from_bytes(bytes(IMAGE_MAX_SIZE)), BMS, BITRATE_BPS)
+    assert result.total_packets == 65_535
 
 
 @pytest.mark.parametrize("bitrate_bps", [0, -250_000])

@@ -18,7 +18,7 @@ from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.write import plan_write
 from flasher.protocol import contents
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC, Dialect, Node, Target
-from tests.service.battery import ANSWERS, Battery, wire_to
+from tests.api.battery import ANSWERS, Battery, wire_to
 
 BOTH = pytest.mark.parametrize("dialect", [WELLING, MOTINOVA], ids=lambda d: d.name)
 SILENT = frozenset(ANSWERS)
