@@ -423,8 +423,9 @@ def test_the_default_deadline_is_every_wait_at_its_limit() -> None:
         end_tries=3,
         application_start_timeout_s=600_000.0,
     )
-    gaps = {"frame_gap_s": 0.0625, "packet_gap_s": 8.0}
-    options = UpgradeOptions(timings=timings, attempts=5, adapter_return_s=7e6, **gaps)
+    options = UpgradeOptions(
+        timings=timings, attempts=5, adapter_return_s=7e6, frame_gap_s=0.0625, packet_gap_s=8.0
+    )
     made = plan(image_of(300), BMS, 250_000)
     # Each of the 3 packets has 18 frames; reset has 2, the update command 3, end of transfer 2.
     frame_gaps_s = 0.0625 * (3 * 17 + 1 + 2 + 1)

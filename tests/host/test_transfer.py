@@ -11,6 +11,7 @@ from flasher.errors import ExitCode
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
 from flasher.host.table import Ending, State
+from flasher.image.plan import plan
 from flasher.protocol.messages import (
     Ack,
     BootVersion,
@@ -23,7 +24,7 @@ from flasher.protocol.messages import (
     Row,
     UpdateCommand,
 )
-from flasher.protocol.spec import FRAMES_PER_PACKET
+from flasher.protocol.spec import BMS
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from tests.host.bench import BOOT, Bench, answer_frames
 
@@ -201,27 +202,25 @@ def test_quiet_after_a_copy_that_was_answered_while_it_left_begins_at_its_end() 
     assert 0.05 < bench.sent[-1][0] - left_at < 0.065
 
 
-def test_an_answer_is_waited_for_from_the_moment_in_which_the_packet_left(
+def test_an_answer_is_waited_for_from_the_moment_in_which_the_packet_has_left(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """And not from the one in which a busy computer hears that it has."""
+    """And not from the one in which an adapter has taken its last frame."""
     bench = Bench()
     bench.to_request()
     told = bench.engine.frame_sent
-    left_at: list[float] = []
 
-    def hear_late(at: float) -> None:
+    def take_at_once(at: float) -> None:
         told(at)
-        left_at.append(bench.now)
-        if len(left_at) == FRAMES_PER_PACKET:
-            bench.now += 0.3
+        bench.now = at
 
-    monkeypatch.setattr(bench.engine, "frame_sent", hear_late)
+    monkeypatch.setattr(bench.engine, "frame_sent", take_at_once)
     bench.say(RequestTransfer())
     assert bench.expect(Packet).number == 1
+    taken_at = bench.sent[-1][0]
     assert bench.expect(Packet).number == 1
-    copy_took_s = left_at[-1] - left_at[FRAMES_PER_PACKET]
-    assert 0.5 < left_at[-1] - left_at[FRAMES_PER_PACKET - 1] < 0.51 + copy_took_s
+    wire_s = plan(bench.image, BMS, 250_000).packet_wire_s(1)
+    assert 0.5 + 0.9 * wire_s < bench.sent[-1][0] - taken_at < 0.5 + 1.1 * wire_s
 
 
 def test_a_late_answer_does_not_double_the_packets_that_follow() -> None:
