@@ -18,7 +18,7 @@ from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode, InterruptedByUserError, UsageError
 from flasher.host.items import writable
 from flasher.host.write import WritePlan, Written, field_changes, plan_write
-from flasher.protocol.fields import Content, label
+from flasher.protocol.fields import label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target
 
 _EXAMPLES: Final = """\
@@ -137,27 +137,24 @@ def write(
         device = connection.device(target, dialect=bus.dialect, taps=record.taps)
         with stop_on_signal() as stopped:
             old = device.content_before(plan, cancelled=stopped)
-        _show(plan, old, output)
+        output.result(f"{target.node.name} {plan.writable.name}")
+        output.table(
+            (
+                (each.name, f"old {'unknown' if each.old is None else repr(each.old)}",
+                 f"new {each.new!r}")
+                for each in field_changes(plan, old)
+            ),
+            indent=2,
+        )  # fmt: skip
         if not yes and not _agrees(plan):
             output.progress("nothing was written")
             output.document(NotWrittenDocument(written=False), exit_code=ExitCode.INTERRUPTED)
             return ExitCode.INTERRUPTED
         with stop_on_signal(lambda: output.error_line("the write ends first ...")):
             written = device.carry_out(plan, old)
-        if (error := written.error()) is not None:
+        error = written.error()
+        if error is not None:
             record.failed(error)
-    return _conclude(written, output)
-
-
-def _show(plan: WritePlan, old: Content | None, output: Output) -> None:
-    output.result(f"{plan.target.node.name} {plan.writable.name}")
-    for change in field_changes(plan, old):
-        before = "unknown" if change.old is None else repr(change.old)
-        output.result(f"  {change.name:<16} old {before}  new {change.new!r}")
-
-
-def _conclude(written: Written, output: Output) -> int:
-    error = written.error()
     if error is not None:
         output.failure(error, _document(written))
         return error.exit_code
