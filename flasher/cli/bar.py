@@ -29,7 +29,7 @@ class Bar:
         self.close()
 
     def move_to(self, done: int, total: int, *, note: str = "") -> None:
-        """So much of the total is done; the first call opens the bar, the last one closes it."""
+        """So much of the total is done; the first call opens the bar."""
         if not self._is_wanted:
             return
         with self._guarded():
@@ -38,8 +38,11 @@ class Bar:
             if note:
                 self._bar.set_postfix_str(note, refresh=False)
             self._bar.update(done - self._bar.n)
-        if done == total:
-            self.close()
+
+    @property
+    def is_shown(self) -> bool:
+        """True while the bar is on the screen."""
+        return self._bar is not None
 
     def describe(self, text: str) -> None:
         """What is being done, beside the bar."""

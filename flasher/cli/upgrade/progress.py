@@ -57,10 +57,12 @@ class Progress:
     def __call__(self, event: object) -> None:
         """Show one event."""
         match event:
-            case events.PacketAcknowledged(number, _, _):
+            case events.PacketAcknowledged(number, total, _):
                 note = f"{self._repetitions} repeated" if self._repetitions else ""
                 done = min(number * PACKET_DATA_SIZE, self._size_bytes)
                 self._bar.move_to(done, self._size_bytes, note=note)
+                if number == total:
+                    self._bar.close()
             case events.PhaseEntered(phase, _) if phase is not events.Phase.TRANSFER:
                 self._bar.close()
             case events.AttemptStarted():
