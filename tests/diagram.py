@@ -25,7 +25,7 @@ _MARKED: Final = re.compile(
     r"(<!-- state diagram -->\n).*?(<!-- end of state diagram -->)", re.DOTALL
 )
 
-_QUIET: Final = {"ignore", "report", "NOTHING", "REPORT", "IMPOSSIBLE"}
+_QUIET: Final = {"ignore", "report"}
 _EVERYWHERE: Final = {"CANCEL", "OUT_OF_TIME", "POWER_CUT", "SECOND_TOOL", "UNEXPECTED"}
 _GOOD: Final = {Ending.COMPLETED, Ending.CONFIRMED_BY_VERSION}
 
@@ -63,8 +63,8 @@ def device_arrows() -> Iterator[_Arrow]:
     """The arrows of the device model's table."""
     for state, row in device.TABLE.items():
         for event, move in row.items():
-            if event.name not in _EVERYWHERE and move.action.name not in _QUIET:
-                yield state, event, move.action.value, move.state
+            if event.name not in _EVERYWHERE and move.action not in _QUIET:
+                yield state, event, move.action.replace("_", " "), move.state or state
 
 
 def diagram(arrows: Iterable[_Arrow], states: type[Enum], *, overview: bool = False) -> str:

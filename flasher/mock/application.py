@@ -1,12 +1,13 @@
 """What runs on a device once its bootloader has started it (R19), and what it may ask of the
 machine that it runs on.
 
-The base says nothing and understands nothing: the documents tell nothing of what WMC and OBC would
-answer. `bms` answers, `talkers` ask.
+The base is silent: the documents tell nothing of what WMC and OBC would answer. `bms` answers,
+`clients` ask.
 """
 
 from __future__ import annotations
 
+from math import inf
 from typing import Protocol
 
 from flasher.protocol.catalogue import ITEMS
@@ -76,9 +77,10 @@ class Application:
     def hold_key(self, now: float) -> None:
         """The key was held for as long as it takes to switch off."""
 
-    def deadline(self) -> float | None:
-        """When it next wants `tick`."""
-        return None
+    @property
+    def due_at(self) -> float:
+        """When it next wants `tick`; infinite while it waits for others."""
+        return inf
 
     def tick(self, now: float) -> None:
         """The time that it asked for has come."""
@@ -91,3 +93,19 @@ def ids_heard_by(node: Node, dialect: Dialect) -> frozenset[int]:
         for item in ITEMS
         if dialect in item.dialects and item.sender is not node and item.receiver in {None, node}
     )
+
+
+def due_again(due_at: float, delay_s: float, now: float) -> float:
+    """When something that repeats is due again: `delay_s` after it was due, so that lateness does
+    not add up, but after `now` where that is over already, or where it was not due.
+    """
+    following = due_at + delay_s
+    return following if now < following < inf else now + delay_s
+
+
+def due_until(due_at: float, delay_s: float, end: float, now: float) -> float:
+    """The same, but `end` once that is nearer than half of `delay_s`: what is repeated last keeps
+    its time to be answered, whatever the sums of times say.
+    """
+    following = due_again(due_at, delay_s, now)
+    return end if following > end - delay_s / 2 else following

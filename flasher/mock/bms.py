@@ -8,10 +8,11 @@ is kept through power cuts and upgrades, as in a memory of its own.
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import inf
 from typing import Final
 
-from flasher.events import DeviceReported, DeviceWritten
-from flasher.mock.application import Application, ids_heard_by
+from flasher.events import DeviceReported, DeviceWritten, ShutdownAnnounced, ShutdownEnded
+from flasher.mock.application import Application, Port, due_again, due_until, ids_heard_by
 from flasher.mock.battery import (
     DESIGN_CAPACITY_MAH,
     DESIGN_VOLTAGE_V,
@@ -19,10 +20,8 @@ from flasher.mock.battery import (
     STATE_OF_HEALTH_PERCENT,
     Battery,
 )
-from flasher.mock.memory_map import MemoryMap
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.shutdown import Shutdown
-from flasher.mock.timer import due_again
+from flasher.mock.store import MemoryMap
 from flasher.protocol import contents
 from flasher.protocol.catalogue import ITEMS, Item, answer_of, decode, encode
 from flasher.protocol.contents import CheckCode, Fault, PhysicalId, ProductionInformation
@@ -40,6 +39,10 @@ from flasher.protocol.spec import (
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message
 
+SHUTDOWN_PERIOD_S: Final = 0.2
+"""The announcement is repeated at this interval until all others are ready."""
+SHUTDOWN_DELAY_S: Final = 1.0
+"""From the first announcement to the opening of the discharge switch, whoever answered."""
 FAULT_PERIOD_S: Final = 0.2
 """Faults are told at this interval while any is set (5.1)."""
 IDLE_SHUTDOWN_S: Final = 30 * 60.0
@@ -60,7 +63,43 @@ _NO_STATE_OF_HEALTH: Final = 0
 _NEWER_QUERIES: Final = frozenset(
     {(Node.OBC, contents.CellVoltages), (Node.HMI, contents.CellVoltages)}
 )
-"""Who may ask an older battery for what in vain (section 6)."""
+"""Queries, by sender and content of the answer, that an older battery does not answer (section 6).
+"""
+
+
+class Shutdown:
+    """One shutdown handshake (5.1): announce, collect the others' answers, switch off."""
+
+    def __init__(self, dialect: Dialect, port: Port, why: str, now: float) -> None:
+        self._port = port
+        self._announcement = _sent_item(contents.Shutdown, dialect)
+        self._missing = {
+            item.sender
+            for item in ITEMS
+            if item.content is contents.Ready and item.receiver is None and dialect in item.dialects
+        }
+        self._answered: set[Node] = set()
+        self._off_at = now + SHUTDOWN_DELAY_S
+        self.due_at = now
+        port.emit(ShutdownAnnounced(why))
+
+    def ready(self, node: Node) -> None:
+        """A node answered that it is ready."""
+        if node in self._missing:
+            self._missing.remove(node)
+            self._answered.add(node)
+            if not self._missing:
+                self.due_at = self._off_at
+
+    def tick(self, now: float) -> None:
+        """Announce again, or switch off."""
+        if now >= self._off_at:
+            self._port.emit(ShutdownEnded(_names(self._answered), _names(self._missing)))
+            self._port.switch_off(now)
+        elif self._missing and now >= self.due_at:
+            if self._port.is_idle:
+                self._port.send(encode(self._announcement, contents.Shutdown()))
+            self.due_at = due_until(self.due_at, SHUTDOWN_PERIOD_S, self._off_at, now)
 
 
 class BmsApplication(Application):
@@ -75,10 +114,10 @@ class BmsApplication(Application):
         self._memory = memory
         self._firmware = ""
         self._shutdown: Shutdown | None = None
-        self._fault_due: float | None = None
+        self._fault_due_at = inf
         self._idle_since: float | None = None
         """Since when there was no frame, and the current was small; None before the first tick."""
-        self._current_due = float("-inf")
+        self._current_due_at = -inf
         self._faults_item = _sent_item(contents.Faults, self.dialect)
         self._feedback_item = _sent_item(contents.GeneralFeedback, self.dialect)
         self._readers: dict[type[Content], Callable[[float], Content]] = {
@@ -100,28 +139,27 @@ class BmsApplication(Application):
         self._firmware = firmware
         self._shutdown = None
         self._idle_since = None
-        self._fault_due = now if self.faults else None
+        self._fault_due_at = now if self.faults else inf
 
     def stop(self) -> None:
         self._shutdown = None
-        self._fault_due = None
+        self._fault_due_at = inf
 
     def heard(self, now: float) -> None:
         self._idle_since = now
 
-    def deadline(self) -> float | None:
-        shutdown_due = None if self._shutdown is None else self._shutdown.due
-        due = (self._fault_due, self._idle_due(), shutdown_due)
-        return min((moment for moment in due if moment is not None), default=None)
+    @property
+    def due_at(self) -> float:
+        shutdown_due_at = inf if self._shutdown is None else self._shutdown.due_at
+        return min(self._fault_due_at, self._idle_due_at, shutdown_due_at)
 
     def tick(self, now: float) -> None:
-        if self._fault_due is not None and self._fault_due <= now:
+        if self._fault_due_at <= now:
             if self.port.is_idle:
                 self.port.send(encode(self._faults_item, contents.Faults(self.faults)))
             self._idle_since = now  # its own frames keep the bus busy too
-            self._fault_due = due_again(self._fault_due, FAULT_PERIOD_S, now)
-        idle_due = self._idle_due()
-        if idle_due is not None and idle_due <= now:
+            self._fault_due_at = due_again(self._fault_due_at, FAULT_PERIOD_S, now)
+        if self._idle_due_at <= now:
             self._look_at_current(now)
         if self._shutdown is not None:
             self._shutdown.tick(now)
@@ -132,9 +170,9 @@ class BmsApplication(Application):
         """These faults are set from now on, and no other."""
         self.faults = faults
         if not faults:
-            self._fault_due = None
-        elif self._fault_due is None:
-            self._fault_due = now
+            self._fault_due_at = inf
+        elif self._fault_due_at == inf:
+            self._fault_due_at = now
 
     def hold_key(self, now: float) -> None:
         """The key was held for 3 s: announce shutdown, then switch off."""
@@ -145,15 +183,16 @@ class BmsApplication(Application):
             self._shutdown = Shutdown(self.dialect, self.port, why, now)
             self._shutdown.tick(now)
 
-    def _idle_due(self) -> float | None:
+    @property
+    def _idle_due_at(self) -> float:
         if self.profile.idle_shutdown == "off" or self._shutdown is not None:
-            return None
+            return inf
         # Without a frame so far, the time counts from the first tick.
         since = self._idle_since
-        return float("-inf") if since is None else min(self._current_due, since + IDLE_SHUTDOWN_S)
+        return -inf if since is None else min(self._current_due_at, since + IDLE_SHUTDOWN_S)
 
     def _look_at_current(self, now: float) -> None:
-        self._current_due = now + CURRENT_PERIOD_S
+        self._current_due_at = now + CURRENT_PERIOD_S
         is_small = abs(self.battery.at(now).current_ma) < IDLE_CURRENT_MA[self.dialect]
         if self._idle_since is None or not is_small:
             self._idle_since = now
@@ -327,3 +366,7 @@ def _sent_item(content: type[Content], dialect: Dialect) -> Item:
 
 def _shown(content: Content) -> str:
     return ", ".join(value for _, value, _ in content.shown())
+
+
+def _names(nodes: set[Node]) -> tuple[str, ...]:
+    return tuple(node.name for node in sorted(nodes, key=lambda node: node.value))

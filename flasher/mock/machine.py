@@ -1,8 +1,7 @@
-"""The device's side of the engine interface: reception, sending, timers. What to make of it is the
-business of the model, and of the application that runs on it.
+"""What every node of the device model has: reception, sending, one timer, an application.
 
-One timer is enough for a bootloader, as in every state it waits for one thing; the application has
-its own.
+`MockDevice` (`model`) adds the bootloader; a `Unit` is a node without one. One timer is enough, as
+a bootloader waits for one thing in every state; the application has its own.
 """
 
 from __future__ import annotations
@@ -13,8 +12,7 @@ from math import inf
 from typing import ClassVar, Final
 
 from flasher.events import BytesDamaged, DeviceReported
-from flasher.mock.application import Application
-from flasher.mock.timer import due_again
+from flasher.mock.application import Application, due_again
 from flasher.protocol.engine import Transmitter
 from flasher.protocol.frame import Frame
 from flasher.protocol.timing import Timings
@@ -54,11 +52,11 @@ class Machine(ABC):
         """Those of them that may hold a part of a message."""
         self._transmitter = Transmitter(bitrate_bps)
         self._events: list[object] = []
-        self._due: float | None = None
+        self._due_at = inf
+        self._off_bus_until: float | None = None
         self._is_deaf = False
         self._is_cancelled = False
         self._runs_application = False
-        self._off_bus_until: float | None = None
         application.attach(self)
 
     # -- the engine interface ---------------------------------------------------------------------
@@ -69,7 +67,7 @@ class Machine(ABC):
         return self._is_cancelled and self._transmitter.idle
 
     def receive(self, frame: Frame, now: float) -> None:
-        """A CAN frame arrived. Only payload on the ids that concern this device is looked at."""
+        """A frame arrived. Only payload on the ids that concern this device is looked at."""
         if self._off_bus_until is not None:
             self._rejoin_bus(now)
         if self._is_cancelled or self._is_deaf or self._off_bus_until is not None:
@@ -89,11 +87,10 @@ class Machine(ABC):
             self._take(found, now)
 
     def tick(self, now: float) -> None:
-        """Let everything happen that is due by `now`."""
         if self._is_cancelled:
             return
         self._rejoin_bus(now)
-        for reassembler in self._reassemblers.values():
+        for reassembler in tuple(self._half_received.values()):
             for found in reassembler.tick(now):
                 self._take(found, now)
         self._run_timer(now)
@@ -101,35 +98,28 @@ class Machine(ABC):
             self.application.tick(now)
 
     def deadline(self) -> float | None:
-        """When it next wants `tick` or has a frame to send; None while it waits for the bus."""
-        wanted = self._transmitter.deadline()
-        if self._is_cancelled:
-            return wanted
-        others = [reassembler.deadline() for reassembler in self._half_received.values()]
-        others += (self._due, self._off_bus_until)
-        if self._runs_application:
-            others.append(self.application.deadline())
-        for other in others:
-            if other is not None and (wanted is None or other < wanted):
-                wanted = other
-        return wanted
+        due_at = self._transmitter.due_at
+        if not self._is_cancelled:
+            due_at = min(due_at, self._due_at)
+            for reassembler in self._half_received.values():
+                due_at = min(due_at, reassembler.due_at)
+            if self._off_bus_until is not None:
+                due_at = min(due_at, self._off_bus_until)
+            if self._runs_application:
+                due_at = min(due_at, self.application.due_at)
+        return None if due_at == inf else due_at
 
     def next_frame(self, now: float) -> Frame | None:
-        """The next frame to send; the same one until `frame_sent` is called."""
         return self._transmitter.next_frame(now)
 
     def frame_sent(self, now: float) -> None:
-        """The adapter has accepted it. What a power cut made void meanwhile is not missed."""
-        if not self._transmitter.idle:
-            self._transmitter.frame_sent(now)
+        self._transmitter.frame_sent(now)
 
     def cancel(self, now: float) -> None:
-        """Send the message under way to its end, then nothing more."""
         self._is_cancelled = True
         self._transmitter.drop_unstarted()
 
     def take_events(self) -> Sequence[object]:
-        """What happened since the last call."""
         if not self._events:
             return ()
         events, self._events = self._events, []
@@ -139,7 +129,6 @@ class Machine(ABC):
 
     @property
     def is_idle(self) -> bool:
-        """True when nothing waits to be sent."""
         return self._transmitter.idle
 
     def send(self, message: Message) -> None:
@@ -150,11 +139,9 @@ class Machine(ABC):
         self._transmitter.queue(frames, wire_s=_UNUSED_WIRE_S)
 
     def emit(self, event: object) -> None:
-        """Tell those who watch."""
         self._events.append(event)
 
     def switch_off(self, now: float) -> None:
-        """The application cuts the power."""
         self.power_cut(now)
 
     def hold_key(self, now: float) -> None:
@@ -213,11 +200,11 @@ class Machine(ABC):
 
     def _run_timer(self, now: float) -> None:
         """Let the timer expire as often as it is due; with times of 0 one leads to the next."""
-        while self._due is not None and self._due <= now:
+        while self._due_at <= now:
             self._expire(now)
 
     def _rearm(self, delay_s: float, now: float) -> None:
-        self._due = due_again(self._due, delay_s, now)
+        self._due_at = due_again(self._due_at, delay_s, now)
 
     def _report(self, what: str) -> None:
         self.emit(DeviceReported(what))
@@ -232,13 +219,13 @@ class Machine(ABC):
         self._forget_received()
         self._transmitter = Transmitter(self._bitrate_bps)
         self._off_bus_until = None
-        self._due = None
+        self._due_at = inf
 
     def _take(self, found: Message | Damage, now: float) -> None:
         # A message before this one may have restarted the device.
         if self._is_deaf:
             return
-        due_before = self._due
+        due_before = self._due_at
         if isinstance(found, Damage):
             self.emit(BytesDamaged(found.can_id, found.reason.value, found.data))
             self._take_damage(found, now)
@@ -246,7 +233,7 @@ class Machine(ABC):
             self._take_message(found, now)
         # What this message began is over at once with times of 0. A timer that ran before waits for
         # `tick`: messages that were held up somewhere are taken first.
-        if self._due != due_before:
+        if self._due_at != due_before:
             self._run_timer(now)
 
 
@@ -259,18 +246,15 @@ class Unit(Machine):
 
     @property
     def has_power(self) -> bool:
-        """False after a power cut."""
         return self._runs_application
 
     def power_cut(self, now: float) -> None:
-        """The power goes."""
         self._runs_application = False
         self._is_deaf = True
         self.application.stop()
         self._lose_memory()
 
     def power_on(self, now: float) -> None:
-        """The power comes back."""
         if not self._runs_application:
             self._runs_application = True
             self._is_deaf = False
@@ -283,4 +267,4 @@ class Unit(Machine):
         pass
 
     def _expire(self, now: float) -> None:
-        self._due = None
+        self._due_at = inf

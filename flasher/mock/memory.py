@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
+from math import inf
 from typing import Final, NamedTuple
 
 from flasher.errors import FlasherError
@@ -178,9 +179,10 @@ class FlashController:
         self._began_at = 0.0
 
     @property
-    def ends_at(self) -> float | None:
-        """When the operation under way is over; None while there is none."""
-        return self.reached_at(1.0)
+    def ends_at(self) -> float:
+        """When the operation under way is over; infinite while there is none."""
+        reached_at = self.reached_at(1.0)
+        return inf if reached_at is None else reached_at
 
     def reached_at(self, share: float) -> float | None:
         """When `share` (0 to 1) of the operation under way is done; None while there is none."""

@@ -1,74 +1,343 @@
 """The device: a bootloader on a flash of its own, and the application that it starts, written from
 the document alone.
 
-Here is what it does, action by action of its table (`table`); how messages and time become events
-of the table, and what else a device is, stands in `core`.
+How to read it: a message or an expired timer becomes an event (`_classify`, `_elapsed`), the table
+names the action and the next state, and the actions are the methods below, in the order of the
+states. An action may change everything but the state, and returns a few words for those who watch.
+
+Flash operations take their time in the controller. While they last the device hears, but a packet
+that comes before the answer to the one before is out of turn.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
-from typing import Final
+from dataclasses import dataclass
+from math import inf
+from typing import ClassVar, Final
 
-from flasher.errors import FlasherError
-from flasher.events import ImageStored, PacketStored
-from flasher.mock.core import DeviceCore
-from flasher.mock.memory import Operation
-from flasher.mock.table import Action, State
+from flasher.errors import FlasherError, UsageError
+from flasher.events import DeviceStateEntered, ImageStored, PacketStored
+from flasher.mock.application import Application
+from flasher.mock.bms import BmsApplication
+from flasher.mock.machine import Machine
+from flasher.mock.memory import FlashController, Operation
+from flasher.mock.profile import DeviceProfile
+from flasher.mock.store import ApplicationStore, MemoryMap, checksum_fits, factory_image
+from flasher.mock.table import TABLE, Event, State
 from flasher.protocol import messages
-from flasher.protocol.spec import PACKET_COUNT_MAX
+from flasher.protocol.spec import (
+    BOOT_VERSION_BURST,
+    COMMAND_SIZE,
+    DIALECTS,
+    HEADER,
+    LENGTH_SIZE,
+    MODE_SIZE,
+    PACKET_COUNT_MAX,
+    PREFIX_SIZE,
+    Command,
+    Mode,
+    Node,
+    Target,
+    data_size,
+    packet_count,
+)
 from flasher.protocol.text import find_firmware_version
+from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
+from flasher.protocol.wire import Damage, Message
 
 NO_VERSION: Final = "unknown"
 """Firmware text of an application in whose image no version was found."""
+AnyRow = messages.Row | messages.Malformed | messages.Unknown
+"""A message as the bootloader takes it."""
+_DEFAULT_PROFILE: Final = DeviceProfile()
+_DEAF: Final = frozenset((State.OFF, State.RESTARTING))
+_WORKS_ON_FLASH: Final = frozenset((State.ERASING, State.PROGRAMMING, State.CHECKING))
+_PER_PACKET: Final = frozenset((State.TRANSFER, State.PROGRAMMING))
+_DURING_END: Final = frozenset((State.CHECKING, State.STARTING))
+_AFTER_END: Final = _DURING_END | {State.REFUSED}
+_WAITS_FOR_UPDATE: Final = frozenset((State.ANNOUNCING, State.REFUSED))
+_TIMER_EVENTS: Final = {
+    State.RESTARTING: Event.RESTART_DUE,
+    State.TRANSFER: Event.PAUSE_OVER,
+    State.REFUSED: Event.HOLD_OVER,
+    **dict.fromkeys(_WORKS_ON_FLASH, Event.FLASH_DONE),
+}
+"""What the timer of a state means when it expires; in the others it depends."""
+_UPGRADE: Final = frozenset((Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER))
+_PACKET_HEAD: Final = (
+    HEADER
+    + Mode.WRITE.to_bytes(MODE_SIZE, "big")
+    + (COMMAND_SIZE + data_size(Command.PACKET)).to_bytes(LENGTH_SIZE, "big")
+    + Command.PACKET.to_bytes(COMMAND_SIZE, "big")
+)
+_NUMBER_AT: Final = PREFIX_SIZE + COMMAND_SIZE + 1
+"""Where the packet number lies: behind the start byte."""
+_NUMBER_END: Final = _NUMBER_AT + 2
 
 
-class MockDevice(DeviceCore):
-    """One upgradable device, an engine (`flasher.protocol.engine`); made as `DeviceCore` says."""
+@dataclass
+class Transfer:
+    """An image on its way in: its size, and how many of its packets are stored."""
 
-    def _make_actions(self) -> Mapping[Action, Callable[[float], str]]:
-        return {
-            Action.NOTHING: self._nothing,
-            Action.IMPOSSIBLE: self._impossible,
-            Action.CONFIRM_RESET: self._confirm_reset,
-            Action.RESTART: self._restart,
-            Action.SEND_FEEDBACK: self._send_feedback,
-            Action.ANSWER: self._answer,
-            Action.BOOT: self._boot,
-            Action.ANNOUNCE: self._announce,
-            Action.START: self._start,
-            Action.REFUSE_UPDATE: self._refuse_update,
-            Action.ERASE: self._erase,
-            Action.REQUEST: self._request,
-            Action.STORE: self._store,
-            Action.ACKNOWLEDGE: self._acknowledge,
-            Action.ANSWER_REPEATED: self._answer_repeated,
-            Action.ANSWER_OLDER: self._answer_older,
-            Action.ANSWER_BAD: self._answer_bad,
-            Action.RECORD: self._record,
-            Action.COMPLETE: self._complete,
-            Action.COMPLETE_AGAIN: self._complete_again,
-            Action.REFUSE_END: self._refuse_end,
-            Action.REFUSE_END_AGAIN: self._refuse_end_again,
-            Action.SWITCH_OFF: self._switch_off,
-        }
+    size_bytes: int
+    stored: int = 0
 
-    def _send(self, row: messages.Row) -> None:
-        """Send one of the upgrade's messages to the tool."""
-        self.send(row.to_message(self.target.answer_id))
+    @property
+    def total(self) -> int:
+        return packet_count(self.size_bytes)
+
+    @property
+    def wanted(self) -> int:
+        """Number of the packet that is next; of the last one when all are stored."""
+        return min(self.stored + 1, self.total)
+
+
+def is_damaged_packet(damage: Damage) -> bool:
+    """True when damaged bytes begin as a packet does, so that a NAK is due (TX-01)."""
+    return damage.data.startswith(_PACKET_HEAD)
+
+
+class MockDevice(Machine):
+    """One upgradable device, an engine (`flasher.protocol.engine`).
+
+    At construction it has been on for a while: its application runs, or, when there is none, its
+    bootloader announces itself from the first time it is given. A BMS has an application that
+    answers, others a silent one unless another is given. Raises UsageError for timings that would
+    make it announce without a pause.
+    """
+
+    store_type: ClassVar[type[ApplicationStore]] = ApplicationStore
+    transfer_type: ClassVar[type[Transfer]] = Transfer
+    burst: ClassVar[int] = BOOT_VERSION_BURST
+    """How often it announces itself before it starts the application."""
+
+    def __init__(
+        self,
+        target: Target,
+        *,
+        bitrate_bps: int,
+        profile: DeviceProfile = _DEFAULT_PROFILE,
+        timings: Timings = DEFAULT_TIMINGS,
+        has_application: bool = True,
+        application: Application | None = None,
+    ) -> None:
+        if timings.boot_version_spacing_s <= 0:
+            raise UsageError("the time between two announcements is greater than 0")
+        self.target = target
+        self.profile = profile
+        self.store = self.store_type(profile)
+        if application is None and target.node is Node.BMS:
+            application = BmsApplication(profile, MemoryMap(self.store.flash))
+        super().__init__(
+            application or Application(target.node, DIALECTS[profile.dialect]),
+            frozenset((target.request_id,)),
+            bitrate_bps=bitrate_bps,
+            timings=timings,
+        )
+        self.state = State.APPLICATION if has_application else State.ANNOUNCING
+        self._controller = FlashController(
+            self.store.flash,
+            erase_time_s=profile.erase_time_s,
+            program_time_s=profile.program_time_s,
+        )
+        self._transfer = self.transfer_type(0)
+        self._announced = 0
+        self._has_whole_application = has_application
+        self._runs_application = has_application
+        # What the message in hand brought, for the action that follows it.
+        self._offered_bytes = 0
+        self._number: int | None = None
+        self._payload = b""
+        self._message: Message | None = None
+        if has_application:
+            self.store.load(factory_image(profile))
+            detail = self._start(0.0)
+        else:
+            self._due_at = -inf
+            detail = "no application"
+        self._events.append(DeviceStateEntered(self.state.value, detail))
+
+    # -- what tests and the conformance suite look at ---------------------------------------------
+
+    @property
+    def stored_image(self) -> bytes | None:
+        """The image of the whole application in the flash, exactly its size; None without one."""
+        return self.store.image()
+
+    @property
+    def erase_count(self) -> int:
+        """Pages erased to the end since construction."""
+        return self.store.flash.erase_count
+
+    @property
+    def program_count(self) -> int:
+        """Program operations (a packet, or the final record) done to the end since construction."""
+        return self.store.flash.program_count
+
+    @property
+    def operations_done(self) -> int:
+        """Flash operations, erasing a page or programming, done to the end since construction."""
+        return self.erase_count + self.program_count
+
+    def readback(self, size_bytes: int | None = None) -> bytes:
+        """The first `size_bytes` of the application area, whole or torn, as a debugger reads them;
+        all of it without a size.
+        """
+        return self.store.read(
+            self.profile.application_area_bytes if size_bytes is None else size_bytes
+        )
+
+    def operation_reaches(self, share: float) -> float | None:
+        """When `share` (0 to 1) of the flash operation under way is done: the time for a power cut
+        in the middle of it. None while there is none.
+        """
+        return self._controller.reached_at(share)
+
+    # -- power ------------------------------------------------------------------------------------
+
+    @property
+    def has_power(self) -> bool:
+        return self.state is not State.OFF
+
+    def power_cut(self, now: float) -> None:
+        """The power goes: all is lost but the flash, and an operation under way stays torn."""
+        self._handle(Event.POWER_CUT, now)
+
+    def power_on(self, now: float) -> None:
+        """The power comes back; the device passes through its bootloader (R19)."""
+        self._handle(Event.POWER_ON, now)
+        self._run_timer(now)
+
+    # -- from messages and timers to events -------------------------------------------------------
+
+    def _take_message(self, message: Message, now: float) -> None:
+        self._message = message
+        # On other ids there is nothing for a bootloader, whatever the command.
+        if message.can_id == self.target.request_id:
+            self._take_row(messages.decode(message), now)
+        else:
+            self._handle(Event.QUERY, now)
+
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if isinstance(row, messages.Packet):
+            self._number, self._payload = row.number, row.payload
+        elif isinstance(row, messages.UpdateCommand):
+            self._offered_bytes = row.size_bytes
+        elif isinstance(row, messages.Malformed):
+            self._number = None
+            self._report(f"malformed message {row.message.command:04X}: {row.problem}")
+        self._handle(self._classify(row), now)
+
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        is_own = damage.can_id == self.target.request_id
+        if is_own and is_damaged_packet(damage) and self.state is State.TRANSFER:
+            number = damage.data[_NUMBER_AT:_NUMBER_END]
+            is_whole = len(number) == _NUMBER_END - _NUMBER_AT
+            self._number = int.from_bytes(number, "little") if is_whole else None
+            self._handle(Event.PACKET_BAD, now)
+
+    def _classify(self, row: AnyRow) -> Event:
+        """The event that a message is. Where the profile decides whether it changes the state, that
+        is decided here; where it decides what is answered only, the action does.
+        """
+        if self.state is State.APPLICATION:
+            return _in_application(row)
+        match row:
+            case messages.Reset():
+                announces = self.state is State.ANNOUNCING
+                profile = self.profile
+                choice = profile.reset_in_bootloader if announces else profile.reset_in_transfer
+                return Event.RESET if choice == "restarts" else Event.RESET_IGNORED
+            case messages.Unknown():
+                return Event.QUERY
+            case messages.UpdateCommand() if row.text == self.target.update_text:
+                return self._classify_update(row)
+            case messages.Packet() if self.state is State.TRANSFER:
+                return self._classify_packet(row)
+            case messages.EndOfTransfer():
+                return self._classify_end()
+            case messages.Packet():
+                return Event.OUT_OF_TURN
+            case messages.Malformed() if row.message.command == Command.PACKET:
+                return Event.PACKET_BAD if self.state is State.TRANSFER else Event.OUT_OF_TURN
+        return Event.NO_CONCERN
+
+    def _classify_update(self, row: messages.UpdateCommand) -> Event:
+        state, transfer = self.state, self._transfer
+        if not 0 < row.size_bytes <= self.profile.image_limit_bytes or state in _DURING_END:
+            return Event.UPDATE_REFUSED
+        if state in _WAITS_FOR_UPDATE:
+            return Event.UPDATE
+        # One transfer, however often the host says it before packet 1 (UP-05).
+        is_begun = state is State.PROGRAMMING or transfer.stored
+        if not is_begun and row.size_bytes == transfer.size_bytes:
+            return Event.UPDATE_AGAIN
+        starts_over = self.profile.update_in_transfer == "starts_over"
+        return Event.UPDATE if starts_over else Event.UPDATE_REFUSED
+
+    def _classify_packet(self, row: messages.Packet) -> Event:
+        transfer = self._transfer
+        if row.total != transfer.total or row.number > min(row.total, transfer.stored + 1):
+            return Event.PACKET_BAD
+        if row.number > transfer.stored:
+            return Event.PACKET_NEXT
+        return Event.PACKET_REPEATED if row.number == transfer.stored else Event.PACKET_OLDER
+
+    def _classify_end(self) -> Event:
+        if self.state in _AFTER_END:
+            return Event.END_AGAIN
+        if self.state is not State.TRANSFER:
+            return Event.OUT_OF_TURN
+        if self._transfer.stored != self._transfer.total:
+            return Event.END_EARLY
+        return Event.END_WHOLE if self._accepts_image() else Event.END_WRONG
+
+    def _accepts_image(self) -> bool:
+        """False when the product's images carry a checksum and this one's is wrong (R7)."""
+        if self.profile.image_checksum == "none":
+            return True
+        return checksum_fits(self.store.read(self._transfer.size_bytes))
+
+    def _expire(self, now: float) -> None:
+        if self.state in _WORKS_ON_FLASH and not self._controller.advance(now):
+            self._due_at = self._controller.ends_at
+        else:
+            self._handle(self._elapsed(), now)
+
+    def _elapsed(self) -> Event:
+        """What the expired timer means."""
+        if self.state is State.ANNOUNCING:
+            if self._announced < self.burst or not self._has_whole_application:
+                return Event.ANNOUNCEMENT_DUE
+            return Event.WINDOW_OVER
+        if self.state is State.STARTING:
+            restarts = self.profile.after_complete == "restarts"
+            return Event.START_BY_RESTART_DUE if restarts else Event.START_DUE
+        return _TIMER_EVENTS[self.state]
+
+    def _handle(self, event: Event, now: float) -> None:
+        before = self.state
+        move = TABLE[before].get(event)
+        if move is None:
+            raise FlasherError(
+                "the device model met an event that cannot happen",
+                where=f"state {before.value}",
+                cause="a bug of the device model",
+            )
+        self.state = move.state or before
+        self._is_deaf = self.state in _DEAF
+        self._runs_application = self.state is State.APPLICATION
+        if before is State.APPLICATION and not self._runs_application:
+            self.application.stop()
+        detail = getattr(self, f"_{move.action}")(now)
+        if self.state is not before and not {self.state, before} <= _PER_PACKET:
+            self._events.append(DeviceStateEntered(self.state.value, detail))
 
     # -- actions: application, reset, announcements -----------------------------------------------
 
-    def _nothing(self, now: float) -> str:
+    def _ignore(self, now: float) -> str:
         return ""
-
-    def _impossible(self, now: float) -> str:
-        raise FlasherError(
-            "the device model met an event that cannot happen",
-            where=f"state {self.state.value}",
-            cause="a bug of the device model",
-        )
 
     def _send_feedback(self, now: float) -> str:
         if self.profile.upgrade_in_application == "general_feedback":
@@ -94,13 +363,13 @@ class MockDevice(DeviceCore):
     def _await_restart(self, now: float) -> None:
         self._controller.abort(now)
         self._forget_received()
-        self._due = now + self.profile.reset_delay_s
+        self._due_at = now + self.profile.reset_delay_s
 
     def _boot(self, now: float) -> str:
         """Only what is whole may be started; without it the announcements go on (R14)."""
         self._has_whole_application = self.store.image() is not None
         self._announced = 0
-        self._due = now
+        self._due_at = now
         return "whole application" if self._has_whole_application else "no application"
 
     def _announce(self, now: float) -> str:
@@ -115,11 +384,11 @@ class MockDevice(DeviceCore):
         elif self._has_whole_application:
             self._rearm(self.profile.window_s, now)
         else:
-            self._due = None
+            self._due_at = inf
         return ""
 
     def _start(self, now: float) -> str:
-        self._due = None
+        self._due_at = inf
         firmware = self._firmware()
         self.application.start(firmware, now)
         return f"version {firmware}"
@@ -138,6 +407,7 @@ class MockDevice(DeviceCore):
         return ""
 
     def _erase(self, now: float) -> str:
+        """The record first, then the pages."""
         self._transmitter.drop_unstarted()
         self._transfer = self.transfer_type(self._offered_bytes)
         self._work(self.store.erasing(self._offered_bytes), now)
@@ -145,7 +415,7 @@ class MockDevice(DeviceCore):
 
     def _work(self, operations: list[Operation], now: float) -> None:
         self._controller.run(operations, now)
-        self._due = self._controller.ends_at
+        self._due_at = self._controller.ends_at
 
     def _request(self, now: float) -> str:
         self._send(messages.RequestTransfer())
@@ -154,12 +424,11 @@ class MockDevice(DeviceCore):
 
     def _await_host(self, now: float) -> None:
         waits = self.profile.pause_in_transfer == "waits"
-        self._due = None if waits else now + self.profile.transfer_timeout_s
+        self._due_at = inf if waits else now + self.profile.transfer_timeout_s
 
     def _store(self, now: float) -> str:
         transfer = self._transfer
-        number = transfer.wanted
-        operation = self.store.storing(number, self._payload, transfer.size_bytes)
+        operation = self.store.storing(transfer.wanted, self._payload, transfer.size_bytes)
         self._work([operation], now)
         return ""
 
@@ -208,7 +477,7 @@ class MockDevice(DeviceCore):
         image = self.store.read(self._transfer.size_bytes)
         self._events.append(ImageStored(len(image), hashlib.sha256(image).hexdigest()))
         self._send(messages.Complete())
-        self._due = now + self.profile.start_delay_s
+        self._due_at = now + self.profile.start_delay_s
         return "the new application"
 
     def _complete_again(self, now: float) -> str:
@@ -220,7 +489,7 @@ class MockDevice(DeviceCore):
         """The number in it is that of the packet wanted, of the last one when all are there."""
         self._send(messages.Nak(self._transfer.wanted))
         if self.state is State.REFUSED:
-            self._due = now + self.profile.refused_hold_s
+            self._due_at = now + self.profile.refused_hold_s
         else:
             self._await_host(now)
         return "image checksum wrong"
@@ -234,3 +503,23 @@ class MockDevice(DeviceCore):
         self._controller.abort(now)
         self._lose_memory()
         return ""
+
+    def _send(self, row: messages.Row) -> None:
+        """Send one of the upgrade's messages to the tool."""
+        self.send(row.to_message(self.target.answer_id))
+
+
+def _in_application(row: AnyRow) -> Event:
+    """The event that a message to the running application is."""
+    match row:
+        case messages.Reset():
+            return Event.RESET
+        case messages.UpdateCommand() | messages.Packet() | messages.EndOfTransfer():
+            return Event.UPGRADE_IN_APPLICATION
+        case messages.Malformed():
+            # A write like others, which may be confirmed (2.2.1(2), R17).
+            is_upgrade = row.message.mode == Mode.WRITE and row.message.command in _UPGRADE
+            return Event.UPGRADE_IN_APPLICATION if is_upgrade else Event.QUERY
+        case messages.Unknown():
+            return Event.QUERY
+    return Event.NO_CONCERN

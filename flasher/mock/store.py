@@ -1,4 +1,5 @@
-"""Where the application lies in the flash, and the record that says that it is whole.
+"""What stands where in the memory of a device: the application, the record that says that it is
+whole, and the rest for those who read memory (0x4308).
 
 The application area is followed by one page for the record. The record is erased before anything
 else and written after everything else, its magic last, so a power cut at any moment leaves either
@@ -21,6 +22,11 @@ _RECORD: Final = Struct("<II8s")
 _MAGIC: Final = b"WHOLEAPP"
 _CHECKSUM: Final = Struct("<I")
 _FACTORY_IMAGE_BYTES: Final = 500
+_ROM_START: Final = 0x0800_0000
+_ROM_SIZE_BYTES: Final = AREA_START - _ROM_START
+"""The bootloader, up to where the application area begins."""
+_RAM_START: Final = 0x2000_0000
+_RAM_SIZE_BYTES: Final = 0x5000
 
 
 def checksum_fits(image: bytes) -> bool:
@@ -100,3 +106,34 @@ class ApplicationStore:
         """`data` filled up to whole program units."""
         unit = self.flash.program_unit_bytes
         return data.ljust(-(-len(data) // unit) * unit, bytes((ERASED,)))
+
+
+class MemoryMap:
+    """Bootloader, flash and RAM, with nothing between them; what stands in the first and the last
+    is made up, but fixed.
+    """
+
+    def __init__(self, flash: Flash) -> None:
+        self._areas = (
+            (_ROM_START, _ROM_SIZE_BYTES, _made_up),
+            (flash.start, flash.size_bytes, flash.read),
+            (_RAM_START, _RAM_SIZE_BYTES, _made_up),
+        )
+
+    def read(self, start: int, end: int) -> bytes | None:
+        """The bytes from `start` to before `end`; None when one of them is nowhere."""
+        found = b""
+        while start < end:
+            area = next((each for each in self._areas if 0 <= start - each[0] < each[1]), None)
+            if area is None:
+                return None
+            area_start, area_bytes, read = area
+            size_bytes = min(end, area_start + area_bytes) - start
+            found += read(start, size_bytes)
+            start += size_bytes
+        return found
+
+
+def _made_up(start: int, size_bytes: int) -> bytes:
+    addresses = range(start, start + size_bytes)
+    return bytes((address * 167 + (address >> 8) * 13) & 0xFF for address in addresses)

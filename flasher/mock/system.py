@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from flasher.mock.application import Application
+from flasher.mock.clients import ClientApplication
 from flasher.mock.machine import Machine, Unit
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.talkers import Talker
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, TARGETS, WELLING, Dialect, Node, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
@@ -55,11 +54,14 @@ class System:
                     profile=own_profile if is_target or node is Node.BMS else plain_profile,
                     timings=timings,
                     has_application=has_application or not is_target,
-                    application=_talker(node, dialect, timings),
+                    # A BMS answers, with the application of its own; the others ask it.
+                    application=None
+                    if node is Node.BMS
+                    else ClientApplication(node, dialect, timings),
                 )
             else:
                 self.members[node] = Unit(
-                    Talker(node, dialect, timings),
+                    ClientApplication(node, dialect, timings),
                     bitrate_bps=dialect.bitrate_bps,
                     timings=timings,
                 )
@@ -76,7 +78,6 @@ class System:
 
     @property
     def has_power(self) -> bool:
-        """False after the battery switched off."""
         return self._battery.has_power
 
     def hold_key(self, now: float) -> None:
@@ -103,7 +104,6 @@ class System:
 
     @property
     def done(self) -> bool:
-        """True when all its members are."""
         return all(member.done for member in self._turns)
 
     def receive(self, frame: Frame, now: float) -> None:
@@ -114,13 +114,11 @@ class System:
             member.receive(frame, now)
 
     def tick(self, now: float) -> None:
-        """Let everything happen that is due by `now`."""
         for member in self._turns:
             member.tick(now)
         self._share_power(now)
 
     def deadline(self) -> float | None:
-        """When a member next wants `tick` or has a frame to send."""
         wanted = [member.deadline() for member in self._turns]
         return min((moment for moment in wanted if moment is not None), default=None)
 
@@ -161,8 +159,3 @@ class System:
             if member is not self.device:
                 member.take_events()
         return self.device.take_events()
-
-
-def _talker(node: Node, dialect: Dialect, timings: Timings) -> Application | None:
-    """What a node asks; a BMS answers, with the application of its own."""
-    return None if node is Node.BMS else Talker(node, dialect, timings)

@@ -1,8 +1,9 @@
 """The upgrade as a table, seen from the device: what it does on every event in every state.
 
-A received message or an expired timer is first classified into an `Event` (see `classify`; a choice
-of the profile that changes the state is made there). Then `TABLE[state][event]` names the action
-and the next state. Every pair is listed: what is ignored, and what cannot happen.
+A received message or an expired timer is classified into an `Event` first (see `model`; a choice
+of the profile that changes the state is made there). Then `TABLE[state][event]` names the action, a
+method of `flasher.mock.model.MockDevice`, and the next state. A pair that is not listed cannot
+happen: it is a bug. The state diagram in the documentation is drawn from this table.
 """
 
 from __future__ import annotations
@@ -62,173 +63,87 @@ class Event(Enum):
     POWER_ON = "power on"
 
 
+_S, _E = State, Event
 MESSAGE_EVENTS: Final = frozenset(Event) - {
-    Event.RESTART_DUE,
-    Event.ANNOUNCEMENT_DUE,
-    Event.WINDOW_OVER,
-    Event.FLASH_DONE,
-    Event.PAUSE_OVER,
-    Event.HOLD_OVER,
-    Event.START_DUE,
-    Event.START_BY_RESTART_DUE,
-    Event.POWER_CUT,
-    Event.POWER_ON,
-}
+    _E.RESTART_DUE, _E.ANNOUNCEMENT_DUE, _E.WINDOW_OVER, _E.FLASH_DONE, _E.PAUSE_OVER,
+    _E.HOLD_OVER, _E.START_DUE, _E.START_BY_RESTART_DUE, _E.POWER_CUT, _E.POWER_ON,
+}  # fmt: skip
 """The events that a message on the bus can be."""
 
 
-class Action(Enum):
-    """What to do; each one is a small method of `MockDevice`."""
+class Move(NamedTuple):
+    """What follows an event: the name of the action, and the next state (None: the same one)."""
 
-    NOTHING = "nothing"
-    IMPOSSIBLE = "cannot happen"
-    CONFIRM_RESET = "send general feedback, restart"
-    RESTART = "restart"
-    SEND_FEEDBACK = "send general feedback"
-    ANSWER = "answer it"
-    BOOT = "look for a whole application"
-    ANNOUNCE = "send boot version"
-    START = "start the application"
-    REFUSE_UPDATE = "refuse the update command"
-    ERASE = "erase: record first, then pages"
-    REQUEST = "send request transfer"
-    STORE = "program the packet"
-    ACKNOWLEDGE = "send ACK"
-    ANSWER_REPEATED = "answer the repeated packet"
-    ANSWER_OLDER = "answer the older packet"
-    ANSWER_BAD = "answer the bad packet"
-    RECORD = "program the record"
-    COMPLETE = "send complete"
-    COMPLETE_AGAIN = "answer again"
-    REFUSE_END = "send NAK"
-    REFUSE_END_AGAIN = "send NAK again"
-    SWITCH_OFF = "lose everything but the flash"
+    action: str
+    state: State | None = None
 
 
-class Transition(NamedTuple):
-    """What follows an event."""
+IGNORED: Final = Move("ignore")
+_Row = dict[Event, Move]
 
-    action: Action
-    state: State
+_POWERED: Final[_Row] = {_E.POWER_CUT: Move("switch_off", _S.OFF), _E.POWER_ON: IGNORED}
+_HEARING: Final[_Row] = _POWERED | {event: IGNORED for event in Event if event in MESSAGE_EVENTS}
+_IN_BOOTLOADER: Final[_Row] = _HEARING | {_E.UPDATE_REFUSED: Move("refuse_update")}
+_RESTARTED: Final = Move("restart", _S.RESTARTING)
+_ERASED: Final = Move("erase", _S.ERASING)
+_BOOTED: Final = Move("boot", _S.ANNOUNCING)
 
-
-Row = Mapping[Event, Transition]
-
-
-def _row(
-    state: State,
-    moves: dict[Event, tuple[Action, State]],
-    *,
-    ignores: frozenset[Event] = MESSAGE_EVENTS,
-) -> Row:
-    """A complete row: the moves; messages without one are ignored, the rest cannot happen."""
-    row = {event: Transition(Action.IMPOSSIBLE, state) for event in Event}
-    row |= {event: Transition(Action.NOTHING, state) for event in ignores}
-    row[Event.POWER_CUT] = Transition(Action.SWITCH_OFF, State.OFF)
-    row[Event.POWER_ON] = Transition(Action.NOTHING, state)
-    row |= {event: Transition(*move) for event, move in moves.items()}
-    return row
-
-
-_DURING_UPGRADE: Final[dict[Event, tuple[Action, State]]] = {
-    Event.RESET: (Action.RESTART, State.RESTARTING),
-    Event.UPDATE: (Action.ERASE, State.ERASING),
-}
-
-TABLE: Final[Mapping[State, Row]] = {
+TABLE: Final[Mapping[State, _Row]] = {
     # No power, no reception.
-    State.OFF: _row(
-        State.OFF,
-        {
-            Event.POWER_ON: (Action.RESTART, State.RESTARTING),
-            Event.POWER_CUT: (Action.NOTHING, State.OFF),
-        },
-        ignores=frozenset(),
-    ),
+    _S.OFF: {_E.POWER_ON: _RESTARTED, _E.POWER_CUT: IGNORED},
     # Nothing here erases (UP-03).
-    State.APPLICATION: _row(
-        State.APPLICATION,
-        {
-            Event.RESET: (Action.CONFIRM_RESET, State.RESTARTING),
-            Event.QUERY: (Action.ANSWER, State.APPLICATION),
-            Event.UPGRADE_IN_APPLICATION: (Action.SEND_FEEDBACK, State.APPLICATION),
-        },
-    ),
+    _S.APPLICATION: _HEARING | {
+        _E.RESET: Move("confirm_reset", _S.RESTARTING),
+        _E.QUERY: Move("answer"),
+        _E.UPGRADE_IN_APPLICATION: Move("send_feedback"),
+    },
     # Deaf: a second reset does not restart it twice (RS-02).
-    State.RESTARTING: _row(
-        State.RESTARTING,
-        {Event.RESTART_DUE: (Action.BOOT, State.ANNOUNCING)},
-        ignores=frozenset(),
-    ),
+    _S.RESTARTING: _POWERED | {_E.RESTART_DUE: _BOOTED},
     # Announces and listens, then listens for the window.
-    State.ANNOUNCING: _row(
-        State.ANNOUNCING,
-        {
-            Event.RESET: (Action.RESTART, State.RESTARTING),
-            Event.UPDATE: (Action.ERASE, State.ERASING),
-            Event.UPDATE_REFUSED: (Action.REFUSE_UPDATE, State.ANNOUNCING),
-            Event.ANNOUNCEMENT_DUE: (Action.ANNOUNCE, State.ANNOUNCING),
-            Event.WINDOW_OVER: (Action.START, State.APPLICATION),
-        },
-    ),
-    State.ERASING: _row(
-        State.ERASING,
-        _DURING_UPGRADE
-        | {
-            Event.UPDATE_REFUSED: (Action.REFUSE_UPDATE, State.ERASING),
-            Event.FLASH_DONE: (Action.REQUEST, State.TRANSFER),
-        },
-    ),
-    State.TRANSFER: _row(
-        State.TRANSFER,
-        _DURING_UPGRADE
-        | {
-            Event.UPDATE_AGAIN: (Action.REQUEST, State.TRANSFER),
-            Event.UPDATE_REFUSED: (Action.REFUSE_UPDATE, State.TRANSFER),
-            Event.PACKET_NEXT: (Action.STORE, State.PROGRAMMING),
-            Event.PACKET_REPEATED: (Action.ANSWER_REPEATED, State.TRANSFER),
-            Event.PACKET_OLDER: (Action.ANSWER_OLDER, State.TRANSFER),
-            Event.PACKET_BAD: (Action.ANSWER_BAD, State.TRANSFER),
-            Event.END_EARLY: (Action.REFUSE_END, State.TRANSFER),
-            Event.END_WHOLE: (Action.RECORD, State.CHECKING),
-            Event.END_WRONG: (Action.REFUSE_END, State.REFUSED),
-            Event.PAUSE_OVER: (Action.BOOT, State.ANNOUNCING),
-        },
-    ),
-    State.PROGRAMMING: _row(
-        State.PROGRAMMING,
-        _DURING_UPGRADE
-        | {
-            Event.UPDATE_REFUSED: (Action.REFUSE_UPDATE, State.PROGRAMMING),
-            Event.FLASH_DONE: (Action.ACKNOWLEDGE, State.TRANSFER),
-        },
-    ),
-    State.CHECKING: _row(
-        State.CHECKING,
-        {
-            Event.RESET: (Action.RESTART, State.RESTARTING),
-            Event.UPDATE_REFUSED: (Action.REFUSE_UPDATE, State.CHECKING),
-            Event.FLASH_DONE: (Action.COMPLETE, State.STARTING),
-        },
-    ),
+    _S.ANNOUNCING: _IN_BOOTLOADER | {
+        _E.RESET: _RESTARTED,
+        _E.UPDATE: _ERASED,
+        _E.ANNOUNCEMENT_DUE: Move("announce"),
+        _E.WINDOW_OVER: Move("start", _S.APPLICATION),
+    },
+    _S.ERASING: _IN_BOOTLOADER | {
+        _E.RESET: _RESTARTED,
+        _E.UPDATE: _ERASED,
+        _E.FLASH_DONE: Move("request", _S.TRANSFER),
+    },
+    _S.TRANSFER: _IN_BOOTLOADER | {
+        _E.RESET: _RESTARTED,
+        _E.UPDATE: _ERASED,
+        _E.UPDATE_AGAIN: Move("request"),
+        _E.PACKET_NEXT: Move("store", _S.PROGRAMMING),
+        _E.PACKET_REPEATED: Move("answer_repeated"),
+        _E.PACKET_OLDER: Move("answer_older"),
+        _E.PACKET_BAD: Move("answer_bad"),
+        _E.END_EARLY: Move("refuse_end"),
+        _E.END_WHOLE: Move("record", _S.CHECKING),
+        _E.END_WRONG: Move("refuse_end", _S.REFUSED),
+        _E.PAUSE_OVER: _BOOTED,
+    },
+    _S.PROGRAMMING: _IN_BOOTLOADER | {
+        _E.RESET: _RESTARTED,
+        _E.UPDATE: _ERASED,
+        _E.FLASH_DONE: Move("acknowledge", _S.TRANSFER),
+    },
+    _S.CHECKING: _IN_BOOTLOADER | {
+        _E.RESET: _RESTARTED,
+        _E.FLASH_DONE: Move("complete", _S.STARTING),
+    },
     # On its way to the application: an update command would erase what was just completed.
-    State.STARTING: _row(
-        State.STARTING,
-        {
-            Event.UPDATE_REFUSED: (Action.REFUSE_UPDATE, State.STARTING),
-            Event.END_AGAIN: (Action.COMPLETE_AGAIN, State.STARTING),
-            Event.START_DUE: (Action.START, State.APPLICATION),
-            Event.START_BY_RESTART_DUE: (Action.BOOT, State.ANNOUNCING),
-        },
-    ),
+    _S.STARTING: _IN_BOOTLOADER | {
+        _E.END_AGAIN: Move("complete_again"),
+        _E.START_DUE: Move("start", _S.APPLICATION),
+        _E.START_BY_RESTART_DUE: _BOOTED,
+    },
     # Repeats its answer for a host that asks once more (R6), then can be rescued (EN-04).
-    State.REFUSED: _row(
-        State.REFUSED,
-        _DURING_UPGRADE
-        | {
-            Event.UPDATE_REFUSED: (Action.REFUSE_UPDATE, State.REFUSED),
-            Event.END_AGAIN: (Action.REFUSE_END_AGAIN, State.REFUSED),
-            Event.HOLD_OVER: (Action.BOOT, State.ANNOUNCING),
-        },
-    ),
-}
+    _S.REFUSED: _IN_BOOTLOADER | {
+        _E.RESET: _RESTARTED,
+        _E.UPDATE: _ERASED,
+        _E.END_AGAIN: Move("refuse_end_again"),
+        _E.HOLD_OVER: _BOOTED,
+    },
+}  # fmt: skip

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import inf
+
 import pytest
 
 from flasher.mock.memory import (
@@ -141,7 +143,7 @@ def test_operations_take_their_time_one_after_another() -> None:
     assert controller.ends_at == pytest.approx(11.1)
     assert controller.advance(11.2)
     assert flash.program_count == 1
-    assert controller.ends_at is None
+    assert controller.ends_at == inf
 
 
 def test_late_attention_does_not_delay_what_follows() -> None:
@@ -174,7 +176,7 @@ def test_an_aborted_erase_is_as_torn_as_its_time_says(cut_at_s: float, erased_by
     controller.abort(cut_at_s)
     assert flash.read(START, PAGE) == b"\xff" * erased_bytes + b"\x00" * (PAGE - erased_bytes)
     assert flash.erase_count == (erased_bytes == PAGE)
-    assert controller.ends_at is None
+    assert controller.ends_at == inf
 
 
 def test_an_aborted_program_is_torn_and_the_operations_behind_it_are_forgotten() -> None:

@@ -15,41 +15,27 @@ from flasher.errors import UsageError, did_you_mean
 from flasher.mock.application import Application
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.variants import (
-    announcing,
-    checksum,
+from flasher.mock.variants import (  # noqa: F401  each declares its variants
     ending,
+    entering,
     framing,
-    more_en,
-    more_tx,
     surroundings,
     transfer,
-    update,
 )
-from flasher.mock.variants.base import HangingDevice, Variant
+from flasher.mock.variants.base import DECLARED, HangingDevice, Variant
 from flasher.protocol.spec import Target
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 
 __all__ = ["VARIANTS", "HangingDevice", "Variant", "find", "make"]
 
+_GROUPS: Final = ("FR", "CR", "RS", "UP", "TX", "EN", "PW", "TM", "BU", "SE", "CO")
 VARIANTS: Final[Mapping[str, Variant]] = MappingProxyType(
     {
         variant.name: variant
-        for module in (
-            framing,
-            checksum,
-            announcing,
-            update,
-            transfer,
-            more_tx,
-            ending,
-            more_en,
-            surroundings,
-        )
-        for variant in module.VARIANTS
+        for variant in sorted(DECLARED, key=lambda one: (_GROUPS.index(one.clause[:2]), one.clause))
     }
 )
-"""All of them by name, in the order of the catalogue's groups."""
+"""All of them by name, in the order of the clauses."""
 _DEFAULT_PROFILE: Final = DeviceProfile()
 
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Final, TypeVar
 
 from flasher.mock.memory import Flash, FlashNotErasedError, FlashRangeError
-from flasher.mock.model import MockDevice
+from flasher.mock.model import AnyRow, MockDevice
 from flasher.mock.store import ApplicationStore
-from flasher.protocol import messages
 from flasher.protocol.frame import Frame
 from flasher.protocol.wire import Damage, Message
 
-AnyRow = messages.Row | messages.Malformed | messages.Unknown
-"""A message as the bootloader takes it."""
+__all__ = ["DECLARED", "AnyRow", "HangingDevice", "PlainFlash", "PlainStore", "Variant", "variant"]
+
+_DeviceT = TypeVar("_DeviceT", bound=type[MockDevice])
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,41 @@ class Variant:
     """Choices of the device profile with which it shows; they are set when it is made."""
     timings: Mapping[str, float] = field(default_factory=dict)
     """Timings that are its fault."""
+
+
+DECLARED: Final[list[Variant]] = []
+"""All that the modules of this package declare."""
+
+
+def variant(
+    name: str,
+    clause: str,
+    summary: str,
+    *,
+    also: str = "",
+    upgrade_works: bool = True,
+    profile: Mapping[str, object] | None = None,
+    timings: Mapping[str, float] | None = None,
+) -> Callable[[_DeviceT], _DeviceT]:
+    """Declares a class of device as a `Variant`; the cases in `also` are parted by blanks."""
+
+    def declare(device_type: _DeviceT) -> _DeviceT:
+        others = tuple(also.split())
+        DECLARED.append(
+            Variant(
+                name,
+                clause,
+                summary,
+                device_type,
+                others,
+                upgrade_works,
+                profile or {},
+                timings or {},
+            )
+        )
+        return device_type
+
+    return declare
 
 
 class HangingDevice(MockDevice):

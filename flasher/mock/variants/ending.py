@@ -2,21 +2,27 @@
 
 from __future__ import annotations
 
+from math import inf
 from typing import Final
 
 from flasher.mock.memory import ERASED, Operation
 from flasher.mock.model import MockDevice
 from flasher.mock.store import AREA_START, ApplicationStore
 from flasher.mock.table import Event, State
-from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, Variant
+from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, variant
+from flasher.protocol import messages
 
 _DARK_BOOTS: Final = 2
 """Power-ups in a row without an application after which one is spent in the dark."""
 
 
-# -- end of transfer ------------------------------------------------------------------------------
-
-
+@variant(
+    "announces-after-complete",
+    "EN-01",
+    "does not start the new application until power is cut, announces itself instead",
+    also="EN-07 EN-08",
+    upgrade_works=False,
+)
 class AnnouncesAfterComplete(MockDevice):
     """Goes on as a device without an application after complete, until its power is cut."""
 
@@ -41,9 +47,8 @@ class AnnouncesAfterComplete(MockDevice):
         return super()._switch_off(now)
 
 
+@variant("accepts-early-end", "EN-02", "completes when packets are missing")
 class AcceptsEarlyEnd(MockDevice):
-    """Does not count whether all packets came."""
-
     def _classify(self, row: AnyRow) -> Event:
         event = super()._classify(row)
         if event is not Event.END_EARLY:
@@ -51,9 +56,13 @@ class AcceptsEarlyEnd(MockDevice):
         return Event.END_WHOLE if self._accepts_image() else Event.END_WRONG
 
 
+@variant(
+    "ignores-image-checksum",
+    "EN-04",
+    "starts an image whose own checksum is wrong",
+    profile={"image_checksum": "crc32"},
+)
 class ImageChecksumIgnored(MockDevice):
-    """Does not look at the checksum inside an image."""
-
     def _accepts_image(self) -> bool:
         return True
 
@@ -70,12 +79,22 @@ class _KeepsLastPage(PlainStore):
         return [operation for operation in operations if operation.address != kept]
 
 
+@variant(
+    "keeps-longer-rest",
+    "EN-07",
+    "does not erase the page where a smaller image ends: a mixture with the old one",
+    also="UP-01 UP-08 EN-01 EN-08",
+)
 class KeepsLongerRest(MockDevice):
-    """Leaves the page where a smaller image ends as the longer old one had it."""
-
     store_type = _KeepsLastPage
 
 
+@variant(
+    "reports-old-version",
+    "EN-08",
+    "reports the version from before the upgrade until power is cut (a BMS)",
+    also="EN-01 EN-07",
+)
 class ReportsOldVersion(MockDevice):
     """Reads the version of its application at power-up only."""
 
@@ -91,9 +110,12 @@ class ReportsOldVersion(MockDevice):
         return super()._switch_off(now)
 
 
-# -- power cuts -----------------------------------------------------------------------------------
-
-
+@variant(
+    "starts-torn-image",
+    "PW-01",
+    "starts what is stored of an image that was broken off",
+    also="RS-03 TX-12 EN-04 PW-02",
+)
 class StartsTornImage(MockDevice):
     """Starts whatever stands at the start of the application area."""
 
@@ -112,26 +134,34 @@ class _RecordFirst(ApplicationStore):
         return True
 
 
+@variant(
+    "record-first",
+    "PW-01",
+    "declares the new image whole before its first packet",
+    also="TX-12 EN-04 RS-03 PW-02",
+)
 class RecordFirst(MockDevice):
-    """Writes the record that declares the application whole before the first packet."""
-
     store_type = _RecordFirst
 
     def _record(self, now: float) -> str:
-        self._due = now
+        self._due_at = now
         return f"{self._transfer.size_bytes} bytes"
 
 
+@variant(
+    "ack-before-write",
+    "PW-01",
+    "acknowledges a packet, and writes it when the next message comes",
+    also="TX-02 TX-05",
+)
 class AckBeforeWrite(MockDevice):
-    """Acknowledges a packet that is in its buffer, and writes it when the next message comes."""
-
     _buffered: Operation | None = None
 
     def _store(self, now: float) -> str:
         self._flush()
         transfer = self._transfer
         self._buffered = self.store.storing(transfer.wanted, self._payload, transfer.size_bytes)
-        self._due = now + self.profile.program_time_s
+        self._due_at = now + self.profile.program_time_s
         return ""
 
     def _accepts_image(self) -> bool:
@@ -156,9 +186,13 @@ class AckBeforeWrite(MockDevice):
         return super()._switch_off(now)
 
 
+@variant(
+    "dark-after-second-cut",
+    "PW-02",
+    "hangs at the second power-up in a row without an application",
+    also="PW-01",
+)
 class DarkAfterSecondCut(HangingDevice):
-    """Hangs at the second power-up in a row that finds no application."""
-
     _dark_boots = 0
     _is_power_up = False
 
@@ -182,63 +216,79 @@ class DarkAfterSecondCut(HangingDevice):
         return super()._complete(now)
 
 
-VARIANTS: Final = (
-    Variant(
-        "announces-after-complete",
-        "EN-01",
-        "does not start the new application until power is cut, announces itself instead",
-        AnnouncesAfterComplete,
-        also=("EN-07", "EN-08"),
-        upgrade_works=False,
-    ),
-    Variant("accepts-early-end", "EN-02", "completes when packets are missing", AcceptsEarlyEnd),
-    Variant(
-        "ignores-image-checksum",
-        "EN-04",
-        "starts an image whose own checksum is wrong",
-        ImageChecksumIgnored,
-        profile={"image_checksum": "crc32"},
-    ),
-    Variant(
-        "keeps-longer-rest",
-        "EN-07",
-        "does not erase the page where a smaller image ends: a mixture with the old one",
-        KeepsLongerRest,
-        also=("UP-01", "UP-08", "EN-01", "EN-08"),
-    ),
-    Variant(
-        "reports-old-version",
-        "EN-08",
-        "reports the version from before the upgrade until power is cut (a BMS)",
-        ReportsOldVersion,
-        also=("EN-01", "EN-07"),
-    ),
-    Variant(
-        "starts-torn-image",
-        "PW-01",
-        "starts what is stored of an image that was broken off",
-        StartsTornImage,
-        also=("RS-03", "TX-12", "EN-04", "PW-02"),
-    ),
-    Variant(
-        "record-first",
-        "PW-01",
-        "declares the new image whole before its first packet",
-        RecordFirst,
-        also=("TX-12", "EN-04", "RS-03", "PW-02"),
-    ),
-    Variant(
-        "ack-before-write",
-        "PW-01",
-        "acknowledges a packet, and writes it when the next message comes",
-        AckBeforeWrite,
-        also=("TX-02", "TX-05"),
-    ),
-    Variant(
-        "dark-after-second-cut",
-        "PW-02",
-        "hangs at the second power-up in a row without an application",
-        DarkAfterSecondCut,
-        also=("PW-01",),
-    ),
+@variant(
+    "runs-new-application-once",
+    "EN-01",
+    "does not find the new application any more after the next restart",
+    also="CR-03 RS-01 RS-02 RS-03 RS-05 UP-02 UP-03 UP-04 UP-06 TM-05 SE-01 SE-03 SE-04 CO-01",
 )
+class RunsOnce(MockDevice):
+    _ended = False
+
+    def _complete(self, now: float) -> str:
+        self._ended = True
+        return super()._complete(now)
+
+    def _boot(self, now: float) -> str:
+        detail = super()._boot(now)
+        if self._ended and self.profile.after_complete == "starts":
+            self._has_whole_application = False
+        return detail
+
+    def _erase(self, now: float) -> str:
+        self._ended = False
+        return super()._erase(now)
+
+
+@variant(
+    "second-end-refused", "EN-02", "answers the end of transfer that follows complete with a NAK"
+)
+class RefusesSecondEnd(MockDevice):
+    """Takes the second end of transfer for one that came too early."""
+
+    def _complete_again(self, now: float) -> str:
+        self._send(messages.Nak(self._transfer.total))
+        return ""
+
+
+@variant(
+    "believes-second-early-end",
+    "EN-02",
+    "refuses an early end of transfer once, and completes at the second one",
+)
+class CompletesSecondEnd(MockDevice):
+    _refused = False
+
+    def _erase(self, now: float) -> str:
+        self._refused = False
+        return super()._erase(now)
+
+    def _classify(self, row: AnyRow) -> Event:
+        event = super()._classify(row)
+        if event is not Event.END_EARLY:
+            return event
+        if self._refused and self._accepts_image():
+            return Event.END_WHOLE
+        self._refused = True
+        return event
+
+
+@variant(
+    "refusal-is-final",
+    "EN-04",
+    "takes nothing after it has refused an image, until power is cut",
+    profile={"image_checksum": "crc32"},
+)
+class RefusalHangs(HangingDevice):
+    """Waits for ever after it has refused an image."""
+
+    def _refuse_end(self, now: float) -> str:
+        detail = super()._refuse_end(now)
+        if self.state is State.REFUSED:
+            self._due_at = inf
+        return detail
+
+    def _classify(self, row: AnyRow) -> Event:
+        event = super()._classify(row)
+        stuck = self.state is State.REFUSED and event is not Event.END_AGAIN
+        return Event.NO_CONCERN if stuck else event

@@ -1,27 +1,32 @@
-"""Wrong bootloaders: framing (FR)."""
+"""Wrong bootloaders: framing (FR) and checksum (CR)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import inf
 from typing import Final
 
-from flasher.mock.model import MockDevice
+from flasher.mock.model import MockDevice, is_damaged_packet
 from flasher.mock.table import Event, State
-from flasher.mock.variants.base import AnyRow, HangingDevice, Variant
+from flasher.mock.variants.base import AnyRow, HangingDevice, variant
 from flasher.protocol import messages
 from flasher.protocol.catalogue import ITEMS
+from flasher.protocol.crc import crc32
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import (
+    COMMAND_SIZE,
     CRC_SIZE,
     FRAME_DATA_SIZE,
     HEADER,
     LENGTH_MIN,
+    PACKET_FILLER,
     PREFIX_SIZE,
     TAIL,
     Command,
     Mode,
+    data_size,
 )
-from flasher.protocol.wire import Damage, DamageReason, Message, Reassembler
+from flasher.protocol.wire import Damage, DamageReason, Message, Reassembler, encode, split
 
 _CRC_AT: Final = slice(-CRC_SIZE - len(TAIL), -len(TAIL))
 _BACK_TO_BACK_S: Final = 0.0007
@@ -30,6 +35,9 @@ takes 0.4 to 0.55 ms.
 """
 _KNOWN_COMMANDS: Final = frozenset(Command) | {item.command for item in ITEMS}
 _KNOWN_MODES: Final = frozenset(Mode)
+"""A frame that ends so soon after the last one followed it without a pause: at 250 kbit/s a frame
+takes 0.4 to 0.55 ms.
+"""
 
 
 class _ShortFrameEnds(Reassembler):
@@ -40,9 +48,12 @@ class _ShortFrameEnds(Reassembler):
         return found
 
 
+@variant(
+    "short-frame-ends-message",
+    "FR-01",
+    "drops a message when a frame other than its last has less than 8 bytes",
+)
 class ShortFrameEnds(MockDevice):
-    """Takes a frame of less than 8 bytes for the last one of a message."""
-
     reassembler_type = _ShortFrameEnds
 
 
@@ -52,9 +63,12 @@ class _HeaderAtFrameStart(Reassembler):
         return super().feed(payload, now) if self._buffer or starts else ()
 
 
+@variant(
+    "header-at-frame-start-only",
+    "FR-02",
+    "misses a message whose header stands behind junk in the same frame",
+)
 class HeaderAtFrameStart(MockDevice):
-    """Looks for a header at the start of a frame only: behind junk it is missed."""
-
     reassembler_type = _HeaderAtFrameStart
 
 
@@ -65,6 +79,11 @@ class _HeaderRestarts(Reassembler):
         return super().feed(payload, now)
 
 
+@variant(
+    "header-in-data-restarts",
+    "FR-03",
+    "begins a new message where 55 AA stands at the start of a frame of data",
+)
 class HeaderRestarts(MockDevice):
     """Begins anew at every frame that starts with a header's bytes."""
 
@@ -77,18 +96,16 @@ class _TailIgnored(Reassembler):
         super()._judge_message(size, found)
 
 
+@variant("ignores-tail", "FR-04", "takes a message with any last byte", also="CR-01")
 class TailIgnored(MockDevice):
-    """Does not look at the tail."""
-
     reassembler_type = _TailIgnored
 
 
 class _LengthTrusted(Reassembler):
-    def deadline(self) -> float | None:
-        return None
-
-    def tick(self, now: float) -> Sequence[Message | Damage]:
-        return ()
+    def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
+        found = super().feed(payload, now)
+        self.due_at = inf
+        return found
 
     def _damage(self, reason: DamageReason, size: int, found: list[Message | Damage]) -> None:
         """Give up all that the length covers, not its header only."""
@@ -96,12 +113,21 @@ class _LengthTrusted(Reassembler):
         del self._buffer[:size]
 
 
+@variant(
+    "trusts-length",
+    "FR-05",
+    "after a broken-off message, swallows the next ones until its length is used up",
+    also="TX-01 CR-02",
+)
 class LengthTrusted(MockDevice):
     """Waits for as many bytes as the length says, for ever, whatever comes meanwhile."""
 
     reassembler_type = _LengthTrusted
 
 
+@variant(
+    "short-length-hangs", "FR-06", "hangs on a length of 0 or 1 until power is cut", also="SE-03"
+)
 class ShortLengthHangs(HangingDevice):
     """Computes length minus 2 unsigned."""
 
@@ -122,16 +148,16 @@ class _PaddingFatal(Reassembler):
         return found
 
 
+@variant("padding-is-fatal", "FR-07", "drops a message whose last frame is padded to 8 bytes")
 class PaddingFatal(MockDevice):
-    """Wants a message to end with its last frame."""
-
     reassembler_type = _PaddingFatal
 
 
+@variant(
+    "back-to-back-lost", "FR-08", "misses a message that follows the one before without a pause"
+)
 class BackToBackLost(MockDevice):
-    """Is not yet ready for the first frame that follows a message without a pause."""
-
-    _message_ended_at = float("-inf")
+    _message_ended_at = -inf
     _skips = False
 
     def receive(self, frame: Frame, now: float) -> None:
@@ -145,6 +171,11 @@ class BackToBackLost(MockDevice):
         super()._take_message(message, now)
 
 
+@variant(
+    "every-frame-is-payload",
+    "FR-09",
+    "takes remote, extended, error and empty frames between for payload",
+)
 class EveryFrameIsPayload(MockDevice):
     """Copies its receive buffer at every frame with its id, of whatever kind."""
 
@@ -154,6 +185,12 @@ class EveryFrameIsPayload(MockDevice):
         super().receive(frame, now)
 
 
+@variant(
+    "unknown-restarts",
+    "FR-10",
+    "its bootloader restarts on an unknown command or mode",
+    also="SE-01 SE-03 FR-06",
+)
 class UnknownRestarts(MockDevice):
     """Its bootloader's default branch is a restart."""
 
@@ -166,69 +203,73 @@ class UnknownRestarts(MockDevice):
         return super()._classify(row)
 
 
-VARIANTS: Final = (
-    Variant(
-        "short-frame-ends-message",
-        "FR-01",
-        "drops a message when a frame other than its last has less than 8 bytes",
-        ShortFrameEnds,
-    ),
-    Variant(
-        "header-at-frame-start-only",
-        "FR-02",
-        "misses a message whose header stands behind junk in the same frame",
-        HeaderAtFrameStart,
-    ),
-    Variant(
-        "header-in-data-restarts",
-        "FR-03",
-        "begins a new message where 55 AA stands at the start of a frame of data",
-        HeaderRestarts,
-    ),
-    Variant(
-        "ignores-tail",
-        "FR-04",
-        "takes a message with any last byte",
-        TailIgnored,
-        also=("CR-01",),
-    ),
-    Variant(
-        "trusts-length",
-        "FR-05",
-        "after a broken-off message, swallows the next ones until its length is used up",
-        LengthTrusted,
-        also=("TX-01", "CR-02"),
-    ),
-    Variant(
-        "short-length-hangs",
-        "FR-06",
-        "hangs on a length of 0 or 1 until power is cut",
-        ShortLengthHangs,
-        also=("SE-03",),
-    ),
-    Variant(
-        "padding-is-fatal",
-        "FR-07",
-        "drops a message whose last frame is padded to 8 bytes",
-        PaddingFatal,
-    ),
-    Variant(
-        "back-to-back-lost",
-        "FR-08",
-        "misses a message that follows the one before without a pause",
-        BackToBackLost,
-    ),
-    Variant(
-        "every-frame-is-payload",
-        "FR-09",
-        "takes remote, extended, error and empty frames between for payload",
-        EveryFrameIsPayload,
-    ),
-    Variant(
-        "unknown-restarts",
-        "FR-10",
-        "its bootloader restarts on an unknown command or mode",
-        UnknownRestarts,
-        also=("SE-01", "SE-03", "FR-06"),
-    ),
+def _with_mirrored_crc(wire: bytes) -> bytes:
+    """`wire` with its CRC the other way round."""
+    changed = bytearray(wire)
+    changed[_CRC_AT] = changed[_CRC_AT][::-1]
+    return bytes(changed)
+
+
+class _CrcIgnored(Reassembler):
+    def _crc_fits(self, wire: bytes) -> bool:
+        return True
+
+
+@variant("no-crc-check", "CR-01", "takes a message with any CRC", also="CR-02 CR-03 TX-01 BU-01")
+class CrcIgnored(MockDevice):
+    reassembler_type = _CrcIgnored
+
+
+@variant(
+    "short-packet-filled",
+    "CR-02",
+    "fills a packet that lost a frame with FF and stores it",
+    also="TX-01 TM-02 BU-01 BU-02",
 )
+class ShortPacketFilled(MockDevice):
+    """Takes a packet that ends early for a whole one: it has no CRC, so none is looked at."""
+
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        if damage.reason is DamageReason.INCOMPLETE and is_damaged_packet(damage):
+            data = damage.data[PREFIX_SIZE + COMMAND_SIZE :][: data_size(Command.PACKET)]
+            filled = data.ljust(data_size(Command.PACKET), bytes((PACKET_FILLER,)))
+            message = Message(damage.can_id, Mode.WRITE, Command.PACKET, filled)
+            self._take_row(messages.decode(message), now)
+        else:
+            super()._take_damage(damage, now)
+
+
+class _EitherCrcOrder(Reassembler):
+    def _crc_fits(self, wire: bytes) -> bool:
+        return super()._crc_fits(wire) or super()._crc_fits(_with_mirrored_crc(wire))
+
+
+@variant("either-crc-order", "CR-03", "takes a little-endian CRC as well")
+class EitherCrcOrder(MockDevice):
+    reassembler_type = _EitherCrcOrder
+
+
+class _CrcWithoutId(Reassembler):
+    def _crc_fits(self, wire: bytes) -> bool:
+        crc = int.from_bytes(wire[_CRC_AT], "big")
+        return super()._crc_fits(wire) or crc32(wire[: -CRC_SIZE - len(TAIL)]) == crc
+
+
+@variant("crc-without-id", "CR-03", "takes a CRC that leaves the id out as well")
+class CrcWithoutId(MockDevice):
+    reassembler_type = _CrcWithoutId
+
+
+@variant(
+    "feedback-crc-mirrored",
+    "CR-04",
+    "sends general feedback with a little-endian CRC",
+    also="RS-01 RS-04 UP-03",
+)
+class FeedbackCrcMirrored(MockDevice):
+    def send(self, message: Message) -> None:
+        if message.command != Command.GENERAL_FEEDBACK:
+            super().send(message)
+        elif not self.is_off_bus:
+            frames = split(message.can_id, _with_mirrored_crc(encode(message)))
+            self._transmitter.queue(frames)

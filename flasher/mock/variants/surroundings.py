@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import deque
 from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
+from math import inf
 from typing import Final
 
 from flasher.mock.machine import BUS_OFF_S
 from flasher.mock.model import MockDevice
 from flasher.mock.store import AREA_START
 from flasher.mock.table import Event, State
-from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, Variant
+from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, variant
 from flasher.protocol import messages
 from flasher.protocol.catalogue import ITEMS
 from flasher.protocol.frame import Frame
@@ -20,6 +22,7 @@ from flasher.protocol.spec import FRAME_DATA_SIZE, OVERHEAD_SIZE, PACKET_DATA_SI
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Damage, DamageReason, Message, Reassembler
 
+_WORD: Final = 0xFFFF_FFFF
 _PACKETS_A_PAGE: Final = 16
 _SLOW_S: Final = DEFAULT_TIMINGS.ack_timeout_s + 0.1
 """Later than a host waits for an ACK (R12)."""
@@ -33,25 +36,35 @@ _APPLICATION_COMMANDS: Final = frozenset(item.command for item in ITEMS)
 _USELESS: Final = frozenset((Event.NO_CONCERN, Event.OUT_OF_TURN, Event.RESET_IGNORED))
 
 
-# -- timing ---------------------------------------------------------------------------------------
+@variant(
+    "drops-after-20-ms-gap",
+    "TM-02",
+    "drops a message when 20 ms pass between two of its frames",
+    also="BU-01",
+    timings={"inter_frame_timeout_s": 0.02},
+)
+class ImpatientWithGaps(MockDevice):
+    pass
 
 
+@variant(
+    "slow-sixteenth-packet", "TM-05", "acknowledges packets 16, 32, ... after 0.6 s", also="TX-07"
+)
 class SlowSixteenth(MockDevice):
-    """Every sixteenth packet takes longer than a host waits."""
-
     def _store(self, now: float) -> str:
         detail = super()._store(now)
         if self._transfer.wanted % _PACKETS_A_PAGE == 0:
-            self._due = now + _SLOW_S
+            self._due_at = now + _SLOW_S
         return detail
 
 
-# -- bus ------------------------------------------------------------------------------------------
-
-
+@variant(
+    "doubled-frame-hangs",
+    "BU-01",
+    "hangs at a message with a doubled frame until power is cut",
+    also="CR-02",
+)
 class DoubledFrameHangs(HangingDevice):
-    """A frame that comes twice in a message leaves it hanging."""
-
     def _take_damage(self, damage: Damage, now: float) -> None:
         size = FRAME_DATA_SIZE
         frames = [damage.data[at : at + size] for at in range(0, len(damage.data), size)]
@@ -63,25 +76,30 @@ class DoubledFrameHangs(HangingDevice):
             super()._take_damage(damage, now)
 
 
+@variant("stays-off-after-bus-off", "BU-02", "does not come back from bus-off until power is cut")
 class StaysOffBus(MockDevice):
-    """Does not bring its controller back after bus-off."""
-
     def bus_off(self, now: float, off_s: float = BUS_OFF_S) -> None:
-        super().bus_off(now, float("inf"))
+        super().bus_off(now, inf)
 
 
+@variant(
+    "collision-hangs",
+    "BU-06",
+    "hangs when somebody else sends with its answer id, until power is cut",
+)
 class CollisionHangs(HangingDevice):
-    """A frame of somebody else with the id of its own answers leaves it hanging."""
-
     def receive(self, frame: Frame, now: float) -> None:
         if frame.can_id == self.target.answer_id and self.has_power and not self.hangs:
             self._hang()
         super().receive(frame, now)
 
 
-# -- bad input ------------------------------------------------------------------------------------
-
-
+@variant(
+    "logs-useless-messages",
+    "SE-01",
+    "hangs after 4 KiB of messages of no use in a row",
+    also="SE-03 CO-04",
+)
 class LogsUseless(HangingDevice):
     """Keeps every message of no use until a useful one comes, in a memory that is soon full."""
 
@@ -105,9 +123,13 @@ class LogsUseless(HangingDevice):
         return event in _USELESS
 
 
+@variant(
+    "noise-hangs",
+    "SE-03",
+    "hangs at 64 bytes of junk in a row, or at a report sent to its bootloader",
+    also="SE-01 FR-10 FR-02 TX-01 BU-01 CR-01 CR-02 FR-06",
+)
 class NoiseHangs(HangingDevice):
-    """A report sent to it, or more junk than its ring holds, leaves it hanging."""
-
     def _take_message(self, message: Message, now: float) -> None:
         is_own = message.can_id == self.target.request_id
         if is_own and message.mode == Mode.REPORT and self.state is not State.APPLICATION:
@@ -122,6 +144,9 @@ class NoiseHangs(HangingDevice):
             super()._take_damage(damage, now)
 
 
+@variant(
+    "writes-anywhere", "SE-04", "writes and acknowledges a packet beyond the total", also="TX-03"
+)
 class WritesAnywhere(MockDevice):
     """Writes a packet beyond the total to where its number says, whatever lies there."""
 
@@ -151,9 +176,43 @@ class WritesAnywhere(MockDevice):
         return ""
 
 
-# -- other traffic --------------------------------------------------------------------------------
+@variant(
+    "size-rounds-to-small",
+    "SE-04",
+    "rounds a size of nearly 2^32 up to a small one, and erases for it",
+    also="UP-02",
+)
+class SizeRoundedUp(MockDevice):
+    """Rounds the size up to whole packets in 32 bits, then looks whether it fits."""
+
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if isinstance(row, messages.UpdateCommand):
+            rounded = row.size_bytes + PACKET_DATA_SIZE - 1
+            if rounded > _WORD:
+                wrapped = max((rounded & _WORD) // PACKET_DATA_SIZE, 1) * PACKET_DATA_SIZE
+                row = dataclasses.replace(row, size_bytes=wrapped)
+        super()._take_row(row, now)
 
 
+@variant(
+    "any-message-is-life",
+    "SE-01",
+    "window and pause begin anew with every message of no use",
+    also="CO-04",
+)
+class AnyMessageIsLife(MockDevice):
+    def _take_message(self, message: Message, now: float) -> None:
+        before, due = self.state, self._due_at
+        super()._take_message(message, now)
+        if self.state is not before or self._due_at != due:
+            return
+        if self.state is State.TRANSFER:
+            self._await_host(now)
+        elif self.state is State.ANNOUNCING and self._announced >= self.burst:
+            self._due_at = now + self.profile.window_s
+
+
+@variant("load-hangs", "CO-01", "hangs when 140 frames of others come within 100 ms", also="CO-02")
 class LoadHangs(HangingDevice):
     """Is interrupted by every frame on the bus: more than it can serve leave it hanging."""
 
@@ -172,9 +231,13 @@ class LoadHangs(HangingDevice):
         super().receive(frame, now)
 
 
+@variant(
+    "hears-other-targets",
+    "CO-02",
+    "takes packets for other targets during its own transfer",
+    also="CO-04",
+)
 class HearsOtherTargets(MockDevice):
-    """While it is upgraded, takes packets and ends for other targets too."""
-
     @cached_property
     def _others(self) -> dict[int, Reassembler]:
         return {
@@ -198,9 +261,13 @@ class HearsOtherTargets(MockDevice):
                     self._take(one._replace(can_id=self.target.request_id), now)
 
 
+@variant(
+    "answers-in-bootloader",
+    "CO-04",
+    "its bootloader confirms messages of chapter 3",
+    also="FR-10 SE-01",
+)
 class AnswersInBootloader(MockDevice):
-    """Its bootloader confirms every message of chapter 3, as the application would."""
-
     def _take_row(self, row: AnyRow, now: float) -> None:
         in_bootloader = self.state is not State.APPLICATION
         if in_bootloader and isinstance(row, messages.Unknown):
@@ -210,82 +277,3 @@ class AnswersInBootloader(MockDevice):
     def _confirm(self, command: int) -> None:
         if command in _APPLICATION_COMMANDS:
             self._send(messages.GeneralFeedback())
-
-
-VARIANTS: Final = (
-    Variant(
-        "drops-after-20-ms-gap",
-        "TM-02",
-        "drops a message when 20 ms pass between two of its frames",
-        timings={"inter_frame_timeout_s": 0.02},
-        also=("BU-01",),
-    ),
-    Variant(
-        "slow-sixteenth-packet",
-        "TM-05",
-        "acknowledges packets 16, 32, ... after 0.6 s",
-        SlowSixteenth,
-        also=("TX-07",),
-    ),
-    Variant(
-        "doubled-frame-hangs",
-        "BU-01",
-        "hangs at a message with a doubled frame until power is cut",
-        DoubledFrameHangs,
-        also=("CR-02",),
-    ),
-    Variant(
-        "stays-off-after-bus-off",
-        "BU-02",
-        "does not come back from bus-off until power is cut",
-        StaysOffBus,
-    ),
-    Variant(
-        "collision-hangs",
-        "BU-06",
-        "hangs when somebody else sends with its answer id, until power is cut",
-        CollisionHangs,
-    ),
-    Variant(
-        "logs-useless-messages",
-        "SE-01",
-        "hangs after 4 KiB of messages of no use in a row",
-        LogsUseless,
-        also=("SE-03", "CO-04"),
-    ),
-    Variant(
-        "noise-hangs",
-        "SE-03",
-        "hangs at 64 bytes of junk in a row, or at a report sent to its bootloader",
-        NoiseHangs,
-        also=("SE-01", "FR-10", "FR-02", "TX-01", "BU-01", "CR-01", "CR-02", "FR-06"),
-    ),
-    Variant(
-        "writes-anywhere",
-        "SE-04",
-        "writes and acknowledges a packet beyond the total",
-        WritesAnywhere,
-        also=("TX-03",),
-    ),
-    Variant(
-        "load-hangs",
-        "CO-01",
-        "hangs when 140 frames of others come within 100 ms",
-        LoadHangs,
-        also=("CO-02",),
-    ),
-    Variant(
-        "hears-other-targets",
-        "CO-02",
-        "takes packets for other targets during its own transfer",
-        HearsOtherTargets,
-        also=("CO-04",),
-    ),
-    Variant(
-        "answers-in-bootloader",
-        "CO-04",
-        "its bootloader confirms messages of chapter 3",
-        AnswersInBootloader,
-        also=("FR-10", "SE-01"),
-    ),
-)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from math import inf
 from typing import ClassVar, Final
 
-from flasher.mock.classify import is_damaged_packet
-from flasher.mock.model import MockDevice
+from flasher.mock.memory import Operation
+from flasher.mock.model import MockDevice, is_damaged_packet
+from flasher.mock.store import AREA_START
 from flasher.mock.table import Event, State
-from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, Variant
+from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, variant
 from flasher.protocol import messages
 from flasher.protocol.spec import (
     PACKET_COUNT_MAX,
@@ -23,17 +25,28 @@ from flasher.protocol.wire import Damage, Message
 _BYTE: Final = 0xFF
 _HANGS_AFTER: Final = 256
 _UPGRADING: Final = frozenset((State.ERASING, State.TRANSFER, State.PROGRAMMING))
+_BANK_BYTES: Final = 0x10000
 
 
+@variant(
+    "nak-wrong-number",
+    "TX-01",
+    "asks for the next packet when one was damaged",
+    also="CR-01 CR-02 CR-03 TX-03 TX-04 TX-06 SE-04 BU-01",
+)
 class NakWrongNumber(MockDevice):
-    """Asks for the packet after the one that it wants."""
-
     def _answer_bad(self, now: float) -> str:
         self._send(messages.Nak(min(self._transfer.wanted + 1, PACKET_COUNT_MAX)))
         self._await_host(now)
         return ""
 
 
+@variant(
+    "swallows-after-bad",
+    "TX-01",
+    "misses the message after a damaged packet",
+    also="CR-01 CR-02 CR-03 FR-04 BU-01 CR-04 FR-05",
+)
 class SwallowsAfterBad(MockDevice):
     """Skips a message after a damaged packet, as if the damage had been a message more."""
 
@@ -51,6 +64,12 @@ class SwallowsAfterBad(MockDevice):
             super()._take_message(message, now)
 
 
+@variant(
+    "writes-repeated-twice",
+    "TX-02",
+    "writes a repeated packet behind its first copy: the rest of the image is moved",
+    also="TX-05 BU-01 BU-02",
+)
 class WritesRepeated(MockDevice):
     """Writes wherever it stopped writing: a packet that is repeated stands there twice."""
 
@@ -63,7 +82,7 @@ class WritesRepeated(MockDevice):
 
     def _store(self, now: float) -> str:
         self._append()
-        self._due = now + self.profile.program_time_s
+        self._due_at = now + self.profile.program_time_s
         return ""
 
     def _answer_repeated(self, now: float) -> str:
@@ -78,6 +97,7 @@ class WritesRepeated(MockDevice):
             self.store.flash.program(operation.address, operation.data or b"")
 
 
+@variant("accepts-skipped-number", "TX-03", "takes a packet after a gap, and leaves the gap")
 class AcceptsSkipped(MockDevice):
     """Takes any number beyond the last one, and goes on from there."""
 
@@ -92,18 +112,20 @@ class AcceptsSkipped(MockDevice):
         return Event.PACKET_NEXT
 
 
+@variant("ignores-total", "TX-04", "takes a packet with any total")
 class IgnoresTotal(MockDevice):
-    """Does not look at the total."""
-
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.Packet) and self._transfer.total:
             row = dataclasses.replace(row, total=self._transfer.total)
         super()._take_row(row, now)
 
 
+@variant(
+    "repeat-overwrites",
+    "TX-05",
+    "programs a repeated packet with other data over the first: a mixture of both",
+)
 class RepeatOverwrites(MockDevice):
-    """Programs a repeated packet over its first copy."""
-
     store_type = PlainStore
 
     def _answer_repeated(self, now: float) -> str:
@@ -113,9 +135,8 @@ class RepeatOverwrites(MockDevice):
         return super()._answer_repeated(now)
 
 
+@variant("ignores-start-byte", "TX-06", "takes a packet with any start byte")
 class IgnoresStartByte(MockDevice):
-    """Does not look at the start byte of a packet."""
-
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.Malformed):
             message = row.message
@@ -125,6 +146,7 @@ class IgnoresStartByte(MockDevice):
         super()._take_row(row, now)
 
 
+@variant("eight-bit-numbers", "TX-07", "expects packet 0 after packet 255")
 class ByteNumbers(MockDevice):
     """Counts packets in a byte: the one after 255 is 0."""
 
@@ -143,6 +165,7 @@ class ByteNumbers(MockDevice):
         return ""
 
 
+@variant("hangs-after-256-packets", "TX-07", "hangs when packet 257 is stored, until power is cut")
 class HangsAfter256(HangingDevice):
     """Has room for 256 packets in its list of what was received."""
 
@@ -150,9 +173,8 @@ class HangsAfter256(HangingDevice):
         return self._hang() if self._transfer.stored >= _HANGS_AFTER else super()._acknowledge(now)
 
 
+@variant("filler-checked", "TX-08", "refuses a last packet whose bytes behind the image are not FF")
 class FillerChecked(MockDevice):
-    """Refuses a last packet that is filled with anything but FF."""
-
     def _classify(self, row: AnyRow) -> Event:
         event = super()._classify(row)
         if event is Event.PACKET_NEXT and isinstance(row, messages.Packet):
@@ -163,6 +185,12 @@ class FillerChecked(MockDevice):
         return event
 
 
+@variant(
+    "never-times-out",
+    "TX-12",
+    "after a pause in the transfer, takes only the next packet until power is cut",
+    also="SE-01 SE-03",
+)
 class NeverTimesOut(MockDevice):
     """After a long pause, still takes nothing but the next packet: a transfer that was left can
     be ended by a power cut only.
@@ -172,12 +200,12 @@ class NeverTimesOut(MockDevice):
 
     def _await_host(self, now: float) -> None:
         self._waits_on = False
-        self._due = now + self.profile.transfer_timeout_s
+        self._due_at = now + self.profile.transfer_timeout_s
 
     def _expire(self, now: float) -> None:
         if self.state is State.TRANSFER:
             self._waits_on = True
-            self._due = None
+            self._due_at = inf
         else:
             super()._expire(now)
 
@@ -192,9 +220,13 @@ class NeverTimesOut(MockDevice):
         return super()._switch_off(now)
 
 
+@variant(
+    "reset-in-transfer-hangs",
+    "TX-13",
+    "hangs at a reset during the upgrade until power is cut",
+    also="SE-03",
+)
 class ResetHangs(HangingDevice):
-    """A reset in the midst of an upgrade leaves it hanging."""
-
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.Reset) and self.state in _UPGRADING:
             self._hang()
@@ -202,9 +234,14 @@ class ResetHangs(HangingDevice):
             super()._take_row(row, now)
 
 
+@variant(
+    "big-endian-numbers",
+    "TX-01",
+    "sends the numbers of ACK and NAK high byte first (against R4)",
+    also="CR-01 CR-02 CR-03 EN-02",
+    upgrade_works=False,
+)
 class BigEndianNumbers(MockDevice):
-    """Sends packet numbers high byte first."""
-
     big_endian: ClassVar[tuple[type[messages.Row], ...]] = (messages.Ack, messages.Nak)
 
     def _send(self, row: messages.Row) -> None:
@@ -214,93 +251,78 @@ class BigEndianNumbers(MockDevice):
         super()._send(row)
 
 
+@variant(
+    "big-endian-nak",
+    "TX-01",
+    "sends the number of a NAK high byte first (against R4)",
+    also="CR-01 CR-02 CR-03 TX-03 TX-04 TX-06 SE-04 BU-01 EN-02",
+)
 class BigEndianNak(BigEndianNumbers):
-    """The same, where it asks again only."""
-
     big_endian = (messages.Nak,)
 
 
-VARIANTS: Final = (
-    Variant(
-        "nak-wrong-number",
-        "TX-01",
-        "asks for the next packet when one was damaged",
-        NakWrongNumber,
-        also=("CR-01", "CR-02", "CR-03", "TX-03", "TX-04", "TX-06", "SE-04", "BU-01"),
-    ),
-    Variant(
-        "swallows-after-bad",
-        "TX-01",
-        "misses the message after a damaged packet",
-        SwallowsAfterBad,
-        also=("CR-01", "CR-02", "CR-03", "FR-04", "BU-01", "CR-04", "FR-05"),
-    ),
-    Variant(
-        "writes-repeated-twice",
-        "TX-02",
-        "writes a repeated packet behind its first copy: the rest of the image is moved",
-        WritesRepeated,
-        also=("TX-05", "BU-01", "BU-02"),
-    ),
-    Variant(
-        "accepts-skipped-number",
-        "TX-03",
-        "takes a packet after a gap, and leaves the gap",
-        AcceptsSkipped,
-    ),
-    Variant("ignores-total", "TX-04", "takes a packet with any total", IgnoresTotal),
-    Variant(
-        "repeat-overwrites",
-        "TX-05",
-        "programs a repeated packet with other data over the first: a mixture of both",
-        RepeatOverwrites,
-    ),
-    Variant("ignores-start-byte", "TX-06", "takes a packet with any start byte", IgnoresStartByte),
-    Variant(
-        "eight-bit-numbers",
-        "TX-07",
-        "expects packet 0 after packet 255",
-        ByteNumbers,
-    ),
-    Variant(
-        "hangs-after-256-packets",
-        "TX-07",
-        "hangs when packet 257 is stored, until power is cut",
-        HangsAfter256,
-    ),
-    Variant(
-        "filler-checked",
-        "TX-08",
-        "refuses a last packet whose bytes behind the image are not FF",
-        FillerChecked,
-    ),
-    Variant(
-        "never-times-out",
-        "TX-12",
-        "after a pause in the transfer, takes only the next packet until power is cut",
-        NeverTimesOut,
-        also=("SE-01", "SE-03"),
-    ),
-    Variant(
-        "reset-in-transfer-hangs",
-        "TX-13",
-        "hangs at a reset during the upgrade until power is cut",
-        ResetHangs,
-        also=("SE-03",),
-    ),
-    Variant(
-        "big-endian-nak",
-        "TX-01",
-        "sends the number of a NAK high byte first (against R4)",
-        BigEndianNak,
-        also=("CR-01", "CR-02", "CR-03", "TX-03", "TX-04", "TX-06", "SE-04", "BU-01", "EN-02"),
-    ),
-    Variant(
-        "big-endian-numbers",
-        "TX-01",
-        "sends the numbers of ACK and NAK high byte first (against R4)",
-        BigEndianNumbers,
-        also=("CR-01", "CR-02", "CR-03", "EN-02"),
-        upgrade_works=False,
-    ),
+@variant(
+    "damage-ends-transfer",
+    "TX-01",
+    "announces itself again when a packet was damaged",
+    also="FR-02 FR-04 FR-05 FR-06 CR-01 CR-02 CR-03 CR-04 BU-01",
 )
+class DamageEndsTransfer(MockDevice):
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        in_transfer = self.state is State.TRANSFER
+        super()._take_damage(damage, now)
+        if in_transfer and len(damage.data) > PACKET_DATA_SIZE:
+            self._handle(Event.PAUSE_OVER, now)
+
+
+@variant(
+    "repeat-unanswered",
+    "TX-02",
+    "does not answer a repeated packet",
+    also="FR-08 TX-05 BU-01 BU-02",
+)
+class RepeatUnanswered(MockDevice):
+    def _answer_repeated(self, now: float) -> str:
+        self._await_host(now)
+        return ""
+
+
+@variant(
+    "older-overwrites",
+    "TX-03",
+    "programs a packet that is older than the last one over its first copy",
+)
+class OlderOverwrites(MockDevice):
+    """Programs every packet that it had before at its place, and acknowledges it."""
+
+    store_type = PlainStore
+
+    def _answer_older(self, now: float) -> str:
+        if self._number:
+            size_bytes = self._transfer.size_bytes
+            operation = self.store.storing(self._number, self._payload, size_bytes)
+            self.store.flash.program(operation.address, operation.data or b"")
+        return super()._answer_older(now)
+
+
+@variant("total-looked-at-once", "TX-04", "looks at the total of packet 1 only")
+class TotalLookedAtOnce(MockDevice):
+    def _classify(self, row: AnyRow) -> Event:
+        event = super()._classify(row)
+        if event is Event.PACKET_BAD and isinstance(row, messages.Packet):
+            is_next = row.number == self._transfer.stored + 1 <= self._transfer.total
+            return Event.PACKET_NEXT if is_next and self._transfer.stored else event
+        return event
+
+
+class _SixteenBitStore(PlainStore):
+    def storing(self, number: int, payload: bytes, size_bytes: int) -> Operation:
+        """Offsets are counted in 16 bits."""
+        operation = super().storing(number, payload, size_bytes)
+        offset = (operation.address - AREA_START) % _BANK_BYTES
+        return operation._replace(address=AREA_START + offset)
+
+
+@variant("sixteen-bit-offsets", "TX-07", "writes what lies behind 64 KiB over the beginning")
+class SixteenBitOffsets(MockDevice):
+    store_type = _SixteenBitStore

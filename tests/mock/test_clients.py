@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from flasher.mock.clients import ClientApplication
 from flasher.mock.machine import Unit
 from flasher.mock.model import MockDevice
-from flasher.mock.talkers import Talker
 from flasher.protocol.spec import MOTINOVA, OBC, WELLING, WMC, Dialect, Node, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from tests.mock.talk import READ, REPORT, START_S, WRITE, Talk
@@ -28,7 +28,7 @@ ANSWERS = {
 
 
 def node(which: Node, dialect: Dialect = WELLING) -> Talk:
-    talker = Talker(which, dialect)
+    talker = ClientApplication(which, dialect)
     return Talk(Unit(talker, bitrate_bps=dialect.bitrate_bps, timings=DEFAULT_TIMINGS))
 
 
@@ -208,7 +208,7 @@ def test_power_that_comes_back_begins_the_questions_anew() -> None:
 
 @pytest.mark.parametrize("target", [WMC, OBC], ids=lambda target: target.name)
 def test_the_application_talks_and_the_bootloader_does_not(target: Target) -> None:
-    talker = Talker(target.node, WELLING)
+    talker = ClientApplication(target.node, WELLING)
     talk = Talk(MockDevice(target, bitrate_bps=250_000, application=talker))
     talk.run(0.1)
     (first,) = talk.take()

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Final
 
-from flasher.mock.application import Application, ids_heard_by
-from flasher.mock.timer import due_again, due_until
+from flasher.mock.application import Application, due_again, due_until, ids_heard_by
 from flasher.protocol import contents
 from flasher.protocol.catalogue import ITEMS, Item, answer_of, decode, encode
 from flasher.protocol.spec import Dialect, Node
@@ -28,7 +28,7 @@ PAUSE_S: Final = 1.0
 
 
 @dataclass(frozen=True)
-class Habit:
+class RoutineQuery:
     """A question that a node asks when it starts: once, every `period_s`, or until answered."""
 
     title: str
@@ -36,24 +36,27 @@ class Habit:
     insists: bool = False
 
 
-_VERSIONS: Final = (Habit("read version information"), Habit("read design information"))
-HABITS: Final[Mapping[Node, Sequence[Habit]]] = {
+_VERSIONS: Final = (
+    RoutineQuery("read version information"),
+    RoutineQuery("read design information"),
+)
+ROUTINES: Final[Mapping[Node, Sequence[RoutineQuery]]] = {
     Node.WMC: (
-        Habit("handshake", insists=True),
-        Habit("read physical id"),
-        Habit("read check code"),
-        Habit("read design information"),
+        RoutineQuery("handshake", insists=True),
+        RoutineQuery("read physical id"),
+        RoutineQuery("read check code"),
+        RoutineQuery("read design information"),
     ),
     Node.OBC: (
         *_VERSIONS,
-        Habit("read cell voltages"),
-        Habit("read running information", RUNNING_INFORMATION_PERIOD_S),
+        RoutineQuery("read cell voltages"),
+        RoutineQuery("read running information", RUNNING_INFORMATION_PERIOD_S),
     ),
-    Node.HMI: (*_VERSIONS, Habit("read cell voltages", CELL_VOLTAGES_PERIOD_S)),
+    Node.HMI: (*_VERSIONS, RoutineQuery("read cell voltages", CELL_VOLTAGES_PERIOD_S)),
 }
 
 
-class Talker(Application):
+class ClientApplication(Application):
     """A node that asks the BMS what it needs, one question after the other, and gets ready when the
     BMS announces shutdown. After that it is silent until it starts again.
     """
@@ -62,12 +65,12 @@ class Talker(Application):
         super().__init__(node, dialect)
         self._timings = timings
         rows = {item.title: item for item in ITEMS if _sends(node, item, dialect)}
-        self._questions = [(habit, rows[habit.title]) for habit in HABITS[node]]
+        self._questions = [(routine, rows[routine.title]) for routine in ROUTINES[node]]
         self._ready = next(item for item in rows.values() if item.content is contents.Ready)
         self._goodbye = next((i for i in rows.values() if i.content is contents.Shutdown), None)
-        self._waiting: deque[tuple[Habit, Item]] = deque()
-        self._asked: tuple[Habit, Item] | None = None
-        self._due: float | None = None
+        self._waiting: deque[tuple[RoutineQuery, Item]] = deque()
+        self._asked: tuple[RoutineQuery, Item] | None = None
+        self._due_at = inf
         self._give_up_at = 0.0
         self._periodic: dict[str, float] = {}
         self._is_asleep = True
@@ -86,33 +89,31 @@ class Talker(Application):
         self._waiting = deque(self._questions)
         self._asked = None
         self._periodic = {
-            item.title: now + habit.period_s for habit, item in self._questions if habit.period_s
+            item.title: now + routine.period_s
+            for routine, item in self._questions
+            if routine.period_s
         }
-        self._due = now
+        self._due_at = now
 
     def stop(self) -> None:
         self._is_asleep = True
 
-    def deadline(self) -> float | None:
-        if self._is_asleep:
-            return None
-        due = [*self._periodic.values()]
-        if self._due is not None:
-            due.append(self._due)
-        return min(due, default=None)
+    @property
+    def due_at(self) -> float:
+        return inf if self._is_asleep else min((self._due_at, *self._periodic.values()))
 
     def tick(self, now: float) -> None:
         if self._is_asleep:
             return
         self._take_up_again(now)
-        if self._due is None or now < self._due:
+        if now < self._due_at:
             return
         if self._asked is not None and now >= self._give_up_at:
             self._give_up(now)
         elif self._asked is not None:
             self._say(self._asked[1])
             repeat_s = self._timings.command_repeat_s
-            self._due = due_until(self._due, repeat_s, self._give_up_at, now)
+            self._due_at = due_until(self._due_at, repeat_s, self._give_up_at, now)
         else:
             self._ask_next(now)
 
@@ -121,29 +122,29 @@ class Talker(Application):
     def _take_up_again(self, now: float) -> None:
         """Periodic questions that are due wait their turn, each once."""
         for question in self._questions:
-            habit, item = question
+            routine, item = question
             due = self._periodic.get(item.title)
-            if habit.period_s is None or due is None or due > now:
+            if routine.period_s is None or due is None or due > now:
                 continue
-            self._periodic[item.title] = due_again(due, habit.period_s, now)
+            self._periodic[item.title] = due_again(due, routine.period_s, now)
             if question not in self._waiting and question != self._asked:
                 self._waiting.append(question)
-                if self._due is None:
-                    self._due = now
+                if self._due_at == inf:
+                    self._due_at = now
 
     def _ask_next(self, now: float) -> None:
         self._asked = self._waiting.popleft() if self._waiting else None
-        self._due = None
+        self._due_at = inf
         if self._asked is not None:
             self._say(self._asked[1])
             self._give_up_at = now + self._timings.command_timeout_s
-            self._due = now + self._timings.command_repeat_s
+            self._due_at = now + self._timings.command_repeat_s
 
     def _give_up(self, now: float) -> None:
         question, self._asked = self._asked, None
         if question is not None and question[0].insists:
             self._waiting.appendleft(question)
-            self._due = now + PAUSE_S
+            self._due_at = now + PAUSE_S
         else:
             self._ask_next(now)
 
@@ -170,7 +171,8 @@ class Talker(Application):
         """Answer every announcement, as each one asks anew; ask nothing more."""
         self._waiting.clear()
         self._periodic.clear()
-        self._asked = self._due = None
+        self._asked = None
+        self._due_at = inf
         self.port.send(encode(self._ready, contents.Ready()))
         if self._goodbye is not None and not self._said_goodbye:
             self._said_goodbye = True

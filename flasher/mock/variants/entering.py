@@ -1,0 +1,267 @@
+"""Wrong bootloaders: reset and boot version (RS), update command (UP)."""
+
+from __future__ import annotations
+
+import dataclasses
+from math import inf
+from typing import Final, TypeGuard
+
+from flasher.mock.model import MockDevice, Transfer
+from flasher.mock.table import Event, State
+from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, variant
+from flasher.protocol import messages
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import PACKET_DATA_SIZE, Command, Mode
+from flasher.protocol.wire import Message, Reassembler
+
+_PATIENCE: Final = 8
+"""Announcements after which a device without an application gives up."""
+_LISTENS_UNTIL: Final = 3
+_LOOP_S: Final = 0.005
+"""Until the bootloader looks into its queue again."""
+
+
+@variant("no-feedback", "RS-01", "restarts at a reset without general feedback")
+class NoFeedback(MockDevice):
+    def _confirm_reset(self, now: float) -> str:
+        self._await_restart(now)
+        return "reset"
+
+
+@variant("announces-three-times", "RS-01", "announces itself three times", also="RS-02 RS-05 UP-04")
+class ThreeAnnouncements(MockDevice):
+    burst = 3
+
+
+@variant(
+    "announces-every-60-ms",
+    "RS-01",
+    "announces itself 60 ms apart",
+    also="RS-05 TM-05",
+    timings={"boot_version_spacing_s": 0.06},
+)
+class SlowAnnouncements(MockDevice):
+    pass
+
+
+@variant(
+    "feedback-on-wrong-id",
+    "RS-01",
+    "answers on its broadcast id: general feedback to 7S0",
+    also="CR-04 UP-03",
+)
+class FeedbackOnWrongId(MockDevice):
+    """Confirms a reset to everybody, not to the tool."""
+
+    def send(self, message: Message) -> None:
+        if message.command == Command.GENERAL_FEEDBACK:
+            message = message._replace(can_id=self.target.broadcast_id)
+        super().send(message)
+
+
+@variant("two-restarts", "RS-02", "restarts once for each of two resets")
+class TwoRestarts(MockDevice):
+    """Keeps a reset that comes during the restart, and carries it out after the burst."""
+
+    _waiting_reset = False
+
+    def _await_restart(self, now: float) -> None:
+        super()._await_restart(now)
+        self._meanwhile = Reassembler(self.target.request_id, self.timings.inter_frame_timeout_s)
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if self.state is State.RESTARTING and frame.can_id == self.target.request_id:
+            for found in self._meanwhile.feed(frame.data, now):
+                if isinstance(found, Message) and messages.decode(found) == messages.Reset():
+                    self._waiting_reset = True
+        super().receive(frame, now)
+
+    def _elapsed(self) -> Event:
+        burst_over = self.state is State.ANNOUNCING and self._announced >= self.burst
+        if burst_over and self._waiting_reset:
+            self._waiting_reset = False
+            return Event.RESET
+        return super()._elapsed()
+
+
+@variant(
+    "stays-in-bootloader",
+    "RS-03",
+    "without an update command, waits silently for ever",
+    also="RS-02 RS-05 UP-02 UP-04 UP-03 UP-06 PW-01 EN-01 BU-02 CO-01 SE-01 SE-03 SE-04",
+)
+class StaysInBootloader(MockDevice):
+    def _announce(self, now: float) -> str:
+        detail = super()._announce(now)
+        if self._has_whole_application and self._announced >= self.burst:
+            self._due_at = inf
+        return detail
+
+
+@variant(
+    "gives-up-without-application",
+    "RS-03",
+    "without an application, announces itself eight times and hangs",
+    also="TX-07 TX-12 PW-01 PW-02 SE-01",
+)
+class GivesUp(HangingDevice):
+    """Without an application to start, announces itself twice four times and hangs."""
+
+    def _announce(self, now: float) -> str:
+        detail = super()._announce(now)
+        hopeless = not self._has_whole_application and self._announced > _PATIENCE
+        return self._hang() if hopeless else detail
+
+
+def _is_bad_reset(row: AnyRow) -> TypeGuard[messages.Malformed]:
+    return isinstance(row, messages.Malformed) and row.message.command == Command.RESET
+
+
+@variant("resets-at-any-text", "RS-04", "takes a reset with a wrong text")
+class ResetByAnyText(MockDevice):
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if _is_bad_reset(row) and row.message.mode == Mode.WRITE:
+            row = messages.Reset()
+        super()._take_row(row, now)
+
+
+@variant("resets-on-read", "RS-04", "takes a reset that is a read")
+class ResetByRead(MockDevice):
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if _is_bad_reset(row) and row.message.data == messages.Reset.DATA:
+            row = messages.Reset()
+        super()._take_row(row, now)
+
+
+@variant("silent-power-up", "RS-05", "starts the application at power-up without announcing itself")
+class SilentPowerUp(MockDevice):
+    """Starts a whole application at power-up without passing through the announcements."""
+
+    _is_power_up = False
+
+    def power_on(self, now: float) -> None:
+        self._is_power_up = not self.has_power
+        super().power_on(now)
+
+    def _boot(self, now: float) -> str:
+        detail = super()._boot(now)
+        if self._is_power_up and self._has_whole_application:
+            self._announced = self.burst
+        self._is_power_up = False
+        return detail
+
+
+class _OnePacketMore(Transfer):
+    @property
+    def total(self) -> int:
+        return self.size_bytes // PACKET_DATA_SIZE + 1
+
+
+@variant(
+    "full-last-packet-fails",
+    "UP-01",
+    "wants a packet more when the size is a multiple of 128",
+    also="EN-01 EN-07 EN-08 PW-01 PW-02 TX-07",
+)
+class FullPacketsFail(MockDevice):
+    transfer_type = _OnePacketMore
+
+
+@variant(
+    "erases-before-checking-size",
+    "UP-02",
+    "erases the application before it refuses an impossible size",
+    also="SE-04",
+)
+class ErasesBeforeCheck(MockDevice):
+    def _refuse_update(self, now: float) -> str:
+        size_bytes, limit_bytes = self._offered_bytes, self.profile.image_limit_bytes
+        if self.state is State.ANNOUNCING and not 0 < size_bytes <= limit_bytes:
+            _erase_at_once(self)
+            self._has_whole_application = False
+        return super()._refuse_update(now)
+
+
+@variant(
+    "erases-from-application",
+    "UP-03",
+    "erases at an update command to the running application",
+    also="SE-03",
+)
+class ErasesFromApplication(MockDevice):
+    def _send_feedback(self, now: float) -> str:
+        if self._message is not None and self._message.command == Command.UPDATE:
+            _erase_at_once(self)
+        return super()._send_feedback(now)
+
+
+def _erase_at_once(device: MockDevice) -> None:
+    """The record and the first page are gone; the time that it takes is not modelled."""
+    for operation in device.store.erasing(1)[:2]:
+        device.store.flash.erase_page(operation.address)
+
+
+@variant(
+    "listens-until-third-version",
+    "UP-04",
+    "takes no update command from its third announcement on",
+    also="UP-05",
+)
+class StopsListening(MockDevice):
+    """Listens between its first announcements only, when it has an application to start."""
+
+    def _classify(self, row: AnyRow) -> Event:
+        event = super()._classify(row)
+        is_late = self.state is State.ANNOUNCING and self._announced >= _LISTENS_UNTIL
+        is_deaf = is_late and self._has_whole_application
+        return Event.NO_CONCERN if is_deaf and event is Event.UPDATE else event
+
+
+@variant("queues-updates", "UP-05", "erases and requests once for each update command that came")
+class QueuesUpdates(MockDevice):
+    """Keeps an update command that comes while it erases, and erases and requests again for it."""
+
+    _waiting_update = False
+
+    def _handle(self, event: Event, now: float) -> None:
+        if event is Event.UPDATE_AGAIN and self.state is State.ERASING:
+            self._waiting_update = True
+        super()._handle(event, now)
+
+    def _request(self, now: float) -> str:
+        detail = super()._request(now)
+        if self._waiting_update:
+            self._due_at = now + _LOOP_S
+        return detail
+
+    def _elapsed(self) -> Event:
+        if self.state is State.TRANSFER and self._waiting_update:
+            self._waiting_update = False
+            return Event.UPDATE
+        return super()._elapsed()
+
+
+@variant("any-target-name", "UP-06", "takes the update command of any target")
+class AnyTargetName(MockDevice):
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if isinstance(row, messages.UpdateCommand):
+            row = dataclasses.replace(row, text=self.target.update_text)
+        super()._take_row(row, now)
+
+
+@variant(
+    "mixes-transfers",
+    "UP-08",
+    "goes on with what is stored when an update command comes in the midst",
+)
+class MixesTransfers(MockDevice):
+    """On an update command in the midst, requests anew but keeps what is stored, and its count."""
+
+    store_type = PlainStore
+
+    def _classify(self, row: AnyRow) -> Event:
+        event = super()._classify(row)
+        if event is Event.UPDATE and self.state is State.TRANSFER and self._transfer.stored:
+            self._transfer.size_bytes = self._offered_bytes
+            return Event.UPDATE_AGAIN
+        return event
