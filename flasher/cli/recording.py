@@ -31,10 +31,8 @@ from flasher.driver import Tap
 from flasher.errors import ExitCode, FlasherError, InterruptedByUserError
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
-from flasher.trace.figures import LinkReport
-from flasher.trace.link import LinkMeter
-from flasher.trace.ring import FlightRecorder
-from flasher.trace.unechoed import Unechoed
+from flasher.trace.figures import LinkMeter, LinkReport
+from flasher.trace.taps import FlightRecorder, Unechoed
 
 BUNDLE_FOLDER: Final = "FLASHER_BUNDLE_DIR"
 """The environment variable that names the folder for bundles."""

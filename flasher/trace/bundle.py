@@ -27,11 +27,10 @@ from typing import Any, Final
 import can
 
 from flasher.protocol.text import printable
-from flasher.trace.decoder import BusEvent
-from flasher.trace.pieces import Pieces, bits_of
+from flasher.trace.decoder import BusEvent, TimedDecoder, bits_of
 from flasher.trace.recorder import message_of
-from flasher.trace.ring import Entry, FlightRecorder
 from flasher.trace.steps import step_of
+from flasher.trace.taps import Entry, FlightRecorder
 
 TRACE: Final = "trace.blf"
 OLDER_TRACE: Final = "trace.log"
@@ -129,7 +128,7 @@ def transcript(recorder: FlightRecorder) -> Iterator[str]:
     """Every message of the ring, one line each: seconds since the oldest frame, direction, id,
     sender and receiver, what it says.
     """
-    pieces = Pieces()
+    pieces = TimedDecoder()
     first_at: float | None = None
     last_at = 0.0
     own: dict[int, str] = {}
@@ -137,17 +136,17 @@ def transcript(recorder: FlightRecorder) -> Iterator[str]:
         first_at = at_s if first_at is None else first_at
         last_at = at_s - first_at
         own[frame.can_id] = "out" if sent else "in"
-        for piece in pieces.feed(frame, last_at, bits_of(frame)):
-            yield _line(piece.seen, own.get(piece.seen.can_id, "in"))
-    for piece in pieces.finish(last_at):
-        yield _line(piece.seen, own.get(piece.seen.can_id, "in"))
+        for timed in pieces.feed(frame, last_at, bits_of(frame)):
+            yield _line(timed.event, own.get(timed.event.can_id, "in"))
+    for timed in pieces.finish(last_at):
+        yield _line(timed.event, own.get(timed.event.can_id, "in"))
 
 
-def _line(seen: BusEvent, direction: str) -> str:
-    step = step_of(seen, seen.at)
+def _line(event: BusEvent, direction: str) -> str:
+    step = step_of(event, event.at)
     route = f"{step.sender} > {step.receiver}" if step.sender else ""
     said = ("! " if step.is_trouble else "") + step.title + (f": {step.text}" if step.text else "")
-    return f"{step.at_s:10.6f}  {direction:<3}  {seen.can_id:03X}  {route:<9}  {said}"
+    return f"{step.at_s:10.6f}  {direction:<3}  {event.can_id:03X}  {route:<9}  {said}"
 
 
 def _circumstances(recorder: FlightRecorder, now: float) -> dict[str, Any]:

@@ -2,19 +2,27 @@
 
 `Decoder` takes the whole bus, whoever sends: one byte stream for each CAN id. It gives a `BusEvent`
 for each message, each stretch of damaged bytes and each foreign frame, with its fields both typed
-and as text that is safe on any screen. Pure: the time is an argument.
+and as text that is safe on any screen. `TimedDecoder` adds the time that each of them took.
+
+A time stamp means different things: adapters stamp a received frame when it has ended, a recorder
+of our own stamps a sent frame when the adapter accepted it, and a queue accepts a whole message at
+once. `TimedEvent.left_s` copes with both: frames whose stamps lie closer together than they can be
+on the wire were accepted, not sent, and their message ended when the wire could have carried it.
+
+Pure: the time is an argument.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any, Final, NamedTuple
 
 from flasher.prose import prose
 from flasher.protocol import catalogue, messages
+from flasher.protocol.bittime import fixed_bits, frame_bits
 from flasher.protocol.contents import Faults
 from flasher.protocol.fields import Bits, Content, Reserved, Text, flag_names, label
 from flasher.protocol.frame import Frame
@@ -22,6 +30,13 @@ from flasher.protocol.spec import TARGETS, Dialect, Mode, Node, can_id
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Damage, Message, Reassembler
+
+_LONG_ID_BITS: Final = 20
+"""What a 29-bit id adds to a frame: 18 id bits, SRR and r1."""
+_ERROR_FRAME_BITS: Final = 20
+"""About what an error frame takes: flags, delimiter, interframe space."""
+_ACCEPTED_SHARE: Final = 0.9
+"""Frames that take less of their wire time than this, stamp to stamp, bear times of acceptance."""
 
 
 class Kind(Enum):
@@ -288,3 +303,89 @@ def _plain_value(value: object) -> Any:
             return list(value)
         case _:
             return value
+
+
+# -- with times ----------------------------------------------------------------------------------
+
+
+def bits_of(frame: Frame) -> int:
+    """Bit times of any frame; without stuff bits where only the base format's are known exactly."""
+    if frame.is_error:
+        return _ERROR_FRAME_BITS
+    if frame.is_extended:
+        return fixed_bits(len(frame.data)) + _LONG_ID_BITS
+    return frame_bits(frame)
+
+
+@dataclass(frozen=True, slots=True)
+class TimedEvent:
+    """One thing seen, with the first of its frames and the bits of all of them."""
+
+    event: BusEvent
+    begin_s: float
+    """Stamp of the first frame."""
+    end_s: float
+    """Stamp of the last frame."""
+    bits: int
+    first_bits: int
+    """Bits of the first frame alone."""
+
+    def left_s(self, bitrate_bps: int) -> float:
+        """When the last frame had left the wire, as well as the stamps tell."""
+        between_s = (self.bits - self.first_bits) / bitrate_bps
+        if self.end_s - self.begin_s >= _ACCEPTED_SHARE * between_s:
+            return self.end_s
+        return max(self.end_s, self.begin_s + self.bits / bitrate_bps)
+
+
+@dataclass(slots=True)
+class _Open:
+    """Frames of one id since its last timed."""
+
+    begin_s: float
+    first_bits: int
+    bits: int = 0
+    end_s: float = field(default=0.0)
+
+
+class TimedDecoder:
+    """Takes the frames of a bus in the order of time, gives what they say."""
+
+    def __init__(
+        self, inter_frame_timeout_s: float = DEFAULT_TIMINGS.inter_frame_timeout_s
+    ) -> None:
+        self._decoder = Decoder(inter_frame_timeout_s)
+        self._open: dict[int, _Open] = {}
+
+    def feed(self, frame: Frame, now: float, bits: int) -> Iterator[TimedEvent]:
+        """What was cut short before `now`, then what the frame completed."""
+        due = self._decoder.deadline()
+        if due is not None and due < now:
+            yield from self._cut_short(now)
+        is_ours = frame.is_payload
+        if is_ours:
+            held = self._open.get(frame.can_id)
+            if held is None:
+                held = self._open[frame.can_id] = _Open(now, bits)
+            held.bits += bits
+            held.end_s = now
+        for event in self._decoder.feed(frame, now):
+            yield self._timed(event, bits)
+
+    def finish(self, now: float) -> Iterator[TimedEvent]:
+        """What is left unfinished at the end."""
+        yield from self._cut_short(now + 2 * DEFAULT_TIMINGS.inter_frame_timeout_s)
+
+    def _cut_short(self, now: float) -> Iterator[TimedEvent]:
+        while (due := self._decoder.deadline()) is not None and due < now:
+            for event in self._decoder.tick(due):
+                yield self._timed(event, 0)
+
+    def _timed(self, event: BusEvent, bits: int) -> TimedEvent:
+        held = None
+        if event.kind not in (Kind.FOREIGN, Kind.ERROR_FRAME):
+            # A second timed out of the same frame begins and ends with it.
+            held = self._open.pop(event.can_id, None)
+        if held is None:
+            return TimedEvent(event, event.at, event.at, bits, bits)
+        return TimedEvent(event, held.begin_s, held.end_s, held.bits, held.first_bits)

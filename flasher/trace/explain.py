@@ -24,21 +24,25 @@ from flasher.protocol.spec import (
 )
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
-from flasher.trace.busload import MAX_TALKERS, BusCounter
-from flasher.trace.decoder import Kind
-from flasher.trace.dialogue import Dialogue
-from flasher.trace.pieces import Piece, Pieces, bits_of
+from flasher.trace.decoder import BusEvent, Kind, TimedDecoder, TimedEvent, bits_of, route
+from flasher.trace.observed_upgrade import ObservedUpgrade
 from flasher.trace.steps import MAX_STEPS, StepList, mark_unanswered, step_of
 from flasher.trace.story import (
+    BusFigures,
     Cause,
     Recorded,
     Step,
     Story,
+    Talker,
+    TalkerKind,
     TraceVerdict,
     UpgradeStory,
 )
 from flasher.trace.verdict import judge, remarks
 
+MAX_TALKERS: Final = 100
+"""Different ids that are told; a bus with more of them babbles."""
+_MAX_IDS: Final = 100_000
 MAX_PACKETS: Final = 200_000
 """Packets that a story holds one by one, over all upgrades."""
 EVERYTHING_LIMIT: Final = 200_000
@@ -99,12 +103,12 @@ class _Reading:
         self._everything = everything
         self._is_one_tool = is_one_tool
         self._bus = BusCounter()
-        self._pieces = Pieces()
-        self._open: dict[Target, Dialogue] = {}
+        self._decoder = TimedDecoder()
+        self._open: dict[Target, ObservedUpgrade] = {}
         self._upgrades: list[tuple[float, UpgradeStory]] = []
         self._packets_left = MAX_PACKETS
         self._outside = self._new_steps()
-        self._announced: dict[Target, list[Piece]] = {}
+        self._announced: dict[Target, list[TimedEvent]] = {}
         """The latest announcements that no tool has answered yet."""
         self._announcements = 0
         self._has_hmi = False
@@ -119,108 +123,109 @@ class _Reading:
         bits = bits_of(frame)
         self._bus.frame(frame, now, bits)
         if frame.is_error:
-            for dialogue in self._open.values():
-                dialogue.error_frame(now)
+            for upgrade in self._open.values():
+                upgrade.error_frame(now)
             if not self._open:
                 self._outside.error_frame(now)
             return
-        for piece in self._pieces.feed(frame, now, bits):
-            self._piece(piece)
+        for timed in self._decoder.feed(frame, now, bits):
+            self._take(timed)
         target = None if frame.is_extended else _BY_REQUEST.get(frame.can_id)
         if target in self._open and frame.is_payload:
             self._open[target].interleaving.frame(frame, now)
 
-    def _piece(self, piece: Piece) -> None:
-        seen = piece.seen
-        if seen.kind is Kind.FOREIGN:
+    def _take(self, timed: TimedEvent) -> None:
+        event = timed.event
+        if event.kind is Kind.FOREIGN:
             return
-        self._has_nodes |= seen.kind is not Kind.DAMAGED
-        self._has_hmi |= seen.can_id in _HMI_IDS
-        self._bus.seen(seen)
-        if seen.can_id in _BY_REQUEST:
-            self._tool(_BY_REQUEST[seen.can_id], piece)
-        elif seen.can_id in _BY_ANSWER:
-            self._device(_BY_ANSWER[seen.can_id], piece)
+        self._has_nodes |= event.kind is not Kind.DAMAGED
+        self._has_hmi |= event.can_id in _HMI_IDS
+        self._bus.note(event)
+        if event.can_id in _BY_REQUEST:
+            self._tool(_BY_REQUEST[event.can_id], timed)
+        elif event.can_id in _BY_ANSWER:
+            self._device(_BY_ANSWER[event.can_id], timed)
         else:
-            self._other(piece)
+            self._other(timed)
 
     # -- who it is for ---------------------------------------------------------------------------
 
-    def _tool(self, target: Target, piece: Piece) -> None:
-        dialogue = self._open.get(target)
-        if dialogue is not None and dialogue.begins_another(piece.seen):
-            self._close(target, piece.begin_s)
-            dialogue = None
-        if dialogue is None:
-            if piece.seen.kind is not Kind.MESSAGE or piece.seen.command not in _BEGINNERS:
-                self._outside.add(step_of(piece.seen, piece.end_s))
+    def _tool(self, target: Target, timed: TimedEvent) -> None:
+        upgrade = self._open.get(target)
+        if upgrade is not None and upgrade.begins_another(timed.event):
+            self._close(target, timed.begin_s)
+            upgrade = None
+        if upgrade is None:
+            if timed.event.kind is not Kind.MESSAGE or timed.event.command not in _BEGINNERS:
+                self._outside.add(step_of(timed.event, timed.end_s))
                 return
-            dialogue = self._begin(target, piece)
-        dialogue.tool(piece)
+            upgrade = self._begin(target, timed)
+        upgrade.tool(timed)
 
-    def _begin(self, target: Target, piece: Piece) -> Dialogue:
+    def _begin(self, target: Target, timed: TimedEvent) -> ObservedUpgrade:
         """An upgrade, with the announcements that led to it."""
         heard = [
             said
             for said in self._announced.pop(target, [])
-            if piece.begin_s - said.end_s <= _BURST_S
+            if timed.begin_s - said.end_s <= _BURST_S
         ]
-        dialogue = self._open[target] = Dialogue(
+        upgrade = self._open[target] = ObservedUpgrade(
             target,
-            heard[0].begin_s if heard else piece.begin_s,
+            heard[0].begin_s if heard else timed.begin_s,
             self._bitrate_bps,
             steps=self._new_steps(),
+            judge=judge,
             max_packets=self._packets_left,
             is_one_tool=self._is_one_tool,
         )
         for said in heard:
-            dialogue.device(said)
-        return dialogue
+            upgrade.device(said)
+        return upgrade
 
-    def _end_of_restart(self, target: Target, piece: Piece) -> None:
+    def _end_of_restart(self, target: Target, timed: TimedEvent) -> None:
         """A device that announced itself, was told of no update, and answers as an application now
         was restarted: that was no upgrade.
         """
-        dialogue = self._open.get(target)
-        is_application = piece.seen.kind in (Kind.MESSAGE, Kind.UNKNOWN)
-        if dialogue is None or not dialogue.is_restart or not is_application:
+        upgrade = self._open.get(target)
+        is_application = timed.event.kind in (Kind.MESSAGE, Kind.UNKNOWN)
+        if upgrade is None or not upgrade.is_restart or not is_application:
             return
-        if piece.seen.command not in _OF_BOOTLOADERS:
+        if timed.event.command not in _OF_BOOTLOADERS:
             del self._open[target]
-            for line in dialogue.steps.lines():
+            for line in upgrade.steps.lines():
                 if isinstance(line, Step):
                     self._outside.add(line)
 
-    def _device(self, target: Target, piece: Piece) -> None:
-        self._end_of_restart(target, piece)
-        dialogue = self._open.get(target)
-        if dialogue is not None:
-            dialogue.device(piece)
+    def _device(self, target: Target, timed: TimedEvent) -> None:
+        self._end_of_restart(target, timed)
+        upgrade = self._open.get(target)
+        if upgrade is not None:
+            upgrade.device(timed)
             return
-        if piece.seen.command == Command.BOOT_VERSION and piece.seen.kind is Kind.MESSAGE:
+        if timed.event.command == Command.BOOT_VERSION and timed.event.kind is Kind.MESSAGE:
             self._announcements += 1
             self._announced[target] = [
                 *self._announced.get(target, [])[1 - BOOT_VERSION_BURST :],
-                piece,
+                timed,
             ]
-        self._outside.add(step_of(piece.seen, piece.end_s))
+        self._outside.add(step_of(timed.event, timed.end_s))
 
-    def _other(self, piece: Piece) -> None:
+    def _other(self, timed: TimedEvent) -> None:
         """A message between other nodes, or to all of them."""
-        seen = piece.seen
-        if seen.kind is Kind.MESSAGE and seen.can_id == BMS.broadcast_id:
-            if seen.command == Command.VERSION_INFORMATION:
-                self._end_of_restart(BMS, piece)
+        event = timed.event
+        if event.kind is Kind.MESSAGE and event.can_id == BMS.broadcast_id:
+            if event.command == Command.VERSION_INFORMATION:
+                self._end_of_restart(BMS, timed)
             battery = self._open.get(BMS)
-            if seen.command == Command.VERSION_INFORMATION and battery is not None:
-                battery.version(piece)
+            if event.command == Command.VERSION_INFORMATION and battery is not None:
+                battery.version(timed)
                 return
-            if seen.command == _SHUTDOWN:
-                for dialogue in self._open.values():
-                    dialogue.shutdown(piece)
-        tells = seen.is_trouble or Node.CDL.name in (seen.sender, seen.receiver)
-        if tells or self._everything or seen.command == _SHUTDOWN:
-            self._outside.add(step_of(seen, piece.end_s))
+            if event.command == _SHUTDOWN:
+                for upgrade in self._open.values():
+                    upgrade.shutdown(timed)
+        tells = event.is_trouble or Node.CDL.name in (event.sender, event.receiver)
+        if tells or self._everything or event.command == _SHUTDOWN:
+            self._outside.add(step_of(event, timed.end_s))
 
     def _new_steps(self) -> StepList:
         limit = EVERYTHING_LIMIT if self._everything else MAX_STEPS
@@ -229,31 +234,31 @@ class _Reading:
     # -- the story ---------------------------------------------------------------------------------
 
     def _close(self, target: Target, until_s: float) -> None:
-        dialogue = self._open.pop(target)
-        dialogue.finish()
-        self._packets_left = max(0, self._packets_left - len(dialogue.packets))
-        is_alone = self._bus.is_alone and not dialogue.is_answered
-        verdict = judge(dialogue, until_s, is_alone=is_alone)
+        upgrade = self._open.pop(target)
+        upgrade.finish()
+        self._packets_left = max(0, self._packets_left - len(upgrade.packets))
+        is_alone = self._bus.is_alone and not upgrade.is_answered
+        verdict = judge(upgrade, until_s, is_alone=is_alone)
         story = UpgradeStory(
             target=target.node.name,
-            begin_s=dialogue.begin_s,
-            end_s=dialogue.last_at_s,
-            image_size_bytes=dialogue.image_size_bytes,
-            total_packets=dialogue.total,
-            boot_version=next(reversed(dialogue.boot_versions), None),
-            running_version=dialogue.running_version,
-            attempts=dialogue.attempt,
-            phases=tuple(dialogue.spans),
-            packets=tuple(record.story() for record in dialogue.packets),
+            begin_s=upgrade.begin_s,
+            end_s=upgrade.last_at_s,
+            image_size_bytes=upgrade.image_size_bytes,
+            total_packets=upgrade.total,
+            boot_version=next(reversed(upgrade.boot_versions), None),
+            running_version=upgrade.running_version,
+            attempts=upgrade.attempt,
+            phases=tuple(upgrade.spans),
+            packets=tuple(record.story() for record in upgrade.packets),
             steps=mark_unanswered(
-                dialogue.steps, target.node.name, is_over=verdict.cause not in _MAY_BE_ANSWERED
+                upgrade.steps, target.node.name, is_over=verdict.cause not in _MAY_BE_ANSWERED
             ),
-            steps_left_out=dialogue.steps.left_out,
-            link=dialogue.link.report(),
-            remarks=remarks(dialogue, verdict.cause),
+            steps_left_out=upgrade.steps.left_out,
+            link=upgrade.link.report(),
+            remarks=remarks(upgrade, verdict.cause),
             verdict=verdict,
         )
-        self._upgrades.append((dialogue.begin_s, story))
+        self._upgrades.append((upgrade.begin_s, story))
 
     def story(
         self, source: str, suffix: str, until: float | None, recorded: Recorded | None
@@ -263,11 +268,11 @@ class _Reading:
         """
         start = self._start or 0.0
         until_s = max(self._bus.last_at, 0.0 if until is None else until - start)
-        for piece in self._pieces.finish(self._bus.last_at):
+        for timed in self._decoder.finish(self._bus.last_at):
             # A device that was still speaking when the recording ended has damaged nothing.
-            was_speaking = until_s - piece.end_s < DEFAULT_TIMINGS.inter_frame_timeout_s
-            if piece.seen.can_id in _BY_REQUEST or not was_speaking:
-                self._piece(piece)
+            was_speaking = until_s - timed.end_s < DEFAULT_TIMINGS.inter_frame_timeout_s
+            if timed.event.can_id in _BY_REQUEST or not was_speaking:
+                self._take(timed)
         for target in tuple(self._open):
             self._close(target, until_s)
         upgrades = tuple(story for _, story in sorted(self._upgrades, key=lambda one: one[0]))
@@ -332,3 +337,80 @@ def _chief(upgrades: tuple[UpgradeStory, ...]) -> TraceVerdict | None:
     verdicts = list(last.values())
     bad = [verdict for verdict in verdicts if not verdict.cause.is_good]
     return next(iter(bad or verdicts), None)
+
+
+class BusCounter:
+    """Counts the frames of a trace."""
+
+    def __init__(self) -> None:
+        self.frames = 0
+        self.first_at: float | None = None
+        self.last_at = 0.0
+        self.error_frames = 0
+        self.damaged = 0
+        self.malformed = 0
+        self.is_alone = True
+        """Nobody but the tool was heard."""
+        self._bits = 0
+        self._peak_bits = 0
+        self._second = 0
+        self._second_bits = 0
+        self._gap = (0.0, 0.0)
+        self._talkers: dict[tuple[int, bool], int] = {}
+
+    def frame(self, frame: Frame, now: float, bits: int) -> None:
+        """Take one frame; times do not go back."""
+        if self.first_at is None:
+            self.first_at = self.last_at = now
+        if now - self.last_at > self._gap[0]:
+            self._gap = (now - self.last_at, self.last_at)
+        self.last_at = now
+        self._bits += bits
+        second = int(now - self.first_at)
+        if second != self._second:
+            self._second, self._second_bits = second, 0
+        self._second_bits += bits
+        self._peak_bits = max(self._peak_bits, self._second_bits)
+        if frame.is_error:
+            self.error_frames += 1
+            return
+        self.frames += 1
+        key = (frame.can_id, frame.is_extended)
+        if key in self._talkers or len(self._talkers) < _MAX_IDS:
+            self._talkers[key] = self._talkers.get(key, 0) + 1
+        if self.is_alone:
+            names = None if frame.is_extended else route(frame.can_id)
+            self.is_alone = names is not None and names[0] == Node.CDL.name
+
+    def note(self, event: BusEvent) -> None:
+        """Take note of what was no message."""
+        self.damaged += event.kind is Kind.DAMAGED
+        self.malformed += event.kind in (Kind.MALFORMED, Kind.UNKNOWN)
+
+    def figures(self, bitrate_bps: int) -> BusFigures:
+        """The sums."""
+        first_at = self.first_at or 0.0
+        duration_s = self.last_at - first_at if self.frames or self.error_frames else 0.0
+        return BusFigures(
+            duration_s=duration_s,
+            frames=self.frames,
+            load=self._bits / bitrate_bps / duration_s if duration_s > 0 else None,
+            peak_load=self._peak_bits / bitrate_bps if duration_s >= 1 else None,
+            error_frames=self.error_frames,
+            damaged=self.damaged,
+            malformed=self.malformed,
+            longest_gap_s=self._gap[0],
+            longest_gap_at_s=max(0.0, self._gap[1] - first_at),
+        )
+
+    def talkers(self, but: frozenset[int]) -> list[Talker]:
+        """Everybody, most frames first, `but` these 11-bit ids."""
+        found = []
+        for (of_id, is_extended), frames in self._talkers.items():
+            names = None if is_extended else route(of_id)
+            if of_id in but and not is_extended:
+                continue
+            kind = TalkerKind.FOREIGN if names is None else TalkerKind.NODE
+            name = "" if names is None else f"{names[0]} > {names[1]}"
+            found.append(Talker(of_id, is_extended, name, frames, kind))
+        return sorted(found, key=lambda talker: -talker.frames)

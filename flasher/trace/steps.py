@@ -131,20 +131,20 @@ def mark_unanswered(steps: StepList, device: str, *, is_over: bool) -> tuple[Sto
     return tuple(lines)
 
 
-def step_of(seen: BusEvent, at_s: float) -> Step:
-    """A thing seen as a line."""
-    kind = StepKind.DAMAGED if seen.kind is Kind.DAMAGED else StepKind.MESSAGE
-    width = None if seen.is_alarm else _VALUE_WIDTH  # no fault is left out
-    said = ", ".join(_field_text(shown, width) for shown in seen.fields if _says_something(shown))
+def step_of(event: BusEvent, at_s: float) -> Step:
+    """A bus event as a line."""
+    kind = StepKind.DAMAGED if event.kind is Kind.DAMAGED else StepKind.MESSAGE
+    width = None if event.is_alarm else _VALUE_WIDTH  # no fault is left out
+    said = ", ".join(_field_text(shown, width) for shown in event.fields if _says_something(shown))
     return Step(
         at_s,
         kind,
-        seen.sender,
-        seen.receiver,
-        seen.title,
+        event.sender,
+        event.receiver,
+        event.title,
         said,
-        is_trouble=seen.is_trouble,
-        can_id=seen.can_id,
+        is_trouble=event.is_trouble,
+        can_id=event.can_id,
     )
 
 

@@ -11,27 +11,7 @@ from dataclasses import dataclass
 from enum import Enum
 
 from flasher.events import Phase
-from flasher.trace.figures import Distribution, LinkReport
-
-__all__ = [
-    "BusFigures",
-    "Cause",
-    "Distribution",
-    "StoryLine",
-    "LinkReport",
-    "PacketRun",
-    "PacketStory",
-    "Phase",
-    "PhaseSpan",
-    "Recorded",
-    "Step",
-    "StepKind",
-    "Story",
-    "Talker",
-    "TalkerKind",
-    "UpgradeStory",
-    "TraceVerdict",
-]
+from flasher.trace.figures import LinkReport
 
 
 class Cause(Enum):

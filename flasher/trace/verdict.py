@@ -9,10 +9,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Final, NamedTuple
 
+from flasher.events import Phase
 from flasher.prose import explanation
 from flasher.protocol.text import BOOT_VERSION_FORM
-from flasher.trace.facts import Facts
-from flasher.trace.story import Cause, Phase, TraceVerdict
+from flasher.trace.observed_upgrade import ObservedUpgrade
+from flasher.trace.story import Cause, TraceVerdict
 
 _SILENT_S: Final = 1.0
 """A tool that says nothing for so long, while it is its turn, has stopped."""
@@ -31,7 +32,7 @@ class _Found(NamedTuple):
     text: str
 
 
-def judge(upgrade: Facts, until_s: float, *, is_alone: bool) -> TraceVerdict:
+def judge(upgrade: ObservedUpgrade, until_s: float, *, is_alone: bool = False) -> TraceVerdict:
     """The verdict. The trace is known to go on until `until_s`; `is_alone` when nobody but the tool
     was ever heard.
     """
@@ -64,7 +65,7 @@ def judge(upgrade: Facts, until_s: float, *, is_alone: bool) -> TraceVerdict:
     )
 
 
-def _completed(upgrade: Facts) -> _Found | None:
+def _completed(upgrade: ObservedUpgrade) -> _Found | None:
     node, running = upgrade.target.node.name, upgrade.running_version
     if upgrade.completed_at_s is None:
         return None
@@ -79,13 +80,13 @@ def _completed(upgrade: Facts) -> _Found | None:
     )
 
 
-def _is_other(upgrade: Facts) -> bool:
+def _is_other(upgrade: ObservedUpgrade) -> bool:
     """True when the one version inside the image is not the one that answers."""
     known = upgrade.image_versions
     return len(known) == 1 and upgrade.running_version not in known
 
 
-def _other_version(upgrade: Facts) -> _Found:
+def _other_version(upgrade: ObservedUpgrade) -> _Found:
     (sent,) = upgrade.image_versions
     said = "said complete" if upgrade.completed_at_s is not None else "did not say complete"
     return _Found(
@@ -98,7 +99,7 @@ def _other_version(upgrade: Facts) -> _Found:
 # -- what spoils everything -----------------------------------------------------------------------
 
 
-def _spoiled(upgrade: Facts, *, is_alone: bool) -> _Found | None:
+def _spoiled(upgrade: ObservedUpgrade, *, is_alone: bool) -> _Found | None:
     node = upgrade.target.node.name
     if upgrade.intrusions and not upgrade.is_one_tool:
         said = "; ".join(upgrade.intrusions[:3])
@@ -134,7 +135,7 @@ def _spoiled(upgrade: Facts, *, is_alone: bool) -> _Found | None:
     return None
 
 
-def _two_devices(upgrade: Facts) -> str:
+def _two_devices(upgrade: ObservedUpgrade) -> str:
     node = upgrade.target.node.name
     if upgrade.boot_changes:
         heard = ", ".join(f"{text} ({count})" for text, count in upgrade.boot_versions.items())
@@ -145,7 +146,7 @@ def _two_devices(upgrade: Facts) -> str:
 # -- phase by phase -------------------------------------------------------------------------------
 
 
-def _before_update(upgrade: Facts, until_s: float) -> _Found:
+def _before_update(upgrade: ObservedUpgrade, until_s: float) -> _Found:
     node = upgrade.target.node.name
     if upgrade.is_announced:
         said = ", ".join(upgrade.boot_versions)
@@ -160,7 +161,7 @@ def _before_update(upgrade: Facts, until_s: float) -> _Found:
     return _Found(Cause.RECORDING_ENDS, text)
 
 
-def _in_update(upgrade: Facts) -> _Found:
+def _in_update(upgrade: ObservedUpgrade) -> _Found:
     node = upgrade.target.node.name
     sent = f"The update command was sent {_times(upgrade.updates)}"
     if upgrade.feedbacks_after_update:
@@ -172,7 +173,7 @@ def _in_update(upgrade: Facts) -> _Found:
     return _Found(Cause.NO_REQUEST, f"{sent}, and the {node} did not request the transfer.")
 
 
-def _in_transfer(upgrade: Facts, silent_s: float) -> _Found:
+def _in_transfer(upgrade: ObservedUpgrade, silent_s: float) -> _Found:
     node, packet = upgrade.target.node.name, upgrade.current
     if upgrade.is_restarted:
         at = "" if packet is None else f" at packet {packet.number} of {upgrade.total}"
@@ -200,7 +201,7 @@ def _in_transfer(upgrade: Facts, silent_s: float) -> _Found:
     return _Found(Cause.RECORDING_ENDS, f"{sent}, its answer is not in the trace any more.")
 
 
-def _at_end(upgrade: Facts) -> _Found:
+def _at_end(upgrade: ObservedUpgrade) -> _Found:
     node = upgrade.target.node.name
     if upgrade.running_version is not None:
         if _is_other(upgrade):
@@ -246,7 +247,7 @@ def _times(count: int) -> str:
 # -- what else was remarkable ---------------------------------------------------------------------
 
 
-def remarks(upgrade: Facts, cause: Cause) -> tuple[str, ...]:
+def remarks(upgrade: ObservedUpgrade, cause: Cause) -> tuple[str, ...]:
     """What is worth saying beside the verdict; what the verdict says is left out."""
     found = []
     names = upgrade.boot_names

@@ -13,9 +13,9 @@ from flasher.errors import UsageError
 from flasher.protocol.frame import Frame
 from flasher.trace.bundle import write_bundle
 from flasher.trace.reader import read_trace
-from flasher.trace.ring import FlightRecorder
 from flasher.trace.source import explain_path
 from flasher.trace.story import Cause
+from flasher.trace.taps import FlightRecorder
 
 from .tape import START_S, Tape
 

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from flasher.events import Phase
 from flasher.protocol.frame import Frame
 from flasher.trace.explain import explain
 from flasher.trace.source import explain_path
-from flasher.trace.story import Cause, PacketRun, Phase, Step, StepKind, Story
+from flasher.trace.story import Cause, PacketRun, Step, StepKind, Story
 from tests.peers.wording import READ
 
 from .tape import Tape

@@ -11,8 +11,8 @@ from flasher.cli.documents import as_json
 from flasher.cli.look.explain_text import story_lines
 from flasher.protocol.bittime import message_bits
 from flasher.protocol.frame import Frame
+from flasher.trace.decoder import TimedDecoder, TimedEvent, bits_of
 from flasher.trace.explain import explain
-from flasher.trace.pieces import Piece, Pieces, bits_of
 
 from .tape import Tape
 
@@ -60,14 +60,14 @@ def test_a_spoilt_trace_has_a_story(seed: int) -> None:
 def test_frames_accepted_at_once_leave_as_late_as_the_wire_lets_them() -> None:
     frames = [frame for _, frame in Tape().packet(1).frames]
     wire_s = message_bits(frames) / 250_000
-    pieces = Pieces()
+    pieces = TimedDecoder()
     (piece,) = [piece for each in frames for piece in pieces.feed(each, 5.0, bits_of(each))]
     assert piece.left_s(250_000) == pytest.approx(5.0 + wire_s)
 
 
 def test_frames_stamped_as_they_ended_leave_with_the_last_stamp() -> None:
-    pieces, now = Pieces(), 5.0
-    found: list[Piece] = []
+    pieces, now = TimedDecoder(), 5.0
+    found: list[TimedEvent] = []
     for _, frame in Tape().packet(1).frames:
         now += bits_of(frame) / 250_000
         found += pieces.feed(frame, now, bits_of(frame))

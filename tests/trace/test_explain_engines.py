@@ -10,9 +10,9 @@ from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import TARGETS, WELLING
 from flasher.trace.explain import explain
-from flasher.trace.link import LinkMeter
-from flasher.trace.ring import FlightRecorder
+from flasher.trace.figures import LinkMeter
 from flasher.trace.story import Cause, Story
+from flasher.trace.taps import FlightRecorder
 from tests.end_to_end.world import Traffic, upgrade
 from tests.peers.dialogue import strays
 from tests.peers.scripted_device import DeviceScript, ScriptedDevice

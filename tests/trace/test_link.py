@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from flasher.protocol.spec import BMS, WELLING
-from flasher.trace.link import LinkMeter
+from flasher.trace.figures import LinkMeter
 from tests.trace.tape import FRAME_S, Tape
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from flasher.bus.echoes import ECHO_LIMIT_S, Echoes
 from flasher.protocol.frame import Frame
-from flasher.trace.ring import FlightRecorder
-from flasher.trace.unechoed import Unechoed
+from flasher.trace.taps import FlightRecorder, Unechoed
 
 OWN = Frame(0x752, b"\x01")
 ANSWER = Frame(0x725, b"\x02")

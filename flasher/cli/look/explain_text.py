@@ -8,10 +8,9 @@ from typing import Final
 
 from flasher.cli.output import byte_count, counted, duration, spread_ms
 from flasher.prose import prose
+from flasher.trace.figures import Distribution, LinkReport
 from flasher.trace.story import (
     BusFigures,
-    Distribution,
-    LinkReport,
     PacketRun,
     PacketStory,
     Story,

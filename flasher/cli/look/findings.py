@@ -25,7 +25,7 @@ from flasher.protocol import contents
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import FRAMES_PER_PACKET, Dialect, Node
 from flasher.protocol.text import printable
-from flasher.trace.pieces import bits_of
+from flasher.trace.decoder import bits_of
 
 _SHOWN_AT_MOST: Final = 20
 """Adapters listed."""

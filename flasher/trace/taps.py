@@ -1,14 +1,16 @@
-"""The flight recorder: the last frames in both directions, always, at the price of a few megabytes.
+"""Taps of the driver: the flight recorder, and what keeps echoes from other taps.
 
-Nothing is written until somebody asks for it (`bundle`); memory is bounded whatever a bus carries.
+The flight recorder keeps the last frames in both directions, always, at the price of a few
+megabytes. Nothing is written until somebody asks for it (`bundle`); memory is bounded whatever a
+bus carries.
 """
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
-from typing import Final, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Final, NamedTuple, Protocol
 
 from flasher.protocol.frame import Frame
 
@@ -58,3 +60,25 @@ class FlightRecorder:
     def last(self) -> Entry | None:
         """The latest frame; None before the first."""
         return self._entries[-1] if self._entries else None
+
+
+class _Tap(Protocol):
+    """As `flasher.driver.Tap`."""
+
+    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None: ...
+
+
+class Unechoed:
+    """A driver's tap in front of others, which keeps an adapter's echoes from them: a frame that
+    was sent stands in a trace once. `taps` is asked at each frame: more may come later.
+    """
+
+    def __init__(self, taps: Callable[[], Sequence[_Tap]]) -> None:
+        self._taps = taps
+
+    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
+        """Hand on one frame, unless it is an echo."""
+        if frame.is_echo:
+            return
+        for tap in self._taps():
+            tap(frame, sent=sent, now=now)

@@ -1,0 +1,504 @@
+"""One upgrade of one target as it is heard on the bus: the facts, in the order in which they come.
+
+It is no host and no device: it does not know what has to come next, it takes down what was said.
+What the facts mean is judged by `verdict`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from flasher.events import Phase
+from flasher.protocol.frame import Frame
+from flasher.protocol.messages import BootVersion
+from flasher.protocol.spec import (
+    COMMAND_SIZE,
+    HEADER,
+    OVERHEAD_SIZE,
+    PREFIX_SIZE,
+    Command,
+    Mode,
+    Target,
+)
+from flasher.protocol.text import find_firmware_version
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.protocol.wire import DamageReason
+from flasher.trace.decoder import BusEvent, Kind, TimedEvent
+from flasher.trace.figures import Transfer
+from flasher.trace.steps import StepList, step_of
+from flasher.trace.story import PacketStory, PhaseSpan, Step, StepKind, TraceVerdict
+
+NEXT_UPGRADE_S: Final = 15.0
+"""A reset after so much silence begins another upgrade, not another attempt."""
+_GAP_S: Final = 1.0
+"""Silence that is worth a line."""
+_AT_ONCE_S: Final = 0.3
+"""A tool that gives up waits longer than this for an answer, before it starts over."""
+_IN_VAIN_S: Final = 2 * DEFAULT_TIMINGS.command_timeout_s
+"""A tool that is silent for so long before the transfer has waited for an answer."""
+_LATE_BOOT_S: Final = 0.25
+"""Boot versions up to here after an update command may have been on their way."""
+_VERSION_SIZE: Final = 32
+"""Bytes of the packet before, in which a version that spans two packets may begin."""
+_MAX_NOTED: Final = 10
+"""Different texts of one sort that are kept."""
+
+
+@dataclass(slots=True)
+class PacketRecord:
+    """One packet in one attempt."""
+
+    number: int
+    attempt: int
+    sent_at_s: float
+    left_s: float
+    tries: int = 1
+    naks: int = 0
+    answered_at_s: float | None = None
+    answer_s: float | None = None
+
+    @property
+    def is_clean(self) -> bool:
+        """True while nothing went wrong with it."""
+        return self.tries == 1 and not self.naks
+
+    def story(self) -> PacketStory:
+        return PacketStory(
+            self.number,
+            self.attempt,
+            self.tries,
+            self.naks,
+            self.sent_at_s,
+            self.answered_at_s,
+            self.answer_s,
+        )
+
+
+class Interleaving:
+    """Finds messages that begin inside another one on the same id: two senders at once."""
+
+    def __init__(self) -> None:
+        self.found = 0
+        self._left = 0
+        self._last_at = 0.0
+
+    def frame(self, frame: Frame, now: float) -> None:
+        """One frame on the id."""
+        data = frame.data
+        if _is_head(data):
+            soon = now - self._last_at <= DEFAULT_TIMINGS.inter_frame_timeout_s
+            if self._left > 0 and soon:
+                self.found += 1
+            self._left = OVERHEAD_SIZE + data[PREFIX_SIZE - 1]
+        self._left -= len(data)
+        self._last_at = now
+
+    def answered(self) -> None:
+        """The other side spoke: the message was over, whatever is missing here."""
+        self._left = 0
+
+
+def _is_head(data: bytes) -> bool:
+    return (
+        len(data) > PREFIX_SIZE + 1
+        and data.startswith(HEADER)
+        and data[len(HEADER)] in (Mode.READ, Mode.WRITE)
+        and data[PREFIX_SIZE + 1] == data[PREFIX_SIZE - 1] - COMMAND_SIZE
+    )
+
+
+@dataclass
+class ObservedUpgrade:
+    """One upgrade of one target so far. Times are seconds on the trace's clock.
+
+    `steps` and `link` grow with it; `judge` gives the verdict of an attempt that is followed by
+    another one.
+    """
+
+    target: Target
+    begin_s: float
+    bitrate_bps: int
+    steps: StepList
+    judge: Callable[[ObservedUpgrade, float], TraceVerdict]
+    max_packets: int
+    is_one_tool: bool = False
+    """All that is sent on the tool's id is known to come from one tool."""
+
+    phase: Phase | None = None
+    phase_begin_s: float = 0.0
+    spans: list[PhaseSpan] = field(default_factory=list)
+    attempt: int = 1
+    earlier: TraceVerdict | None = None
+    """That of the attempt before, if it had come to the transfer."""
+    is_answered: bool = False
+    """The target said something intact."""
+
+    # Before the transfer.
+    resets: int = 0
+    feedbacks: int = 0
+    boot_versions: dict[str, int] = field(default_factory=dict)
+    """Name and version, and how often each was announced."""
+    boot_names: set[str] = field(default_factory=set)
+    is_boot_odd: bool = False
+    """A version was announced that has not the document's form."""
+    boot_changes: int = 0
+    """How often a boot version differs from the one before it in the same attempt."""
+    is_announced: bool = False
+    """The bootloader announced itself in this attempt."""
+    updates: int = 0
+    boots_after_update: int = 0
+    feedbacks_after_update: int = 0
+    image_size_bytes: int | None = None
+
+    # The transfer.
+    total: int | None = None
+    packets: list[PacketRecord] = field(default_factory=list)
+    """In the order of first copies; their number is limited."""
+    current: PacketRecord | None = None
+    restarts: int = 0
+    is_restarted: bool = False
+    """The device restarted and has not been told to prepare since."""
+    damage_from_tool: int = 0
+    damage_from_device: int = 0
+    damage_now: int = 0
+    """Damage since the last progress."""
+    is_cut_short: bool = False
+    """The latest thing on the tool's id is a message that was never finished."""
+    errors: int = 0
+    errors_now: int = 0
+    """Error frames since the last progress."""
+    extra_acks: int = 0
+    """ACKs for a packet that was sent once and had its ACK already."""
+    image_versions: set[str] = field(default_factory=set)
+    """Firmware versions found inside the packets."""
+
+    # The end.
+    ends: int = 0
+    end_naks: int = 0
+    boots_after_end: int = 0
+    completed_at_s: float | None = None
+    early_complete: bool = False
+    running_version: str | None = None
+
+    # Others.
+    shutdown_at_s: float | None = None
+    intrusions: list[str] = field(default_factory=list)
+    """What the tool's id said that this upgrade does not explain."""
+    interleaving: Interleaving = field(default_factory=Interleaving)
+
+    def __post_init__(self) -> None:
+        self.last_at_s = self.tool_at_s = self.begin_s
+        """The latest message of either side, and of the tool."""
+        self.link = Transfer(self.bitrate_bps)
+        self._update_at_s = self._request_at_s = self.begin_s
+        self._by_number: dict[int, PacketRecord] = {}
+        self._last_boot = ""
+        self._tail = b""
+
+    @property
+    def is_restart(self) -> bool:
+        """So far the device was restarted and announced itself, and was told of no update."""
+        return self.is_announced and not self.updates and self.phase is Phase.BOOT
+
+    # -- what is told to it ------------------------------------------------------------------------
+
+    def begins_another(self, event: BusEvent) -> bool:
+        """True when a message of the tool belongs to the next upgrade, not to this one."""
+        is_over = self.completed_at_s is not None or self.early_complete
+        if event.command == Command.RESET:
+            return is_over or event.at - self.last_at_s > NEXT_UPGRADE_S
+        if event.command == Command.UPDATE:
+            return self.completed_at_s is not None
+        return False
+
+    def tool(self, timed: TimedEvent) -> None:
+        """Something on the id of the tool's messages to the target."""
+        self._silence(timed.begin_s)
+        values = values_of(timed.event)
+        is_damaged = timed.event.kind is Kind.DAMAGED
+        self.damage_from_tool += is_damaged
+        self.damage_now += is_damaged
+        self.is_cut_short = is_damaged and values["reason"] == DamageReason.INCOMPLETE.value
+        if timed.event.kind is Kind.MESSAGE and timed.event.command == Command.PACKET:
+            self._packet(timed, values)
+        else:
+            self.steps.add(step_of(timed.event, timed.end_s))
+            self._tool_says(timed, values)
+        self.last_at_s = self.tool_at_s = timed.end_s
+
+    def device(self, timed: TimedEvent) -> None:
+        """Something on the id of the target's answers to the tool."""
+        self._silence(timed.begin_s)
+        self.interleaving.answered()
+        self.is_answered |= timed.event.kind is not Kind.DAMAGED
+        step = step_of(timed.event, timed.end_s)
+        values = values_of(timed.event)
+        if timed.event.kind is Kind.MESSAGE and timed.event.command == Command.ACK:
+            self.steps.ack(values["number"], step)
+            self._ack(values["number"], timed)
+        else:
+            self.steps.add(step)
+            if timed.event.kind is Kind.DAMAGED:
+                self.damage_from_device += 1
+                self.damage_now += 1
+            elif timed.event.kind is Kind.MESSAGE:
+                self._device_says(timed, values)
+        self.last_at_s = timed.end_s
+
+    def version(self, timed: TimedEvent) -> None:
+        """The target's application told its version."""
+        self.steps.add(step_of(timed.event, timed.end_s))
+        if self.ends:
+            self._enter(Phase.CONFIRM, timed.begin_s)
+            self.running_version = str(values_of(timed.event)["firmware_version"])
+            self.last_at_s = timed.end_s
+
+    def shutdown(self, timed: TimedEvent) -> None:
+        """The battery announced that it switches off."""
+        if self.shutdown_at_s is None:
+            self.shutdown_at_s = timed.end_s
+            self.steps.add(step_of(timed.event, timed.end_s))
+
+    def error_frame(self, at_s: float) -> None:
+        """An error frame."""
+        self.errors += 1
+        self.errors_now += 1
+        self.steps.error_frame(at_s)
+
+    def finish(self) -> None:
+        """Nothing more will come."""
+        self._leave(self.last_at_s)
+
+    # -- the tool ----------------------------------------------------------------------------------
+
+    def _tool_says(self, timed: TimedEvent, values: dict[str, Any]) -> None:
+        event = timed.event
+        if event.kind is not Kind.MESSAGE:
+            return
+        match event.command:
+            case Command.RESET:
+                self._reset(timed)
+            case Command.UPDATE:
+                self._update(timed, values["size_bytes"])
+            case Command.END_OF_TRANSFER:
+                self.ends += 1
+                if self.completed_at_s is None:
+                    self._enter(Phase.END, timed.begin_s)
+                    self._progress()
+            case _ if self.phase is Phase.TRANSFER:
+                self._intrude(f"{event.title} (command {event.command:04X})")
+            case _ if self.phase is Phase.END and event.command == Command.READ_VERSION:
+                self._enter(Phase.CONFIRM, timed.begin_s)
+
+    def _reset(self, timed: TimedEvent) -> None:
+        is_early = self.phase in (None, Phase.RESET, Phase.BOOT)
+        if is_early and self._gave_up(timed.begin_s):
+            self._next_attempt(timed.begin_s)
+        self.resets += 1
+        if is_early:
+            if self.phase is None:
+                self._enter(Phase.RESET, timed.begin_s)
+        elif self._is_undisturbed(timed.begin_s):
+            self._intrude("reset")
+        else:
+            self._next_attempt(timed.begin_s)
+            self._enter(Phase.RESET, timed.begin_s)
+
+    def _update(self, timed: TimedEvent, size_bytes: int) -> None:
+        if self._is_undisturbed(timed.begin_s):
+            self._intrude("update command")
+            return
+        in_silence = not self.is_announced and self._gave_up(timed.begin_s)
+        if self.phase in (Phase.TRANSFER, Phase.END, Phase.CONFIRM) or in_silence:
+            self._next_attempt(timed.begin_s)
+        self.updates += 1
+        self.image_size_bytes = size_bytes
+        self.is_restarted = False
+        if self.phase is not Phase.UPDATE:
+            self._update_at_s = timed.end_s
+        self._enter(Phase.UPDATE, timed.begin_s)
+
+    def _gave_up(self, now: float) -> bool:
+        """True when a tool that has told the device to update before waited for it in vain: what it
+        sends now is its next attempt.
+        """
+        return self.updates > 0 and now - self.tool_at_s >= _IN_VAIN_S
+
+    def _is_undisturbed(self, now: float) -> bool:
+        """True while all goes well, so that no tool has a reason to start over."""
+        if self.is_one_tool:
+            return False
+        packet = self.current
+        running = self.phase is Phase.TRANSFER and packet is not None and packet.is_clean
+        return running and now - self.last_at_s < _AT_ONCE_S and not self.is_restarted
+
+    def _intrude(self, what: str) -> None:
+        if len(self.intrusions) < _MAX_NOTED:
+            at = "" if self.current is None else f" while packet {self.current.number} was in work"
+            self.intrusions.append(f"{what}{at}")
+
+    def _packet(self, timed: TimedEvent, values: dict[str, Any]) -> None:
+        number = values["number"]
+        self.steps.packet(number, timed.begin_s, step_of(timed.event, timed.end_s))
+        if self.phase is not Phase.TRANSFER or (self.is_restarted and number == 1):
+            if self.phase in (Phase.END, Phase.CONFIRM) or self.is_restarted:
+                self._next_attempt(timed.begin_s)
+            self._enter(Phase.TRANSFER, timed.begin_s)
+        self.total = values["total"]
+        self._look_for_version(bytes.fromhex(values["payload"]))
+        self.link.packet(number, timed)
+        record = self._by_number.get(number)
+        current = self.current
+        if record is None:
+            left_s = timed.left_s(self.bitrate_bps)
+            record = PacketRecord(number, self.attempt, timed.end_s, left_s)
+            self._by_number[number] = record
+            if len(self.packets) < self.max_packets:
+                self.packets.append(record)
+        else:
+            if current is not None and current.number > number and record.answered_at_s:
+                self._intrude(f"packet {number} once more")
+                return
+            record.tries += 1
+            record.left_s = timed.left_s(self.bitrate_bps)
+        self.current = record
+
+    def _look_for_version(self, payload: bytes) -> None:
+        found = find_firmware_version(self._tail + payload)
+        if found is not None and len(self.image_versions) < _MAX_NOTED:
+            self.image_versions.add(found)
+        self._tail = payload[-_VERSION_SIZE:]
+
+    # -- the device --------------------------------------------------------------------------------
+
+    def _device_says(self, timed: TimedEvent, values: dict[str, Any]) -> None:
+        match timed.event.command:
+            case Command.GENERAL_FEEDBACK:
+                self._feedback(timed)
+            case Command.BOOT_VERSION:
+                self._boot_version(timed, values)
+            case Command.REQUEST_TRANSFER:
+                self._request(timed)
+            case Command.NAK:
+                self._nak(values["number"], timed)
+            case Command.COMPLETE:
+                self._complete(timed)
+
+    def _feedback(self, timed: TimedEvent) -> None:
+        self.feedbacks += 1
+        if self.phase is Phase.RESET:
+            self._enter(Phase.BOOT, timed.end_s)
+        elif self.phase in (Phase.UPDATE, Phase.TRANSFER):
+            self.feedbacks_after_update += 1
+
+    def _boot_version(self, timed: TimedEvent, values: dict[str, Any]) -> None:
+        now, text = timed.end_s, f"{values['name']} {values['version']}"
+        self.boot_changes += bool(self._last_boot) and text != self._last_boot
+        self._last_boot = text
+        self.is_announced = True
+        if text in self.boot_versions or len(self.boot_versions) < _MAX_NOTED:
+            self.boot_versions[text] = self.boot_versions.get(text, 0) + 1
+            self.boot_names.add(values["name"])
+            self.is_boot_odd |= not BootVersion(values["name"], values["version"]).is_version
+        match self.phase:
+            case None | Phase.RESET:
+                self._enter(Phase.BOOT, timed.begin_s)
+            case Phase.UPDATE if now - self._update_at_s > _LATE_BOOT_S:
+                self.boots_after_update += 1
+            case Phase.TRANSFER:
+                if now - self._request_at_s > DEFAULT_TIMINGS.leftover_boot_version_s:
+                    self._restarted()
+            case Phase.END | Phase.CONFIRM if self.completed_at_s is None:
+                self.boots_after_end += 1
+
+    def _request(self, timed: TimedEvent) -> None:
+        if self.phase is Phase.TRANSFER and self.current is not None:
+            if self.current.number > 1 or self.current.answered_at_s is not None:
+                self._restarted()
+            return
+        self._request_at_s = timed.end_s
+        self.link.begin_attempt()
+        self._enter(Phase.TRANSFER, timed.end_s)
+        self._progress()
+
+    def _restarted(self) -> None:
+        if not self.is_restarted:
+            self.is_restarted = True
+            self.restarts += 1
+
+    def _ack(self, number: int, timed: TimedEvent) -> None:
+        if self.phase is not Phase.TRANSFER:
+            return
+        self.link.answer(number, timed, is_ack=True)
+        packet = self._by_number.get(number)
+        if packet is None:
+            return
+        if packet.answered_at_s is not None:
+            self.extra_acks += packet.is_clean
+            return
+        packet.answered_at_s = timed.end_s
+        packet.answer_s = max(0.0, timed.end_s - packet.left_s)
+        self._progress()
+
+    def _nak(self, number: int, timed: TimedEvent) -> None:
+        if self.phase is Phase.TRANSFER:
+            self.link.answer(number, timed, is_ack=False)
+            if self.current is not None and self.current.number == number:
+                self.current.naks += 1
+        elif self.phase in (Phase.END, Phase.CONFIRM):
+            self.end_naks += 1
+
+    def _complete(self, timed: TimedEvent) -> None:
+        if not self.ends:
+            self.early_complete = True
+        elif self.completed_at_s is None:
+            self.completed_at_s = timed.end_s
+
+    # -- phases, attempts and silence --------------------------------------------------------------
+
+    def _enter(self, phase: Phase, at_s: float) -> None:
+        """A phase begins, or goes on."""
+        if self.phase is not phase:
+            self._leave(at_s)
+            self.phase, self.phase_begin_s = phase, at_s
+
+    def _leave(self, at_s: float) -> None:
+        """The phase, if there is one, is over."""
+        if self.phase is not None:
+            end_s = max(self.phase_begin_s, at_s)
+            self.spans.append(PhaseSpan(self.phase, self.attempt, self.phase_begin_s, end_s))
+
+    def _progress(self) -> None:
+        """Something went well: trouble before it explains nothing any more."""
+        self.damage_now = self.errors_now = 0
+
+    def _next_attempt(self, at_s: float) -> None:
+        """The tool starts over: what belongs to one attempt alone begins anew."""
+        if self.phase in (Phase.TRANSFER, Phase.END):
+            self.earlier = self.judge(self, at_s)
+        self._leave(at_s)
+        self.phase = None
+        self.attempt += 1
+        self.current = None
+        self.ends = self.end_naks = self.boots_after_end = self.boots_after_update = 0
+        self.feedbacks_after_update = self.feedbacks = self.resets = 0
+        self.is_restarted = self.early_complete = self.is_announced = False
+        self._progress()
+        self.link.begin_attempt()
+        self._by_number = {}
+        self._last_boot = ""
+
+    def _silence(self, until_s: float) -> None:
+        silent_s = until_s - self.last_at_s
+        if silent_s >= _GAP_S:
+            text = f"{silent_s:.2f} s without a message between tool and device"
+            self.steps.add(
+                Step(self.last_at_s, StepKind.GAP, "", "", "silence", text, is_trouble=False)
+            )
+
+
+def values_of(event: BusEvent) -> dict[str, Any]:
+    """The values of the fields by their names."""
+    return {shown.name: shown.value for shown in event.fields}
