@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, Self
 
-from flasher.image.marks import named_targets
-from flasher.protocol.spec import Target
-from flasher.protocol.text import find_firmware_version
+from flasher.protocol.spec import TARGETS, Target
+from flasher.protocol.text import find_firmware_version, firmware_version_spans
 
 ADDRESS_SPACE: Final = 1 << 32
 """One past the highest address that a file can name."""
@@ -78,3 +78,42 @@ class Image:
     def named_targets(self) -> frozenset[Target]:
         """The targets that `data` names by itself; empty when it names none."""
         return named_targets(self.data)
+
+
+# -- which targets an image names -----------------------------------------------------------------
+
+# Only strong evidence counts, since a wrong guess would refuse a good image: the name of a device
+# right beside a firmware version, or the whole text of an update command.
+
+NEIGHBOURHOOD_SIZE: Final = 64
+"""In bytes, before and behind a firmware version: a name in there belongs to it."""
+
+
+def _whole_words(texts: dict[str, Target]) -> re.Pattern[bytes]:
+    """Finds each of these texts where no letter, digit or underscore touches it."""
+    choice = "|".join(map(re.escape, texts)).encode("ascii")
+    return re.compile(rb"(?<![A-Za-z0-9_])(?:" + choice + rb")(?![A-Za-z0-9_])")
+
+
+_NAMES: Final = {
+    name: target for target in TARGETS.values() for name in (target.node.name, target.boot_name)
+}
+_UPDATE_TEXTS: Final = {target.update_text: target for target in TARGETS.values()}
+_NAME: Final = _whole_words(_NAMES)
+_UPDATE_TEXT: Final = _whole_words(_UPDATE_TEXTS)
+
+
+def named_targets(data: bytes) -> frozenset[Target]:
+    """The targets that an image names; empty when it names none, several for mixed texts."""
+    found = {_UPDATE_TEXTS[match[0].decode("ascii")] for match in _UPDATE_TEXT.finditer(data)}
+    for start, end in firmware_version_spans(data):
+        # The version itself ends a word: in a packed structure nothing else separates them.
+        before = _NAME.finditer(data, max(0, start - NEIGHBOURHOOD_SIZE), start)
+        behind = _NAME.finditer(data[end : end + NEIGHBOURHOOD_SIZE + 1])
+        found |= {_NAMES[match[0].decode("ascii")] for match in before}
+        found |= {
+            _NAMES[match[0].decode("ascii")]
+            for match in behind
+            if match.end() <= NEIGHBOURHOOD_SIZE
+        }
+    return frozenset(found)

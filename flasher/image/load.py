@@ -1,28 +1,75 @@
-"""A file to an `Image`: choose the format, read it sparse, check it, join it."""
+"""A file to an `Image`: choose the format, read it sparse, check it, join it.
+
+The format is found by the content first and the suffix second. A damaged text file of records is
+still one, and is refused as such by its reader. What is none of the formats is taken for a raw
+binary; whether it can be a program is judged by `flasher.image.plausible`.
+"""
 
 from __future__ import annotations
 
+import codecs
 import os
+import re
 from dataclasses import replace
+from enum import Enum
+from pathlib import PurePath
 from typing import BinaryIO, Final
 
 from flasher.errors import ImageError, UsageError
 from flasher.files import opened
-from flasher.image import elf, hexfile, srec
+from flasher.image import elf
 from flasher.image.cortexm import check_starts_inside
-from flasher.image.detect import HEAD_SIZE, Format, detect
 from flasher.image.image import ADDRESS_SPACE, Image
+from flasher.image.records import read_hex, read_srec
 from flasher.image.segments import SparseBytes, too_large
 from flasher.protocol.spec import IMAGE_MAX_SIZE
 from flasher.protocol.text import find_firmware_version, printable
 
+HEAD_SIZE: Final = 65_536
+"""How much of a file is looked at to find its format, in bytes."""
+_LINES_JUDGED: Final = 100
 DEFAULT_FILL_GAPS_UP_TO: Final = 4096
 """In bytes. Covers the room between a vector table and the code; a larger gap is another part."""
 FILE_MAX_SIZE: Final = 128 * 1024 * 1024
 """In bytes, of any format but a raw binary: beyond, a file is not read at all."""
+
+
+class Format(Enum):
+    """The formats; the value is the option's word, `title` what it is called in messages."""
+
+    HEX = "hex"
+    BIN = "bin"
+    SREC = "srec"
+    ELF = "elf"
+
+    @property
+    def title(self) -> str:
+        return _TITLES[self]
+
+
+_TITLES: Final = {
+    Format.HEX: "Intel HEX",
+    Format.BIN: "raw binary",
+    Format.SREC: "Motorola S-record",
+    Format.ELF: "ELF",
+}
+_SUFFIXES: Final = {
+    **dict.fromkeys((".hex", ".ihx", ".ihex", ".h86", ".mcs"), Format.HEX),
+    **dict.fromkeys(
+        (".s19", ".s28", ".s37", ".srec", ".sre", ".s", ".mot", ".mhx", ".sx", ".s1", ".s2", ".s3"),
+        Format.SREC,
+    ),
+    **dict.fromkeys((".elf", ".axf"), Format.ELF),
+}
+_RECORDS: Final = {
+    Format.HEX: re.compile(rb":[0-9A-Fa-f]{8}"),
+    Format.SREC: re.compile(rb"S[0-9][0-9A-Fa-f]{4}"),
+}
+_STARTS: Final = {Format.HEX: re.compile(rb":"), Format.SREC: re.compile(rb"S[0-9]")}
+_TEXT: Final = bytes(range(0x20, 0x7F)) + b"\t\n\v\f\r"
 FORMATS: Final = tuple(form.value for form in Format)
 """The words that `format` takes."""
-_READERS: Final = {Format.HEX: hexfile.read, Format.SREC: srec.read, Format.ELF: elf.read}
+_READERS: Final = {Format.HEX: read_hex, Format.SREC: read_srec, Format.ELF: elf.read}
 
 
 def load(
@@ -47,7 +94,9 @@ def load(
     _check_options(format, base, range_, fill_gaps_up_to)
     source = printable(os.fspath(path))
     with opened(path, None, error=ImageError) as (file, size_bytes):
-        form = Format(format) if format else _detect(file, source)
+        head = file.read(HEAD_SIZE)
+        file.seek(0)
+        form = Format(format) if format else _detect(head, source)
         sparse = SparseBytes(source, range_)
         if form is Format.BIN:
             image = _binary(file, size_bytes, sparse, base, fill_gaps_up_to)
@@ -67,8 +116,7 @@ def load(
             _READERS[form](file, source, sparse)
             image = _joined(sparse, form, fill_gaps_up_to)
         if form is Format.ELF:
-            file.seek(0)
-            image = replace(image, elf_machine=elf.machine_of(file.read(HEAD_SIZE)))
+            image = replace(image, elf_machine=elf.machine_of(head))
     if not allow_outside_vector:
         check_starts_inside(image)
     return image
@@ -90,10 +138,29 @@ def _check_options(
         raise UsageError(f"gaps cannot be filled up to {fill_gaps_up_to} bytes")
 
 
-def _detect(file: BinaryIO, source: str) -> Format:
-    head = file.read(HEAD_SIZE)
-    file.seek(0)
-    return detect(head, source)
+def _detect(head: bytes, source: str) -> Format:
+    """The format of a file that starts with `head` (its first `HEAD_SIZE` bytes)."""
+    if head.startswith(elf.MAGIC):
+        return Format.ELF
+    body = head.removeprefix(codecs.BOM_UTF8).lstrip()
+    if _is_mostly_text(body):
+        for form, start in _STARTS.items():
+            if start.match(body):
+                return form
+    lines = [line.strip() for line in body.splitlines()[:_LINES_JUDGED]]
+    for form, record in _RECORDS.items():
+        matching = sum(record.match(line) is not None for line in lines)
+        if 2 * matching > len(lines):
+            return form
+    suffix = PurePath(source).suffix.lower()
+    if suffix in _SUFFIXES:
+        return _SUFFIXES[suffix]
+    return Format.BIN
+
+
+def _is_mostly_text(head: bytes) -> bool:
+    """A damaged text file still is; a program that happens to begin like a record is not."""
+    return 2 * len(head.translate(None, _TEXT)) <= len(head)
 
 
 def _binary(

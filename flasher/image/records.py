@@ -1,4 +1,4 @@
-"""What Intel HEX and S-record files have in common: lines of hex digits with a check sum.
+"""Intel HEX and Motorola S-record: lines of hex digits with a check sum.
 
 Every record is checked and decoded in one pass, in constant memory. Libraries that read these
 formats accept a missing end record, addresses that wrap around and bytes that contradict each
@@ -15,6 +15,7 @@ from typing import BinaryIO, Final
 
 from flasher.errors import ImageError
 from flasher.image.image import ADDRESS_SPACE
+from flasher.image.segments import SparseBytes
 
 LINES_MAX: Final = 1_100_000
 """The largest image has 1,048,560 records of eight bytes, and programs write 16 or 32. Bounds the
@@ -25,7 +26,7 @@ _SHOWN_MAX: Final = 40
 
 
 @dataclass
-class Scanner:
+class _Scanner:
     """The lines of one file, and the refusals that both formats share."""
 
     file: BinaryIO
@@ -72,17 +73,30 @@ class Scanner:
                 "the file was cut off while it was written or copied",
             )
 
-    def unhex(self, digits: str, text: str) -> bytes:
-        """The bytes of a record's digits; raises ImageError when they are not pairs of digits."""
-        try:
-            return unhexlify(digits)
-        except (HexError, ValueError):
-            raise self.refuse(f"{shown(text)} is not made of pairs of hex digits") from None
+    def record(
+        self, text: str, digits_at: int, *, least_size: int, uncounted_size: int, total: int
+    ) -> bytes:
+        """The bytes of the record `text`, whose hex digits begin at `digits_at`: first a count of
+        all but `uncounted_size` bytes, last a check sum, by which they add up to `total`.
 
-    def check_end(self, end: int) -> None:
-        """Raises ImageError when bytes lie beyond the 32-bit address space."""
-        if end > ADDRESS_SPACE:
+        Raises ImageError when anything of this is wrong.
+        """
+        try:
+            record = unhexlify(text[digits_at:])
+        except (HexError, ValueError):
+            raise self.refuse(f"{_shown(text)} is not made of pairs of hex digits") from None
+        if len(record) < least_size or len(record) != uncounted_size + record[0]:
+            raise self.refuse(f"{_shown(text)} does not have the length that it states")
+        if sum(record) & 0xFF != total:
+            computed = (total - sum(record[:-1])) & 0xFF
+            raise self.refuse(f"the check sum is {record[-1]:02X}, computed {computed:02X}")
+        return record
+
+    def add(self, into: SparseBytes, address: int, data: bytes) -> None:
+        """Take the data of a record. Raises ImageError beyond the 32-bit address space."""
+        if address + len(data) > ADDRESS_SPACE:
             raise self.refuse("the record runs past the last 32-bit address, 0xFFFFFFFF")
+        into.add(address, data, self.place)
 
     def refuse(self, what: str, cause: str = "") -> ImageError:
         """The error for the line read last."""
@@ -98,7 +112,98 @@ class Scanner:
         return f"line {self.line}"
 
 
-def shown(text: str) -> str:
+def _shown(text: str) -> str:
     """A line for a message: escaped, and not too long."""
     cut = text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
     return ascii(cut)
+
+
+# -- Intel HEX ------------------------------------------------------------------------------------
+
+# Record: colon, then size, 16-bit address, type, data and check sum; all bytes together add up to
+# 0. Types: 00 data, 01 end, 02 extended segment address (times 16), 03 and 05 start address (of no
+# use here), 04 extended linear address (upper 16 bits).
+_DATA, _END, _SEGMENT, _START_SEGMENT, _LINEAR, _START_LINEAR = range(6)
+_SIZES: Final = {_END: 0, _SEGMENT: 2, _START_SEGMENT: 4, _LINEAR: 2, _START_LINEAR: 4}
+_HEAD_SIZE: Final = 4
+_OVERHEAD_SIZE: Final = _HEAD_SIZE + 1
+_SEGMENT_SIZE: Final = 0x1_0000
+
+
+def read_hex(file: BinaryIO, source: str, into: SparseBytes) -> None:
+    """All data of an Intel HEX file. Raises ImageError with the line number on any damage."""
+    scanner = _Scanner(file, source, "Intel HEX")
+    offset = 0
+    is_linear = False
+    for text in scanner.lines():
+        if text[0] != ":":
+            raise scanner.refuse(f"{_shown(text)} does not start with a colon")
+        record = scanner.record(
+            text, 1, least_size=_OVERHEAD_SIZE, uncounted_size=_OVERHEAD_SIZE, total=0
+        )
+        kind, data = record[3], record[_HEAD_SIZE:-1]
+        address = int.from_bytes(record[1:3], "big")
+        if kind > _START_LINEAR:
+            raise scanner.refuse(f"there is no record type {kind:02X}")
+        if _SIZES.get(kind, len(data)) != len(data):
+            raise scanner.refuse(f"a record of type {kind:02X} holds {len(data)} bytes")
+        if kind == _DATA and data:
+            # Only under an extended linear address may a record go on beyond 64 KiB: elsewhere the
+            # format has it wrap around and programs do not agree on it.
+            if not is_linear and address + len(data) > _SEGMENT_SIZE:
+                raise scanner.refuse("the record runs past the end of its 64 KiB segment")
+            scanner.add(into, offset + address, data)
+        elif kind in (_SEGMENT, _LINEAR):
+            if address:
+                raise scanner.refuse("an extended address record has an address of its own")
+            is_linear = kind == _LINEAR
+            offset = int.from_bytes(data, "big") << (16 if is_linear else 4)
+        elif kind == _END:
+            scanner.ended = True
+
+
+# -- Motorola S-record ----------------------------------------------------------------------------
+
+# Record: S and type digit, then the count of what follows, an address, data and check sum; count to
+# check sum add up to FF. Types: 0 header, 1 2 3 data with 16, 24, 32-bit address, 5 6 count of data
+# records, 7 8 9 end. Some programs (bincopy is one) write the count and no end: a right count shows
+# as well that nothing was lost, so it is taken for an end.
+_ADDRESS_SIZES: Final = {
+    "0": 2, "1": 2, "2": 3, "3": 4, "5": 2, "6": 3, "7": 4, "8": 3, "9": 2,
+}  # fmt: skip
+_HEADER: Final = "0"
+_DATA_KINDS: Final = "123"
+_COUNTS: Final = "56"
+_ENDS: Final = "789"
+
+
+def read_srec(file: BinaryIO, source: str, into: SparseBytes) -> None:
+    """All data of an S-record file. Raises ImageError with the line number on any damage."""
+    scanner = _Scanner(file, source, "Motorola S-record")
+    data_records = 0
+    first_line = 0
+    for text in scanner.lines():
+        kind = text[1:2]
+        if text[0] != "S" or kind not in _ADDRESS_SIZES:
+            raise scanner.refuse(f"{_shown(text)} does not start with S and a record type")
+        data_at = 1 + _ADDRESS_SIZES[kind]
+        record = scanner.record(text, 2, least_size=data_at + 1, uncounted_size=1, total=0xFF)
+        address, data = int.from_bytes(record[1:data_at], "big"), record[data_at:-1]
+        if data and kind in _COUNTS + _ENDS:
+            raise scanner.refuse(f"a record of type S{kind} holds {len(data)} bytes of data")
+        first_line = first_line or scanner.line
+        if kind == _HEADER and scanner.line != first_line:
+            raise scanner.refuse(
+                "a header stands behind another record",
+                "a damaged type: no check sum covers it, and this would lose a data record",
+            )
+        if kind in _DATA_KINDS:
+            data_records += 1
+            scanner.add(into, address, data)
+        scanner.counted = kind in _COUNTS
+        if scanner.counted and address != data_records:
+            raise scanner.refuse(
+                f"{data_records} data records stand before the count of {address}",
+                "lines were lost or doubled",
+            )
+        scanner.ended = kind in _ENDS

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import struct
+from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
+from typing import BinaryIO
 
 import bincopy
 import pytest
@@ -14,8 +15,9 @@ from hypothesis import strategies as st
 from intelhex import IntelHex
 
 from flasher.errors import ImageError
-from flasher.image import elf, hexfile, srec
+from flasher.image import elf
 from flasher.image.load import load
+from flasher.image.records import read_hex, read_srec
 from flasher.image.segments import SparseBytes
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
@@ -255,12 +257,14 @@ SMALL_SREC = "S00400004AB1\nS3090800001001020304D4\nS3090800001405060708C0\nS705
 
 
 @pytest.mark.parametrize(
-    ("module", "text"), [(hexfile, SMALL_HEX), (srec, SMALL_SREC)], ids=["hex", "srec"]
+    ("read_records", "text"), [(read_hex, SMALL_HEX), (read_srec, SMALL_SREC)], ids=["hex", "srec"]
 )
-def test_no_single_changed_character_gives_other_bytes(module: ModuleType, text: str) -> None:
+def test_no_single_changed_character_gives_other_bytes(
+    read_records: Callable[[BinaryIO, str, SparseBytes], None], text: str
+) -> None:
     def read(content: str) -> tuple[bytes, int]:
         sparse = SparseBytes("app")
-        module.read(io.BytesIO(content.encode()), "app", sparse)
+        read_records(io.BytesIO(content.encode()), "app", sparse)
         return sparse.join(4096)
 
     assert read(text) == (bytes(range(1, 9)), 0x0800_0010)

@@ -305,7 +305,7 @@ def test_a_file_that_fails_while_it_is_read_is_refused(monkeypatch: pytest.Monke
     def failing(*_: object) -> None:
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr(load_module, "detect", failing)
+    monkeypatch.setattr(load_module, "_detect", failing)
     with pytest.raises(ImageError, match="cannot be read: Input/output error"):
         load(SAMPLES / "wmc.hex")
 

@@ -7,9 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from flasher.image.image import Image
+from flasher.image.image import NEIGHBOURHOOD_SIZE, Image, named_targets
 from flasher.image.load import load
-from flasher.image.marks import NEIGHBOURHOOD_SIZE, named_targets
 from flasher.protocol.spec import BMS, OBC, TARGETS, WMC, Target
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
