@@ -21,7 +21,7 @@ from flasher.conformance.results import (
     TraceEntry,
 )
 from flasher.protocol.frame import Frame
-from flasher.report import chart, spread
+from flasher.report import chart
 from flasher.report.base import Status, render_page
 from flasher.trace.decoder import BusEvent, Decoder
 from flasher.trace.figures import Distribution
@@ -90,7 +90,7 @@ class TimesView(NamedTuple):
     name: str
     distribution: Distribution
     uncertainty_s: float
-    histograms: dict[str, spread.Histogram]
+    histograms: dict[str, chart.Histogram]
     """A drawing for each width; empty where there is nothing to draw."""
 
 
@@ -131,7 +131,7 @@ def _times(report: RunReport) -> Sequence[TimesView]:
         is_spread = found.minimum_s > 0 and found.maximum_s - found.minimum_s > _CLOCK_S
         if found.count >= HISTOGRAM_LEAST and is_spread:
             values_s = [one.value_s for one in measured]
-            drawings = {width: spread.histogram(values_s, at) for width, at in chart.WIDTHS.items()}
+            drawings = {width: chart.histogram(values_s, at) for width, at in chart.WIDTHS.items()}
         unsure_s = max(one.uncertainty_s for one in measured)
         views.append(TimesView(name, found, unsure_s, drawings))
     return views

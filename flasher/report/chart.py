@@ -1,4 +1,6 @@
-"""The latency chart as numbers: where every dot and tick lies. `templates/charts.html` draws it.
+"""Charts as numbers: where every dot, bar and tick lies. `templates/charts.html` draws them.
+
+Answer time over packet number, a histogram, and a distribution on one line.
 
 Pure layout. A chart is made for a width in CSS pixels, so that its text has its full size both
 on a phone and on a desk (`WIDTHS`). Long series are drawn as stretches, so that a chart has a
@@ -7,33 +9,32 @@ bounded size however long the series is.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from statistics import median
 from typing import Final, NamedTuple
 
-from flasher.report.scale import (
-    Axis,
-    Tick,
-    duration_text,
-    middle,
-    slices,
-    whole_ticks,
-)
+from flasher.report.scale import Axis, Tick, duration_text, linear_ticks, slices, whole_ticks
+from flasher.trace.figures import Distribution
 
 WIDTHS: Final = {"wide": 880, "narrow": 340}
 """Width of a drawing for each class of the style sheet; a page holds both and shows one."""
 _DOTS_PER_WIDTH: Final = 0.5
 """More samples than this a pixel are drawn as stretches with minimum, median and maximum."""
 _STRETCH_WIDTH: Final = 6
-LEFT: Final = 58
-RIGHT: Final = 14
-TOP: Final = 12
+_LEFT: Final = 58
+_RIGHT: Final = 14
+_TOP: Final = 12
 _LATENCY_HEIGHT: Final = 200
 _LANE_HEIGHT: Final = 18
 _LANE_GAP: Final = 6
 _Y_INTERVALS: Final = 7
-AXIS_HEIGHT: Final = 40
+_AXIS_HEIGHT: Final = 40
+_HISTOGRAM_HEIGHT: Final = 150
+_BINS: Final = 20
+_SPREAD_HEIGHT: Final = 54
 
 
 class Frame(NamedTuple):
@@ -126,14 +127,14 @@ def latency_chart(samples: Sequence[Sample], width: float) -> LatencyChart:
     """The chart of these packets, in order, `width` CSS pixels wide. Raises ValueError for none."""
     if not samples:
         raise ValueError("no packets")
-    plot_width = width - LEFT - RIGHT
+    plot_width = width - _LEFT - _RIGHT
     kinds = [kind for kind in MarkKind if any(_count(sample, kind) for sample in samples)]
-    bottom = TOP + _LATENCY_HEIGHT
+    bottom = _TOP + _LATENCY_HEIGHT
     lanes_top = bottom + _LANE_GAP
-    height = lanes_top + _LANE_HEIGHT * len(kinds) + AXIS_HEIGHT
-    frame = Frame(width, height, LEFT, TOP, width - RIGHT, bottom)
+    height = lanes_top + _LANE_HEIGHT * len(kinds) + _AXIS_HEIGHT
+    frame = Frame(width, height, _LEFT, _TOP, width - _RIGHT, bottom)
     known = [sample.seconds for sample in samples if sample.seconds is not None]
-    y_axis = Axis.over(known, bottom, TOP, from_zero=True, intervals=_Y_INTERVALS)
+    y_axis = Axis.over(known, bottom, _TOP, from_zero=True, intervals=_Y_INTERVALS)
     groups = slices(len(samples), len(samples))
     folded = len(samples) > plot_width * _DOTS_PER_WIDTH
     if folded:
@@ -165,7 +166,7 @@ def _places(count: int, frame: Frame) -> Callable[[float], float]:
 
 def _number_ticks(samples: Sequence[Sample], frame: Frame) -> Iterable[Tick]:
     """Ticks at round packet numbers; where numbers are missing, at round counts of packets."""
-    begin, end, intervals = frame.left + 4, frame.right - 4, intervals_for(frame.width)
+    begin, end, intervals = frame.left + 4, frame.right - 4, _intervals_for(frame.width)
     first, last = samples[0].number, samples[-1].number
     if last - first == len(samples) - 1:
         yield from whole_ticks(first, last, begin, end, intervals)
@@ -174,7 +175,7 @@ def _number_ticks(samples: Sequence[Sample], frame: Frame) -> Iterable[Tick]:
         yield Tick(samples[int(tick.value)].number, tick.at)
 
 
-def intervals_for(width: float) -> int:
+def _intervals_for(width: float) -> int:
     """Ticks that an axis of this width has room for, less one."""
     return max(2, int(width // 90))
 
@@ -210,7 +211,7 @@ def _stretches(parts: _Parts, axis: Axis) -> Iterable[Stretch]:
     for x, part in parts:
         known = sorted(sample.seconds for sample in part if sample.seconds is not None)
         if known:
-            low, mid, high = known[0], middle(known), known[-1]
+            low, mid, high = known[0], median(known), known[-1]
             top = round(axis.at(high) - 1, 1)
             tip = (
                 f"{_name(part)}: {duration_text(low)} to {duration_text(high)}, "
@@ -233,9 +234,112 @@ def _describe(samples: Sequence[Sample], known: Sequence[float]) -> str:
     if known:
         said += (
             f": {duration_text(min(known))} to {duration_text(max(known))}, "
-            f"median {duration_text(middle(sorted(known)))}"
+            f"median {duration_text(median(known))}"
         )
     for kind in (MarkKind.REPEATED, MarkKind.NAK):
         count = sum(_count(sample, kind) for sample in samples)
         said += f"; {count:,} {'repetitions' if kind is MarkKind.REPEATED else 'NAKs'}"
     return said + "."
+
+
+# -- how times are spread -------------------------------------------------------------------------
+
+
+class Bar(NamedTuple):
+    """One bin of a histogram."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    tip: str
+
+
+@dataclass(frozen=True)
+class Histogram:
+    """How many values fall where; `x_axis` has the values, `y_ticks` the counts."""
+
+    frame: Frame
+    x_axis: Axis
+    y_ticks: tuple[Tick, ...]
+    bars: tuple[Bar, ...]
+    description: str
+
+
+def histogram(values: Sequence[float], width: float) -> Histogram:
+    """How these times (in seconds) are spread, in bins of one width on paper: on a logarithmic axis
+    they grow with the values. `width` is in CSS pixels. Raises ValueError for none.
+    """
+    if not values:
+        raise ValueError("no values")
+    bottom = _TOP + _HISTOGRAM_HEIGHT
+    frame = Frame(width, bottom + _AXIS_HEIGHT, _LEFT, _TOP, width - _RIGHT - 10, bottom)
+    x_axis = Axis.over(values, frame.left, frame.right, intervals=_intervals_for(width))
+    bin_width = (frame.right - frame.left) / _BINS
+    counts = [0] * _BINS
+    for value in values:
+        counts[min(_BINS - 1, int((x_axis.at(value) - frame.left) / bin_width))] += 1
+    places = [place for place in linear_ticks(0, max(counts), 4) if place == int(place)]
+    top_count = places[-1]
+    y_ticks = tuple(
+        Tick(place, round(bottom - place / top_count * _HISTOGRAM_HEIGHT, 1)) for place in places
+    )
+    bars = []
+    for index, count in enumerate(counts):
+        if count:
+            tall = round(max(1.0, count / top_count * _HISTOGRAM_HEIGHT), 1)
+            begin = frame.left + index * bin_width
+            edges = (_value_at(x_axis, index / _BINS), _value_at(x_axis, (index + 1) / _BINS))
+            tip = f"{duration_text(edges[0])} to {duration_text(edges[1])}: {count:,}"
+            bars.append(Bar(round(begin + 1, 1), bottom - tall, round(bin_width - 2, 1), tall, tip))
+    ordered = sorted(values)
+    description = (
+        f"{len(values):,} values from {duration_text(ordered[0])} to {duration_text(ordered[-1])}, "
+        f"median {duration_text(median(values))}."
+    )
+    return Histogram(frame, x_axis, y_ticks, tuple(bars), description)
+
+
+def _value_at(axis: Axis, share: float) -> float:
+    """The value at this share of the way along the axis."""
+    if axis.is_log:
+        return axis.low * math.pow(axis.high / axis.low, share)
+    return axis.low + (axis.high - axis.low) * share
+
+
+class Figure(NamedTuple):
+    """A named value of a spread."""
+
+    name: str
+    value_s: float
+    x: float
+
+
+@dataclass(frozen=True)
+class Spread:
+    """A distribution on one line: from minimum to maximum, and what lies between."""
+
+    frame: Frame
+    x_axis: Axis
+    figures: tuple[Figure, ...]
+    """Minimum, median, p95, p99, maximum."""
+    description: str
+
+
+def spread(distribution: Distribution, width: float) -> Spread:
+    """How a distribution lies on an axis of its own, `width` CSS pixels wide."""
+    named = (
+        ("minimum", distribution.minimum_s),
+        ("median", distribution.median_s),
+        ("95 %", distribution.p95_s),
+        ("99 %", distribution.p99_s),
+        ("maximum", distribution.maximum_s),
+    )
+    frame = Frame(width, _SPREAD_HEIGHT, 24, 6, width - 34, 26)
+    values = [value for _, value in named]
+    x_axis = Axis.over(
+        values, frame.left, frame.right, from_zero=True, intervals=_intervals_for(width)
+    )
+    figures = tuple(Figure(name, value, round(x_axis.at(value), 1)) for name, value in named)
+    said = ", ".join(f"{name} {duration_text(value)}" for name, value in named)
+    return Spread(frame, x_axis, figures, f"{distribution.count:,} values: {said}.")

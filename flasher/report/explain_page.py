@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 from flasher.prose import prose
 from flasher.protocol.spec import Node
-from flasher.report import chart, sequence, spread
+from flasher.report import chart, sequence
 from flasher.report.base import Status, render_page
 from flasher.report.scale import duration_text
 from flasher.trace.figures import Distribution
@@ -71,7 +71,7 @@ class SpreadRow(NamedTuple):
 
     name: str
     distribution: Distribution | None
-    drawings: dict[str, spread.Spread] | None
+    drawings: dict[str, chart.Spread] | None
 
 
 class LatencyView(NamedTuple):
@@ -108,7 +108,7 @@ class UpgradeView:
     sequence: dict[str, list[sequence.Part]]
     latencies: tuple[LatencyView, ...]
     spreads: tuple[SpreadRow, ...]
-    histogram: dict[str, spread.Histogram] | None
+    histogram: dict[str, chart.Histogram] | None
     """Of the answers to packets that were sent once; None when there are only a few."""
     troubled: tuple[PacketStory, ...]
     troubled_count: int
@@ -210,11 +210,11 @@ def _latencies(packets: Sequence[PacketStory], most: int) -> Iterable[LatencyVie
         yield LatencyView(attempt, drawings)
 
 
-def _histogram(packets: Iterable[PacketStory]) -> dict[str, spread.Histogram] | None:
+def _histogram(packets: Iterable[PacketStory]) -> dict[str, chart.Histogram] | None:
     values = [one.answer_s for one in packets if one.tries == 1 and one.answer_s is not None]
     if len(values) < _HISTOGRAM_LEAST:
         return None
-    return {name: spread.histogram(values, width) for name, width in chart.WIDTHS.items()}
+    return {name: chart.histogram(values, width) for name, width in chart.WIDTHS.items()}
 
 
 def _spreads(upgrade: UpgradeStory) -> Iterable[SpreadRow]:
@@ -227,7 +227,7 @@ def _spreads(upgrade: UpgradeStory) -> Iterable[SpreadRow]:
         drawings = (
             None
             if found is None or found.maximum_s <= 0
-            else {width: spread.spread(found, at) for width, at in chart.WIDTHS.items()}
+            else {width: chart.spread(found, at) for width, at in chart.WIDTHS.items()}
         )
         yield SpreadRow(name, found, drawings)
 

@@ -7,7 +7,7 @@ caller measures.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -160,14 +160,6 @@ def slices(count: int, most: int) -> list[tuple[int, int]]:
     """
     parts = min(count, most)
     return [(count * part // parts, count * (part + 1) // parts) for part in range(parts)]
-
-
-def middle(ordered: Sequence[float]) -> float:
-    """The median of values in ascending order. Raises ValueError for none."""
-    if not ordered:
-        raise ValueError("no values")
-    half = len(ordered) // 2
-    return ordered[half] if len(ordered) % 2 else (ordered[half - 1] + ordered[half]) / 2
 
 
 def duration_text(seconds: float | None) -> str:

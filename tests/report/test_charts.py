@@ -10,9 +10,10 @@ from flasher.report.chart import (
     WIDTHS,
     MarkKind,
     Sample,
+    histogram,
     latency_chart,
+    spread,
 )
-from flasher.report.spread import histogram, spread
 from flasher.trace.figures import Distribution
 
 WIDTH = WIDTHS["wide"]

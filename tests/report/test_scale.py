@@ -11,7 +11,6 @@ from flasher.report.scale import (
     duration_text,
     linear_ticks,
     log_ticks,
-    middle,
     nice_step,
     slices,
     wants_log,
@@ -154,13 +153,6 @@ def test_slices_are_all_of_it_in_nearly_equal_parts(count: int, most: int) -> No
     sizes = {end - begin for begin, end in parts}
     assert len(parts) <= most
     assert not sizes or max(sizes) - min(sizes) <= 1
-
-
-def test_the_median_lies_in_the_middle() -> None:
-    assert middle([1, 2, 9]) == 2
-    assert middle([1, 2, 4, 9]) == 3
-    with pytest.raises(ValueError, match="no values"):
-        middle([])
 
 
 @pytest.mark.parametrize(
