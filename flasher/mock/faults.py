@@ -104,11 +104,9 @@ class FaultInjector:
 
     @property
     def done(self) -> bool:
-        """True when the device is."""
         return self.device.done
 
     def receive(self, frame: Frame, now: float) -> None:
-        """A frame arrived."""
         self._happen(now)
         self.device.receive(frame, now)
         if self._frames_left and frame.can_id == self.device.target.request_id:
@@ -119,14 +117,12 @@ class FaultInjector:
         self._happen(now)
 
     def tick(self, now: float) -> None:
-        """Let everything happen that is due by `now`, each thing at its time."""
         self._happen(now)
         self.device.tick(now)
         self._look_at_flash()
         self._happen(now)
 
     def deadline(self) -> float | None:
-        """When the device or a fault next wants `tick`."""
         wanted = self.device.deadline()
         for moment in (self._due, self._power_due):
             if moment is not None and (wanted is None or moment < wanted):
@@ -134,19 +130,15 @@ class FaultInjector:
         return wanted
 
     def next_frame(self, now: float) -> Frame | None:
-        """The next frame to send."""
         return self.device.next_frame(now)
 
     def frame_sent(self, now: float) -> None:
-        """The adapter has accepted it."""
         self.device.frame_sent(now)
 
     def cancel(self, now: float) -> None:
-        """As the device."""
         self.device.cancel(now)
 
     def take_events(self) -> Sequence[object]:
-        """What happened to the device."""
         return self.device.take_events()
 
     # -- how it happens ---------------------------------------------------------------------------

@@ -123,7 +123,6 @@ class System:
         return min((moment for moment in wanted if moment is not None), default=None)
 
     def next_frame(self, now: float) -> Frame | None:
-        """The next frame to send, of one member after the other."""
         if self._sending is not None:
             frame = self._sending.next_frame(now)
             if frame is not None:
@@ -149,7 +148,6 @@ class System:
         self._turns.append(sender)
 
     def cancel(self, now: float) -> None:
-        """Every member sends the message under way to its end, then nothing more."""
         for member in self._turns:
             member.cancel(now)
 

@@ -100,11 +100,9 @@ class Watcher:
 
     @property
     def done(self) -> bool:
-        """True when there is nothing left to watch for."""
         return self._cancelled or self._left == 0
 
     def receive(self, frame: Frame, now: float) -> None:
-        """A CAN frame arrived."""
         if self.done or (self._ends_at is not None and now > self._ends_at):
             return
         self.frames += 1
@@ -113,7 +111,6 @@ class Watcher:
         self._take(self._decoder.feed(frame, now))
 
     def tick(self, now: float) -> None:
-        """The time that `deadline` asked for has come."""
         if not self._begun:
             self._begun = True
             self._ends_at = None if self._duration_s is None else now + self._duration_s
@@ -126,7 +123,6 @@ class Watcher:
             self._cancelled = True
 
     def deadline(self) -> float | None:
-        """When it next wants `tick`; at once before the beginning."""
         if self.done:
             return None
         if not self._begun:
@@ -135,18 +131,15 @@ class Watcher:
         return min((at for at in times if at is not None), default=None)
 
     def next_frame(self, now: float) -> Frame | None:
-        """Nothing, ever: watching does not disturb."""
-        return None
+        return None  # watching does not disturb
 
     def frame_sent(self, now: float) -> None:
-        """Never called."""
+        pass
 
     def cancel(self, now: float) -> None:
-        """End."""
         self._cancelled = True
 
     def take_events(self) -> Sequence[object]:
-        """What was seen since the last call."""
         taken, self._events = self._events, []
         return taken
 

@@ -14,7 +14,7 @@ from flasher.protocol.wire import Damage, Message
 
 __all__ = ["DECLARED", "AnyRow", "HangingDevice", "PlainFlash", "PlainStore", "Variant", "variant"]
 
-_DeviceT = TypeVar("_DeviceT", bound=type[MockDevice])
+_WrongT = TypeVar("_WrongT", bound=type[object])
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,13 @@ def variant(
     upgrade_works: bool = True,
     profile: Mapping[str, object] | None = None,
     timings: Mapping[str, float] | None = None,
-) -> Callable[[_DeviceT], _DeviceT]:
-    """Declares a class of device as a `Variant`; the cases in `also` are parted by blanks."""
+) -> Callable[[_WrongT], _WrongT]:
+    """Declares a class as what is wrong with a `Variant`: a device, or one of the parts that it is
+    made of. The cases in `also` are parted by blanks.
+    """
 
-    def declare(device_type: _DeviceT) -> _DeviceT:
+    def declare(wrong: _WrongT) -> _WrongT:
+        device_type = wrong if issubclass(wrong, MockDevice) else _device_with(wrong)
         others = tuple(also.split())
         DECLARED.append(
             Variant(
@@ -71,9 +74,17 @@ def variant(
                 timings or {},
             )
         )
-        return device_type
+        return wrong
 
     return declare
+
+
+def _device_with(part: type[object]) -> type[MockDevice]:
+    """A device that is made with this part, and is right in everything else."""
+    for attribute in ("reassembler_type", "store_type", "transfer_type"):
+        if issubclass(part, getattr(MockDevice, attribute)):
+            return type(part.__name__, (MockDevice,), {attribute: part})
+    raise TypeError(f"{part.__name__} is no part of a device")
 
 
 class HangingDevice(MockDevice):

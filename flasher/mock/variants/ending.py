@@ -67,7 +67,13 @@ class ImageChecksumIgnored(MockDevice):
         return True
 
 
-class _KeepsLastPage(PlainStore):
+@variant(
+    "keeps-longer-rest",
+    "EN-07",
+    "does not erase the page where a smaller image ends: a mixture with the old one",
+    also="UP-01 UP-08 EN-01 EN-08",
+)
+class KeepsLongerRest(PlainStore):
     def erasing(self, size_bytes: int) -> list[Operation]:
         """All but the page where the new image ends, when the old one reaches beyond it."""
         old = self.image()
@@ -77,16 +83,6 @@ class _KeepsLastPage(PlainStore):
         page = self.flash.page_size_bytes
         kept = AREA_START + (size_bytes - 1) // page * page
         return [operation for operation in operations if operation.address != kept]
-
-
-@variant(
-    "keeps-longer-rest",
-    "EN-07",
-    "does not erase the page where a smaller image ends: a mixture with the old one",
-    also="UP-01 UP-08 EN-01 EN-08",
-)
-class KeepsLongerRest(MockDevice):
-    store_type = _KeepsLastPage
 
 
 @variant(

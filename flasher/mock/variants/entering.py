@@ -151,20 +151,16 @@ class SilentPowerUp(MockDevice):
         return detail
 
 
-class _OnePacketMore(Transfer):
-    @property
-    def total(self) -> int:
-        return self.size_bytes // PACKET_DATA_SIZE + 1
-
-
 @variant(
     "full-last-packet-fails",
     "UP-01",
     "wants a packet more when the size is a multiple of 128",
     also="EN-01 EN-07 EN-08 PW-01 PW-02 TX-07",
 )
-class FullPacketsFail(MockDevice):
-    transfer_type = _OnePacketMore
+class FullPacketsFail(Transfer):
+    @property
+    def total(self) -> int:
+        return self.size_bytes // PACKET_DATA_SIZE + 1
 
 
 @variant(

@@ -35,12 +35,14 @@ takes 0.4 to 0.55 ms.
 """
 _KNOWN_COMMANDS: Final = frozenset(Command) | {item.command for item in ITEMS}
 _KNOWN_MODES: Final = frozenset(Mode)
-"""A frame that ends so soon after the last one followed it without a pause: at 250 kbit/s a frame
-takes 0.4 to 0.55 ms.
-"""
 
 
-class _ShortFrameEnds(Reassembler):
+@variant(
+    "short-frame-ends-message",
+    "FR-01",
+    "drops a message when a frame other than its last has less than 8 bytes",
+)
+class ShortFrameEnds(Reassembler):
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
         found = super().feed(payload, now)
         if len(payload) < FRAME_DATA_SIZE:
@@ -49,34 +51,14 @@ class _ShortFrameEnds(Reassembler):
 
 
 @variant(
-    "short-frame-ends-message",
-    "FR-01",
-    "drops a message when a frame other than its last has less than 8 bytes",
-)
-class ShortFrameEnds(MockDevice):
-    reassembler_type = _ShortFrameEnds
-
-
-class _HeaderAtFrameStart(Reassembler):
-    def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
-        starts = payload.startswith(HEADER) or HEADER.startswith(payload)
-        return super().feed(payload, now) if self._buffer or starts else ()
-
-
-@variant(
     "header-at-frame-start-only",
     "FR-02",
     "misses a message whose header stands behind junk in the same frame",
 )
-class HeaderAtFrameStart(MockDevice):
-    reassembler_type = _HeaderAtFrameStart
-
-
-class _HeaderRestarts(Reassembler):
+class HeaderAtFrameStart(Reassembler):
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
-        if payload.startswith(HEADER):
-            self.reset()
-        return super().feed(payload, now)
+        starts = payload.startswith(HEADER) or HEADER.startswith(payload)
+        return super().feed(payload, now) if self._buffer or starts else ()
 
 
 @variant(
@@ -84,24 +66,31 @@ class _HeaderRestarts(Reassembler):
     "FR-03",
     "begins a new message where 55 AA stands at the start of a frame of data",
 )
-class HeaderRestarts(MockDevice):
+class HeaderRestarts(Reassembler):
     """Begins anew at every frame that starts with a header's bytes."""
 
-    reassembler_type = _HeaderRestarts
+    def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
+        if payload.startswith(HEADER):
+            self.reset()
+        return super().feed(payload, now)
 
 
-class _TailIgnored(Reassembler):
+@variant("ignores-tail", "FR-04", "takes a message with any last byte", also="CR-01")
+class TailIgnored(Reassembler):
     def _judge_message(self, size: int, found: list[Message | Damage]) -> None:
         self._buffer[size - len(TAIL) : size] = TAIL
         super()._judge_message(size, found)
 
 
-@variant("ignores-tail", "FR-04", "takes a message with any last byte", also="CR-01")
-class TailIgnored(MockDevice):
-    reassembler_type = _TailIgnored
+@variant(
+    "trusts-length",
+    "FR-05",
+    "after a broken-off message, swallows the next ones until its length is used up",
+    also="TX-01 CR-02",
+)
+class LengthTrusted(Reassembler):
+    """Waits for as many bytes as the length says, for ever, whatever comes meanwhile."""
 
-
-class _LengthTrusted(Reassembler):
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
         found = super().feed(payload, now)
         self.due_at = inf
@@ -111,18 +100,6 @@ class _LengthTrusted(Reassembler):
         """Give up all that the length covers, not its header only."""
         found.append(Damage(self.can_id, reason, bytes(self._buffer[:size])))
         del self._buffer[:size]
-
-
-@variant(
-    "trusts-length",
-    "FR-05",
-    "after a broken-off message, swallows the next ones until its length is used up",
-    also="TX-01 CR-02",
-)
-class LengthTrusted(MockDevice):
-    """Waits for as many bytes as the length says, for ever, whatever comes meanwhile."""
-
-    reassembler_type = _LengthTrusted
 
 
 @variant(
@@ -139,18 +116,14 @@ class ShortLengthHangs(HangingDevice):
             super()._take_damage(damage, now)
 
 
-class _PaddingFatal(Reassembler):
+@variant("padding-is-fatal", "FR-07", "drops a message whose last frame is padded to 8 bytes")
+class PaddingFatal(Reassembler):
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
         found = super().feed(payload, now)
         if self.held_size and any(isinstance(one, Message) for one in found):
             self.reset()
             return (Damage(self.can_id, DamageReason.JUNK, payload),)
         return found
-
-
-@variant("padding-is-fatal", "FR-07", "drops a message whose last frame is padded to 8 bytes")
-class PaddingFatal(MockDevice):
-    reassembler_type = _PaddingFatal
 
 
 @variant(
@@ -210,14 +183,10 @@ def _with_mirrored_crc(wire: bytes) -> bytes:
     return bytes(changed)
 
 
-class _CrcIgnored(Reassembler):
+@variant("no-crc-check", "CR-01", "takes a message with any CRC", also="CR-02 CR-03 TX-01 BU-01")
+class CrcIgnored(Reassembler):
     def _crc_fits(self, wire: bytes) -> bool:
         return True
-
-
-@variant("no-crc-check", "CR-01", "takes a message with any CRC", also="CR-02 CR-03 TX-01 BU-01")
-class CrcIgnored(MockDevice):
-    reassembler_type = _CrcIgnored
 
 
 @variant(
@@ -239,25 +208,17 @@ class ShortPacketFilled(MockDevice):
             super()._take_damage(damage, now)
 
 
-class _EitherCrcOrder(Reassembler):
+@variant("either-crc-order", "CR-03", "takes a little-endian CRC as well")
+class EitherCrcOrder(Reassembler):
     def _crc_fits(self, wire: bytes) -> bool:
         return super()._crc_fits(wire) or super()._crc_fits(_with_mirrored_crc(wire))
 
 
-@variant("either-crc-order", "CR-03", "takes a little-endian CRC as well")
-class EitherCrcOrder(MockDevice):
-    reassembler_type = _EitherCrcOrder
-
-
-class _CrcWithoutId(Reassembler):
+@variant("crc-without-id", "CR-03", "takes a CRC that leaves the id out as well")
+class CrcWithoutId(Reassembler):
     def _crc_fits(self, wire: bytes) -> bool:
         crc = int.from_bytes(wire[_CRC_AT], "big")
         return super()._crc_fits(wire) or crc32(wire[: -CRC_SIZE - len(TAIL)]) == crc
-
-
-@variant("crc-without-id", "CR-03", "takes a CRC that leaves the id out as well")
-class CrcWithoutId(MockDevice):
-    reassembler_type = _CrcWithoutId
 
 
 @variant(

@@ -315,14 +315,10 @@ class TotalLookedAtOnce(MockDevice):
         return event
 
 
-class _SixteenBitStore(PlainStore):
+@variant("sixteen-bit-offsets", "TX-07", "writes what lies behind 64 KiB over the beginning")
+class SixteenBitOffsets(PlainStore):
     def storing(self, number: int, payload: bytes, size_bytes: int) -> Operation:
         """Offsets are counted in 16 bits."""
         operation = super().storing(number, payload, size_bytes)
         offset = (operation.address - AREA_START) % _BANK_BYTES
         return operation._replace(address=AREA_START + offset)
-
-
-@variant("sixteen-bit-offsets", "TX-07", "writes what lies behind 64 KiB over the beginning")
-class SixteenBitOffsets(MockDevice):
-    store_type = _SixteenBitStore
