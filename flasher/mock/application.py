@@ -69,7 +69,7 @@ class Application:
         """A restart, or the power is gone: all is lost but what is kept on purpose."""
 
     def heard(self, now: float) -> None:
-        """There was a frame on the bus, whosesoever."""
+        """A frame was received, from any node."""
 
     def take(self, message: Message, now: float) -> None:
         """An intact message arrived on one of the ids that it hears."""

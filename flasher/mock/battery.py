@@ -1,7 +1,7 @@
-"""A battery that behaves: charge, cells, temperature and current as functions of the time.
+"""A battery model: charge, cells, temperature and current as functions of the time.
 
-It needs neither chance nor a running simulation: whoever asks gives the time, and the same time
-gives the same answer. Time counts from when it is first asked.
+Without random numbers and without a running simulation: the same time gives the same answer. Time
+counts from the first call.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _CHARGE_S: Final = 3 * 3600
 _RIDES_FROM, _RIDES_TO = 0.85, 0.25
 """Share of the full capacity at which a ride begins and ends."""
 _SWAY_S: Final = 20.0
-"""Hills and straights: the current sways about its mean with this period."""
+"""Period with which the current varies about its mean, as on hills."""
 _SWAY: Final = 0.6
 _FIRST_RIDE_AT_S: Final = 900.0
-"""A battery is first met a quarter of an hour into a ride."""
+"""The first call is a quarter of an hour into a ride."""
 _EMPTY_CELL_MV: Final = 3250.0
 _FULL_CELL_MV: Final = 4150.0
 _CELL_RESISTANCE_OHM: Final = 0.02

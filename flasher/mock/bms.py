@@ -84,7 +84,6 @@ class Shutdown:
         port.emit(ShutdownAnnounced(why))
 
     def ready(self, node: Node) -> None:
-        """A node answered that it is ready."""
         if node in self._missing:
             self._missing.remove(node)
             self._answered.add(node)
@@ -298,7 +297,7 @@ class BmsApplication(Application):
         )
 
     def _history(self, now: float) -> Content:
-        """An easy life: none of its counters ever counted."""
+        """The history of a battery whose protections never acted."""
         return contents.History(
             highest_cell_temperature_c=45,
             lowest_cell_temperature_c=-5,

@@ -29,7 +29,7 @@ PAUSE_S: Final = 1.0
 
 @dataclass(frozen=True)
 class RoutineQuery:
-    """A question that a node asks when it starts: once, every `period_s`, or until answered."""
+    """A query that a node sends when it starts: once, every `period_s`, or until answered."""
 
     title: str
     period_s: float | None = None

@@ -187,5 +187,5 @@ def _three(value: float) -> str:
 
 
 def _clean(value: float) -> float:
-    """Without the dust of binary fractions."""
+    """Rounded to 12 digits, so that 0.1 + 0.2 is 0.3."""
     return float(f"{value:.12g}")

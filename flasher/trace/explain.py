@@ -41,7 +41,7 @@ from flasher.trace.story import (
 from flasher.trace.verdict import judge, remarks
 
 MAX_TALKERS: Final = 100
-"""Different ids that are told; a bus with more of them babbles."""
+"""Different ids that are listed; more of them are only counted."""
 _MAX_IDS: Final = 100_000
 MAX_PACKETS: Final = 200_000
 """Packets that a story holds one by one, over all upgrades."""
@@ -116,7 +116,6 @@ class _Reading:
         self._start: float | None = None
 
     def frame(self, frame: Frame, now: float) -> None:
-        """Take one frame."""
         if self._start is None:
             self._start = now
         now -= self._start
@@ -326,7 +325,7 @@ class _Reading:
 
 
 def _ids_of(upgrades: tuple[UpgradeStory, ...]) -> frozenset[int]:
-    """The ids of the dialogues that are told in full."""
+    """The ids of the tool and the devices of these upgrades."""
     targets = [TARGETS[upgrade.target.lower()] for upgrade in upgrades]
     return frozenset(used for each in targets for used in (each.request_id, each.answer_id))
 
@@ -359,7 +358,7 @@ class BusCounter:
         self._talkers: dict[tuple[int, bool], int] = {}
 
     def frame(self, frame: Frame, now: float, bits: int) -> None:
-        """Take one frame; times do not go back."""
+        """Count one frame; times do not go back."""
         if self.first_at is None:
             self.first_at = self.last_at = now
         if now - self.last_at > self._gap[0]:
@@ -383,12 +382,11 @@ class BusCounter:
             self.is_alone = names is not None and names[0] == Node.CDL.name
 
     def note(self, event: BusEvent) -> None:
-        """Take note of what was no message."""
+        """Count what was no message of the documents."""
         self.damaged += event.kind is Kind.DAMAGED
         self.malformed += event.kind in (Kind.MALFORMED, Kind.UNKNOWN)
 
     def figures(self, bitrate_bps: int) -> BusFigures:
-        """The sums."""
         first_at = self.first_at or 0.0
         duration_s = self.last_at - first_at if self.frames or self.error_frames else 0.0
         return BusFigures(
@@ -404,7 +402,7 @@ class BusCounter:
         )
 
     def talkers(self, but: frozenset[int]) -> list[Talker]:
-        """Everybody, most frames first, `but` these 11-bit ids."""
+        """All senders, most frames first, without these 11-bit ids."""
         found = []
         for (of_id, is_extended), frames in self._talkers.items():
             names = None if is_extended else route(of_id)

@@ -112,7 +112,6 @@ class Transfer:
         self._number = self._highest = self._copies = 0
 
     def packet(self, number: int, timed: TimedEvent) -> None:
-        """A packet was sent."""
         if self._begin_s is None:
             self._begin_s = timed.begin_s
         if number > self._highest:
@@ -181,7 +180,6 @@ class LinkMeter:
         self._is_over = False
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """Take one frame."""
         if frame.can_id not in self._ids or not frame.is_payload:
             return
         for timed in self._decoder.feed(frame, now, bits_of(frame)):

@@ -1,7 +1,7 @@
-"""One upgrade of one target as it is heard on the bus: the facts, in the order in which they come.
+"""One upgrade of one target as it is heard on the bus: what happened, in the order of time.
 
-It is no host and no device: it does not know what has to come next, it takes down what was said.
-What the facts mean is judged by `verdict`.
+It follows no protocol: it does not know which message has to come next, it only records. What the
+facts mean is judged by `verdict`.
 """
 
 from __future__ import annotations
@@ -85,7 +85,6 @@ class Interleaving:
         self._last_at = 0.0
 
     def frame(self, frame: Frame, now: float) -> None:
-        """One frame on the id."""
         data = frame.data
         if _is_head(data):
             soon = now - self._last_at <= DEFAULT_TIMINGS.inter_frame_timeout_s
@@ -248,7 +247,6 @@ class ObservedUpgrade:
         self.last_at_s = timed.end_s
 
     def version(self, timed: TimedEvent) -> None:
-        """The target's application told its version."""
         self.steps.add(step_of(timed.event, timed.end_s))
         if self.ends:
             self._enter(Phase.CONFIRM, timed.begin_s)
@@ -256,19 +254,16 @@ class ObservedUpgrade:
             self.last_at_s = timed.end_s
 
     def shutdown(self, timed: TimedEvent) -> None:
-        """The battery announced that it switches off."""
         if self.shutdown_at_s is None:
             self.shutdown_at_s = timed.end_s
             self.steps.add(step_of(timed.event, timed.end_s))
 
     def error_frame(self, at_s: float) -> None:
-        """An error frame."""
         self.errors += 1
         self.errors_now += 1
         self.steps.error_frame(at_s)
 
     def finish(self) -> None:
-        """Nothing more will come."""
         self._leave(self.last_at_s)
 
     # -- the tool ----------------------------------------------------------------------------------

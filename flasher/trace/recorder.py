@@ -67,7 +67,6 @@ class Recorder:
         self._wall_offset_s: float | None = None
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """Record one frame."""
         if self.failure is not None:
             return
         if self._wall_offset_s is None:

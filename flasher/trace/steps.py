@@ -38,7 +38,6 @@ class StepList:
         return self._taken - len(self._head) - len(self._tail)
 
     def add(self, step: Step) -> None:
-        """One more line."""
         self._flush()
         self._keep(step)
 
@@ -74,7 +73,6 @@ class StepList:
         self._errors_at = (self._errors_at[0], at_s)
 
     def lines(self) -> tuple[StoryLine, ...]:
-        """All that were kept."""
         self._flush()
         return (*self._head, *self._tail)
 

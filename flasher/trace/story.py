@@ -94,7 +94,7 @@ class StepKind(Enum):
     ERROR_FRAMES = "error frames"
     """One or more error frames in a row; no sender."""
     GAP = "gap"
-    """Nobody of the dialogue said anything for a notable time; no sender."""
+    """Neither tool nor device sent anything for a notable time; no sender."""
     NOTE = "note"
     """A remark of the explanation itself; no sender."""
 
@@ -131,7 +131,6 @@ class PacketRun:
 
     @property
     def count(self) -> int:
-        """How many packets."""
         return self.last - self.first + 1
 
 

@@ -44,7 +44,6 @@ class FlightRecorder:
         """None before the first frame."""
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        """Keep one frame."""
         if self.wall_offset_s is None:
             self.wall_offset_s = self._wall_clock() - now
         self.frames += 1

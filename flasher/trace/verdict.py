@@ -1,7 +1,7 @@
 """What the facts of an upgrade mean: how it ended, where, most likely why, what to do.
 
-The order of the questions is the order of strength: what spoils everything (a second tool, a dead
-bus, two devices) is asked before what it would look like in the phase where it happened.
+Causes that concern the whole bus (a second tool, no acknowledgement, two devices) are looked for
+first, as their symptoms would be taken for the fault of a phase.
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ def _at_end(upgrade: ObservedUpgrade) -> _Found:
 
 
 def _stopped(text: str, silent_s: float) -> _Found:
-    """It was the tool's turn: it stopped, or the recording did."""
+    """The verdict where the tool had to send next: it stopped, or the recording did."""
     if silent_s >= _SILENT_S:
         return _Found(Cause.TOOL_STOPPED, f"{text} The trace goes on for {silent_s:.2f} s.")
     return _Found(Cause.RECORDING_ENDS, text)
@@ -234,7 +234,7 @@ def _pieces(count: int) -> str:
 
 
 def _short(silent_s: float) -> str:
-    """The proviso of a trace that ends before the wait is over."""
+    """What to add where the trace ends before a wait is over."""
     if silent_s >= _SILENT_S:
         return f" The trace goes on for {silent_s:.2f} s."
     return " The trace ends here: either the tool gave up, or the recording was stopped."

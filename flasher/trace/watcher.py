@@ -55,7 +55,6 @@ class Filter:
     trouble_only: bool = False
 
     def accepts(self, seen: BusEvent) -> bool:
-        """True when it is to be shown."""
         if self.nodes and not self.nodes & {seen.sender, seen.receiver}:
             return False
         title = seen.title.lower()
@@ -177,7 +176,7 @@ def replay(
 
 
 def _pass_time(watcher: Watcher, until: float) -> None:
-    """Let the watcher do what is due before `until`."""
+    """Tick the watcher for all that is due before `until`."""
     while (due := watcher.deadline()) is not None and due < until:
         watcher.tick(until if due == _AT_ONCE else due)
 
