@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import inf
 from typing import Final
 
 from flasher.mock.machine import BUS_OFF_S
@@ -80,20 +81,20 @@ class FaultInjector:
         self._moment: Moment | None = None
         self._operations_before = 0
         self._frames_left = 0
-        self._due: float | None = None
-        self._power_due: float | None = None
+        self._due_at = self._power_due_at = inf
 
     def set(self, fault: Fault, moment: Moment) -> None:
         """Let `fault` happen at `moment`, in place of one that is still to come."""
         self._fault, self._moment = fault, moment
         self._operations_before = self.device.operations_done
         self._frames_left = moment.frames if isinstance(moment, AfterFrame) else 0
-        self._due = moment.at_s if isinstance(moment, AtTime) else None
+        self._due_at = moment.at_s if isinstance(moment, AtTime) else inf
         self._look_at_flash()
 
     def clear(self) -> None:
         """Let no fault happen; power that is off still comes back."""
-        self._fault = self._moment = self._due = None
+        self._fault = self._moment = None
+        self._due_at = inf
 
     @property
     def is_set(self) -> bool:
@@ -112,7 +113,7 @@ class FaultInjector:
         if self._frames_left and frame.can_id == self.device.target.request_id:
             self._frames_left -= 1
             if not self._frames_left and isinstance(self._moment, AfterFrame):
-                self._due = now + self._moment.delay_s
+                self._due_at = now + self._moment.delay_s
         self._look_at_flash()
         self._happen(now)
 
@@ -124,10 +125,8 @@ class FaultInjector:
 
     def deadline(self) -> float | None:
         wanted = self.device.deadline()
-        for moment in (self._due, self._power_due):
-            if moment is not None and (wanted is None or moment < wanted):
-                wanted = moment
-        return wanted
+        due_at = min(self._due_at, self._power_due_at, inf if wanted is None else wanted)
+        return None if due_at == inf else due_at
 
     def next_frame(self, now: float) -> Frame | None:
         return self.device.next_frame(now)
@@ -148,22 +147,22 @@ class FaultInjector:
         moment = self._moment
         if isinstance(moment, InOperation):
             begun = self.device.operations_done - self._operations_before
-            self._due = (
-                self.device.operation_reaches(moment.share) if begun == moment.operation else None
-            )
+            reached_at = self.device.operation_reaches(moment.share)
+            is_under_way = begun == moment.operation
+            self._due_at = inf if reached_at is None or not is_under_way else reached_at
 
     def _happen(self, now: float) -> None:
-        if self._power_due is not None and self._power_due <= now:
-            at_s, self._power_due = self._power_due, None
+        if self._power_due_at <= now:
+            at_s, self._power_due_at = self._power_due_at, inf
             self.device.power_on(at_s)
-        if self._fault is None or self._due is None or self._due > now:
+        if self._fault is None or self._due_at > now:
             return
         # At its own time, not when it was noticed: so much of the operation is done, and no more.
-        fault, at_s = self._fault, self._due
+        fault, at_s = self._fault, self._due_at
         self.clear()
         self.happened += 1
         if isinstance(fault, BusOff):
             self.device.bus_off(at_s, fault.off_s)
             return
         self.device.power_cut(at_s)
-        self._power_due = None if fault.off_s is None else at_s + fault.off_s
+        self._power_due_at = inf if fault.off_s is None else at_s + fault.off_s

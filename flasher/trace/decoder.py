@@ -14,7 +14,6 @@ Pure: the time is an argument.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from enum import Enum
@@ -245,19 +244,15 @@ def _remark(name: str, unit: str, value: object) -> str:
 
 def _row_fields(row: messages.Row) -> tuple[Field, ...]:
     """The fields of a message of the upgrade."""
-    return tuple(_row_field(field.name, getattr(row, field.name)) for field in _declared(row))
-
-
-def _declared(row: messages.Row) -> tuple[dataclasses.Field[Any], ...]:
-    return dataclasses.fields(row)
-
-
-def _row_field(name: str, value: int | str | bytes) -> Field:
-    if isinstance(value, bytes):
-        return _raw(name, value)
-    if name == "size_bytes":
-        return Field(name, value, "size", str(value), "B")
-    return _plain(name, value)
+    fields = []
+    for name, value in vars(row).items():
+        if isinstance(value, bytes):
+            fields.append(_raw(name, value))
+        elif name == "size_bytes":
+            fields.append(Field(name, value, "size", str(value), "B"))
+        else:
+            fields.append(_plain(name, value))
+    return tuple(fields)
 
 
 def _undecoded(message: Message, problem: str = "") -> tuple[Field, ...]:

@@ -277,7 +277,10 @@ class _Reading:
         upgrades = tuple(story for _, story in sorted(self._upgrades, key=lambda one: one[0]))
         bitrate_bps = self._rate(bool(upgrades))
         bus = self._bus.figures(bitrate_bps)
-        talkers = self._bus.talkers(_ids_of(upgrades))
+        told = [TARGETS[upgrade.target.lower()] for upgrade in upgrades]
+        talkers = self._bus.talkers(
+            {of for each in told for of in (each.request_id, each.answer_id)}
+        )
         return Story(
             source=printable(source),
             format=printable(suffix),
@@ -322,12 +325,6 @@ class _Reading:
             text += f" Error frames: {bus.error_frames:,}."
         likely, remedy = explanation(cause)
         return TraceVerdict(cause, None, None, 0, text, likely, remedy)
-
-
-def _ids_of(upgrades: tuple[UpgradeStory, ...]) -> frozenset[int]:
-    """The ids of the tool and the devices of these upgrades."""
-    targets = [TARGETS[upgrade.target.lower()] for upgrade in upgrades]
-    return frozenset(used for each in targets for used in (each.request_id, each.answer_id))
 
 
 def _chief(upgrades: tuple[UpgradeStory, ...]) -> TraceVerdict | None:
@@ -401,7 +398,7 @@ class BusCounter:
             longest_gap_at_s=max(0.0, self._gap[1] - first_at),
         )
 
-    def talkers(self, but: frozenset[int]) -> list[Talker]:
+    def talkers(self, but: set[int]) -> list[Talker]:
         """All senders, most frames first, without these 11-bit ids."""
         found = []
         for (of_id, is_extended), frames in self._talkers.items():
