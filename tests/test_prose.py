@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from enum import Enum
 
-import pytest
-
 from flasher import prose
 from flasher.bus.health import ControllerState
 from flasher.events import Phase
@@ -15,6 +13,7 @@ from flasher.host.verify import Verdict
 from flasher.protocol.wire import DamageReason
 from flasher.trace import decoder
 from flasher.trace.story import Cause, TalkerKind
+from tests.loops import each
 
 TOLD: tuple[type[Enum], ...] = (
     Cause,
@@ -30,7 +29,7 @@ TOLD: tuple[type[Enum], ...] = (
 )
 
 
-@pytest.mark.parametrize("told", TOLD, ids=lambda told: told.__name__)
+@each("told", TOLD)
 def test_every_member_has_a_word_and_a_text(told: type[Enum]) -> None:
     for member in told:
         assert member.value == member.name.lower()

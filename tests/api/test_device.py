@@ -12,6 +12,7 @@ from flasher import contents
 from flasher.errors import InterruptedByUserError, NoAnswerError, UsageError
 from tests.api.battery import Battery, wire_to
 from tests.firmware import VECTORS
+from tests.loops import each
 
 IMAGE = flasher.Image.from_bytes(VECTORS + random.Random(3).randbytes(500))
 
@@ -43,7 +44,7 @@ def test_a_target_without_a_version_query_says_so() -> None:
         wire_to().device("wmc").version()
 
 
-@pytest.mark.parametrize("target", ["wmc", "obc"])
+@each("target", ["wmc", "obc"])
 def test_only_the_memory_of_the_battery_is_read(target: str) -> None:
     with pytest.raises(UsageError, match="no way to read memory"):
         wire_to().device(target).read_memory(0, 16)

@@ -31,6 +31,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC
 from flasher.protocol.timing import Timings
 from tests.firmware import VECTORS
+from tests.loops import each
 
 DATA = VECTORS + random.Random(31).randbytes(284)
 IMAGE = flasher.Image.from_bytes(DATA)
@@ -208,8 +209,8 @@ def test_a_final_answer_that_never_comes_is_unconfirmed_not_done() -> None:
     assert device.stored_image == DATA
 
 
-@pytest.mark.parametrize(
-    ("claimed", "ending"),
+@each(
+    "claimed, ending",
     [
         ("V2r0r0_20260101", flasher.Ending.CONFIRMED_BY_VERSION),
         ("V3r0r0_20260301", flasher.Ending.OTHER_VERSION),

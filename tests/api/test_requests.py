@@ -19,6 +19,7 @@ from flasher.host.write import plan_write
 from flasher.protocol import contents
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC, Dialect, Node, Target
 from tests.api.battery import ANSWERS, Battery, wire_to
+from tests.loops import each
 
 BOTH = pytest.mark.parametrize("dialect", [WELLING, MOTINOVA], ids=lambda d: d.name)
 SILENT = frozenset(ANSWERS)
@@ -62,7 +63,7 @@ def test_an_unknown_name_is_refused_with_the_closest_one() -> None:
     assert "Did you mean serial-number?" in caught.value.remedy
 
 
-@pytest.mark.parametrize("target", [WMC, OBC], ids=lambda t: t.name)
+@each("target", [WMC, OBC])
 def test_devices_without_queries_are_not_asked(target: Target) -> None:
     with pytest.raises(UsageError, match="nothing to read"):
         wire_to().device(target).read("version-information")
@@ -145,8 +146,8 @@ def test_a_write_is_seen_through_once_it_has_begun() -> None:
     assert written.is_confirmed
 
 
-@pytest.mark.parametrize(
-    ("name", "values", "says"),
+@each(
+    "name, values, says",
     [
         ("production-information", ("ACME", "SUZHOU", "20260230"), "not in the calendar"),
         ("production-information", ("ACME", "SUZHOU", "2026W101"), "not a date"),
@@ -195,7 +196,7 @@ def test_repeated_answers_do_not_shift_the_pieces() -> None:
     assert wire_to(battery).device().read_memory(0x1000, 0x1400) == battery.memory
 
 
-@pytest.mark.parametrize(("start", "end"), [(8, 8), (9, 8), (0, 0x1_0000_0000)])
+@each("start, end", [(8, 8), (9, 8), (0, 0x1_0000_0000)])
 def test_an_impossible_range_is_refused(start: int, end: int) -> None:
     with pytest.raises(UsageError, match="no range of memory"):
         wire_to().device().read_memory(start, end)
@@ -239,7 +240,7 @@ def test_info_does_not_ask_into_the_dialogue_of_another_tool() -> None:
     assert battery.received == []
 
 
-@pytest.mark.parametrize(
+@each(
     "ask",
     [
         lambda wire: wire.device().read("history"),
@@ -247,7 +248,6 @@ def test_info_does_not_ask_into_the_dialogue_of_another_tool() -> None:
         lambda wire: wire.device().write("user-string-1", "rack 7"),
         lambda wire: wire.device().carry_out(plan_write("user-string-1", ["rack 7"], BMS), None),
     ],
-    ids=["read", "read memory", "write", "write what was agreed to"],
 )
 def test_nobody_asks_or_writes_before_having_listened_for_another_tool(
     ask: Callable[[Any], object],
@@ -292,14 +292,13 @@ def test_scan_finds_who_talks_and_who_answers() -> None:
     assert survey.guess_dialect()[0] is None
 
 
-@pytest.mark.parametrize(
-    ("report", "dialect"),
+@each(
+    "report, dialect",
     [
         ((0x740, 0x1305, b"READY"), MOTINOVA),
         ((0x710, 0x1808, b"SHUTDOWN"), WELLING),
         ((0x725, 0xC109, b"BMSV1.2.3"), WELLING),
     ],
-    ids=["HMI", "WMC shutdown", "boot version"],
 )
 def test_traffic_of_one_dialect_only_tells_it(
     report: tuple[int, int, bytes], dialect: Dialect

@@ -12,6 +12,7 @@ from flasher import api
 from flasher.bus.bit_rate import BitRate
 from flasher.bus.inspect_interface import Interface
 from flasher.errors import BusError, ExitCode, UsageError
+from tests.loops import each
 
 CAN0 = {"interface": "socketcan", "channel": "can0"}
 PCAN = {"interface": "pcan", "channel": "PCAN_USBBUS1"}
@@ -99,7 +100,7 @@ def test_on_socketcan_the_kernels_holds_and_is_compared(monkeypatch: pytest.Monk
         assert "ip link set can0 type can bitrate 250000" in caught.value.remedy
 
 
-@pytest.mark.parametrize("value", [0, -250_000, 1, 4_999, 1_000_001, 10**30, "fast", 2.5, True])
+@each("value", [0, -250_000, 1, 4_999, 1_000_001, 10**30, "fast", 2.5, True])
 def test_what_is_no_bit_rate_is_wrong_usage(value: Any) -> None:
     with pytest.raises(UsageError, match="is no bit rate"):
         api.bit_rate(**PCAN, bitrate=value)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from flasher.bus.health import (
     LAYOUTS,
     BusTrouble,
@@ -16,6 +14,7 @@ from flasher.bus.health import (
 from flasher.errors import ExitCode
 from flasher.prose import prose
 from flasher.protocol.frame import Frame
+from tests.loops import each
 
 ORDINARY = Frame(0x725, b"\x01")
 
@@ -49,7 +48,7 @@ LINUX = [
 ]
 
 
-@pytest.mark.parametrize(("can_id", "data", "kind", "words"), LINUX)
+@each("can_id, data, kind, words", LINUX)
 def test_linux_error_frames(can_id: int, data: str, kind: TroubleKind, words: str) -> None:
     trouble = linux(can_id, data)
     assert trouble.kind is kind
@@ -74,7 +73,7 @@ PCAN = [
 ]
 
 
-@pytest.mark.parametrize(("can_id", "data", "kind", "words"), PCAN)
+@each("can_id, data, kind, words", PCAN)
 def test_pcan_error_frames(can_id: int, data: str, kind: TroubleKind, words: str) -> None:
     trouble = decode_error_frame(error_frame(can_id, data), Layout.PCAN)
     assert trouble.kind is kind
@@ -83,8 +82,8 @@ def test_pcan_error_frames(can_id: int, data: str, kind: TroubleKind, words: str
     assert (trouble.rx_errors, trouble.tx_errors) == (counters[2], counters[3])
 
 
-@pytest.mark.parametrize("layout", list(Layout))
-@pytest.mark.parametrize("data", ["", "FF", "FF FF FF FF FF FF FF FF"])
+@each("layout", list(Layout))
+@each("data", ["", "FF", "FF FF FF FF FF FF FF FF"])
 def test_odd_error_frames_are_no_error_of_ours(layout: Layout, data: str) -> None:
     """socketcand sends one byte, a vendor's firmware what it likes."""
     for can_id in (0, 0x7FF):
@@ -113,7 +112,7 @@ NO_ACK = error_frame(0x0A8, "00 00 80 19 00 00 00 00")
 BUS_OFF = error_frame(0x040)
 
 
-@pytest.mark.parametrize("evidence", [PASSIVE, NO_ACK])
+@each("evidence", [PASSIVE, NO_ACK])
 def test_frames_sent_and_nothing_received_but_that_evidence_is_no_acknowledgement(
     evidence: Frame,
 ) -> None:

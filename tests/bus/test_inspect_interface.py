@@ -12,6 +12,7 @@ import pytest
 
 from flasher.bus.health import ControllerState
 from flasher.bus.inspect_interface import Interface, Unseen, look_up, read_interface
+from tests.loops import each
 
 CAN0: dict[str, Any] = {
     "ifindex": 5,
@@ -96,8 +97,8 @@ def test_everything_that_ip_tells(sysfs: Path) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("word", "state"),
+@each(
+    "word, state",
     [
         ("ERROR-ACTIVE", ControllerState.ACTIVE),
         ("ERROR-WARNING", ControllerState.ACTIVE),

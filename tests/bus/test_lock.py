@@ -14,6 +14,7 @@ import pytest
 from flasher.bus import lock
 from flasher.bus.adapter import open_adapter
 from flasher.errors import BusError, ExitCode
+from tests.loops import each
 
 SLCAN = {"interface": "slcan", "channel": "COM3"}
 CAN0 = {"interface": "socketcan", "channel": "can0"}
@@ -48,8 +49,8 @@ def test_a_second_holder_is_told_who_has_it_and_since_when() -> None:
     assert is_free(CAN0)
 
 
-@pytest.mark.parametrize(
-    ("one", "other", "same"),
+@each(
+    "one, other, same",
     [
         (CAN0, {"interface": "socketcan", "channel": "can1"}, False),
         (CAN0, {"interface": "gs_usb", "channel": "can0"}, False),
@@ -77,7 +78,6 @@ def test_a_second_holder_is_told_who_has_it_and_since_when() -> None:
             False,
         ),
     ],
-    ids=str,
 )
 def test_the_same_adapter_is_known_however_it_is_named(
     one: dict[str, Any], other: dict[str, Any], *, same: bool

@@ -16,6 +16,7 @@ from flasher.cli.options import can_filter
 from flasher.errors import ExitCode
 from flasher.protocol.spec import BMS, OBC, TARGETS, WMC
 from tests.cli.conftest import SAMPLES, Flasher
+from tests.loops import each
 
 OBC_BIN = SAMPLES / "obc.bin"
 
@@ -23,15 +24,15 @@ OBC_BIN = SAMPLES / "obc.bin"
 # -- single values --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("text", "value"),
+@each(
+    "text, value",
     [("0", 0), ("1_000", 1000), ("0XfF", 255), ("2k", 2048), ("0x2K", 2048), ("3m", 3 << 20)],
 )
 def test_numbers_are_decimal_or_hexadecimal_with_a_suffix(text: str, value: int) -> None:
     assert values.number(text) == value
 
 
-@pytest.mark.parametrize("text", ["", "-1", "1.5", "0b1", "12x", "K", "1 K", "0x", "٣"])
+@each("text", ["", "-1", "1.5", "0b1", "12x", "K", "1 K", "0x", "٣"])
 def test_what_is_no_number_is_refused(text: str) -> None:
     with pytest.raises(click.BadParameter, match="is no number"):
         values.number(text)
@@ -43,7 +44,7 @@ def test_a_range_is_two_numbers_and_a_colon() -> None:
         values.address_range("0x8004000")
 
 
-@pytest.mark.parametrize("text", ["-0.1", "nan", "inf", "soon", ""])
+@each("text", ["-0.1", "nan", "inf", "soon", ""])
 def test_a_time_is_a_finite_number_of_seconds(text: str) -> None:
     assert values.seconds("0.25") == 0.25
     assert values.seconds("0") == 0.0
@@ -51,7 +52,7 @@ def test_a_time_is_a_finite_number_of_seconds(text: str) -> None:
         values.seconds(text)
 
 
-@pytest.mark.parametrize("text", ["0.01", "-1", "fast"])
+@each("text", ["0.01", "-1", "fast"])
 def test_a_speed_is_zero_or_fast_enough_to_be_stopped(text: str) -> None:
     assert values.speed("0") == 0.0
     assert values.speed("0.1") == 0.1
@@ -74,14 +75,12 @@ def test_targets_go_by_every_name_that_the_documents_use() -> None:
     assert all(name in caught.value.message for name in TARGETS)
 
 
-@pytest.mark.parametrize(
-    ("text", "read"), [("a=1", ("a", "1")), ("a=", ("a", "")), ("a_1=x y=2", ("a_1", "x y=2"))]
-)
+@each("text, read", [("a=1", ("a", "1")), ("a=", ("a", "")), ("a_1=x y=2", ("a_1", "x y=2"))])
 def test_a_keyword_has_a_value(text: str, read: tuple[str, str]) -> None:
     assert values.key_value(text) == read
 
 
-@pytest.mark.parametrize("text", ["", "a", "=1", "1=2", "./b=2.hex"])
+@each("text", ["", "a", "=1", "1=2", "./b=2.hex"])
 def test_what_is_no_keyword_is_refused(text: str) -> None:
     with pytest.raises(click.BadParameter, match="is not KEY=VALUE"):
         values.key_value(text)

@@ -21,6 +21,7 @@ from flasher.cli.output import Output
 from flasher.errors import ExitCode
 from tests.cli.conftest import Flasher
 from tests.end_to_end.processes import FLASHER, clean_environment
+from tests.loops import each
 
 Complete = Callable[[str], set[str]]
 
@@ -110,7 +111,7 @@ def test_can_interfaces_of_linux_are_offered_as_channels(
     assert complete("flasher scan -c ") == {"can0", "vcan1"}
 
 
-@pytest.mark.parametrize("shell", ["zsh", "fish"])
+@each("shell", ["zsh", "fish"])
 def test_the_program_itself_answers_the_shell(shell: str) -> None:
     asked = {
         "_FLASHER_COMPLETE": f"{shell}_complete",
@@ -125,7 +126,7 @@ def test_the_program_itself_answers_the_shell(shell: str) -> None:
     assert done.stderr == b""
 
 
-@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+@each("shell", ["bash", "zsh", "fish"])
 def test_a_shell_is_told_how_to_ask(shell: str) -> None:
     done = subprocess.run(
         FLASHER,
@@ -203,10 +204,10 @@ def with_actions(command: click.Command) -> Iterator[click.Command]:
         yield from command.commands.values()
 
 
-@pytest.mark.parametrize("command", COMMANDS)
+@each("command", COMMANDS)
 def test_actions_of_a_command_take_the_output_options_too(command: str) -> None:
-    for each in with_actions(command_of(command)):
-        assert any("--log-file" in param.opts for param in each.params), each.name
+    for found in with_actions(command_of(command)):
+        assert any("--log-file" in param.opts for param in found.params), found.name
 
 
 def test_help_lists_the_commands_by_purpose(flasher: Flasher) -> None:

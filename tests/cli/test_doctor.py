@@ -26,6 +26,7 @@ from flasher.protocol.frame import Frame
 from tests.api.battery import ANSWERS, Battery, wire_to
 from tests.bus.test_adapter import FakeBus, error_message, message
 from tests.cli.conftest import Flasher, Run
+from tests.loops import each
 
 MOCK = ("--mock", "--mock-speed", "0")
 SILENT = frozenset(ANSWERS)
@@ -479,8 +480,8 @@ def test_it_is_over_when_it_has_listened(flasher: Flasher) -> None:
     assert time.monotonic() - began < 5.0
 
 
-@pytest.mark.parametrize(
-    ("given", "words"),
+@each(
+    "given, words",
     [
         ({}, "-i pcan -c 'a b'"),
         ({"interface": "pcan", "channel": "a b"}, "-i pcan -c 'a b'"),

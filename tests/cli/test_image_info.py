@@ -9,6 +9,7 @@ import pytest
 from flasher.cli.values import number
 from flasher.errors import ExitCode
 from tests.cli.conftest import SAMPLES, Flasher
+from tests.loops import each
 
 
 def test_the_sample_is_described_with_its_plan(flasher: Flasher) -> None:
@@ -70,7 +71,7 @@ def test_an_outside_vector_is_refused_until_waived(flasher: Flasher) -> None:
     assert flasher("image-info", bad, "--allow-outside-vector").code == ExitCode.OK
 
 
-@pytest.mark.parametrize(("text", "value"), [("4K", 4096), ("0x10", 16), ("1M", 1048576), ("7", 7)])
+@each("text, value", [("4K", 4096), ("0x10", 16), ("1M", 1048576), ("7", 7)])
 def test_numbers_take_hex_and_suffixes(text: str, value: int) -> None:
     assert number(text) == value
 

@@ -20,6 +20,7 @@ from flasher.cli.output import counted, duration
 from flasher.errors import ExitCode
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.processes import FLASHER, clean_environment, lines_until
+from tests.loops import each
 
 OBC_BIN = str(SAMPLES / "obc.bin")
 MOCK = ("flash", OBC_BIN, "-t", "obc", "--mock", "--mock-speed", "0")
@@ -70,9 +71,7 @@ def test_python_m_flasher_is_the_same_and_exits_with_the_code(
     assert "4,000 bytes to send" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"), [(0.0, "0.00 s"), (119.994, "119.99 s"), (3725.0, "62 min 05 s")]
-)
+@each("seconds, text", [(0.0, "0.00 s"), (119.994, "119.99 s"), (3725.0, "62 min 05 s")])
 def test_long_times_are_told_in_minutes(seconds: float, text: str) -> None:
     assert duration(seconds) == text
 

@@ -23,6 +23,7 @@ from flasher.trace.decoder import BusEvent
 from flasher.trace.recorder import Recorder
 from flasher.trace.watcher import Board, Watcher, replay
 from tests.cli.conftest import Flasher
+from tests.loops import each
 from tests.peers.wording import REPORT
 from tests.trace import traffic
 
@@ -332,8 +333,8 @@ def test_what_has_no_room_is_counted() -> None:
     assert len(lines) <= 10
 
 
-@pytest.mark.parametrize("width", [40, 80, 116, 200])
-@pytest.mark.parametrize("height", [8, 10, 24, 60])
+@each("width", [40, 80, 116, 200])
+@each("height", [8, 10, 24, 60])
 def test_it_never_exceeds_the_window(width: int, height: int) -> None:
     board = board_of(
         traffic.running(),

@@ -31,6 +31,7 @@ from flasher.station.scans import Word
 from tests.cli.conftest import SAMPLES, Flasher, Run
 from tests.cli.station_threads import ThreadPort
 from tests.cli.test_schema import hold, hold_output
+from tests.loops import each
 from tests.station.factory import SERIAL, USUAL, Bench, write_recipe
 
 RECIPE = SAMPLES / "station" / "recipe.toml"
@@ -423,7 +424,7 @@ def test_the_guide_lists_every_code_with_what_to_do() -> None:
         assert row in guide
 
 
-@pytest.mark.parametrize("model", [Recipe, StationConfig], ids=lambda model: model.__name__)
+@each("model", [Recipe, StationConfig])
 def test_the_guide_names_every_key(model: type[Table]) -> None:
     guide = GUIDE.read_text(encoding="utf-8")
     tables = [model]

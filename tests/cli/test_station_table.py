@@ -333,7 +333,7 @@ def sample(hint: Any) -> Any:
     return tuple(map(sample, options)) if options else sample_of(hint)
 
 
-@pytest.mark.parametrize("event", LINES, ids=lambda event: event.__name__)
+@each("event", LINES)
 def test_every_event_is_as_described(event: Any) -> None:
     schema = json.loads(SCHEMA.read_text(encoding="utf-8"))
     made = event(**{name: sample(hint) for name, hint in get_type_hints(event).items()})

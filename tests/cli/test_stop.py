@@ -20,6 +20,7 @@ from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.processes import FLASHER, clean_environment, lines_until
+from tests.loops import each
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 signals_reach_processes = pytest.mark.skipif(
@@ -30,7 +31,7 @@ signals_reach_processes = pytest.mark.skipif(
 # -- handlers -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("number", SIGNALS)
+@each("number", SIGNALS)
 def test_the_first_signal_asks_and_the_second_interrupts(number: signal.Signals) -> None:
     with stop_on_signal() as stopped:
         assert not stopped()

@@ -11,6 +11,7 @@ import pytest
 from flasher.cli.main import main
 from flasher.cli.terminal import painted, wrap_line
 from flasher.errors import ExitCode
+from tests.loops import each
 from tests.trace import traffic
 
 from .conftest import SAMPLES, Flasher
@@ -22,7 +23,7 @@ LONG = (
 )
 
 
-@pytest.mark.parametrize("width", [40, 60, 80, 120, 300])
+@each("width", [40, 60, 80, 120, 300])
 def test_text_is_wrapped_between_words_and_hangs_behind_its_label(width: int) -> None:
     lines = wrap_line(LONG, width)
     assert " ".join(line.strip() for line in lines) == LONG.strip()
@@ -30,8 +31,8 @@ def test_text_is_wrapped_between_words_and_hangs_behind_its_label(width: int) ->
     assert all(line.startswith(" " * 16) for line in lines[1:])
 
 
-@pytest.mark.parametrize(
-    ("line", "wrapped"),
+@each(
+    "line, wrapped",
     [
         ("short", ["short"]),
         ("", [""]),

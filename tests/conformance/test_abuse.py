@@ -19,6 +19,7 @@ from flasher.conformance.runner import RunObserver, run
 from flasher.errors import ExitCode
 from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
+from tests.loops import each
 
 from .bench import PROFILE, Babbler, DeafDevice, maker
 
@@ -136,7 +137,7 @@ def test_a_device_that_babbles_on_its_own_id_does_not_keep_the_run_from_its_end(
     assert report.count(CaseVerdict.PASS) == 0
 
 
-@pytest.mark.parametrize("case_id", ["RS-01", "RS-03", "EN-01"])
+@each("case_id", ["RS-01", "RS-03", "EN-01"])
 def test_an_adapter_unplugged_midway_leaves_the_verdicts_so_far(case_id: str) -> None:
     subject = MockSubject("bms")
     report = run(subject, PROFILE, selection=SELECTION, observer=Unplugger(subject, case_id))

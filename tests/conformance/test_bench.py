@@ -12,6 +12,7 @@ from flasher.conformance.mock import GOOD_IMAGE, MOCK_PROFILE, SECOND_IMAGE, pro
 from flasher.conformance.results import CaseLimitReached, CaseStopped
 from flasher.conformance.tester import Fault, FaultKind
 from flasher.conformance.wire import Kind, RawFrame
+from tests.loops import each
 
 from .bench import PROFILE, subject
 
@@ -24,8 +25,8 @@ def sent(bench: Bench) -> list[int]:
     return [entry.frame.data[0] for entry in bench.tester.trace if entry.sent]
 
 
-@pytest.mark.parametrize(
-    ("fault", "carried"),
+@each(
+    "fault, carried",
     [
         (Fault(FaultKind.DROP, 1), [0, 2, 3]),
         (Fault(FaultKind.DOUBLE, 1), [0, 1, 1, 2, 3]),
@@ -33,7 +34,6 @@ def sent(bench: Bench) -> list[int]:
         (Fault(FaultKind.SWAP, 3), [0, 1, 2, 3]),
         (Fault(FaultKind.DELAY, 1, delay_s=0.05), [0, 1, 2, 3]),
     ],
-    ids=str,
 )
 def test_a_fault_befalls_one_frame(fault: Fault, carried: list[int]) -> None:
     bench = made()
@@ -78,7 +78,7 @@ def test_what_is_expected_and_does_not_come_ends_the_case() -> None:
     assert (check.expected, check.got) == ("ACK 3", "nothing within 0.1 s")
 
 
-@pytest.mark.parametrize("lost", [0, 5, 30, 200])
+@each("lost", [0, 5, 30, 200])
 def test_the_patient_host_gets_an_image_through_a_lost_frame(lost: int) -> None:
     bench = made()
     with bench.disturb(Fault(FaultKind.DROP, lost)):
@@ -112,7 +112,7 @@ def test_a_device_that_is_off_the_bus_hears_nothing_for_that_long() -> None:
     assert bench.application_version(1.0) is not None
 
 
-@pytest.mark.parametrize("choice", ["nak_expected", "nak_received", "silence"])
+@each("choice", ["nak_expected", "nak_received", "silence"])
 def test_a_packet_that_is_rejected_is_judged_by_the_profile(choice: Any) -> None:
     device = replace(MOCK_PROFILE, bad_packet=choice)
     bench = Bench(subject(profile=device), profile_of_mock(device), limit_s=100.0)

@@ -13,6 +13,7 @@ from flasher.conformance.profile import profile_keys
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.mock.variants import VARIANTS
+from tests.loops import each
 
 MINE = ("RS", "UP")
 WRONG = {name: one for name, one in VARIANTS.items() if one.clause.partition("-")[0] in MINE}
@@ -32,7 +33,7 @@ def failed(
     return [result.case_id for result in report.results if result.verdict is not CaseVerdict.PASS]
 
 
-@pytest.mark.parametrize("target", ["wmc", "bms"])
+@each("target", ["wmc", "bms"])
 def test_the_mock_passes(target: str) -> None:
     assert failed(target=target) == []
 
@@ -41,7 +42,7 @@ def test_the_mock_passes_as_obc() -> None:
     assert failed(target="obc", only=("RS-01", "RS-04", "UP-06")) == []
 
 
-@pytest.mark.parametrize(
+@each(
     "choices",
     [
         {"reset_in_bootloader": "restarts", "without_application": "listens"},
@@ -51,14 +52,13 @@ def test_the_mock_passes_as_obc() -> None:
         {"largest_image_bytes": 1300, "image_checksum": "crc32", "start_delay_s": 1.0},
         {"erased_pages": "all", "erase_time_s": 0.01, "program_time_s": 0.02},
     ],
-    ids=str,
 )
 def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, Any]) -> None:
     assert failed(**choices) == []
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize("name", WRONG)
+@each("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
     clause = WRONG[name].clause
     assert failed(name, only=(clause,)) == [clause]

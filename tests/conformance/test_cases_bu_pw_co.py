@@ -11,6 +11,7 @@ from flasher.conformance.mock import MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.results import CaseResult, CaseVerdict, CheckOutcome
 from flasher.conformance.runner import run
 from flasher.conformance.wire import Encoder
+from tests.loops import each
 
 from .verdicts import cases_of, not_passed, variants_of, verdicts
 
@@ -45,7 +46,7 @@ def test_a_target_without_a_version_query_passes() -> None:
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize(
+@each(
     "choices",
     [
         {"reset_in_bootloader": "restarts", "without_application": "listens"},
@@ -53,14 +54,13 @@ def test_a_target_without_a_version_query_passes() -> None:
         {"reset_in_transfer": "restarts", "window_s": 0.5, "after_complete": "restarts"},
         {"bad_packet": "silence", "repeated_packet": "nak_next", "repeated_end": "silence"},
     ],
-    ids=str,
 )
 def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, Any]) -> None:
     assert not_passed(*QUICK, **choices) == []
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize("name", WRONG)
+@each("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
     assert verdicts([WRONG[name]], name) == {WRONG[name]: CaseVerdict.FAIL}
 
@@ -87,9 +87,7 @@ def test_a_bench_with_power_alone_judges_what_it_can_and_says_what_it_cannot() -
     ]
 
 
-@pytest.mark.parametrize(
-    ("case_id", "power"), [("PW-01", "has_power"), ("PW-02", "has_power"), ("BU-02", "has_bus_off")]
-)
+@each("case_id, power", [("PW-01", "has_power"), ("PW-02", "has_power"), ("BU-02", "has_bus_off")])
 def test_what_a_bench_lacks_makes_a_case_unsupported(case_id: str, power: str) -> None:
     assert result_of(case_id, None, **{power: False}).verdict is CaseVerdict.UNSUPPORTED
 

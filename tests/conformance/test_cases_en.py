@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from flasher.conformance.results import CaseVerdict
+from tests.loops import each
 
 from .verdicts import cases_of, not_passed, variants_of, verdicts
 
@@ -29,21 +30,20 @@ def test_a_target_without_a_version_query_passes_all_but_the_version() -> None:
     assert set(found.values()) == {CaseVerdict.PASS}
 
 
-@pytest.mark.parametrize(
+@each(
     "choices",
     [
         {"repeated_end": "silence", "without_application": "listens"},
         {"after_complete": "restarts", "reset_in_bootloader": "restarts"},
         {"start_delay_s": 1.0, "states": {"en_02": "either"}, "pause_in_transfer": "waits"},
     ],
-    ids=str,
 )
 def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, Any]) -> None:
     assert not_passed(*CASES, image_checksum="crc32", **choices) == []
 
 
-@pytest.mark.parametrize(
-    ("case_id", "states"),
+@each(
+    "case_id, states",
     [
         ("EN-01", {"en_03": "restarts"}),
         ("EN-02", {"en_02": "silence"}),
@@ -57,7 +57,7 @@ def test_a_device_that_chooses_otherwise_than_its_profile_says_fails(
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize("name", WRONG)
+@each("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
     assert not_passed(WRONG[name], variant=name) == [WRONG[name]]
 

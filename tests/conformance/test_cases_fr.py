@@ -19,6 +19,7 @@ from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import CaseVerdict, CheckOutcome, RunReport
 from flasher.conformance.runner import run
 from flasher.mock.variants import VARIANTS
+from tests.loops import each
 
 MINE = ("FR", "CR", "TM")
 LONGEST = ("CR-01", "CR-02")
@@ -48,16 +49,16 @@ def failed(done: RunReport) -> list[str]:
     return [result.case_id for result in done.results if result.verdict is not CaseVerdict.PASS]
 
 
-@pytest.mark.parametrize(
-    ("target", "only"),
+@each(
+    "target, only",
     [("bms", SHORT), ("wmc", ("FR-08", "CR-03", "CR-04")), ("obc", ("FR-01", "CR-04", "TM-05"))],
 )
 def test_the_mock_passes(target: str, only: tuple[str, ...]) -> None:
     assert failed(report(target=target, only=only)) == []
 
 
-@pytest.mark.parametrize(
-    ("only", "choices"),
+@each(
+    "only, choices",
     [
         (SHORT, {"bad_packet": "silence", "update_in_transfer": "ignored", "window_s": 0.05}),
         (
@@ -75,7 +76,6 @@ def test_the_mock_passes(target: str, only: tuple[str, ...]) -> None:
             {"transfer_timeout_s": 1.0, "erase_time_s": 0.05, "program_time_s": 0.02},
         ),
     ],
-    ids=["silent", "talkative", "slow"],
 )
 def test_the_mock_passes_by_its_profile_whatever_it_chooses(
     only: tuple[str, ...], choices: dict[str, Any]
@@ -93,14 +93,14 @@ def test_no_damaged_packet_is_taken_by_the_mock() -> None:
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize("name", WRONG)
+@each("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
     clause = WRONG[name].clause
     assert failed(report(name, only=(clause,))) == [clause]
 
 
-@pytest.mark.parametrize(
-    ("name", "case_id", "key", "value"),
+@each(
+    "name, case_id, key, value",
     [
         ("short-frame-ends-message", "FR-01", "fr_01", "rejected"),
         ("header-at-frame-start-only", "FR-02", "fr_02", "lost"),

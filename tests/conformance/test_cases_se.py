@@ -6,6 +6,8 @@ from typing import Any
 
 import pytest
 
+from tests.loops import each
+
 from .verdicts import cases_of, not_passed, variants_of
 
 CASES = ("SE-01", "SE-03", "SE-04")
@@ -22,8 +24,8 @@ def test_a_target_without_a_version_query_passes() -> None:
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize(
-    ("cases", "choices"),
+@each(
+    "cases, choices",
     [
         (("SE-01",), {"pause_in_transfer": "waits"}),
         (("SE-03",), {"update_in_transfer": "ignored", "after_complete": "restarts"}),
@@ -31,7 +33,6 @@ def test_a_target_without_a_version_query_passes() -> None:
         (("SE-04",), {"bad_packet": "silence"}),
         (("SE-04",), {"bad_packet": "nak_received", "largest_image_bytes": 1300}),
     ],
-    ids=str,
 )
 def test_the_mock_passes_by_its_profile_whatever_it_chooses(
     cases: tuple[str, ...], choices: dict[str, Any]
@@ -40,6 +41,6 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize("name", WRONG)
+@each("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
     assert not_passed(WRONG[name], variant=name) == [WRONG[name]]

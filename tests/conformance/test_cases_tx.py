@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from flasher.conformance.results import CaseVerdict
+from tests.loops import each
 
 from .verdicts import cases_of, not_passed, variants_of, verdicts
 
@@ -23,13 +24,13 @@ def test_the_mock_passes() -> None:
     assert not_passed(*cases) == []
 
 
-@pytest.mark.parametrize("target", ["wmc", "obc"])
+@each("target", ["wmc", "obc"])
 def test_a_target_without_a_version_query_passes(target: str) -> None:
     assert not_passed("TX-01", "TX-13", target=target) == []
 
 
-@pytest.mark.parametrize(
-    ("cases", "choices"),
+@each(
+    "cases, choices",
     [
         (
             BAD_PACKET + REPEATED,
@@ -63,7 +64,6 @@ def test_a_target_without_a_version_query_passes(target: str) -> None:
             },
         ),
     ],
-    ids=str,
 )
 def test_the_mock_passes_by_its_profile_whatever_it_chooses(
     cases: tuple[str, ...], choices: dict[str, Any]
@@ -71,8 +71,8 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(
     assert not_passed(*cases, **choices) == []
 
 
-@pytest.mark.parametrize(
-    ("case_id", "states"),
+@each(
+    "case_id, states",
     [
         ("TX-01", {"tx_01": "silence"}),
         ("TX-01", {"tx_01": "nak_received"}),
@@ -91,7 +91,7 @@ def test_a_device_that_chooses_otherwise_than_its_profile_says_fails(
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize("name", WRONG)
+@each("name", WRONG)
 def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
     size = LARGE if name == "sixteen-bit-offsets" else {}
     assert not_passed(WRONG[name], variant=name, **size) == [WRONG[name]]

@@ -20,6 +20,7 @@ from flasher.conformance.real import RealPort, RealSubject
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.protocol.spec import WELLING
+from tests.loops import each
 from tests.peers.scripted_device import ScriptedDevice
 
 _AREA_BYTES: Final = 12 * 1024
@@ -137,8 +138,8 @@ def test_a_right_device_of_others_passes() -> None:
     assert judged(ScriptedDevice, cases) == {}
 
 
-@pytest.mark.parametrize(
-    ("kind", "cases", "choices"),
+@each(
+    "kind, cases, choices",
     [
         (
             SlowDevice,
@@ -159,8 +160,8 @@ def test_other_ways_that_the_document_leaves_open_pass(
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize(
-    ("kind", "cases"),
+@each(
+    "kind, cases",
     [
         (LateListener, ("FR-08", "UP-04")),
         (ChoosyDevice, ("TX-04", "TX-06")),

@@ -19,6 +19,7 @@ from flasher.errors import BusError, UsageError
 from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING
+from tests.loops import each
 
 SCRIPT = "import sys; open(sys.argv[1], 'w').write(sys.argv[2])"
 
@@ -100,8 +101,8 @@ def test_the_power_command_says_on_or_off(tmp_path: Path, on: bool, said: str) -
     assert path.read_text() == said
 
 
-@pytest.mark.parametrize(
-    ("command", "said"),
+@each(
+    "command, said",
     [
         ("no-such-relay {on|off}", "cannot be run"),
         (f'{sys.executable} -c "raise SystemExit(3)" {{on|off}}', "exit code 3"),
@@ -118,7 +119,7 @@ def test_a_power_command_that_hangs_is_cut() -> None:
         command(True)
 
 
-@pytest.mark.parametrize("template", ["relay on", "relay {on}", "relay '{on|off}"])
+@each("template", ["relay on", "relay {on}", "relay '{on|off}"])
 def test_a_power_command_that_makes_no_sense_is_refused(template: str) -> None:
     with pytest.raises(UsageError):
         PowerCommand(template)

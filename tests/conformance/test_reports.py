@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any, Final
 
 import jsonschema
-import pytest
 
 from flasher.cli.bench.conformance import ConformanceDocument
 from flasher.cli.schema import schema_of
@@ -28,6 +27,7 @@ from flasher.conformance.results import (
     RunReport,
 )
 from flasher.conformance.runner import RunOptions, run
+from tests.loops import each
 from tests.report.pages import Page, assert_self_contained, assert_visible
 
 from .bench import PROFILE, fails_once, passes_once, run_case
@@ -81,7 +81,7 @@ def page_of(report: RunReport, **replays: str) -> str:
 # -- JSON -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("make", [wrong_run, hostile_report, lambda: run_case(passes_once)])
+@each("make", [wrong_run, hostile_report, lambda: run_case(passes_once)])
 def test_the_document_is_as_its_schema_says(make: Any) -> None:
     document = {"report": document_of(make())}
     jsonschema.validate(document, schema_of(ConformanceDocument))

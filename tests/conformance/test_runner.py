@@ -15,6 +15,7 @@ from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import RunOptions, run
 from flasher.conformance.wire import RawFrame
 from flasher.errors import UsageError
+from tests.loops import each
 
 from .bench import (
     PROFILE,
@@ -178,8 +179,8 @@ def test_a_quick_run_leaves_out_what_is_long_unless_it_is_named() -> None:
     assert not Selection(groups=("UP",)).has("RS-01")
 
 
-@pytest.mark.parametrize(
-    ("selection", "said"),
+@each(
+    "selection, said",
     [
         (Selection(cases=("RS-1",)), "Did you mean RS-0"),
         (Selection(groups=("XX",)), "There is no group"),
@@ -227,7 +228,7 @@ def test_a_device_that_only_a_power_cycle_brings_back_fails_the_case_and_the_run
     assert report.final_image == "verified"
 
 
-@pytest.mark.parametrize("has_power", [False, True])
+@each("has_power", [False, True])
 def test_a_device_that_is_killed_ends_the_run_and_names_the_case(has_power: bool) -> None:
     device = subject(DeafDevice)
     assert isinstance(device.device, DeafDevice)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from flasher.conformance import wire
 from flasher.conformance.wire import (
     Decoder,
@@ -15,6 +13,7 @@ from flasher.conformance.wire import (
     describe,
     split,
 )
+from tests.loops import each
 
 BMS = Encoder("bms")
 
@@ -37,8 +36,8 @@ def test_the_crc_is_that_of_the_documents_example() -> None:
     assert wire.message_crc(0x712, bytes.fromhex("1103220100")) == bytes.fromhex("01295122")
 
 
-@pytest.mark.parametrize(
-    ("target", "reset", "update", "end"),
+@each(
+    "target, reset, update, end",
     [
         (
             "wmc",
@@ -74,8 +73,8 @@ def test_a_packet_is_18_whole_frames() -> None:
     assert frames[1].data[:3] == bytes.fromhex("010403")
 
 
-@pytest.mark.parametrize(
-    ("payloads", "kind", "shown"),
+@each(
+    "payloads, kind, shown",
     [
         ("55AA0C0555034143 4BB209FC46F0", Kind.FEEDBACK, "general feedback"),
         (
@@ -96,7 +95,7 @@ def test_what_the_device_says_is_named(payloads: str, kind: Kind, shown: str) ->
     assert (heard.first_at, heard.at) == (0.0, 0.001 * payloads.count(" "))
 
 
-@pytest.mark.parametrize(
+@each(
     "payloads",
     [
         "55AA0C04C2020100 0027EA05F1",  # tail
@@ -119,8 +118,8 @@ def test_a_message_that_stops_midway_is_damaged_once_another_begins() -> None:
     assert [one.kind for one in found] == [Kind.DAMAGED, Kind.ACK]
 
 
-@pytest.mark.parametrize(
-    ("can_id", "command", "kinds"),
+@each(
+    "can_id, command, kinds",
     [
         (0x720, wire.ACK, [Kind.OTHER]),  # a wrong id of the same sender
         (0x720, 0x1402, [Kind.APPLICATION]),

@@ -107,7 +107,7 @@ def test_two_swapped_frames_anywhere_never_end_in_a_wrong_image(index: int) -> N
     judge(upgrade(device, image=IMAGE, disturbance=swap), device)
 
 
-@pytest.mark.parametrize("seed", range(20))
+@each("seed", range(20))
 def test_a_bus_that_loses_frames_at_random_never_leads_to_a_wrong_image(seed: int) -> None:
     draw = random.Random(seed)
     device = device_model()
@@ -164,7 +164,7 @@ class Babbler:
         return []
 
 
-@pytest.mark.parametrize("can_id", [0x001, 0x720, 0x7FF])
+@each("can_id", [0x001, 0x720, 0x7FF])
 def test_other_traffic_at_high_load_changes_nothing_but_the_time(can_id: int) -> None:
     """CO-01: a frame of 8 bytes takes about 0.5 ms; 70 % and more of the bus are taken."""
     device = device_model()
@@ -174,7 +174,7 @@ def test_other_traffic_at_high_load_changes_nothing_but_the_time(can_id: int) ->
     assert device.stored_image == IMAGE
 
 
-@pytest.mark.parametrize("target", ["wmc", "bms", "obc"])
+@each("target", ["wmc", "bms", "obc"])
 def test_a_device_without_application_announces_on_and_is_upgraded(target: str) -> None:
     """R14."""
     device = MockDevice(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, has_application=False)

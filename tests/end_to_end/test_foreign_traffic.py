@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from flasher import api, events
 from flasher.driver import Tap
 from flasher.errors import ExitCode
@@ -15,6 +13,7 @@ from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, WELLING, WMC
 from tests.end_to_end.stage import IMAGE, NEW, SMALL, Speaker, Stage, image_of
+from tests.loops import each
 
 
 def data(text: str) -> bytes:
@@ -86,11 +85,10 @@ def flash(stage: Stage, *others: Engine, taps: tuple[Tap, ...] = ()) -> Ids:
     return ids
 
 
-@pytest.mark.parametrize("target", ["bms", "obc"])
-@pytest.mark.parametrize(
+@each("target", ["bms", "obc"])
+@each(
     "frames",
     [CANOPEN, XCP, UDS, OTHER_KINDS],
-    ids=["CANopen", "XCP", "UDS", "29 bits and remote"],
 )
 def test_other_protocols_on_the_bus_are_nothing_to_an_upgrade(
     target: str, frames: tuple[Frame, ...]
@@ -103,9 +101,7 @@ def test_neighbours_of_our_ids_are_neither_taken_for_the_device_nor_for_a_second
     flash(Stage(), Speaker(*NEIGHBOURS, every_s=0.001))
 
 
-@pytest.mark.parametrize(
-    ("can_id", "load"), [(0x001, 0.7), (0x723, 0.7), (0x7FF, 0.7), (0x001, 0.9)]
-)
+@each("can_id, load", [(0x001, 0.7), (0x723, 0.7), (0x7FF, 0.7), (0x001, 0.9)])
 def test_a_bus_that_others_use_to_70_percent_and_more_makes_it_slower_only(
     can_id: int, load: float
 ) -> None:
@@ -172,7 +168,7 @@ class Flood(Speaker):
         return None if self._clock.now() > self._ends_at else super().deadline()
 
 
-@pytest.mark.parametrize("lasts_s", [0.3, 1.5])
+@each("lasts_s", [0.3, 1.5])
 def test_a_bus_that_is_full_for_a_while_in_the_transfer_is_waited_for(lasts_s: float) -> None:
     """Not a single bit time is free, in the middle of a packet."""
     stage = Stage()

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections import Counter
 
-import pytest
-
 from tests.campaigns.beside_a_flash import on_the_simulated_bus
 from tests.campaigns.lost_contact import Fault, trial
+from tests.loops import each
 
 SEEDS = (6, 10, 11, 25)
 """The moments of which lie in the restart, in the erase, in the transfer and at the end."""
 
 
-@pytest.mark.parametrize("fault", Fault, ids=lambda fault: fault.value)
+@each("fault", Fault)
 def test_a_lost_adapter_needs_no_power_cycle_however_stubborn_the_device(fault: Fault) -> None:
     for seed in SEEDS:
         tried = trial(fault, seed)

@@ -151,10 +151,9 @@ class Puller(Sender):
             self.bus.unplug()
 
 
-@pytest.mark.parametrize(
+@each(
     "at_s",
     [0.0005, 0.03, 0.055, 0.5, 1.2, 1.25],
-    ids=["in reset", "restart", "version", "erase", "packet", "a later packet"],
 )
 def test_an_adapter_that_is_pulled_out_ends_it_within_a_second(at_s: float) -> None:
     """BU-05: also while there is nothing to do but to wait."""

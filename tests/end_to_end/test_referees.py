@@ -5,15 +5,13 @@ from __future__ import annotations
 
 import random
 
-import pytest
-
 from flasher.api import as_target
 from flasher.errors import ExitCode
 from flasher.host.options import UpgradeOptions
 from flasher.host.table import Ending
 from flasher.mock.model import MockDevice
 from tests.end_to_end.world import IMAGE, Traffic, upgrade
-from tests.peers.dialogue import strays
+from tests.loops import each
 from tests.peers.scripted_device import DeviceScript, ScriptedDevice
 from tests.peers.scripted_host import HostScript, ScriptedHost
 from tests.peers.virtual_wire import run
@@ -29,8 +27,8 @@ def some(*numbers: int) -> frozenset[int]:
 # -- flasher's host, a device of literal frames -------------------------------------------------
 
 
-@pytest.mark.parametrize("size_bytes", SIZES)
-@pytest.mark.parametrize("target", ["wmc", "bms", "obc"])
+@each("size_bytes", SIZES)
+@each("target", ["wmc", "bms", "obc"])
 def test_the_host_upgrades_a_device_of_literal_frames(target: str, size_bytes: int) -> None:
     image = random.Random(size_bytes).randbytes(size_bytes)
     device = ScriptedDevice(target)
@@ -75,7 +73,7 @@ STRAYS_THAT_ARE_OVERCOME = [
 ]
 
 
-@pytest.mark.parametrize("script", STRAYS_THAT_ARE_OVERCOME, ids=strays)
+@each("script", STRAYS_THAT_ARE_OVERCOME)
 def test_the_host_copes_with_a_device_that_strays(script: DeviceScript) -> None:
     device = ScriptedDevice("bms", script)
     outcome = upgrade(device)
@@ -84,8 +82,8 @@ def test_the_host_copes_with_a_device_that_strays(script: DeviceScript) -> None:
     assert device.state == "application"
 
 
-@pytest.mark.parametrize(
-    ("script", "ending", "code"),
+@each(
+    "script, ending, code",
     [
         (DeviceScript(deaf_to_reset=True), Ending.NO_BOOT_VERSION, ExitCode.NO_ANSWER),
         (DeviceScript(no_request=True), Ending.NO_REQUEST, ExitCode.NO_ANSWER),
@@ -109,7 +107,6 @@ def test_the_host_copes_with_a_device_that_strays(script: DeviceScript) -> None:
             ExitCode.UNCONFIRMED,
         ),
     ],
-    ids=lambda value: strays(value) or getattr(value, "name", None),
 )
 def test_the_host_ends_explicitly_where_a_device_cannot_be_upgraded(
     script: DeviceScript, ending: Ending, code: ExitCode
@@ -121,7 +118,7 @@ def test_the_host_ends_explicitly_where_a_device_cannot_be_upgraded(
     assert error.exit_code == code
 
 
-@pytest.mark.parametrize("lost", [1, 2])
+@each("lost", [1, 2])
 def test_a_final_answer_that_was_lost_is_asked_for_again(lost: int) -> None:
     """EN-03: the device is still in its bootloader."""
     device = ScriptedDevice("bms", DeviceScript(lose_complete=lost), start_s=60.0)
@@ -174,8 +171,8 @@ def test_a_lost_final_answer_never_leads_to_a_second_erase() -> None:
 # -- a host of literal frames, flasher's device model -------------------------------------------
 
 
-@pytest.mark.parametrize("size_bytes", [1, 127, 128, 129, 78351])
-@pytest.mark.parametrize("target", ["wmc", "bms", "obc"])
+@each("size_bytes", [1, 127, 128, 129, 78351])
+@each("target", ["wmc", "bms", "obc"])
 def test_a_host_of_literal_frames_upgrades_the_device_model(target: str, size_bytes: int) -> None:
     image = random.Random(size_bytes).randbytes(size_bytes)
     device = MockDevice(as_target(target), bitrate_bps=250_000)
@@ -185,7 +182,7 @@ def test_a_host_of_literal_frames_upgrades_the_device_model(target: str, size_by
     assert device.stored_image == image
 
 
-@pytest.mark.parametrize(
+@each(
     "script",
     [
         HostScript(no_reset=False, update_on_version=2),
@@ -208,7 +205,6 @@ def test_a_host_of_literal_frames_upgrades_the_device_model(target: str, size_by
         HostScript(filler=0x00),
         HostScript(end_twice=True),
     ],
-    ids=strays,
 )
 def test_the_device_model_copes_with_a_host_that_strays(script: HostScript) -> None:
     device = MockDevice(as_target("bms"), bitrate_bps=250_000)

@@ -22,6 +22,7 @@ from flasher.prose import prose
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BOOT_VERSION_BURST
 from tests.end_to_end.stage import IMAGE, NEW, SMALL, Stage, image_of
+from tests.loops import each
 
 PACKETS = 40
 LONG = image_of(PACKETS)
@@ -34,7 +35,7 @@ COMPLETE = bytes.fromhex("55AA0C04C5020000")
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize("number", range(1, PACKETS + 1))
+@each("number", range(1, PACKETS + 1))
 def test_a_device_that_lost_power_at_any_packet_is_rescued(number: int) -> None:
     """Every other one announces itself at power-up only."""
     stage = Stage(profile=SMALL if number % 2 else LISTENS)
@@ -50,7 +51,7 @@ def test_a_device_that_lost_power_at_any_packet_is_rescued(number: int) -> None:
     assert stage.has == LONG.data
 
 
-@pytest.mark.parametrize("number", [1, 20, PACKETS])
+@each("number", [1, 20, PACKETS])
 def test_power_that_comes_back_within_the_session_is_no_failure(number: int) -> None:
     stage = Stage()
     stage.at_packet[number] = stage.cycle_power
@@ -72,8 +73,8 @@ def test_a_power_cut_in_the_middle_of_a_rescue_is_rescued_in_the_same_run() -> N
 # -- which device can be rescued ------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("target", ["wmc", "bms", "obc"])
-@pytest.mark.parametrize("profile", [SMALL, LISTENS], ids=["announces on", "at power-up only"])
+@each("target", ["wmc", "bms", "obc"])
+@each("profile", [SMALL, LISTENS])
 def test_a_device_without_application_is_rescued_whichever_way_it_announces(
     target: str, profile: DeviceProfile
 ) -> None:
@@ -143,7 +144,7 @@ def lose_complete(frame: Frame, _now: float) -> list[Frame]:
     return [] if frame.data == COMPLETE else [frame]
 
 
-@pytest.mark.parametrize("target", ["wmc", "obc"])
+@each("target", ["wmc", "obc"])
 def test_a_lost_final_answer_is_unconfirmed_and_the_device_can_be_rescued(target: str) -> None:
     stage = Stage(target)
     stage.disturb = lose_complete
@@ -172,7 +173,7 @@ def test_a_refusal_at_the_end_leaves_a_device_that_can_be_rescued() -> None:
 
 
 @pytest.mark.no_cover
-@pytest.mark.parametrize("number", range(1, PACKETS + 1))
+@each("number", range(1, PACKETS + 1))
 def test_an_adapter_that_fails_at_any_packet_is_exit_4_or_overcome(number: int) -> None:
     """In turn: pulled out for good, pulled out and back, bus-off that restarts by itself."""
     stage = Stage()
@@ -239,7 +240,7 @@ def when(stage: Stage, phase: Phase, happens: object) -> None:
     stage.at_event[events.PhaseEntered] = on_phase
 
 
-@pytest.mark.parametrize("phase", PHASES)
+@each("phase", PHASES)
 def test_an_adapter_that_is_lost_for_good_in_any_phase_is_exit_4(phase: Phase) -> None:
     stage = Stage()
     when(stage, phase, stage.bus.unplug)
@@ -251,7 +252,7 @@ def test_an_adapter_that_is_lost_for_good_in_any_phase_is_exit_4(phase: Phase) -
     assert stage.has in (None, IMAGE.data) or phase in PHASES[:5]
 
 
-@pytest.mark.parametrize("phase", PHASES)
+@each("phase", PHASES)
 def test_an_adapter_that_comes_back_in_any_phase_is_no_failure(phase: Phase) -> None:
     stage = Stage()
     when(stage, phase, lambda: stage.bus.unplug(0.5))
@@ -260,7 +261,7 @@ def test_an_adapter_that_comes_back_in_any_phase_is_no_failure(phase: Phase) -> 
     assert stage.seen(events.AdapterBack)
 
 
-@pytest.mark.parametrize("phase", PHASES)
+@each("phase", PHASES)
 def test_an_adapter_that_restarts_after_a_bus_off_in_any_phase_is_overcome(phase: Phase) -> None:
     stage = Stage()
     when(stage, phase, lambda: stage.bus.bus_off(0.5))
@@ -352,7 +353,7 @@ def some_trouble(stage: Stage, draw: random.Random) -> Callable[[], None]:
     )
 
 
-@pytest.mark.parametrize("seed", range(12))
+@each("seed", range(12))
 def test_whatever_happens_success_is_never_claimed_wrongly_and_the_device_is_rescued(
     seed: int,
 ) -> None:

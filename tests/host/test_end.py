@@ -29,6 +29,7 @@ from flasher.protocol.spec import BMS, OBC, WMC, Target
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message
 from tests.host.bench import BOOT, Bench, answer_frames, image_of
+from tests.loops import each
 
 NEW = "V2r0r1_20260102"
 READ_VERSION = (0x11, 0x3300, b"")
@@ -63,7 +64,7 @@ def answer_version(bench: Bench, version: str) -> None:
 # -- NAK at the end (R6, EN-06) -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize("number", [0, 2, 3, 65535])
+@each("number", [0, 2, 3, 65535])
 def test_one_nak_gets_end_of_transfer_once_more(number: int) -> None:
     bench = Bench(200)
     bench.to_end()
@@ -72,7 +73,7 @@ def test_one_nak_gets_end_of_transfer_once_more(number: int) -> None:
     assert bench.complete().ending is Ending.COMPLETED
 
 
-@pytest.mark.parametrize("number", [0, 2, 3, 65535])
+@each("number", [0, 2, 3, 65535])
 def test_a_second_nak_whatever_its_number_means_refused(number: int) -> None:
     bench = Bench(200)
     bench.to_end()
@@ -125,7 +126,7 @@ def test_end_of_transfer_is_asked_again_after_ten_seconds() -> None:
     assert bench.complete().ok
 
 
-@pytest.mark.parametrize("target", [WMC, OBC])
+@each("target", [WMC, OBC])
 def test_three_unanswered_ends_are_unconfirmed_where_no_version_can_be_asked(
     target: Target,
 ) -> None:
@@ -297,7 +298,7 @@ def test_announcements_beyond_a_burst_while_the_version_is_asked_start_over() ->
     assert isinstance(bench.unread[-1], UpdateCommand)
 
 
-@pytest.mark.parametrize("times", [(0.0, 0.05, 0.05, 0.1, 0.15), (0.0, 0.05, 0.1, 0.15, 0.2, 0.25)])
+@each("times", [(0.0, 0.05, 0.05, 0.1, 0.15), (0.0, 0.05, 0.1, 0.15, 0.2, 0.25)])
 def test_a_doubled_or_a_fifth_announcement_does_not_erase_a_good_image(
     times: tuple[float, ...],
 ) -> None:
@@ -357,8 +358,8 @@ def test_complete_after_the_first_boot_version_still_completes() -> None:
 # -- cancelled by the user ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("reach", "left"),
+@each(
+    "reach, left",
     [
         ("to_boot", DeviceLeft.UNTOUCHED),
         ("to_request", DeviceLeft.PERHAPS_ERASED),
@@ -413,8 +414,8 @@ def test_cancelling_in_the_middle_of_a_message_finishes_the_message() -> None:
     assert bench._frames == before + 18
 
 
-@pytest.mark.parametrize(
-    ("stage", "kind", "left"),
+@each(
+    "stage, kind, left",
     [
         ("boot", UpdateCommand, DeviceLeft.PERHAPS_ERASED),
         ("last", EndOfTransfer, DeviceLeft.UNKNOWN),

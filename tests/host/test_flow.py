@@ -28,10 +28,11 @@ from flasher.protocol.messages import (
 from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Target
 from flasher.protocol.timing import Timings
 from tests.host.bench import BOOT, Bench, answer_frames, image_of
+from tests.loops import each
 
 
-@pytest.mark.parametrize(
-    ("target", "boot_name", "text"),
+@each(
+    "target, boot_name, text",
     [(WMC, "WMC", "WMC_UPD"), (BMS, "BMS", "BMS_UPD"), (OBC, "PBU", "OBC_UPD")],
 )
 def test_a_right_device_is_upgraded_with_every_message_once(
@@ -132,7 +133,7 @@ def test_no_boot_version_ends_with_no_answer_and_an_untouched_device() -> None:
     assert bench.now - 100.0 < 21.0
 
 
-@pytest.mark.parametrize(("late_s", "answered"), [(-0.001, True), (0.001, False)])
+@each("late_s, answered", [(-0.001, True), (0.001, False)])
 def test_the_boot_version_may_come_up_to_five_seconds_after_the_reset(
     *, late_s: float, answered: bool
 ) -> None:
@@ -172,7 +173,7 @@ def test_boot_versions_that_queued_up_are_one_version() -> None:
     assert bench.unread == []
 
 
-@pytest.mark.parametrize(("after_s", "commands"), [(0.029, 1), (0.031, 2)])
+@each("after_s, commands", [(0.029, 1), (0.031, 2)])
 def test_a_boot_version_within_30_ms_of_the_update_command_is_not_answered(
     after_s: float, commands: int
 ) -> None:
@@ -199,7 +200,7 @@ def test_the_update_command_is_never_repeated_into_silence() -> None:
     assert error.exit_code == ExitCode.NO_ANSWER
 
 
-@pytest.mark.parametrize(("late_s", "in_time"), [(-0.001, True), (0.001, False)])
+@each("late_s, in_time", [(-0.001, True), (0.001, False)])
 def test_request_transfer_may_come_up_to_ten_seconds_after_the_update_command(
     *, late_s: float, in_time: bool
 ) -> None:
@@ -243,8 +244,8 @@ def _receive_without_sending(bench: Bench, row: BootVersion | RequestTransfer) -
 # -- who answers (RS-08, RS-09) -----------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "version"),
+@each(
+    "name, version",
     [("WMC", "V1.2.3"), ("BMS", "V1.2-3"), ("BMS", "\x1b[2J<b"), ("\x00\xff\x1b", "V1.2.3")],
 )
 def test_another_device_or_no_version_is_refused_before_anything_is_sent_to_it(
@@ -377,8 +378,8 @@ def test_a_device_that_answers_only_the_last_try_is_ended_by_the_overall_deadlin
     assert bench.now - 100.0 <= limit_s + 1.0
 
 
-@pytest.mark.parametrize(
-    ("reach", "code"),
+@each(
+    "reach, code",
     [
         ("to_boot", ExitCode.NO_ANSWER),
         ("to_request", ExitCode.NO_ANSWER),

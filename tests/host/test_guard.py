@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from flasher import events
 from flasher.bus.echoes import DOUBLE_LIMIT_S, ECHO_LIMIT_S, Echoes
 from flasher.host.guard import Foreign, Guard
@@ -11,6 +9,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Message, encode, split
+from tests.loops import each
 
 OWN = [Frame(0x752, bytes([number] * 8)) for number in range(18)]
 OTHER = Frame(0x752, bytes.fromhex("55AA160742055245"))
@@ -39,14 +38,14 @@ def sent(frames: list[Frame]) -> MarkedGuard:
     return made
 
 
-@pytest.mark.parametrize("delay_s", [0.0005, 0.1, ECHO_LIMIT_S - 0.001])
+@each("delay_s", [0.0005, 0.1, ECHO_LIMIT_S - 0.001])
 def test_echoes_of_what_was_sent_are_nobody_also_when_they_are_late(delay_s: float) -> None:
     made = sent(OWN)
     for number, frame in enumerate(OWN):
         assert made.see(frame, 1.0 + number * 0.0005 + delay_s) is None
 
 
-@pytest.mark.parametrize("step", [2, 3, 7])
+@each("step", [2, 3, 7])
 def test_echoes_of_which_some_are_missing_are_nobody(step: int) -> None:
     made = sent(OWN)
     assert all(made.see(frame, 1.01) is None for frame in OWN[::step])
@@ -78,7 +77,7 @@ def test_nothing_sent_at_all_and_somebody_speaks() -> None:
     assert guard().see(OWN[0], 1.0) is not None
 
 
-@pytest.mark.parametrize("late_s", [ECHO_LIMIT_S + 0.01, 60.0])
+@each("late_s", [ECHO_LIMIT_S + 0.01, 60.0])
 def test_what_was_sent_long_ago_is_no_echo_any_more(late_s: float) -> None:
     made = guard()
     made.link.sent(OWN[0], 1.0)
@@ -121,14 +120,14 @@ def test_a_foreign_query_is_harmless_and_named() -> None:
 SEEN = "frame %s with id 0x752, not sent by this tool"
 
 
-@pytest.mark.parametrize("frame", [WRITE[0], PACKET[0], Frame(0x752, b"\x55\xaa\x0c" + bytes(5))])
+@each("frame", [WRITE[0], PACKET[0], Frame(0x752, b"\x55\xaa\x0c" + bytes(5))])
 def test_every_other_foreign_message_is_not_harmless(frame: Frame) -> None:
     found = guard().see(frame, 1.0)
     assert found is not None
     assert not found.is_harmless
 
 
-@pytest.mark.parametrize("frame", TAILS, ids=str)
+@each("frame", TAILS)
 def test_a_frame_that_begins_no_message_is_not_judged_by_itself(frame: Frame) -> None:
     """Its beginning was, or got lost, as when the adapter was away for a moment."""
     found = guard().see(frame, 1.0)
@@ -144,7 +143,7 @@ def test_an_adapter_without_echoes_hides_no_second_tool() -> None:
     assert made.see(other[0], 1.01) is not None
 
 
-@pytest.mark.parametrize(
+@each(
     "frame",
     [
         Frame(0x752, b"", is_remote=True),
@@ -165,7 +164,7 @@ def frames_of(can_id: int, mode: int, command: int, data: bytes) -> list[Frame]:
     return split(can_id, encode(Message(can_id, mode, command, data)))
 
 
-@pytest.mark.parametrize("target", [BMS, OBC])
+@each("target", [BMS, OBC])
 def test_the_batterys_shutdown_is_noticed_whatever_the_target_and_told_once(
     target: Target,
 ) -> None:

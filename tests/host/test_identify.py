@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from flasher.host.identify import LISTEN_FIRST_S, LISTENS_ON_S, Identify
 from flasher.host.options import UpgradeOptions
 from flasher.host.query import Request
@@ -19,6 +17,7 @@ from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Target
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message, Reassembler, encode, split
 from tests.host.bench import answer_frames, image_of
+from tests.loops import each
 
 VERSION, RUNNING = (0x720, 0x1540), (0x720, 0x1010)
 BATTERY = RunningInformation(40_000, -8, 8000, 9800, 22, 85, Status(0), 98, bytes(4))
@@ -93,7 +92,7 @@ def test_a_battery_is_asked_for_its_version_and_its_state_and_no_more() -> None:
     assert asked.told.answers == [version()]
 
 
-@pytest.mark.parametrize("target", [WMC, OBC])
+@each("target", [WMC, OBC])
 def test_who_has_no_query_is_not_asked(target: Target) -> None:
     asked = Asked(target)
     assert asked.engine.deadline() is not None, "it listens all the same"
@@ -156,7 +155,7 @@ def test_an_announcement_in_the_middle_of_a_question_lets_it_go_to_its_end_only(
     assert asked.engine.done
 
 
-@pytest.mark.parametrize("other", [version("W2"), version(firmware="V9r0r0_20250101")])
+@each("other", [version("W2"), version(firmware="V9r0r0_20250101")])
 def test_different_answers_are_kept_apart_and_equal_ones_are_one(other: Content) -> None:
     asked = Asked()
     asked.run(10.01)

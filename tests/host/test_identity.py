@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
-import pytest
-
 from flasher.host.identity import (
     WAIVABLE,
     Check,
@@ -26,6 +24,7 @@ from flasher.protocol.spec import BMS, OBC, WMC
 from flasher.protocol.text import encode_text
 from flasher.settings.manifest import release_of
 from tests.firmware import VECTORS
+from tests.loops import each
 
 NEW, OLD = "V2r0r1_20260102", "V1r0r0_20220512"
 IMAGE = replace(Image.from_bytes(VECTORS + bytes(64) + NEW.encode()), version=NEW)
@@ -46,8 +45,8 @@ def verdicts(findings: Iterable[CheckResult]) -> list[tuple[Check, CheckVerdict]
     return [(found.check, found.verdict) for found in findings]
 
 
-@pytest.mark.parametrize(
-    ("image", "stated", "verdict"),
+@each(
+    "image, stated, verdict",
     [
         (NAMELESS, None, CheckVerdict.UNKNOWN),
         (IMAGE, {}, CheckVerdict.PASSED),
@@ -73,8 +72,8 @@ PASSED, UNKNOWN, REFUSED, WARNED = (
 )  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("stated", "device", "expected"),
+@each(
+    "stated, device, expected",
     [
         (None, DeviceAnswers(), {HARDWARE: UNKNOWN}),
         (None, seen(), {HARDWARE: UNKNOWN, DOWNGRADE: PASSED}),
@@ -109,8 +108,8 @@ def test_a_device_that_tells_no_version_cannot_be_compared_and_that_is_said() ->
     assert "the OBC's application does not tell its versions" in found[0].text
 
 
-@pytest.mark.parametrize(
-    ("change", "expected"),
+@each(
+    "change, expected",
     [
         ({}, {}),
         ({"mean_current_ma": -1000}, {}),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import pytest
-
 from flasher import events
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
@@ -18,6 +16,7 @@ from flasher.protocol.messages import (
 )
 from flasher.protocol.timing import Timings
 from tests.host.bench import BOOT, Bench
+from tests.loops import each
 
 WAITING = UpgradeOptions(at_power_up=True, power_up_timeout_s=30.0)
 
@@ -51,7 +50,7 @@ def test_every_announcement_of_the_burst_is_answered_until_one_is_heard() -> Non
     assert bench.expect(Packet).number == 1
 
 
-@pytest.mark.parametrize("row", [GeneralFeedback(), RequestTransfer()])
+@each("row", [GeneralFeedback(), RequestTransfer()])
 def test_nothing_else_that_the_device_says_is_answered(row: GeneralFeedback) -> None:
     bench = Bench(options=WAITING)
     bench.say(row)

@@ -13,6 +13,7 @@ from flasher.protocol import contents
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
+from tests.loops import each
 from tests.peers.wording import build, payloads
 
 RATE = 250_000
@@ -171,8 +172,8 @@ def test_the_answer_ends_it_at_once() -> None:
     assert bench.events == [events.QueryAnswered("read version information", answer, 1)]
 
 
-@pytest.mark.parametrize(
-    ("can_id", "mode", "command", "data"),
+@each(
+    "can_id, mode, command, data",
     [
         (0x725, 0x0C, 0x1540, VERSION),
         (0x715, 0x0C, 0x1540, VERSION),
@@ -180,7 +181,6 @@ def test_the_answer_ends_it_at_once() -> None:
         (0x720, 0x0C, 0x1010, RUNNING),
         (0x720, 0x0C, 0x1530, VERSION[:0x30]),
     ],
-    ids=["id of the tool", "id of another", "mode", "command", "length"],
 )
 def test_what_is_not_the_answer_is_not_taken_for_it(
     can_id: int, mode: int, command: int, data: bytes

@@ -13,6 +13,7 @@ from flasher.host.survey import Survey
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC, Dialect, Node, Target
+from tests.loops import each
 from tests.peers.wording import build, payloads
 
 BOTH = pytest.mark.parametrize("dialect", [WELLING, MOTINOVA], ids=lambda d: d.name)
@@ -55,18 +56,18 @@ def test_everything_that_can_be_written_can_be_read_back(dialect: Dialect) -> No
     assert reserved == {"production-information", "model", "serial-number"}
 
 
-@pytest.mark.parametrize("target", [WMC, OBC], ids=lambda t: t.name)
+@each("target", [WMC, OBC])
 def test_the_documents_give_nothing_for_the_others(target: Target) -> None:
     assert readable(target, MOTINOVA) == {}
     assert writable(target, MOTINOVA) == {}
 
 
-@pytest.mark.parametrize("text", ["20240229", "2024-02-29"])
+@each("text", ["20240229", "2024-02-29"])
 def test_a_leap_day_is_a_date(text: str) -> None:
     assert check_date(text) == "20240229"
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     ["20230229", "20261301", "20260100", "00000101", "2026W101", "260517", "", "\uff120260517"],
 )

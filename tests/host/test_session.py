@@ -33,6 +33,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, TARGETS, WELLING, WMC
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message, Reassembler, encode, split
+from tests.loops import each
 
 NEW = "V2r0r1_20260102"
 BASE = 0x0800_8000
@@ -252,7 +253,7 @@ def test_an_application_that_starts_slowly_is_waited_for() -> None:
     assert check.result.verdict is Verdict.VERSION_RIGHT
 
 
-@pytest.mark.parametrize("asked", [True, False])
+@each("asked", [True, False])
 def test_cancelling_a_check_says_that_the_upgrade_was_complete(*, asked: bool) -> None:
     check = version_check(planned(), UpgradeOptions())
     application = Application(check)

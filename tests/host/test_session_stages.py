@@ -29,6 +29,7 @@ from flasher.protocol.text import encode_text
 from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Message, encode, split
 from tests.end_to_end.stage import IMAGE, NEW, SMALL, Speaker, Stage, image_of
+from tests.loops import each
 
 OTHER_TOOL = Frame(0x752, bytes.fromhex("55AA16123A105A5A"))
 """Begins to write user string 1."""
@@ -78,8 +79,8 @@ class Witness:
         self.has_heard = self.has_heard or (not sent and frame in (OTHER_TOOL, QUERY[0]))
 
 
-@pytest.mark.parametrize(
-    ("phase", "frame"),
+@each(
+    "phase, frame",
     [(phase, OTHER_TOOL) for phase in (*Phase, VERIFICATION)]
     + [(phase, QUERY[0]) for phase in BEFORE_ERASE],
 )
@@ -126,7 +127,7 @@ def test_a_second_tool_cuts_a_message_short_that_was_finished_for_a_clean_end() 
     assert witness.sent_after == []
 
 
-@pytest.mark.parametrize("target", ["bms", "obc"])
+@each("target", ["bms", "obc"])
 def test_a_tool_that_flashes_is_heard_before_anything_is_sent(target: str) -> None:
     """The OBC cannot be asked: before its reset nothing else would have told."""
     stage = Stage(target)
@@ -141,7 +142,7 @@ def test_a_tool_that_flashes_is_heard_before_anything_is_sent(target: str) -> No
     assert result.outcome.device_left is DeviceLeft.UNTOUCHED
 
 
-@pytest.mark.parametrize("phase", [Phase.UPDATE, Phase.TRANSFER, Phase.END, VERIFICATION])
+@each("phase", [Phase.UPDATE, Phase.TRANSFER, Phase.END, VERIFICATION])
 def test_a_query_of_a_second_tool_is_reported_once_and_the_upgrade_goes_on(
     phase: Phase | str,
 ) -> None:
@@ -204,11 +205,10 @@ class Echoing:
         return self._link.health()
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.002, 0.3])
-@pytest.mark.parametrize(
+@each("delay_s", [0.0, 0.002, 0.3])
+@each(
     "copies",
     [lambda _n: 1, lambda n: int(n % 3 > 0), lambda _n: 2, lambda n: n % 3],
-    ids=["every one", "some missing", "twice", "none to two"],
 )
 def test_echoes_of_own_frames_are_no_second_tool(
     copies: Callable[[int], int], delay_s: float
@@ -241,9 +241,7 @@ def with_another(stage: Stage, **differs: str) -> MockDevice:
     return other
 
 
-@pytest.mark.parametrize(
-    "differs", [{"serial_number": "W2605002"}, {"factory_version": "V1r0r1_20230512"}], ids=str
-)
+@each("differs", [{"serial_number": "W2605002"}, {"factory_version": "V1r0r1_20230512"}])
 def test_two_devices_that_tell_different_versions_are_refused_before_the_reset(
     differs: dict[str, str],
 ) -> None:
@@ -278,7 +276,7 @@ class LateTwin(Speaker):
             self._next = NEVER
 
 
-@pytest.mark.parametrize("delay_s", [0.015, 0.04, 0.08])
+@each("delay_s", [0.015, 0.04, 0.08])
 def test_a_second_device_that_answers_later_is_noticed_before_the_reset_too(
     delay_s: float,
 ) -> None:
@@ -305,7 +303,7 @@ def test_two_bootloaders_that_announce_different_versions_are_refused() -> None:
 # -- a device that announces itself ---------------------------------------------------------------
 
 
-@pytest.mark.parametrize("after_s", [0.0, 0.013, 0.1, 0.35, 0.9])
+@each("after_s", [0.0, 0.013, 0.1, 0.35, 0.9])
 def test_an_announcement_while_the_device_is_asked_is_answered_inside_of_its_window(
     after_s: float,
 ) -> None:
@@ -369,7 +367,7 @@ def test_a_packet_whose_tries_are_exhausted_begins_another_attempt_and_each_is_r
     assert result.outcome.statistics.attempts == 3
 
 
-@pytest.mark.parametrize("attempts", [1, 2, 4])
+@each("attempts", [1, 2, 4])
 def test_attempts_are_bounded(attempts: int) -> None:
     stage = Stage()
     stage.disturb = deaf_to(2, times=1000)
@@ -383,8 +381,8 @@ def test_attempts_are_bounded(attempts: int) -> None:
     assert (attempts == 1) is (resets == 1)
 
 
-@pytest.mark.parametrize("timeout_s", [0.3, 1.2, 3.0])
-@pytest.mark.parametrize("cut", [None, 1, 3])
+@each("timeout_s", [0.3, 1.2, 3.0])
+@each("cut", [None, 1, 3])
 def test_the_deadline_bounds_every_stage_together(timeout_s: float, cut: int | None) -> None:
     """Silent from the beginning, or from a packet on."""
     stage = Stage()
@@ -397,7 +395,7 @@ def test_the_deadline_bounds_every_stage_together(timeout_s: float, cut: int | N
     assert stage.clock.now() <= timeout_s + 0.05
 
 
-@pytest.mark.parametrize("level", [Level.VERSION, Level.NONE])
+@each("level", [Level.VERSION, Level.NONE])
 def test_the_deadline_bounds_the_verification_too(level: Level) -> None:
     stage = Stage()
     stage.at_event[events.VerificationStarted] = stage.cut_power

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import pytest
-
 from flasher.host.outcome import _EXPLANATIONS
 from flasher.host.table import BEFORE_THE_START, TABLE, TIMERS, Ending, Event, State
 from flasher.host.upgrade import UpgradeStage
+from tests.loops import each
 
 RUNNING = [state for state in State if state not in {State.STOPPING, State.DONE}]
 FROM_OUTSIDE = {Event.LINK_BACK, Event.SECOND_TOOL, Event.OUT_OF_TIME, Event.CANCEL}
@@ -65,7 +64,7 @@ def test_every_state_is_reached_from_the_first() -> None:
     assert reached == set(RUNNING)
 
 
-@pytest.mark.parametrize("state", RUNNING)
+@each("state", RUNNING)
 def test_the_user_the_deadline_and_a_second_tool_end_every_state(state: State) -> None:
     assert TABLE[state][Event.CANCEL].leads_to == (Ending.CANCELLED,)
     assert TABLE[state][Event.OUT_OF_TIME].leads_to == (Ending.OUT_OF_TIME,)

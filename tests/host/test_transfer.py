@@ -27,6 +27,7 @@ from flasher.protocol.messages import (
 from flasher.protocol.spec import BMS
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from tests.host.bench import BOOT, Bench, answer_frames
+from tests.loops import each
 
 ONE_ATTEMPT = UpgradeOptions(attempts=1)
 
@@ -44,7 +45,7 @@ def test_a_refused_packet_is_sent_again_at_once() -> None:
     assert events.MessageRepeated("packet 2", "packet_refused", 2) in bench.events
 
 
-@pytest.mark.parametrize("naks", [1, 2, 3, 4])
+@each("naks", [1, 2, 3, 4])
 def test_a_packet_may_be_refused_as_often_as_there_are_tries_but_one(naks: int) -> None:
     bench = Bench(100)
     bench.to_packet(1)
@@ -73,7 +74,7 @@ def test_the_last_try_refused_ends_the_upgrade_naming_the_packet() -> None:
     assert bench.unread == []
 
 
-@pytest.mark.parametrize(("late_s", "in_time"), [(-0.001, True), (0.001, False)])
+@each("late_s, in_time", [(-0.001, True), (0.001, False)])
 def test_the_answer_may_come_up_to_500_ms_after_the_packet_has_left(
     *, late_s: float, in_time: bool
 ) -> None:
@@ -107,7 +108,7 @@ def test_the_number_of_tries_is_the_users() -> None:
 # -- stale, doubled, future answers (R10, TX-10) ------------------------------------------------
 
 
-@pytest.mark.parametrize("stale", [Ack(1), Nak(1), Ack(0), Nak(0)])
+@each("stale", [Ack(1), Nak(1), Ack(0), Nak(0)])
 def test_an_answer_for_an_older_packet_is_ignored(stale: Row) -> None:
     bench = Bench()
     bench.to_packet(2)
@@ -118,7 +119,7 @@ def test_an_answer_for_an_older_packet_is_ignored(stale: Row) -> None:
     assert bench.expect(Packet).number == 3
 
 
-@pytest.mark.parametrize("future", [Ack(3), Nak(3), Ack(65535), Nak(65535)])
+@each("future", [Ack(3), Nak(3), Ack(65535), Nak(65535)])
 def test_an_answer_for_a_later_packet_is_reported_and_ignored(future: Row) -> None:
     bench = Bench()
     bench.to_packet(2)
@@ -416,7 +417,7 @@ def test_request_transfer_while_packet_1_settles_waits_for_quiet() -> None:
 # -- what breaks the protocol -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("number", [1, 2])
+@each("number", [1, 2])
 def test_complete_before_end_of_transfer_is_a_protocol_error(number: int) -> None:
     """EN-05."""
     bench = Bench()

@@ -11,6 +11,7 @@ from flasher.errors import ImageError
 from flasher.image.cortexm import VectorTable, check_starts_inside, vector_table
 from flasher.image.image import Image
 from flasher.image.load import load
+from tests.loops import each
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
 BASE = 0x0800_4000
@@ -22,7 +23,7 @@ def image(*words: int, base: int | None = BASE, size: int = 0x1000) -> Image:
     return Image.from_bytes(data, base=base, source="app.bin")
 
 
-@pytest.mark.parametrize("name", ["wmc.hex", "obc.elf"])
+@each("name", ["wmc.hex", "obc.elf"])
 def test_the_samples_look_like_programs(name: str) -> None:
     table = vector_table(load(SAMPLES / name))
     assert table is not None
@@ -44,8 +45,8 @@ def test_two_words_are_enough() -> None:
     assert table.entry == BASE + 4
 
 
-@pytest.mark.parametrize(
-    ("stack_pointer", "plausible"),
+@each(
+    "stack_pointer, plausible",
     [
         (0x2000_0004, True),
         (0x2000_0000, True),  # the end of a RAM in the code region
@@ -68,8 +69,8 @@ def test_a_stack_pointer_is_an_aligned_end_of_a_ram(stack_pointer: int, *, plaus
     assert any("stack pointer" in problem for problem in table.problems) is not plausible
 
 
-@pytest.mark.parametrize(
-    ("reset", "words"),
+@each(
+    "reset, words",
     [(BASE + 0x100, "no Thumb bit"), (0xFFFF_FFFF, "is empty"), (1, "is empty")],
 )
 def test_a_reset_vector_is_a_thumb_address(reset: int, words: str) -> None:
@@ -79,7 +80,7 @@ def test_a_reset_vector_is_a_thumb_address(reset: int, words: str) -> None:
     assert words in table.problems[0]
 
 
-@pytest.mark.parametrize("reset", [BASE + 1, BASE + 0xFFF])
+@each("reset", [BASE + 1, BASE + 0xFFF])
 def test_a_program_that_starts_at_its_first_or_last_halfword_is_accepted(reset: int) -> None:
     program = image(STACK, reset)
     check_starts_inside(program)
@@ -88,7 +89,7 @@ def test_a_program_that_starts_at_its_first_or_last_halfword_is_accepted(reset: 
     assert not table.problems
 
 
-@pytest.mark.parametrize("reset", [BASE - 1, BASE + 0x1001, 0x0800_0101, 0])
+@each("reset", [BASE - 1, BASE + 0x1001, 0x0800_0101, 0])
 def test_a_program_that_starts_outside_of_itself_is_refused(reset: int) -> None:
     with pytest.raises(ImageError) as caught:
         check_starts_inside(image(STACK, reset))
@@ -165,8 +166,8 @@ def test_no_more_than_four_further_programs_are_named() -> None:
     assert table.notes[0].count("0x") == 4
 
 
-@pytest.mark.parametrize("nothing", [0, 0xFFFF_FFFF])
-@pytest.mark.parametrize("base", [BASE, None])
+@each("nothing", [0, 0xFFFF_FFFF])
+@each("base", [BASE, None])
 def test_a_vector_that_is_empty_lies_nowhere(nothing: int, base: int | None) -> None:
     """Zero, or erased: it counts in no distance of the vectors from each other."""
     table = vector_table(image(STACK, BASE + 5, nothing, nothing, base=base))

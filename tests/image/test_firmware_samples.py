@@ -6,11 +6,10 @@ import runpy
 from dataclasses import replace
 from pathlib import Path
 
-import pytest
-
 from flasher.image.cortexm import vector_table
 from flasher.image.load import load
 from flasher.protocol.spec import BMS, OBC, WMC, Target
+from tests.loops import each
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
 SCRIPT = SAMPLES / "make_samples.py"
@@ -34,8 +33,8 @@ def test_the_script_makes_every_file_again_bit_for_bit(tmp_path: Path) -> None:
     assert [name for name in made if made[name] != kept[name]] == []
 
 
-@pytest.mark.parametrize(
-    ("name", "target", "version", "base"),
+@each(
+    "name, target, version, base",
     [
         ("bms.hex", BMS, "V1r0r4_20220512", 0x0800_8000),
         ("bms.bin", BMS, "V1r0r4_20220512", None),

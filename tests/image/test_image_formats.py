@@ -19,6 +19,7 @@ from flasher.image import elf
 from flasher.image.load import load
 from flasher.image.records import read_hex, read_srec
 from flasher.image.segments import SparseBytes
+from tests.loops import each
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
 FAR = 1 << 20
@@ -256,9 +257,7 @@ SMALL_HEX = ":020000040800F2\n:0400100001020304E2\n:0400140005060708CE\n:0000000
 SMALL_SREC = "S00400004AB1\nS3090800001001020304D4\nS3090800001405060708C0\nS70500000000FA\n"
 
 
-@pytest.mark.parametrize(
-    ("read_records", "text"), [(read_hex, SMALL_HEX), (read_srec, SMALL_SREC)], ids=["hex", "srec"]
-)
+@each("read_records, text", [(read_hex, SMALL_HEX), (read_srec, SMALL_SREC)])
 def test_no_single_changed_character_gives_other_bytes(
     read_records: Callable[[BinaryIO, str, SparseBytes], None], text: str
 ) -> None:

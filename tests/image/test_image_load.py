@@ -20,6 +20,7 @@ from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, load
 from flasher.image.plausible import check_plausible
 from flasher.protocol.spec import IMAGE_MAX_SIZE
 from flasher.protocol.text import find_firmware_version
+from tests.loops import each
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
 BAD = SAMPLES / "bad"
@@ -95,7 +96,7 @@ REFUSALS: list[tuple[str, dict[str, Any], tuple[str, ...]]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "options", "words"), REFUSALS)
+@each("name, options, words", REFUSALS)
 def test_each_bad_file_is_refused_in_the_words_for_it(
     name: str, options: dict[str, Any], words: tuple[str, ...]
 ) -> None:
@@ -112,7 +113,7 @@ def test_every_bad_file_is_in_the_table() -> None:
     assert {name for name, _, _ in REFUSALS} == {path.name for path in BAD.iterdir()}
 
 
-@pytest.mark.parametrize("name", ["text.bin", "zip.bin", "hex_inside.bin", "check_sum.hex"])
+@each("name", ["text.bin", "zip.bin", "hex_inside.bin", "check_sum.hex"])
 def test_a_user_who_insists_on_a_raw_binary_gets_one(name: str) -> None:
     image = load(BAD / name, format="bin")
     assert image.format == "raw binary"
@@ -246,8 +247,8 @@ def test_the_default_limit_of_a_gap_is_four_kib() -> None:
     assert DEFAULT_FILL_GAPS_UP_TO == 4096
 
 
-@pytest.mark.parametrize(
-    ("name", "options", "words"),
+@each(
+    "name, options, words",
     [
         ("obc.bin", {"format": "uf2"}, "no image format 'uf2'"),
         ("obc.bin", {"range_": (0, 16)}, "--base"),
@@ -370,8 +371,8 @@ def test_an_image_of_bytes_at_hand_is_as_one_from_a_file(tmp_path: Path) -> None
     assert Image.from_bytes(data, base=0x0800_2000).base == 0x0800_2000
 
 
-@pytest.mark.parametrize(
-    ("data", "version"),
+@each(
+    "data, version",
     [
         (b"\0\0V1r2r3_20240131\0", "V1r2r3_20240131"),
         (b"BMSV1r2r3_20240131.HW", "V1r2r3_20240131"),

@@ -23,6 +23,7 @@ from flasher.settings.manifest import (
     release_of,
     to_toml,
 )
+from tests.loops import each
 
 VERSION = "V1r0r4_20220512"
 IMAGE = Image.from_bytes(b"BMS\0" + VERSION.encode() + bytes(200), source="firmware.bin")
@@ -186,8 +187,8 @@ def test_the_bytes_it_was_made_of_agree() -> None:
     assert [finding.agrees for finding in release().findings(IMAGE)] == [True] * 4
 
 
-@pytest.mark.parametrize(
-    ("changes", "key"),
+@each(
+    "changes, key",
     [
         ({"size_bytes": 1}, "size_bytes is 1 there"),
         ({"sha256": "0" * 64}, "sha256 is 000"),
@@ -264,8 +265,8 @@ def test_a_name_inside_the_image_speaks_against_another_target() -> None:
 # -- the device -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("patterns", "text", "fits"),
+@each(
+    "patterns, text, fits",
     [
         ((), "anything", True),
         (("V1r2r0_20220512",), "V1r2r0_20220512", True),
@@ -292,8 +293,8 @@ def test_a_hostile_pattern_is_answered_at_once() -> None:
     assert not release(hardware_versions=(pattern,)).fits_hardware("a" * 64)
 
 
-@pytest.mark.parametrize(
-    ("text", "fits"),
+@each(
+    "text, fits",
     [
         ("V1r0r0_20220512", True),
         ("V1r0r3_20220801", False),

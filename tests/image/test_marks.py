@@ -5,31 +5,28 @@ from __future__ import annotations
 import random
 from pathlib import Path
 
-import pytest
-
 from flasher.image.image import NEIGHBOURHOOD_SIZE, Image, named_targets
 from flasher.image.load import load
 from flasher.protocol.spec import BMS, OBC, TARGETS, WMC, Target
+from tests.loops import each
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
 VERSION = b"V1r0r4_20220512"
 
 
-@pytest.mark.parametrize(
-    ("name", "target"), [("bms.hex", BMS), ("wmc.s19", WMC), ("obc.bin", OBC), ("obc.elf", OBC)]
-)
+@each("name, target", [("bms.hex", BMS), ("wmc.s19", WMC), ("obc.bin", OBC), ("obc.elf", OBC)])
 def test_each_sample_names_its_target(name: str, target: Target) -> None:
     assert load(SAMPLES / name).named_targets == {target}
 
 
-@pytest.mark.parametrize("target", TARGETS.values(), ids=list(TARGETS))
+@each("target", TARGETS.values())
 def test_both_names_and_the_update_text_name_a_target(target: Target) -> None:
     for name in (target.node.name, target.boot_name):
         assert named_targets(name.encode() + b"\0" + VERSION) == {target}
     assert named_targets(b"\x01" + target.update_text.encode() + b"\0") == {target}
 
 
-@pytest.mark.parametrize(
+@each(
     "data",
     [
         b"BMS\0" + VERSION,
@@ -44,7 +41,7 @@ def test_a_name_before_or_behind_a_version_counts(data: bytes) -> None:
     assert named_targets(data) == {BMS}
 
 
-@pytest.mark.parametrize(
+@each(
     "data",
     [
         b"",

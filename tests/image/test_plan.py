@@ -17,6 +17,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.messages import Packet, decode
 from flasher.protocol.spec import BMS, IMAGE_MAX_SIZE, OBC, TARGETS, WMC, Target
 from flasher.protocol.wire import Message, Reassembler, encode, split
+from tests.loops import each
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
 BITRATE_BPS = 250_000
@@ -52,9 +53,7 @@ def test_the_document_s_own_example_comes_to_613_packets() -> None:
     assert 613 * 18 * 111 / BITRATE_BPS < result.wire_s < 613 * 20 * 135 / BITRATE_BPS
 
 
-@pytest.mark.parametrize(
-    ("size", "packets"), [(1, 1), (127, 1), (128, 1), (129, 2), (256, 2), (257, 3)]
-)
+@each("size, packets", [(1, 1), (127, 1), (128, 1), (129, 2), (256, 2), (257, 3)])
 def test_every_128_bytes_begun_are_a_packet(size: int, packets: int) -> None:
     assert made(size).total_packets == packets
 
@@ -74,7 +73,7 @@ def test_a_packet_number_is_little_endian() -> None:
     assert frames[0].data[6:] + frames[1].data[:1] == bytes.fromhex("01 02 01")
 
 
-@pytest.mark.parametrize("target", TARGETS.values(), ids=TARGETS.keys())
+@each("target", TARGETS.values())
 def test_the_packets_hold_the_image_and_the_last_is_filled_up_with_ff(target: Target) -> None:
     result = made(300, target)
     packets = [received(result.packet_frames(number)) for number in (1, 2, 3)]
@@ -90,8 +89,8 @@ def test_a_packet_s_seconds_are_those_of_its_frames() -> None:
         assert result.packet_wire_s(number) == bits / BITRATE_BPS
 
 
-@pytest.mark.parametrize(
-    ("target", "update", "name"),
+@each(
+    "target, update, name",
     [(WMC, b"WMC_UPD", b"WMC"), (BMS, b"BMS_UPD", b"BMS"), (OBC, b"OBC_UPD", b"PBU")],
 )
 def test_the_seconds_of_the_upgrade_are_those_of_every_frame_in_both_directions(
@@ -129,7 +128,7 @@ def test_the_bytes_themselves_decide_about_the_time() -> None:
     assert erased.wire_s > 1.05 * mixed.wire_s
 
 
-@pytest.mark.parametrize("number", [0, -1, 4])
+@each("number", [0, -1, 4])
 def test_there_are_no_other_packets_than_those(number: int) -> None:
     result = made(300)
     with pytest.raises(IndexError, match="of 3"):
@@ -152,7 +151,7 @@ def test_an_image_of_exactly_the_largest_size_is_planned(monkeypatch: pytest.Mon
     assert result.total_packets == 65_535
 
 
-@pytest.mark.parametrize("bitrate_bps", [0, -250_000])
+@each("bitrate_bps", [0, -250_000])
 def test_a_bit_rate_is_positive(bitrate_bps: int) -> None:
     with pytest.raises(UsageError, match="no bit rate"):
         plan(Image.from_bytes(b"a"), BMS, bitrate_bps)

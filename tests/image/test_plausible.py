@@ -13,6 +13,7 @@ from flasher.image.image import Image
 from flasher.image.load import load
 from flasher.image.plausible import check_plausible, doubt
 from tests.firmware import VECTORS
+from tests.loops import each
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
 PE = b"MZ" + bytes(58) + struct.pack("<I", 64) + b"PE\0\0" + bytes(60)
@@ -38,7 +39,7 @@ MARKED = [
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("data", "words"), MARKED, ids=lambda value: str(value)[:24])
+@each("data, words", MARKED)
 def test_another_kind_of_file_is_named_and_is_certain(data: bytes, words: str) -> None:
     found = doubt(Image.from_bytes(data))
     assert found is not None
@@ -78,7 +79,7 @@ def test_no_random_bytes_begin_like_a_program() -> None:
         assert "cpu" in found.ways
 
 
-@pytest.mark.parametrize("base", [None, 0x0800_4000])
+@each("base", [None, 0x0800_4000])
 def test_a_vector_table_is_enough(base: int | None) -> None:
     program = VECTORS + random.Random(1).randbytes(4096)
     assert doubt(Image.from_bytes(program, base=base)) is None
@@ -90,6 +91,6 @@ def test_seven_bytes_have_no_vector_table() -> None:
     assert "too short" in found.text
 
 
-@pytest.mark.parametrize("name", ["bms.hex", "bms.bin", "wmc.s19", "obc.elf", "station/bms.bin"])
+@each("name", ["bms.hex", "bms.bin", "wmc.s19", "obc.elf", "station/bms.bin"])
 def test_every_good_sample_is_plausible(name: str) -> None:
     check_plausible(load(SAMPLES / name))

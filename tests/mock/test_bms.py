@@ -13,6 +13,7 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.table import State
 from flasher.protocol.spec import BMS, OBC, WMC, Target
+from tests.loops import each
 from tests.mock.talk import READ, REPORT, START_S, WRITE, Answer, Talk
 
 DIALECTS = ["welling", "motinova"]
@@ -80,8 +81,8 @@ FEEDBACK = Answer(START_S, 0x725, REPORT, 0x5503, b"ACK")
 # -- queries --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dialect", DIALECTS)
-@pytest.mark.parametrize("query", QUERIES.values(), ids=QUERIES)
+@each("dialect", DIALECTS)
+@each("query", QUERIES.values())
 def test_every_query_gets_the_answer_of_the_document_on_its_id(
     query: tuple[int, int, int, int, bytes], dialect: str
 ) -> None:
@@ -90,7 +91,7 @@ def test_every_query_gets_the_answer_of_the_document_on_its_id(
     assert talk.ask(asked_on, READ, asked) == [Answer(START_S, answered_on, REPORT, answer, data)]
 
 
-@pytest.mark.parametrize("query", HMI_QUERIES.values(), ids=HMI_QUERIES)
+@each("query", HMI_QUERIES.values())
 def test_queries_of_the_hmi_are_answered_in_its_own_dialect_only(
     query: tuple[int, int, int, int, bytes],
 ) -> None:
@@ -100,7 +101,7 @@ def test_queries_of_the_hmi_are_answered_in_its_own_dialect_only(
     assert battery(dialect="welling").ask(asked_on, READ, asked) == []
 
 
-@pytest.mark.parametrize("dialect", DIALECTS)
+@each("dialect", DIALECTS)
 def test_the_handshake_is_answered_to_the_wmc_alone(dialect: str) -> None:
     talk = battery(dialect=dialect)
     expected = [Answer(START_S, 0x721, REPORT, 0x3005, b"READY")]
@@ -108,8 +109,8 @@ def test_the_handshake_is_answered_to_the_wmc_alone(dialect: str) -> None:
     assert talk.ask(0x712, READ, 0x3009, b"HANDSHAKY") == []
 
 
-@pytest.mark.parametrize("mode", [WRITE, REPORT])
-@pytest.mark.parametrize("query", QUERIES.values(), ids=QUERIES)
+@each("mode", [WRITE, REPORT])
+@each("query", QUERIES.values())
 def test_a_query_in_the_wrong_mode_is_not_answered(
     query: tuple[int, int, int, int, bytes], mode: int
 ) -> None:
@@ -118,13 +119,13 @@ def test_a_query_in_the_wrong_mode_is_not_answered(
     assert battery().ask(query[0], mode, query[1]) == ([feedback] if mode == WRITE else [])
 
 
-@pytest.mark.parametrize("can_id", [0x751, 0x753, 0x710, 0x720, 0x725, 0x713, 0x731])
-@pytest.mark.parametrize("command", [0x3300, 0x3000, 0x5000])
+@each("can_id", [0x751, 0x753, 0x710, 0x720, 0x725, 0x713, 0x731])
+@each("command", [0x3300, 0x3000, 0x5000])
 def test_queries_to_others_are_never_answered(can_id: int, command: int) -> None:
     assert battery().ask(can_id, READ, command) == []
 
 
-@pytest.mark.parametrize("target", [WMC, OBC], ids=lambda target: target.name)
+@each("target", [WMC, OBC])
 def test_wmc_and_obc_answer_no_query_and_no_write(target: Target) -> None:
     talk = battery(target)
     for can_id in (target.request_id, 0x752, 0x712, 0x732):
@@ -134,7 +135,7 @@ def test_wmc_and_obc_answer_no_query_and_no_write(target: Target) -> None:
             assert talk.ask(can_id, WRITE, command, data) == []
 
 
-@pytest.mark.parametrize("dialect", DIALECTS)
+@each("dialect", DIALECTS)
 def test_an_older_battery_has_no_state_of_health_and_knows_fewer_queries(dialect: str) -> None:
     talk = battery(older_battery="yes", dialect=dialect)
     (heard,) = talk.ask(0x752, READ, 0x3400)
@@ -155,7 +156,7 @@ def test_queries_that_the_profile_names_are_not_answered_the_others_are() -> Non
     assert talk.data_of(0x5100, 0x732) == VERSION
 
 
-@pytest.mark.parametrize("text", ["38G0", "x:3800", ",", "732:"])
+@each("text", ["38G0", "x:3800", ",", "732:"])
 def test_silent_queries_that_are_no_commands_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is no command"):
         DeviceProfile(silent_queries=text)
@@ -164,8 +165,8 @@ def test_silent_queries_that_are_no_commands_are_refused(text: str) -> None:
 # -- writes ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dialect", DIALECTS)
-@pytest.mark.parametrize("write", WRITES.values(), ids=WRITES)
+@each("dialect", DIALECTS)
+@each("write", WRITES.values())
 def test_every_write_is_confirmed_and_reads_back(
     write: tuple[int, bytes, int, slice], dialect: str
 ) -> None:
@@ -187,7 +188,7 @@ def test_writes_do_not_touch_each_other() -> None:
         assert talk.data_of(query)[part] == data
 
 
-@pytest.mark.parametrize("write", WRITES.values(), ids=WRITES)
+@each("write", WRITES.values())
 def test_what_was_written_outlasts_power_cuts_and_an_upgrade(
     write: tuple[int, bytes, int, slice],
 ) -> None:
@@ -229,7 +230,7 @@ def test_the_bootloader_answers_no_query_and_keeps_nothing() -> None:
     assert talk.data_of(0x3300)[:5] == b"BM36."
 
 
-@pytest.mark.parametrize(
+@each(
     "data", [b"\x00" * 16, b"\x1b[2J....\xff\xfe      ", b"no terminator 16", b"a.b.c           "]
 )
 def test_broken_texts_are_kept_as_they_are_and_reported_harmlessly(data: bytes) -> None:
@@ -243,8 +244,8 @@ def test_broken_texts_are_kept_as_they_are_and_reported_harmlessly(data: bytes) 
     assert event.after.isprintable()
 
 
-@pytest.mark.parametrize(
-    ("command", "data"),
+@each(
+    "command, data",
     [(0x4108, b"W2605999"), (0x7701, b"?"), (0x4205, b"RESEt"), (0x4204, b"RESE"), (0xA401, b"?")],
 )
 def test_a_write_that_is_no_row_of_the_document_is_confirmed_and_changes_nothing(
@@ -258,7 +259,7 @@ def test_a_write_that_is_no_row_of_the_document_is_confirmed_and_changes_nothing
     assert talk.data_of(0x3300) == VERSION
 
 
-@pytest.mark.parametrize("can_id", [0x712, 0x732, 0x742, 0x751, 0x753, 0x710])
+@each("can_id", [0x712, 0x732, 0x742, 0x751, 0x753, 0x710])
 def test_only_the_tool_may_write(can_id: int) -> None:
     """Others get general feedback on the battery's id to them, as 2.2.1(2) says."""
     talk = battery(dialect="motinova")
@@ -277,7 +278,7 @@ def memory(talk: Talk, start: int, end: int) -> list[Answer]:
     return talk.ask(0x752, READ, 0x4308, struct.pack("<II", start, end))
 
 
-@pytest.mark.parametrize(("start", "size"), [(0, 128), (0, 1), (5, 20), (300, 128), (400, 100)])
+@each("start, size", [(0, 128), (0, 1), (5, 20), (300, 128), (400, 100)])
 def test_memory_reads_give_the_application_as_it_stands_in_the_flash(start: int, size: int) -> None:
     """R5."""
     talk = battery()
@@ -314,8 +315,8 @@ def test_a_read_may_run_from_the_bootloader_into_the_application() -> None:
     assert both.data[8:40] == low.data[8:24] + high.data[8:24]
 
 
-@pytest.mark.parametrize(
-    ("start", "end"),
+@each(
+    "start, end",
     [
         (0x0000_0000, 0x0000_0010),
         (0x07FF_FFF0, 0x0800_0010),

@@ -16,6 +16,7 @@ from flasher.mock.table import State
 from flasher.protocol.contents import Fault
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WMC
+from tests.loops import each
 from tests.mock.talk import READ, REPORT, START_S, WRITE, Talk
 
 FIVE = [0.0, 0.2, 0.4, 0.6, 0.8]
@@ -133,8 +134,8 @@ def test_shutdown_is_repeated_every_200_ms_until_1_s_when_nobody_answers_then_it
     ]
 
 
-@pytest.mark.parametrize(
-    ("dialect", "answers"),
+@each(
+    "dialect, answers",
     [
         ("welling", [WMC_READY, OBC_READY]),
         ("motinova", [WMC_READY, OBC_READY, HMI_READY]),
@@ -157,7 +158,7 @@ def test_shutdown_is_said_once_when_all_others_are_ready_at_once_and_off_still_c
     assert ended.silent == ()
 
 
-@pytest.mark.parametrize("missing", [0, 1, 2])
+@each("missing", [0, 1, 2])
 def test_one_node_that_does_not_answer_keeps_it_repeating(missing: int) -> None:
     answers = [WMC_READY, OBC_READY, HMI_READY]
     names = ("WMC", "OBC", "HMI")
@@ -183,7 +184,7 @@ def test_answers_that_come_in_between_end_the_repetitions() -> None:
     assert talk.times_of(*SHUTDOWN) == pytest.approx([0.0, 0.2, 0.4])
 
 
-@pytest.mark.parametrize(
+@each(
     "answer",
     [
         (0x710, REPORT, 0x1305, b"REDAY"),
@@ -257,7 +258,7 @@ def test_the_key_means_nothing_to_a_bootloader_and_to_others_than_the_bms() -> N
 # -- idle -----------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dialect", ["welling", "motinova"])
+@each("dialect", ["welling", "motinova"])
 def test_a_resting_battery_on_an_idle_bus_shuts_down_after_half_an_hour(dialect: str) -> None:
     talk = battery(idle_shutdown="on", dialect=dialect)
     talk.run(10.0)

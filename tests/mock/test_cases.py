@@ -21,6 +21,7 @@ from flasher.protocol.messages import Ack, Complete, EndOfTransfer, Nak, Packet,
 from flasher.protocol.spec import BMS, IMAGE_MAX_SIZE, WELLING, Command, Mode
 from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Message, encode
+from tests.loops import each
 from tests.mock.bench import QUICK, READ_VERSION, SMALL, Bench, VersionQuery, image_of, packets_of
 
 IMAGE = image_of(600)
@@ -111,8 +112,8 @@ def test_what_follows_a_reset_in_the_same_bytes_is_not_heard() -> None:
     assert bench.device.state is State.RESTARTING
 
 
-@pytest.mark.parametrize(
-    ("can_id", "mode", "data"),
+@each(
+    "can_id, mode, data",
     [
         (0x752, Mode.WRITE, b"RESEt"),
         (0x752, Mode.READ, b"RESET"),
@@ -135,7 +136,7 @@ def test_a_reset_that_is_none_is_ignored(can_id: int, mode: Mode, data: bytes) -
 # -- UP: update command ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", [1, 127, 128, 129, 78351, 256 * 1024])
+@each("size", [1, 127, 128, 129, 78351, 256 * 1024])
 def test_images_from_one_byte_to_the_whole_area_are_taken_and_stored_exactly(size: int) -> None:
     """UP-01, TX-07: numbers pass 255 and 256 on the way."""
     bench = Bench(profile_with(application_area_bytes=256 * 1024))
@@ -159,8 +160,8 @@ def test_the_largest_image_of_the_protocol_is_taken_where_it_fits() -> None:
     assert (stored[:1], stored[-1:]) == (b"\x11", b"\x22")
 
 
-@pytest.mark.parametrize(
-    ("choices", "size"),
+@each(
+    "choices, size",
     [
         ({}, 0),
         ({"application_area_bytes": 256 * 1024}, 256 * 1024 + 1),
@@ -186,7 +187,7 @@ def test_an_impossible_size_is_refused_before_erasing_and_the_old_application_st
     assert bench.device.erase_count == 0
 
 
-@pytest.mark.parametrize("heard", [1, 2, 3, 4])
+@each("heard", [1, 2, 3, 4])
 def test_the_update_command_is_taken_at_each_of_the_announcements(heard: int) -> None:
     """UP-04."""
     bench = Bench()
@@ -199,8 +200,8 @@ def test_the_update_command_is_taken_at_each_of_the_announcements(heard: int) ->
     assert bench.take() == []
 
 
-@pytest.mark.parametrize(("offset_s", "taken"), [(-0.001, True), (0.001, False)])
-@pytest.mark.parametrize("window_s", [0.0, 0.05, 1.0])
+@each("offset_s, taken", [(-0.001, True), (0.001, False)])
+@each("window_s", [0.0, 0.05, 1.0])
 def test_the_window_ends_when_the_profile_says(
     offset_s: float, window_s: float, *, taken: bool
 ) -> None:
@@ -257,8 +258,8 @@ def test_another_size_while_erasing_erases_for_that_size_and_requests_once() -> 
     finish(bench, PACKETS, IMAGE)
 
 
-@pytest.mark.parametrize(
-    ("text", "command", "mode"),
+@each(
+    "text, command, mode",
     [
         (b"WMC_UPD\x58\x02\0\0", Command.UPDATE, Mode.WRITE),
         (b"OBC_UPD\x58\x02\0\0", Command.UPDATE, Mode.WRITE),
@@ -281,8 +282,8 @@ def test_an_update_command_for_another_target_or_of_another_shape_is_rejected(
     assert bench.device.erase_count == 0
 
 
-@pytest.mark.parametrize("size", [600, 300])
-@pytest.mark.parametrize("stored", [1, 5])
+@each("size", [600, 300])
+@each("stored", [1, 5])
 def test_an_update_command_in_the_middle_starts_over_cleanly(stored: int, size: int) -> None:
     """UP-08."""
     bench = bench_in_transfer(stored=stored)
@@ -291,7 +292,7 @@ def test_an_update_command_in_the_middle_starts_over_cleanly(stored: int, size: 
     finish(bench, packets_of(other), other)
 
 
-@pytest.mark.parametrize("stored", [0, 2])
+@each("stored", [0, 2])
 def test_an_update_command_while_a_packet_is_programmed_starts_over_cleanly(stored: int) -> None:
     bench = bench_in_transfer(SMALL, stored=stored)
     bench.send(PACKETS[stored])
@@ -336,9 +337,9 @@ def damaged_wires(packet: Packet) -> dict[str, bytes]:
     return {"data": bytes(flipped), "crc": bytes(crc), "tail": bytes(tail)}
 
 
-@pytest.mark.parametrize("kind", ["data", "crc", "tail"])
-@pytest.mark.parametrize(
-    ("choice", "answer"),
+@each("kind", ["data", "crc", "tail"])
+@each(
+    "choice, answer",
     [("nak_expected", [Nak(3)]), ("nak_received", [Nak(3)]), ("silence", [])],
 )
 def test_a_damaged_packet_is_answered_as_the_profile_says_and_taken_when_sent_again(
@@ -352,7 +353,7 @@ def test_a_damaged_packet_is_answered_as_the_profile_says_and_taken_when_sent_ag
     finish(bench, PACKETS[2:], IMAGE)
 
 
-@pytest.mark.parametrize("lost", [1, 9, 17])
+@each("lost", [1, 9, 17])
 def test_a_lost_frame_is_answered_by_nak_once_the_rest_does_not_come(lost: int) -> None:
     """TX-01."""
     bench = bench_in_transfer(stored=2)
@@ -407,7 +408,7 @@ def test_damage_that_does_not_begin_like_a_packet_is_not_answered() -> None:
     assert bench.take() == []
 
 
-@pytest.mark.parametrize(("choice", "answer"), [("ack", Ack(2)), ("nak_next", Nak(3))])
+@each("choice, answer", [("ack", Ack(2)), ("nak_next", Nak(3))])
 def test_a_repeated_packet_is_answered_as_the_profile_says_and_nothing_is_written_twice(
     choice: str, answer: messages.Row
 ) -> None:
@@ -449,9 +450,7 @@ def test_a_packet_after_the_last_one_is_rejected() -> None:
     finish(bench, [], IMAGE)
 
 
-@pytest.mark.parametrize(
-    ("choice", "answer"), [("ack", [Ack(1)]), ("nak", [Nak(4)]), ("silence", [])]
-)
+@each("choice, answer", [("ack", [Ack(1)]), ("nak", [Nak(4)]), ("silence", [])])
 def test_an_older_packet_is_answered_as_the_profile_says(
     choice: str, answer: list[messages.Row]
 ) -> None:
@@ -478,8 +477,8 @@ IMPOSSIBLE_PACKETS = {
 }
 
 
-@pytest.mark.parametrize("kind", IMPOSSIBLE_PACKETS)
-@pytest.mark.parametrize(("choice", "answer"), [("nak_expected", [Nak(3)]), ("silence", [])])
+@each("kind", IMPOSSIBLE_PACKETS)
+@each("choice, answer", [("nak_expected", [Nak(3)]), ("silence", [])])
 def test_an_impossible_packet_is_rejected_and_the_transfer_goes_on(
     kind: str, choice: str, answer: list[Nak]
 ) -> None:
@@ -552,9 +551,7 @@ def test_a_reset_during_the_transfer_is_ignored_by_default() -> None:
     finish(bench, PACKETS[3:], IMAGE)
 
 
-@pytest.mark.parametrize(
-    "state", [State.ERASING, State.TRANSFER, State.PROGRAMMING, State.CHECKING]
-)
+@each("state", [State.ERASING, State.TRANSFER, State.PROGRAMMING, State.CHECKING])
 def test_a_reset_during_the_upgrade_may_restart_and_the_device_is_rescuable(state: State) -> None:
     """TX-13."""
     bench = Bench(dataclasses.replace(SMALL, reset_in_transfer="restarts"))
@@ -602,7 +599,7 @@ def test_packets_and_end_without_an_update_command_are_rejected() -> None:
 # -- EN: end --------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("stored", [0, 1, 4])
+@each("stored", [0, 1, 4])
 def test_an_early_end_is_answered_by_nak_with_the_packet_wanted_and_the_transfer_goes_on(
     stored: int,
 ) -> None:
@@ -613,7 +610,7 @@ def test_an_early_end_is_answered_by_nak_with_the_packet_wanted_and_the_transfer
     finish(bench, PACKETS[stored:], IMAGE)
 
 
-@pytest.mark.parametrize(("choice", "answer"), [("same_answer", [Complete()]), ("silence", [])])
+@each("choice, answer", [("same_answer", [Complete()]), ("silence", [])])
 def test_a_second_end_is_answered_as_the_profile_says(choice: str, answer: list[Complete]) -> None:
     """EN-02."""
     bench = bench_in_transfer(profile_with(repeated_end=choice), stored=5)
@@ -662,7 +659,7 @@ def test_an_image_with_a_right_checksum_is_taken() -> None:
     assert bench.device.stored_image == image
 
 
-@pytest.mark.parametrize(
+@each(
     "image",
     [
         image_of(600),
@@ -737,7 +734,7 @@ def test_an_end_while_the_record_is_written_is_answered_once() -> None:
 # -- SE: anything at all --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(20))
+@each("seed", range(20))
 def test_random_traffic_leaves_the_device_reachable_and_an_application_old_or_none(
     seed: int,
 ) -> None:

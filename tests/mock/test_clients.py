@@ -9,6 +9,7 @@ from flasher.mock.machine import Unit
 from flasher.mock.model import MockDevice
 from flasher.protocol.spec import MOTINOVA, OBC, WELLING, WMC, Dialect, Node, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
+from tests.loops import each
 from tests.mock.talk import READ, REPORT, START_S, WRITE, Talk
 
 FIVE = [0.0, 0.2, 0.4, 0.6, 0.8]
@@ -97,7 +98,7 @@ def test_an_answer_to_something_else_ends_no_question() -> None:
     assert questions(talk) == [HANDSHAKE]
 
 
-@pytest.mark.parametrize("dialect", [WELLING, MOTINOVA], ids=lambda dialect: dialect.name)
+@each("dialect", [WELLING, MOTINOVA])
 def test_the_obc_reads_version_design_and_cells_then_running_information_every_second(
     dialect: Dialect,
 ) -> None:
@@ -146,8 +147,8 @@ def test_a_bus_that_takes_nothing_gets_one_copy_once_it_does() -> None:
 # -- shutdown -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("which", "dialect", "said"),
+@each(
+    "which, dialect, said",
     [
         (
             Node.WMC,
@@ -206,7 +207,7 @@ def test_power_that_comes_back_begins_the_questions_anew() -> None:
 # -- as an application of a device that can be upgraded -------------------------------------------
 
 
-@pytest.mark.parametrize("target", [WMC, OBC], ids=lambda target: target.name)
+@each("target", [WMC, OBC])
 def test_the_application_talks_and_the_bootloader_does_not(target: Target) -> None:
     talker = ClientApplication(target.node, WELLING)
     talk = Talk(MockDevice(target, bitrate_bps=250_000, application=talker))

@@ -15,6 +15,7 @@ from flasher.protocol import messages
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, TARGETS, WMC, Command, Mode, Target
 from flasher.protocol.wire import Message, encode
+from tests.loops import each
 from tests.mock.bench import QUICK, READ_VERSION, START_S, Bench, image_of, packets_of
 from tests.peers.wording import build
 from tests.protocol.cases import case
@@ -59,7 +60,7 @@ ANSWER_IDS = {WMC: 0x715, BMS: 0x725, OBC: 0x735}
 TARGET_LIST = list(TARGETS.values())
 
 
-@pytest.mark.parametrize("target", TARGET_LIST, ids=lambda target: target.name)
+@each("target", TARGET_LIST)
 def test_a_whole_upgrade_is_answered_byte_by_byte_as_in_the_document(target: Target) -> None:
     reset, feedback, version, update, request, ack, end, complete = DIALOGUES[target]
     image = image_of(128)
@@ -82,7 +83,7 @@ def test_a_whole_upgrade_is_answered_byte_by_byte_as_in_the_document(target: Tar
     assert bench.device.stored_image == image
 
 
-@pytest.mark.parametrize("target", TARGET_LIST, ids=lambda target: target.name)
+@each("target", TARGET_LIST)
 def test_the_packet_of_the_document_is_acknowledged(target: Target) -> None:
     bench = Bench(target=target)
     bench.enter_bootloader()
@@ -169,15 +170,15 @@ def test_the_bms_reports_its_version_information_as_in_the_document() -> None:
     assert (sent.can_id, sent.wire) == (0x720, golden.wire)
 
 
-@pytest.mark.parametrize("target", [WMC, OBC], ids=lambda target: target.name)
+@each("target", [WMC, OBC])
 def test_wmc_and_obc_do_not_know_the_version_query(target: Target) -> None:
     bench = Bench(target=target)
     bench.send(READ_VERSION)
     assert bench.take() == []
 
 
-@pytest.mark.parametrize(
-    ("text", "field"),
+@each(
+    "text, field",
     [
         (b"...V2r0r1_20260101..", b"V2r0r1_20260101."),
         (b"...V2r10r1_20260101.", b"V2r10r1_20260101"),
@@ -205,7 +206,7 @@ def test_nobody_answers_the_version_query_in_the_bootloader() -> None:
     assert bench.take() == []
 
 
-@pytest.mark.parametrize(("choice", "answers"), [("general_feedback", True), ("silence", False)])
+@each("choice, answers", [("general_feedback", True), ("silence", False)])
 def test_the_application_answers_upgrade_messages_with_feedback_or_not_and_erases_nothing(
     choice: str, *, answers: bool
 ) -> None:
@@ -247,7 +248,7 @@ def test_frames_of_other_ids_and_kinds_between_those_of_a_message_are_nothing() 
     assert bench.take() == [messages.GeneralFeedback()]
 
 
-@pytest.mark.parametrize("size", range(1, 9))
+@each("size", range(1, 9))
 def test_a_message_is_understood_in_whatever_pieces_it_comes(size: int) -> None:
     """FR-01."""
     bench = Bench()

@@ -22,6 +22,7 @@ from flasher.mock.table import State
 from flasher.protocol.engine import Engine
 from flasher.protocol.spec import BMS, WELLING
 from tests.end_to_end import world
+from tests.loops import each
 from tests.mock.bench import image_of
 from tests.mock.talk import READ, WRITE, Talk
 from tests.mock.tool import Tool
@@ -89,8 +90,8 @@ def test_an_operation_under_way_tells_when_it_is_half_done() -> None:
 # -- power cuts -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-@pytest.mark.parametrize("operation", range(OPERATIONS))
+@each("share", [0.0, 0.5, 1.0])
+@each("operation", range(OPERATIONS))
 def test_a_power_cut_in_any_operation_leaves_the_old_image_none_or_the_new_and_a_way_back(
     operation: int, share: float
 ) -> None:
@@ -132,7 +133,7 @@ def test_a_moment_that_never_comes_cuts_nothing() -> None:
     assert not injector.is_set
 
 
-@pytest.mark.parametrize("frames", [1, UPDATE_FRAMES + 2, UPDATE_FRAMES + 2 + 40])
+@each("frames", [1, UPDATE_FRAMES + 2, UPDATE_FRAMES + 2 + 40])
 def test_a_power_cut_at_a_received_frame_is_survived(frames: int) -> None:
     """PW-01. The reset has two frames of its own."""
     device = make_device()
@@ -214,7 +215,7 @@ def test_a_power_cut_ends_bus_off() -> None:
 MOMENTS: list[Moment] = [AfterFrame(frames) for frames in (1, 2, 4, 5, 13, 23, 24, 95, 96, 97)]
 
 
-@pytest.mark.parametrize("moment", MOMENTS, ids=repr)
+@each("moment", MOMENTS)
 def test_bus_off_at_any_frame_is_survived(moment: Moment) -> None:
     """BU-02."""
     device = make_device()

@@ -14,6 +14,7 @@ from flasher.mock.memory import (
     FlashRangeError,
     Operation,
 )
+from tests.loops import each
 
 START = 0x1000
 PAGE = 32
@@ -47,7 +48,7 @@ def test_erasing_a_page_leaves_the_others() -> None:
     assert flash.erase_count == 1
 
 
-@pytest.mark.parametrize("content", [b"\x00" * UNIT, b"\xff" * UNIT])
+@each("content", [b"\x00" * UNIT, b"\xff" * UNIT])
 def test_a_unit_is_programmed_only_once_even_with_ff(content: bytes) -> None:
     flash = make_flash()
     flash.program(START, content)
@@ -66,13 +67,13 @@ def test_a_program_that_reaches_into_a_programmed_unit_changes_nothing() -> None
     assert flash.read(START, 2 * UNIT) == b"\xff" * UNIT + b"\x00" * UNIT
 
 
-@pytest.mark.parametrize(("address", "size"), [(START + 4, 8), (START, 7), (START, 0), (START, 12)])
+@each("address, size", [(START + 4, 8), (START, 7), (START, 0), (START, 12)])
 def test_a_program_off_the_unit_is_refused(address: int, size: int) -> None:
     with pytest.raises(FlashAlignmentError, match="8 bytes a unit"):
         make_flash().program(address, b"\x00" * size)
 
 
-@pytest.mark.parametrize("address", [START - 8, START + 4 * PAGE - 8, START + 4 * PAGE, 0])
+@each("address", [START - 8, START + 4 * PAGE - 8, START + 4 * PAGE, 0])
 def test_outside_nothing_is_programmed_or_read(address: int) -> None:
     flash = make_flash()
     with pytest.raises(FlashRangeError, match="outside of the flash"):
@@ -90,7 +91,7 @@ def test_a_page_is_erased_from_its_beginning_and_inside_only() -> None:
     assert flash.erase_count == 0
 
 
-@pytest.mark.parametrize(("size", "page", "unit"), [(100, 32, 8), (128, 32, 5)])
+@each("size, page, unit", [(100, 32, 8), (128, 32, 5)])
 def test_sizes_that_do_not_divide_each_other_are_an_error(size: int, page: int, unit: int) -> None:
     with pytest.raises(ValueError, match="whole"):
         Flash(START, size, page_size_bytes=page, program_unit_bytes=unit)
@@ -165,9 +166,7 @@ def test_new_operations_wait_for_the_one_under_way_and_replace_the_waiting_ones(
     assert flash.read(START, UNIT) == b"\xff" * UNIT
 
 
-@pytest.mark.parametrize(
-    ("cut_at_s", "erased_bytes"), [(10.0, 0), (10.25, 8), (10.75, 24), (11.0, 32), (99.0, 32)]
-)
+@each("cut_at_s, erased_bytes", [(10.0, 0), (10.25, 8), (10.75, 24), (11.0, 32), (99.0, 32)])
 def test_an_aborted_erase_is_as_torn_as_its_time_says(cut_at_s: float, erased_bytes: int) -> None:
     flash = make_flash()
     flash.program(START, b"\x00" * PAGE)

@@ -217,7 +217,7 @@ def test_power_that_is_on_already_changes_nothing() -> None:
     assert bench.device.state is State.APPLICATION
 
 
-@pytest.mark.parametrize("flipped_byte", [0, 300, 599])
+@each("flipped_byte", [0, 300, 599])
 def test_an_image_that_was_altered_in_the_flash_does_not_boot(flipped_byte: int) -> None:
     """R7: what is stored is held against its record at every start."""
     bench = Bench(SMALL)
@@ -231,7 +231,7 @@ def test_an_image_that_was_altered_in_the_flash_does_not_boot(flipped_byte: int)
     assert bench.device.stored_image == NEW
 
 
-@pytest.mark.parametrize("size", [0, 1025, 0xFFFFFFFF])
+@each("size", [0, 1025, 0xFFFFFFFF])
 def test_a_record_with_an_impossible_size_does_not_boot(size: int) -> None:
     bench = Bench(SMALL)
     bench.device.store.flash._put(1024, size.to_bytes(4, "little"))

@@ -10,12 +10,13 @@ import pytest
 from flasher.errors import UsageError
 from flasher.mock.profile import DeviceProfile
 from flasher.settings.device_model import describe_options, set_option
+from tests.loops import each
 
 DEFAULT = DeviceProfile()
 
 
-@pytest.mark.parametrize(
-    ("key", "text", "value"),
+@each(
+    "key, text, value",
     [
         ("repeated_packet", "nak_next", "nak_next"),
         ("boot_version", "V9.8.7", "V9.8.7"),
@@ -56,8 +57,8 @@ def test_a_value_like_none_of_the_allowed_ones_gets_no_suggestion() -> None:
     assert caught.value.remedy.startswith("It is ack, nak, silence: ")
 
 
-@pytest.mark.parametrize(
-    ("key", "text"),
+@each(
+    "key, text",
     [
         ("window_s", "soon"),
         ("window_s", "nan"),
@@ -74,8 +75,8 @@ def test_a_number_that_is_none_or_out_of_range_is_refused_by_name(key: str, text
         set_option(DEFAULT, key, text)
 
 
-@pytest.mark.parametrize(
-    ("change", "problem"),
+@each(
+    "change, problem",
     [
         ({"program_unit_bytes": 3}, "program_unit_bytes divides 128; 3 does not"),
         ({"program_unit_bytes": 0}, "program_unit_bytes divides 128"),
@@ -115,8 +116,8 @@ def test_every_value_that_is_described_can_be_set() -> None:
             assert str(getattr(set_option(DEFAULT, key, text), key)) in {text, "None"}
 
 
-@pytest.mark.parametrize(
-    ("area", "largest", "limit"),
+@each(
+    "area, largest, limit",
     [(2048, None, 2048), (2048, 100, 100), (2048, 9999, 2048), (16 << 20, None, 8_388_480)],
 )
 def test_the_largest_image_is_bounded_by_area_option_and_protocol(

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import pytest
-
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.table import State
@@ -15,7 +13,6 @@ from flasher.protocol.spec import BMS, TARGETS, WELLING, Target
 from flasher.settings.device_model import describe_options, set_option
 from tests.loops import each
 from tests.mock.bench import image_of
-from tests.peers.dialogue import strays
 from tests.peers.scripted_host import HostScript, ScriptedHost
 from tests.peers.virtual_wire import run
 
@@ -42,7 +39,7 @@ def assert_upgraded(host: ScriptedHost, device: MockDevice) -> None:
     assert device.state is State.APPLICATION
 
 
-@pytest.mark.parametrize("target", TARGETS.values(), ids=lambda target: target.name)
+@each("target", TARGETS.values())
 def test_a_plain_upgrade_of_every_target_completes(target: Target) -> None:
     assert_upgraded(*upgrade(target=target))
 
@@ -52,7 +49,7 @@ def test_a_plain_upgrade_completes_with_every_choice_of_the_profile(key: str, va
     assert_upgraded(*upgrade(profile=set_option(DeviceProfile(), key, value)))
 
 
-@pytest.mark.parametrize(
+@each(
     "script",
     [
         HostScript(update_on_version=4),
@@ -71,14 +68,13 @@ def test_a_plain_upgrade_completes_with_every_choice_of_the_profile(key: str, va
         HostScript(pause_s={5: 30.0}),
         HostScript(filler=0x00),
     ],
-    ids=strays,
 )
 def test_a_host_that_strays_ends_with_the_right_image(script: HostScript) -> None:
     assert_upgraded(*upgrade(script))
 
 
-@pytest.mark.parametrize(
-    ("script", "choice", "answers"),
+@each(
+    "script, choice, answers",
     [
         (HostScript(repeat=frozenset({3})), "repeated_packet=ack", [("ack", 3)]),
         (HostScript(repeat=frozenset({3})), "repeated_packet=nak_next", [("nak", 4)]),
@@ -103,7 +99,6 @@ def test_a_host_that_strays_ends_with_the_right_image(script: HostScript) -> Non
             [("request", 0)],
         ),
     ],
-    ids=strays,
 )
 def test_what_is_said_out_of_turn_is_answered_as_the_profile_says(
     script: HostScript, choice: str, answers: list[tuple[str, int]]
@@ -113,7 +108,7 @@ def test_what_is_said_out_of_turn_is_answered_as_the_profile_says(
     assert_upgraded(host, device)
 
 
-@pytest.mark.parametrize(
+@each(
     "script",
     [
         HostScript(update_size_bytes=0),
@@ -122,7 +117,6 @@ def test_what_is_said_out_of_turn_is_answered_as_the_profile_says(
         HostScript(update_text=b"BMS_UP"),
         HostScript(update_text=b"BMS_UPDT"),
     ],
-    ids=strays,
 )
 def test_an_update_command_that_does_not_fit_leaves_the_old_application(script: HostScript) -> None:
     host, device = upgrade(script)

@@ -19,6 +19,7 @@ from flasher.mock.system import System
 from flasher.mock.table import State
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, TARGETS, WELLING, WMC, Dialect, Node, Target
+from tests.loops import each
 from tests.mock.bench import image_of
 from tests.mock.talk import READ, WRITE, Talk
 from tests.peers.wording import build, intact, payloads
@@ -106,7 +107,7 @@ SPEECH = {
 LOAD_PERCENT = {"welling": 0.31, "motinova": 0.82}
 
 
-@pytest.mark.parametrize("dialect", DIALECTS, ids=lambda dialect: dialect.name)
+@each("dialect", DIALECTS)
 def test_in_30_s_every_question_is_asked_and_answered_and_the_bus_is_hardly_busy(
     dialect: Dialect,
 ) -> None:
@@ -117,7 +118,7 @@ def test_in_30_s_every_question_is_asked_and_answered_and_the_bus_is_hardly_busy
     assert load_percent == pytest.approx(LOAD_PERCENT[dialect.name], abs=0.01)
 
 
-@pytest.mark.parametrize("dialect", DIALECTS, ids=lambda dialect: dialect.name)
+@each("dialect", DIALECTS)
 def test_the_key_shuts_the_whole_bicycle_down_and_power_wakes_it(dialect: Dialect) -> None:
     street = Street(dialect)
     street.listen(5.05)
@@ -141,7 +142,7 @@ def test_the_key_shuts_the_whole_bicycle_down_and_power_wakes_it(dialect: Dialec
     assert street.ear.order[-1] == (0x720, 0x1010)
 
 
-@pytest.mark.parametrize("target", TARGETS.values(), ids=lambda target: target.name)
+@each("target", TARGETS.values())
 def test_each_device_is_upgraded_while_the_others_talk(target: Target) -> None:
     street = Street(WELLING, target)
     street.listen(2.05)
@@ -209,7 +210,7 @@ class _Echoed(System):
             self.receive(frame._replace(is_echo=True), now)
 
 
-@pytest.mark.parametrize("dialect", DIALECTS)
+@each("dialect", DIALECTS)
 def test_a_bus_that_gives_own_frames_back_is_answered_once(dialect: Dialect) -> None:
     said = []
     for build_system in (System, _Echoed):

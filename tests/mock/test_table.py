@@ -7,6 +7,7 @@ import pytest
 from flasher.errors import FlasherError
 from flasher.mock.model import MockDevice
 from flasher.mock.table import IGNORED, MESSAGE_EVENTS, TABLE, Event, State
+from tests.loops import each
 from tests.mock.bench import Bench
 
 DEAF = {State.OFF, State.RESTARTING}
@@ -32,12 +33,12 @@ def test_every_pair_that_can_happen_is_listed_and_no_other() -> None:
         assert set(row) == heard | power | TIMERS.get(state, set()), state
 
 
-@pytest.mark.parametrize("state", list(State))
+@each("state", list(State))
 def test_a_power_cut_ends_every_state(state: State) -> None:
     assert (TABLE[state][Event.POWER_CUT].state or state) is State.OFF
 
 
-@pytest.mark.parametrize("state", list(State))
+@each("state", list(State))
 def test_an_ignored_event_does_not_change_the_state(state: State) -> None:
     for action, after in TABLE[state].values():
         if action == IGNORED.action:

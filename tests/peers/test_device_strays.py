@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import pytest
 
-from .dialogue import IMAGE, assert_upgraded, strays, upgrade
+from tests.loops import each
+
+from .dialogue import IMAGE, assert_upgraded, upgrade
 from .scripted_device import DeviceScript, ScriptedDevice
 from .scripted_host import HostScript, Limits, ScriptedHost
 from .virtual_wire import run
 from .wording import WORDINGS, Frame, literal
 
 
-@pytest.mark.parametrize(
+@each(
     "script",
     [
         DeviceScript(no_feedback=True),
@@ -30,15 +32,14 @@ from .wording import WORDINGS, Frame, literal
         DeviceScript(end_nak=1),
         DeviceScript(foreign_frames=True),
     ],
-    ids=strays,
 )
 def test_a_stray_that_the_documents_allow_for_is_overcome(script: DeviceScript) -> None:
     host, device = upgrade(script)
     assert_upgraded(host, device)
 
 
-@pytest.mark.parametrize(
-    ("script", "outcome"),
+@each(
+    "script, outcome",
     [
         (DeviceScript(deaf_to_reset=True), "no boot version"),
         (DeviceScript(versions_lost=frozenset({1, 2, 3, 4})), "no boot version"),
@@ -51,7 +52,6 @@ def test_a_stray_that_the_documents_allow_for_is_overcome(script: DeviceScript) 
         (DeviceScript(end_nak=2), "refused"),
         (DeviceScript(lose_complete=3), "no complete"),
     ],
-    ids=strays,
 )
 def test_a_stray_that_cannot_be_overcome_is_named(script: DeviceScript, outcome: str) -> None:
     host, _ = upgrade(script)

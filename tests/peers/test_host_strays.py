@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import pytest
 
-from .dialogue import assert_upgraded, strays, upgrade
+from tests.loops import each
+
+from .dialogue import assert_upgraded, upgrade
 from .scripted_device import DeviceScript, ScriptedDevice
 from .scripted_host import HostScript, Limits
 from .wording import WORDINGS, Frame, literal
 
 
-@pytest.mark.parametrize(
+@each(
     "script",
     [
         HostScript(update_on_version=4),
@@ -35,7 +37,6 @@ from .wording import WORDINGS, Frame, literal
         HostScript(filler=0x00),
         HostScript(end_twice=True),
     ],
-    ids=strays,
 )
 def test_a_device_ends_with_the_right_image_whatever_the_host_said_in_between(
     script: HostScript,
@@ -44,8 +45,8 @@ def test_a_device_ends_with_the_right_image_whatever_the_host_said_in_between(
     assert_upgraded(host, device)
 
 
-@pytest.mark.parametrize(
-    ("script", "name", "answers"),
+@each(
+    "script, name, answers",
     [
         (HostScript(repeat=frozenset({3})), "repeat 3", [("ack", 3)]),
         (HostScript(other_data_on_repeat=frozenset({3})), "other data 3", [("ack", 3)]),
@@ -57,7 +58,6 @@ def test_a_device_ends_with_the_right_image_whatever_the_host_said_in_between(
         (HostScript(end_twice=True), "end twice", [("complete", 0)]),
         (HostScript(update_again_before_packet_1=True), "update before 1", [("request", 0)]),
     ],
-    ids=strays,
 )
 def test_the_answers_to_an_aside_are_collected(
     script: HostScript, name: str, answers: list[tuple[str, int]]
@@ -66,8 +66,8 @@ def test_the_answers_to_an_aside_are_collected(
     assert host.asides == {name: answers}
 
 
-@pytest.mark.parametrize(
-    ("script", "naks"),
+@each(
+    "script, naks",
     [
         (HostScript(wrong_crc=frozenset({3})), [3]),
         (HostScript(wrong_tail=frozenset({3})), [3]),
@@ -75,7 +75,6 @@ def test_the_answers_to_an_aside_are_collected(
         (HostScript(head={3: bytes.fromhex("01 07 00 0A 00")}), [3]),
         (HostScript(lost_frame={3: 8}), []),
     ],
-    ids=strays,
 )
 def test_a_damaged_first_copy_is_refused_or_not_answered_and_sent_again(
     script: HostScript, naks: list[int]
@@ -86,7 +85,7 @@ def test_a_damaged_first_copy_is_refused_or_not_answered_and_sent_again(
     assert host.numbers("packet", "said").count(3) == 2
 
 
-@pytest.mark.parametrize(
+@each(
     "script",
     [
         HostScript(update_size_bytes=0),
@@ -96,7 +95,6 @@ def test_a_damaged_first_copy_is_refused_or_not_answered_and_sent_again(
         HostScript(update_text=b"BMS_UP"),
         HostScript(update_text=b"BMS_UPDT"),
     ],
-    ids=strays,
 )
 def test_an_update_command_that_does_not_fit_leaves_the_old_application(
     script: HostScript,

@@ -7,6 +7,8 @@ import random
 
 import pytest
 
+from tests.loops import each
+
 from .dialogue import IMAGE, TARGETS, assert_upgraded, upgrade
 from .scripted_device import ScriptedDevice
 from .scripted_host import HostScript, ScriptedHost
@@ -14,8 +16,8 @@ from .virtual_wire import FRAME_S, run
 from .wording import WORDINGS, Frame, intact, literal
 
 
-@pytest.mark.parametrize("target", TARGETS)
-@pytest.mark.parametrize("size_bytes", [1, 127, 128, 129])
+@each("target", TARGETS)
+@each("size_bytes", [1, 127, 128, 129])
 def test_an_upgrade_of_any_target_succeeds(target: str, size_bytes: int) -> None:
     image = random.Random(size_bytes).randbytes(size_bytes)
     host, device = upgrade(target=target, image=image)

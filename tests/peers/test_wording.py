@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
+from tests.loops import each
 
 from .dialogue import TARGETS
 from .wording import WORDINGS, build, crc, intact, literal, numbered, payloads
@@ -15,7 +15,7 @@ def test_the_crc_has_the_documents_example() -> None:
     assert crc(bytes.fromhex("55 AA 07 12 11 03 22 01 00")) == 0x01295122
 
 
-@pytest.mark.parametrize("target", TARGETS)
+@each("target", TARGETS)
 def test_the_literals_are_what_the_tables_and_the_crc_yield(target: str) -> None:
     words = WORDINGS[target]
     to, back = words.to_device, words.to_tool
@@ -36,7 +36,7 @@ def test_the_literals_are_what_the_tables_and_the_crc_yield(target: str) -> None
         assert literal(text) == payloads(wire)
 
 
-@pytest.mark.parametrize("target", TARGETS)
+@each("target", TARGETS)
 def test_the_literals_are_the_vectors(target: str) -> None:
     path = Path(__file__).parent.parent / "vectors.json"
     vectors = {

@@ -13,6 +13,7 @@ from flasher.protocol.bittime import fixed_bits, frame_bits, message_bits, strea
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import Ack, Packet
 from flasher.protocol.wire import encode, split
+from tests.loops import each
 
 
 def _bits(value: int, width: int) -> list[int]:
@@ -58,7 +59,7 @@ _PATHOLOGICAL: Final = [
 ]
 
 
-@pytest.mark.parametrize("can_id", [0x000, 0x7FF, 0x0F0, 0x70F, 0x78F, 0x751, 0x725])
+@each("can_id", [0x000, 0x7FF, 0x0F0, 0x70F, 0x78F, 0x751, 0x725])
 def test_pathological_frames_have_the_length_of_the_reference(can_id: int) -> None:
     for data in _PATHOLOGICAL:
         assert frame_bits(Frame(can_id, data)) == _reference_bits(can_id, data), data.hex()
@@ -71,7 +72,7 @@ def test_random_frames_of_all_ids_and_sizes_have_the_length_of_the_reference() -
         assert frame_bits(Frame(can_id, data)) == _reference_bits(can_id, data), (can_id, data)
 
 
-@pytest.mark.parametrize("can_id", [0x000, 0x715, 0x752, 0x7FF])
+@each("can_id", [0x000, 0x715, 0x752, 0x7FF])
 def test_a_stream_has_the_lengths_of_its_frames(can_id: int) -> None:
     full = [data for data in _PATHOLOGICAL if len(data) == 8]
     stream = b"".join(full) + random.Random(3).randbytes(8 * 500)
@@ -86,18 +87,18 @@ def test_an_empty_stream_has_no_lengths() -> None:
     assert stream_bits(0x752, b"") == b""
 
 
-@pytest.mark.parametrize("size_bytes", [1, 7, 9, 143])
+@each("size_bytes", [1, 7, 9, 143])
 def test_a_stream_of_broken_frames_is_refused(size_bytes: int) -> None:
     with pytest.raises(ValueError, match=f"{size_bytes} bytes are no whole number"):
         stream_bits(0x752, bytes(size_bytes))
 
 
-@pytest.mark.parametrize(("size_bytes", "bits"), [(0, 47), (1, 55), (5, 87), (8, 111)])
+@each("size_bytes, bits", [(0, 47), (1, 55), (5, 87), (8, 111)])
 def test_without_stuffing_a_frame_is_47_bits_and_its_data(size_bytes: int, bits: int) -> None:
     assert fixed_bits(size_bytes) == bits
 
 
-@pytest.mark.parametrize(("size_bytes", "least", "most"), [(8, 111, 135), (5, 87, 105)])
+@each("size_bytes, least, most", [(8, 111, 135), (5, 87, 105)])
 def test_a_frame_lies_between_no_stuffing_and_a_stuff_bit_in_four(
     size_bytes: int, least: int, most: int
 ) -> None:
@@ -110,8 +111,8 @@ def test_a_frame_lies_between_no_stuffing_and_a_stuff_bit_in_four(
     assert max(lengths) <= most
 
 
-@pytest.mark.parametrize(
-    ("can_id", "data", "bits"),
+@each(
+    "can_id, data, bits",
     [
         (0x751, "f5a5555555555555", 111),
         (0x752, "9e9ad55555555555", 111),
@@ -128,8 +129,8 @@ def test_frames_without_a_stuff_bit_exist_on_the_upgrades_ids(
     assert frame_bits(frame) == _reference_bits(*frame[:2]) == bits
 
 
-@pytest.mark.parametrize(
-    ("can_id", "data", "bits"),
+@each(
+    "can_id, data, bits",
     [
         # The bound of a stuff bit in four (135, 105) is out of reach: RTR, IDE, r0 and the size
         # interrupt the alternation. These are the longest frames there are, over all ids and over

@@ -229,12 +229,12 @@ def test_the_dialects_differ_in_bit_rate_nodes_and_upgrade() -> None:
     assert not MOTINOVA.has_upgrade
 
 
-@pytest.mark.parametrize("dialect", DIALECTS.values(), ids=DIALECTS)
+@each("dialect", DIALECTS.values())
 def test_both_dialects_keep_the_reset_command(dialect: Dialect) -> None:
     assert (0x752, 0x4205) in rows_of(dialect)
 
 
-@pytest.mark.parametrize("dialect", DIALECTS.values(), ids=DIALECTS)
+@each("dialect", DIALECTS.values())
 def test_both_dialects_give_the_four_queries_of_the_push_buttons_and_the_obc(
     dialect: Dialect,
 ) -> None:
@@ -242,7 +242,7 @@ def test_both_dialects_give_the_four_queries_of_the_push_buttons_and_the_obc(
     assert asked == {0x5000, 0x5100, 0x5200, 0x5300}
 
 
-@pytest.mark.parametrize("dialect", DIALECTS.values(), ids=DIALECTS)
+@each("dialect", DIALECTS.values())
 def test_both_dialects_leave_four_bytes_reserved_in_running_information(dialect: Dialect) -> None:
     """R1: one document lists five, which its own length of 16 leaves no room for."""
     decoded = decode(Message(0x720, P, 0x1010, bytes(12) + b"\x01\x02\x03\x04"), dialect)
@@ -333,7 +333,7 @@ def test_nineteen_vectors_are_messages_of_the_catalogue() -> None:
     assert len(VECTORS) == 19
 
 
-@pytest.mark.parametrize("vector", VECTORS, ids=lambda vector: vector.name)
+@each("vector", VECTORS)
 def test_a_vector_is_decoded_and_encoded_to_its_wire_bytes(vector: Case) -> None:
     decoded = decode(vector.message)
     assert decoded is not None
@@ -342,8 +342,8 @@ def test_a_vector_is_decoded_and_encoded_to_its_wire_bytes(vector: Case) -> None
     assert wire.encode(message) == vector.wire
 
 
-@pytest.mark.parametrize(
-    ("key", "content", "name"),
+@each(
+    "key, content, name",
     [
         (
             (0x720, 0x1010),
@@ -430,7 +430,6 @@ def test_a_vector_is_decoded_and_encoded_to_its_wire_bytes(vector: Case) -> None
         ((0x752, 0x4205), contents.Reset(), "bms reset"),
         ((0x725, 0x5503), contents.GeneralFeedback(), "bms general feedback ACK"),
     ],
-    ids=lambda value: value if isinstance(value, str) else None,
 )
 def test_a_vector_says_what_its_name_says(
     key: tuple[int, int], content: Content, name: str
@@ -457,7 +456,7 @@ def test_a_value_that_does_not_fit_is_refused_with_the_name_of_its_field() -> No
         encode(BY_KEY[0x752, 0x4110], contents.SerialNumber(**too_long))
 
 
-@pytest.mark.parametrize("content", [contents.Empty(), contents.CheckCode(bytes(12))])
+@each("content", [contents.Empty(), contents.CheckCode(bytes(12))])
 def test_the_content_of_another_message_is_refused(content: Content) -> None:
     with pytest.raises(ValueError, match=r"^write model \(752 4010\) carries Model, not "):
         encode(BY_KEY[0x752, 0x4010], content)
@@ -491,7 +490,7 @@ def test_the_document_lists_the_row_with_its_answer(row: Row) -> None:
     assert cells[-1] == ("" if row.dialects == "both" else f"{row.dialects} only")
 
 
-@pytest.mark.parametrize(
+@each(
     "line",
     [
         "| 2 | 2 | mean current | int16 | mA | |",

@@ -16,6 +16,7 @@ from flasher.protocol import contents
 from flasher.protocol.catalogue import ITEMS
 from flasher.protocol.contents import Fault, Status
 from flasher.protocol.fields import Content, Text
+from tests.loops import each
 
 CONTENTS: Final = sorted({item.content for item in ITEMS}, key=lambda content: content.__name__)
 every_content = pytest.mark.parametrize("content", CONTENTS, ids=lambda found: found.__name__)
@@ -196,8 +197,8 @@ def test_its_bytes_are_decoded_to_the_content(content: Content, data: bytes) -> 
     assert type(content).from_data(data) == content
 
 
-@pytest.mark.parametrize(
-    ("content", "data"),
+@each(
+    "content, data",
     [
         (
             contents.DesignInformation,
@@ -262,8 +263,8 @@ GOOD: Final[dict[type[Content], Content]] = {
 }
 
 
-@pytest.mark.parametrize(
-    ("content", "field", "value", "refusal"),
+@each(
+    "content, field, value, refusal",
     [
         (contents.RunningInformation, "voltage_mv", 65536, "voltage: 65536 does not fit 2 bytes"),
         (contents.RunningInformation, "voltage_mv", -1, "voltage: -1 does not fit 2 bytes"),
@@ -359,14 +360,14 @@ def shown_faults(data: bytes) -> str:
     return value
 
 
-@pytest.mark.parametrize(("bits", "name"), UPPER_HALF)
+@each("bits, name", UPPER_HALF)
 def test_a_warning_is_the_bit_of_the_upper_half(bits: int, name: str) -> None:
     data = b"\x00\x00" + half(bits)
     assert shown_faults(data) == name
     assert contents.Faults(Fault[name.upper().replace(" ", "_")]).data() == data
 
 
-@pytest.mark.parametrize(("bits", "name"), LOWER_HALF)
+@each("bits, name", LOWER_HALF)
 def test_a_protection_or_defect_is_the_bit_of_the_lower_half(bits: int, name: str) -> None:
     data = half(bits) + b"\x00\x00"
     assert shown_faults(data) == name
@@ -377,7 +378,7 @@ def test_no_other_bit_has_a_name() -> None:
     assert len(Fault) == len(UPPER_HALF) + len(LOWER_HALF) == 25
 
 
-@pytest.mark.parametrize("bit", range(25, 32))
+@each("bit", range(25, 32))
 def test_an_unnamed_fault_is_kept_and_shown_by_its_number(bit: int) -> None:
     data = b"\x00\x00\x00" + bytes([1 << (bit - 24)])
     assert contents.Faults.from_data(data).data() == data
@@ -395,8 +396,8 @@ def test_no_fault_is_shown_as_none() -> None:
     assert shown_faults(bytes(4)) == "none"
 
 
-@pytest.mark.parametrize(
-    ("status", "shown"),
+@each(
+    "status, shown",
     [
         (0x00, "no flag (00)"),
         (0x01, "charger connected"),
@@ -412,8 +413,8 @@ def test_the_status_is_shown_by_its_bits(status: int, shown: str) -> None:
 # -- for people -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("name", "lines"),
+@each(
+    "name, lines",
     [
         (
             "running information, discharging at 20 A in the cold, charger connected",

@@ -5,9 +5,8 @@ from __future__ import annotations
 import random
 from typing import Final
 
-import pytest
-
 from flasher.protocol.crc import crc32
+from tests.loops import each
 
 _POLYNOMIAL: Final = 0x04C11DB7
 
@@ -38,8 +37,8 @@ def _crc_of_the_appendix(data: bytes) -> int:
     return register
 
 
-@pytest.mark.parametrize(
-    ("index", "entry"),
+@each(
+    "index, entry",
     [
         # The first rows of the printed table, the corners of some others, and its last entry.
         (0, 0x00000000),

@@ -26,6 +26,7 @@ from flasher.protocol.fields import (
     flag_names,
     label,
 )
+from tests.loops import each
 
 
 class Lamp(Bits):
@@ -49,8 +50,8 @@ class Sample(Content):
 # -- codecs ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("codec", "value", "raw"),
+@each(
+    "codec, value, raw",
     [
         (Number(1), 0, "00"),
         (Number(1), 255, "FF"),
@@ -84,8 +85,8 @@ def test_a_codec_gives_and_takes_the_bytes(codec: Codec, value: object, raw: str
     assert codec.decode(data) == value
 
 
-@pytest.mark.parametrize(
-    ("codec", "value", "refusal"),
+@each(
+    "codec, value, refusal",
     [
         (Number(1), 256, "256 does not fit 1 bytes"),
         (Number(2), -1, "-1 does not fit 2 bytes"),
@@ -115,8 +116,8 @@ def test_a_codec_refuses_what_does_not_fit(codec: Codec, value: object, refusal:
         codec.encode(value)
 
 
-@pytest.mark.parametrize(
-    ("codec", "value", "shown"),
+@each(
+    "codec, value, shown",
     [
         (Number(2, "mA", signed=True), -1234, "-1234"),
         (Address(4), 0x4000, "0x00004000"),
@@ -165,8 +166,8 @@ def test_text_reads_up_to_its_terminator_and_keeps_its_bytes() -> None:
     assert text != Text(b"AB\xff.\x00\x00\x00\x00")
 
 
-@pytest.mark.parametrize(
-    ("name", "unit", "expected"),
+@each(
+    "name, unit, expected",
     [
         ("voltage_mv", "mV", "voltage"),
         ("design_voltage_v", "V", "design voltage"),
@@ -213,7 +214,7 @@ def test_a_declaration_without_fields_is_empty() -> None:
     assert list(Nothing.from_data(b"").shown()) == []
 
 
-@pytest.mark.parametrize("size_bytes", [0, 11, 13])
+@each("size_bytes", [0, 11, 13])
 def test_data_of_another_size_is_refused(size_bytes: int) -> None:
     with pytest.raises(ValueError, match=f"{size_bytes} bytes of data, not 12"):
         Sample.from_data(bytes(size_bytes))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -93,7 +92,7 @@ def test_a_row_in_another_mode_is_malformed(row: Row, can_id: int, text: str, mo
 _CONSTANT: Final = [entry for entry in _ROWS if not vars(entry[0]) and entry[2][3:] != "3300"]
 
 
-@pytest.mark.parametrize(("row", "can_id", "text"), _CONSTANT, ids=[t for _, _, t in _CONSTANT])
+@each("row, can_id, text", _CONSTANT)
 def test_no_byte_of_a_constant_row_may_differ(row: Row, can_id: int, text: str) -> None:
     message = _message(can_id, text)
     assert decode(message) == row
@@ -105,8 +104,8 @@ def test_no_byte_of_a_constant_row_may_differ(row: Row, can_id: int, text: str) 
         assert bytes(data).hex(" ") in found.problem
 
 
-@pytest.mark.parametrize(
-    ("data", "problem"),
+@each(
+    "data, problem",
     [
         ("00 01 00 01 00", "a packet starts with 01, not 00"),
         ("02 01 00 01 00", "a packet starts with 01, not 02"),
@@ -125,9 +124,7 @@ def test_a_packet_beyond_its_total_is_for_the_receiver_to_judge() -> None:
     assert decode(message) == Packet(3, 2, _PAYLOAD)
 
 
-@pytest.mark.parametrize(
-    "text", [b"BMS_UPd", b"PBU_UPD", b"HMI_UPD", b"\x00" * 7, b"\xff\x1b[2J\r\n"]
-)
+@each("text", [b"BMS_UPd", b"PBU_UPD", b"HMI_UPD", b"\x00" * 7, b"\xff\x1b[2J\r\n"])
 def test_an_update_text_of_no_target_is_malformed(text: bytes) -> None:
     message = Message(0x752, 0x16, 0xA10B, text + b"\x80\x00\x00\x00")
     found = decode(message)
@@ -137,8 +134,8 @@ def test_an_update_text_of_no_target_is_malformed(text: bytes) -> None:
     assert found.problem.isascii()
 
 
-@pytest.mark.parametrize(
-    ("version", "is_version"),
+@each(
+    "version, is_version",
     [
         ("V1.2.3", True),
         ("V0.0.0", True),
@@ -163,18 +160,18 @@ def test_a_boot_version_text_is_kept_as_received_and_judged(version: str, is_ver
     assert found.is_version is is_version
 
 
-@pytest.mark.parametrize("version", ["V1.2.34", "V\u0661.2.3", "xV1.2.3", ""])
+@each("version", ["V1.2.34", "V\u0661.2.3", "xV1.2.3", ""])
 def test_a_text_that_could_not_come_over_the_wire_is_no_version_either(version: str) -> None:
     assert not BootVersion("BMS", version).is_version
 
 
-@pytest.mark.parametrize("can_id", [0x715, 0x725, 0x735, 0x7FF])
+@each("can_id", [0x715, 0x725, 0x735, 0x7FF])
 def test_the_typed_form_does_not_depend_on_the_id(can_id: int) -> None:
     assert decode(Message(can_id, 0x0C, 0xC202, b"\x05\x00")) == Ack(5)
     assert Ack(5).to_message(can_id).can_id == can_id
 
 
-@pytest.mark.parametrize("command", [0x0000, 0x1010, 0x4206, 0xC203, 0xA384, 0xFFFF])
+@each("command", [0x0000, 0x1010, 0x4206, 0xC203, 0xA384, 0xFFFF])
 def test_a_command_that_is_not_in_the_table_is_unknown(command: int) -> None:
     message = Message(0x752, 0x16, command, bytes(command & 0xFF))
     assert decode(message) == Unknown(message)

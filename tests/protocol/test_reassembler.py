@@ -79,7 +79,7 @@ def test_a_tail_at_every_place_in_data_ends_nothing() -> None:
     assert feed_all(make_reassembler(_ID), pieces(encode(message), 8)) == [message]
 
 
-@pytest.mark.parametrize("position", [0, 4, 5, 13, 60])
+@each("position", [0, 4, 5, 13, 60])
 def test_a_whole_message_inside_data_is_data(position: int) -> None:
     message = _packet(bytes(position) + _END.wire)
     assert feed_all(make_reassembler(_ID), pieces(encode(message), 8)) == [message]
@@ -131,7 +131,7 @@ def test_after_a_wrong_tail_the_rest_is_scanned_again() -> None:
     assert messages_of(found) == [_END.message]
 
 
-@pytest.mark.parametrize(
+@each(
     "head",
     [
         "55 AA 16 00 42 05",
@@ -172,7 +172,7 @@ def test_an_intact_message_with_an_unknown_mode_and_command_is_handed_on() -> No
 # -- lost, doubled and swapped frames ---------------------------------------------------------
 
 
-@pytest.mark.parametrize("lost", range(18))
+@each("lost", range(18))
 def test_after_a_lost_frame_the_next_message_is_found(lost: int) -> None:
     payloads = [*_PACKET.payloads[:lost], *_PACKET.payloads[lost + 1 :]]
     reassembler = make_reassembler(_ID)
@@ -183,7 +183,7 @@ def test_after_a_lost_frame_the_next_message_is_found(lost: int) -> None:
     assert feed_all(reassembler, _PACKET.payloads, now=1.0) == [_PACKET.message]
 
 
-@pytest.mark.parametrize("lost", range(18))
+@each("lost", range(18))
 def test_after_a_lost_frame_the_next_message_is_found_without_silence_too(lost: int) -> None:
     payloads = [*_PACKET.payloads[:lost], *_PACKET.payloads[lost + 1 :], *_RESET.payloads]
     reassembler = make_reassembler(_ID)
@@ -193,7 +193,7 @@ def test_after_a_lost_frame_the_next_message_is_found_without_silence_too(lost: 
     assert reasons_of(found)
 
 
-@pytest.mark.parametrize("doubled", range(18))
+@each("doubled", range(18))
 def test_a_packet_with_a_doubled_frame_is_not_accepted(doubled: int) -> None:
     payloads = [*_PACKET.payloads[: doubled + 1], *_PACKET.payloads[doubled:]]
     reassembler = make_reassembler(_ID)
@@ -204,7 +204,7 @@ def test_a_packet_with_a_doubled_frame_is_not_accepted(doubled: int) -> None:
     assert reasons_of(found)
 
 
-@pytest.mark.parametrize("swapped", range(17))
+@each("swapped", range(17))
 def test_a_packet_with_two_swapped_frames_is_not_accepted(swapped: int) -> None:
     payloads = list(_PACKET.payloads)
     payloads[swapped : swapped + 2] = reversed(payloads[swapped : swapped + 2])
@@ -226,7 +226,7 @@ def test_a_partial_message_waits_until_just_before_the_timeout() -> None:
     assert list(reassembler.feed(_RESET.payloads[1], 5.0999)) == [_RESET.message]
 
 
-@pytest.mark.parametrize("late_s", [0.0, 0.0001, 1000.0])
+@each("late_s", [0.0, 0.0001, 1000.0])
 def test_a_partial_message_is_dropped_at_the_timeout_and_after(late_s: float) -> None:
     reassembler = make_reassembler(_ID)
     reassembler.feed(_RESET.payloads[0], 5.0)
@@ -262,7 +262,7 @@ def test_a_message_behind_a_partial_one_is_found_at_the_timeout() -> None:
     assert messages_of(found) == [_RESET.message]
 
 
-@pytest.mark.parametrize("junk", [b"\x01", b"\x55", b"\x01\x02\x03", b"\x55\xaa", b"\x00" * 20])
+@each("junk", [b"\x01", b"\x55", b"\x01\x02\x03", b"\x55\xaa", b"\x00" * 20])
 def test_junk_is_reported_after_silence_at_the_latest(junk: bytes) -> None:
     reassembler = make_reassembler(_ID)
     assert feed_all(reassembler, [junk]) == []

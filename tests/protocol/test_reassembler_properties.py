@@ -6,11 +6,11 @@ import itertools
 import random
 from typing import Final
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flasher.protocol.wire import Damage, DamageReason, Message, encode
+from tests.loops import each
 
 from .cases import case, feed_all, make_reassembler, messages_of, pieces
 
@@ -123,7 +123,7 @@ def test_no_noise_goes_by_without_a_message_or_a_report(noise: bytes, sizes: lis
     assert all(item.can_id == _ID for item in found)
 
 
-@pytest.mark.parametrize(
+@each(
     "pattern",
     [
         b"\x00",
@@ -136,7 +136,7 @@ def test_no_noise_goes_by_without_a_message_or_a_report(noise: bytes, sizes: lis
         b"\x55\xaa\x0c\x04\xc2\x02\xf0",
     ],
 )
-@pytest.mark.parametrize("size_bytes", [1, 3, 7, 8])
+@each("size_bytes", [1, 3, 7, 8])
 def test_endless_bytes_of_no_use_do_not_fill_the_memory(pattern: bytes, size_bytes: int) -> None:
     # SE-01, without any silence.
     reassembler = make_reassembler(_ID)

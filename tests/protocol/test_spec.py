@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import pytest
-
 from flasher.protocol import spec
 from flasher.protocol.spec import Command, Mode, Node, Target, can_id
 from flasher.protocol.timing import DEFAULT_TIMINGS
+from tests.loops import each
 
 
-@pytest.mark.parametrize(
-    ("sender", "receiver", "expected"),
+@each(
+    "sender, receiver, expected",
     [
         (Node.CDL, Node.WMC, 0x751),
         (Node.CDL, Node.BMS, 0x752),
@@ -37,8 +36,8 @@ def test_an_id_names_sender_and_receiver(
     assert can_id(sender, receiver) == expected
 
 
-@pytest.mark.parametrize(
-    ("target", "name", "request_id", "answer_id", "broadcast_id", "update_text", "boot_name"),
+@each(
+    "target, name, request_id, answer_id, broadcast_id, update_text, boot_name",
     [
         (spec.WMC, "wmc", 0x751, 0x715, 0x710, "WMC_UPD", "WMC"),
         (spec.BMS, "bms", 0x752, 0x725, 0x720, "BMS_UPD", "BMS"),
@@ -65,8 +64,8 @@ def test_only_the_bms_has_a_version_query() -> None:
     assert asked == ["bms"]
 
 
-@pytest.mark.parametrize(
-    ("name", "target"),
+@each(
+    "name, target",
     [
         ("wmc", spec.WMC),
         ("WMC", spec.WMC),
@@ -83,8 +82,8 @@ def test_a_target_is_found_by_its_names_in_either_case(name: str, target: Target
     assert spec.find_target(name) is target
 
 
-@pytest.mark.parametrize(
-    ("command", "code", "size_bytes"),
+@each(
+    "command, code, size_bytes",
     [
         (Command.RESET, 0x4205, 5),
         (Command.GENERAL_FEEDBACK, 0x5503, 3),
@@ -126,8 +125,8 @@ def test_the_upgrade_has_the_documents_constants() -> None:
     assert spec.BOOT_VERSION_BURST == 4
 
 
-@pytest.mark.parametrize(
-    ("size_bytes", "packets"),
+@each(
+    "size_bytes, packets",
     [
         (0, 0),
         (1, 1),

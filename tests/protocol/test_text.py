@@ -18,10 +18,11 @@ from flasher.protocol.text import (
     firmware_version_spans,
     printable,
 )
+from tests.loops import each
 
 
-@pytest.mark.parametrize(
-    ("text", "size_bytes", "field"),
+@each(
+    "text, size_bytes, field",
     [
         ("BM36", 16, b"BM36.           "),
         ("V1r2r3_20220512", 16, b"V1r2r3_20220512."),
@@ -38,21 +39,19 @@ def test_a_text_ends_with_a_dot_and_is_filled_with_spaces(
     assert decode_text(field) == text
 
 
-@pytest.mark.parametrize(("text", "size_bytes"), [("WELLINGS", 8), ("A" * 16, 16), ("", 0)])
+@each("text, size_bytes", [("WELLINGS", 8), ("A" * 16, 16), ("", 0)])
 def test_a_text_without_room_for_its_terminator_is_refused(text: str, size_bytes: int) -> None:
     with pytest.raises(ValueError, match=f"longer than {size_bytes - 1} characters"):
         encode_text(text, size_bytes)
 
 
-@pytest.mark.parametrize("text", [".", "V1.2", "BM36."])
+@each("text", [".", "V1.2", "BM36."])
 def test_a_text_with_the_terminator_in_it_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="which ends a field"):
         encode_text(text, 16)
 
 
-@pytest.mark.parametrize(
-    "text", ["caf\u00e9", "\u7535\u6c60", "a\nb", "a\tb", "\x1b[2J", "\x00", "\x7f"]
-)
+@each("text", ["caf\u00e9", "\u7535\u6c60", "a\nb", "a\tb", "\x1b[2J", "\x00", "\x7f"])
 def test_a_text_that_is_not_printable_ascii_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="not printable ASCII") as refused:
         encode_text(text, 16)
@@ -60,8 +59,8 @@ def test_a_text_that_is_not_printable_ascii_is_refused(text: str) -> None:
     assert str(refused.value).isprintable()
 
 
-@pytest.mark.parametrize(
-    ("field", "text"),
+@each(
+    "field, text",
     [
         (b"FULLFIELDOFTEXT!", "FULLFIELDOFTEXT!"),
         (b"NO END  ", "NO END"),
@@ -81,8 +80,8 @@ def test_a_field_that_breaks_the_rule_is_shown_as_it_is(field: bytes, text: str)
     assert decode_text(field) == text
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"),
+@each(
+    "text, shown",
     [
         ("plain <text> & more", "plain <text> & more"),
         ("\x1b]0;title\x07", r"\x1b]0;title\x07"),
@@ -117,8 +116,8 @@ def test_a_text_that_keeps_the_rule_comes_back(text: str) -> None:
 # -- versions -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("older", "newer"),
+@each(
+    "older, newer",
     [
         ("V1r0r4_20220512", "V1r0r5_20220512"),
         ("V1r0r9_20220512", "V1r1r0_20220512"),
@@ -142,7 +141,7 @@ def test_a_firmware_version_in_its_parts() -> None:
     assert FirmwareVersion.parse("V01r2r3_20220512") == FirmwareVersion.parse("V1r2r3_20220512")
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     [
         "",
@@ -186,8 +185,8 @@ def test_the_same_version_twice_is_one_and_two_are_none() -> None:
     assert find_firmware_version(one + b"\0" + other) is None
 
 
-@pytest.mark.parametrize(
-    ("text", "number"),
+@each(
+    "text, number",
     [
         ("V1.0.0", (1, 0, 0)),
         ("V0.9.8", (0, 9, 8)),

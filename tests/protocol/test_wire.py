@@ -6,17 +6,18 @@ import pytest
 
 from flasher.protocol.frame import Frame
 from flasher.protocol.wire import Message, encode, split
+from tests.loops import each
 
 from .cases import make_reassembler
 
 
-@pytest.mark.parametrize("size_bytes", [0, 1, 3, 255])
+@each("size_bytes", [0, 1, 3, 255])
 def test_data_of_another_size_than_the_command_names_are_refused(size_bytes: int) -> None:
     with pytest.raises(ValueError, match=f"C202 carries 2 data bytes, not {size_bytes}"):
         encode(Message(0x751, 0x0C, 0xC202, bytes(size_bytes)))
 
 
-@pytest.mark.parametrize("size_bytes", [254, 255])
+@each("size_bytes", [254, 255])
 def test_a_command_beyond_the_length_field_is_refused(size_bytes: int) -> None:
     with pytest.raises(ValueError, match="longer than the length field"):
         encode(Message(0x751, 0x0C, 0x1000 | size_bytes, bytes(size_bytes)))
@@ -46,8 +47,8 @@ def test_a_frame_is_a_standard_data_frame_unless_told_otherwise() -> None:
     assert Frame(0x751, b"\x55") == (0x751, b"\x55", False, False, False, False)
 
 
-@pytest.mark.parametrize(
-    ("frame", "is_payload"),
+@each(
+    "frame, is_payload",
     [
         (Frame(0x751, b"\x00"), True),
         (Frame(0x751, bytes(8)), True),

@@ -6,10 +6,11 @@ import jinja2
 import pytest
 
 from flasher.report.base import counted, percent, render_page, shortened, visible
+from tests.loops import each
 
 
-@pytest.mark.parametrize(
-    ("text", "shown"),
+@each(
+    "text, shown",
     [
         ("BMS V1.0.0", "BMS V1.0.0"),
         ("870 \u00b5s \u2013 \u4e2d", "870 \u00b5s \u2013 \u4e2d"),

@@ -9,6 +9,7 @@ import pytest
 from flasher.report.base import Status
 from flasher.report.explain_page import render, status_of
 from flasher.trace.story import Cause, PacketStory, Recorded, Story
+from tests.loops import each
 from tests.report import stories
 from tests.report.pages import Page, assert_self_contained, assert_visible
 
@@ -24,7 +25,7 @@ EVERY_KIND = {
 }
 
 
-@pytest.mark.parametrize("name", EVERY_KIND)
+@each("name", EVERY_KIND)
 def test_every_page_is_well_formed_and_complete_in_itself(name: str) -> None:
     page = Page(render(EVERY_KIND[name]))
     assert_self_contained(page)
@@ -126,7 +127,7 @@ def test_what_the_recording_tool_said_is_shown() -> None:
     assert "a packet was not acknowledged" in page.text
 
 
-@pytest.mark.parametrize("text", stories.HOSTILE)
+@each("text", stories.HOSTILE)
 def test_hostile_text_is_shown_and_does_nothing(text: str) -> None:
     told = replace(stories.hostile_story(text), recorded=Recorded(text, None, text))
     page = Page(render(told))
@@ -223,8 +224,8 @@ def test_figures_that_were_not_measured_are_named_so() -> None:
     assert "the device's answer to a packet not measured" in said
 
 
-@pytest.mark.parametrize(
-    ("cause", "status"),
+@each(
+    "cause, status",
     [
         (Cause.COMPLETED, Status.GOOD),
         (Cause.CONFIRMED_BY_VERSION, Status.GOOD),

@@ -16,12 +16,13 @@ from flasher.report.scale import (
     wants_log,
     whole_ticks,
 )
+from tests.loops import each
 
 positive = st.floats(min_value=1e-7, max_value=1e7)
 
 
-@pytest.mark.parametrize(
-    ("span", "intervals", "step"),
+@each(
+    "span, intervals, step",
     [
         (10, 5, 2),
         (1, 5, 0.2),
@@ -36,7 +37,7 @@ def test_a_step_is_1_2_or_5_times_a_power_of_ten(span: float, intervals: int, st
     assert nice_step(span, intervals) == pytest.approx(step)
 
 
-@pytest.mark.parametrize(("span", "intervals"), [(0, 5), (-1, 5), (1, 0)])
+@each("span, intervals", [(0, 5), (-1, 5), (1, 0)])
 def test_there_is_no_step_of_nothing(span: float, intervals: int) -> None:
     with pytest.raises(ValueError, match="positive"):
         nice_step(span, intervals)
@@ -78,7 +79,7 @@ def test_log_ticks_are_1_2_5_over_few_decades_and_powers_over_many() -> None:
     assert log_ticks(1, 1) == [1, 2]
 
 
-@pytest.mark.parametrize(("low", "high"), [(0, 1), (-1, 1), (2, 1)])
+@each("low, high", [(0, 1), (-1, 1), (2, 1)])
 def test_a_logarithm_needs_positive_values_in_order(low: float, high: float) -> None:
     with pytest.raises(ValueError, match="logarithmic"):
         log_ticks(low, high)
@@ -101,7 +102,7 @@ def test_a_wide_range_of_positive_values_wants_a_logarithm() -> None:
     assert not wants_log([])
 
 
-@pytest.mark.parametrize("values", [[0.001, 0.002], [0.001, 0.9], [3.0], []])
+@each("values", [[0.001, 0.002], [0.001, 0.9], [3.0], []])
 def test_an_axis_puts_its_ends_at_its_ends_and_keeps_the_order(values: list[float]) -> None:
     axis = Axis.over(values, 200, 10)
     assert axis.at(axis.low) == pytest.approx(200)
@@ -155,8 +156,8 @@ def test_slices_are_all_of_it_in_nearly_equal_parts(count: int, most: int) -> No
     assert not sizes or max(sizes) - min(sizes) <= 1
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"),
+@each(
+    "seconds, text",
     [
         (None, "\u2013"),
         (0, "0 s"),

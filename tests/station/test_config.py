@@ -17,6 +17,7 @@ from flasher.station.config import (
     mock_config,
     power_command,
 )
+from tests.loops import each
 
 USUAL = """\
 name = "line-2"
@@ -124,7 +125,7 @@ def test_an_adapter_that_is_not_plugged_in_is_named() -> None:
         resolve([socket(interface="slcan", serial_number="C3")], PLUGGED)
 
 
-@pytest.mark.parametrize(
+@each(
     "sockets",
     [
         [

@@ -16,6 +16,7 @@ from flasher.station.line import Line
 from flasher.station.messages import PresenceChanged
 from flasher.station.records.model import RunState
 from flasher.station.socket import Binding, Occupancy, Phase, Socket
+from tests.loops import each
 from tests.station.line_world import Walk, World
 
 STEPS = 100
@@ -36,7 +37,7 @@ def walks(sockets: tuple[str, ...], steps: int) -> Counter[str]:
     return seen
 
 
-@pytest.mark.parametrize("sockets", [("A",), ("A", "B", "C")])
+@each("sockets", [("A",), ("A", "B", "C")])
 def test_no_label_runs_on_another_unit_and_nobody_is_stuck(sockets: tuple[str, ...]) -> None:
     seen = walks(sockets, 10_000)
     assert seen["run"] > 1000

@@ -24,7 +24,7 @@ STANDARD_EXAMPLES = {
 }
 
 
-@pytest.mark.parametrize(("method", "texts"), STANDARD_EXAMPLES.items())
+@each("method, texts", STANDARD_EXAMPLES.items())
 def test_a_check_digit_agrees_with_the_examples_of_its_standard(
     method: str, texts: list[str]
 ) -> None:
@@ -35,7 +35,7 @@ def test_every_method_has_a_known_answer() -> None:
     assert set(STANDARD_EXAMPLES) == set(CHECKS)
 
 
-@pytest.mark.parametrize("method", CHECKS)
+@each("method", CHECKS)
 def test_a_wrong_character_is_found_wherever_it_stands(method: str) -> None:
     for text in STANDARD_EXAMPLES[method]:
         for place, char in enumerate(text):
@@ -60,7 +60,7 @@ def test_a_pattern_gives_its_groups_for_the_whole_text_only() -> None:
     assert pattern.match("W26\u0661\u0662") is None  # digits of another script
 
 
-@pytest.mark.parametrize(
+@each(
     "text",
     ["(A+)+", "A*", "A{2,}", "(?:AB){2}", "(?P<a>x)(?P=a)", r"(x)\1", "(?=x)x", "(?i)x", "A{3}{3}",
      "A{65}", "A{5,2}", "(A", "A)", "A??", "[A", r"\q", "(?P<a>x)(?P<a>x)", "A" * 201],
@@ -97,8 +97,8 @@ def test_no_pattern_that_is_taken_is_slow(pieces: list[str], count: int) -> None
 SCAN = Scan("W2605002", date(2026, 5, 17), "L7", {"week": "05"})
 
 
-@pytest.mark.parametrize(
-    ("template", "text"),
+@each(
+    "template, text",
     [
         ("{serial}", "W2605002"),
         ("{date:%Y%m%d}", "20260517"),
@@ -113,7 +113,7 @@ def test_a_template_is_filled_from_the_scan(template: str, text: str) -> None:
     assert fill(template, SCAN) == text
 
 
-@pytest.mark.parametrize(
+@each(
     "template",
     ["{", "}", "{}", "{serial.__class__}", "{serial!r}", "{match.none}", "{0}", "{date:%s}",
      "{date:%Y%m%d%n}", "{match}", "{serial:>99999999}", "{{{"],

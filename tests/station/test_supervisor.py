@@ -13,6 +13,7 @@ from flasher.station.config import MockUnits
 from flasher.station.messages import FromWorker, Ready, VirtualUnits, WorkerSetup
 from flasher.station.power import PowerCommand
 from flasher.station.supervisor import ProcessPort, Supervisor, WorkerLost
+from tests.loops import each
 from tests.station.factory import make_recipe
 
 LIMIT_S = 30.0
@@ -82,8 +83,8 @@ def test_a_power_command_that_fails_is_told_when_it_is_looked_at() -> None:
     power.check()
 
 
-@pytest.mark.parametrize(
-    ("template", "said"),
+@each(
+    "template, said",
     [("false {on|off}", "exit code 1"), ("no-such-command {on|off}", "cannot be run")],
 )
 def test_a_real_power_command_that_does_not_work(template: str, said: str) -> None:

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from flasher.protocol.frame import Frame
 from flasher.trace.decoder import BusEvent, Decoder, Kind, message_titles
+from tests.loops import each
 from tests.peers.wording import READ, REPORT, WORDINGS, WRITE, literal
 from tests.trace import traffic
 
@@ -54,8 +55,8 @@ def test_values_are_typed_and_their_names_carry_the_units() -> None:
     assert json.loads(json.dumps(values)) == values
 
 
-@pytest.mark.parametrize(
-    ("raw", "text"),
+@each(
+    "raw, text",
     [
         (0, "0 % (or an older device, which does not know it)"),
         (1, "1"),
@@ -77,8 +78,8 @@ def test_reserved_bytes_are_shown_only_when_they_are_not_zero() -> None:
     assert texts(only(traffic.running(data)))["reserved"] == "00 00 00 07"
 
 
-@pytest.mark.parametrize(
-    ("target", "attribute", "title", "fields"),
+@each(
+    "target, attribute, title, fields",
     [
         ("bms", "reset", "reset", {"text": "RESET"}),
         ("wmc", "reset", "reset", {}),
@@ -136,8 +137,8 @@ def test_an_unknown_command_is_shown_with_its_bytes() -> None:
     assert seen.is_trouble
 
 
-@pytest.mark.parametrize(
-    ("can_id", "mode", "command", "data", "problem"),
+@each(
+    "can_id, mode, command, data, problem",
     [
         (0x720, READ, 0x1010, bytes(16), "mode is 11, not 0C"),
         (0x725, WRITE, 0xC202, b"\x01\x00", "mode is 16, not 0C"),
@@ -182,8 +183,8 @@ def test_a_message_cut_short_is_told_when_its_time_is_over() -> None:
     assert decoder.deadline() is None
 
 
-@pytest.mark.parametrize(
-    ("frame", "kind"),
+@each(
+    "frame, kind",
     [
         (Frame(0x123, b"abc"), Kind.FOREIGN),
         (Frame(0x722, b"\x55\xaa"), Kind.FOREIGN),
@@ -224,10 +225,10 @@ def test_nothing_on_the_bus_raises_and_everything_is_harmless(
     decoder = Decoder()
     seen = [s for can_id, data in traffic_ for s in decoder.feed(Frame(can_id, data), 0.0)]
     seen += decoder.tick(1.0)
-    for each in seen:
-        json.dumps({shown.name: shown.value for shown in each.fields})
-        assert all(shown.text.replace("°", "").isascii() for shown in each.fields)
-        assert all(shown.text.isprintable() for shown in each.fields)
+    for found in seen:
+        json.dumps({shown.name: shown.value for shown in found.fields})
+        assert all(shown.text.replace("°", "").isascii() for shown in found.fields)
+        assert all(shown.text.isprintable() for shown in found.fields)
 
 
 def test_every_title_is_listed_once() -> None:

@@ -12,6 +12,7 @@ from flasher.protocol.frame import Frame
 from flasher.trace.explain import explain
 from flasher.trace.source import explain_path
 from flasher.trace.story import Cause, PacketRun, Step, StepKind, Story
+from tests.loops import each
 from tests.peers.wording import READ
 
 from .tape import Tape
@@ -208,10 +209,9 @@ CAUSES: list[tuple[str, Callable[[Tape], object], Cause, Phase | None, int | Non
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("write", "cause", "phase", "packet"),
+@each(
+    "write, cause, phase, packet",
     [row[1:] for row in CAUSES],
-    ids=[row[0] for row in CAUSES],
 )
 def test_every_cause_is_named_with_its_phase_and_packet(
     write: Callable[[Tape], object], cause: Cause, phase: Phase | None, packet: int | None

@@ -13,6 +13,7 @@ from flasher.protocol.bittime import message_bits
 from flasher.protocol.frame import Frame
 from flasher.trace.decoder import TimedDecoder, TimedEvent, bits_of
 from flasher.trace.explain import explain
+from tests.loops import each
 
 from .tape import Tape
 
@@ -43,7 +44,7 @@ def spoilt(chance: random.Random) -> list[tuple[float, Frame]]:
     return frames
 
 
-@pytest.mark.parametrize("seed", range(40))
+@each("seed", range(40))
 def test_a_spoilt_trace_has_a_story(seed: int) -> None:
     story = explain(spoilt(random.Random(seed)), source="x")
     assert story.verdict.text

@@ -14,7 +14,7 @@ from flasher.trace.figures import LinkMeter
 from flasher.trace.story import Cause, Story
 from flasher.trace.taps import FlightRecorder
 from tests.end_to_end.world import Traffic, upgrade
-from tests.peers.dialogue import strays
+from tests.loops import each
 from tests.peers.scripted_device import DeviceScript, ScriptedDevice
 
 
@@ -35,8 +35,8 @@ class Tapped(Traffic):
         return explain(frames, source="engines")
 
 
-@pytest.mark.parametrize(
-    ("script", "ending", "cause"),
+@each(
+    "script, ending, cause",
     [
         (DeviceScript(), Ending.COMPLETED, Cause.COMPLETED),
         (DeviceScript(deaf_to_reset=True), Ending.NO_BOOT_VERSION, Cause.NO_BOOT_VERSION),
@@ -57,7 +57,6 @@ class Tapped(Traffic):
         (DeviceScript(lose_complete=9), Ending.UNCONFIRMED, Cause.UNCONFIRMED),
         (DeviceScript(foreign_frames=True), Ending.COMPLETED, Cause.COMPLETED),
     ],
-    ids=strays,
 )
 def test_the_verdict_is_the_hosts_outcome(
     script: DeviceScript, ending: Ending, cause: Cause

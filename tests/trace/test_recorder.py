@@ -13,6 +13,7 @@ import pytest
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.frame import Frame
 from flasher.trace.recorder import Recorder
+from tests.loops import each
 
 SENT = Frame(0x752, b"\x55\xaa\x16\x07")
 RECEIVED = Frame(0x725, b"\x55\xaa\x13\x05\x55\x03\x42\x05")
@@ -194,8 +195,8 @@ def test_a_real_full_disk_is_noticed_while_recording(tmp_path: Path, suffix: str
     assert recorder.failure is not None
 
 
-@pytest.mark.parametrize(
-    ("name", "shown"),
+@each(
+    "name, shown",
     [("no\x1b[2J/x.log", "no\\x1b[2J/x.log"), ("x\x1b.y", "x\\x1b.y"), ("", "''")],
 )
 def test_a_name_that_cannot_be_written_is_shown_harmlessly(name: str, shown: str) -> None:

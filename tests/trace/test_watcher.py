@@ -12,6 +12,7 @@ from flasher.driver import drive
 from flasher.protocol.frame import Frame
 from flasher.trace.decoder import BusEvent, Kind
 from flasher.trace.watcher import Board, Filter, MessageHistory, Pulse, RawFrame, Watcher, replay
+from tests.loops import each
 from tests.trace import traffic
 
 
@@ -38,8 +39,8 @@ MIXED = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("shown", "expected"),
+@each(
+    "shown, expected",
     [
         (Filter(), ["running information", "handshake", "reset", "NAK", "foreign frame"]),
         (Filter(nodes=frozenset({"WMC"})), ["handshake", "reset"]),

@@ -25,6 +25,7 @@ from flasher.station.records.errors import (
 from flasher.station.records.model import RunState
 from flasher.station.records.schema import SCHEMA_VERSION
 from flasher.station.records.store import Store
+from tests.loops import each
 from tests.station.factory import Bench, FakeClock
 
 
@@ -151,7 +152,7 @@ def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
         Store.open(str(tmp_path / "none" / "r.sqlite"), station="x")
 
 
-@pytest.mark.parametrize(
+@each(
     "url",
     [
         "nonsense://x",
