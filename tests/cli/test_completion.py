@@ -111,12 +111,11 @@ def test_can_interfaces_of_linux_are_offered_as_channels(
     assert complete("flasher scan -c ") == {"can0", "vcan1"}
 
 
-@each("shell", ["zsh", "fish"])
-def test_the_program_itself_answers_the_shell(shell: str) -> None:
+def test_the_program_itself_answers_the_shell() -> None:
     asked = {
-        "_FLASHER_COMPLETE": f"{shell}_complete",
+        "_FLASHER_COMPLETE": "zsh_complete",
         "COMP_WORDS": "flasher flash x.hex -t b",
-        "COMP_CWORD": "4" if shell == "zsh" else "b",
+        "COMP_CWORD": "4",
     }
     done = subprocess.run(
         FLASHER, env=clean_environment() | asked, capture_output=True, timeout=30, check=True
@@ -126,16 +125,27 @@ def test_the_program_itself_answers_the_shell(shell: str) -> None:
     assert done.stderr == b""
 
 
-@each("shell", ["bash", "zsh", "fish"])
-def test_a_shell_is_told_how_to_ask(shell: str) -> None:
-    done = subprocess.run(
-        FLASHER,
-        env=clean_environment() | {"_FLASHER_COMPLETE": f"{shell}_source"},
-        capture_output=True,
-        timeout=30,
-        check=True,
-    )
-    assert f"_FLASHER_COMPLETE={shell}_complete".encode() in done.stdout
+def test_fish_is_answered_by_the_word_under_the_cursor(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("_FLASHER_COMPLETE", "fish_complete")
+    monkeypatch.setenv("COMP_WORDS", "flasher flash x.hex -t b")
+    monkeypatch.setenv("COMP_CWORD", "b")
+    answer = flasher()
+    assert answer.code == ExitCode.OK
+    assert "bms" in answer.out
+    assert "wmc" not in answer.out
+    assert answer.err == ""
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_a_shell_is_told_how_to_ask(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch, shell: str
+) -> None:
+    monkeypatch.setenv("_FLASHER_COMPLETE", f"{shell}_source")
+    told = flasher()
+    assert told.code == ExitCode.OK
+    assert f"_FLASHER_COMPLETE={shell}_complete" in told.out
 
 
 # -- help ------------------------------------------------------------------------------------------

@@ -25,6 +25,8 @@ from tests.end_to_end.stage import IMAGE, NEW, SMALL, Stage, image_of
 from tests.loops import each
 
 PACKETS = 40
+SAMPLE = (1, 2, 3, 20, 21, PACKETS - 1, PACKETS)
+"""`python -m tests.campaigns.rescues` loses every packet."""
 LONG = image_of(PACKETS)
 ONCE = UpgradeOptions(attempts=1)
 LISTENS = replace(SMALL, without_application="listens")
@@ -35,8 +37,12 @@ COMPLETE = bytes.fromhex("55AA0C04C5020000")
 
 
 @pytest.mark.no_cover
-@each("number", range(1, PACKETS + 1))
+@each("number", SAMPLE)
 def test_a_device_that_lost_power_at_any_packet_is_rescued(number: int) -> None:
+    lose_power_at(number)
+
+
+def lose_power_at(number: int) -> None:
     """Every other one announces itself at power-up only."""
     stage = Stage(profile=SMALL if number % 2 else LISTENS)
     stage.at_packet[number] = stage.cut_power
@@ -173,8 +179,12 @@ def test_a_refusal_at_the_end_leaves_a_device_that_can_be_rescued() -> None:
 
 
 @pytest.mark.no_cover
-@each("number", range(1, PACKETS + 1))
+@each("number", SAMPLE)
 def test_an_adapter_that_fails_at_any_packet_is_exit_4_or_overcome(number: int) -> None:
+    lose_the_adapter_at(number)
+
+
+def lose_the_adapter_at(number: int) -> None:
     """In turn: pulled out for good, pulled out and back, bus-off that restarts by itself."""
     stage = Stage()
     match number % 3:
