@@ -129,7 +129,7 @@ def test_the_largest_image_is_bounded_by_area_option_and_protocol(
 
 def test_a_profile_made_in_a_program_is_checked_as_one_that_is_read() -> None:
     with pytest.raises(UsageError, match="older_battery cannot be 'yse'") as caught:
-        DeviceProfile(older_battery="yse")
+        DeviceProfile(older_battery="yse")  # type: ignore[arg-type]  # as a program may
     assert "Did you mean yes?" in caught.value.remedy
     with pytest.raises(UsageError, match="program_time_s is a number from 0 on, not -1"):
         DeviceProfile(program_time_s=-1.0)
