@@ -9,12 +9,13 @@ from __future__ import annotations
 import os
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypedDict, TypeVar, Unpack, overload
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Final, TypedDict, TypeVar, Unpack, overload
 
 from flasher.driver import Tap, adrive, drive
-from flasher.errors import FlasherError
+from flasher.errors import FlasherError, UsageError
 from flasher.host.identity import Check, CheckResult, Identity, judge_image
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft, Outcome, before_the_start
@@ -78,6 +79,8 @@ __all__ = [
 EventHandler = Callable[[object], None]
 T = TypeVar("T")
 C = TypeVar("C", bound=Content)
+_TURN_PAUSE_S: Final = 0.01
+"""Between two looks whether the call of another task has ended."""
 
 
 class Watch(TypedDict, total=False):
@@ -105,6 +108,8 @@ class Connection:
     name: str
     bit_rate: BitRate | None = None
     """What the bus runs at, and where that comes from; None where that is not known."""
+    _turn: Lock = field(default_factory=Lock, init=False, repr=False, compare=False)
+    """Held by the call that is under way: two at once would take each other's frames."""
 
     def device(
         self,
@@ -308,7 +313,8 @@ class Device(_OnBus):
     """A device on a bus, for programs that wait for it; made by `Connection.device`.
 
     Every method takes the keywords of `Watch`, and raises BusError when the adapter fails or
-    another tool speaks on the bus, InterruptedByUserError when `cancelled` said so.
+    another tool speaks on the bus, InterruptedByUserError when `cancelled` said so, UsageError
+    while another call is under way on the connection (in another thread, or around `on_event`).
     """
 
     def identify(self, **watch: Unpack[Watch]) -> DeviceInfo:
@@ -446,7 +452,19 @@ class Device(_OnBus):
         self._run(_alone(engine), watch)
 
     def _run(self, procedure: Procedure[T], of_call: Watch) -> T:
-        watch: Watch = {**self._watch, **of_call}
+        turn = self.connection._turn  # noqa: SLF001  of this module
+        if not turn.acquire(blocking=False):
+            raise UsageError(
+                f"Another call is under way on {self.connection.name}.",
+                cause="two threads use one connection, or a call is made from on_event",
+                remedy="Make one call after the other; from several tasks use async_device.",
+            )
+        try:
+            return self._finished(procedure, {**self._watch, **of_call})
+        finally:
+            turn.release()
+
+    def _finished(self, procedure: Procedure[T], watch: Watch) -> T:
         try:
             step = next(procedure)
             while True:
@@ -484,6 +502,7 @@ class Device(_OnBus):
 class AsyncDevice(_OnBus):
     """`Device` for programs with an event loop; made by `Connection.async_device`. Every method is
     that of `Device`, awaited. A task that is cancelled ends at the next message boundary first.
+    Calls of several tasks on one connection wait for each other.
     """
 
     async def identify(self, **watch: Unpack[Watch]) -> DeviceInfo:
@@ -563,7 +582,17 @@ class AsyncDevice(_OnBus):
     async def _run(self, procedure: Procedure[T], of_call: Watch) -> T:
         import asyncio  # noqa: PLC0415  for programs that have it already
 
-        watch: Watch = {**self._watch, **of_call}
+        turn = self.connection._turn  # noqa: SLF001  of this module
+        while not turn.acquire(blocking=False):
+            await asyncio.sleep(_TURN_PAUSE_S)
+        try:
+            return await self._finished(procedure, {**self._watch, **of_call})
+        finally:
+            turn.release()
+
+    async def _finished(self, procedure: Procedure[T], watch: Watch) -> T:
+        import asyncio  # noqa: PLC0415  for programs that have it already
+
         try:
             step = next(procedure)
             while True:

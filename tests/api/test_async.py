@@ -115,3 +115,19 @@ def test_the_wrong_device_is_refused_with_the_typed_error() -> None:
                 await device.flash(named)
 
     asyncio.run(work())
+
+
+def test_calls_of_several_tasks_wait_for_each_other() -> None:
+    """A question in the midst of an upgrade would take its frames, and be in its way."""
+
+    async def work() -> None:
+        with flasher.connect_mock("bms", speed=0) as connection:
+            device = connection.async_device("bms")
+            result, running = await asyncio.gather(
+                device.flash(IMAGE), device.read(contents.RunningInformation)
+            )
+            assert result.ok
+            assert result.outcome.statistics.repetitions == 0
+            assert running.voltage_mv > 0
+
+    asyncio.run(work())

@@ -103,3 +103,19 @@ def test_who_has_the_bus_alone_need_not_listen_first() -> None:
     wire = wire_to(Battery(delay_s=0.0))
     wire.device(is_alone=True).read("history")
     assert wire.clock.now() < 0.05
+
+
+def test_a_call_from_within_another_one_is_refused_and_does_no_harm() -> None:
+    refused: list[UsageError] = []
+    with flasher.connect_mock("bms", speed=0) as connection:
+        device = connection.device("bms")
+
+        def ask(event: object) -> None:
+            if isinstance(event, flasher.events.PacketAcknowledged) and not refused:
+                with pytest.raises(UsageError, match="Another call is under way") as caught:
+                    device.read("history")
+                refused.append(caught.value)
+
+        assert device.flash(IMAGE, on_event=ask).ok
+        assert "one call after the other" in refused[0].remedy
+        device.read("history")
