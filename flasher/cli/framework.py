@@ -411,7 +411,8 @@ def usage_error(wrong: click.UsageError, command: str | None) -> UsageError:
     if ctx is not None and isinstance(ctx.command, Group) and " command" in said:
         said = said.replace("command", "action")
         remedy = remedy or f"Actions are {', '.join(ctx.command.commands)}. "
-    if ctx is not None and "extra argument" in said:
+    is_left_over = "extra argument" in said or isinstance(wrong, click.exceptions.NoSuchCommand)
+    if ctx is not None and is_left_over:
         remedy += "".join(
             f"{param.opts[-1]} takes one value, and may be repeated. "
             for param in ctx.command.params

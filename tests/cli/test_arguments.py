@@ -173,6 +173,9 @@ def test_a_second_value_behind_an_option_that_repeats_is_wrong_usage(flasher: Fl
     run = flasher("flash", "--bus-kwargs", "a=1", "b=2", OBC_BIN, "-t", "obc", "-i", "virtual")
     assert run.code == ExitCode.USAGE
     assert "--bus-kwargs takes one value, and may be repeated" in run.err
+    run = flasher("conformance", "--mock", "-t", "bms", "--case", "FR-01", "UP-01")
+    assert run.code == ExitCode.USAGE
+    assert "--case takes one value, and may be repeated" in run.err
 
 
 def test_behind_two_dashes_everything_is_positional(
