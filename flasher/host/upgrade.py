@@ -164,6 +164,8 @@ class UpgradeStage:
         """The packet that ended an earlier attempt."""
         self._nak_next_seen = False
         """A repeated packet n was answered with NAK n+1, and that was not taken for an ACK."""
+        self._second_tool = ""
+        """What somebody else was seen to send."""
 
         self._acknowledged = 0
         self._repetitions = 0
