@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TYPE_CHECKING, Final
 
+from flasher.conformance.clauses import contents
 from flasher.conformance.results import CaseText
 from flasher.conformance.subject import Subject
 from flasher.errors import UsageError, did_you_mean
@@ -90,7 +91,9 @@ CaseScript = Callable[["Bench"], None]
 
 @dataclass(frozen=True)
 class Case:
-    """One case of the catalogue. `choices` are the keys of the profile it is judged by."""
+    """One case of the catalogue. `clause` names what it is judged by, as `clauses` lists it;
+    `choices` are the keys of the profile that decide.
+    """
 
     id: str
     title: str
@@ -119,11 +122,14 @@ def case(
     choices: tuple[str, ...] = (),
     limit_s: float = 300.0,
 ) -> Callable[[CaseScript], CaseScript]:
-    """Register the function below as a case. Raises ValueError for an id that is taken."""
+    """Register the function below as a case. Raises ValueError for an id that is taken and a clause
+    that does not exist.
+    """
 
     def register(run: CaseScript) -> CaseScript:
         if case_id in CASES:
             raise ValueError(f"there are two cases {case_id}")
+        contents(clause)
         needs = frozenset(requires)
         CASES[case_id] = Case(
             case_id, title, clause, stimulus, expectation, run, needs, choices, limit_s
@@ -161,6 +167,7 @@ def case_text(case_id: str, profile: ConformanceProfile) -> CaseText:
         group_of(case_id),
         case.title,
         case.clause,
+        contents(case.clause),
         case.stimulus,
         case.expectation,
         tuple(sorted(need.value for need in case.requires)),

@@ -125,7 +125,8 @@ def _was_wanted(report: RunReport) -> bool:
 
 def _details(text: CaseText, result: CaseResult, replay: str) -> str:
     failed = [check for check in result.checks if check.outcome is CheckOutcome.FAIL]
-    lines = [f"clause: {text.clause}", f"stimulus: {text.stimulus}"]
+    lines = [f"clause: {label}: {content}" for label, content in text.clauses.items()]
+    lines.append(f"stimulus: {text.stimulus}")
     lines += map(str, failed[:_FINDINGS])
     if len(failed) > _FINDINGS:
         lines.append(f"{len(failed) - _FINDINGS} more failed checks")

@@ -88,6 +88,9 @@ class CaseText:
     title: str
     """For a case that cannot be run, the reason."""
     clause: str = ""
+    """What it is judged by, as the documents number it, parted by "; "."""
+    clauses: Mapping[str, str] = field(default_factory=dict)
+    """Each of these with its content."""
     stimulus: str = ""
     expectation: str = ""
     requires: tuple[str, ...] = ()

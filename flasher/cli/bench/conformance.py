@@ -398,13 +398,14 @@ def _list(selection: Selection, output: Output) -> int:
             text.group,
             text.title,
             text.clause,
+            text.clauses,
             text.requires,
             tuple(text.choices),
             can_be_run=text.id in CASES,
         )
         for text in texts
     ]
-    for line in list_lines(found):
+    for line in list_lines(found, verbose=output.verbosity > 0):
         output.result(line)
     output.document(CaseListDocument(found))
     return ExitCode.OK

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from typing import Final
 
@@ -95,6 +95,8 @@ def _told(text: CaseText, result: CaseResult, replays: ByResult, *, verbose: boo
     yield printable(f"{head}: {_short(said)}") + (f" | replay: {replay}" if replay else "")
     failed = [one for one in result.checks if one.outcome is CheckOutcome.FAIL]
     if verbose:
+        for label, content in text.clauses.items():
+            yield printable(f"    {label}: {content}")
         for one in failed[1:]:
             yield printable(f"    also: {_short(str(one))}")
     elif len(failed) > 1:
@@ -155,14 +157,16 @@ class ListedCase:
     title: str
     """For a case that cannot be run, the reason."""
     clause: str
+    clauses: Mapping[str, str]
+    """Each of the clauses that `clause` names, with its content."""
     requires: tuple[str, ...]
     choices: tuple[str, ...]
     """Keys of the profile that it depends on."""
     can_be_run: bool
 
 
-def list_lines(cases: Sequence[ListedCase]) -> Iterator[str]:
-    """The catalogue, a line a case."""
+def list_lines(cases: Sequence[ListedCase], *, verbose: bool = False) -> Iterator[str]:
+    """The catalogue, a line a case; with `verbose` its clauses with their contents too."""
     width = max((len(case.title) for case in cases if case.can_be_run), default=0)
     for case in cases:
         if not case.can_be_run:
@@ -170,6 +174,8 @@ def list_lines(cases: Sequence[ListedCase]) -> Iterator[str]:
             continue
         needs = f"  ({', '.join(case.requires)})" if case.requires else ""
         yield f"{case.id}  {case.title:<{width}}  {case.clause}{needs}"
+        if verbose:
+            yield from (f"       {label}: {content}" for label, content in case.clauses.items())
     can_be_run = sum(case.can_be_run for case in cases)
     yield f"{counted(len(cases), 'case')}, {can_be_run} of them can be run"
 

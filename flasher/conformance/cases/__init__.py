@@ -5,7 +5,7 @@ How to write a case
 
     @case(
         "TX-06", "wrong start byte",
-        clause="4.1",                                    # section or reading (R10)
+        clause="Welling 5.2, table 8 (A385); R10",       # of `conformance.clauses`
         stimulus="packets that begin with 00, 02 and FF",   # both texts stand in the reports
         expectation="not stored; packet 1 is accepted when it comes as it should",
         requires={DESTRUCTIVE},                          # `Requirement`; what is missing on a

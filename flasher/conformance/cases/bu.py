@@ -138,7 +138,7 @@ def _off_bus_in_answer(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sen
 @case(
     "BU-01",
     "frames lost, doubled, late and swapped",
-    clause="R10, R12",
+    clause="R10; R12",
     stimulus="each frame of reset, update command, packet and end of transfer dropped, doubled, "
     "delayed and swapped with the next one, in turn; frames of the answers dropped and doubled",
     expectation="the upgrade by a patient host completes correctly, or is refused explicitly",
@@ -158,7 +158,7 @@ def disturbed_frames(bench: Bench) -> None:
 @case(
     "BU-02",
     "the device goes bus-off",
-    clause="4.2",
+    clause="robustness, not in the document",
     stimulus="the device's controller leaves the bus for 0.2 s before, between and after the "
     "frames of every message, and in the middle of its answers",
     expectation="the device is back, and the upgrade by a patient host completes correctly",
@@ -180,7 +180,7 @@ def bus_off(bench: Bench) -> None:
 @case(
     "BU-06",
     "somebody else uses the id of the device's answers",
-    clause="1",
+    clause="Welling 2.2.2, table 2; robustness, not in the document",
     stimulus="answers that are not the device's on its own id, before its answer to each message "
     "and between two of them",
     expectation="the device does not mind them, or is back afterwards",

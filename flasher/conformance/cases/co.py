@@ -86,7 +86,7 @@ _MEMORY_READ: Final = 0x4308
 @case(
     "CO-01",
     "bus load and a babbling node",
-    clause="1",
+    clause="Welling 2.2.2, table 2; robustness, not in the document",
     stimulus="90 % bus load of other ids around reset, update command and packets; a node that "
     "takes the whole bus with id 001 for 1 s, in the announcements and in the transfer",
     expectation="nothing fails under load; what the babbling node delays goes on after it",
@@ -129,7 +129,7 @@ def load(bench: Bench) -> None:
 @case(
     "CO-02",
     "another target is upgraded at the same time",
-    clause="1",
+    clause="Welling 2.2.2, table 2",
     stimulus="the upgrade of each other target, both sides of it, frame by frame between the "
     "frames of the device's own upgrade",
     expectation="no crosstalk: every packet is acknowledged once, and the image is right",
@@ -159,7 +159,7 @@ def two_upgrades(bench: Bench) -> None:
 @case(
     "CO-04",
     "traffic of the application in the bootloader",
-    clause="5, R15",
+    clause="Welling 3, tables 4 to 7; R15",
     stimulus="messages of chapter 3 to the device and between other nodes, during the "
     "announcements, before packet 1, between packets and before the end",
     expectation="ignored: no answer, and the upgrade goes on as if nothing had been said",

@@ -58,7 +58,7 @@ Damage = tuple[str, Callable[[bytes], bytes]]
 @case(
     "CR-01",
     "every single-bit flip",
-    clause="2, 3",
+    clause="Welling 2.2.1 (6)",
     stimulus="a packet once for each of its 1152 bits, with that bit the other way round",
     expectation="none accepted; the packet is taken afterwards, and stored as it is",
     requires={DESTRUCTIVE, LONG},
@@ -78,7 +78,7 @@ def single_bits(bench: Bench) -> None:
 @case(
     "CR-02",
     "bursts; lost, doubled and swapped frames",
-    clause="2, 3",
+    clause="Welling 2.2.1 (6); Welling 2.2.3, table 3",
     stimulus="packets with 2 to 8 bits in a row changed, chosen by the seed; each frame of a "
     "packet lost, doubled, swapped with the next one",
     expectation="none accepted; the packet is taken afterwards, and stored as it is",
@@ -107,7 +107,7 @@ def bursts(bench: Bench) -> None:
 @case(
     "CR-03",
     "a checksum of another kind",
-    clause="3",
+    clause="Welling 2.2.1 (6); Welling 4.2",
     stimulus="update commands and packets whose CRC is for another id, leaves the id out, or "
     "stands low byte first",
     expectation="rejected; update command and packet with the right one are taken",
@@ -130,7 +130,7 @@ def other_checksums(bench: Bench) -> None:
 @case(
     "CR-04",
     "messages byte for byte",
-    clause="2, 3",
+    clause="Welling 2.2.1, table 1; Welling 4.1; Welling 4.2",
     stimulus="an upgrade, then the beginning of one by written-out messages",
     expectation="they are taken, and each answer is the written-out one to the last byte",
     requires={DESTRUCTIVE},

@@ -20,7 +20,7 @@ _UPGRADE_KINDS: Final = (Kind.REQUEST, Kind.ACK, Kind.NAK, Kind.COMPLETE, Kind.F
 @case(
     "EN-01",
     "end of transfer",
-    clause="4.2, 5; R19",
+    clause="Welling 5.1, figure 2 (end); Welling 5.2, table 9 (C502); R19",
     stimulus="all packets, then end of transfer; a restart afterwards",
     expectation="complete within the limit, then the new application, at once or through the "
     "bootloader (en_03), and again after the restart",
@@ -47,7 +47,7 @@ def end(bench: Bench) -> None:
 @case(
     "EN-02",
     "end of transfer early, and twice",
-    clause="4.2, 5; R6",
+    clause="Welling 5.1, figure 2 (end); Welling 5.2, table 8 (A401); R6",
     stimulus="end of transfer before packet 1, after it and before the last one; end of transfer "
     "again after complete",
     expectation="NAK, and the transfer goes on or can be begun anew; the second one is answered as "
@@ -117,7 +117,7 @@ def _check_second_end(bench: Bench, first_answer: Kind) -> None:
 @case(
     "EN-04",
     "image with a wrong checksum",
-    clause="4.2, 5; R6, R7",
+    clause="Welling 5.1, figure 2 (end); R6; R7",
     stimulus="the good image with another checksum, end of transfer twice; then the good image",
     expectation="NAK, the second time too (en_02); it is not started, and the device is rescuable",
     requires={DESTRUCTIVE, Requirement.CHECKSUM},
@@ -148,7 +148,7 @@ def wrong_checksum(bench: Bench) -> None:
 @case(
     "EN-07",
     "upgrades in a row",
-    clause="4.2",
+    clause="Welling 5.1, figure 2 (end)",
     stimulus="three upgrades, each one begun as soon as the one before is complete, to a smaller "
     "image and back",
     expectation="each one right: nothing of the image before is left in it",
@@ -192,7 +192,7 @@ def _enter_at_once(bench: Bench) -> None:
 @case(
     "EN-08",
     "version after an upgrade",
-    clause="5.1, 1540",
+    clause="Welling 3.2, table 5 (1540)",
     stimulus="version query after an upgrade to another version, and after one back",
     expectation="the application reports the version of the image that it is",
     requires={DESTRUCTIVE, Requirement.SECOND_IMAGE},

@@ -69,7 +69,7 @@ _UNKNOWN_MODES: Final = (0x00, 0x0D, 0x17, 0x96, 0xFF)
 @case(
     "FR-01",
     "splits of a message",
-    clause="2, R19",
+    clause="Welling 2.2.3, table 3; robustness, not in the document",
     stimulus="update command and packets in CAN frames of 1 to 8 bytes, all alike or by chance",
     expectation="decoded alike, or rejected (fr_01); packets in frames of 8 bytes are accepted",
     requires={DESTRUCTIVE},
@@ -94,7 +94,7 @@ def splits(bench: Bench) -> None:
 @case(
     "FR-02",
     "junk before a message",
-    clause="2, 2.2",
+    clause="Welling 2.2.1 (1); R19; robustness, not in the document",
     stimulus="junk in frames of its own, in the frame of the header, 55 55 AA, 55 ending a frame",
     expectation="resynchronised on the next message; one in the frame of the junk: fr_02",
     requires={DESTRUCTIVE},
@@ -120,7 +120,7 @@ def junk(bench: Bench) -> None:
 @case(
     "FR-03",
     "header and tail inside data",
-    clause="2",
+    clause="Welling 2.2.1, table 1",
     stimulus="packets full of 55 AA and F0, at frame boundaries too; whole messages inside data",
     expectation="no false start or end: each one acknowledged once, and stored as it is",
     requires={DESTRUCTIVE},
@@ -138,7 +138,7 @@ def header_in_data(bench: Bench) -> None:
 @case(
     "FR-04",
     "wrong tail",
-    clause="2",
+    clause="Welling 2.2.1 (1); robustness, not in the document",
     stimulus="packets with another last byte than F0; a packet behind a wrong tail, in its frame",
     expectation="discarded, the next message is taken; the one in the same frame: fr_04",
     requires={DESTRUCTIVE},
@@ -162,7 +162,7 @@ def wrong_tail(bench: Bench) -> None:
 @case(
     "FR-05",
     "length greater than what follows",
-    clause="2, R12",
+    clause="Welling 2.2.1 (3); R12",
     stimulus="messages that end before their length is used up, then a packet: after the "
     "inter-frame timeout, and at once",
     expectation="a packet is taken after the timeout; at once it may be taken or lost",
@@ -187,7 +187,7 @@ def broken_off(bench: Bench) -> None:
 @case(
     "FR-06",
     "lengths that cannot be",
-    clause="2",
+    clause="Welling 2.2.1 (3); Welling 2.2.1 (4, 5)",
     stimulus="length 0 and 1; length other than the command's second byte + 2; 255 with an "
     "unknown command; all with the right CRC",
     expectation="discarded, no overflow: the next packet is taken, nothing else is stored",
@@ -208,7 +208,7 @@ def wrong_length(bench: Bench) -> None:
 @case(
     "FR-07",
     "last frame padded",
-    clause="2",
+    clause="Welling 2.2.3, table 3; robustness, not in the document",
     stimulus="update command padded to 8 bytes with 00, FF, AA, 55 and F0; padded end of transfer",
     expectation="as the profile says (fr_07): padding ignored, or the message rejected",
     requires={DESTRUCTIVE},
@@ -246,7 +246,7 @@ def padded(bench: Bench) -> None:
 @case(
     "FR-08",
     "two messages back to back",
-    clause="2",
+    clause="Welling 2.2.1, table 1; R19",
     stimulus="a query and the update command without a pause; queries and a packet; the last "
     "packet again and the next one",
     expectation="both decoded",
@@ -277,7 +277,7 @@ def back_to_back(bench: Bench) -> None:
 @case(
     "FR-09",
     "frames that carry no payload",
-    clause="2",
+    clause="Welling 2.1; Welling 2.2.3, table 3",
     stimulus="frames of 0 bytes, remote, extended and error frames between the frames of a packet",
     expectation="never taken for payload: the packet is acknowledged",
     requires={DESTRUCTIVE},
@@ -300,7 +300,7 @@ def no_payload(bench: Bench) -> None:
 @case(
     "FR-10",
     "unknown mode, unknown command",
-    clause="2, 4.1",
+    clause="Welling 2.2.1 (2); R15",
     stimulus="packets and update commands with modes that nobody has; commands that nobody has",
     expectation="rejected with NAK or silence; update command and packets are taken as before",
     requires={DESTRUCTIVE},

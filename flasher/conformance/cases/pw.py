@@ -55,7 +55,7 @@ class _Upgrade:
 @case(
     "PW-01",
     "power cuts in an upgrade",
-    clause="R14, R19",
+    clause="R14; R19",
     stimulus="power cut at the frames of reset, update command, packets and end of transfer; "
     "before, in and after every flash operation",
     expectation="the device announces itself again, starts nothing but a whole image, and can be "
@@ -86,7 +86,7 @@ def cuts(bench: Bench) -> None:
 @case(
     "PW-02",
     "a second power cut, in the rescue",
-    clause="R14, R19",
+    clause="R14; R19",
     stimulus="power cut in a transfer, and again: during the announcements, the erase, a packet, "
     "between two of them, before and at end of transfer",
     expectation="the device announces itself again, starts nothing but a whole image, and can be "

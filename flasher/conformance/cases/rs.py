@@ -34,7 +34,8 @@ _IGNORED_RESETS: Final = (
 @case(
     "RS-01",
     "reset of the application",
-    clause="4.2, 1 and 2",
+    clause="Welling 5.1, figure 2 (begin); Welling 3.4, table 7 (4205); "
+    "Welling 3.2, table 5 (5503); Welling 5.2; Welling 5.2, table 9 (C109); R3",
     stimulus="reset to the running application",
     expectation="general feedback, then boot version 4 times, 50 ms apart",
     requires={TIMING},
@@ -51,7 +52,7 @@ def reset(bench: Bench) -> None:
 @case(
     "RS-02",
     "reset twice, and during the announcements",
-    clause="4.2, R18",
+    clause="Welling 5.1, figure 2 (begin); R18",
     stimulus="two resets in a row; reset after the second boot version",
     expectation="one clean restart; inside the bootloader as the profile says (rs_02)",
     choices=("rs_02",),
@@ -79,7 +80,7 @@ def reset_again(bench: Bench) -> None:
 @case(
     "RS-03",
     "no update command",
-    clause="4.2, 2; R14",
+    clause="Welling 5.1, figure 2 (begin); R14; R19",
     stimulus="silence after the announcements, with an application and without one",
     expectation="a valid application is started; without one the bootloader stays (rs_03)",
     requires={DESTRUCTIVE},
@@ -108,7 +109,7 @@ def no_update(bench: Bench) -> None:
 @case(
     "RS-04",
     "what is no reset",
-    clause="4.1, 4205",
+    clause="Welling 3.4, table 7 (4205); Welling 2.2.1 (2); Welling 2.2.2, table 2",
     stimulus="reset with another text, as a read, as a report, to another target's id",
     expectation="no restart; the application runs on",
 )
@@ -124,7 +125,7 @@ def no_reset(bench: Bench) -> None:
 @case(
     "RS-05",
     "power-up",
-    clause="4.2, 1",
+    clause="Welling 5.1, figure 2 (begin); R19",
     stimulus="power off and on",
     expectation="boot version 4 times, 50 ms apart",
     requires={POWER, TIMING},

@@ -47,7 +47,7 @@ _SETTINGS: Final = range(0x30, 0x50)
 @case(
     "SE-01",
     "endless bytes and useless messages",
-    clause="R12",
+    clause="R12; robustness, not in the document",
     stimulus="header after header, data without an end, long and short messages of no use: to the "
     "application, in the announcements and in a transfer",
     expectation="it goes on as if nothing had come; the window and the pause (tx_12) end in time",
@@ -134,7 +134,7 @@ def _drip_until(
 @case(
     "SE-03",
     "random input in every state",
-    clause="R12, R19",
+    clause="R19; robustness, not in the document",
     stimulus="random frames and random intact messages (by the seed) to the application, in the "
     "announcements, while it erases, before, amid and after the packets, and after complete",
     expectation="reachable, and the old or the new application is intact",
@@ -229,7 +229,7 @@ def _wild_message(bench: Bench) -> list[RawFrame]:
 @case(
     "SE-04",
     "writes outside of the application area",
-    clause="R8, R9",
+    clause="R8; R9",
     stimulus="update command for sizes beyond the area, also such as become small when they are "
     "rounded up; packets with number 0 and beyond the total, with the total to match as well",
     expectation="rejected; nothing of it is stored, and application and bootloader are unharmed",

@@ -72,7 +72,7 @@ def gaps(bench: Bench) -> None:
 @case(
     "TM-05",
     "times of an upgrade",
-    clause="4.2, R12",
+    clause="Welling 5.1, figure 2 (begin); R12",
     stimulus="a transfer of many packets, an upgrade, and some resets",
     expectation="each time within the profile's limits: reset to the first boot version, their "
     "spacing, update command to request transfer, packet to ACK, end of transfer to complete",

@@ -112,7 +112,7 @@ def _check_naks(bench: Bench, numbers: Collection[int] | None, counts: Collectio
 @case(
     "TX-01",
     "damaged packet",
-    clause="4.2, 4",
+    clause="Welling 5.1, figure 2 (packets); Welling 5.2, table 9 (C202, C302)",
     stimulus="first, second and last packet with a wrong CRC, with a wrong bit, without a frame",
     expectation="rejected (tx_01, tx_01_lost_frame); accepted when it is sent again",
     requires={DESTRUCTIVE},
@@ -162,7 +162,7 @@ def _lose_frame(bench: Bench, image: bytes, number: int, index: int) -> None:
 @case(
     "TX-02",
     "ACK lost",
-    clause="R10",
+    clause="Welling 5.1, figure 2 (packets); R10",
     stimulus="first, second and last packet sent again after their ACK, twice each",
     expectation="ACK n again (tx_02), one answer a copy; nothing is written twice",
     requires={DESTRUCTIVE},
@@ -215,7 +215,7 @@ def _check_repeated(bench: Bench, number: int, total: int) -> None:
 @case(
     "TX-03",
     "packet numbers out of order",
-    clause="4.2, 4; R10",
+    clause="Welling 5.2, table 8 (A385); R10",
     stimulus="before packet 1, after packet 3 and after the last one: a number skipped, the last "
     "one, 0, beyond the total, 65535; older ones, with right and with other data",
     expectation="rejected (tx_01), the older ones as the profile says (tx_03); nothing of it is "
@@ -263,7 +263,7 @@ def _check_older(bench: Bench, number: int) -> None:
 @case(
     "TX-04",
     "total that does not fit the size",
-    clause="4.1, A385",
+    clause="Welling 5.2, table 8 (A385)",
     stimulus="packet 1, 4 and the last one with a total that is 1 less, 1 more, 0, 65535 or "
     "high byte first",
     expectation="rejected (tx_01); accepted with the right total",
@@ -286,7 +286,7 @@ def wrong_total(bench: Bench) -> None:
 @case(
     "TX-06",
     "wrong start byte",
-    clause="4.1, A385",
+    clause="Welling 5.2, table 8 (A385)",
     stimulus="packet 1, 4 and the last one beginning with 00, 02, 04, 10, 81 and FF",
     expectation="rejected (tx_01); accepted with 01",
     requires={DESTRUCTIVE},
@@ -309,7 +309,7 @@ def wrong_start_byte(bench: Bench) -> None:
 @case(
     "TX-07",
     "many packets",
-    clause="4.1, A385; R9",
+    clause="Welling 5.2, table 8 (A385); R4; R9",
     stimulus="the largest image, all its packets: across 255/256, up to the last one",
     expectation="every packet is accepted and stored at its place",
     requires={DESTRUCTIVE, LONG},
@@ -342,7 +342,7 @@ def many_packets(bench: Bench) -> None:
 @case(
     "TX-08",
     "last packet not filled with FF",
-    clause="4.1, A385",
+    clause="Welling 5.2, table 8 (A385)",
     stimulus="other bytes than FF behind the end of the image in the last packet",
     expectation="ignored or rejected (tx_08)",
     requires={DESTRUCTIVE},
@@ -372,7 +372,7 @@ def other_filler(bench: Bench) -> None:
 @case(
     "TX-12",
     "pause in a transfer",
-    clause="R12, R14",
+    clause="R12; R14",
     stimulus="half of limits.pause_s before a packet; more than it before packet 1, amid the "
     "packets and before the end",
     expectation="announces again, or waits on (tx_12); reachable in both",

@@ -30,7 +30,7 @@ _FIRST_PACKETS: Final = 3
 @case(
     "UP-01",
     "sizes that are taken",
-    clause="4.1, A10B; R9",
+    clause="Welling 5.2, table 8 (A10B); Welling 2.2.1 (7); Welling 5.2, table 9 (C402); R9",
     stimulus="update command for 1, 127, 128, 129, 78351 bytes and the largest image",
     expectation="request transfer within the erase limit, and the packets of that size are taken",
     requires={DESTRUCTIVE, LONG},
@@ -52,7 +52,7 @@ def sizes(bench: Bench) -> None:
 @case(
     "UP-02",
     "sizes that are rejected",
-    clause="R9",
+    clause="Welling 5.2, table 8 (A10B); R9",
     stimulus="update command for 0 bytes, more than the largest image, 2^32 - 1 bytes",
     expectation="rejected before anything is erased: the old application starts",
     requires={DESTRUCTIVE},
@@ -96,7 +96,7 @@ def without_reset(bench: Bench) -> None:
 @case(
     "UP-04",
     "when the update command is heard",
-    clause="4.2, 2; R2",
+    clause="Welling 5.1, figure 2 (begin); R2",
     stimulus="update command at each boot version, just before and just after the window's end",
     expectation="accepted inside the window; between the announcements and after the window as the "
     "profile says (up_04_burst, up_04)",
@@ -128,7 +128,7 @@ def window(bench: Bench) -> None:
 @case(
     "UP-05",
     "update command repeated",
-    clause="R2, R16",
+    clause="R2; R25; robustness, not in the document",
     stimulus="update command twice before request transfer; again before packet 1",
     expectation="one transfer, which begins at packet 1 and ends well",
     requires={DESTRUCTIVE},
@@ -159,7 +159,7 @@ def repeated(bench: Bench) -> None:
 @case(
     "UP-06",
     "update command that is not for this device",
-    clause="4.1, A10B",
+    clause="Welling 5.2, table 8 (A10B); Welling 2.2.2, table 2",
     stimulus="names of other targets, wrong case, payload too short and too long, as a read",
     expectation="rejected; the old application starts",
     requires={DESTRUCTIVE},
@@ -173,7 +173,7 @@ def wrong_names(bench: Bench) -> None:
 @case(
     "UP-08",
     "update command in the middle of a transfer",
-    clause="R2",
+    clause="R2; robustness, not in the document",
     stimulus="update command of the same size, and of another one, after packet 3",
     expectation="starts over cleanly or rejects (up_08), and never mixes two images",
     requires={DESTRUCTIVE},
