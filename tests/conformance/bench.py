@@ -137,7 +137,7 @@ def run_case(
 ) -> RunReport:
     """A run of one case that does `action` and is called FR-00; with `before_others`, RS-04 too."""
     CASES["FR-00"] = Case(
-        "FR-00", "a test", "none", "something", "something", action, requires, limit_s=limit_s
+        "FR-00", "a test", "R12", "something", "something", action, requires, limit_s=limit_s
     )
     try:
         return run(
