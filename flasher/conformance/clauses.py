@@ -4,7 +4,7 @@ vendor's document under its own numbers, and the readings of what it leaves open
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 ROBUSTNESS: Final = "robustness, not in the document"
 """Label of a case that no clause asks for; what the product does is a choice in the profile, or it
@@ -53,50 +53,224 @@ _DOCUMENT: Final = {
     "5.2, table 9 (C402)": "request transfer: 00 00",
     "5.2, table 9 (C502)": "complete: 00 00",
 }
-_READINGS: Final = {
-    "R1": "running information has 16 bytes, 4 of them reserved",
-    "R2": "the tool answers every boot version with the update command until request transfer "
-    "comes; a device may listen during the announcements or only after them",
-    "R3": "reset and general feedback of WMC and OBC are those of the BMS on their own ids",
-    "R4": "packet numbers are sent low byte first in packet, ACK and NAK alike",
-    "R5": "a memory query names the first byte and the one behind the last",
-    "R6": "a NAK after end of transfer may be a damaged message: the tool sends it once more, and "
-    "a second NAK means that the image was refused",
-    "R7": "no CRC of the image is sent: the device checks that all packets are there and fit the "
-    "size, and the image's own checksum where the product has one",
-    "R8": "the image has no address: it is sent from its lowest byte on, gaps filled with FF, and "
-    "has to fit the application area",
-    "R9": "the update command has the true size, 1 to 65535 x 128 bytes; the last packet is filled "
-    "with FF",
-    "R10": "a packet that is stored and comes again is acknowledged again and not stored again",
-    "R11": "a boot version in the midst of a transfer is a restart; after end of transfer it is "
-    "not answered",
-    "R12": "the limits of the upgrade are not in the document: they are values of the profile; the "
-    "frames of a message are at most 100 ms apart",
-    "R13": "a short physical ID may be filled with FF or with 01",
-    "R14": "without a valid application the bootloader announces itself until an update command "
-    "comes",
-    "R15": "the bootloader answers update command, packet and end of transfer with its own "
-    "messages; general feedback beside them, or to an unknown write, is right too",
-    "R16": "request transfer again before the first ACK: the tool sends packet 1 again",
-    "R17": "an application that runs answers upgrade messages with general feedback or nothing, "
-    "and erases nothing",
-    "R18": "the bootloader ignores reset, which belongs to the application",
-    "R19": "power-up passes through the bootloader; without update command it starts the "
-    "application, after complete the new one; a message begins at the beginning of a frame",
-    "R20": "texts that break the rule of the terminator are shown as they are",
-    "R21": "status 00 of the battery means that no flag is set",
-    "R22": "state of health 0 may be that of an older device",
-    "R23": "SHUTDOWN is repeated every 200 ms, for 1 s at most",
-    "R24": "fault bits 25 to 31 have no meaning",
-    "R25": "a second update command before the first packet may be answered by a second request "
-    "transfer, or not",
-    "R26": "a device that sits silent in a broken transfer gets one update command into the "
-    "silence",
+
+
+class Reading(NamedTuple):
+    """How this project reads a place where the documents are silent or contradict themselves."""
+
+    asks: str
+    why: str
+    suite: tuple[str, ...] = ()
+    """Keys of the suite's profile that change it."""
+    host: tuple[str, ...] = ()
+    """Keys of the host's profile (`flasher profile`) that change it."""
+    model: tuple[str, ...] = ()
+    """Choices of the device model (`flasher mock --set`) that change it."""
+
+
+READINGS: Final = {
+    "R1": Reading(
+        "running information has 16 bytes, 4 of them reserved",
+        "Welling lists 5 reserved bytes, but the command says 16 bytes of data, which leaves 4; "
+        "MOTINOVA lists 4.",
+    ),
+    "R2": Reading(
+        "the tool answers every boot version with the update command until request transfer "
+        "comes; a device may listen during the announcements or only after them",
+        "The flow chart does not tell when the device listens. A device that waits for the end of "
+        "its burst and one that listens from the first announcement on are both upgraded by a tool "
+        "that answers each announcement, at least 30 ms after its last update command: a second "
+        "one may begin a second erase. Into silence it sends none, as a silent device may be "
+        "erasing (but R26).",
+        suite=("up_04", "up_04_burst", "up_08", "limits.window_s"),
+        host=("timings.update_spacing_s",),
+        model=("window_s", "update_in_transfer"),
+    ),
+    "R3": Reading(
+        "reset and general feedback of WMC and OBC are those of the BMS on their own ids",
+        "They are said to stand in chapter 3, which has them for the BMS alone.",
+        suite=("device.reset_command", "device.reset_data"),
+        host=("reset_command", "reset_data"),
+    ),
+    "R4": Reading(
+        "packet numbers are sent low byte first in packet, ACK and NAK alike",
+        "The tables do not say it of these numbers; all data are sent so (2.2.1 (7)).",
+    ),
+    "R5": Reading(
+        "a memory query names the first byte and the one behind the last",
+        "The answer is filled up where the end less the start is below 128: so that difference "
+        "is the number of bytes.",
+    ),
+    "R6": Reading(
+        "a NAK after end of transfer may be a damaged message: the tool sends it once more, and "
+        "a second NAK means that the image was refused",
+        "The flow chart has two branches there, one for a message that was not received rightly "
+        "and one for an upgrade that has failed, and NAK in both.",
+        suite=("en_02", "limits.refused_s"),
+        host=("timings.end_tries",),
+        model=("repeated_end", "refused_hold_s"),
+    ),
+    "R7": Reading(
+        "no CRC of the image is sent: the device checks that all packets are there and fit the "
+        "size, and the image's own checksum where the product has one",
+        "The document calls it a CRC32 check of what was received, but gives the device nothing "
+        "to compare with.",
+        suite=("en_04",),
+        model=("image_checksum",),
+    ),
+    "R8": Reading(
+        "the image has no address: it is sent from its lowest byte on, gaps filled with FF, and "
+        "has to fit the application area",
+        "No message carries an address. A file with bootloader and application in one would be "
+        "written to the wrong place, so the host refuses what lies outside of the area.",
+        suite=("device.application_bytes", "device.largest_image_bytes"),
+        host=("application_area.start", "application_area.size_bytes", "image_limit_bytes", "cpu"),
+        model=("application_area_bytes", "largest_image_bytes"),
+    ),
+    "R9": Reading(
+        "the update command has the true size, 1 to 65535 x 128 bytes; the last packet is filled "
+        "with FF",
+        "The document's example, 78351 bytes, is no multiple of 128; packet numbers end at 65535; "
+        "an image without bytes is an error.",
+        suite=("up_02", "tx_08", "device.largest_image_bytes"),
+        host=("image_limit_bytes",),
+        model=("largest_image_bytes",),
+    ),
+    "R10": Reading(
+        "a packet that is stored and comes again is acknowledged again and not stored again",
+        "A lost ACK makes every tool repeat the packet. Some bootloaders answer NAK n+1 then "
+        '("I want the next one"), which is an ACK only where a profile says so and the packet was '
+        "sent more than once. An ACK or NAK of an older packet is stale. After a repetition the "
+        "tool waits until each copy is answered or 50 ms passed, else one late answer doubles "
+        "every later packet.",
+        suite=("tx_02", "tx_03"),
+        host=("nak_next_is_ack", "timings.quiet_after_repeat_s"),
+        model=("repeated_packet", "older_packet"),
+    ),
+    "R11": Reading(
+        "a boot version in the midst of a transfer is a restart; after end of transfer it is "
+        "not answered",
+        "A device that announces itself has left the transfer, so the upgrade begins again, a "
+        "bounded number of times; up to 60 ms after request transfer it is a leftover of the "
+        "burst. Behind the end the device may be on the way into its new application, which an "
+        "update command would erase: the version answer decides, else the outcome is unconfirmed.",
+        suite=("en_03",),
+        host=("attempts", "timings.leftover_boot_version_s", "timings.announcing_on_s"),
+        model=("after_complete",),
+    ),
+    "R12": Reading(
+        "the limits of the upgrade are not in the document: they are values of the profile; the "
+        "frames of a message are at most 100 ms apart",
+        "The 200 ms and 1 s of chapter 3 are about queries and writes of the application. A limit "
+        "counts from the moment the last frame of a message has left.",
+        suite=(
+            "tm_02",
+            "limits.erase_s",
+            "limits.ack_s",
+            "limits.complete_s",
+            "limits.first_version_s",
+            "limits.inter_frame_s",
+            "limits.pause_s",
+        ),
+        host=(
+            "timings.boot_version_timeout_s",
+            "timings.request_transfer_timeout_s",
+            "timings.ack_timeout_s",
+            "timings.complete_timeout_s",
+            "timings.inter_frame_timeout_s",
+        ),
+        model=("transfer_timeout_s",),
+    ),
+    "R13": Reading(
+        "a short physical ID may be filled with FF or with 01",
+        'The document fills it "with 1", by a word that means bit or place: a reader shows all 12 '
+        "bytes.",
+    ),
+    "R14": Reading(
+        "without a valid application the bootloader announces itself until an update command comes",
+        "The document does not describe such a device. One that is silent after its burst can be "
+        "upgraded too, but only after power-up.",
+        suite=("rs_03", "tx_12"),
+        host=("power_up_timeout_s",),
+        model=("without_application", "pause_in_transfer"),
+    ),
+    "R15": Reading(
+        "the bootloader answers update command, packet and end of transfer with its own "
+        "messages; general feedback beside them, or to an unknown write, is right too",
+        "2.2.1 (2) has every device confirm a write by general feedback, appendix 3 gives the "
+        "bootloader answers of its own. Both devices are right.",
+    ),
+    "R16": Reading(
+        "request transfer again before the first ACK: the tool sends packet 1 again",
+        "An update command would make the device erase again; later than that it is a restart "
+        "(R11).",
+    ),
+    "R17": Reading(
+        "an application that runs answers upgrade messages with general feedback or nothing, "
+        "and erases nothing",
+        "They are writes, but belong to the bootloader.",
+        suite=("up_03",),
+        model=("upgrade_in_application",),
+    ),
+    "R18": Reading(
+        "the bootloader ignores reset, which belongs to the application",
+        "The document places the command in the application (5.2). A bootloader that restarts is a "
+        "choice.",
+        suite=("rs_02", "tx_13"),
+        model=("reset_in_bootloader", "reset_in_transfer"),
+    ),
+    "R19": Reading(
+        "power-up passes through the bootloader; without update command it starts the "
+        "application, after complete the new one; a message begins at the beginning of a frame",
+        "Not said in words, but nothing else makes sense of the flow chart and of the way in which "
+        "messages are put into frames. A temperature is degrees Celsius + 40, the 32 fault bits "
+        "stand low byte first as all data.",
+        suite=("fr_02", "en_03", "limits.start_s"),
+        model=("after_complete", "start_delay_s"),
+    ),
+    "R20": Reading(
+        "texts that break the rule of the terminator are shown as they are",
+        "Real devices fill a field to its last byte; control characters are shown escaped. The "
+        "project itself writes only texts that keep the rule.",
+    ),
+    "R21": Reading(
+        "status 00 of the battery means that no flag is set",
+        "The table calls 00 asleep, and the byte flags joined by or: an awake battery without a "
+        "charger is 00 too.",
+    ),
+    "R22": Reading(
+        "state of health 0 may be that of an older device",
+        "The byte was one of five reserved zero bytes before (R1). It is shown as received; more "
+        "than 100 % is marked.",
+        model=("older_battery",),
+    ),
+    "R23": Reading(
+        "SHUTDOWN is repeated every 200 ms, for 1 s at most",
+        "The document gives this rhythm for the tool's commands and none for SHUTDOWN.",
+        model=("idle_shutdown",),
+    ),
+    "R24": Reading(
+        "fault bits 25 to 31 have no meaning",
+        "They are not in the document, and not called reserved either: shown by their numbers.",
+    ),
+    "R25": Reading(
+        "a second update command before the first packet may be answered by a second request "
+        "transfer, or not",
+        "The device may erase again, or see that it has done so.",
+    ),
+    "R26": Reading(
+        "a device that sits silent in a broken transfer gets one update command into the silence",
+        "No end of a transfer is given, so a device whose tool was lost may wait for ever, without "
+        "an announcement and without knowing reset. When both stayed unanswered and the erase "
+        "limit has passed, the tool tries the update command once, as a new attempt.",
+        suite=("tx_12", "tx_13"),
+        host=("attempts",),
+        model=("pause_in_transfer",),
+    ),
 }
 CLAUSES: Final = {
     **{f"Welling {number}": content for number, content in _DOCUMENT.items()},
-    **_READINGS,
+    **{number: reading.asks for number, reading in READINGS.items()},
     ROBUSTNESS: "no clause asks for it, but a bootloader on a real bus meets it",
 }
 """Every clause with its content."""
