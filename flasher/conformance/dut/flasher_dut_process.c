@@ -1,0 +1,184 @@
+/* Makes a program of a bootloader that implements flasher_dut.h: link it, and give the program to
+ * `flasher conformance --subject`. It talks to the suite on standard input and output; what the
+ * bootloader prints goes to standard error.
+ *
+ * Each message is a header of 8 bytes (type, three zeros, size of the rest as uint32) and the rest;
+ * integers are little-endian, frames are `flasher_frame` as it lies in memory.
+ *
+ *   program to suite, first:   'f' facts: nine uint32 in the order of flasher_dut_facts, name
+ *   suite to program:          'S' start: uint64 now, uint32 cause
+ *                              'R' received: uint64 now, uint32 pending, frame
+ *                              'T' tick: uint64 now, uint32 pending
+ *   program to suite, during:  'r' read: uint32 offset, uint32 size; answered by 'd' data
+ *                              'e' erase: uint64 now, uint32 offset; answered by 'k' uint64 now
+ *                              'w' write: uint64 now, uint32 offset, data; answered by 'k'
+ *                              'l' log: text
+ *                              'a' start the application, 'z' reset: uint64 now; end the program
+ *   program to suite, at last: '.' done: uint64 now, uint64 next tick, frames to send
+ */
+#define _POSIX_C_SOURCE 200809L
+
+#include "flasher_dut.h"
+
+#include <stdlib.h>
+#include <string.h>
+#include <sys/uio.h>
+#include <unistd.h>
+
+#if __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "written for little-endian computers"
+#endif
+
+enum { FRAMES_MAX = 512 };
+
+static int to_suite;
+static uint64_t now;
+static uint32_t pending;
+
+static void read_exactly(void *data, size_t size)
+{
+    uint8_t *at = data;
+    while (size > 0) {
+        ssize_t got = read(STDIN_FILENO, at, size);
+        if (got <= 0)
+            _exit(0); /* the suite has ended */
+        at += got;
+        size -= (size_t)got;
+    }
+}
+
+typedef struct {
+    uint8_t type;
+    uint8_t zeros[3];
+    uint32_t size;
+} header;
+
+/* A message of two parts. */
+static void tell(uint8_t type, const void *one, size_t one_size, const void *two, size_t two_size)
+{
+    const header head = {type, {0, 0, 0}, (uint32_t)(one_size + two_size)};
+    const struct iovec parts[] = {
+        {(void *)&head, sizeof head}, {(void *)one, one_size}, {(void *)two, two_size}};
+    if (writev(to_suite, parts, 3) != (ssize_t)(sizeof head + head.size))
+        _exit(0); /* the suite has ended */
+}
+
+static uint32_t next_message(uint8_t *type)
+{
+    header head;
+    read_exactly(&head, sizeof head);
+    *type = head.type;
+    return head.size;
+}
+
+/* -- the hardware ----------------------------------------------------------------------------- */
+
+static uint64_t now_us(void)
+{
+    return now++; /* so that a loop that waits for a time ends */
+}
+
+static void flash_read(uint32_t offset, void *data, uint32_t size)
+{
+    uint8_t type;
+    const uint32_t request[2] = {offset, size};
+    tell('r', request, sizeof request, NULL, 0);
+    if (next_message(&type) != size)
+        abort();
+    read_exactly(data, size);
+}
+
+static void await_flash(void)
+{
+    uint8_t type;
+    if (next_message(&type) != sizeof now)
+        abort();
+    read_exactly(&now, sizeof now);
+}
+
+typedef struct {
+    uint64_t now;
+    uint32_t offset;
+} flash_place;
+
+enum { FLASH_PLACE_BYTES = 12 };
+
+static void flash_erase(uint32_t offset)
+{
+    const flash_place place = {now, offset};
+    tell('e', &place, FLASH_PLACE_BYTES, NULL, 0);
+    await_flash();
+}
+
+static void flash_write(uint32_t offset, const void *data, uint32_t size)
+{
+    const flash_place place = {now, offset};
+    tell('w', &place, FLASH_PLACE_BYTES, data, size);
+    await_flash();
+}
+
+static uint32_t transmit_pending(void)
+{
+    return pending;
+}
+
+static void start_application(void)
+{
+    tell('a', &now, sizeof now, NULL, 0);
+    _exit(0);
+}
+
+static void reset(void)
+{
+    tell('z', &now, sizeof now, NULL, 0);
+    _exit(0);
+}
+
+static void log_text(const char *text)
+{
+    tell('l', text, strlen(text), NULL, 0);
+}
+
+static const flasher_host host = {
+    now_us, flash_read, flash_erase, flash_write, transmit_pending, start_application, reset, log_text,
+};
+
+/* -- the suite's calls ------------------------------------------------------------------------ */
+
+static void turn(void)
+{
+    static flasher_frame frames[FRAMES_MAX];
+    size_t count = 0;
+    uint64_t times[2];
+    times[1] = flasher_dut_tick(now);
+    while (count < FRAMES_MAX && flasher_dut_next_frame(&frames[count]))
+        ++count;
+    times[0] = now;
+    tell('.', times, sizeof times, frames, count * sizeof frames[0]);
+}
+
+int main(void)
+{
+    const flasher_dut_facts *facts = flasher_dut_about();
+    to_suite = dup(STDOUT_FILENO);
+    dup2(STDERR_FILENO, STDOUT_FILENO);
+    tell('f', facts, 9 * sizeof(uint32_t), facts->name, strlen(facts->name));
+    for (;;) {
+        uint8_t type;
+        flasher_frame frame;
+        uint32_t number;
+        uint32_t size = next_message(&type);
+        read_exactly(&now, sizeof now);
+        read_exactly(&number, sizeof number);
+        if (size == sizeof now + sizeof number + sizeof frame)
+            read_exactly(&frame, sizeof frame);
+        if (type == 'S') {
+            flasher_dut_start(&host, number);
+        } else {
+            pending = number;
+            if (type == 'R')
+                flasher_dut_receive(&frame);
+        }
+        turn();
+    }
+}
