@@ -7,25 +7,18 @@ bytes does not import them.
 from __future__ import annotations
 
 import zlib
-from collections import deque
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from typing import Final
 
-from flasher.bus.link import VirtualClock
-from flasher.bus.simulated import SimulatedBus
 from flasher.conformance.profile import ConformanceProfile, Value
-from flasher.conformance.results import DeviceCrashed, Unsupported
-from flasher.conformance.subject import Arrival
-from flasher.conformance.wire import RawFrame
-from flasher.errors import BusError, FlasherError
+from flasher.conformance.results import Unsupported
+from flasher.conformance.simulated import CRASHES, SimulatedPort
 from flasher.mock.faults import FaultInjector, InOperation, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.variants import find, make
 from flasher.protocol.bittime import frame_bits
 from flasher.protocol.engine import Engine
-from flasher.protocol.frame import Frame
 from flasher.protocol.messages import BootVersion
 from flasher.protocol.spec import TARGETS, WELLING
 from flasher.protocol.timing import DEFAULT_TIMINGS
@@ -34,7 +27,6 @@ from flasher.protocol.wire import encode, split
 AREA_BYTES: Final = 256 * 1024
 """The mock's application area: large enough for every case, small enough to be filled."""
 MOCK_PROFILE: Final = DeviceProfile(application_area_bytes=AREA_BYTES)
-_AT_ONCE: Final = float("-inf")
 _SPACING_TOLERANCE_S: Final = 0.005
 """An announcement of the model waits for a few frames of others at the most."""
 _WINDOW_TOLERANCE_S: Final = 0.0005
@@ -50,65 +42,6 @@ def model_image(version: str, size_bytes: int) -> bytes:
 
 GOOD_IMAGE: Final = model_image("V2r0r1_20240131", 10 * 128 - 3)
 SECOND_IMAGE: Final = model_image("V1r9r0_20230517", 6 * 128)
-
-
-class MockPort:
-    """A way onto a simulated bus, with exact end times of all frames, the own ones included. Its
-    methods raise DeviceCrashed too.
-    """
-
-    echoes = True
-    timestamp_source = "simulated bus"
-    uncertainty_s = 0.0
-
-    def __init__(self, bitrate_bps: int) -> None:
-        self.bitrate_bps = bitrate_bps
-        self.bus = SimulatedBus(bitrate_bps, VirtualClock(), self._record)
-        self._link = self.bus.link()
-        self._arrived: deque[tuple[Frame, float]] = deque()
-        self._pending: deque[Frame] = deque()
-
-    def now(self) -> float:
-        return self.bus.clock.now()
-
-    def send(self, frame: RawFrame) -> None:
-        made = Frame(*frame)
-        self._pending.append(made)
-        with _CRASHES:
-            self._link.send(made)
-
-    def receive(self, deadline: float) -> Arrival | None:
-        with _CRASHES:
-            while not self._arrived:
-                if self.now() >= deadline:
-                    return None
-                self.bus.advance(deadline)
-                # The link has the same frames; it reports errors, and raises when unplugged.
-                while (seen := self._link.receive(_AT_ONCE)) is not None:
-                    if seen.is_error:
-                        self._arrived.append((seen, self.now()))
-        frame, at = self._arrived.popleft()
-        is_echo = bool(self._pending) and frame is self._pending[0]
-        if is_echo:
-            self._pending.popleft()
-        return Arrival(RawFrame(*frame[:5]), at, is_echo)
-
-    def _record(self, frame: Frame, at: float) -> Sequence[Frame]:
-        """Take note of every frame on the wire, unless the adapter is off the bus."""
-        if self.bus.faults.takes_part:
-            self._arrived.append((frame, at))
-        return (frame,)
-
-
-class _Crashes(AbstractContextManager[None]):
-    """A device model that raises has done what a real part does not allow."""
-
-    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        if isinstance(error, FlasherError) and not isinstance(error, BusError):
-            raise DeviceCrashed(f"the device stopped: {error.what}") from error
-
-
-_CRASHES: Final = _Crashes()
 
 
 class MockSubject:
@@ -139,14 +72,14 @@ class MockSubject:
         self.good_image = good_image
         self.second_image = second_image
         self.device = (make_device or plain_device)(target, profile)
-        self.port = MockPort(WELLING.bitrate_bps)
+        self.port = SimulatedPort(WELLING.bitrate_bps)
         self.bus = self.port.bus
         self._injector = FaultInjector(self.device)
         for engine in (self._injector, *others):
             self.bus.attach(engine)
 
     def power(self, *, on: bool) -> None:
-        with _CRASHES:
+        with CRASHES:
             if on:
                 self.device.power_on(self.port.now())
             else:

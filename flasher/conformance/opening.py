@@ -43,6 +43,8 @@ class BenchOptions:
 
     target: str
     is_mock: bool = False
+    subject: str | None = None
+    """A bootloader that is compiled for the computer: a program, a library, MODULE:FACTORY."""
     variant: str | None = None
     choices: Sequence[str] = ()
     profile: str | None = None
@@ -72,6 +74,16 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
         subject, profile = _mock(options, profile, good, second)
         _check_size(subject.good_image, profile)
         yield subject, profile
+        return
+    if options.subject is not None:
+        from flasher.conformance.dut.subject import open_subject  # noqa: PLC0415  only here
+
+        target = api.as_target(options.target).name
+        with open_subject(
+            options.subject, target, profile, good_image=good, second_image=second
+        ) as (compiled, profile):
+            _check_size(compiled.good_image, profile)
+            yield compiled, profile
         return
     assert good is not None  # noqa: S101  check_bench
     profile = profile or ConformanceProfile()
@@ -114,12 +126,16 @@ def _image(path: str | None, options: BenchOptions) -> bytes | None:
 
 def check_bench(options: BenchOptions) -> None:
     """Raises UsageError for a bench that makes no sense."""
-    if options.is_mock:
-        if options.power is not None or options.readback is not None:
-            raise UsageError("The mock has power control and readback of its own.")
-        return
-    if options.variant is not None or options.choices:
+    if options.is_mock and options.subject is not None:
+        raise UsageError("The mock is no bootloader under test: choose one of the two.")
+    is_simulated = options.is_mock or options.subject is not None
+    if is_simulated and not (options.power is None and options.readback is None):
+        what = "The mock" if options.is_mock else "A bootloader on the computer"
+        raise UsageError(f"{what} has power control and readback of its own.")
+    if not options.is_mock and (options.variant is not None or options.choices):
         raise UsageError("Variants and choices of the device model are for the mock only.")
+    if is_simulated:
+        return
     if options.good_image is None:
         raise UsageError(
             "A good image is required.",

@@ -16,8 +16,9 @@ from flasher.cli.bench.conformance import exit_code
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases import rs
 from flasher.conformance.catalogue import CASES, NOT_IMPLEMENTED, QUICK
-from flasher.conformance.mock import MockPort, MockSubject
+from flasher.conformance.mock import MockSubject
 from flasher.conformance.profile import ConformanceProfile, load_profile, profile_keys
+from flasher.conformance.simulated import SimulatedPort
 from flasher.errors import BusError, ExitCode
 from tests.cli.conftest import SAMPLES, Flasher
 
@@ -257,14 +258,14 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, case_id: str, times: int = 1) 
 def test_an_adapter_that_fails_gives_its_exit_code_and_the_report(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    sound = MockPort.send
+    sound = SimulatedPort.send
 
-    def send(port: MockPort, frame: object) -> None:
+    def send(port: SimulatedPort, frame: object) -> None:
         if port.now() > 3.0:
             raise BusError("The adapter was unplugged.")
         sound(port, frame)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(MockPort, "send", send)
+    monkeypatch.setattr(SimulatedPort, "send", send)
     run = flasher(*MOCK, "--group", "RS")
     assert run.code == ExitCode.BUS
     assert "the run is not complete" in run.err

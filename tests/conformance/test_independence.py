@@ -8,7 +8,7 @@ from pathlib import Path
 import flasher.conformance
 
 _PACKAGE = Path(flasher.conformance.__file__).parent
-_EDGES = {"mock", "real"}
+_EDGES = {"mock", "simulated", "real"}
 """Where the suite meets the rest of flasher."""
 _REPORTING = {
     *("diff", "html_report", "json_report", "reports"),

@@ -8,6 +8,7 @@ import shlex
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
+from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -47,6 +48,8 @@ examples:
   flasher conformance --list --group TX
   flasher conformance diff old.json new.json
   flasher conformance profile > p.toml
+  flasher conformance header .
+  flasher conformance -t bms --subject ./boot
 
 Without power control the device is brought back by the protocol, and cases that cut the power are
 reported as unsupported. Ctrl-C ends the run with a report of what was run, and puts the good image
@@ -102,7 +105,16 @@ class ProfileKeysDocument:
     """A whole profile, as it is printed without --json."""
 
 
-DOCUMENTS: Final = (ConformanceDocument, CaseListDocument, Difference, ProfileKeysDocument)
+@dataclass(frozen=True)
+class HeaderDocument:
+    """The files that were written."""
+
+    files: list[str]
+
+
+DOCUMENTS: Final = (
+    ConformanceDocument, CaseListDocument, Difference, ProfileKeysDocument, HeaderDocument,
+)  # fmt: skip
 
 
 # -- a run -----------------------------------------------------------------------------------------
@@ -121,6 +133,7 @@ class Choices:
     readback_cmd: str | None
     uncertainty: float
     mock: bool
+    subject: str | None
     variant: str | None
     choices: tuple[str, ...]
     is_list: bool
@@ -177,6 +190,11 @@ _choices = option_set(
     _without_hardware(
         "--mock", is_flag=True, brief=True,
         help="test the device model in this process; takes no time",
+    ),
+    _without_hardware(
+        "--subject", metavar="BOOTLOADER", brief=True,
+        help="test a bootloader that is compiled for the computer: a program, a shared library, or "
+        "MODULE:FACTORY; see `flasher conformance header`",
     ),
     _without_hardware(
         "--variant", metavar="NAME",
@@ -271,14 +289,18 @@ def _checked_bench(chosen: Choices, bus: Bus) -> BenchOptions:
         raise UsageError(
             "flasher conformance: -t/--target is required.", remedy="Write -t wmc, bms or obc."
         )
-    mock_only = {"--variant": chosen.variant, "--set": chosen.choices}
+    for name, value in {"--variant": chosen.variant, "--set": chosen.choices}.items():
+        if value and not chosen.mock:
+            raise UsageError(f"{name} works with --mock only.")
+    without = "--mock" if chosen.mock else "--subject" if chosen.subject else ""
     bench_only = {"--power-cmd": chosen.power_cmd, "--readback-cmd": chosen.readback_cmd}
-    for name, value in (bench_only if chosen.mock else mock_only).items():
-        if value:
-            raise UsageError(f"{name} works {'without' if chosen.mock else 'with'} --mock only.")
+    for name, value in bench_only.items():
+        if value and without:
+            raise UsageError(f"{name} works without {without} only.")
     bench = BenchOptions(
         target=chosen.target.name,
         is_mock=chosen.mock,
+        subject=chosen.subject,
         variant=chosen.variant,
         choices=chosen.choices,
         profile=chosen.profile,
@@ -454,4 +476,24 @@ def profile(output: Output, *, mock: bool, choices: tuple[str, ...]) -> int:
         for key in profile_keys().values()
     ]
     output.document(ProfileKeysDocument(keys=keys, toml=toml))
+    return ExitCode.OK
+
+
+@conformance.action("header", exit_codes=())
+@argument(
+    "folder", type=values.FolderPath(), metavar="FOLDER", required=False, default=".",
+    help="where the two files are written (default: here)",
+)  # fmt: skip
+def header(output: Output, *, folder: Path) -> int:
+    """Write the two C files that make a bootloader a subject for --subject: flasher_dut.h, and
+    flasher_dut_process.c for one that is linked as a program.
+    """
+    names = ("flasher_dut.h", "flasher_dut_process.c")
+    written = []
+    for name in names:
+        content = (resources.files("flasher.conformance.dut") / name).read_bytes()
+        write_whole(folder / name, content, "FOLDER")
+        written.append(str(folder / name))
+        output.result(printable(written[-1]))
+    output.document(HeaderDocument(written))
     return ExitCode.OK

@@ -1,0 +1,181 @@
+"""What runs in the process of a bootloader that is a shared library or written in Python: it talks
+to the suite as `flasher_dut_process.c` does.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import importlib
+import os
+import sys
+from collections.abc import Callable
+from typing import Any, ClassVar, Final, Never, cast
+
+from flasher.conformance.dut import Bootloader, CanFrame, Facts, pipes
+from flasher.conformance.dut.pipes import Kind, Pipe
+
+_FRAMES_MAX: Final = 512
+
+
+class _ProcessHost:
+    """The hardware, at the other end of the pipe."""
+
+    def __init__(self, pipe: Pipe) -> None:
+        self._pipe = pipe
+        self.now = 0
+        self.pending = 0
+
+    def now_us(self) -> int:
+        self.now += 1  # so that a loop that waits for a time ends
+        return self.now - 1
+
+    def flash_read(self, offset: int, size_bytes: int) -> bytes:
+        self._pipe.write(Kind.FLASH_READ, pipes.RANGE.pack(offset, size_bytes))
+        return _next(self._pipe)[1]
+
+    def flash_erase(self, offset: int) -> None:
+        self._pipe.write(Kind.FLASH_ERASE, pipes.PLACE.pack(self.now, offset))
+        (self.now,) = pipes.TIME.unpack(_next(self._pipe)[1])
+
+    def flash_write(self, offset: int, data: bytes) -> None:
+        self._pipe.write(Kind.FLASH_WRITE, pipes.PLACE.pack(self.now, offset), data)
+        (self.now,) = pipes.TIME.unpack(_next(self._pipe)[1])
+
+    def transmit_pending(self) -> int:
+        return self.pending
+
+    def start_application(self) -> None:
+        self._pipe.write(Kind.APPLICATION, pipes.TIME.pack(self.now))
+        os._exit(0)
+
+    def reset(self) -> None:
+        self._pipe.write(Kind.RESET, pipes.TIME.pack(self.now))
+        os._exit(0)
+
+    def log(self, text: str) -> None:
+        self._pipe.write(Kind.LOG, text.encode(errors="replace"))
+
+
+# -- a shared library ------------------------------------------------------------------------------
+
+
+class _Frame(ctypes.Structure):
+    _fields_: ClassVar = [
+        ("can_id", ctypes.c_uint32),
+        *((name, ctypes.c_uint8) for name in ("length", "extended", "remote", "reserved")),
+        ("data", ctypes.c_uint8 * 8),
+    ]
+
+
+class _Facts(ctypes.Structure):
+    _fields_: ClassVar = [
+        *((name, ctypes.c_uint32) for name in ("abi", *list(Facts.__dataclass_fields__)[:-1])),
+        ("name", ctypes.c_char_p),
+    ]
+
+
+_HOST: Final = {
+    "now_us": ctypes.CFUNCTYPE(ctypes.c_uint64),
+    "flash_read": ctypes.CFUNCTYPE(None, ctypes.c_uint32, ctypes.c_void_p, ctypes.c_uint32),
+    "flash_erase": ctypes.CFUNCTYPE(None, ctypes.c_uint32),
+    "flash_write": ctypes.CFUNCTYPE(None, ctypes.c_uint32, ctypes.c_void_p, ctypes.c_uint32),
+    "transmit_pending": ctypes.CFUNCTYPE(ctypes.c_uint32),
+    "start_application": ctypes.CFUNCTYPE(None),
+    "reset": ctypes.CFUNCTYPE(None),
+    "log": ctypes.CFUNCTYPE(None, ctypes.c_char_p),
+}
+
+
+class _HostTable(ctypes.Structure):
+    _fields_: ClassVar = list(_HOST.items())
+
+
+class _Library:
+    """A shared library with the functions of the header, as a `Bootloader`."""
+
+    def __init__(self, path: str) -> None:
+        self._library = library = ctypes.CDLL(path)
+        library.flasher_dut_about.restype = ctypes.POINTER(_Facts)
+        library.flasher_dut_tick.restype = ctypes.c_uint64
+        library.flasher_dut_tick.argtypes = [ctypes.c_uint64]
+        found = library.flasher_dut_about().contents
+        if found.abi != pipes.ABI:
+            raise ValueError(
+                f"it was built with version {found.abi} of flasher_dut.h, and not {pipes.ABI}"
+            )
+        numbers = {name: getattr(found, name) for name in list(Facts.__dataclass_fields__)[:-1]}
+        self.facts = Facts(**numbers, name=(found.name or b"").decode(errors="replace"))
+        self._table: _HostTable | None = None
+        self._out = _Frame()
+
+    def start(self, host: _ProcessHost, cause: int) -> None:
+        def read(offset: int, data: int, size: int) -> None:
+            ctypes.memmove(data, host.flash_read(offset, size), size)
+
+        def write(offset: int, data: int, size: int) -> None:
+            host.flash_write(offset, ctypes.string_at(data, size))
+
+        def log(text: bytes) -> None:
+            host.log(text.decode(errors="replace"))
+
+        own: dict[str, Callable[..., Any]] = {"flash_read": read, "flash_write": write, "log": log}
+        calls = [made(own.get(name) or getattr(host, name)) for name, made in _HOST.items()]
+        self._table = _HostTable(*calls)
+        self._library.flasher_dut_start(ctypes.byref(self._table), cause)
+
+    def receive(self, frame: CanFrame) -> None:
+        packed = _Frame.from_buffer_copy(pipes.pack_frame(frame))
+        self._library.flasher_dut_receive(ctypes.byref(packed))
+
+    def tick(self, now_us: int) -> int | None:
+        return cast("int", self._library.flasher_dut_tick(now_us))
+
+    def next_frame(self) -> CanFrame | None:
+        if not self._library.flasher_dut_next_frame(ctypes.byref(self._out)):
+            return None
+        return pipes.unpack_frame(bytes(self._out))
+
+
+# -- the process -----------------------------------------------------------------------------------
+
+
+def _make(subject: str) -> Bootloader:
+    if os.path.exists(subject):  # noqa: PTH110  as the suite has seen it
+        return cast("Bootloader", _Library(subject))
+    name, _, attribute = subject.partition(":")
+    sys.path.insert(0, os.getcwd())  # noqa: PTH109  as for `python -m`
+    found = importlib.import_module(name)
+    for part in attribute.split("."):
+        found = getattr(found, part)
+    return cast("Callable[[], Bootloader]", found)()
+
+
+def _next(pipe: Pipe) -> tuple[Kind, bytes]:
+    """The next message of the suite; ends the process when the suite has ended."""
+    while (found := pipe.take()) is None:
+        if not pipe.fill():
+            os._exit(0)
+    return found
+
+
+def serve(subject: str, pipe: Pipe) -> Never:
+    """Be one start of the bootloader, to its end: of the library with this path, or of what the
+    function MODULE:FACTORY makes.
+    """
+    bootloader, host = _make(subject), _ProcessHost(pipe)
+    pipe.write(Kind.FACTS, pipes.pack_facts(bootloader.facts))
+    while True:
+        kind, data = _next(pipe)
+        host.now, number = pipes.TURN.unpack_from(data)
+        if kind is Kind.START:
+            bootloader.start(host, number)
+        else:
+            host.pending = number
+            if kind is Kind.RECEIVE:
+                bootloader.receive(pipes.unpack_frame(data[pipes.TURN.size :]))
+        wanted = bootloader.tick(host.now)
+        frames: list[bytes] = []
+        while len(frames) < _FRAMES_MAX and (frame := bootloader.next_frame()) is not None:
+            frames.append(pipes.pack_frame(frame))
+        done = pipes.DONE.pack(host.now, pipes.NEVER if wanted is None else wanted)
+        pipe.write(Kind.DONE, done, *frames)

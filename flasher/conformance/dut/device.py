@@ -1,0 +1,309 @@
+"""The device around a bootloader that is compiled for the computer: flash, CAN controller, power,
+and the application that the bootloader starts.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import deque
+from math import inf
+from struct import Struct
+from typing import Final
+
+from flasher.conformance.dut import CanFrame, pipes
+from flasher.conformance.dut.pipes import Kind
+from flasher.conformance.dut.process import BootloaderError, BootloaderProcess
+from flasher.errors import FlasherError
+from flasher.mock.application import Application
+from flasher.mock.bms import BmsApplication
+from flasher.mock.machine import Machine
+from flasher.mock.memory import Flash
+from flasher.mock.profile import DeviceProfile
+from flasher.mock.store import AREA_START, MemoryMap
+from flasher.protocol import messages
+from flasher.protocol.bittime import frame_bits
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import DIALECTS, Node, Target
+from flasher.protocol.text import find_firmware_version
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.protocol.wire import Damage, Message
+
+POWER_ON: Final = 0
+RESET: Final = 1
+_TICK_S: Final = 0.001
+_RESTART_S: Final = 0.01
+"""From a reset, or from what a watchdog of the chip ends, to the first instruction."""
+_US: Final = 1_000_000
+_MAGIC: Final = b"FLASHERA"
+_HEAD: Final = Struct("<II8sI")
+_STACK: Final = 0x2000_1000
+_ENTRY: Final = AREA_START + 0x101
+_CHECKSUM_SIZE: Final = 4
+
+
+def application_image(version: str, size_bytes: int) -> bytes:
+    """An image for the application that the suite plays: it begins as a program for a Cortex-M
+    does, and can tell whether it is whole.
+    """
+    body = _HEAD.pack(_STACK, _ENTRY, _MAGIC, size_bytes) + version.encode("ascii") + b"\0"
+    body += bytes(index * 7 % 253 for index in range(size_bytes - len(body) - _CHECKSUM_SIZE))
+    return body + zlib.crc32(body).to_bytes(_CHECKSUM_SIZE, "little")
+
+
+def _is_torn(area: bytes) -> bool:
+    """True for nothing at all, and for an image of `application_image` that is not whole."""
+    if len(area) < _HEAD.size:
+        return False
+    _, _, magic, size_bytes = _HEAD.unpack_from(area)
+    if magic != _MAGIC:
+        return bool(magic == b"\xff" * len(_MAGIC))
+    body = area[: size_bytes - _CHECKSUM_SIZE]
+    checksum = area[len(body) : size_bytes]
+    return zlib.crc32(body).to_bytes(_CHECKSUM_SIZE, "little") != checksum
+
+
+class CompiledDevice(Machine):
+    """A device with the bootloader of `process`; an engine. It has no application at first.
+
+    Whatever the flash does not allow, and a bootloader that ends or does not return, raises
+    FlasherError; the device begins anew then, as by a watchdog.
+    """
+
+    def __init__(self, target: Target, process: BootloaderProcess, *, bitrate_bps: int) -> None:
+        self.target = target
+        self._process = process
+        self.facts = facts = process.start()
+        process.kill()
+        self.flash = Flash(
+            AREA_START - facts.application_offset,
+            facts.flash_bytes,
+            page_size_bytes=facts.sector_bytes,
+            program_unit_bytes=facts.write_bytes,
+        )
+        profile = DeviceProfile()
+        application = Application(target.node, DIALECTS[profile.dialect])
+        if target.node is Node.BMS:
+            application = BmsApplication(profile, MemoryMap(self.flash))
+        super().__init__(
+            application,
+            frozenset((target.request_id,)),
+            bitrate_bps=bitrate_bps,
+            timings=DEFAULT_TIMINGS,
+        )
+        self._has_power = False
+        self._received: deque[CanFrame] = deque()
+        self._to_send: deque[Frame] = deque()
+        self._left_at = -inf
+        """When the frame that the bus has taken last is through."""
+        self._busy_until = -inf
+        """The processor is in a call, or waits for the flash."""
+        self._tick_at = inf
+        self._operations = 0
+        self._cut: tuple[int, float, float] | None = None
+        self._cause = POWER_ON
+        self._log: deque[str] = deque(maxlen=3)
+        self.power_on(0.0)
+
+    # -- the engine interface: the bootloader's part, else the machine's ---------------------------
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if self._runs_application:
+            super().receive(frame, now)
+            return
+        if self._off_bus_until is not None:
+            self._rejoin_bus(now)
+        is_deaf = self._off_bus_until is not None or not self._process.is_running
+        if is_deaf or frame.is_error or len(self._received) >= self.facts.receive_frames:
+            return
+        self._received.append(CanFrame(*frame[:4]))
+        self._work(now)
+
+    def tick(self, now: float) -> None:
+        super().tick(now)
+        self._work(now)
+
+    def deadline(self) -> float | None:
+        wanted = [inf if (found := super().deadline()) is None else found]
+        if self._process.is_running:
+            wanted.append(self._busy_until if self._received else self._next_turn_at)
+        if self._to_send:
+            wanted.append(self._busy_until)
+        due_at = min(wanted)
+        return None if due_at == inf else due_at
+
+    def next_frame(self, now: float) -> Frame | None:
+        if self._to_send:
+            return self._to_send[0] if now >= self._busy_until else None
+        return super().next_frame(now)
+
+    def frame_sent(self, now: float) -> None:
+        if self._to_send:
+            self._left_at = now + frame_bits(self._to_send.popleft()) / self._bitrate_bps
+        else:
+            super().frame_sent(now)
+
+    # -- power and reset ---------------------------------------------------------------------------
+
+    @property
+    def has_power(self) -> bool:
+        return self._has_power
+
+    def power_cut(self, now: float) -> None:
+        self._has_power = False
+        self._begin_anew(POWER_ON, inf)
+
+    def power_on(self, now: float) -> None:
+        if not self._has_power:
+            self._has_power = True
+            self._begin_anew(POWER_ON, now)
+
+    def set_cut(self, operation: int, share: float, off_s: float) -> None:
+        """Cut the power when `share` (0 to 1) of the flash operation number `operation` from now
+        on is done, for `off_s` seconds.
+        """
+        self._operations = 0
+        self._cut = (operation, share, off_s)
+
+    def take_cut(self) -> bool:
+        """True when the cut has happened; one that has not is cancelled."""
+        happened, self._cut = self._cut is None, None
+        return happened
+
+    def bus_off(self, now: float, off_s: float = 0.02) -> None:
+        super().bus_off(now, off_s)
+        self._to_send.clear()
+        self._received.clear()
+
+    def readback(self) -> bytes:
+        """The application area."""
+        return self.flash.read(AREA_START, self.facts.application_bytes)
+
+    def _begin_anew(self, cause: int, at: float) -> None:
+        """RAM and all that was under way are lost; the bootloader starts at that time."""
+        self._process.kill()
+        if self._runs_application:
+            self.application.stop()
+        self._runs_application = False
+        self._lose_memory()
+        self._received.clear()
+        self._to_send.clear()
+        self._busy_until = -inf
+        self._tick_at = inf
+        self._cause = cause
+        self._due_at = at
+
+    def _expire(self, now: float) -> None:
+        """The time to start has come: after a reset, or as the power is there."""
+        self._due_at = inf
+        if self._runs_application:
+            self._begin_anew(RESET, now)
+            self._due_at = inf
+        self._has_power = True
+        self._process.start()
+        self._call(Kind.START, self._cause, now)
+
+    # -- the running application -------------------------------------------------------------------
+
+    def _take_message(self, message: Message, now: float) -> None:
+        row = messages.decode(message) if message.can_id == self.target.request_id else None
+        if isinstance(row, messages.Reset):
+            self.send(messages.GeneralFeedback().to_message(self.target.answer_id))
+            self._due_at = now + _RESTART_S
+        else:
+            self.application.take(message, now)
+
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        pass
+
+    def _start_application(self, now: float) -> None:
+        area = self.readback()
+        if _is_torn(area):
+            self._begin_anew(POWER_ON, inf)  # whatever it does, nobody can rely on it
+            raise FlasherError("the bootloader started an application that is not whole")
+        self._begin_anew(RESET, inf)
+        self._runs_application = True
+        self.application.start(find_firmware_version(area.rstrip(b"\xff")) or "unknown", now)
+
+    # -- the bootloader ----------------------------------------------------------------------------
+
+    @property
+    def _next_turn_at(self) -> float:
+        return max(self._tick_at, self._busy_until)
+
+    def _work(self, now: float) -> None:
+        """Hand over what was received, and give it its turn, unless it is busy."""
+        while self._process.is_running and self._received and now >= self._busy_until:
+            frame = pipes.pack_frame(self._received.popleft())
+            self._call(Kind.RECEIVE, self._pending(now), now, frame)
+        if self._process.is_running and now >= self._next_turn_at:
+            self._call(Kind.TICK, self._pending(now), now)
+
+    def _pending(self, now: float) -> int:
+        return len(self._to_send) + (now < self._left_at)
+
+    def _call(self, kind: Kind, number: int, now: float, frame: bytes = b"") -> None:
+        try:
+            answer = self._process.call(
+                kind, pipes.TURN.pack(round(now * _US), number), frame, during=self._hardware
+            )
+        except FlasherError as error:
+            self._begin_anew(RESET, now + _RESTART_S)
+            if isinstance(error, BootloaderError) and self._log:
+                said = "; ".join(self._log)
+                raise BootloaderError(
+                    f"{error.what}; it had logged: {said}", cause=error.cause
+                ) from error
+            raise
+        if answer is None:
+            return
+        how, data = answer
+        if how is Kind.APPLICATION:
+            self._start_application(now)
+        elif how is Kind.RESET:
+            self._begin_anew(RESET, now + _RESTART_S)
+        else:
+            left_us, wanted_us = pipes.DONE.unpack_from(data)
+            self._busy_until = max(now, left_us / _US)
+            self._tick_at = inf
+            if wanted_us != pipes.NEVER:
+                is_later = wanted_us > left_us
+                self._tick_at = wanted_us / _US if is_later else self._busy_until + _TICK_S
+            if self._off_bus_until is None:
+                size = pipes.FRAME.size
+                for at in range(pipes.DONE.size, len(data), size):
+                    made = pipes.unpack_frame(data[at : at + size])
+                    self._to_send.append(Frame(*made[:4]))
+
+    def _hardware(self, asked: Kind, data: bytes) -> bytes | None:
+        """What a function of the hardware gives; None for no answer."""
+        if asked is Kind.LOG:
+            self._log.append(data.decode(errors="replace"))
+            return None
+        if asked is Kind.FLASH_READ:
+            offset, size_bytes = pipes.RANGE.unpack(data)
+            return self.flash.read(self.flash.start + offset, size_bytes)
+        now_us, offset = pipes.PLACE.unpack_from(data)
+        address, content = self.flash.start + offset, data[pipes.PLACE.size :]
+        is_erase = asked is Kind.FLASH_ERASE
+        units = len(content) // self.facts.write_bytes
+        takes_us = self.facts.erase_us if is_erase else units * self.facts.write_us
+        if self._is_cut_here():
+            _, share, off_s = self._cut or (0, 0.0, 0.0)
+            self._cut = None
+            if is_erase:
+                self.flash.tear_erase(address, share)
+            else:
+                self.flash.tear_program(address, content, share)
+            self.power_cut(now_us / _US)
+            self._due_at = (now_us + share * takes_us) / _US + off_s
+            return None
+        if is_erase:
+            self.flash.erase_page(address)
+        else:
+            self.flash.program(address, content)
+        return pipes.TIME.pack(now_us + takes_us)
+
+    def _is_cut_here(self) -> bool:
+        """Counts flash operations; True for the one at which the power is to be cut."""
+        self._operations += 1
+        return self._cut is not None and self._operations == self._cut[0] + 1

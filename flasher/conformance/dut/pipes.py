@@ -1,0 +1,121 @@
+"""The messages between the suite and the process of a bootloader; their meaning stands in
+`flasher_dut_process.c`.
+"""
+
+from __future__ import annotations
+
+import os
+from enum import Enum
+from struct import Struct
+from typing import Final
+
+from flasher.conformance.dut import CanFrame, Facts
+
+ABI: Final = 1
+HEADER: Final = Struct("<B3xI")
+FACTS: Final = Struct("<9I")
+START: Final = Struct("<QI")
+TURN: Final = Struct("<QI")
+FRAME: Final = Struct("<IBBBx8s")
+RANGE: Final = Struct("<II")
+PLACE: Final = Struct("<QI")
+TIME: Final = Struct("<Q")
+DONE: Final = Struct("<QQ")
+NEVER: Final = 0xFFFF_FFFF_FFFF_FFFF
+"""The next tick of a bootloader that waits for a frame."""
+_READ_SIZE: Final = 1 << 16
+
+
+class Kind(Enum):
+    """The first byte of a message."""
+
+    FACTS = ord("f")
+    START = ord("S")
+    RECEIVE = ord("R")
+    TICK = ord("T")
+    FLASH_READ = ord("r")
+    FLASH_DATA = ord("d")
+    FLASH_ERASE = ord("e")
+    FLASH_WRITE = ord("w")
+    FLASH_DONE = ord("k")
+    LOG = ord("l")
+    APPLICATION = ord("a")
+    RESET = ord("z")
+    DONE = ord(".")
+
+
+class Pipe:
+    """Two file descriptors as a way for messages."""
+
+    def __init__(self, read_fd: int, write_fd: int) -> None:
+        self.read_fd = read_fd
+        self._write_fd = write_fd
+        self._buffer = bytearray()
+
+    def write(self, kind: Kind, *parts: bytes) -> None:
+        """Send a message. Raises BrokenPipeError when the other side has ended."""
+        data = b"".join(parts)
+        view = memoryview(HEADER.pack(kind.value, len(data)) + data)
+        while view:
+            view = view[os.write(self._write_fd, view) :]
+
+    def take(self) -> tuple[Kind, bytes] | None:
+        """A message that has arrived whole; None without one. Raises ValueError for bytes that are
+        no message.
+        """
+        if len(self._buffer) < HEADER.size:
+            return None
+        kind, size = HEADER.unpack_from(self._buffer)
+        end = HEADER.size + size
+        if len(self._buffer) < end:
+            return None
+        data = bytes(self._buffer[HEADER.size : end])
+        del self._buffer[:end]
+        return Kind(kind), data
+
+    def fill(self) -> bool:
+        """Wait for more bytes; False when the other side has ended."""
+        data = os.read(self.read_fd, _READ_SIZE)
+        self._buffer += data
+        return bool(data)
+
+    def close(self) -> None:
+        """Close both descriptors."""
+        os.close(self.read_fd)
+        os.close(self._write_fd)
+
+
+def pack_frame(frame: CanFrame) -> bytes:
+    """The 16 bytes of a frame."""
+    length = len(frame.data) if frame.length is None else frame.length
+    return FRAME.pack(frame.can_id, length, frame.is_extended, frame.is_remote, frame.data)
+
+
+def unpack_frame(data: bytes) -> CanFrame:
+    """The frame of 16 bytes."""
+    can_id, length, is_extended, is_remote, content = FRAME.unpack(data)
+    payload = b"" if is_remote else content[:length]
+    return CanFrame(can_id, payload, bool(is_extended), bool(is_remote), length)
+
+
+def pack_facts(facts: Facts) -> bytes:
+    """The content of a message with facts."""
+    numbers = (
+        *(ABI, facts.flash_bytes, facts.sector_bytes, facts.write_bytes),
+        *(facts.application_offset, facts.application_bytes),
+        *(facts.erase_us, facts.write_us, facts.receive_frames),
+    )
+    return FACTS.pack(*numbers) + facts.name.encode()
+
+
+def unpack_facts(data: bytes) -> Facts:
+    """The facts of such a content. Raises ValueError for another version, or what cannot be."""
+    if len(data) < FACTS.size:
+        raise ValueError("the facts are cut off")
+    abi, *numbers = FACTS.unpack_from(data)
+    if abi != ABI:
+        raise ValueError(f"it was built with version {abi} of flasher_dut.h, and not {ABI}")
+    names = list(Facts.__dataclass_fields__)
+    return Facts(
+        **dict(zip(names, numbers, strict=False)), name=data[FACTS.size :].decode(errors="replace")
+    )

@@ -1,0 +1,184 @@
+"""The process of a bootloader, as the suite sees it: started, called, killed, and watched."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import tempfile
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final, Never
+
+from flasher.conformance.dut import Facts, pipes
+from flasher.conformance.dut.pipes import Kind, Pipe
+from flasher.errors import FlasherError, UsageError, printable
+
+WATCHDOG_S: Final = 5.0
+"""A call that takes longer on the computer does not return."""
+_WAIT_S: Final = 0.01
+_SAID_SIZE: Final = 4096
+_STDIN, _STDOUT, _STDERR = range(3)
+_LIBRARY: Final = frozenset((".so", ".dylib"))
+
+
+class BootloaderError(FlasherError):
+    """The process of the bootloader ended, or had to be ended, where it had to go on."""
+
+
+class BootloaderProcess:
+    """Starts of one bootloader, one after another, each in a process of its own. `subject` is a
+    program or a shared library by its path, or MODULE:FACTORY. Raises UsageError for what is none.
+    """
+
+    def __init__(self, subject: str) -> None:
+        if not hasattr(os, "fork"):
+            raise UsageError(
+                "A bootloader under test needs a system with fork and pipes.",
+                remedy="Use Linux, macOS, or WSL on Windows.",
+            )
+        self.subject = subject
+        path = Path(subject)
+        self._is_program = path.is_file() and not _LIBRARY.intersection(path.suffixes)
+        if not path.is_file() and ":" not in subject:
+            raise UsageError(
+                f"There is no bootloader {printable(subject)}.",
+                cause="it is neither a file nor MODULE:FACTORY",
+                remedy="Name a program, a shared library, or a function that makes a bootloader, "
+                "as package.module:make.",
+            )
+        if self._is_program and not os.access(path, os.X_OK):
+            raise UsageError(
+                f"{printable(subject)} is no program and no shared library.",
+                remedy="Link it with flasher_dut_process.c, or as a shared library (.so).",
+            )
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115  lives as long as this object
+        self._process: int | None = None
+        self._pipe = Pipe(-1, -1)
+        self._poll = select.poll()
+
+    @property
+    def is_running(self) -> bool:
+        """True from a start until the process has ended."""
+        return self._process is not None
+
+    def start(self) -> Facts:
+        """Begin a process; returns what it says of the device. Raises BootloaderError, and
+        UsageError for one that does not talk as it has to.
+        """
+        self.kill()
+        self._stderr.seek(0)
+        self._stderr.truncate()
+        read_fd, its_write_fd = os.pipe()
+        its_read_fd, write_fd = os.pipe()
+        self._process = os.fork()
+        if not self._process:
+            os.close(read_fd)
+            os.close(write_fd)
+            self._be_bootloader(its_read_fd, its_write_fd)
+        os.close(its_read_fd)
+        os.close(its_write_fd)
+        self._pipe = Pipe(read_fd, write_fd)
+        self._poll.register(read_fd, select.POLLIN)
+        try:
+            kind, data = self._next("flasher_dut_about")
+            if kind is not Kind.FACTS:
+                raise ValueError("its first message holds no facts")  # noqa: TRY301
+            return pipes.unpack_facts(data)
+        except ValueError as error:
+            self.kill()
+            raise UsageError(
+                f"{printable(self.subject)} is no bootloader for the suite: {error}.",
+                cause=self.said(),
+                remedy="Build it with the two files that `flasher conformance header` writes.",
+            ) from error
+
+    def call(
+        self, kind: Kind, *parts: bytes, during: Callable[[Kind, bytes], bytes | None]
+    ) -> tuple[Kind, bytes] | None:
+        """Call the bootloader, and answer with `during` what it asks of its hardware meanwhile.
+
+        Returns how the call ended (DONE, APPLICATION, RESET) and what was said with it; None when
+        `during` killed the process. Raises BootloaderError when it ends, or does not return.
+        """
+        doing = f"flasher_dut_{kind.name.lower()}"
+        try:
+            self._pipe.write(kind, *parts)
+            while True:
+                asked, data = self._next(doing)
+                if asked is Kind.DONE:
+                    return asked, data
+                if asked in {Kind.APPLICATION, Kind.RESET}:
+                    self.kill()
+                    return asked, data
+                reply = during(asked, data)
+                if not self.is_running:
+                    return None
+                if reply is not None:
+                    is_read = asked is Kind.FLASH_READ
+                    self._pipe.write(Kind.FLASH_DATA if is_read else Kind.FLASH_DONE, reply)
+        except (BrokenPipeError, ValueError):
+            raise self._died(doing) from None
+
+    def kill(self) -> int | None:
+        """End the process at once, as a power cut does; returns how it ended, None without one."""
+        process, self._process = self._process, None
+        if process is None:
+            return None
+        self._poll.unregister(self._pipe.read_fd)
+        self._pipe.close()
+        os.kill(process, signal.SIGKILL)  # until it is waited for, its number is its own
+        return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+
+    def close(self) -> None:
+        """End the process, and forget what it printed."""
+        self.kill()
+        self._stderr.close()
+
+    def said(self) -> str:
+        """What the process printed, the report of a sanitizer for instance; "" for nothing."""
+        self._stderr.seek(0)
+        lines = self._stderr.read(_SAID_SIZE).decode(errors="replace").splitlines()
+        return " | ".join(printable(line) for line in lines if line.strip(" ="))
+
+    def _be_bootloader(self, read_fd: int, write_fd: int) -> Never:
+        """In the process of the bootloader: become it."""
+        try:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the suite
+            os.dup2(self._stderr.fileno(), _STDERR)
+            if self._is_program:
+                os.dup2(read_fd, _STDIN)
+                os.dup2(write_fd, _STDOUT)
+                os.execv(self.subject, [self.subject])  # noqa: S606  what the user named
+            os.dup2(_STDERR, _STDOUT)  # what it prints is no message
+            from flasher.conformance.dut.child import serve  # noqa: PLC0415  only here
+
+            serve(self.subject, Pipe(read_fd, write_fd))
+        except BaseException:  # noqa: BLE001  nothing of the suite may go on in this process
+            os.write(_STDERR, traceback.format_exc(limit=-2).encode())
+        finally:
+            os._exit(1)
+
+    def _next(self, doing: str) -> tuple[Kind, bytes]:
+        while (found := self._pipe.take()) is None:
+            if not self._poll.poll(WATCHDOG_S * 1000):
+                self.kill()
+                raise BootloaderError(
+                    f"the bootloader did not return from {doing} within {WATCHDOG_S:g} s of the "
+                    "computer's time, and was ended"
+                )
+            if not self._pipe.fill():
+                raise self._died(doing)
+        return found
+
+    def _died(self, doing: str) -> BootloaderError:
+        """The process has ended, or talks nonsense: what it was, with what it printed."""
+        assert self._process is not None  # noqa: S101  it was started
+        for _ in range(round(WATCHDOG_S / _WAIT_S)):  # its pipe is closed a little sooner
+            if os.waitid(os.P_PID, self._process, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+                break
+            select.select([], [], [], _WAIT_S)
+        status = self.kill() or 0
+        how = f"by {signal.Signals(-status).name}" if status < 0 else f"with status {status}"
+        return BootloaderError(f"the bootloader ended {how} in {doing}", cause=self.said())

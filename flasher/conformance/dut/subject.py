@@ -1,0 +1,99 @@
+"""A bootloader that is compiled for the computer as a subject, on a simulated bus."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import replace
+from typing import Final
+
+from flasher.conformance.dut.device import CompiledDevice, application_image
+from flasher.conformance.dut.process import BootloaderError, BootloaderProcess
+from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.results import Unsupported
+from flasher.conformance.simulated import CRASHES, SimulatedPort
+from flasher.errors import UsageError, printable
+from flasher.protocol.spec import TARGETS, WELLING
+
+_GOOD: Final = ("V2r0r1_20240131", 10 * 128 - 3)
+_SECOND: Final = ("V1r9r0_20230517", 6 * 128)
+
+
+class CompiledSubject:
+    """A device with that bootloader, with power, readback and cuts in flash operations. Without
+    images it gets those that the suite's own application runs.
+    """
+
+    has_power = True
+    has_readback = True
+    has_bus_off = True
+    has_timed_cuts = True
+
+    def __init__(
+        self,
+        process: BootloaderProcess,
+        target: str,
+        *,
+        good_image: bytes | None = None,
+        second_image: bytes | None = None,
+    ) -> None:
+        if target not in TARGETS:
+            raise Unsupported(f"there is no target {target}")
+        self.target = target
+        self.port = SimulatedPort(WELLING.bitrate_bps)
+        self.device = CompiledDevice(TARGETS[target], process, bitrate_bps=WELLING.bitrate_bps)
+        facts = self.device.facts
+        self.name = f"{facts.name or 'the bootloader'} ({process.subject})"
+        self.good_image = good_image or application_image(*_GOOD)
+        # The built-in second image belongs to the built-in good one.
+        self.second_image = second_image or (None if good_image else application_image(*_SECOND))
+        self.port.bus.attach(self.device)
+
+    def power(self, *, on: bool) -> None:
+        with CRASHES:
+            if on:
+                self.device.power_on(self.port.now())
+            else:
+                self.device.power_cut(self.port.now())
+
+    def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
+        self.device.set_cut(operation, share, off_s)
+
+    def take_cut(self) -> bool:
+        return self.device.take_cut()
+
+    def readback(self) -> bytes:
+        return self.device.readback()
+
+    def bus_off(self, for_s: float) -> None:
+        self.device.bus_off(self.port.now(), for_s)
+
+
+@contextmanager
+def open_subject(
+    what: str,
+    target: str,
+    profile: ConformanceProfile | None,
+    *,
+    good_image: bytes | None,
+    second_image: bytes | None,
+) -> Iterator[tuple[CompiledSubject, ConformanceProfile]]:
+    """The bootloader `what` (`BootloaderProcess`) and the profile, with the sizes that it tells
+    where the profile leaves them open. Raises UsageError.
+    """
+    with closing(BootloaderProcess(what)) as process:
+        try:
+            subject = CompiledSubject(
+                process, target, good_image=good_image, second_image=second_image
+            )
+        except BootloaderError as error:
+            raise UsageError(
+                f"{printable(what)} does not start: {error.what}.",
+                cause=error.cause,
+                remedy="Build it with the two files that `flasher conformance header` writes.",
+            ) from error
+        profile = profile or ConformanceProfile()
+        size_bytes = subject.device.facts.application_bytes
+        area_bytes = profile.given.get("device.application_bytes", size_bytes)
+        told = {"device.application_bytes": size_bytes, "device.largest_image_bytes": area_bytes}
+        yield subject, replace(profile, given={**told, **profile.given})

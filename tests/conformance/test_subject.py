@@ -1,0 +1,192 @@
+"""A bootloader under test in a process of its own: `--subject`."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from flasher.conformance.catalogue import Selection
+from flasher.conformance.dut.pipes import FACTS, HEADER, Kind
+from flasher.conformance.dut.subject import open_subject
+from flasher.conformance.results import CaseVerdict, RunReport
+from flasher.conformance.runner import run
+from flasher.errors import UsageError
+from tests.cli.conftest import Flasher
+from tests.peers.python_bootloader import PythonBootloader
+
+_HERE = "tests.peers.python_bootloader:PythonBootloader"
+_FLAWS = "tests.conformance.test_subject:"
+
+
+class Hangs(PythonBootloader):
+    def receive(self, frame: object) -> None:
+        while self._stored == 2:
+            pass
+        super().receive(frame)  # type: ignore[arg-type]
+
+
+class Raises(PythonBootloader):
+    def _end(self) -> None:
+        self.host.log("about to divide")
+        self._size //= 0
+
+
+class WritesTwice(PythonBootloader):
+    def _store(self, data: bytes) -> None:
+        super()._store(data)
+        self.host.flash_write(0x1000, bytes(8))
+
+
+class ReadsOutside(PythonBootloader):
+    def _end(self) -> None:
+        self.host.flash_read(0xFFF0, 32)
+
+
+class StartsWhatIsTorn(PythonBootloader):
+    """Trusts a record that it writes before the packets."""
+
+    def _begin(self, size: int) -> None:
+        super()._begin(size)
+        self.host.flash_erase(0)
+        self.host.flash_write(0, bytes(8))
+
+    def _end(self) -> None:
+        self._send(b"\xc5\x02", bytes(2))
+        self._is_starting = True
+
+    def _is_whole(self) -> bool:
+        return self.host.flash_read(0, 8) == bytes(8)
+
+
+class WaitsForTheClock(PythonBootloader):
+    """Polls the time, as code without timers does."""
+
+    def _send(self, command: bytes, data: bytes) -> None:
+        began_at = self.host.now_us()
+        while self.host.now_us() < began_at + 1000:
+            pass
+        super()._send(command, data)
+
+
+class LosesComplete(PythonBootloader):
+    """Starts the application while its last answer is on its way."""
+
+    def _end(self) -> None:
+        super()._end()
+        self.host.start_application()
+
+
+class Restarts(PythonBootloader):
+    """Resets itself in the midst of a transfer."""
+
+    def _store(self, data: bytes) -> None:
+        if self._stored == 3:
+            self.host.reset()
+        super()._store(data)
+
+
+def _run(subject: str, *cases: str) -> RunReport:
+    with open_subject(subject, "bms", None, good_image=None, second_image=None) as (
+        device,
+        profile,
+    ):
+        return run(device, profile, selection=Selection(cases))
+
+
+def _failures(report: RunReport) -> str:
+    return " / ".join(
+        result.reason for result in report.results if result.verdict is CaseVerdict.FAIL
+    )
+
+
+def test_a_bootloader_that_follows_the_document_passes() -> None:
+    report = _run(_HERE, "RS-01", "TX-01", "EN-07", "PW-01", "BU-02")
+    assert [result.verdict for result in report.results] == [CaseVerdict.PASS] * 5
+    assert report.ok
+
+
+def test_time_passes_for_one_that_polls_the_clock() -> None:
+    assert _run(_FLAWS + "WaitsForTheClock", "EN-01").ok
+
+
+@pytest.mark.parametrize(
+    ("flaw", "case_id", "found"),
+    [
+        ("Raises", "EN-01", "ended with status 1 in flasher_dut_receive; it had logged: about to"),
+        ("Raises", "EN-01", "ZeroDivisionError"),
+        ("WritesTwice", "EN-01", "programmed without having been erased"),
+        ("ReadsOutside", "EN-01", "32 bytes at 0x08016FF0 lie outside"),
+        ("StartsWhatIsTorn", "PW-01", "an application that is not whole"),
+        ("LosesComplete", "EN-01", "expected complete"),
+        ("Restarts", "EN-01", "boot version"),
+    ],
+)
+def test_what_a_chip_does_not_allow_is_a_finding(flaw: str, case_id: str, found: str) -> None:
+    report = _run(_FLAWS + flaw, case_id)
+    assert found in _failures(report) + report.not_upgradable + report.stopped
+
+
+def test_a_call_that_does_not_return_is_ended_and_is_a_finding(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("flasher.conformance.dut.process.WATCHDOG_S", 0.2)
+    report = _run(_FLAWS + "Hangs", "TX-06")
+    found = _failures(report) + report.not_upgradable + report.stopped
+    assert "did not return from flasher_dut_receive" in found
+
+
+def test_no_process_is_left_behind() -> None:
+    with open_subject(_HERE, "bms", None, good_image=None, second_image=None) as (device, _):
+        device.power(on=True)
+        device.port.receive(0.01)
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, os.WNOHANG)
+
+
+@pytest.mark.parametrize(
+    ("subject", "said"),
+    [
+        ("missing", "There is no bootloader missing"),
+        ("nowhere:make", "No module named 'nowhere'"),
+        (_FLAWS + "nothing", "has no attribute 'nothing'"),
+        ("README.md", "no program and no shared library"),
+        (shutil.which("true") or "", "ended with status 0 in flasher_dut_about"),
+    ],
+)
+def test_what_is_no_bootloader_is_said_at_once(subject: str, said: str) -> None:
+    with pytest.raises(UsageError) as raised:
+        _run(subject, "RS-01")
+    assert said in f"{raised.value} {raised.value.cause}"
+
+
+def test_a_program_of_another_version_of_the_header_is_refused(tmp_path: Path) -> None:
+    program = tmp_path / "boot"
+    facts = HEADER.pack(Kind.FACTS.value, FACTS.size) + FACTS.pack(2, *8 * [0])
+    program.write_text(f"#!{sys.executable}\nimport os\nos.write(1, {facts!r})\nos.read(0, 1)\n")
+    program.chmod(0o755)
+    with pytest.raises(UsageError, match="built with version 2"):
+        _run(str(program), "RS-01")
+
+
+def test_the_command_line_tests_it(flasher: Flasher) -> None:
+    ran = flasher("conformance", "-t", "bms", "--subject", _HERE, "--case", "RS-01", "--json")
+    assert ran.code == 0
+    assert ran.document["report"]["subject"] == f"python bootloader ({_HERE})"
+
+
+def test_the_mock_and_a_bootloader_exclude_each_other(flasher: Flasher) -> None:
+    ran = flasher("conformance", "-t", "bms", "--subject", _HERE, "--mock")
+    assert ran.code == 2
+    assert "choose one of the two" in ran.err
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+def test_the_c_files_that_are_written_compile(flasher: Flasher, tmp_path: Path) -> None:
+    assert flasher("conformance", "header", str(tmp_path)).code == 0
+    strict = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror")
+    subprocess.run(["cc", *strict, "-c", "flasher_dut_process.c"], cwd=tmp_path, check=True)
