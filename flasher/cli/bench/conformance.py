@@ -10,11 +10,12 @@ from datetime import UTC, datetime
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import click
 
 from flasher.cli import values
+from flasher.cli.bench.conformance_bench import BenchChoices, bench_options, set_option
 from flasher.cli.bench.conformance_text import (
     ListedCase,
     difference_lines,
@@ -23,20 +24,15 @@ from flasher.cli.bench.conformance_text import (
 )
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import argument, group, option, option_set, retyped
-from flasher.cli.options import Bus, adapter_options, allow_implausible_option, target_option
+from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
 from flasher.conformance.catalogue import GROUPS, Selection
 from flasher.conformance.diff import THRESHOLD_PERCENT, Difference, compare, read_report
 from flasher.conformance.json_report import ReportDocument
-from flasher.conformance.real import HOST_UNCERTAINTY_S
 from flasher.conformance.results import CaseVerdict, CheckOutcome, RunReport
 from flasher.errors import ExitCode, UsageError
-from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
-
-if TYPE_CHECKING:
-    from flasher.conformance.opening import BenchOptions
 
 _EXAMPLES: Final = """\
 examples:
@@ -122,20 +118,8 @@ DOCUMENTS: Final = (
 
 @dataclass(frozen=True)
 class Choices:
-    """The device under test, what is run, and the files that are written."""
+    """What is run, and the files that are written."""
 
-    target: Target | None
-    profile: str | None
-    good_image: str | None
-    second_image: str | None
-    allow_implausible: bool
-    power_cmd: str | None
-    readback_cmd: str | None
-    uncertainty: float
-    mock: bool
-    subject: str | None
-    variant: str | None
-    choices: tuple[str, ...]
     is_list: bool
     cases: tuple[str, ...]
     groups: tuple[str, ...]
@@ -155,52 +139,11 @@ class Choices:
         return Selection(self.cases, self.groups, quick=self.quick)
 
 
-_bench = partial(option, panel="device under test")
-_without_hardware = partial(option, panel="without hardware")
 _what = partial(option, panel="what is run, and how")
 _report = partial(option, metavar="FILE", type=values.FilePath(gives=Path), panel="reports")
-_image = partial(_bench, metavar="IMAGE", type=values.FilePath(*values.IMAGE_SUFFIXES))
-_set_option: Final = _without_hardware(
-    "--set", "choices", multiple=True, metavar="KEY=VALUE",
-    help="set a choice of the model, see `flasher mock --help`; may be repeated",
-)  # fmt: skip
 _choices = option_set(
     "chosen",
     Choices,
-    target_option(required=False),
-    _bench(
-        "--profile", metavar="FILE", type=values.FilePath("toml"), brief=True,
-        help="the product's choices and limits (TOML)",
-    ),
-    _image("--good-image", brief=True, help="an image that runs on the device"),
-    _image("--second-image", help="another one, smaller, of another version"),
-    allow_implausible_option("device under test"),
-    _bench(
-        "--power-cmd", metavar="COMMAND",
-        help="command that switches the device, as 'relay 3 {on|off}'",
-    ),
-    _bench(
-        "--readback-cmd", metavar="COMMAND",
-        help="command that dumps the application area, as 'dump {file}'",
-    ),
-    _bench(
-        "--uncertainty", type=values.seconds, default=HOST_UNCERTAINTY_S, metavar="SECONDS",
-        help="how far the adapter's and the computer's times may be off",
-    ),
-    _without_hardware(
-        "--mock", is_flag=True, brief=True,
-        help="test the device model in this process; takes no time",
-    ),
-    _without_hardware(
-        "--subject", metavar="BOOTLOADER", brief=True,
-        help="test a bootloader that is compiled for the computer: a program, a shared library, or "
-        "MODULE:FACTORY; see `flasher conformance header`",
-    ),
-    _without_hardware(
-        "--variant", metavar="NAME",
-        help="one that is wrong, see `flasher mock --list-variants`",
-    ),
-    _set_option,
     _what("--list", "is_list", is_flag=True, brief=True, help="list the cases, and end"),
     _what(
         "--case", "cases", multiple=True, type=str.upper, metavar="ID", brief=True,
@@ -241,9 +184,10 @@ _choices = option_set(
     ),
     runs_alone=True,
 )  # fmt: skip
+@bench_options
 @_choices
 @adapter_options
-def conformance(output: Output, bus: Bus, chosen: Choices) -> int:
+def conformance(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> int:
     """Test a bootloader against the protocol, case by case: on a device on a bench, or on the
     built-in device model. Every case begins with a device that runs the known-good image; at the
     end that image is flashed once more and verified. The device is erased and written many times.
@@ -254,13 +198,14 @@ def conformance(output: Output, bus: Bus, chosen: Choices) -> int:
     from flasher.conformance.opening import open_bench  # noqa: PLC0415
     from flasher.conformance.runner import RunOptions, run  # noqa: PLC0415
 
-    bench = _checked_bench(chosen, bus)
+    described = bench.described(bus)
+    _check_files(chosen)
     stopping = lambda: output.progress(  # noqa: E731
         "stopping: the device gets its good image back; press again to end at once"
     )
     started_at = datetime.now(UTC).isoformat(timespec="seconds")
     with (
-        open_bench(bench) as (subject, profile),
+        open_bench(described) as (subject, profile),
         stop_on_signal(stopping) as stopped,
         progress(output) as observer,
     ):
@@ -278,41 +223,8 @@ def conformance(output: Output, bus: Bus, chosen: Choices) -> int:
     return code
 
 
-def _checked_bench(chosen: Choices, bus: Bus) -> BenchOptions:
-    """The bench that the options describe; makes sure that all files can be written. Raises
-    UsageError.
-    """
-    from flasher.conformance.opening import BenchOptions, check_bench  # noqa: PLC0415
-    from flasher.conformance.real import PowerCommand, ReadbackCommand  # noqa: PLC0415
-
-    if chosen.target is None:
-        raise UsageError(
-            "flasher conformance: -t/--target is required.", remedy="Write -t wmc, bms or obc."
-        )
-    for name, value in {"--variant": chosen.variant, "--set": chosen.choices}.items():
-        if value and not chosen.mock:
-            raise UsageError(f"{name} works with --mock only.")
-    without = "--mock" if chosen.mock else "--subject" if chosen.subject else ""
-    bench_only = {"--power-cmd": chosen.power_cmd, "--readback-cmd": chosen.readback_cmd}
-    for name, value in bench_only.items():
-        if value and without:
-            raise UsageError(f"{name} works without {without} only.")
-    bench = BenchOptions(
-        target=chosen.target.name,
-        is_mock=chosen.mock,
-        subject=chosen.subject,
-        variant=chosen.variant,
-        choices=chosen.choices,
-        profile=chosen.profile,
-        good_image=chosen.good_image,
-        second_image=chosen.second_image,
-        allow_implausible=chosen.allow_implausible,
-        bus=bus.config,
-        power=None if chosen.power_cmd is None else PowerCommand(chosen.power_cmd),
-        readback=None if chosen.readback_cmd is None else ReadbackCommand(chosen.readback_cmd),
-        uncertainty_s=chosen.uncertainty,
-    )
-    check_bench(bench)
+def _check_files(chosen: Choices) -> None:
+    """Make sure that all files can be written. Raises UsageError."""
     for name, option_name in _FILES.items():
         if getattr(chosen, name) is not None:
             check_writable(getattr(chosen, name), option_name)
@@ -322,7 +234,6 @@ def _checked_bench(chosen: Choices, bus: Bus) -> BenchOptions:
         except OSError as error:
             said = f"{printable(str(chosen.trace_dir))} cannot be made: {error.strerror}."
             raise UsageError(said, where=_TRACE_DIR) from error
-    return bench
 
 
 def _tell(
@@ -458,7 +369,7 @@ def diff(output: Output, *, old: Path, new: Path, threshold: float, strict: bool
 
 @conformance.action("profile", exit_codes=())
 @option("--mock", is_flag=True, help="what the built-in device model would have")
-@_set_option
+@set_option
 def profile(output: Output, *, mock: bool, choices: tuple[str, ...]) -> int:
     """Print a profile with every key explained."""
     from flasher.conformance.profile import ConformanceProfile, profile_keys  # noqa: PLC0415

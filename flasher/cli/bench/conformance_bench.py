@@ -1,0 +1,117 @@
+"""The device under test, as the options of `flasher conformance` describe it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from flasher.cli import values
+from flasher.cli.framework import option, option_set
+from flasher.cli.options import Bus, allow_implausible_option, target_option
+from flasher.conformance.real import HOST_UNCERTAINTY_S
+from flasher.errors import UsageError
+from flasher.protocol.spec import Target
+
+if TYPE_CHECKING:
+    from flasher.conformance.opening import BenchOptions
+
+
+@dataclass(frozen=True)
+class BenchChoices:
+    """The device under test."""
+
+    target: Target | None
+    profile: str | None
+    good_image: str | None
+    second_image: str | None
+    allow_implausible: bool
+    power_cmd: str | None
+    readback_cmd: str | None
+    uncertainty: float
+    mock: bool
+    subject: str | None
+    variant: str | None
+    choices: tuple[str, ...]
+
+    def described(self, bus: Bus) -> BenchOptions:
+        """The bench. Raises UsageError for one that makes no sense."""
+        from flasher.conformance.opening import BenchOptions, check_bench  # noqa: PLC0415
+        from flasher.conformance.real import PowerCommand, ReadbackCommand  # noqa: PLC0415
+
+        if self.target is None:
+            raise UsageError(
+                "flasher conformance: -t/--target is required.", remedy="Write -t wmc, bms or obc."
+            )
+        for name, value in {"--variant": self.variant, "--set": self.choices}.items():
+            if value and not self.mock:
+                raise UsageError(f"{name} works with --mock only.")
+        without = "--mock" if self.mock else "--subject" if self.subject else ""
+        bench_only = {"--power-cmd": self.power_cmd, "--readback-cmd": self.readback_cmd}
+        for name, value in bench_only.items():
+            if value and without:
+                raise UsageError(f"{name} works without {without} only.")
+        bench = BenchOptions(
+            target=self.target.name,
+            is_mock=self.mock,
+            subject=self.subject,
+            variant=self.variant,
+            choices=self.choices,
+            profile=self.profile,
+            good_image=self.good_image,
+            second_image=self.second_image,
+            allow_implausible=self.allow_implausible,
+            bus=bus.config,
+            power=None if self.power_cmd is None else PowerCommand(self.power_cmd),
+            readback=None if self.readback_cmd is None else ReadbackCommand(self.readback_cmd),
+            uncertainty_s=self.uncertainty,
+        )
+        check_bench(bench)
+        return bench
+
+
+_bench = partial(option, panel="device under test")
+_without_hardware = partial(option, panel="without hardware")
+_image = partial(_bench, metavar="IMAGE", type=values.FilePath(*values.IMAGE_SUFFIXES))
+set_option: Final = _without_hardware(
+    "--set", "choices", multiple=True, metavar="KEY=VALUE",
+    help="set a choice of the model, see `flasher mock --help`; may be repeated",
+)  # fmt: skip
+bench_options: Final = option_set(
+    "bench",
+    BenchChoices,
+    target_option(required=False),
+    _bench(
+        "--profile", metavar="FILE", type=values.FilePath("toml"), brief=True,
+        help="the product's choices and limits (TOML)",
+    ),
+    _image("--good-image", brief=True, help="an image that runs on the device"),
+    _image("--second-image", help="another one, smaller, of another version"),
+    allow_implausible_option("device under test"),
+    _bench(
+        "--power-cmd", metavar="COMMAND",
+        help="command that switches the device, as 'relay 3 {on|off}'",
+    ),
+    _bench(
+        "--readback-cmd", metavar="COMMAND",
+        help="command that dumps the application area, as 'dump {file}'",
+    ),
+    _bench(
+        "--uncertainty", type=values.seconds, default=HOST_UNCERTAINTY_S, metavar="SECONDS",
+        help="how far the adapter's and the computer's times may be off",
+    ),
+    _without_hardware(
+        "--mock", is_flag=True, brief=True,
+        help="test the device model in this process; takes no time",
+    ),
+    _without_hardware(
+        "--subject", metavar="BOOTLOADER", brief=True,
+        help="test a bootloader that is compiled for the computer: a program, a shared library, or "
+        "MODULE:FACTORY; see `flasher conformance header`",
+    ),
+    _without_hardware(
+        "--variant", metavar="NAME",
+        help="one that is wrong, see `flasher mock --list-variants`",
+    ),
+    set_option,
+)  # fmt: skip
