@@ -1,0 +1,28 @@
+/* What bootloader and application share of the board: QEMU's mps2-an385, a Cortex-M3 whose CAN
+ * controller is a UART that speaks slcan.
+ */
+#ifndef BOARD_H
+#define BOARD_H
+
+#include "hal.h"
+
+/* The bootloader has the first 8 KiB of memory. */
+#define APPLICATION_AT 0x2000u
+
+void board_start(void);
+uint32_t board_ms(void);
+
+/* The next data or remote frame received, if there is one. */
+bool board_receive(can_frame *frame);
+void board_send(const can_frame *frame);
+bool board_sent_all(void);
+
+/* Until something was received, or 1 ms. */
+void board_sleep(void);
+
+_Noreturn void board_reset(void);
+
+/* Stops the clock and the UART, and enters the program whose vector table is there. */
+_Noreturn void board_enter(uint32_t vectors);
+
+#endif

@@ -1,0 +1,32 @@
+/* The application in flash memory, and the record that says that it is whole.
+ *
+ * The record holds the size and the CRC of the application. It is erased before anything else is
+ * touched and written when all else is right, so that a power cut at any moment leaves either a
+ * whole application with its record, or no record. What the flash memory holds after a cut in the
+ * middle of erasing or writing is not known: the record has a CRC of its own, and the application's
+ * is calculated anew at each start.
+ */
+#ifndef STORE_H
+#define STORE_H
+
+#include "config.h"
+
+#include <stdbool.h>
+#include <stdint.h>
+
+enum { PACKET_BYTES = 128 };
+
+/* A whole application is stored. Reads all of it. */
+bool store_has_application(void);
+
+/* Erasing takes STORE_ERASE_STEPS steps, counted from 0, in this order. */
+enum { STORE_ERASE_STEPS = 1 + APPLICATION_BYTES / SECTOR_BYTES };
+bool store_erase(uint32_t step);
+
+/* Writes `size` bytes, 1 to PACKET_BYTES, of which `data` has PACKET_BYTES. */
+bool store_write(uint32_t offset, const uint8_t *data, uint32_t size);
+
+/* Makes what was written the application, when it is what was received. */
+bool store_finish(uint32_t size, uint32_t crc);
+
+#endif

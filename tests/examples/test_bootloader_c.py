@@ -1,0 +1,79 @@
+"""The example bootloader in C: under the whole suite, and on an emulated Cortex-M."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from tests.cli.conftest import Flasher
+from tests.examples.bootloader import PROFILE, REQUIRED, emulated, make, missing
+
+FLASH_BYTES = 8192
+
+
+def _need(*programs: str) -> None:
+    if why := missing(*programs):
+        if os.environ.get(REQUIRED):
+            pytest.fail(f"{why}, and {REQUIRED} wants it")
+        pytest.skip(why)
+
+
+def test_the_whole_suite_under_sanitizers(flasher: Flasher, tmp_path: Path) -> None:
+    _need("make", "gcc")
+    make("host", tmp_path)
+    ran = flasher(
+        *(
+            "conformance",
+            "-t",
+            "bms",
+            "--subject",
+            tmp_path / "boot",
+            "--profile",
+            PROFILE,
+            "--json",
+        )
+    )
+    results = ran.document["report"]["results"]
+    others = {result["id"]: result["findings"] for result in results if result["status"] != "pass"}
+    assert list(others) == ["EN-04"], others  # its images have no checksum of their own
+    assert ran.code == 0
+
+
+@pytest.mark.parametrize("target", ["wmc", "obc"])
+def test_the_other_targets_in_a_shared_library(
+    flasher: Flasher, tmp_path: Path, target: str
+) -> None:
+    _need("make", "gcc")
+    make("host", tmp_path, f"DEFINES=-DTARGET=TARGET_{target.upper()}")
+    subject = tmp_path / "libboot.so"
+    ran = flasher(
+        *("conformance", "-t", target, "--subject", subject, "--profile", PROFILE, "--quick")
+    )
+    assert ran.code == 0, ran.out
+
+
+def test_an_emulated_processor_is_flashed_twice_over_slcan(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    _need("make", "arm-none-eabi-gcc", "qemu-system-arm")
+    said = make("arm", tmp_path)
+    sizes = re.findall(r"^ *(\d+)\s+(\d+)\s+\d+\s+\d+\s+\w+\s+\S*boot\.elf$", said, re.MULTILINE)
+    assert [int(text) + int(data) < FLASH_BYTES for text, data in sizes] == [True], said
+    make("arm", tmp_path / "newer", "APPLICATION_VERSION=V2r0r0_20260202")
+    with emulated(tmp_path / "boot.elf") as channel:
+        line = ("-t", "bms", "-i", "slcan", "-c", channel, "--bus-kwargs", "sleep_after_open=0")
+        first = flasher("flash", tmp_path / "application.bin", *line)
+        assert "BMS runs V1r0r0_20260101 (version read back)" in first.out, first.err
+        newer = tmp_path / "newer" / "application.bin"
+        second = flasher("flash", newer, *line, "--base", "0x2000", "--verify", "memory")
+        assert "BMS runs V2r0r0_20260202, was V1r0r0_20260101" in second.out, second.err
+        assert (first.code, second.code) == (0, 0)
+
+
+def test_a_unit_longer_than_a_packet_does_not_compile(tmp_path: Path) -> None:
+    _need("make", "gcc")
+    with pytest.raises(AssertionError, match="a packet begins a unit"):
+        make("host", tmp_path, "DEFINES=-DWRITE_BYTES=256u")
