@@ -18,7 +18,7 @@ from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Subject
 from flasher.conformance.tester import BusTester
-from flasher.conformance.wire import Encoder, Kind, Received, describe, packet_count, version_in
+from flasher.conformance.wire import Encoder, Kind, Received, describe, packet_count, told_version
 
 
 class Bench:
@@ -194,13 +194,21 @@ class Bench:
 
     def check_image(self, image: bytes) -> None:
         """The application of `image` runs, and the flash holds it."""
-        self.check_application(image)
+        self._check_runs(image)
         self.check_stored(image)
 
     def check_application(self, image: bytes | None = None) -> None:
-        """The application of `image` (the good one) runs, and tells its version where it can."""
-        wanted = version_in(self.good_image if image is None else image)
-        if self.encoder.has_version_query and wanted is not None:
+        """The application of `image` (the good one) runs. One that tells no version is known by
+        the flash, if it may be another one than before the case.
+        """
+        chosen = self.good_image if image is None else image
+        self._check_runs(chosen)
+        if self.tester.update_was_sent and told_version(self.subject.target, chosen) is None:
+            self.check_stored(chosen)
+
+    def _check_runs(self, image: bytes) -> None:
+        wanted = told_version(self.subject.target, image)
+        if wanted is not None:
             found = self.application_version(self.limit("start_s"))
             self.check(found == wanted, f"application {wanted} runs", f"{found!a}")
         else:
@@ -208,9 +216,11 @@ class Bench:
             self.check(runs, "the application runs", "it answers" if runs else "no answer")
 
     def check_stored(self, image: bytes) -> None:
-        """The flash holds exactly `image`; nothing is judged on a bench without readback."""
+        """The flash holds exactly `image`; not tried on a bench without readback."""
         if not self.subject.has_readback:
-            self.unsupported("the flash holds the image", "the bench has no readback")
+            tells = told_version(self.subject.target, image) is not None
+            why = "" if tells else ", and the device does not tell which application runs"
+            self.unsupported("the flash holds the image", f"the bench has no readback{why}")
             return
         stored = self.subject.readback()[: len(image)]
         differs = next(

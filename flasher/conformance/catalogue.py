@@ -33,7 +33,9 @@ GROUPS: Final = {
     "CO": "concurrency",
 }
 """The groups in the order of the catalogue, with their titles."""
-NOT_IMPLEMENTED: Final[dict[str, str]] = {}
+NOT_IMPLEMENTED: Final[dict[str, str]] = {
+    "BU-07": "frames of one id that begin in the same bit time: it takes an injector on the line",
+}
 """Case of the bootloader to the reason why software cannot run it; reported as unsupported."""
 HOST_CASES: Final = (
     *("RS-06", "RS-07", "RS-08", "RS-09"),

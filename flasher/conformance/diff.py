@@ -64,6 +64,9 @@ class Difference:
     new: Sequence[VerdictChange]
     gone: Sequence[VerdictChange]
     """Judged in the older run, not in the newer one."""
+    less: Sequence[VerdictChange]
+    """Passed in full in the older run, in part in the newer one."""
+    more: Sequence[VerdictChange]
     slower: Sequence[TimeChange]
     faster: Sequence[TimeChange]
     unchanged: int
@@ -119,7 +122,8 @@ def compare(
     before, after = _verdicts(old), _verdicts(new)
     titles = {case.id: case.title for case in (*old.cases, *new.cases)}
     reasons = _reasons(new)
-    found: dict[str, list[VerdictChange]] = {"better": [], "worse": [], "new": [], "gone": []}
+    kinds = ("better", "worse", "new", "gone", "less", "more")
+    found: dict[str, list[VerdictChange]] = {kind: [] for kind in kinds}
     unchanged = 0
     for case_id in dict.fromkeys((*after, *before)):
         was, is_now = before.get(case_id), after.get(case_id)
@@ -130,6 +134,8 @@ def compare(
         elif _RANKS[is_now] == _RANKS[was]:
             unchanged += 1
             continue
+        elif {was, is_now} == {CaseVerdict.PASS, CaseVerdict.PASS_IN_PART}:
+            kind = "more" if is_now is CaseVerdict.PASS else "less"
         else:
             kind = "worse" if _RANKS[is_now] > _RANKS[was] else "better"
         change = VerdictChange(
@@ -139,10 +145,7 @@ def compare(
     moved = _moved(old, new, threshold_percent)
     return Difference(
         threshold_percent=threshold_percent,
-        better=found["better"],
-        worse=found["worse"],
-        new=found["new"],
-        gone=found["gone"],
+        **found,
         slower=[one for one in moved if one.after_s > one.before_s],
         faster=[one for one in moved if one.after_s < one.before_s],
         unchanged=unchanged,
@@ -163,7 +166,11 @@ def _reasons(report: ReportDocument) -> dict[str, str]:
     """What the first result of each case says that has something to say."""
     found: dict[str, str] = {}
     for result in report.results:
-        reason = str(result.findings[0]) if result.findings else result.note
+        reason = result.note
+        if result.status is CaseVerdict.PASS_IN_PART:
+            reason = f"not tried: {'; '.join(result.not_tried)}"
+        elif result.findings:
+            reason = str(result.findings[0])
         if reason:
             found.setdefault(result.id, reason)
     return found

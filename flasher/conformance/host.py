@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.results import Unsupported
 from flasher.conformance.tester import BusTester, Sent
-from flasher.conformance.wire import Kind, Received, packet_count, version_in
+from flasher.conformance.wire import Kind, Received, packet_count, told_version
 
 PACKET_TRIES: Final = 5
 END_TRIES: Final = 3
@@ -171,7 +171,7 @@ class PatientHost:
             refusals += heard is not None
             if refusals == 2:
                 return Upgraded(ok=False, reason="the image was refused")
-        wanted = version_in(image) if self._encoder.has_version_query else None
+        wanted = told_version(self._encoder.target, image)
         if wanted is None or self.application_version(self._profile.limit("start_s")) != wanted:
             return Upgraded(ok=False, reason="no final answer")
         return Upgraded(ok=True)

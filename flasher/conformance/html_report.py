@@ -44,6 +44,7 @@ _CLOCK_S: Final = 1e-6
 """No clock tells apart what differs by less: there is nothing to draw."""
 _COLOURS: Final = {
     CaseVerdict.PASS: Status.GOOD,
+    CaseVerdict.PASS_IN_PART: Status.GOOD,
     CaseVerdict.FAIL: Status.BAD,
     CaseVerdict.ERROR: Status.BAD,
     CaseVerdict.DEVIATION: Status.WARNING,
@@ -82,6 +83,7 @@ class CaseView(NamedTuple):
     trace: Sequence[TraceRow]
     trace_text: str
     """Which part of the case's frames `trace` is."""
+    in_part: bool
 
 
 class TimesView(NamedTuple):
@@ -154,6 +156,7 @@ def _case(text: CaseText, result: CaseResult, replay: str, trace_file: str) -> C
         infos=result.infos[:_INFOS_SHOWN],
         trace=trace,
         trace_text=trace_text,
+        in_part=result.verdict is CaseVerdict.PASS_IN_PART,
     )
 
 

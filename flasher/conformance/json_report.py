@@ -27,7 +27,7 @@ from flasher.conformance.results import (
 if TYPE_CHECKING:
     from pydantic import TypeAdapter
 
-SCHEMA_VERSION: Final = 1
+SCHEMA_VERSION: Final = 2
 """Counts up when a field changes its meaning or goes away; not for a new one."""
 BINS: Final = 20
 CHECKS_KEPT: Final = 50
@@ -56,6 +56,8 @@ class ResultDocument:
     checks: CheckCounts
     findings: Sequence[Check]
     """The checks that did not pass, the first ones of many."""
+    not_tried: Sequence[str]
+    """The parts that this bench could not try, each with the reason."""
     infos: Sequence[str]
     deviation_resolved: bool
     """The profile documents a deviation, but the case passes."""
@@ -121,6 +123,13 @@ class ReportDocument:
     """Why the good image could not be flashed at first; empty when it could."""
     final_image: str
     """"verified", or what came of the good image at the end."""
+    final_image_seen_by: Sequence[str]
+    """By what it was verified: version, readback; with neither, some application answers."""
+    passes: int
+    """Cases that passed, in full or in part."""
+    passes_in_full: int
+    not_tried: dict[str, list[str]]
+    """Reasons why parts were not tried, with the cases that passed without them."""
     counts: dict[str, int]
     """How many results have each status."""
     cases: Sequence[CaseText]
@@ -163,6 +172,10 @@ def report_document(
         killed_by=report.killed_by,
         not_upgradable=report.not_upgradable,
         final_image=report.final_image,
+        final_image_seen_by=report.final_image_seen_by,
+        passes=report.count(CaseVerdict.PASS) + report.count(CaseVerdict.PASS_IN_PART),
+        passes_in_full=report.count(CaseVerdict.PASS),
+        not_tried=report.not_tried(),
         counts={verdict.value: report.count(verdict) for verdict in CaseVerdict},
         cases=report.cases,
         results=[
@@ -191,6 +204,7 @@ def _result(result: CaseResult, replay: str, trace_file: str) -> ResultDocument:
             unsupported=result.count(CheckOutcome.UNSUPPORTED),
         ),
         findings=bad[:CHECKS_KEPT],
+        not_tried=result.not_tried,
         infos=result.infos,
         deviation_resolved=result.deviation_resolved,
         duration_s=result.duration_s,

@@ -35,14 +35,16 @@ class Judge:
     def verdict(self) -> CaseVerdict:
         """The verdict that follows from what was recorded."""
         outcomes = {check.outcome for check in self.checks}
-        for outcome, verdict in (
-            (CheckOutcome.FAIL, CaseVerdict.FAIL),
-            (CheckOutcome.INCONCLUSIVE, CaseVerdict.INCONCLUSIVE),
-            (CheckOutcome.PASS, CaseVerdict.PASS),
-            (CheckOutcome.UNSUPPORTED, CaseVerdict.UNSUPPORTED),
-        ):
-            if outcome in outcomes:
-                return verdict
+        if CheckOutcome.FAIL in outcomes:
+            return CaseVerdict.FAIL
+        if CheckOutcome.INCONCLUSIVE in outcomes:
+            return CaseVerdict.INCONCLUSIVE
+        if outcomes == {CheckOutcome.PASS}:
+            return CaseVerdict.PASS
+        if CheckOutcome.PASS in outcomes:
+            return CaseVerdict.PASS_IN_PART
+        if outcomes:
+            return CaseVerdict.UNSUPPORTED
         return CaseVerdict.INFO if self.infos or self.measurements else CaseVerdict.ERROR
 
     @contextmanager

@@ -109,7 +109,7 @@ class PluginRun:
         self.measurements.add(result.measurements)
         told = f"{result.verdict.text}: {result.reason}"
         match result.verdict:
-            case CaseVerdict.PASS | CaseVerdict.INFO:
+            case CaseVerdict.PASS | CaseVerdict.PASS_IN_PART | CaseVerdict.INFO:
                 return
             case CaseVerdict.UNSUPPORTED | CaseVerdict.INCONCLUSIVE:
                 pytest.skip(told)

@@ -72,6 +72,11 @@ def junit_report(report: RunReport, *, started_at: str, replays: ByResult) -> by
         "profile": report.profile_source,
         "timestamp_source": report.timestamp_source,
         "uncertainty_s": report.uncertainty_s,
+        "judged_in_full": report.in_full,
+        "not_tried": "; ".join(
+            f"{why}: {' '.join(case_ids)}" for why, case_ids in report.not_tried().items()
+        ),
+        "final_image": report.final_image_text,
     }
     suites = {
         f"{group} {group_title(group)}": [
@@ -102,8 +107,13 @@ def _junit_case(text: CaseText, result: CaseResult, report: RunReport, replay: s
     elif report.strict and result.deviation_resolved:
         ended, kind = JUnitResult.FAILURE, "resolved deviation"
         message = f"the profile says that it deviates ({text.deviation}), but it passes"
+    elif report.strict and result.verdict is CaseVerdict.PASS_IN_PART:
+        ended = JUnitResult.FAILURE
     is_deviation = result.verdict is CaseVerdict.DEVIATION
     said = [f"deviation: {text.deviation}"] if is_deviation else []
+    if result.verdict is CaseVerdict.PASS_IN_PART:
+        said.append(word)
+    said += [f"not tried: {part}" for part in result.not_tried]
     return JUnitCase(
         f"conformance.{text.group}",
         f"{text.id} {text.title}{repeat}",
@@ -143,11 +153,14 @@ def _junit_run(report: RunReport) -> list[JUnitCase]:
     else:
         verified = report.final_image == FINAL_IMAGE_OK
         image = JUnitResult.PASSED if verified else JUnitResult.ERROR
-        message, kind = report.final_image, "final image"
+        message, kind = report.final_image_text, "final image"
     class_name, remarks = f"conformance.{_RUN}", "; ".join(report.remarks())
     return [
         JUnitCase(class_name, "the run goes to its planned end", 0.0, whole, remarks, "stopped"),
-        JUnitCase(class_name, "the good image is back on the device", 0.0, image, message, kind),
+        JUnitCase(
+            *(class_name, "the good image is back on the device", 0.0, image, message, kind),
+            output=report.final_image_text,
+        ),
     ]
 
 

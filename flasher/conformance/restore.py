@@ -13,7 +13,7 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import CaseEnded, CaseLimitReached, RunStopped
 from flasher.conformance.subject import Subject
-from flasher.conformance.wire import Kind, version_in
+from flasher.conformance.wire import Kind, told_version
 
 _MARGIN_S: Final = 60.0
 _ASK_S: Final = 0.4
@@ -108,8 +108,8 @@ def _limit_s(subject: Subject, profile: ConformanceProfile) -> float:
 
 
 def _runs(bench: Bench) -> str:
-    wanted = version_in(bench.good_image)
-    if not bench.encoder.has_version_query or wanted is None:
+    wanted = told_version(bench.subject.target, bench.good_image)
+    if wanted is None:
         return "" if bench.application_runs() else "no application answers"
     found = bench.application_version(bench.limit("start_s"))
     return "" if found == wanted else f"version {found!a}, not {wanted}"

@@ -16,6 +16,8 @@ class CaseVerdict(Enum):
     """The verdict on a case; the members are in order of gravity, the best first."""
 
     PASS = "pass"  # noqa: S105  no password
+    PASS_IN_PART = "pass_in_part"  # noqa: S105
+    """What was tried passes, but a part was not tried: it is told which, and why."""
     INFO = "info"
     """Nothing to judge, only measured or observed."""
     UNSUPPORTED = "unsupported"
@@ -126,6 +128,12 @@ class CaseResult:
         return self.case_id, self.repeat
 
     @property
+    def not_tried(self) -> tuple[str, ...]:
+        """The parts that were not tried, each with the reason, once."""
+        found = (one for one in self.checks if one.outcome is CheckOutcome.UNSUPPORTED)
+        return tuple(dict.fromkeys(f"{one.expected} ({one.got})" for one in found))
+
+    @property
     def first_failure(self) -> Check | None:
         """The first check that failed, else the first that was inconclusive; None without any."""
         for outcome in (CheckOutcome.FAIL, CheckOutcome.INCONCLUSIVE):
@@ -136,7 +144,11 @@ class CaseResult:
 
     @property
     def reason(self) -> str:
-        """Why the verdict is what it is, in one line: the first failure, or the note."""
+        """Why the verdict is what it is, in one line: the first failure, what was not tried, or the
+        note.
+        """
+        if self.verdict is CaseVerdict.PASS_IN_PART:
+            return f"not tried: {'; '.join(self.not_tried)}"
         return str(self.first_failure or self.note)
 
     def count(self, outcome: CheckOutcome) -> int:
@@ -185,6 +197,8 @@ class RunReport:
     rescues: tuple[Rescue, ...] = ()
     final_image: str = ""
     """Whether the good image is back at the end: "verified", or what failed."""
+    final_image_seen_by: tuple[str, ...] = ()
+    """By what that was seen: "version", "readback"; with neither, some application answers."""
     duration_s: float = 0.0
 
     def count(self, verdict: CaseVerdict) -> int:
@@ -198,10 +212,12 @@ class RunReport:
 
     @property
     def ok(self) -> bool:
-        """True when nothing failed, nothing was left out by a stop, and the good image is back."""
+        """True when nothing failed, nothing was left out by a stop, and the good image is back. A
+        strict run has no pass in part, and no deviation that is none any more.
+        """
         if self.stopped or self.final_image != FINAL_IMAGE_OK:
             return False
-        if self.strict and self.resolved_deviations:
+        if self.strict and (self.resolved_deviations or self.count(CaseVerdict.PASS_IN_PART)):
             return False
         bad = (CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.NOT_RUN)
         return not any(result.verdict in bad for result in self.results)
@@ -210,6 +226,31 @@ class RunReport:
     def headline(self) -> str:
         """The run in one line."""
         return count_text(self.results) or "no case"
+
+    @property
+    def in_full(self) -> str:
+        """How many of the passes were judged in full; "" without any pass."""
+        full = self.count(CaseVerdict.PASS)
+        passes = full + self.count(CaseVerdict.PASS_IN_PART)
+        return f"{full} of {passes} passes were judged in full" if passes else ""
+
+    @property
+    def final_image_text(self) -> str:
+        """What is known of the good image at the end, as people read it."""
+        if self.final_image != FINAL_IMAGE_OK:
+            return self.final_image or "not flashed: no case was run"
+        if not self.final_image_seen_by:
+            return "flashed, an application answers; nothing here tells which one it is"
+        return f"flashed and verified by {' and '.join(self.final_image_seen_by)}"
+
+    def not_tried(self) -> dict[str, list[str]]:
+        """Reasons why parts were not tried, with the cases that passed without them."""
+        found: dict[str, dict[str, None]] = {}
+        for _, result in self.by_case():
+            for check in result.checks if result.verdict is CaseVerdict.PASS_IN_PART else ():
+                if check.outcome is CheckOutcome.UNSUPPORTED:
+                    found.setdefault(check.got, {})[result.case_id] = None
+        return {why: list(case_ids) for why, case_ids in found.items()}
 
     def by_case(self) -> list[tuple[CaseText, CaseResult]]:
         """Every result with its case, in the order of the catalogue."""

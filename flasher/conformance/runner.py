@@ -43,6 +43,7 @@ from flasher.conformance.results import (
     Unsupported,
 )
 from flasher.conformance.subject import Subject
+from flasher.conformance.wire import told_version
 from flasher.errors import BusError
 
 
@@ -113,8 +114,8 @@ def execute(case: Case, bench: Bench) -> CaseEnd:
     except CaseStopped:
         return CaseEnd(bench.judge.verdict)
     except Unsupported as ended:
-        failed = bench.judge.verdict is CaseVerdict.FAIL
-        return CaseEnd(CaseVerdict.FAIL if failed else CaseVerdict.UNSUPPORTED, str(ended))
+        bench.unsupported("the rest of the case", str(ended))
+        return CaseEnd(bench.judge.verdict, str(ended))
     except RunStopped as ended:
         return CaseEnd(CaseVerdict.NOT_RUN, str(ended), str(ended))
     except (CaseLimitReached, DeviceCrashed) as ended:
@@ -156,6 +157,7 @@ class Run:
         self._not_upgradable = ""
         self._killed_by = ""
         self._final_image = ""
+        self._final_image_seen_by: tuple[str, ...] = ()
 
     def go(self, chosen: Sequence[str]) -> RunReport:
         """Run the cases with these ids; one that this bench cannot run has its result at once."""
@@ -220,7 +222,8 @@ class Run:
                 duration_s,
                 bench.tester.trace,
                 bench.tester.trace_dropped,
-                deviation_resolved=is_known and verdict is CaseVerdict.PASS,
+                deviation_resolved=is_known
+                and verdict in (CaseVerdict.PASS, CaseVerdict.PASS_IN_PART),
             )
         )
 
@@ -233,8 +236,8 @@ class Run:
         return self._restore(f"after {what}", flash=erased, case_id=what, is_off=bench.is_off)
 
     def finish(self) -> str:
-        """Flash the good image once more and verify it, by its version and by readback; returns
-        `FINAL_IMAGE_OK`, or what failed.
+        """Flash the good image once more and verify it, by its version and by readback where there
+        are such; returns `FINAL_IMAGE_OK`, or what failed.
         """
         if self._killed_by:
             self._final_image = "not flashed: the device could not be brought back"
@@ -247,6 +250,10 @@ class Run:
                 image = self._subject.good_image
                 if self._subject.readback()[: len(image)] != image:
                     self._final_image = "the flash does not hold the good image"
+            if self._final_image == FINAL_IMAGE_OK:
+                told = told_version(self._subject.target, self._subject.good_image)
+                seen = {"version": told is not None, "readback": self._subject.has_readback}
+                self._final_image_seen_by = tuple(name for name, is_seen in seen.items() if is_seen)
         except (BusError, CaseEnded) as error:
             self._final_image = error.what if isinstance(error, BusError) else str(error)
         return self._final_image
@@ -275,6 +282,7 @@ class Run:
             killed_by=self._killed_by,
             rescues=tuple(self._rescues),
             final_image=self._final_image,
+            final_image_seen_by=self._final_image_seen_by,
             duration_s=port.now() - self._began_at,
         )
 

@@ -149,6 +149,11 @@ _TARGETS: Final = {
 TARGET_NAMES: Final = tuple(_TARGETS)
 
 
+def told_version(target: str, image: bytes) -> str | None:
+    """The version by which a device tells that it runs `image`; None where it cannot."""
+    return version_in(image) if _TARGETS[target].has_version_query else None
+
+
 class Encoder:
     """The messages of the tool to one target, as CAN frames, and the CAN ids of both directions.
 

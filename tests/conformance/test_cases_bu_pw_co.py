@@ -80,7 +80,7 @@ def test_versions_tell_a_torn_image_on_a_bench_without_readback() -> None:
 
 def test_a_bench_with_power_alone_judges_what_it_can_and_says_what_it_cannot() -> None:
     result = result_of("PW-01", has_readback=False, has_timed_cuts=False)
-    assert result.verdict is CaseVerdict.PASS
+    assert result.verdict is CaseVerdict.PASS_IN_PART
     assert not_judged(result)[:2] == [
         "power cuts before, in and after every flash operation",
         "what was acknowledged is stored",
@@ -90,12 +90,6 @@ def test_a_bench_with_power_alone_judges_what_it_can_and_says_what_it_cannot() -
 @each("case_id, power", [("PW-01", "has_power"), ("PW-02", "has_power"), ("BU-02", "has_bus_off")])
 def test_what_a_bench_lacks_makes_a_case_unsupported(case_id: str, power: str) -> None:
     assert result_of(case_id, None, **{power: False}).verdict is CaseVerdict.UNSUPPORTED
-
-
-def test_frames_that_meet_in_one_bit_time_are_left_to_an_injector() -> None:
-    result = result_of("BU-06")
-    assert result.verdict is CaseVerdict.PASS
-    assert not_judged(result) == ["frames of one id that begin in the same bit time"]
 
 
 def test_others_take_nine_tenths_of_the_bus() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 
 import pytest
 
@@ -11,7 +12,7 @@ from flasher.conformance.catalogue import CASES, HOST_CASES, NOT_IMPLEMENTED, Re
 from flasher.conformance.json_report import report_document, to_bytes
 from flasher.conformance.mock import MockSubject
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.results import CaseVerdict
+from flasher.conformance.results import CaseVerdict, Unsupported
 from flasher.conformance.runner import RunOptions, run
 from flasher.conformance.wire import RawFrame
 from flasher.errors import UsageError
@@ -104,10 +105,54 @@ def test_a_part_that_the_bench_cannot_do_is_said_and_the_rest_judged() -> None:
         bench.unsupported("a thing", "no tool")
         passes(bench)
 
-    assert status_of(partly) is CaseVerdict.PASS
-    assert (
-        status_of(lambda bench: bench.unsupported("a thing", "no tool")) is CaseVerdict.UNSUPPORTED
-    )
+    def not_to_its_end(bench: Bench) -> None:
+        passes(bench)
+        raise Unsupported("no tool")
+
+    def only_said(bench: Bench) -> None:
+        bench.unsupported("a thing", "no tool")
+
+    report = run_case(partly)
+    assert one(report, "FR-00").verdict is CaseVerdict.PASS_IN_PART
+    assert one(report, "FR-00").not_tried == ("a thing (no tool)",)
+    assert report.in_full == "0 of 1 passes were judged in full"
+    assert report.ok
+    assert not run_case(partly, strict=True).ok
+    assert status_of(not_to_its_end) is CaseVerdict.PASS_IN_PART
+    assert status_of(only_said) is CaseVerdict.UNSUPPORTED
+
+
+def test_the_good_image_is_verified_by_what_there_is_and_the_report_says_how() -> None:
+    def seen(target: str, *, readback: bool) -> str:
+        device = MockSubject(target)
+        device.has_readback = readback
+        return run_case(passes, device=device).final_image_text
+
+    assert seen("bms", readback=True) == "flashed and verified by version and readback"
+    assert seen("bms", readback=False) == "flashed and verified by version"
+    assert seen("wmc", readback=True) == "flashed and verified by readback"
+    assert "nothing here tells which one" in seen("wmc", readback=False)
+
+
+def test_an_application_without_a_version_is_known_by_the_flash_once_it_may_be_another() -> None:
+    def restarted(bench: Bench) -> None:
+        bench.reset_to_bootloader()
+        bench.check_application()
+
+    def upgraded(bench: Bench) -> None:
+        bench.upgrade(bench.good_image)
+        bench.check_application()
+
+    def without_readback(action: Callable[[Bench], None]) -> CaseVerdict:
+        device = MockSubject("wmc")
+        device.has_readback = False
+        return one(run_case(action, device=device), "FR-00").verdict
+
+    assert without_readback(restarted) is CaseVerdict.PASS
+    assert without_readback(upgraded) is CaseVerdict.PASS_IN_PART
+    report = run_case(upgraded, device=MockSubject("wmc"))
+    assert one(report, "FR-00").verdict is CaseVerdict.PASS
+    assert "the flash holds the image" in [one.expected for one in report.results[0].checks]
 
 
 def test_a_time_at_its_limit_is_inconclusive_within_the_uncertainty() -> None:

@@ -165,7 +165,7 @@ _choices = option_set(
     ),
     _what(
         "--strict", is_flag=True,
-        help="a deviation of the profile that is none any more fails the run",
+        help="a pass in part fails the run, and a deviation of the profile that is none any more",
     ),
     _report("--junit", help="JUnit XML, for CI servers"),
     _report("--json-report", help="the report as JSON, for `flasher conformance diff`"),
@@ -352,7 +352,10 @@ def _list(selection: Selection, output: Output) -> int:
     help="a time is slower when its median or p95 grew by more than this, and by more than its "
     "uncertainty",
 )  # fmt: skip
-@option("--strict", is_flag=True, help="slower times and cases that are gone count as worse too")
+@option(
+    "--strict", is_flag=True,
+    help="slower times, and cases that are gone or judged less fully, count as worse too",
+)  # fmt: skip
 def diff(output: Output, *, old: Path, new: Path, threshold: float, strict: bool) -> int:
     """Compare two reports that --json-report wrote. Exit code 12 when a case got worse, or a new
     one fails.
@@ -361,7 +364,7 @@ def diff(output: Output, *, old: Path, new: Path, threshold: float, strict: bool
     output.result(f"{printable(str(old))}, then {printable(str(new))}")
     for line in difference_lines(found):
         output.result(line)
-    is_worse = found.is_worse or (strict and bool(found.slower or found.gone))
+    is_worse = found.is_worse or (strict and bool(found.slower or found.gone or found.less))
     code = ExitCode.PARTIAL if is_worse else ExitCode.OK
     output.document(found, exit_code=code)
     return code

@@ -10,7 +10,6 @@ from flasher.cli.output import counted, duration
 from flasher.conformance.diff import Difference, VerdictChange
 from flasher.conformance.reports import ByResult, distribution, group_title
 from flasher.conformance.results import (
-    FINAL_IMAGE_OK,
     CaseResult,
     CaseText,
     CaseVerdict,
@@ -50,7 +49,7 @@ def report_lines(report: RunReport, replays: ByResult, *, verbose: bool = False)
     if verbose:
         yield ""
         yield from (
-            printable(f"{result.verdict.text:<12}  {text.id}  {text.title}")
+            printable(f"{result.verdict.text:<12}  {text.id}  {text.title}{_untried(result)}")
             for text, result in cases
         )
     for status in _TOLD:
@@ -69,11 +68,15 @@ def report_lines(report: RunReport, replays: ByResult, *, verbose: bool = False)
     for line in report.remarks():
         yield printable(f"note: {line}")
     if report.final_image:
-        verified = report.final_image == FINAL_IMAGE_OK
-        said = "flashed and verified" if verified else report.final_image
-        yield printable(f"good image at the end: {said}")
+        yield printable(f"good image at the end: {report.final_image_text}")
+    if report.in_full:
+        yield report.in_full
     verdict = "passed" if report.ok else "NOT PASSED"
     yield f"{verdict}: {report.headline}; {duration(report.duration_s)} on the bus"
+
+
+def _untried(result: CaseResult) -> str:
+    return f": {result.reason}" if result.verdict is CaseVerdict.PASS_IN_PART else ""
 
 
 def _groups(report: RunReport) -> Iterator[str]:
@@ -104,11 +107,13 @@ def _told(text: CaseText, result: CaseResult, replays: ByResult, *, verbose: boo
 
 
 def _not_judged(report: RunReport) -> Iterator[str]:
-    """Cases without a verdict, together with those that have the same reason."""
+    """Cases without a verdict, or with one in part, together with those of the same reason."""
     reasons: dict[tuple[CaseVerdict, str], list[str]] = {}
     for result in report.results:
         if result.verdict in (CaseVerdict.UNSUPPORTED, CaseVerdict.NOT_RUN):
             reasons.setdefault((result.verdict, _why(result)), []).append(result.case_id)
+    for why, case_ids in report.not_tried().items():
+        reasons[CaseVerdict.PASS_IN_PART, why] = case_ids
     if reasons:
         yield ""
     for (status, why), case_ids in reasons.items():
@@ -187,7 +192,7 @@ def difference_lines(found: Difference) -> Iterator[str]:
     """What a run has made better, worse and slower."""
     for condition in found.conditions:
         yield f"not the same: {condition}"
-    for kind in ("worse", "better", "new", "gone"):
+    for kind in ("worse", "better", "new", "gone", "less", "more"):
         changes: Sequence[VerdictChange] = getattr(found, kind)
         for change in changes:
             before = "not judged" if change.before is None else change.before.text
@@ -203,7 +208,8 @@ def difference_lines(found: Difference) -> Iterator[str]:
         )
     yield (
         f"{len(found.worse)} worse, {len(found.better)} better, {len(found.new)} new, "
-        f"{len(found.gone)} gone, {found.unchanged} unchanged; {len(found.slower)} slower and "
+        f"{len(found.gone)} gone, {found.unchanged} unchanged; {len(found.less)} judged less "
+        f"fully, {len(found.more)} more fully; {len(found.slower)} slower and "
         f"{len(found.faster)} faster by more than {found.threshold_percent:g} % and the uncertainty"
     )
 

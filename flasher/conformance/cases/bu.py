@@ -202,9 +202,6 @@ def same_id(bench: Bench) -> None:
             bench.packet(image, number)
         bench.end_transfer()
         bench.check_image(image)
-    bench.unsupported(
-        "frames of one id that begin in the same bit time", "it takes an injector to make them meet"
-    )
 
 
 # -- an upgrade in which something happens to every message --------------------------------------

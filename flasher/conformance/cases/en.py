@@ -29,6 +29,8 @@ _UPGRADE_KINDS: Final = (Kind.REQUEST, Kind.ACK, Kind.NAK, Kind.COMPLETE, Kind.F
 )
 def end(bench: Bench) -> None:
     image = bench.subject.second_image or bench.good_image
+    if image is bench.good_image:
+        bench.unsupported("another image than the one before", "the bench has no second good image")
     bench.start_transfer(len(image))
     bench.packets(image)
     bench.end_transfer()

@@ -103,6 +103,9 @@ def second_cut(bench: Bench) -> None:
     second = [_Cut(0, 1), _Cut(0, update), _Cut(1, 9), _Cut(1, _PACKET_FRAMES)]
     if total <= _FAR_PACKET:
         second += [_Cut(total, _PACKET_FRAMES), _Cut(total + 1, end - 1), _Cut(total + 1, end)]
+    else:
+        why = f"the image has more than {_FAR_PACKET} packets"
+        bench.unsupported("a second cut in the last packet and at end of transfer", why)
     for cut in second:
         with bench.step("first cut"):
             _go_to(bench, upgrade, _Cut(1, 9))
@@ -274,6 +277,7 @@ def _cut_operations(bench: Bench, upgrade: _Upgrade) -> None:
                     upgrade.turn()
                     return
                 _check_after_cut(bench, upgrade, version)
+    bench.info(f"only the first {_OPERATIONS_MAX} flash operations of the upgrade were cut")
 
 
 def _upgrade_until_cut(bench: Bench, upgrade: _Upgrade) -> Received | None:

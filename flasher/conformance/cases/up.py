@@ -37,6 +37,8 @@ _FIRST_PACKETS: Final = 3
 )
 def sizes(bench: Bench) -> None:
     largest = bench.number("largest_image_bytes")
+    if largest < max(_SIZES):
+        bench.info(f"no image of more than {largest} bytes, which is all that the device takes")
     bench.reset_to_bootloader()
     for index, size in enumerate([*(size for size in _SIZES if size < largest), largest]):
         with bench.step(f"{size} bytes"):
