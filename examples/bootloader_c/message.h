@@ -14,10 +14,10 @@ enum {
 
 /* Puts the messages of one id together. All zero: nothing received. */
 typedef struct {
-    uint32_t last_ms; /* when the last frame of the message came */
-    uint16_t have;    /* bytes received; 0 between messages */
+    uint8_t bytes[MESSAGE_MAX_BYTES]; /* not at the end, where a sanitizer lets an index be too big */
+    uint16_t have;                    /* bytes received; 0 between messages */
     uint16_t want;
-    uint8_t bytes[MESSAGE_MAX_BYTES];
+    uint32_t last_ms; /* when the last frame of the message came */
 } message_receiver;
 
 typedef enum {

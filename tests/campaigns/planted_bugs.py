@@ -1,0 +1,103 @@
+"""Builds the example bootloader in C with each of its planted bugs, and runs the whole suite against
+it: `python -m tests.campaigns.planted_bugs`. Says which case catches which bug, and which are missed.
+
+A bug is a patch of one line, or nearly, in tests/examples/planted; its first line says what is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from tests.examples.bootloader import PROFILE, SOURCE, make
+
+PLANTED = Path(__file__).parents[1] / "examples" / "planted"
+_RUN_MAX_S = 600
+_DUT = Path(__file__).parents[2] / "flasher" / "conformance" / "dut"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the suite said of a bootloader."""
+
+    name: str
+    found: dict[str, str]
+    """What the cases that failed found first, by their ids."""
+    took_s: float
+
+    @property
+    def line(self) -> str:
+        by = ", ".join(self.found) or "MISSED"
+        return f"{self.name:36} {self.took_s:5.1f} s  {by}"
+
+
+def plant(patch: Path, folder: Path) -> Path:
+    """The sources with a bug, in a folder of their own."""
+    sources = folder / patch.stem
+    shutil.copytree(SOURCE, sources, ignore=shutil.ignore_patterns("build"))
+    subprocess.run(
+        ["patch", "--silent", "-p1", "-d", sources, "-i", patch], check=True, capture_output=True
+    )
+    return sources
+
+
+def run(name: str, sources: Path, arguments: list[str]) -> Outcome:
+    """The suite on a build with sanitizers."""
+    make("host", sources / "build", f"DUT={_DUT}", source=sources)
+    began = time.monotonic()
+    command = [sys.executable, "-m", "flasher", "conformance", "-t", "bms", "--json"]
+    command += ["--subject", str(sources / "build" / "boot"), "--profile", str(PROFILE), *arguments]
+    ran = subprocess.run(
+        command, capture_output=True, text=True, timeout=_RUN_MAX_S, check=False, cwd=sources
+    )
+    took_s = time.monotonic() - began
+    report = json.loads(ran.stdout)["report"]
+    found = {
+        result["id"]: f"{check['expected']}; got {check['got']}"
+        for result in report["results"]
+        if result["status"] == "fail"
+        for check in result["findings"][:1]
+    }
+    stopped = report["not_upgradable"] or report["stopped"]
+    if stopped and not found:
+        found = {"before the first case": stopped}
+    return Outcome(name, found, took_s)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("bugs", nargs="*", metavar="BUG", help="numbers or names; all by default")
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--verbose", action="store_true", help="what was found first")
+    parser.add_argument("--quick", action="store_true", help="the quick cases only")
+    arguments = parser.parse_args()
+    patches = sorted(PLANTED.glob("*.patch"))
+    chosen = [
+        patch
+        for patch in patches
+        if not arguments.bugs or any(patch.stem.startswith(bug) for bug in arguments.bugs)
+    ]
+    options = ["--quick"] if arguments.quick else []
+    with tempfile.TemporaryDirectory() as name, ThreadPoolExecutor(arguments.jobs) as pool:
+        folder = Path(name)
+        outcomes = pool.map(lambda p: run(p.stem, plant(p, folder), options), chosen)
+        caught = 0
+        for outcome in outcomes:
+            caught += bool(outcome.found)
+            print(outcome.line, flush=True)
+            if arguments.verbose:
+                print("".join(f"    {case}: {what:.200}\n" for case, what in outcome.found.items()))
+    print(f"caught {caught} of {len(chosen)}")
+    sys.exit(0 if caught == len(chosen) else 1)
+
+
+if __name__ == "__main__":
+    main()
