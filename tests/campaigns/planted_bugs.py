@@ -1,7 +1,7 @@
-"""Builds the example bootloader in C with each of its planted bugs, and runs the whole suite against
-it: `python -m tests.campaigns.planted_bugs`. Says which case catches which bug, and which are missed.
+"""Builds the example bootloader in C with each of its planted bugs, and runs the whole suite on it:
+`python -m tests.campaigns.planted_bugs`. Says which case catches which bug, and which are missed.
 
-A bug is a patch of one line, or nearly, in tests/examples/planted; its first line says what is wrong.
+A bug is a patch of a line or two in tests/examples/planted; its first line says what is wrong.
 """
 
 from __future__ import annotations
@@ -92,10 +92,12 @@ def main() -> None:
         caught = 0
         for outcome in outcomes:
             caught += bool(outcome.found)
-            print(outcome.line, flush=True)
+            lines = [outcome.line]
             if arguments.verbose:
-                print("".join(f"    {case}: {what:.200}\n" for case, what in outcome.found.items()))
-    print(f"caught {caught} of {len(chosen)}")
+                lines += [f"    {case}: {what:.200}" for case, what in outcome.found.items()]
+            sys.stdout.write("\n".join(lines) + "\n")
+            sys.stdout.flush()
+    sys.stdout.write(f"caught {caught} of {len(chosen)}\n")
     sys.exit(0 if caught == len(chosen) else 1)
 
 
