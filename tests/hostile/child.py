@@ -7,6 +7,7 @@ forks: what it takes to start Python is neither paid nor counted each time.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import resource
@@ -14,9 +15,18 @@ import signal
 import sys
 import tempfile
 
-# What most of them need, once.
+# What they need, once.
+import flasher.cli.bench.conformance
+import flasher.cli.look.explain
+import flasher.cli.look.monitor
 import flasher.cli.station.check
+import flasher.cli.station.run
+import flasher.cli.upgrade.flash
+import flasher.cli.upgrade.image_info
+import flasher.cli.upgrade.manifest
+import flasher.cli.upgrade.profile
 import flasher.conformance.diff
+import flasher.conformance.opening
 import flasher.conformance.runner
 import flasher.trace.source  # noqa: F401
 from flasher.cli.main import main
@@ -55,4 +65,5 @@ def run(folder: str, words: list[str]) -> tuple[int, str, str, float, float]:
 
 
 if __name__ == "__main__":
+    gc.freeze()  # or each fork copies what the collector touches
     json.dump([run(folder, words) for folder, words in json.load(sys.stdin)], sys.stdout)
