@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -20,6 +21,7 @@ _EVERYWHERE: Final = frozenset({"errors", "events", "prose", "log", "files", "fo
 """Small modules that many import: they would hide the drawing behind arrows."""
 
 
+@cache
 def imports() -> dict[str, set[str]]:
     """Which package or top-level module of flasher imports which others."""
     package = _ROOT / "flasher"

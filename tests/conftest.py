@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
@@ -14,6 +15,14 @@ if TYPE_CHECKING:
 
 POSTGRES_REQUIRED = "FLASHER_TEST_POSTGRES"
 """With this variable a missing server is an error, not a reason to skip."""
+
+
+@pytest.fixture(autouse=True, scope="session")
+def no_wait_for_the_disk() -> Iterator[None]:
+    """No test of this process pulls the plug, and all share one disk."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _file: None)
+        yield
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -29,7 +38,13 @@ def files_elsewhere(tmp_path_factory: pytest.TempPathFactory) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What is loaded by now stays: the collector need not look through it again and again."""
+    """Where records are tested, they compile each statement once. What is loaded by now stays: the
+    collector need not look through it again and again.
+    """
+    if "flasher.station.records.database" in sys.modules:
+        from tests.station import statements  # noqa: PLC0415  needs the extra `postgres`
+
+        statements.share()
     gc.collect()
     gc.freeze()
 

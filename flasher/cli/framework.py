@@ -26,6 +26,7 @@ import click
 import rich_click
 from click.core import ParameterSource
 
+from flasher import __version__
 from flasher.cli.help import BRIEF, HelpedCommand
 from flasher.cli.logs import LOG_FILE, Logs
 from flasher.cli.output import SAID, Output
@@ -42,9 +43,8 @@ Decorator = Callable[[Any], Any]
 class Session:
     """One run of the program: what it says, and what the output options ask for."""
 
-    def __init__(self, output: Output, logs: Logs, words: Sequence[str], version: str) -> None:
+    def __init__(self, output: Output, logs: Logs, words: Sequence[str]) -> None:
         self.output = output
-        self.version = version
         self.command_line = [hide_passwords(word) for word in words]
         """As typed, but for passwords."""
         self._logs = logs
@@ -77,7 +77,7 @@ class Session:
             )
         self._logs.open(self._verbosity, self._log_file, typed_values(but="log_file"))
         told = printable(shlex.join(["flasher", *self.command_line]))
-        _LOG.info("flasher %s: %s", self.version, told, extra=SAID)
+        _LOG.info("flasher %s: %s", __version__, told, extra=SAID)
 
 
 def _session(ctx: click.Context) -> Session:
@@ -228,10 +228,10 @@ def _show(ctx: click.Context, param: click.Parameter, value: bool) -> None:  # n
     """Show help or version, and end."""
     if not value or ctx.resilient_parsing:
         return
-    session = _session(ctx)
     ctx.meta[BRIEF] = param.name == "brief_help"
     is_version = param.name == "version"
-    session.output.print_help(f"flasher {session.version}" if is_version else ctx.get_help())
+    output = _session(ctx).output
+    output.print_help(f"flasher {__version__}" if is_version else ctx.get_help())
     ctx.exit()
 
 
@@ -282,11 +282,14 @@ class _OurCommand(HelpedCommand):
     def make_context(self, *args: Any, **more: Any) -> click.Context:
         return super().make_context(*args, token_normalize_func=self._whole_name, **more)
 
+    @functools.cached_property
+    def _names(self) -> set[str]:
+        return {name.lstrip("-") for param in self.params for name in param.opts}
+
     def _whole_name(self, token: str) -> str:
         """The long option that begins like this, if there is one alone."""
-        names = [name.lstrip("-") for param in self.params for name in param.opts]
-        matches = [name for name in names if name.startswith(token)]
-        is_whole = len(token) == 1 or token in names
+        matches = [name for name in self._names if name.startswith(token)]
+        is_whole = len(token) == 1 or token in self._names
         return token if is_whole or len(matches) != 1 else matches[0]
 
 

@@ -7,7 +7,6 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from typing import Final
 
 import click
@@ -110,7 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     prepare_streams()
     output = Output(json_wanted="--json" in words)
     with Logs(output) as logs:
-        session = Session(output, logs, words, _version())
+        session = Session(output, logs, words)
         code = _guarded(lambda: _run(session, words), output)
         _LOG.info("exit code %d", code, extra=SAID)
     return code
@@ -175,10 +174,3 @@ def flasher(ctx: click.Context) -> int:
     if ctx.invoked_subcommand is None:
         output.print_help(ctx.get_help())
     return ExitCode.USAGE
-
-
-def _version() -> str:
-    try:
-        return version("welling-flasher")
-    except PackageNotFoundError:
-        return "(not installed)"

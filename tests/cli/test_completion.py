@@ -201,7 +201,7 @@ def test_every_example_parses(monkeypatch: pytest.MonkeyPatch, command: str | No
     for words in examples_of(command_of(command)):
         output = Output()
         with Logs(output) as logs:
-            session = Session(output, logs, words, "")
+            session = Session(output, logs, words)
             with program.make_context("flasher", list(words), obj=session) as ctx:
                 program.invoke(ctx)
         assert command in (None, output.command)

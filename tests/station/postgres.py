@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import psycopg
-from sqlalchemy import Connection, NullPool, Table, create_engine
+from sqlalchemy import Engine, Table, create_engine
 
 from flasher.station.records.schema import metadata
 from flasher.station.records.store import Store
@@ -28,6 +28,16 @@ host all {OWNER} 127.0.0.1/32 trust
 host all all 127.0.0.1/32 scram-sha-256
 """
 _FAST = "-c fsync=off -c synchronous_commit=off -c full_page_writes=off -c max_connections=60"
+_EMPTY = "SET session_replication_role = replica;" + "".join(
+    f"DELETE FROM {table.name};" for table in metadata.sorted_tables
+)
+"""Deletes all rows, against the rules of the records."""
+_COUNT_ON = "".join(
+    f"SELECT setval(pg_get_serial_sequence('{table.name}', 'id'),"
+    f" (SELECT coalesce(max(id), 0) + 1 FROM {table.name}), false);"
+    for table in metadata.sorted_tables
+    if "id" in table.c
+)
 
 
 @dataclass
@@ -38,7 +48,7 @@ class Server:
     folder: Path
     port: int
     _made: int = 0
-    _shared: str = ""
+    _shared: Engine | None = None
     _first_rows: dict[Table, list[dict[str, Any]]] = field(default_factory=dict)
 
     def url(self, database: str, user: str = OWNER) -> str:
@@ -51,23 +61,20 @@ class Server:
 
     def records(self) -> str:
         """The URL of records with nothing in them; always the same ones, for one test at a time."""
-        if not self._shared:
-            self._shared = self.own_records()
-            with self._without_rules(self._shared) as connection:
+        if self._shared is None:
+            self._shared = create_engine(self.own_records())
+            with self._shared.begin() as connection:
                 self._first_rows = {
                     table: [dict(row) for row in connection.execute(table.select()).mappings()]
                     for table in metadata.sorted_tables
                 }
-        with self._without_rules(self._shared) as connection:
+        with self._shared.begin() as connection:
+            connection.exec_driver_sql(_EMPTY)
             for table, rows in self._first_rows.items():
-                connection.execute(table.delete())
                 if rows:
                     connection.execute(table.insert(), rows)
-                if "id" in table.c:
-                    sequence = f"pg_get_serial_sequence('{table.name}', 'id')"
-                    next_id = f"(SELECT coalesce(max(id), 0) + 1 FROM {table.name})"
-                    connection.exec_driver_sql(f"SELECT setval({sequence}, {next_id}, false)")
-        return self._shared
+            connection.exec_driver_sql(_COUNT_ON)
+        return self._shared.url.render_as_string()
 
     def own_records(self) -> str:
         """The URL of new records; a new database takes half a second."""
@@ -84,14 +91,6 @@ class Server:
             connection.execute(f"CREATE DATABASE {name}".encode())
         return name
 
-    @staticmethod
-    @contextmanager
-    def _without_rules(url: str) -> Iterator[Connection]:
-        engine = create_engine(url, poolclass=NullPool)
-        with engine.begin() as connection:
-            connection.exec_driver_sql("SET session_replication_role = replica")
-            yield connection
-
     def start(self) -> None:
         data = self.folder / "data"
         self._run("initdb", "-D", str(data), "-U", OWNER, "-A", "trust", "-N", "-E", "UTF8")
@@ -101,6 +100,8 @@ class Server:
         self._run("pg_ctl", "-D", str(data), "-w", "-l", log, "-o", f"{where} {_FAST}", "start")
 
     def stop(self) -> None:
+        if self._shared is not None:
+            self._shared.dispose()
         self._run("pg_ctl", "-D", str(self.folder / "data"), "-m", "immediate", "stop")
 
     def _run(self, program: str, *words: str) -> None:
