@@ -218,7 +218,7 @@ class Bench:
     def check_stored(self, image: bytes) -> None:
         """The flash holds exactly `image`; not tried on a bench without readback."""
         if not self.subject.has_readback:
-            tells = told_version(self.subject.target, image) is not None
+            tells = told_version(self.subject.target, self.good_image) is not None
             why = "" if tells else ", and the device does not tell which application runs"
             self.unsupported("the flash holds the image", f"the bench has no readback{why}")
             return

@@ -11,8 +11,9 @@ from enum import Enum
 from typing import TYPE_CHECKING, Final
 
 from flasher.conformance.clauses import contents
-from flasher.conformance.results import CaseText
+from flasher.conformance.results import CaseText, Gap
 from flasher.conformance.subject import Subject
+from flasher.conformance.wire import told_version
 from flasher.errors import UsageError, did_you_mean
 
 if TYPE_CHECKING:  # the profile needs the validation library, which the list of groups does not
@@ -82,6 +83,10 @@ class Requirement(Enum):
     """Takes more than some seconds on a real bus."""
     TIMING = "timing"
     """Judges times: what the adapter's time stamps are worth decides."""
+    ANY_FRAME = "any-frame"
+    """Sends extended, remote and error frames."""
+    VERSION = "version"
+    """Needs an application that tells its version."""
 
 
 DESTRUCTIVE: Final = Requirement.DESTRUCTIVE
@@ -216,23 +221,84 @@ class Selection:
                     )
 
 
+# -- what a bench cannot judge --------------------------------------------------------------------
+
+_SIMULATED: Final = "--mock, or --subject"
+BARE: Final = {
+    Requirement.POWER: ("power control", "--power-cmd"),
+    Requirement.READBACK: ("readback of the flash", "--readback-cmd"),
+    Requirement.SECOND_IMAGE: ("a second good image", "--second-image"),
+    Requirement.BUS_OFF: ("a way to make the device go bus-off", _SIMULATED),
+    Requirement.TIMED_CUT: (
+        "power cuts at the moment of a flash operation or a frame",
+        _SIMULATED,
+    ),
+    Requirement.ANY_FRAME: ("an adapter that sends extended, remote and error frames", _SIMULATED),
+}
+"""What a bench of device, adapter and good image lacks, each with what adds it."""
+_LACKS: Final = {
+    **BARE,
+    Requirement.CHECKSUM: (
+        "images with a checksum of their own",
+        "a product that has one, and en_04 in the profile",
+    ),
+    Requirement.VERSION: (
+        "an application that tells its version",
+        "a BMS, with an image that holds one version",
+    ),
+}
+FULL_BENCH: Final = (Requirement.POWER, Requirement.READBACK, Requirement.SECOND_IMAGE)
+"""What can be added to a bench with a real device."""
+_IN_PART: Final = {
+    Requirement.SECOND_IMAGE: ("EN-01", "EN-07"),
+    Requirement.TIMED_CUT: ("PW-01",),
+    Requirement.ANY_FRAME: ("FR-09",),
+    Requirement.VERSION: ("SE-01",),
+}
+"""Cases that are judged in part without something."""
+_WITHOUT_FLASH: Final = ("FR-05", "FR-08", "CR-04", "EN-08", "TM-05", "SE-01")
+"""Destructive cases that do not look into the flash; all others need readback for a part."""
+
+
+def lacking(subject: Subject, profile: ConformanceProfile) -> list[Requirement]:
+    """What this bench does not have."""
+    has = {
+        Requirement.POWER: subject.has_power,
+        Requirement.READBACK: subject.has_readback,
+        Requirement.SECOND_IMAGE: subject.second_image is not None,
+        Requirement.BUS_OFF: subject.has_bus_off,
+        Requirement.TIMED_CUT: subject.has_timed_cuts,
+        Requirement.ANY_FRAME: subject.port.sends_any_frame,
+        Requirement.CHECKSUM: profile.choice("en_04") != "none",
+        Requirement.VERSION: told_version(subject.target, subject.good_image) is not None,
+    }
+    return [need for need, is_there in has.items() if not is_there]
+
+
+def gaps(lacks: Collection[Requirement], chosen: Iterable[str]) -> tuple[Gap, ...]:
+    """What a bench that lacks this cannot judge of the `chosen` cases."""
+    cases = [CASES[case_id] for case_id in chosen if case_id in CASES]
+    run = [case for case in cases if not case.requires.intersection(lacks)]
+    found = []
+    for need, (name, remedy) in _LACKS.items():
+        if need in lacks:
+            unsupported = tuple(case.id for case in cases if need in case.requires)
+            in_part = tuple(case.id for case in run if need.value in in_part_without(case.id))
+            if unsupported or in_part:
+                found.append(Gap(need.value, name, remedy, unsupported, in_part))
+    return tuple(found)
+
+
+def in_part_without(case_id: str) -> tuple[str, ...]:
+    """What a bench needs to judge all of a case, beside what it needs to run it."""
+    case = CASES.get(case_id)
+    found = [need for need, case_ids in _IN_PART.items() if case_id in case_ids]
+    if case is not None and DESTRUCTIVE in case.requires and case_id not in _WITHOUT_FLASH:
+        found.append(Requirement.READBACK)
+    return tuple(need.value for need in found)
+
+
 def what_is_missing(case: Case, subject: Subject, profile: ConformanceProfile) -> str:
     """Why this bench cannot run a case; empty when it can."""
-    needs = (
-        (Requirement.POWER, subject.has_power, "power control"),
-        (Requirement.READBACK, subject.has_readback, "readback of the flash"),
-        (Requirement.BUS_OFF, subject.has_bus_off, "a way to make the device go bus-off"),
-        (
-            Requirement.TIMED_CUT,
-            subject.has_timed_cuts,
-            "power cuts at the moment of a flash operation or a frame",
-        ),
-        (Requirement.SECOND_IMAGE, subject.second_image is not None, "a second good image"),
-        (
-            Requirement.CHECKSUM,
-            profile.choice("en_04") != "none",
-            "images with a checksum of their own (profile, en_04)",
-        ),
-    )
-    lacks = [name for need, is_there, name in needs if need in case.requires and not is_there]
+    lacks = [_LACKS[need][0] for need in lacking(subject, profile) if need in case.requires]
     return f"needs {' and '.join(lacks)}" if lacks else ""

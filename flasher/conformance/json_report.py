@@ -19,6 +19,7 @@ from flasher.conformance.results import (
     CaseVerdict,
     Check,
     CheckOutcome,
+    Gap,
     Measurement,
     Rescue,
     RunReport,
@@ -136,6 +137,8 @@ class ReportDocument:
     results: Sequence[ResultDocument]
     rescues: Sequence[Rescue]
     times: Sequence[TimesDocument]
+    gaps: Sequence[Gap]
+    """What this bench could not judge of the selected cases, by what it lacks."""
     not_selected: Sequence[str]
     host_cases: Sequence[str]
     """Cases of the catalogue about the tool, which are no part of this suite."""
@@ -184,6 +187,7 @@ def report_document(
         ],
         rescues=report.rescues,
         times=[_times(name, found) for name, found in report.times().items()],
+        gaps=report.gaps,
         not_selected=report.not_selected,
         host_cases=report.host_cases,
     )

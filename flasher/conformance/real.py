@@ -41,6 +41,8 @@ class RealPort:
     have the time of the kernel or, where it gives none, of this process.
     """
 
+    sends_any_frame = False
+
     def __init__(
         self,
         link: Link,

@@ -77,6 +77,7 @@ def junit_report(report: RunReport, *, started_at: str, replays: ByResult) -> by
             f"{why}: {' '.join(case_ids)}" for why, case_ids in report.not_tried().items()
         ),
         "final_image": report.final_image_text,
+        "bench_is": "; ".join(map(str, report.gaps)),
     }
     suites = {
         f"{group} {group_title(group)}": [

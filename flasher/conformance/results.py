@@ -157,6 +157,26 @@ class CaseResult:
 
 
 @dataclass(frozen=True)
+class Gap:
+    """What a bench lacks, and what it cannot judge for that."""
+
+    requirement: str
+    lacks: str
+    remedy: str
+    """What adds it: an option, or another kind of device under test."""
+    unsupported: tuple[str, ...]
+    """Cases that cannot be run."""
+    in_part: tuple[str, ...]
+    """Cases that are judged in part."""
+
+    def __str__(self) -> str:
+        """In one line, without the names of the cases."""
+        costs = {"cannot be run": len(self.unsupported), "judged in part": len(self.in_part)}
+        said = ", ".join(f"{count} {what}" for what, count in costs.items() if count)
+        return f"without {self.lacks}: {said} (it takes {self.remedy})"
+
+
+@dataclass(frozen=True)
 class Rescue:
     """A case after which only power brought the device back."""
 
@@ -181,6 +201,8 @@ class RunReport:
     cases: tuple[CaseText, ...]
     """The cases of `results`, each once, in the order of the catalogue."""
     results: tuple[CaseResult, ...]
+    gaps: tuple[Gap, ...] = ()
+    """What the bench could not judge, by what it lacks."""
     not_selected: tuple[str, ...] = ()
     """Cases that the selection left out."""
     host_cases: tuple[str, ...] = ()

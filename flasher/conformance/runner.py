@@ -21,8 +21,10 @@ from flasher.conformance.catalogue import (
     Case,
     Selection,
     case_text,
+    gaps,
     in_order,
     known_cases,
+    lacking,
     what_is_missing,
 )
 from flasher.conformance.profile import ConformanceProfile, check_deviations, profile_keys
@@ -274,6 +276,7 @@ class Run:
             strict=self._options.strict,
             cases=tuple(case_text(case_id, self._profile) for case_id in chosen),
             results=tuple(self._results),
+            gaps=gaps(lacking(self._subject, self._profile), chosen),
             not_selected=tuple(in_order(set(known_cases()).difference(chosen))),
             host_cases=HOST_CASES,
             stopped=self.stopped,

@@ -25,6 +25,8 @@ class Port(Protocol):
     """Who stamps the frames: "simulated bus", "hardware", "kernel" or "host"."""
     uncertainty_s: float
     """How far a time stamp may be off."""
+    sends_any_frame: bool
+    """True when `send` takes extended, remote and error frames too."""
 
     def now(self) -> float:
         """The time in seconds; it never goes back."""

@@ -19,6 +19,7 @@ from flasher.cli.bench.conformance_bench import BenchChoices, bench_options, set
 from flasher.cli.bench.conformance_text import (
     ListedCase,
     difference_lines,
+    gap_lines,
     list_lines,
     report_lines,
 )
@@ -27,10 +28,20 @@ from flasher.cli.framework import argument, group, option, option_set, retyped
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
-from flasher.conformance.catalogue import GROUPS, Selection
+from flasher.conformance.catalogue import (
+    BARE,
+    CASES,
+    FULL_BENCH,
+    GROUPS,
+    Selection,
+    case_text,
+    gaps,
+    in_part_without,
+    lacking,
+)
 from flasher.conformance.diff import THRESHOLD_PERCENT, Difference, compare, read_report
 from flasher.conformance.json_report import ReportDocument
-from flasher.conformance.results import CaseVerdict, CheckOutcome, RunReport
+from flasher.conformance.results import CaseVerdict, CheckOutcome, Gap, RunReport
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.text import printable
 
@@ -76,9 +87,13 @@ class ConformanceDocument:
 
 @dataclass(frozen=True)
 class CaseListDocument:
-    """The cases that are selected."""
+    """The cases that are selected, and what cannot be judged of them."""
 
     cases: list[ListedCase]
+    bare_bench: tuple[Gap, ...]
+    """On a bench of device, adapter and good image."""
+    full_bench: tuple[Gap, ...]
+    """On one with power control, readback and a second image too."""
 
 
 @dataclass(frozen=True)
@@ -209,6 +224,9 @@ def conformance(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) 
         stop_on_signal(stopping) as stopped,
         progress(output) as observer,
     ):
+        missing = gaps(lacking(subject, profile), chosen.selection.chosen())
+        for line in gap_lines("this bench", missing) if missing else ():
+            output.progress(line)
         report = run(
             subject,
             profile,
@@ -320,11 +338,11 @@ def exit_code(report: RunReport, *, was_stopped: bool) -> ExitCode:
 
 def _list(selection: Selection, output: Output) -> int:
     from flasher.conformance import cases  # noqa: F401, PLC0415  registers the cases
-    from flasher.conformance.catalogue import CASES, case_text  # noqa: PLC0415
     from flasher.conformance.profile import ConformanceProfile  # noqa: PLC0415
 
     selection.check()
-    texts = [case_text(case_id, ConformanceProfile()) for case_id in selection.chosen()]
+    chosen = selection.chosen()
+    texts = [case_text(case_id, ConformanceProfile()) for case_id in chosen]
     found = [
         ListedCase(
             text.id,
@@ -333,6 +351,7 @@ def _list(selection: Selection, output: Output) -> int:
             text.clause,
             text.clauses,
             text.requires,
+            in_part_without(text.id),
             tuple(text.choices),
             can_be_run=text.id in CASES,
         )
@@ -340,7 +359,14 @@ def _list(selection: Selection, output: Output) -> int:
     ]
     for line in list_lines(found, verbose=output.verbosity > 0):
         output.result(line)
-    output.document(CaseListDocument(found))
+    bare, full = gaps(BARE, chosen), gaps(set(BARE).difference(FULL_BENCH), chosen)
+    for name, missing in (
+        ("a bare bench (device, adapter, good image)", bare),
+        ("a full bench (with power, readback and a second image)", full),
+    ):
+        for line in gap_lines(name, missing):
+            output.result(line)
+    output.document(CaseListDocument(found, bare_bench=bare, full_bench=full))
     return ExitCode.OK
 
 

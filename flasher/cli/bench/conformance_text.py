@@ -14,6 +14,7 @@ from flasher.conformance.results import (
     CaseText,
     CaseVerdict,
     CheckOutcome,
+    Gap,
     RunReport,
     count_text,
 )
@@ -64,6 +65,9 @@ def report_lines(report: RunReport, replays: ByResult, *, verbose: bool = False)
             yield from lines
     yield from _not_judged(report)
     yield from _times(report, verbose=verbose)
+    if report.gaps:
+        yield ""
+        yield from (printable(f"this bench is {gap}") for gap in report.gaps)
     yield ""
     for line in report.remarks():
         yield printable(f"note: {line}")
@@ -118,9 +122,7 @@ def _not_judged(report: RunReport) -> Iterator[str]:
         yield ""
     for (status, why), case_ids in reasons.items():
         named = list(dict.fromkeys(case_ids))
-        shown = " ".join(named[:_NOTES_SHOWN])
-        more = f" and {len(named) - _NOTES_SHOWN} more" if len(named) > _NOTES_SHOWN else ""
-        yield printable(f"{status.text}: {shown}{more}: {_short(why)}")
+        yield printable(f"{status.text}: {_some(named)}: {_short(why)}")
 
 
 def _why(result: CaseResult) -> str:
@@ -150,6 +152,24 @@ def _times(report: RunReport, *, verbose: bool) -> Iterator[str]:
         yield f"  {row[0]:<{widths[0]}}  " + "  ".join(cells)
 
 
+# -- what a bench cannot judge --------------------------------------------------------------------
+
+
+def gap_lines(bench: str, gaps: Sequence[Gap]) -> Iterator[str]:
+    """What a bench cannot judge, a line for each thing that it lacks, with the cases."""
+    yield f"{bench}: {'judges all in full' if not gaps else ''}".rstrip()
+    for gap in gaps:
+        costs = {"cannot be run": gap.unsupported, "judged in part": gap.in_part}
+        shown = "; ".join(f"{_some(ids)} {what}" for what, ids in costs.items() if ids)
+        yield printable(f"  without {gap.lacks}: {shown} (it takes {gap.remedy})")
+
+
+def _some(case_ids: Sequence[str]) -> str:
+    more = len(case_ids) - _NOTES_SHOWN
+    shown = " ".join(case_ids[:_NOTES_SHOWN])
+    return f"{shown} and {more} more" if more > 0 else shown
+
+
 # -- the list -------------------------------------------------------------------------------------
 
 
@@ -165,6 +185,8 @@ class ListedCase:
     clauses: Mapping[str, str]
     """Each of the clauses that `clause` names, with its content."""
     requires: tuple[str, ...]
+    in_part_without: tuple[str, ...]
+    """What a bench needs besides, to judge all of it."""
     choices: tuple[str, ...]
     """Keys of the profile that it depends on."""
     can_be_run: bool
@@ -177,7 +199,10 @@ def list_lines(cases: Sequence[ListedCase], *, verbose: bool = False) -> Iterato
         if not case.can_be_run:
             yield f"{case.id}  cannot be run: {case.title}"
             continue
-        needs = f"  ({', '.join(case.requires)})" if case.requires else ""
+        notes = [", ".join(case.requires)] if case.requires else []
+        if case.in_part_without:
+            notes.append(f"in part without {', '.join(case.in_part_without)}")
+        needs = f"  ({'; '.join(notes)})" if notes else ""
         yield f"{case.id}  {case.title:<{width}}  {case.clause}{needs}"
         if verbose:
             yield from (f"       {label}: {content}" for label, content in case.clauses.items())

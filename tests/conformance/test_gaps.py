@@ -1,0 +1,73 @@
+"""What a bench cannot judge: what the suite says beforehand is what comes of the run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from flasher.conformance.catalogue import BARE, CASES, FULL_BENCH, gaps, in_order, lacking
+from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock
+from flasher.conformance.results import CaseVerdict, Unsupported
+from flasher.conformance.runner import run
+from flasher.conformance.wire import RawFrame
+from tests.loops import each
+
+AREA_BYTES = 34 * 1024
+
+
+def bare(target: str) -> MockSubject:
+    """A device on a bench of nothing but adapter and good image."""
+    subject = MockSubject(target, profile=replace(MOCK_PROFILE, application_area_bytes=AREA_BYTES))
+    subject.has_power = subject.has_readback = False
+    subject.has_bus_off = subject.has_timed_cuts = False
+    subject.second_image = None
+    subject.port.sends_any_frame = False
+    send = subject.port.send
+
+    def send_standard(frame: RawFrame) -> None:
+        if frame.is_extended or frame.is_remote or frame.is_error:
+            raise Unsupported("the adapter sends standard data frames only")
+        send(frame)
+
+    subject.port.send = send_standard  # type: ignore[method-assign]
+    return subject
+
+
+@each("target", ["bms", "wmc"])
+def test_what_a_bare_bench_cannot_judge_is_said_beforehand(target: str) -> None:
+    subject = bare(target)
+    profile = profile_of_mock(subject.device.profile)
+    foreseen = gaps(lacking(subject, profile), in_order(CASES))
+    report = run(subject, profile)
+    assert report.gaps == foreseen
+    verdicts = {result.case_id: result.verdict for result in report.results}
+    unsupported = {case_id for gap in foreseen for case_id in gap.unsupported}
+    in_part = {case_id for gap in foreseen for case_id in gap.in_part}
+    assert in_part == {
+        case_id for case_id, verdict in verdicts.items() if verdict is CaseVerdict.PASS_IN_PART
+    }
+    assert {*unsupported, "BU-07"} == {
+        case_id for case_id, verdict in verdicts.items() if verdict is CaseVerdict.UNSUPPORTED
+    }
+
+
+def test_on_a_bench_with_everything_every_pass_is_in_full() -> None:
+    subject = MockSubject(
+        profile=replace(MOCK_PROFILE, application_area_bytes=AREA_BYTES, image_checksum="crc32")
+    )
+    report = run(subject, profile_of_mock(subject.device.profile))
+    assert report.gaps == ()
+    count = len(CASES)
+    assert report.in_full == f"{count} of {count} passes were judged in full"
+
+
+def test_more_of_a_bench_judges_more() -> None:
+    chosen = in_order(CASES)
+    bare_bench, full_bench = gaps(BARE, chosen), gaps(set(BARE).difference(FULL_BENCH), chosen)
+    assert [gap.remedy for gap in bare_bench[:3]] == [
+        "--power-cmd",
+        "--readback-cmd",
+        "--second-image",
+    ]
+    cannot = [{case for gap in one for case in gap.unsupported} for one in (bare_bench, full_bench)]
+    assert cannot == [{"RS-05", "PW-01", "PW-02", "EN-08", "BU-02"}, {"BU-02"}]
+    assert [gap.in_part for gap in full_bench] == [(), ("PW-01",), ("FR-09",)]
