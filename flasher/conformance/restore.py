@@ -17,6 +17,7 @@ from flasher.conformance.wire import Kind, told_version
 
 _MARGIN_S: Final = 60.0
 _ASK_S: Final = 0.4
+_UPGRADE_TRIES: Final = 3
 BY_NOTHING: Final = "it ran"
 BY_UPGRADE: Final = "upgrade"
 BY_POWER: Final = "power cycle, then upgrade"
@@ -100,8 +101,10 @@ def needs_power(profile: ConformanceProfile) -> bool:
 def _limit_s(subject: Subject, profile: ConformanceProfile) -> float:
     """The time limit of one way: all its waits, and the transfer at a slow pace."""
     limit = profile.limit
-    waits_s = 3 * sum(
-        map(limit, ("first_version_s", "pause_s", "erase_s", "complete_s", "start_s"))
+    waits_s = (
+        3
+        * _UPGRADE_TRIES
+        * sum(map(limit, ("first_version_s", "pause_s", "erase_s", "complete_s", "start_s")))
     )
     frames = len(subject.good_image) / 5.0
     return waits_s + 4 * frames * 130 / subject.port.bitrate_bps + _MARGIN_S
@@ -117,14 +120,18 @@ def _runs(bench: Bench) -> str:
 
 def _upgrade(bench: Bench) -> str:
     """Upgrade by the protocol, in a way that does not depend on what a reset (TX-13) or an update
-    command (UP-08) does during a transfer.
+    command (UP-08) does during a transfer; more than once, as a burst may have just begun or ended.
     """
     blind = bench.choice("up_08") == "starts_over"
-    reset = not blind or _may_run(bench)
-    reason = _upgraded(bench, reset=reset, blind=blind)
-    if reason and bench.choice("tx_12") == "announces":
-        bench.wait(bench.limit("pause_s"))
-        reason = _upgraded(bench, reset=_may_run(bench))
+    reason = ""
+    for attempt in range(_UPGRADE_TRIES):
+        if attempt and bench.choice("tx_12") == "announces":
+            bench.wait(bench.limit("pause_s"))
+        reset = not blind or attempt == _UPGRADE_TRIES - 1 or _may_run(bench)
+        # Without an application it may listen silently (RS-03).
+        reason = _upgraded(bench, reset=reset, blind=blind or attempt > 0)
+        if not reason:
+            break
     return reason
 
 

@@ -15,7 +15,9 @@ from typing import Final
 import click
 
 from flasher.cli import values
+from flasher.cli.bench import conformance_explore
 from flasher.cli.bench.conformance_bench import BenchChoices, bench_options, set_option
+from flasher.cli.bench.conformance_explore import explore
 from flasher.cli.bench.conformance_text import (
     ListedCase,
     difference_lines,
@@ -125,6 +127,7 @@ class HeaderDocument:
 
 DOCUMENTS: Final = (
     ConformanceDocument, CaseListDocument, Difference, ProfileKeysDocument, HeaderDocument,
+    *conformance_explore.DOCUMENTS,
 )  # fmt: skip
 
 
@@ -437,3 +440,6 @@ def header(output: Output, *, folder: Path) -> int:
         output.result(printable(written[-1]))
     output.document(HeaderDocument(written))
     return ExitCode.OK
+
+
+conformance.add_command(explore, "explore")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -13,11 +12,12 @@ from flasher.cli import values
 from flasher.cli.framework import argument, command, option
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output
+from flasher.cli.question import agrees, can_ask
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
 from flasher.cli.stop import stop_on_signal
-from flasher.errors import ExitCode, InterruptedByUserError, UsageError
+from flasher.errors import ExitCode, UsageError
 from flasher.host.items import writable
-from flasher.host.write import WritePlan, Written, field_changes, plan_write
+from flasher.host.write import Written, field_changes, plan_write
 from flasher.protocol.fields import label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target
 
@@ -128,7 +128,7 @@ def write(
     if item is None:
         raise UsageError("Nothing to write was named.", remedy="See flasher write --list.")
     plan = plan_write(item, list(value), target, dialect=bus.dialect, manufacturer=manufacturer)
-    if not yes and not _is_terminal():
+    if not yes and not can_ask():
         raise UsageError(
             f"Writing {plan.writable.name} needs a confirmation, and there is no terminal to ask.",
             remedy="Add --yes.",
@@ -146,7 +146,12 @@ def write(
             ),
             indent=2,
         )  # fmt: skip
-        if not yes and not _agrees(plan):
+        node = target.node.name
+        if not yes and not agrees(
+            f"Write {plan.writable.name} to the {node}?",
+            interrupted=f"nothing was written to the {node}, and nothing was sent to it but the "
+            "question for the old value.",
+        ):
             output.progress("nothing was written")
             output.document(NotWrittenDocument(written=False), exit_code=ExitCode.INTERRUPTED)
             return ExitCode.INTERRUPTED
@@ -174,24 +179,6 @@ def _document(written: Written) -> WrittenDocument:
             for each in written.changes
         },
     )
-
-
-def _is_terminal() -> bool:
-    return sys.stdin.isatty() and sys.stderr.isatty()
-
-
-def _agrees(plan: WritePlan) -> bool:
-    sys.stderr.write(f"Write {plan.writable.name} to the {plan.target.node.name}? [y/N] ")
-    sys.stderr.flush()
-    try:
-        answer = sys.stdin.readline()
-    except KeyboardInterrupt as interrupt:
-        sys.stderr.write("\n")
-        raise InterruptedByUserError(
-            f"Interrupted at the question: nothing was written to the {plan.target.node.name}, and "
-            "nothing was sent to it but the question for the old value.",
-        ) from interrupt
-    return answer.strip().lower() in {"y", "yes"}
 
 
 def _list(target: Target, dialect: Dialect, output: Output) -> int:

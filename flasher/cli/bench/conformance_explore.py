@@ -1,0 +1,214 @@
+"""`flasher conformance explore`: random walks through messages of all kinds, until one finds
+something.
+"""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+import click
+
+from flasher.cli import values
+from flasher.cli.bar import Bar
+from flasher.cli.bench.conformance_bench import BenchChoices, bench_options
+from flasher.cli.files import write_whole
+from flasher.cli.framework import command, option, option_set, retyped
+from flasher.cli.options import Bus, adapter_options
+from flasher.cli.output import Output
+from flasher.cli.question import agrees, can_ask
+from flasher.cli.stop import stop_on_signal
+from flasher.errors import ExitCode, UsageError
+from flasher.protocol.text import printable
+
+if TYPE_CHECKING:
+    from flasher.conformance.explore import Explored
+
+_EXAMPLES: Final = """\
+examples:
+  flasher conformance explore -t bms --subject ./boot --steps 5000
+  flasher conformance explore -t bms --mock --variant queues-updates --seed 7
+  flasher conformance explore -t bms --mock --replay 'reset update=384 packet packet-crc'
+
+A walk begins with a running good image, and ends with an upgrade to it, which has to succeed. Only
+what is valid may be answered positively, and what is valid has to be answered. What is found is cut
+down to the shortest walk that finds the same; --replay takes that walk again. Exit code 12 for a
+finding. A device on a bus is erased about twice a walk (12 steps on average).
+"""
+_WALKS_PER_STEP: Final = 1 / 12
+_ERASES_A_WALK: Final = 2
+_REPLACED: Final = frozenset(
+    {
+        *("--steps", "--seed", "--replay", "--trace-file", "--yes"),
+        *("--json", "--events", "--verbose", "--quiet", "--log-file"),
+    }
+)
+
+
+@dataclass(frozen=True)
+class FindingDocument:
+    """What a walk found."""
+
+    rule: str
+    """Which rule was broken: short, and the same from version to version."""
+    text: str
+    steps: list[str]
+    """The shortest walk that finds it."""
+    first_steps: list[str]
+    replay: str
+
+
+@dataclass(frozen=True)
+class CoverageDocument:
+    """How often a step was taken in a phase of the device."""
+
+    phase: str
+    step: str
+    count: int
+
+
+@dataclass(frozen=True)
+class ExploreDocument:
+    """What came of the walks."""
+
+    subject: str
+    seed: str
+    walks: int
+    steps: int
+    finding: FindingDocument | None
+    stopped: str
+    """Why it ended before its number of steps; empty when it did not."""
+    coverage: list[CoverageDocument]
+
+
+DOCUMENTS: Final = (ExploreDocument,)
+
+
+@dataclass(frozen=True)
+class Choices:
+    """How far is walked, and what is written."""
+
+    steps: int
+    seed: str
+    replay: str | None
+    yes: bool
+    trace_file: Path | None
+
+
+_what = partial(option, panel="what is run, and how")
+_choices = option_set(
+    "chosen",
+    Choices,
+    _what(
+        "--steps", type=values.count, default="2000", metavar="N", brief=True,
+        help="end after so many steps",
+    ),
+    _what("--seed", default="1", metavar="SEED", brief=True, help="decides every walk"),
+    _what("--replay", metavar="STEPS", help="take these steps instead, as a finding tells them"),
+    _what("-y", "--yes", is_flag=True, help="do not ask before a device on a bus is worn"),
+    option(
+        "--trace-file", type=values.FilePath("log", gives=Path), metavar="FILE", panel="reports",
+        help="the frames of the walk that found something (candump)",
+    ),
+)  # fmt: skip
+
+
+@command(
+    short_help="Walk through messages of all kinds until something is found",
+    epilog=_EXAMPLES,
+    exit_codes=(ExitCode.IMAGE, ExitCode.BUS, ExitCode.PARTIAL, ExitCode.INTERRUPTED),
+)
+@bench_options
+@_choices
+@adapter_options
+def explore(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> int:
+    """Walk through valid and invalid messages in any order until the device breaks a rule, and
+    find the shortest walk that breaks it.
+    """
+    from flasher.conformance.explore import Explorer  # noqa: PLC0415  much is loaded
+    from flasher.conformance.opening import open_bench  # noqa: PLC0415
+
+    described = bench.described(bus)
+    is_simulated = described.is_mock or described.subject is not None
+    if not (is_simulated or chosen.yes or chosen.replay):
+        _ask(chosen.steps)
+    with (
+        open_bench(described) as (subject, profile),
+        stop_on_signal(lambda: output.progress("stopping; press again to end at once")) as stopped,
+        Bar(output, leave=False, unit=" steps") as bar,
+    ):
+        explorer = Explorer(
+            subject,
+            profile,
+            seed=chosen.seed,
+            stopped=stopped,
+            progress=lambda steps: bar.move_to(min(steps, chosen.steps), chosen.steps),
+        )
+        if chosen.replay is None:
+            explored = explorer.explore(chosen.steps)
+        else:
+            explored = explorer.replay(chosen.replay.split())
+        was_stopped = stopped()
+    code = ExitCode.OK if explored.finding is None else ExitCode.PARTIAL
+    if was_stopped and explored.finding is None:
+        code = ExitCode.INTERRUPTED
+    _tell(explored, output, chosen.trace_file, code)
+    return code
+
+
+def _ask(steps: int) -> None:
+    """Say what the walks cost the device, and ask. Raises UsageError without an answer."""
+    erases = max(1, round(steps * _WALKS_PER_STEP * _ERASES_A_WALK))
+    said = f"{steps} steps erase and write the device about {erases} times"
+    if not can_ask():
+        raise UsageError(f"{said}, and there is no terminal to ask.", remedy="Add --yes.")
+    if not agrees(f"{said}. Begin?", interrupted="nothing was sent to the device."):
+        raise UsageError("Nothing was sent to the device.", remedy="Name fewer steps, or agree.")
+
+
+def _tell(explored: Explored, output: Output, trace_file: Path | None, code: ExitCode) -> None:
+    ctx, finding = click.get_current_context(), explored.finding
+    words = ["flasher", *retyped(ctx, "conformance", without=_REPLACED.__contains__)]
+    words.insert(words.index("conformance") + 1, "explore")
+    replay = ""
+    met = sum(bool(count) for _, _, count in explored.coverage)
+    output.result(
+        f"{printable(explored.subject)}: {explored.walks} walks, {explored.steps} steps, seed "
+        f"{printable(explored.seed)}"
+    )
+    output.result(f"{met} of {len(explored.coverage)} pairs of phase and step were met")
+    if explored.never and output.verbosity > 0:
+        for phase in dict.fromkeys(phase for phase, _ in explored.never):
+            names = [name for its, name in explored.never if its == phase]
+            output.result(f"  never in the phase {phase}: {', '.join(names)}")
+    if finding is not None:
+        replay = shlex.join([*words, "--replay", " ".join(finding.steps)])
+        output.result(f"FOUND {finding.rule}: {printable(finding.text)}")
+        output.result(f"  steps: {' '.join(finding.steps) or 'none: the good image is flashed'}")
+        output.result(f"  replay: {printable(replay)}")
+        if trace_file is not None:
+            from flasher.conformance.reports import candump  # noqa: PLC0415
+
+            write_whole(trace_file, candump(finding.trace), "--trace-file")
+            output.progress(f"trace: {printable(str(trace_file))}")
+    else:
+        output.result(explored.stopped or "nothing was found")
+    output.document(
+        ExploreDocument(
+            explored.subject,
+            explored.seed,
+            explored.walks,
+            explored.steps,
+            None
+            if finding is None
+            else FindingDocument(
+                finding.rule, finding.text, list(finding.steps), list(finding.first_steps), replay
+            ),
+            explored.stopped,
+            [CoverageDocument(*each) for each in explored.coverage],
+        ),
+        exit_code=code,
+    )

@@ -1,0 +1,226 @@
+"""Random walks: many of them, each from the known state, until one finds something; then the
+shortest one that finds the same.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.explore.steps import Step, next_step, parse_step, reachable_pairs
+from flasher.conformance.explore.walk import ALL_STEPS, Phase, Violation, Walk
+from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.restore import BY_POWER, needs_power, restore
+from flasher.conformance.results import (
+    CaseEnded,
+    CaseLimitReached,
+    DeviceCrashed,
+    RunStopped,
+    TraceEntry,
+    Unsupported,
+)
+from flasher.conformance.subject import Subject
+from flasher.errors import UsageError, did_you_mean
+
+WALK_STEPS: Final = 24
+"""The longest walk."""
+SHRINK_TRIES: Final = 60
+_LIMIT_S: Final = 900.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What a walk found, and the shortest one that finds it."""
+
+    rule: str
+    text: str
+    steps: tuple[str, ...]
+    first_steps: tuple[str, ...]
+    """Those of the walk that found it first."""
+    trace: tuple[TraceEntry, ...] = ()
+
+
+@dataclass(frozen=True)
+class Explored:
+    """Walks from the first to the last. `coverage` has every pair of phase and step that a walk may
+    meet, with how often it was met.
+    """
+
+    subject: str
+    seed: str
+    walks: int
+    steps: int
+    coverage: tuple[tuple[str, str, int], ...]
+    finding: Finding | None = None
+    stopped: str = ""
+
+    @property
+    def never(self) -> list[tuple[str, str]]:
+        """Pairs of phase and step that no walk met."""
+        return [(phase, step) for phase, step, count in self.coverage if not count]
+
+
+class Explorer:
+    """Walks on one device; `progress` is told the number of steps after each walk."""
+
+    def __init__(
+        self,
+        subject: Subject,
+        profile: ConformanceProfile,
+        *,
+        seed: str = "1",
+        stopped: Callable[[], bool] = lambda: False,
+        progress: Callable[[int], None] = lambda _: None,
+    ) -> None:
+        self._subject = subject
+        self._profile = profile
+        self._seed = seed
+        self._stopped = stopped
+        self._progress = progress
+        self._met: Counter[tuple[Phase, str]] = Counter()
+        self._steps = 0
+        self._walks = 0
+
+    def explore(self, steps: int) -> Explored:
+        """Walk until so many steps were taken, or something is found. Raises BusError."""
+        try:
+            trouble = self._restored()
+            if trouble:
+                return self._explored(_first_trouble(trouble))
+            while self._steps < steps and not self._stopped():
+                chance = random.Random(f"{self._seed}/{self._walks}")  # noqa: S311  by the seed
+                length = min(chance.randint(3, WALK_STEPS), steps - self._steps)
+                taken: list[Step] = []
+                found = self._walk(_by_chance(chance, length), taken)
+                self._progress(self._steps)
+                if found is not None:
+                    return self._explored(self._shrunk(found, taken))
+        except RunStopped:
+            pass
+        return self._explored(stopped="it was stopped" if self._steps < steps else "")
+
+    def replay(self, texts: Sequence[str]) -> Explored:
+        """Take these steps, as a finding tells them. Raises UsageError, BusError."""
+        try:
+            steps = [parse_step(text) for text in texts]
+        except ValueError as error:
+            word = next(text for text in texts if f"{text!a}" in str(error))
+            raise UsageError(
+                f"There is no step {word!a}.", remedy=did_you_mean(word, ALL_STEPS).rstrip()
+            ) from error
+        trouble = self._restored()
+        if trouble:
+            return self._explored(_first_trouble(trouble))
+        taken: list[Step] = []
+        found = self._walk(_these(steps), taken)
+        return self._explored(found and self._finding(found, taken, taken))
+
+    # -- one walk ----------------------------------------------------------------------------------
+
+    def _walk(
+        self, choose: Callable[[Walk], Step | None], taken: list[Step]
+    ) -> tuple[Violation, Bench] | None:
+        """Take the steps that `choose` gives, then upgrade the device to the good image."""
+        self._walks += 1
+        bench = Bench(self._subject, self._profile, limit_s=_LIMIT_S, stopped=self._stopped)
+        walk = Walk(bench)
+        try:
+            while (step := choose(walk)) is not None:
+                taken.append(step)
+                self._steps += 1
+                self._met[walk.phase, step.name] += 1
+                walk.take(*step)
+            if not walk.was_requested:
+                walk.check_application()
+            trouble = self._restored()
+            if trouble:
+                raise Violation("upgrade", f"no good upgrade afterwards: {trouble}")  # noqa: TRY301
+            walk.check_stored(bench.good_image)
+        except Unsupported:
+            return None
+        except Violation as found:
+            return found, bench
+        except DeviceCrashed as crashed:
+            return Violation("crash", str(crashed)), bench
+        except CaseLimitReached as reached:
+            return Violation("time", str(reached)), bench
+        return None
+
+    def _restored(self) -> str:
+        """Flash the good image, by the protocol alone; returns what went wrong, or ""."""
+        done = restore(self._subject, self._profile, flash=True, stopped=self._stopped)
+        if not done.ok:
+            return done.reason
+        if done.how == BY_POWER and self._walks and not needs_power(self._profile):
+            return "not by the protocol; a power cycle brought it back"
+        return ""
+
+    # -- shrinking ---------------------------------------------------------------------------------
+
+    def _shrunk(self, found: tuple[Violation, Bench], taken: list[Step]) -> Finding:
+        """The shortest walk, by leaving steps out, that ends with the same rule."""
+        best, rule = list(taken), found[0].rule
+        size, tries = max(len(best) // 2, 1), 0
+        while size and tries < SHRINK_TRIES and not self._is_lost():
+            start, was_shorter = 0, False
+            while start < len(best) and tries < SHRINK_TRIES:
+                shorter = best[:start] + best[start + size :]
+                again_taken: list[Step] = []
+                tries += 1
+                again = self._walk(_these(shorter), again_taken) if shorter or rule else None
+                if again is not None and again[0].rule == rule:
+                    best, found, was_shorter = again_taken, again, True
+                else:
+                    start += size
+                if again is not None and self._is_lost():
+                    break
+            if not was_shorter:
+                size //= 2
+        return self._finding(found, best, taken)
+
+    def _is_lost(self) -> bool:
+        """Bring the device back for the next walk; True when that is not possible."""
+        try:
+            return not restore(self._subject, self._profile, flash=True, stopped=self._stopped).ok
+        except RunStopped:
+            return True
+        except CaseEnded:
+            return True
+
+    def _finding(
+        self, found: tuple[Violation, Bench], steps: Sequence[Step], first: Sequence[Step]
+    ) -> Finding:
+        violation, bench = found
+        return Finding(
+            violation.rule,
+            str(violation),
+            tuple(map(str, steps)),
+            tuple(map(str, first)),
+            bench.tester.trace,
+        )
+
+    def _explored(self, finding: Finding | None = None, stopped: str = "") -> Explored:
+        coverage = tuple(
+            (phase.value, name, self._met[phase, name]) for phase, name in reachable_pairs()
+        )
+        return Explored(
+            self._subject.name, self._seed, self._walks, self._steps, coverage, finding, stopped
+        )
+
+
+def _first_trouble(trouble: str) -> Finding:
+    return Finding("upgrade", f"the good image could not be flashed: {trouble}", (), ())
+
+
+def _by_chance(chance: random.Random, length: int) -> Callable[[Walk], Step | None]:
+    left = iter(range(length))
+    return lambda walk: None if next(left, None) is None else next_step(walk, chance)
+
+
+def _these(steps: Sequence[Step]) -> Callable[[Walk], Step | None]:
+    left = iter(steps)
+    return lambda _: next(left, None)

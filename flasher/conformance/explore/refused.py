@@ -1,0 +1,243 @@
+"""Messages that a device has to refuse, or that are no concern of it, by the names of the steps of
+a walk. Each is made at a place in a transfer, which need not be under way.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from flasher.conformance.wire import (
+    END,
+    PACKET,
+    PACKET_BYTES,
+    READ,
+    REPORT,
+    UPDATE,
+    WRITE,
+    Encoder,
+    RawFrame,
+    build,
+    crc,
+    joined,
+    packet_count,
+    packet_payload,
+)
+
+_OTHER_MODE: Final = 0x17
+_UNKNOWN: Final = 0x6F01
+_LONG_UNKNOWN: Final = 0x6F60
+_SPOILT_FRAME: Final = 5
+_LOAD_FRAMES: Final = 150
+_FLOOD_MESSAGES: Final = 60
+_SMALL_BYTES: Final = 3 * PACKET_BYTES
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where in a transfer: the image, and the packet that is next."""
+
+    encoder: Encoder
+    image: bytes
+    wanted: int
+    largest_bytes: int
+    """The largest image that the device takes."""
+
+    @property
+    def total(self) -> int:
+        """Packets of the image."""
+        return packet_count(len(self.image))
+
+    def packet(self, number: int, *, total: int | None = None, start: int = 1) -> bytes:
+        """A packet of the image; an impossible number carries the data of the next one."""
+        inside = number if 1 <= number <= self.total else self.wanted
+        payload = packet_payload(self.image, inside)
+        total = self.total if total is None else total
+        return joined(self.encoder.packet(number, total, payload, start=start))
+
+    @property
+    def next_packet(self) -> bytes:
+        """The packet that is next."""
+        return self.packet(self.wanted)
+
+
+@dataclass(frozen=True)
+class Refused:
+    """What is sent; an intact write may have general feedback (R15)."""
+
+    frames: list[RawFrame]
+    is_intact_write: bool = False
+
+
+Maker = Callable[[Place], Refused]
+
+
+def _bytes(make: Callable[[Place], bytes], *, write: bool = False) -> Maker:
+    """Bytes to the device, in frames of 8."""
+    return lambda place: Refused(place.encoder.frames(make(place)), write)
+
+
+def _frames(make: Callable[[Place], list[RawFrame]], *, write: bool = False) -> Maker:
+    return lambda place: Refused(make(place), write)
+
+
+# -- packets ---------------------------------------------------------------------------------------
+
+
+def _with_crc(crc_bytes: Callable[[bytes], bytes]) -> Maker:
+    """The next packet with a CRC of its own, made of the bytes between header and CRC."""
+
+    def make(place: Place) -> bytes:
+        raw = place.next_packet
+        return raw[:-5] + crc_bytes(raw[2:-5]) + raw[-1:]
+
+    return _bytes(make)
+
+
+def _with_frames(change: Callable[[list[RawFrame]], list[RawFrame]]) -> Maker:
+    """The next packet, some of its frames lost, doubled or exchanged."""
+    return _frames(lambda place: change(place.encoder.frames(place.next_packet)))
+
+
+def _exchanged(frames: list[RawFrame]) -> list[RawFrame]:
+    """Two frames exchanged; where they are alike, one is lost."""
+    at = _SPOILT_FRAME
+    exchanged = [] if frames[at] == frames[at + 1] else [frames[at + 1], frames[at]]
+    return [*frames[:at], *exchanged, *frames[at + 2 :]]
+
+
+def _in_mode(mode: int) -> Maker:
+    return _frames(lambda place: place.encoder.message(mode, PACKET, place.next_packet[6:-5]))
+
+
+def _crc_mirrored(raw: bytes) -> bytes:
+    return raw[:-5] + raw[-5:-1][::-1] + raw[-1:]
+
+
+def _longer(place: Place) -> bytes:
+    """A packet whose length byte and data are longer by one than its command says."""
+    return build(place.encoder.to_device, WRITE, PACKET, place.next_packet[6:-5] + b"\xff")
+
+
+PACKETS: Final[dict[str, Maker]] = {
+    "packet-crc": _with_crc(lambda _: b"\x12\x34\x56\x78"),
+    "packet-crc-zero": _with_crc(lambda _: bytes(4)),
+    "packet-crc-ones": _with_crc(lambda _: b"\xff" * 4),
+    "packet-crc-no-id": _with_crc(lambda body: crc(b"\x55\xaa" + body).to_bytes(4, "big")),
+    "packet-crc-little": _bytes(lambda place: _crc_mirrored(place.next_packet)),
+    "packet-tail": _bytes(lambda place: place.next_packet[:-1] + b"\xf1"),
+    "packet-read": _in_mode(READ),
+    "packet-report": _in_mode(REPORT),
+    "packet-mode": _in_mode(_OTHER_MODE),
+    "packet-skip": _bytes(
+        lambda place: place.packet(place.wanted + 1 + (place.wanted == place.total)), write=True
+    ),
+    "packet-far": _bytes(lambda place: place.packet(place.wanted + 256), write=True),
+    "packet-zero": _bytes(lambda place: place.packet(0), write=True),
+    "packet-beyond": _bytes(lambda place: place.packet(place.total + 1), write=True),
+    "packet-total": _bytes(
+        lambda place: place.packet(place.wanted, total=place.total + 1), write=True
+    ),
+    "packet-start": _bytes(lambda place: place.packet(place.wanted, start=0), write=True),
+    "packet-lost": _with_frames(lambda all_: all_[:_SPOILT_FRAME] + all_[_SPOILT_FRAME + 1 :]),
+    "packet-doubled": _with_frames(lambda all_: all_[:_SPOILT_FRAME] + all_[_SPOILT_FRAME - 1 :]),
+    "packet-exchanged": _with_frames(_exchanged),
+    "packet-half": _with_frames(lambda all_: all_[: len(all_) // 2]),
+    "packet-long": _bytes(_longer),
+}
+
+
+# -- update commands, ends -------------------------------------------------------------------------
+
+
+def _update(size_bytes: Callable[[Place], int]) -> Maker:
+    return _frames(lambda place: place.encoder.update(size_bytes(place) & 0xFFFF_FFFF), write=True)
+
+
+def _small_update(
+    place: Place, *, mode: int = WRITE, text: bytes = b"", spoil: Callable[[bytes], bytes] = bytes
+) -> bytes:
+    data = (text or place.encoder.update_text) + _SMALL_BYTES.to_bytes(4, "little")
+    return spoil(build(place.encoder.to_device, mode, UPDATE, data))
+
+
+def _for_others(place: Place) -> list[RawFrame]:
+    """Update command and packet 1 to the other targets."""
+    packet = (1, packet_count(_SMALL_BYTES), bytes(PACKET_BYTES))
+    return [
+        frame
+        for other in place.encoder.others()
+        for frame in (*other.update(_SMALL_BYTES), *other.packet(*packet))
+    ]
+
+
+def _end(mode: int, data: bytes) -> Callable[[Place], list[RawFrame]]:
+    return lambda place: place.encoder.message(mode, END, data)
+
+
+UPDATES: Final[dict[str, Maker]] = {
+    "update-zero": _update(lambda _: 0),
+    "update-huge": _update(lambda _: -1),
+    "update-large": _update(lambda place: place.largest_bytes + 1),
+    "update-wraps": _update(lambda place: (place.largest_bytes & ~0xFFFF) + 0x10000 + _SMALL_BYTES),
+    "update-crc": _bytes(
+        lambda place: _small_update(place, spoil=lambda raw: raw[:-5] + bytes(4) + raw[-1:])
+    ),
+    "update-tail": _bytes(lambda place: _small_update(place, spoil=lambda raw: raw[:-1] + b"\0")),
+    "update-name": _bytes(
+        lambda place: _small_update(place, text=place.encoder.others()[0].update_text), write=True
+    ),
+    "update-read": _bytes(lambda place: _small_update(place, mode=READ)),
+    "update-others": _frames(_for_others),
+}
+ENDS: Final[dict[str, Maker]] = {
+    "end-mark": _frames(_end(WRITE, b"\x05"), write=True),
+    "end-read": _frames(_end(READ, b"\x04")),
+    "end-crc": _bytes(lambda place: _crc_mirrored(joined(place.encoder.end()))),
+}
+
+# -- no concern ------------------------------------------------------------------------------------
+
+
+def _reset(mode: int, data: Callable[[Encoder], bytes]) -> Callable[[Place], list[RawFrame]]:
+    return lambda place: place.encoder.message(
+        mode, place.encoder.reset_command, data(place.encoder)
+    )
+
+
+def _junk(place: Place) -> list[RawFrame]:
+    chance = random.Random(7)  # noqa: S311  the same at every replay
+    data = [bytes((chance.randrange(0x60, 0xF0),)) + chance.randbytes(7) for _ in range(16)]
+    return [RawFrame(place.encoder.to_device, each) for each in data]
+
+
+def _load(_place: Place) -> list[RawFrame]:
+    return [RawFrame(0x7A0 + number % 5, bytes(8)) for number in range(_LOAD_FRAMES)]
+
+
+NO_CONCERN: Final[dict[str, Maker]] = {
+    "reset-read": _frames(_reset(READ, lambda encoder: encoder.reset_data)),
+    "reset-text": _frames(
+        _reset(WRITE, lambda encoder: bytes(len(encoder.reset_data))), write=True
+    ),
+    "reset-others": _frames(
+        lambda place: [frame for other in place.encoder.others() for frame in other.reset()]
+    ),
+    "unknown": _frames(lambda place: place.encoder.message(WRITE, _UNKNOWN, b"\0"), write=True),
+    "unknown-mode": _frames(lambda place: place.encoder.message(_OTHER_MODE, _UNKNOWN, b"\0")),
+    "report": _frames(lambda place: place.encoder.message(REPORT, _UNKNOWN, b"\0")),
+    "length-zero": _bytes(lambda _: b"\x55\xaa\x16\x00\x12\x34\x56\x78\xf0"),
+    "length-long": _bytes(lambda _: b"\x55\xaa\x16\xff\x77\xfd\x01\x02"),
+    "header-only": _bytes(lambda _: b"\x55\xaa"),
+    "junk": _frames(_junk),
+    "flood": _frames(
+        lambda place: (
+            _FLOOD_MESSAGES
+            * place.encoder.message(READ, _LONG_UNKNOWN, bytes(_LONG_UNKNOWN & 0xFF))
+        )
+    ),
+    "own-id": _frames(lambda place: place.encoder.answer(_UNKNOWN, b"\0")),
+    "load": _frames(_load),
+}

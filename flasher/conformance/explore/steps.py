@@ -1,0 +1,130 @@
+"""Steps of a walk as they are written, and which one comes next."""
+
+from __future__ import annotations
+
+import random
+from typing import Final, NamedTuple
+
+from flasher.conformance.explore.refused import ENDS, NO_CONCERN, PACKETS, UPDATES
+from flasher.conformance.explore.walk import ALL_STEPS, Phase, Walk
+
+_SHARE: Final = 12 / len(PACKETS)
+_WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
+    Phase.APPLICATION: {
+        "reset": 14,
+        **dict.fromkeys(("burst", "burst=twice", "query", "update=384", "packet", "end"), 1),
+        **dict.fromkeys(("wait=0.3", "power", "bus-off", "reset-read", "reset-text", "unknown"), 1),
+        **dict.fromkeys(NO_CONCERN, 0.5),
+        **dict.fromkeys(("packet-crc", "update-others"), 0.4),
+    },
+    Phase.ANNOUNCING: {
+        "update=good": 8,
+        "update=second": 6,
+        "update=384": 6,
+        "update=300": 3,
+        "update=128": 2,
+        "update=wrong": 2,
+        "update=1": 1,
+        "update=33100": 0.5,
+        "update=70000": 0.3,
+        "reset": 2,
+        "wait=window": 1,
+        "wait=0.3": 0.5,
+        "power": 1,
+        **dict.fromkeys(("packet", "end", "query"), 1),
+        **dict.fromkeys(UPDATES, 1),
+        **dict.fromkeys((*NO_CONCERN, "bus-off"), 0.5),
+    },
+    Phase.BEGUN: {
+        "packet": 10,
+        "packets=4": 6,
+        "packets=all": 4,
+        "packets=most": 2,
+        "update=good": 2,
+        **dict.fromkeys(("packet-slow", "packet-behind", "packet-between"), 1),
+        **dict.fromkeys(("end", "reset", "wait=0.3", "power", "query"), 1),
+        **dict.fromkeys(("packet-open=short", "packet-open=junk", "wait=pause"), 0.7),
+        **dict.fromkeys(PACKETS, _SHARE),
+        **dict.fromkeys((*ENDS, *UPDATES, *NO_CONCERN, "bus-off"), 0.3),
+    },
+    Phase.TRANSFER: {
+        "packet": 5,
+        "packets=2": 5,
+        "packets=all": 14,
+        "packets=most": 4,
+        "packet-filler": 3,
+        "packet-again": 3,
+        "packet-again=other": 3,
+        "packet-again=older": 2,
+        "packet-again=older-other": 2,
+        "read": 2,
+        "end": 2,
+        "update=good": 2,
+        "update=300": 1,
+        **dict.fromkeys(("packet-slow", "packet-behind", "packet-between", "reset", "power"), 1),
+        **dict.fromkeys(("packet-open=short", "packet-open=junk", "wait=pause"), 0.7),
+        **dict.fromkeys(("wait=0.3", "query"), 0.5),
+        **dict.fromkeys(PACKETS, _SHARE),
+        **dict.fromkeys((*ENDS, *UPDATES, *NO_CONCERN, "bus-off"), 0.3),
+    },
+    Phase.STORED: {
+        "end": 15,
+        "end=twice": 5,
+        "end=padded": 3,
+        "packet-again": 2,
+        "packet-again=other": 2,
+        "power": 2,
+        "update=good": 2,
+        "packet": 1,
+        "reset": 1,
+        "wait=pause": 0.5,
+        "query": 0.5,
+        **dict.fromkeys(ENDS, 1),
+        **dict.fromkeys((*PACKETS, *NO_CONCERN), 0.2),
+    },
+    Phase.UNCLEAR: {
+        "packet": 3,
+        "end": 3,
+        "update=good": 3,
+        "power": 3,
+        "reset": 2,
+        **dict.fromkeys(("wait=window", "wait=pause", "query"), 1),
+    },
+}
+"""How often each step is taken, by what the device does."""
+
+
+class Step(NamedTuple):
+    """One step, as it is written: `packet`, `update=384`."""
+
+    name: str
+    argument: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.name}={self.argument}" if self.argument else self.name
+
+
+def parse_step(text: str) -> Step:
+    """A step as it is written. Raises ValueError for one that does not exist."""
+    name, _, argument = text.partition("=")
+    if name not in ALL_STEPS:
+        raise ValueError(f"there is no step {text!a}")
+    return Step(name, argument)
+
+
+def next_step(walk: Walk, chance: random.Random) -> Step:
+    """A step for what the device does, by chance; only what the bench can do."""
+    weights, subject = _WEIGHTS[walk.phase], walk.bench.subject
+    lacks = {"power": not subject.has_power, "bus-off": not subject.has_bus_off}
+    texts = [text for text in weights if not lacks.get(text)]
+    (text,) = chance.choices(texts, [weights[text] for text in texts])
+    return parse_step(text)
+
+
+def reachable_pairs() -> list[tuple[Phase, str]]:
+    """Every phase with every step that a walk may take in it, without the steps' arguments."""
+    return [
+        (phase, name)
+        for phase, weights in _WEIGHTS.items()
+        for name in dict.fromkeys(parse_step(text).name for text in weights)
+    ]

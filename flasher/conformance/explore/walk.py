@@ -1,0 +1,664 @@
+"""A walk: steps in any order, valid ones and others, judged by a model of what is certain.
+
+The model knows what a device must do, what it may do, and what the profile decides; where that
+leaves the state open it is UNCLEAR, and only what is never right is judged. Two rules hold
+everywhere: nothing but what is valid is answered positively, and what is valid is answered.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Callable, Sequence
+from enum import Enum
+from functools import partial
+from itertools import pairwise
+from math import inf
+from typing import Final
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.explore.refused import ENDS, NO_CONCERN, PACKETS, UPDATES, Place
+from flasher.conformance.wire import (
+    PACKET_BYTES,
+    Kind,
+    RawFrame,
+    Received,
+    describe,
+    joined,
+    packet_count,
+    packet_payload,
+    version_in,
+)
+
+_LEFTOVER_S: Final = 0.06
+"""A boot version so soon after request transfer was sent before it (R11)."""
+_UPDATE_SPACING_S: Final = 0.03
+"""Update commands are at least this far apart (R2)."""
+_GAP_S: Final = 0.02
+_BUS_OFF_S: Final = 0.02
+_UPDATES_MAX: Final = 8
+
+
+class Phase(Enum):
+    """What the device does, as far as it is certain."""
+
+    APPLICATION = "application"
+    ANNOUNCING = "announcing"
+    BEGUN = "before packet 1"
+    TRANSFER = "transfer"
+    STORED = "all stored"
+    UNCLEAR = "unclear"
+
+
+_IN_TRANSFER: Final = frozenset((Phase.BEGUN, Phase.TRANSFER, Phase.STORED))
+
+
+class Outcome(Enum):
+    """What the end of a transfer has to lead to, by the image."""
+
+    RUNS = "complete"
+    REFUSED = "NAK"
+    NEVER_ENDED = ""
+    """It would start what does not run."""
+
+
+class Violation(Exception):  # noqa: N818  the device's error, and no error of the walk
+    """The device did what is never right, or not what it must; `rule` is short and stable."""
+
+    def __init__(self, rule: str, text: str) -> None:
+        super().__init__(text)
+        self.rule = rule
+
+
+def filler(size_bytes: int) -> bytes:
+    """An image that is never ended: bytes by its size, with headers and tails among them."""
+    chance = random.Random(size_bytes)  # noqa: S311  the same at every replay
+    parts = (b"\x55\xaa\x16\x87\xa3\x85", b"\xf0\x55\xaa", b"\x55\x55\xaa\xf0")
+    data = b""
+    while len(data) < size_bytes:
+        data += chance.choice(parts) if chance.random() < 0.1 else chance.randbytes(7)
+    return data[:size_bytes]
+
+
+class Walk:
+    """The device under the steps of one walk; it begins with a running good image."""
+
+    def __init__(self, bench: Bench) -> None:
+        self.bench = bench
+        self.phase = Phase.APPLICATION
+        self.is_whole = True
+        """There is an application to start."""
+        self.was_requested = False
+        """An update command was accepted in this walk."""
+        self.running = bench.good_image
+        """The image of that application."""
+        self._image = filler(3 * PACKET_BYTES)
+        self._end_is = Outcome.NEVER_ENDED
+        self._offered = (self._image, self._end_is)
+        """What the last update command was about."""
+        self._stored = 0
+        self._updates_unanswered = 0
+        self._acks_due: Counter[int] = Counter()
+        self._naks_due = 0
+        self._nak_numbers: frozenset[int] | None = frozenset()
+        self._feedback_due = 0
+        self._may_restart = False
+        self._may_complete = False
+        self._may_break_off = False
+        """A message of the device may be cut."""
+        self._requested_at = -inf
+        self._version_at = -inf
+        self._useful_at = bench.now
+        """When the device had something to answer, from which a pause counts."""
+
+    def take(self, name: str, argument: str = "") -> None:
+        """Take a step: one of `STEPS`, or a message that is refused. Raises Violation, and what
+        the bench raises.
+        """
+        self._settle()
+        if name in PACKETS:
+            self._bad_packet(name)
+        elif name in UPDATES:
+            self._bad_update(name)
+        elif name in ENDS or name in NO_CONCERN:
+            self._no_concern(name)
+        else:
+            getattr(self, f"_{STEPS[name]}")(argument)
+
+    def check_application(self) -> None:
+        """The application that should be there runs. Raises Violation."""
+        bench = self.bench
+        if self.phase is not Phase.APPLICATION and bench.encoder.has_version_query:
+            bench.wait(bench.host.burst_s)
+        wanted = version_in(self.running)
+        if wanted is None or not bench.encoder.has_version_query:
+            found, wanted = ("answers" if bench.application_runs() else "no answer"), "answers"
+        else:
+            found = bench.application_version(bench.limit("start_s")) or "no answer"
+        if found != wanted:
+            raise Violation("application", f"the application does not run: {found}, not {wanted}")
+        self.phase = Phase.APPLICATION
+        bench.forget()
+
+    def check_stored(self, image: bytes) -> None:
+        """The flash holds `image`, where it can be read. Raises Violation."""
+        if self.bench.subject.has_readback:
+            stored = self.bench.subject.readback()[: len(image)]
+            if stored != image:
+                at = next(
+                    (at for at, (a, b) in enumerate(zip(stored, image, strict=False)) if a != b),
+                    len(stored),
+                )
+                raise Violation("flash", f"the flash differs from the image from offset {at} on")
+
+    # -- what is heard -----------------------------------------------------------------------------
+
+    def _settle(self) -> None:
+        """What time alone has changed since the last step."""
+        bench = self.bench
+        if self.phase is Phase.ANNOUNCING and self.is_whole:
+            silent_s = bench.now - self._version_at
+            if silent_s > bench.host.burst_s:
+                self.phase = Phase.APPLICATION
+        pause_s = bench.now - self._useful_at
+        may_end = bench.choice("tx_12") != "waits" and pause_s > 0.8 * bench.limit("pause_s")
+        if self.phase in _IN_TRANSFER and may_end:
+            self.phase, self._may_restart = Phase.UNCLEAR, True
+
+    def _listen(
+        self, within_s: float, until: Callable[[Received], bool] | None = None
+    ) -> Received | None:
+        """Judge what arrives; ends at the message that was waited for."""
+        deadline = self.bench.now + within_s
+        while (heard := self.bench.next_message(deadline - self.bench.now)) is not None:
+            self._judge(heard)
+            if until is not None and until(heard):
+                return heard
+        return None
+
+    def _await(self, kind: Kind, within_s: float, after: str, number: int | None = None) -> None:
+        """The message has to come. Raises Violation when it does not."""
+        heard = self._listen(
+            within_s, lambda one: one.kind is kind and number in (None, one.number)
+        )
+        if heard is None:
+            named = kind.value if number is None else f"{kind.value} {number}"
+            raise Violation(f"no {kind.value}", f"no {named} within {within_s:g} s after {after}")
+        self._useful_at = self.bench.now
+
+    def _quiet(self) -> None:
+        """Listen for as long as an answer may take, and a broken message is kept."""
+        bench = self.bench
+        broken_s = 1.5 * bench.limit("inter_frame_s")
+        if self.phase is Phase.ANNOUNCING:
+            self._listen(broken_s)  # and no longer: its window is short
+            return
+        self._listen(max(bench.limit("ack_s"), broken_s))
+        self._naks_due = 0
+
+    def _judge(self, heard: Received) -> None:
+        match heard.kind:
+            case Kind.FEEDBACK:
+                if not self._feedback_due:
+                    raise Violation("feedback", "general feedback without a write")
+                self._feedback_due -= 1
+            case Kind.BOOT_VERSION:
+                self._judge_version(heard)
+            case Kind.REQUEST:
+                if not self._updates_unanswered:
+                    raise Violation("request", "request transfer without a valid update command")
+                self._updates_unanswered -= 1
+                self._begin_transfer(heard.at)
+            case Kind.ACK | Kind.NAK:
+                self._judge_number(heard)
+            case Kind.COMPLETE:
+                if not self._may_complete:
+                    raise Violation("complete", "complete without all packets and a valid end")
+            case Kind.OTHER | Kind.DAMAGED if not self._may_break_off:
+                raise Violation("form", f"{heard}: no message that a device sends")
+
+    def _judge_number(self, heard: Received) -> None:
+        if heard.kind is Kind.ACK:
+            if not self._acks_due[heard.number]:
+                raise Violation("ack", f"{heard} without such a packet that is valid")
+            self._acks_due[heard.number] -= 1
+            if heard.number == self._stored + 1:
+                self._store()
+            return
+        allowed = self._nak_numbers
+        if not self._naks_due or not (allowed is None or heard.number in allowed):
+            raise Violation("nak", f"{heard} without a message that has to be refused")
+        self._naks_due -= 1
+
+    def _judge_version(self, heard: Received) -> None:
+        is_leftover = heard.at < self._requested_at + _LEFTOVER_S and not self._may_restart
+        if self.phase in _IN_TRANSFER and is_leftover:
+            return
+        is_expected = self._may_restart or self.phase is Phase.UNCLEAR
+        if self.phase is not Phase.ANNOUNCING and not is_expected:
+            raise Violation("restart", f"{heard} without a reset, a pause or power, in the phase: "
+                            f"{self.phase.value}")  # fmt: skip
+        if heard.boot_name != self.bench.encoder.boot_name or not heard.has_good_version_text:
+            raise Violation("form", f"{heard} is not of the form Vx.x.x of this device")
+        self.phase = Phase.ANNOUNCING
+        self._version_at = heard.at
+        self._may_complete = False
+        self._acks_due.clear()
+
+    def _begin_transfer(self, at: float) -> None:
+        self.phase = Phase.BEGUN
+        self._image, self._end_is = self._offered
+        self.is_whole, self.was_requested = False, True
+        self._stored = 0
+        self._requested_at = self._useful_at = at
+        self._acks_due.clear()
+        self._may_restart = self._may_complete = False
+
+    def _store(self) -> None:
+        self._stored += 1
+        if self.phase is not Phase.UNCLEAR:
+            is_last = self._stored == packet_count(len(self._image))
+            self.phase = Phase.STORED if is_last else Phase.TRANSFER
+
+    # -- reset, power, time ------------------------------------------------------------------------
+
+    def _reset(self, _: str) -> None:
+        bench, before = self.bench, self.phase
+        self._feedback_due += 1
+        if before is Phase.APPLICATION:
+            feedback_due = self._feedback_due
+            self._may_restart = True
+            bench.send(bench.encoder.reset())
+            self._await(Kind.BOOT_VERSION, bench.limit("first_version_s"), "reset")
+            self._may_restart = False
+            if self._feedback_due == feedback_due:
+                raise Violation("no feedback", "no general feedback to a reset of the application")
+            return
+        choice = bench.choice("tx_13") if before in _IN_TRANSFER else ""
+        self._may_restart = self._may_break_off = choice != "ignored"
+        bench.send(bench.encoder.reset())
+        if choice == "restarts":
+            self._await(Kind.BOOT_VERSION, bench.limit("first_version_s"), "reset")
+        else:
+            self._quiet()
+            if choice not in ("", "ignored") and self.phase is before:
+                self.phase = Phase.UNCLEAR
+        self._may_break_off = False
+
+    def _watch_burst(self, argument: str) -> None:
+        """Reset, no update command: the burst is whole, then the application starts. With `twice`,
+        a second reset follows the first one.
+        """
+        if self.phase is not Phase.APPLICATION:
+            self._reset("")
+            return
+        bench = self.bench
+        bench.forget()
+        self._feedback_due += 1
+        bench.send(bench.encoder.reset())
+        if argument == "twice":
+            bench.send(bench.encoder.reset())
+        heard = bench.collect(bench.limit("first_version_s"))
+        if argument == "twice":
+            versions = sum(one.kind is Kind.BOOT_VERSION for one in heard)
+            bursts = 1 if bench.choice("rs_02") == "ignored" else 2
+            if versions > bursts * bench.number("versions"):
+                raise Violation("burst", f"{versions} boot versions after two resets")
+            self._feedback_due = 0
+            self.check_application()
+            return
+        times = [one.at for one in heard if one.kind is Kind.BOOT_VERSION]
+        if [one.kind for one in heard[:1]] != [Kind.FEEDBACK] or len(times) != len(heard) - 1:
+            raise Violation("burst", f"after a reset: {describe(heard)}")
+        if len(times) != bench.number("versions"):
+            raise Violation("burst", f"{len(times)} boot versions after a reset")
+        spacing_s, off_s = bench.limit("version_spacing_s"), bench.port.uncertainty_s
+        off_s += bench.limit("version_spacing_tolerance_s")
+        gaps = [late - early for early, late in pairwise(times)]
+        if any(abs(gap - spacing_s) > off_s for gap in gaps):
+            shown = ", ".join(f"{1000 * gap:.1f}" for gap in gaps)
+            raise Violation("burst", f"boot versions {shown} ms apart")
+        self._feedback_due -= 1
+        self.check_application()
+
+    def _power(self, argument: str) -> None:
+        bench = self.bench
+        bench.power_cycle(float(argument or 0.5))
+        self._acks_due.clear()
+        self._updates_unanswered = self._naks_due = self._feedback_due = 0
+        self._may_restart = self._may_break_off = True
+        self._await(Kind.BOOT_VERSION, bench.limit("first_version_s"), "power-up")
+        self._may_restart = self._may_break_off = False
+
+    def _wait(self, argument: str) -> None:
+        bench = self.bench
+        if argument != "pause":
+            seconds = bench.host.burst_s + _GAP_S if argument == "window" else float(argument)
+            self._listen(seconds)
+            return
+        choice, within_s = bench.choice("tx_12"), bench.limit("pause_s")
+        within_s += bench.limit("first_version_s")
+        if self.phase not in _IN_TRANSFER or choice == "waits":
+            self._may_restart = self._may_restart or self.phase is Phase.UNCLEAR
+            self._listen(1.2 * bench.limit("pause_s"))
+        elif choice == "announces":
+            self._may_restart = True
+            self._await(Kind.BOOT_VERSION, within_s, "the last packet")
+        else:
+            self._may_restart = True
+            self.phase = Phase.UNCLEAR
+            self._listen(within_s)
+
+    def _bus_off(self, _: str) -> None:
+        bench = self.bench
+        bench.subject.bus_off(_BUS_OFF_S)
+        self._may_break_off = True
+        self._listen(4 * _BUS_OFF_S + bench.limit("inter_frame_s"))
+        self._may_break_off = False
+
+    def _query(self, _: str) -> None:
+        if self.phase is Phase.APPLICATION:
+            self.check_application()
+        else:
+            self.bench.send(self.bench.encoder.query_version())
+            self._quiet()
+
+    # -- update command ----------------------------------------------------------------------------
+
+    def _at_version(self) -> None:
+        """Where it announces itself, wait for the moment at which it takes an update command."""
+        if self.phase is not Phase.ANNOUNCING:
+            return
+        bench = self.bench
+        within_s = 4 * bench.limit("version_spacing_s")
+        heard = self._listen(within_s, lambda one: one.kind is Kind.BOOT_VERSION)
+        if not self.is_whole:
+            return
+        if heard is None:  # its window is over, or nearly
+            self._listen(self._version_at + bench.host.burst_s + _GAP_S - bench.now)
+        elif bench.choice("up_04_burst") != "accepted":
+            self._listen(bench.host.burst_s - bench.limit("window_s") / 2)
+        self._settle()
+
+    def _update(self, argument: str) -> None:
+        bench = self.bench
+        image, outcome = self._named_image(argument)
+        frames = bench.encoder.update(len(image))
+        self._at_version()
+        self._feedback_due += 1
+        if self.phase is Phase.APPLICATION:
+            bench.send(frames)
+            self._quiet()
+            return
+        is_same = self.phase is Phase.BEGUN and len(image) == len(self._image)
+        if self.phase in _IN_TRANSFER and not is_same:
+            self._update_in_transfer(frames, image, outcome)
+            return
+        self._offered = image, outcome
+        if is_same or self.phase is Phase.UNCLEAR:
+            self._updates_unanswered += 1
+            bench.send(frames)
+            self._listen(bench.limit("erase_s"), lambda one: one.kind is Kind.REQUEST)
+            return
+        for _ in range(_UPDATES_MAX):
+            self._updates_unanswered += 1
+            sent = bench.send(frames)
+            heard = self._listen(
+                bench.limit("erase_s"),
+                partial(_answers_update, not_before=sent.left_at + _UPDATE_SPACING_S),
+            )
+            if heard is None or heard.kind is Kind.REQUEST:
+                break
+            is_late = heard.at > sent.left_at + _LEFTOVER_S
+            if is_late and bench.choice("up_04_burst") == "accepted":
+                break
+            self._feedback_due += 1
+        if self.phase is not Phase.BEGUN:
+            raise Violation("no request", "no request transfer after a valid update command")
+        # An erase for each of them is right too (R25), and so is one answer.
+        while self._updates_unanswered and self._listen(
+            _LEFTOVER_S, lambda one: one.kind is Kind.REQUEST
+        ):
+            pass
+
+    def _update_in_transfer(self, frames: list[RawFrame], image: bytes, outcome: Outcome) -> None:
+        bench, choice = self.bench, self.bench.choice("up_08")
+        self._naks_due, self._nak_numbers = 1, None
+        if choice == "rejected":
+            bench.send(frames)
+            self._quiet()
+            return
+        self._offered = image, outcome
+        self._updates_unanswered += 1
+        bench.send(frames)
+        if choice == "starts_over":
+            self._await(Kind.REQUEST, bench.limit("erase_s"), "an update command in a transfer")
+        elif not self._listen(bench.limit("erase_s"), lambda one: one.kind is Kind.REQUEST):
+            self.phase = Phase.UNCLEAR
+
+    def _bad_update(self, name: str) -> None:
+        self._at_version()
+        refused = UPDATES[name](self._place)
+        self._feedback_due += refused.is_intact_write
+        self._naks_due, self._nak_numbers = 1, None
+        self.bench.send(refused.frames)
+        self._quiet()
+
+    def _named_image(self, argument: str) -> tuple[bytes, Outcome]:
+        """The image of a step, and what comes of it."""
+        bench = self.bench
+        if argument in ("", "good"):
+            return bench.good_image, Outcome.RUNS
+        if argument == "second":
+            return bench.subject.second_image or bench.good_image, Outcome.RUNS
+        if argument == "wrong":
+            image = bytes((bench.good_image[0] ^ 1,)) + bench.good_image[1:]
+            has_checksum = bench.choice("en_04") != "none"
+            return image, Outcome.REFUSED if has_checksum else Outcome.NEVER_ENDED
+        size_bytes = min(int(argument), bench.number("largest_image_bytes"))
+        return filler(size_bytes), Outcome.NEVER_ENDED
+
+    # -- packets -----------------------------------------------------------------------------------
+
+    @property
+    def total(self) -> int:
+        """Packets of the image."""
+        return packet_count(len(self._image))
+
+    @property
+    def wanted(self) -> int:
+        """The packet that is next."""
+        return min(self._stored + 1, self.total)
+
+    @property
+    def _place(self) -> Place:
+        bench = self.bench
+        largest_bytes = bench.number("largest_image_bytes")
+        return Place(bench.encoder, self._image, self.wanted, largest_bytes)
+
+    def _packet(self, _: str, frames: Sequence[RawFrame] = (), gap_s: float = 0.0) -> None:
+        """The next packet, in these frames; elsewhere than in a transfer it is out of turn."""
+        bench, number = self.bench, self.wanted
+        self._feedback_due += 1
+        is_next = self.phase in (Phase.BEGUN, Phase.TRANSFER)
+        if is_next or self.phase is Phase.UNCLEAR:
+            self._acks_due[number] += 1
+        self._naks_due, self._nak_numbers = int(not is_next), None
+        bench.send(frames or self.bench.encoder.frames(self._place.packet(number)), gap_s=gap_s)
+        if is_next:
+            self._await(Kind.ACK, bench.limit("ack_s"), f"packet {number}", number)
+        else:
+            if self.phase is Phase.STORED:  # the last packet again
+                self._acks_due[number] += 1
+            self._quiet()
+
+    def _packets(self, argument: str) -> None:
+        left = self.total - self._stored
+        count = {"all": left, "most": left - 1}.get(argument)
+        for _ in range(int(argument) if count is None else count):
+            if self.phase not in (Phase.BEGUN, Phase.TRANSFER):
+                break
+            self._packet("")
+        self._read("")
+
+    def _read(self, _: str) -> None:
+        """What was acknowledged is in the flash, unless the device may buffer it."""
+        if self.phase in _IN_TRANSFER and not self.bench.number("buffer_bytes"):
+            self.check_stored(self._image[: self._stored * PACKET_BYTES])
+
+    def _packet_again(self, argument: str) -> None:
+        """The packet that was stored last, or an older one, perhaps with other data."""
+        is_older = argument.startswith("older")
+        number = self._stored - 1 if is_older else self._stored
+        if self.phase not in (Phase.TRANSFER, Phase.STORED) or number < 1:
+            self._packet("")
+            return
+        raw = self._place.packet(number)
+        has_other_data = argument.endswith("other")
+        if has_other_data:
+            other = bytes(byte ^ 0xA5 for byte in packet_payload(self._image, number))
+            raw = joined(self.bench.encoder.packet(number, self.total, other))
+        choice = self.bench.choice("tx_03" if is_older else "tx_02")
+        self._feedback_due += 1
+        self._acks_due[number] += 1
+        self._naks_due, self._nak_numbers = 1, frozenset((number, self.wanted, number + 1))
+        self.bench.send(self.bench.encoder.frames(raw))
+        if choice == "ack" and not has_other_data:
+            self._await(Kind.ACK, self.bench.limit("ack_s"), f"packet {number} again", number)
+        else:
+            self._quiet()
+        self._acks_due[number] = 0
+        self._useful_at = self.bench.now
+
+    def _packet_between(self, _: str) -> None:
+        """Frames without payload between those of the packet."""
+        empty = RawFrame(self.bench.encoder.to_device, b"")
+        frames = self.bench.encoder.frames(self._place.next_packet)
+        self._packet("", [each for frame in frames for each in (frame, empty)])
+
+    def _packet_slow(self, _: str) -> None:
+        gap_s = min(_GAP_S, self.bench.limit("inter_frame_s") / 3)
+        self._packet("", gap_s=gap_s)
+
+    def _packet_behind(self, _: str) -> None:
+        """A query and the packet, back to back."""
+        query = self.bench.encoder.query_version()
+        self._packet("", [*query, *self.bench.encoder.frames(self._place.next_packet)])
+
+    def _packet_open(self, argument: str) -> None:
+        """The next packet in a form that the profile decides about: in short frames, or behind
+        junk in its first frame.
+        """
+        raw = self._place.next_packet
+        key, right = {"short": ("fr_01", "accepted"), "junk": ("fr_02", "found")}[argument]
+        short = self.bench.encoder.frames(raw, 5)
+        frames = short if argument == "short" else self.bench.encoder.frames(b"\x00\x12\x34" + raw)
+        if self.bench.choice(key) == right:
+            self._packet("", frames)
+            return
+        if self.phase in (Phase.BEGUN, Phase.TRANSFER):
+            self._acks_due[self.wanted] += 1
+        self._naks_due, self._nak_numbers = 4, None
+        self._feedback_due += 1
+        self.bench.send(frames)
+        self._quiet()
+        self._acks_due.clear()
+
+    def _packet_filler(self, _: str) -> None:
+        """The last packet, with other bytes than FF behind the image."""
+        rest = len(self._image) % PACKET_BYTES
+        if self.wanted != self.total or not rest or self.bench.choice("tx_08") != "ignored":
+            self._packet("")
+            return
+        payload = packet_payload(self._image, self.wanted)[:rest].ljust(PACKET_BYTES, b"\x00")
+        self._packet("", self.bench.encoder.packet(self.wanted, self.total, payload))
+
+    def _bad_packet(self, name: str) -> None:
+        refused = PACKETS[name](self._place)
+        self._feedback_due += refused.is_intact_write
+        self._naks_due = 1 if refused.is_intact_write else 4
+        self._nak_numbers = None
+        if refused.is_intact_write and self.phase in _IN_TRANSFER:
+            named = int.from_bytes(joined(refused.frames)[7:9], "little")
+            self._nak_numbers = frozenset((self.wanted, named, self.wanted - 1))
+        self.bench.send(refused.frames)
+        self._quiet()
+
+    # -- end of transfer ---------------------------------------------------------------------------
+
+    def _end(self, argument: str) -> None:
+        """End of transfer; with `twice`, again at once."""
+        bench = self.bench
+        self._feedback_due += 1
+        if self.phase is not Phase.STORED:
+            self._naks_due, self._nak_numbers = 1, None
+            was_in_transfer = self.phase in _IN_TRANSFER
+            if self.phase is Phase.UNCLEAR and self._stored == self.total:
+                return  # perhaps it is complete
+            bench.send(bench.encoder.end())
+            self._quiet()
+            if was_in_transfer and self.phase in _IN_TRANSFER:
+                self.phase = Phase.UNCLEAR
+            return
+        if self._end_is is Outcome.NEVER_ENDED:
+            return
+        refused = self._end_is is Outcome.REFUSED
+        self._naks_due, self._nak_numbers = int(refused), None
+        self._may_complete = not refused
+        frames = bench.encoder.end()
+        if argument == "padded" and bench.choice("fr_07") == "ignored":
+            frames = [*frames[:-1], frames[-1]._replace(data=frames[-1].data.ljust(8, b"\x00"))]
+        bench.send(frames)
+        if refused:
+            self._may_restart = True
+            self._await(Kind.NAK, bench.limit("complete_s"), "an image whose checksum is wrong")
+            self.phase = Phase.UNCLEAR
+            return
+        self._await(Kind.COMPLETE, bench.limit("complete_s"), "the end of the transfer")
+        self.phase, self._may_restart = Phase.UNCLEAR, True
+        if argument == "twice":
+            self._feedback_due += 1
+            bench.send(bench.encoder.end())
+            self._listen(bench.limit("ack_s"))
+        self.running, self.is_whole = self._image, True
+        self.check_application()
+        self._may_restart = self._may_complete = False
+        self.check_stored(self.running)
+
+    # -- what is no concern of the device ----------------------------------------------------------
+
+    def _no_concern(self, name: str) -> None:
+        refused = (ENDS.get(name) or NO_CONCERN[name])(self._place)
+        self._feedback_due += refused.is_intact_write
+        self._naks_due, self._nak_numbers = 2, None
+        self.bench.send(refused.frames)
+        self._quiet()
+
+
+def _answers_update(heard: Received, not_before: float) -> bool:
+    """True for request transfer, and for a boot version that follows the update command."""
+    is_later = heard.kind is Kind.BOOT_VERSION and heard.at >= not_before
+    return is_later or heard.kind is Kind.REQUEST
+
+
+STEPS: Final = {
+    "reset": "reset",
+    "burst": "watch_burst",
+    "power": "power",
+    "bus-off": "bus_off",
+    "wait": "wait",
+    "query": "query",
+    "update": "update",
+    "packet": "packet",
+    "packets": "packets",
+    "packet-again": "packet_again",
+    "packet-between": "packet_between",
+    "packet-slow": "packet_slow",
+    "packet-behind": "packet_behind",
+    "packet-filler": "packet_filler",
+    "packet-open": "packet_open",
+    "read": "read",
+    "end": "end",
+}
+"""Steps with the methods of `Walk` that take them; the others send what has to be refused."""
+ALL_STEPS: Final = (*STEPS, *PACKETS, *UPDATES, *ENDS, *NO_CONCERN)

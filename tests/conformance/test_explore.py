@@ -1,0 +1,173 @@
+"""Random walks: what they find, how short they make it, and that they find nothing else."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from flasher.conformance.explore import Explored, Explorer
+from flasher.conformance.explore.refused import ENDS, NO_CONCERN, PACKETS, UPDATES, Place, Refused
+from flasher.conformance.explore.steps import parse_step, reachable_pairs
+from flasher.conformance.explore.walk import ALL_STEPS, filler
+from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
+from flasher.conformance.wire import Encoder, joined
+from flasher.errors import UsageError
+from tests.cli.conftest import Flasher
+
+
+def _explorer(variant: str = "", target: str = "bms", seed: str = "1", **choices: Any) -> Explorer:
+    device = replace(MOCK_PROFILE, **choices)
+    make = variant_maker(variant) if variant else None
+    subject = MockSubject(target, profile=device, make_device=make)
+    return Explorer(subject, profile_of_mock(device), seed=seed)
+
+
+def _found(explored: Explored) -> tuple[str, str]:
+    assert explored.finding is not None
+    return explored.finding.rule, " ".join(explored.finding.steps)
+
+
+@pytest.mark.parametrize(
+    "choices",
+    [
+        {"pause_in_transfer": "waits", "reset_in_transfer": "restarts"},
+        {"update_in_transfer": "ignored", "bad_packet": "silence", "older_packet": "nak"},
+        {"without_application": "listens", "repeated_packet": "nak_next"},
+        {"image_checksum": "crc32", "after_complete": "restarts", "repeated_end": "silence"},
+        {"reset_in_bootloader": "restarts", "upgrade_in_application": "silence"},
+    ],
+    ids=lambda choices: next(iter(choices)),
+)
+def test_nothing_is_found_on_a_device_of_other_choices(choices: dict[str, str]) -> None:
+    assert _explorer(**choices).explore(600).finding is None
+
+
+@pytest.mark.parametrize("target", ["wmc", "bms", "obc"])
+def test_nothing_is_found_on_a_right_device(target: str) -> None:
+    explored = _explorer(target=target).explore(600)
+    assert explored.finding is None
+    assert explored.stopped == ""
+    assert explored.steps >= 600
+
+
+@pytest.mark.parametrize(
+    ("variant", "rule", "steps"),
+    [
+        ("no-feedback", "no feedback", "reset"),
+        ("announces-three-times", "burst", "burst"),
+        ("accepts-skipped-number", "ack", "reset update=good packet-skip"),
+        ("accepts-early-end", "complete", "reset update=good end"),
+        ("erases-before-checking-size", "application", "reset update-large"),
+        ("repeat-unanswered", "no ACK", "reset update=second packet packet-again"),
+    ],
+)
+def test_the_shortest_walk_to_a_flaw_is_found_and_finds_it_again(
+    variant: str, rule: str, steps: str
+) -> None:
+    assert _found(_explorer(variant).explore(2000)) == (rule, steps)
+    assert _found(_explorer(variant, seed="2").replay(steps.split())) == (rule, steps)
+    assert _explorer().replay(steps.split()).finding is None
+
+
+def test_a_seed_decides_everything() -> None:
+    first, second = (_explorer("older-overwrites", seed="5").explore(3000) for _ in range(2))
+    assert first == second
+
+
+def test_a_device_that_takes_no_upgrade_is_a_finding_before_the_first_step() -> None:
+    explored = _explorer("big-endian-numbers").explore(100)
+    assert explored.finding is not None
+    assert explored.finding.rule == "upgrade"
+    assert explored.steps == 0
+
+
+def test_pairs_of_phase_and_step_that_were_never_met_are_told() -> None:
+    explored = _explorer().explore(5)
+    met = {(phase, step) for phase, step, count in explored.coverage if count}
+    assert met
+    assert met.isdisjoint(explored.never)
+    assert len(met) + len(explored.never) == len(reachable_pairs())
+
+
+def test_what_is_transferred_and_does_not_run_is_never_completed() -> None:
+    explored = _explorer().replay(["reset", "update=384", "packets=all", "end", "wait=window"])
+    assert explored.finding is None
+    assert explored.steps == 5
+
+
+def test_a_walk_can_be_stopped() -> None:
+    explorer = Explorer(MockSubject(), profile_of_mock(), stopped=lambda: True)
+    explored = explorer.explore(100)
+    assert explored.stopped == "it was stopped"
+    assert explored.finding is None
+
+
+def test_a_step_that_does_not_exist_is_said() -> None:
+    with pytest.raises(UsageError, match="no step 'pocket'"):
+        _explorer().replay(["reset", "pocket"])
+
+
+def test_every_step_is_written_and_read() -> None:
+    for name in ALL_STEPS:
+        assert str(parse_step(name)) == name
+    assert str(parse_step("packet-again=older-other")) == "packet-again=older-other"
+
+
+def test_no_two_messages_that_are_refused_are_the_same_and_none_is_the_right_one() -> None:
+    place = Place(Encoder("bms"), filler(640), 2, 0x20000)
+    makers = {**PACKETS, **UPDATES, **ENDS, **NO_CONCERN}
+    made: dict[str, Refused] = {name: make(place) for name, make in makers.items()}
+    sent = {name: tuple(refused.frames) for name, refused in made.items()}
+    assert len(set(sent.values())) == len(sent)
+    right = {
+        tuple(place.encoder.frames(place.next_packet)),
+        tuple(place.encoder.end()),
+        tuple(place.encoder.reset()),
+        tuple(place.encoder.update(384)),
+    }
+    assert right.isdisjoint(sent.values())
+    writes = {joined(made[name].frames)[2] for name in made if made[name].is_intact_write}
+    assert writes == {0x16}
+
+
+def test_the_command_prints_a_replay_that_finds_the_same(flasher: Flasher, tmp_path: Path) -> None:
+    trace = tmp_path / "walk.log"
+    ran = flasher(
+        *("conformance", "explore", "-t", "bms", "--mock", "--variant", "accepts-early-end"),
+        *("--trace-file", trace),
+    )
+    assert ran.code == 12
+    assert "FOUND complete: complete without all packets and a valid end" in ran.out
+    (replay,) = (line for line in ran.out.splitlines() if "replay: " in line)
+    words = shlex.split(replay.partition("replay: ")[2])
+    again = flasher(*words[1:], "--json")
+    assert again.code == 12
+    assert again.document["finding"]["steps"] == ["reset", "update=good", "end"]
+    assert trace.read_text().count("752#") > 5
+
+
+def test_nothing_found_is_exit_code_0(flasher: Flasher) -> None:
+    ran = flasher("conformance", "explore", "-t", "bms", "--mock", "--steps", "50", "-v")
+    assert ran.code == 0
+    assert ran.out.splitlines()[-1] == "nothing was found"
+    assert "never in the phase transfer" in ran.out
+
+
+def test_a_device_on_a_bus_is_not_worn_without_being_asked_for(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bench = ("-t", "bms", "-i", "virtual", "-c", "explore", "--good-image", "README.md")
+    ran = flasher("conformance", "explore", *bench)
+    assert ran.code == 2
+    assert "2000 steps erase and write the device about 333 times" in ran.err
+    assert "Add --yes." in ran.err
+    asked = []
+    where = "flasher.cli.bench.conformance_explore"
+    monkeypatch.setattr(f"{where}.can_ask", lambda: True)
+    monkeypatch.setattr(f"{where}.agrees", lambda question, **_: asked.append(question))
+    assert flasher("conformance", "explore", *bench, "--steps", "12").code == 2
+    assert asked == ["12 steps erase and write the device about 2 times. Begin?"]
