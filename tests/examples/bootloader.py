@@ -43,13 +43,16 @@ def make(what: str, folder: Path, *settings: str, source: Path = SOURCE) -> str:
 
 
 @contextmanager
-def emulated(program: Path) -> Iterator[str]:
-    """Runs a program on an emulated Cortex-M3; yields the channel of its slcan line."""
+def emulated(program: Path, monitor: Path) -> Iterator[str]:
+    """Runs a program on an emulated Cortex-M3; yields the channel of its slcan line. QEMU takes
+    orders at the socket `monitor`.
+    """
     with socket.create_server(("127.0.0.1", 0)) as line:
         number = line.fileno()
         command = [
             *("qemu-system-arm", "-M", "mps2-an385", "-kernel", str(program)),
-            *("-nographic", "-nodefaults", "-monitor", "none", "-serial", "chardev:line"),
+            *("-nographic", "-serial", "chardev:line"),
+            *("-monitor", f"unix:{monitor},server=on,wait=off"),
             # Without delay: the line's characters are sent one by one.
             *("-chardev", f"socket,id=line,fd={number},server=on,wait=off,nodelay=on"),
         ]

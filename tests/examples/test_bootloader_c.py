@@ -64,7 +64,7 @@ def test_an_emulated_processor_is_flashed_twice_over_slcan(
     sizes = re.findall(r"^ *(\d+)\s+(\d+)\s+\d+\s+\d+\s+\w+\s+\S*boot\.elf$", said, re.MULTILINE)
     assert [int(text) + int(data) < FLASH_BYTES for text, data in sizes] == [True], said
     make("arm", tmp_path / "newer", "APPLICATION_VERSION=V2r0r0_20260202")
-    with emulated(tmp_path / "boot.elf") as channel:
+    with emulated(tmp_path / "boot.elf", tmp_path / "monitor") as channel:
         line = ("-t", "bms", "-i", "slcan", "-c", channel, "--bus-kwargs", "sleep_after_open=0")
         first = flasher("flash", tmp_path / "application.bin", *line)
         assert "BMS runs V1r0r0_20260101 (version read back)" in first.out, first.err

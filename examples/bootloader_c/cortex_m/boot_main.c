@@ -24,8 +24,14 @@ void hal_flash_read(uint32_t offset, uint8_t *data, uint32_t size)
         data[i] = memory(offset)[i];
 }
 
+/* The processor stands still meanwhile, as that of a chip does; a chip's takes longer. */
+enum { ERASE_MS = 5 };
+
 bool hal_flash_erase(uint32_t offset)
 {
+    const uint32_t began_ms = board_ms();
+    while (board_ms() - began_ms <= ERASE_MS) {
+    }
     for (uint32_t i = 0; i < SECTOR_BYTES; ++i)
         memory(offset)[i] = 0xFF;
     return true;
