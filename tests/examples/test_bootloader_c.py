@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -78,3 +79,20 @@ def test_a_unit_longer_than_a_packet_does_not_compile(tmp_path: Path) -> None:
     _need("make", "gcc")
     with pytest.raises(AssertionError, match="a packet begins a unit"):
         make("host", tmp_path, "DEFINES=-DWRITE_BYTES=256u")
+
+
+def test_the_code_on_the_page_compiles(flasher: Flasher, tmp_path: Path) -> None:
+    _need("gcc")
+    page = (Path(__file__).parents[2] / "docs" / "bootloader.md").read_text(encoding="utf-8")
+    code = re.search(r"```c\n(.*?)```", page, re.DOTALL)
+    assert code is not None
+    assert flasher("conformance", "header", tmp_path).code == 0
+    (tmp_path / "port.c").write_text(code[1])
+    (tmp_path / "YOUR_BOOTLOADER.h").write_text(
+        "void YOUR_START(void);\n"
+        "void YOUR_MAIN_LOOP_ONCE(void);\n"
+        "void YOUR_RECEIVE(uint32_t id, const uint8_t *data, uint8_t length);\n"
+        "int YOUR_NEXT_FRAME(uint32_t *id, uint8_t *data, uint8_t *length);\n"
+    )
+    strict = ("-std=c11", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-I.")
+    subprocess.run(["gcc", *strict, "-c", "port.c"], cwd=tmp_path, check=True)
