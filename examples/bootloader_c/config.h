@@ -37,6 +37,12 @@
 #define RESET_RESTARTS 0
 #endif
 
+/* The protocol sends no checksum of the whole image. 1: each image ends with one, the CRC-32 of all
+ * before it (that of zip, low byte first), and an image whose checksum is wrong is refused. */
+#ifndef IMAGE_CHECKSUM
+#define IMAGE_CHECKSUM 0
+#endif
+
 /* How long an update command is waited for behind the last boot version of a burst. */
 #ifndef WINDOW_MS
 #define WINDOW_MS 200u

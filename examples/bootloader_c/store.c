@@ -29,6 +29,25 @@ static uint32_t stored_crc(uint32_t size)
     return crc;
 }
 
+/* Of the images of a product, not of the protocol. */
+static bool has_checksum(uint32_t size)
+{
+    uint8_t part[PACKET_BYTES];
+    uint32_t crc = 0xFFFFFFFFu, count;
+    if (size <= 4)
+        return false;
+    for (uint32_t at = 0; at < size - 4; at += count) {
+        count = size - 4 - at < sizeof part ? size - 4 - at : sizeof part;
+        hal_flash_read(at, part, count);
+        for (uint32_t bit = 0; bit < 8 * count; ++bit) {
+            crc ^= (uint32_t)part[bit / 8] >> bit % 8 & 1u;
+            crc = crc >> 1 ^ (crc & 1 ? 0xEDB88320u : 0);
+        }
+    }
+    hal_flash_read(size - 4, part, 4);
+    return get32(part) == ~crc;
+}
+
 bool store_has_application(void)
 {
     uint8_t record[RECORD_BYTES];
@@ -57,7 +76,7 @@ bool store_write(uint32_t offset, const uint8_t *data, uint32_t size)
 bool store_finish(uint32_t size, uint32_t crc)
 {
     uint8_t record[RECORD_BYTES];
-    if (stored_crc(size) != crc)
+    if (stored_crc(size) != crc || (IMAGE_CHECKSUM && !has_checksum(size)))
         return false;
     for (uint32_t i = 16; i < sizeof record; ++i)
         record[i] = 0xFF;

@@ -24,7 +24,9 @@ def _need(*programs: str) -> None:
 
 def test_the_whole_suite_under_sanitizers(flasher: Flasher, tmp_path: Path) -> None:
     _need("make", "gcc")
-    make("host", tmp_path)
+    make("host", tmp_path, "DEFINES=-DIMAGE_CHECKSUM=1")
+    profile = tmp_path / "profile.toml"
+    profile.write_text('en_04 = "crc32"\n' + PROFILE.read_text(encoding="utf-8"))
     ran = flasher(
         *(
             "conformance",
@@ -33,14 +35,13 @@ def test_the_whole_suite_under_sanitizers(flasher: Flasher, tmp_path: Path) -> N
             "--subject",
             tmp_path / "boot",
             "--profile",
-            PROFILE,
+            profile,
             "--json",
         )
     )
     results = ran.document["report"]["results"]
     others = {result["id"]: result["findings"] for result in results if result["status"] != "pass"}
-    # Its images have no checksum of their own; nobody can make two frames meet in one bit time.
-    assert list(others) == ["EN-04", "BU-07"], others
+    assert list(others) == ["BU-07"], others  # takes an injector on the line
     assert ran.code == 0
 
 
