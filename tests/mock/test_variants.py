@@ -560,6 +560,211 @@ def useless_messages_in_a_pause(tool: Tool) -> object:
     return bool(tool.heard("version"))
 
 
+# -- mistakes of bootloader engineers -------------------------------------------------------------
+
+
+def with_crc(wire: bytes, crc_field: bytes) -> bytes:
+    return wire[:-5] + crc_field + wire[-1:]
+
+
+def longer(command: int, data: bytes) -> bytes:
+    """A write with four bytes more than its command says, and a CRC over all of it."""
+    wire = build(REQUEST_ID, WRITE, command, data + bytes(4))
+    assert wire[3] == (command & 0xFF) + 6
+    return wire
+
+
+F0_IN_CRC = next(
+    image
+    for image in (bytes((at & 0xFF, at >> 8)) + IMAGE[2:] for at in range(1 << 16))
+    if packet_wire(1, image)[-5] == 0xF0
+)
+BLANK = b"\xff" * 128 + IMAGE[128:]
+READS = build(REQUEST_ID, READ, 0xA401, b"\x04")
+
+does("crc-zero-accepted", right=0, wrong=1)(requests_after(*payloads(with_crc(UPDATE, bytes(4)))))
+does("crc-ones-accepted", right=0, wrong=1)(
+    requests_after(*payloads(with_crc(UPDATE, b"\xff" * 4)))
+)
+does("long-commands-accepted", right=0, wrong=1)(
+    requests_after(*payloads(longer(0xA10B, b"BMS_UPD\x58\x02\x00\x00")))
+)
+does("update-text-of-four", right=0, wrong=1)(
+    requests_after(*payloads(update_wire(600, b"BMS_XYZ")))
+)
+does("ignores-mode", right=[], wrong=["nak 1"])(answers_in_transfer(READS))
+does("any-end-byte", right=[], wrong=["nak 1"])(
+    answers_in_transfer(build(REQUEST_ID, WRITE, 0xA401, b"\x05"))
+)
+does("numbers-modulo-256", right=["nak 1"], wrong=["ack 1"])(
+    answers_in_transfer(build(REQUEST_ID, WRITE, 0xA385, b"\x01\x01\x01\x05\x00" + IMAGE[:128]))
+)
+does("totals-modulo-256", right=["nak 1"], wrong=["ack 1"])(
+    answers_in_transfer(packet_wire(1, IMAGE, total=261))
+)
+does("number-zero-is-first", right=["nak 1"], wrong=["ack 1"])(
+    answers_in_transfer(build(REQUEST_ID, WRITE, 0xA385, b"\x01\x00\x00\x05\x00" + IMAGE[:128]))
+)
+does("acks-damaged-repetition", right=["nak 2"], wrong=["ack 1"])(
+    answers_in_transfer(damaged(FIRST), stored=1)
+)
+does("acks-twice", right=["ack 1"], wrong=["ack 1", "ack 1"])(answers_in_transfer(FIRST))
+
+
+@does("answers-padded", right=["feedback"], wrong=["damaged"])
+def the_bytes_of_an_answer(tool: Tool) -> object:
+    tool.reset()
+    tool.run(0.01)
+    return tool.heard()
+
+
+@does("tail-in-crc", right=["ack 1"], wrong=["nak 1"])
+def a_packet_whose_crc_begins_with_f0(tool: Tool) -> object:
+    tool.transfer(F0_IN_CRC)
+    tool.packet(1, F0_IN_CRC)
+    return tool.heard()
+
+
+@does("reset-text-of-four", right=0, wrong=4)
+def a_reset_whose_last_letter_is_another(tool: Tool) -> object:
+    tool.say(0x4205, b"RESEX")
+    tool.run(1.0)
+    return len(tool.heard("version"))
+
+
+@does("reset-from-any-node", right=0, wrong=4)
+def a_reset_by_the_motor_controller(tool: Tool) -> object:
+    tool.say(0x4205, b"RESET", can_id=0x712)
+    tool.run(1.0)
+    return len(tool.heard("version"))
+
+
+@does("dies-after-255-announcements", right=True, wrong=False)
+def announcements_a_quarter_of_a_minute_after_a_power_cut(tool: Tool) -> object:
+    tool.transfer(IMAGE, 1)
+    tool.cycle_power()
+    tool.run(14.0)
+    tool.heard()
+    tool.run(1.0)
+    return bool(tool.heard("version"))
+
+
+@does("feedback-after-version", right=["feedback", "version"], wrong=["version", "feedback"])
+def what_is_said_first_after_a_reset(tool: Tool) -> object:
+    tool.reset()
+    tool.run(0.06)
+    return tool.heard()
+
+
+@does("leftover-announcement", right=[], wrong=["version"])
+def a_moment_after_request_transfer(tool: Tool) -> object:
+    tool.transfer(IMAGE)
+    tool.run(0.2)
+    return tool.heard()
+
+
+@does("sixteen-bit-size", right=0, wrong=1)
+def a_size_beyond_64_kib(tool: Tool) -> object:
+    tool.boot()
+    tool.update(0x10000 + 600)
+    tool.run(0.03)
+    return len(tool.heard("request"))
+
+
+@does("hangs-at-20th-update", right=20, wrong=19)
+def twenty_transfers_that_are_left(tool: Tool) -> object:
+    tool.boot()
+    for _ in range(20):
+        tool.update(600)
+        tool.run(0.03)
+        tool.packet(1, IMAGE)
+    return len(tool.heard("request"))
+
+
+@does("reset-while-erasing-hangs", right=1, wrong=0)
+def a_reset_just_after_the_update_command(tool: Tool) -> object:
+    tool.boot()
+    tool.update(100_000)
+    tool.reset()
+    tool.run(1.0)
+    return len(tool.heard("request"))
+
+
+@does("completes-without-transfer", right=[], wrong=["complete"])
+def an_end_of_transfer_to_the_announcing_bootloader(tool: Tool) -> object:
+    tool.boot()
+    tool.put_wire(END)
+    return tool.heard()
+
+
+@does("acks-without-transfer", right=[], wrong=["ack 1"])
+def a_packet_to_the_announcing_bootloader(tool: Tool) -> object:
+    tool.boot()
+    tool.packet(1, IMAGE)
+    return tool.heard("ack")
+
+
+@does("blank-packet-unanswered", right=["ack 1", "ack 1"], wrong=["ack 1"])
+def a_packet_of_nothing_but_ff_twice(tool: Tool) -> object:
+    tool.transfer(BLANK)
+    tool.packet(1, BLANK)
+    tool.packet(1, BLANK)
+    return tool.heard()
+
+
+@does("pause-counts-from-start", right=[], wrong=["version"])
+def packets_a_second_apart(tool: Tool) -> object:
+    tool.transfer(IMAGE)
+    for number in (1, 1, 2, 2, 3, 3):
+        tool.run(0.9)
+        tool.packet(number, IMAGE)
+    return tool.heard("version")[:1]
+
+
+@does("timer-wraps", right=[], wrong=["version"])
+def a_transfer_of_more_than_a_minute(tool: Tool) -> object:
+    tool.transfer(IMAGE)
+    for _ in range(20):
+        tool.run(3.5)
+        tool.packet(1, IMAGE)
+    return tool.heard("version")[:1]
+
+
+@does("single-packet-image-fails", right=["complete"], wrong=["nak 1"])
+def an_image_of_one_packet(tool: Tool) -> object:
+    return tool.upgrade(IMAGE[:100])
+
+
+@does("record-erased-last", right=[], wrong=["720 1540"])
+def a_power_cut_in_the_midst_of_erasing(tool: Tool) -> object:
+    tool.upgrade(LONG)
+    tool.boot()
+    tool.update(len(LONG))
+    tool.run(0.005)
+    tool.cycle_power()
+    tool.run(1.0)
+    return tool.asks_version()
+
+
+@does("complete-before-record", right=["720 1540"], wrong=[])
+def a_power_cut_just_after_complete(tool: Tool) -> object:
+    tool.transfer(IMAGE, 5)
+    tool.end()
+    assert tool.heard() == ["complete"]
+    tool.cycle_power()
+    tool.run(1.0)
+    return tool.asks_version()
+
+
+@does("answer-lost-on-busy-bus", right=["ack 1"], wrong=[])
+def a_frame_of_others_just_before_an_answer_is_due(tool: Tool) -> object:
+    tool.transfer(IMAGE)
+    tool.put_wire(FIRST)
+    tool.put(Frame(0x100, bytes(8)))
+    tool.run(0.01)
+    return tool.heard()
+
+
 def make_right(variant: Variant) -> MockDevice:
     profile = dataclasses.replace(PROFILE, **variant.profile)  # type: ignore[arg-type]
     return MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=profile)

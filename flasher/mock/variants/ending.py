@@ -11,6 +11,7 @@ from flasher.mock.store import AREA_START, ApplicationStore
 from flasher.mock.table import Event, State
 from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, variant
 from flasher.protocol import messages
+from flasher.protocol.spec import Command, Mode
 
 _DARK_BOOTS: Final = 2
 """Power-ups in a row without an application after which one is spent in the dark."""
@@ -288,3 +289,81 @@ class RefusalHangs(HangingDevice):
         event = super()._classify(row)
         stuck = self.state is State.REFUSED and event is not Event.END_AGAIN
         return Event.NO_CONCERN if stuck else event
+
+
+@variant("any-end-byte", "EN-02", "takes an end of transfer with another byte than 04")
+class AnyEndByte(MockDevice):
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if isinstance(row, messages.Malformed):
+            message = row.message
+            if (message.command, message.mode) == (Command.END_OF_TRANSFER, Mode.WRITE):
+                row = messages.EndOfTransfer()
+        super()._take_row(row, now)
+
+
+@variant(
+    "single-packet-image-fails",
+    "UP-01",
+    "refuses the end of transfer of an image of one packet",
+)
+class SinglePacketImageFails(MockDevice):
+    """Looks for the last packet where one is stored, not where one comes first."""
+
+    def _classify_end(self) -> Event:
+        event = super()._classify_end()
+        return Event.END_EARLY if event is Event.END_WHOLE and self._transfer.total == 1 else event
+
+
+class _RecordErasedLast(ApplicationStore):
+    def erasing(self, size_bytes: int) -> list[Operation]:
+        record, *pages = super().erasing(size_bytes)
+        return [*pages, record]
+
+    def _is_intact(self, image: bytes, crc: int) -> bool:
+        return True
+
+
+@variant(
+    "record-erased-last",
+    "PW-01",
+    "erases the application first, and then the record that it is whole",
+)
+class RecordErasedLast(MockDevice):
+    store_type = _RecordErasedLast
+
+
+@variant(
+    "complete-before-record",
+    "PW-01",
+    "says complete, and records that the image is whole when it starts it",
+)
+class CompleteBeforeRecord(MockDevice):
+    _owes_record = False
+
+    def _record(self, now: float) -> str:
+        self._send(messages.Complete())
+        self._owes_record = True
+        self._due_at = now
+        return f"{self._transfer.size_bytes} bytes"
+
+    def _complete(self, now: float) -> str:
+        self._due_at = now + self.profile.start_delay_s
+        return "the new application"
+
+    def _start(self, now: float) -> str:
+        self._pay_record()
+        return super()._start(now)
+
+    def _boot(self, now: float) -> str:
+        self._pay_record()
+        return super()._boot(now)
+
+    def _pay_record(self) -> None:
+        if self._owes_record:
+            self._owes_record = False
+            operation = self.store.recording(self._transfer.size_bytes)
+            self.store.flash.program(operation.address, operation.data or b"")
+
+    def _switch_off(self, now: float) -> str:
+        self._owes_record = False
+        return super()._switch_off(now)

@@ -19,6 +19,11 @@ _PATIENCE: Final = 8
 _LISTENS_UNTIL: Final = 3
 _LOOP_S: Final = 0.005
 """Until the bootloader looks into its queue again."""
+_POINTER_BYTES: Final = 4
+_BYTE_MAX: Final = 0xFF
+_SIXTEEN_BITS: Final = 0xFFFF
+_LEFTOVER_S: Final = 0.1
+_UPDATES_MAX: Final = 20
 
 
 @variant("no-feedback", "RS-01", "restarts at a reset without general feedback")
@@ -261,3 +266,167 @@ class MixesTransfers(MockDevice):
             self._transfer.size_bytes = self._offered_bytes
             return Event.UPDATE_AGAIN
         return event
+
+
+@variant("reset-text-of-four", "RS-04", "compares the first four letters of a reset's text")
+class ResetTextOfFour(MockDevice):
+    """Compares as many bytes as a pointer has."""
+
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if _is_bad_reset(row) and row.message.mode == Mode.WRITE:
+            is_alike = row.message.data.startswith(messages.Reset.DATA[:_POINTER_BYTES])
+            row = messages.Reset() if is_alike else row
+        super()._take_row(row, now)
+
+
+@variant("update-text-of-four", "UP-06", "compares the first four letters of a target's name")
+class UpdateTextOfFour(MockDevice):
+    """Compares as many bytes as a pointer has."""
+
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if isinstance(row, messages.Malformed) and row.message.mode == Mode.WRITE:
+            text = self.target.update_text.encode("ascii")
+            message = row.message
+            if message.command == Command.UPDATE and message.data.startswith(text[:_POINTER_BYTES]):
+                row = messages.decode(message._replace(data=text + message.data[len(text) :]))
+        super()._take_row(row, now)
+
+
+@variant("reset-from-any-node", "RS-04", "takes a reset that another node than the tool sends")
+class ResetFromAnyNode(MockDevice):
+    """Goes by the receiver in an id, not by the sender."""
+
+    def _take_message(self, message: Message, now: float) -> None:
+        if messages.decode(message) == messages.Reset():
+            message = message._replace(can_id=self.target.request_id)
+        super()._take_message(message, now)
+
+
+@variant(
+    "dies-after-255-announcements",
+    "RS-03",
+    "without an application, hangs after 255 announcements until power is cut",
+)
+class DiesAfter255(HangingDevice):
+    def _announce(self, now: float) -> str:
+        return self._hang() if self._announced >= _BYTE_MAX else super()._announce(now)
+
+
+@variant("feedback-after-version", "RS-01", "sends general feedback behind the first boot version")
+class FeedbackAfterVersion(MockDevice):
+    """Leaves the answer to a reset to the bootloader."""
+
+    _owes_feedback = False
+
+    def _confirm_reset(self, now: float) -> str:
+        self._owes_feedback = True
+        self._await_restart(now)
+        return "reset"
+
+    def _announce(self, now: float) -> str:
+        detail = super()._announce(now)
+        if self._owes_feedback:
+            self._owes_feedback = False
+            self._send(messages.GeneralFeedback())
+        return detail
+
+
+@variant(
+    "leftover-announcement",
+    "UP-04",
+    "announces itself once more 0.1 s after request transfer",
+)
+class LeftoverAnnouncement(MockDevice):
+    """Does not stop the timer of its announcements at the update command."""
+
+    _leftover_at = inf
+
+    def _request(self, now: float) -> str:
+        self._leftover_at = now + _LEFTOVER_S
+        return super()._request(now)
+
+    def deadline(self) -> float | None:
+        due_at = super().deadline()
+        found = self._leftover_at if due_at is None else min(due_at, self._leftover_at)
+        return None if found == inf else found
+
+    def tick(self, now: float) -> None:
+        super().tick(now)
+        if now >= self._leftover_at:
+            self._leftover_at = inf
+            self._send(messages.BootVersion(self.target.boot_name, self.profile.boot_version))
+
+    def power_cut(self, now: float) -> None:
+        self._leftover_at = inf
+        super().power_cut(now)
+
+
+@variant(
+    "sixteen-bit-size",
+    "UP-02",
+    "keeps 16 bits of the size, and takes one beyond 64 KiB for a small one",
+    profile={"application_area_bytes": 48 * 1024},
+)
+class SixteenBitSize(MockDevice):
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if isinstance(row, messages.UpdateCommand):
+            row = dataclasses.replace(row, size_bytes=row.size_bytes & _SIXTEEN_BITS)
+        super()._take_row(row, now)
+
+
+@variant(
+    "hangs-at-20th-update",
+    "EN-07",
+    "hangs at the 20th update command since power-up until power is cut",
+)
+class HangsAt20thUpdate(HangingDevice):
+    """Allocates a buffer for each transfer, and frees none."""
+
+    _updates = 0
+
+    def _erase(self, now: float) -> str:
+        self._updates += 1
+        return self._hang() if self._updates >= _UPDATES_MAX else super()._erase(now)
+
+    def power_cut(self, now: float) -> None:
+        self._updates = 0
+        super().power_cut(now)
+
+
+@variant(
+    "reset-while-erasing-hangs",
+    "TX-13",
+    "hangs at a reset while it erases until power is cut",
+)
+class ResetWhileErasingHangs(HangingDevice):
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if isinstance(row, messages.Reset) and self.state is State.ERASING:
+            self._hang()
+        else:
+            super()._take_row(row, now)
+
+
+@variant(
+    "completes-without-transfer",
+    "EN-02",
+    "answers an end of transfer with complete while it announces itself",
+)
+class CompletesWithoutTransfer(MockDevice):
+    """Counts no packet missing as long as none was announced."""
+
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if isinstance(row, messages.EndOfTransfer) and self.state is State.ANNOUNCING:
+            self._send(messages.Complete())
+        super()._take_row(row, now)
+
+
+@variant(
+    "acks-without-transfer",
+    "TX-03",
+    "acknowledges packets while it announces itself, and stores nothing",
+)
+class AcksWithoutTransfer(MockDevice):
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if isinstance(row, messages.Packet) and self.state is State.ANNOUNCING:
+            self._send(messages.Ack(row.number))
+        super()._take_row(row, now)

@@ -35,6 +35,7 @@ takes 0.4 to 0.55 ms.
 """
 _KNOWN_COMMANDS: Final = frozenset(Command) | {item.command for item in ITEMS}
 _KNOWN_MODES: Final = frozenset(Mode)
+_WRITTEN: Final = (Command.RESET, Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER)
 
 
 @variant(
@@ -234,3 +235,64 @@ class FeedbackCrcMirrored(MockDevice):
         elif not self.is_off_bus:
             frames = split(message.can_id, _with_mirrored_crc(encode(message)))
             self._transmitter.queue(frames)
+
+
+@variant("crc-zero-accepted", "CR-03", "takes a message whose CRC is 00000000")
+class CrcZeroAccepted(Reassembler):
+    """Has a way past the check, for the first tests on a desk."""
+
+    def _crc_fits(self, wire: bytes) -> bool:
+        return super()._crc_fits(wire) or wire[_CRC_AT] == bytes(CRC_SIZE)
+
+
+@variant("crc-ones-accepted", "CR-03", "takes a message whose CRC is FFFFFFFF")
+class CrcOnesAccepted(Reassembler):
+    def _crc_fits(self, wire: bytes) -> bool:
+        return super()._crc_fits(wire) or wire[_CRC_AT] == b"\xff" * CRC_SIZE
+
+
+@variant(
+    "long-commands-accepted",
+    "FR-06",
+    "takes a reset or update command with more data than its command says",
+)
+class LongCommandsAccepted(Reassembler):
+    """Goes by the length byte, and looks at as much of the data as it needs."""
+
+    def _judge_head(self, found: list[Message | Damage]) -> bool:
+        head = self._buffer[PREFIX_SIZE - 1 : PREFIX_SIZE + COMMAND_SIZE]
+        is_short = int.from_bytes(head[1:], "big") in (Command.RESET, Command.UPDATE)
+        return (is_short and head[2] < head[0] - COMMAND_SIZE) or super()._judge_head(found)
+
+    def _judge_message(self, size: int, found: list[Message | Damage]) -> None:
+        super()._judge_message(size, found)
+        last = found[-1]
+        if isinstance(last, Message):
+            found[-1] = last._replace(data=last.data[: data_size(last.command)])
+
+
+@variant("tail-in-crc", "FR-03", "takes F0 in the first byte of a CRC for the tail")
+class TailInCrc(Reassembler):
+    """Looks for the tail from the end of the data on: the CRC before it may hold the same byte."""
+
+    def _crc_fits(self, wire: bytes) -> bool:
+        return not wire[_CRC_AT].startswith(TAIL) and super()._crc_fits(wire)
+
+
+@variant("answers-padded", "CR-04", "fills the last frame of its messages up to 8 bytes")
+class AnswersPadded(MockDevice):
+    """Its CAN driver always sends 8 bytes."""
+
+    def send(self, message: Message) -> None:
+        if not self.is_off_bus:
+            wire = encode(message)
+            whole = -(-len(wire) // FRAME_DATA_SIZE) * FRAME_DATA_SIZE
+            self._transmitter.queue(split(message.can_id, wire.ljust(whole, b"\x00")))
+
+
+@variant("ignores-mode", "FR-10", "takes reset, update command, packet and end with any mode")
+class IgnoresMode(MockDevice):
+    def _take_message(self, message: Message, now: float) -> None:
+        if message.can_id == self.target.request_id and message.command in _WRITTEN:
+            message = message._replace(mode=Mode.WRITE)
+        super()._take_message(message, now)

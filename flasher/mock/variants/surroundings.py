@@ -23,6 +23,7 @@ from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Damage, DamageReason, Message, Reassembler
 
 _WORD: Final = 0xFFFF_FFFF
+_BUSY_S: Final = 0.001
 _PACKETS_A_PAGE: Final = 16
 _SLOW_S: Final = DEFAULT_TIMINGS.ack_timeout_s + 0.1
 """Later than a host waits for an ACK (R12)."""
@@ -277,3 +278,25 @@ class AnswersInBootloader(MockDevice):
     def _confirm(self, command: int) -> None:
         if command in _APPLICATION_COMMANDS:
             self._send(messages.GeneralFeedback())
+
+
+@variant(
+    "answer-lost-on-busy-bus",
+    "CO-01",
+    "loses an ACK that is due within 1 ms after a frame of others",
+)
+class AnswerLostOnBusyBus(MockDevice):
+    """Gives up when its transmit mailbox is not free at once."""
+
+    _foreign_at = -inf
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if frame.can_id not in (self.target.request_id, self.target.answer_id):
+            self._foreign_at = now
+        super().receive(frame, now)
+
+    def _acknowledge(self, now: float) -> str:
+        detail = super()._acknowledge(now)
+        if now - self._foreign_at < _BUSY_S:
+            self._transmitter.drop_unstarted()
+        return detail

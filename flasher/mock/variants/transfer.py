@@ -26,6 +26,7 @@ _BYTE: Final = 0xFF
 _HANGS_AFTER: Final = 256
 _UPGRADING: Final = frozenset((State.ERASING, State.TRANSFER, State.PROGRAMMING))
 _BANK_BYTES: Final = 0x10000
+_WRAP_S: Final = 65.536
 
 
 @variant(
@@ -322,3 +323,116 @@ class SixteenBitOffsets(PlainStore):
         operation = super().storing(number, payload, size_bytes)
         offset = (operation.address - AREA_START) % _BANK_BYTES
         return operation._replace(address=AREA_START + offset)
+
+
+@variant("numbers-modulo-256", "TX-03", "looks at the low byte of a packet's number only")
+class NumbersModulo256(MockDevice):
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if isinstance(row, messages.Packet) and self.state is State.TRANSFER:
+            transfer = self._transfer
+            for number in (transfer.stored, transfer.wanted):
+                if number and (row.number - number) & _BYTE == 0:
+                    row = dataclasses.replace(row, number=number)
+        super()._take_row(row, now)
+
+
+@variant("totals-modulo-256", "TX-04", "looks at the low byte of a packet's total only")
+class TotalsModulo256(MockDevice):
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if isinstance(row, messages.Packet) and (row.total - self._transfer.total) & _BYTE == 0:
+            row = dataclasses.replace(row, total=self._transfer.total)
+        super()._take_row(row, now)
+
+
+@variant("number-zero-is-first", "TX-03", "takes packet 0 for packet 1 at the beginning")
+class NumberZeroIsFirst(MockDevice):
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if isinstance(row, messages.Malformed) and not self._transfer.stored:
+            message = row.message
+            if (message.command, message.mode) == (Command.PACKET, Mode.WRITE):
+                data = message.data
+                if not any(data[1:3]):
+                    row = messages.decode(message._replace(data=data[:1] + b"\x01\x00" + data[3:]))
+        super()._take_row(row, now)
+
+
+@variant(
+    "acks-damaged-repetition",
+    "TX-01",
+    "acknowledges a damaged packet that names the number stored last",
+)
+class AcksDamagedRepetition(MockDevice):
+    """Looks at the number before the checksum."""
+
+    def _answer_bad(self, now: float) -> str:
+        stored = self._transfer.stored
+        if not self._is_damage or not stored or self._number != stored:
+            return super()._answer_bad(now)
+        self._send(messages.Ack(stored))
+        self._await_host(now)
+        return ""
+
+    _is_damage = False
+
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        self._is_damage = True
+        super()._take_damage(damage, now)
+        self._is_damage = False
+
+
+@variant("acks-twice", "TX-07", "sends every ACK of a packet twice")
+class AcksTwice(MockDevice):
+    def _acknowledge(self, now: float) -> str:
+        detail = super()._acknowledge(now)
+        self._send(messages.Ack(self._transfer.stored))
+        return detail
+
+
+@variant(
+    "blank-packet-unanswered",
+    "TX-07",
+    "does not acknowledge a packet of nothing but FF until it is repeated",
+)
+class BlankPacketUnanswered(MockDevice):
+    """Has nothing to program for a blank packet, and forgets to answer it."""
+
+    def _acknowledge(self, now: float) -> str:
+        if set(self._payload) != {PACKET_FILLER}:
+            return super()._acknowledge(now)
+        self._transfer.stored += 1
+        self._await_host(now)
+        return ""
+
+
+@variant(
+    "pause-counts-from-start",
+    "TX-12",
+    "counts the pause from request transfer on: a transfer that lasts as long is given up",
+)
+class PauseCountsFromStart(MockDevice):
+    _began_at = 0.0
+
+    def _request(self, now: float) -> str:
+        self._began_at = now
+        return super()._request(now)
+
+    def _await_host(self, now: float) -> None:
+        super()._await_host(self._began_at)
+
+
+@variant(
+    "timer-wraps",
+    "TX-12",
+    "gives a transfer up 65.536 s after its start, where its clock of 16 bits wraps",
+)
+class TimerWraps(MockDevice):
+    _booted_at = 0.0
+
+    def _boot(self, now: float) -> str:
+        self._booted_at = now
+        return super()._boot(now)
+
+    def _await_host(self, now: float) -> None:
+        super()._await_host(now)
+        wraps = int((now - self._booted_at) / _WRAP_S) + 1
+        self._due_at = min(self._due_at, self._booted_at + wraps * _WRAP_S)
