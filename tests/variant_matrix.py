@@ -38,7 +38,8 @@ model; the gate runs it again and compares. `flasher mock --variant NAME` serves
 `flasher conformance --mock --variant NAME -t bms` runs the suite on it.
 
 A variant violates one clause and is right in everything else. What it fails beside the case of
-its clause has the same stimulus in it; where no upgrade works, most cases that need one fail.
+its clause has the same stimulus in it; where no upgrade works, or the fault is met in every one,
+most cases that need one fail.
 """
 
 
@@ -94,6 +95,8 @@ def document(rows: Iterable[Row]) -> str:
     for case_id in in_order(CASES):
         caught = ", ".join(row.variant for row in rows if case_id in row.fails)
         lines.append(f"| {case_id} | {CASES[case_id].title} | {caught} |")
+    lines += ["", "## Not seen", ""]
+    lines += [f"- {name}: {one.unseen}." for name, one in VARIANTS.items() if one.unseen]
     if NOT_IMPLEMENTED:
         lines += ["", "## Not done in software", ""]
         lines += [f"- {case_id}: {reason}" for case_id, reason in NOT_IMPLEMENTED.items()]

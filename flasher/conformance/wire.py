@@ -12,7 +12,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from functools import lru_cache
 from itertools import groupby
@@ -271,6 +271,8 @@ class Received:
     mode: int = 0
     command: int = 0
     data: bytes = b""
+    padding: bytes = b""
+    """What follows the tail in the last frame."""
 
     @property
     def number(self) -> int:
@@ -335,7 +337,9 @@ class Decoder:
         if len(raw) < 4 or len(raw) < _OVERHEAD_BYTES + raw[3]:
             self._partial[can_id] = (first_at, at, raw)
             return
-        yield self._judge(raw[: _OVERHEAD_BYTES + raw[3]], first_at, at, can_id)
+        size = _OVERHEAD_BYTES + raw[3]
+        heard = self._judge(raw[:size], first_at, at, can_id)
+        yield replace(heard, padding=raw[size:]) if raw[size:] else heard
 
     def _judge(self, raw: bytes, first_at: float, at: float, can_id: int) -> Received:
         body, found_crc, tail = raw[2:-5], raw[-5:-1], raw[-1:]

@@ -480,7 +480,7 @@ def test_variants_are_listed_with_their_clauses_without_target_or_adapter(flashe
     lines = run.out.splitlines()
     assert len(lines) == len(VARIANTS)
     assert all(len(line) <= 120 for line in lines)
-    assert lines[10] == "no-crc-check                  CR-01  takes a message with any CRC"
+    assert "no-crc-check                  CR-01  takes a message with any CRC" in lines
 
 
 def test_the_list_of_variants_is_a_json_document(flasher: Flasher) -> None:

@@ -11,7 +11,7 @@ from tests.loops import each
 from tests.variant_matrix import Row, groups_passed, listed_rows, row_of
 
 LISTED = listed_rows()
-_NAMES = list(VARIANTS)
+_NAMES = [name for name, variant in VARIANTS.items() if not variant.unseen]
 SAMPLE = [
     _NAMES[0],
     *_NAMES[4:-1:8],
@@ -37,7 +37,8 @@ def test_the_table_has_every_variant() -> None:
 
 
 def test_every_variant_fails_the_case_of_its_clause() -> None:
-    assert [name for name, fails in LISTED.items() if VARIANTS[name].clause not in fails] == []
+    missed = [name for name, fails in LISTED.items() if VARIANTS[name].clause not in fails]
+    assert missed == [name for name, variant in VARIANTS.items() if variant.unseen]
 
 
 def test_every_case_fails_on_a_variant_of_its_own_clause() -> None:
@@ -48,10 +49,9 @@ def test_every_case_fails_on_a_variant_of_its_own_clause() -> None:
 def test_a_variant_fails_nothing_but_its_clause_and_what_it_says_that_it_touches() -> None:
     for name, fails in LISTED.items():
         variant = VARIANTS[name]
-        if variant.upgrade_works:
+        if variant.upgrade_works and not variant.everywhere:
             assert set(fails) <= {variant.clause, *variant.also}, name
-        passed = groups_passed(Row(name, fails, 0))
-        assert passed or not variant.upgrade_works, name
+            assert groups_passed(Row(name, fails, 0)), name
 
 
 @each("name", SAMPLE)

@@ -23,6 +23,7 @@ from flasher.conformance.wire import (
     build,
     crc,
     describe,
+    inverted,
     joined,
 )
 
@@ -108,8 +109,8 @@ def bursts(bench: Bench) -> None:
     "CR-03",
     "a checksum of another kind",
     clause="Welling 2.2.1 (6); Welling 4.2",
-    stimulus="update commands and packets whose CRC is for another id, leaves the id out, or "
-    "stands low byte first",
+    stimulus="update commands and packets whose CRC is for another id, leaves the id out, stands "
+    "low byte first, is inverted, 00000000 or FFFFFFFF",
     expectation="rejected; update command and packet with the right one are taken",
     requires={DESTRUCTIVE},
 )
@@ -132,7 +133,8 @@ def other_checksums(bench: Bench) -> None:
     "messages byte for byte",
     clause="Welling 2.2.1, table 1; Welling 4.1; Welling 4.2",
     stimulus="an upgrade, then the beginning of one by written-out messages",
-    expectation="they are taken, and each answer is the written-out one to the last byte",
+    expectation="they are taken, and each answer is the written-out one to the last byte, its last "
+    "frame no longer than it has to be",
     requires={DESTRUCTIVE},
     choices=("tx_01",),
 )
@@ -283,8 +285,9 @@ class _Exact:
 
     def _judge(self, name: str, wanted: bytes, heard: Received | None) -> None:
         where = self._bench.encoder.to_tool
-        got = "nothing" if heard is None else f"{heard.can_id:03X} {heard.raw.hex(' ').upper()}"
-        ok = heard is not None and (heard.can_id, heard.raw) == (where, wanted)
+        raw = b"" if heard is None else heard.raw + heard.padding
+        got = "nothing" if heard is None else f"{heard.can_id:03X} {raw.hex(' ').upper()}"
+        ok = heard is not None and (heard.can_id, raw) == (where, wanted)
         self._bench.require(ok, f"{name}: {where:03X} {wanted.hex(' ').upper()}", got)
 
 
@@ -346,6 +349,14 @@ def _wrong_checksums(bench: Bench) -> Iterator[Damage]:
     yield "CRC for the id low byte first", by(struct.pack("<H", encoder.to_device))
     yield "CRC without the id", by(b"")
     yield "CRC low byte first", lambda raw: raw[:-5] + raw[-5:-1][::-1] + raw[-1:]
+    yield "CRC inverted", lambda raw: raw[:-5] + inverted(raw[-5:-1]) + raw[-1:]
+    for filler in (b"\x00", b"\xff"):
+        yield f"CRC of {filler.hex().upper()}", _with_crc(4 * filler)
+
+
+def _with_crc(field: bytes) -> Callable[[bytes], bytes]:
+    """The message with this CRC."""
+    return lambda raw: raw[:-5] + field + raw[-1:]
 
 
 # -- judging --------------------------------------------------------------------------------------

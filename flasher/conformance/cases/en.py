@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.tx import transfer_image
+from flasher.conformance.cases.tx import check_out_of_turn, transfer_image
 from flasher.conformance.catalogue import DESTRUCTIVE, Requirement, case
-from flasher.conformance.wire import Kind, Received, describe, packet_count, version_in
+from flasher.conformance.wire import END, WRITE, Kind, Received, describe, packet_count, version_in
 
 _RESET_PERIOD_S: Final = 0.2
 """A tool repeats a command at this interval (4.3)."""
+_WRONG_MARKS: Final = (0x00, 0x01, 0x05, 0xFF)
+"""Bytes of an end of transfer in place of 04."""
 _NO_APPLICATION_S: Final = 1.0
 """How long an application that must not run is asked."""
 _UPGRADE_KINDS: Final = (Kind.REQUEST, Kind.ACK, Kind.NAK, Kind.COMPLETE, Kind.FEEDBACK)
@@ -50,8 +52,8 @@ def end(bench: Bench) -> None:
     "EN-02",
     "end of transfer early, and twice",
     clause="Welling 5.1, figure 2 (end); Welling 5.2, table 8 (A401); R6",
-    stimulus="end of transfer before packet 1, after it and before the last one; end of transfer "
-    "again after complete",
+    stimulus="end of transfer to the announcing bootloader, before packet 1, after it and before "
+    "the last one; with another byte than 04; end of transfer again after complete",
     expectation="NAK, and the transfer goes on or can be begun anew; the second one is answered as "
     "the profile says (en_02)",
     requires={DESTRUCTIVE},
@@ -60,6 +62,9 @@ def end(bench: Bench) -> None:
 def end_early_and_twice(bench: Bench) -> None:
     image = transfer_image(bench)
     total = packet_count(len(image))
+    with bench.step("end of transfer without a transfer"):
+        check_out_of_turn(bench, bench.encoder.end())
+        bench.check_application()
     bench.start_transfer(len(image))
     done = 0
     for stored in (0, 1, total - 1):
@@ -72,6 +77,18 @@ def end_early_and_twice(bench: Bench) -> None:
             bench.expect_silence(bench.limit("ack_s"), ignoring=(Kind.BOOT_VERSION,))
             done += _goes_on(bench, image, stored)
     bench.packets(image, done + 1)
+    for mark in _WRONG_MARKS:
+        with bench.step(f"end of transfer with {mark:02X}"):
+            bench.send(bench.encoder.message(WRITE, END, bytes((mark,))))
+            heard = bench.collect(bench.limit("ack_s"))
+            ok = not any(one.kind in (Kind.COMPLETE, Kind.ACK) for one in heard)
+            bench.require(ok, "rejected", describe(heard))
+        if any(one.kind in (Kind.NAK, Kind.BOOT_VERSION) for one in heard):
+            bench.send_packet(image, total)
+            known = bench.wait_for(Kind.ACK, Kind.NAK, unlike=lambda one: one.number < total)
+            if known is None:
+                _begin_anew(bench, image, total)
+            break
     bench.end_transfer()
     with bench.step("end of transfer after complete"):
         _check_second_end(bench, Kind.COMPLETE)
@@ -88,15 +105,20 @@ def _goes_on(bench: Bench, image: bytes, stored: int) -> int:
         bench.succeed(f"ACK {stored + 1}", heard)
         return 1
     bench.info(f"after packet {stored}, an early end of transfer ends the transfer")
+    _begin_anew(bench, image, stored, heard)
+    return 0
+
+
+def _begin_anew(bench: Bench, image: bytes, stored: int, heard: Received | None = None) -> None:
+    """Send the packets up to that one in a new transfer; `heard` was the last message."""
     bench.send(bench.encoder.reset())
     within_s = bench.limit("refused_s") + bench.limit("first_version_s")
     found = heard if heard is not None and heard.kind is Kind.BOOT_VERSION else None
     found = found or bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
     if bench.choice("rs_03") == "announces":
-        bench.require_received(found, f"ACK {stored + 1} or boot version", within_s)
+        bench.require_received(found, "the transfer goes on, or boot version", within_s)
     bench.update(len(image))
     bench.packets(image, 1, stored)
-    return 0
 
 
 def _check_second_end(bench: Bench, first_answer: Kind) -> None:

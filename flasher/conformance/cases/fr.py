@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Final
 
 from flasher.conformance.bench import Bench
@@ -17,6 +17,7 @@ from flasher.conformance.wire import (
     PACKET_BYTES,
     QUERY_VERSION,
     READ,
+    START,
     UPDATE,
     WRITE,
     Kind,
@@ -35,6 +36,16 @@ _JUNK_FRAMES: Final = (b"\x12", bytes(8), b"\xaa\x55\xf0", b"\xf0" * 8 + b"\xaa"
 _LONG_JUNK_BYTES: Final = 300
 """More than the longest message."""
 _JUNK_IN_FRAME: Final = (b"\x12", b"\x55", b"\x55\x55", b"\xaa", b"\xf0\x00\x34", b"\x12" * 7)
+_CRCS: Final = tuple(
+    map(
+        bytes.fromhex,
+        (
+            *("F0123456", "12F03456", "1234F056", "123456F0", "F0F0F0F0"),
+            *("55AA1687", "1255AA16", "AA0455AA", "00000000", "FFFFFFFF"),
+        ),
+    )
+)
+_FREE_BYTES: Final = 8
 _WRONG_TAILS: Final = (0x00, 0x0F, 0xF1, 0x55, 0xFF)
 _PADDINGS: Final = (0x00, 0xFF, 0xAA, 0x55, 0xF0)
 _UNKNOWN: Final = 0x77FD
@@ -121,12 +132,18 @@ def junk(bench: Bench) -> None:
     "FR-03",
     "header and tail inside data",
     clause="Welling 2.2.1, table 1",
-    stimulus="packets full of 55 AA and F0, at frame boundaries too; whole messages inside data",
+    stimulus="packets full of 55 AA and F0, at frame boundaries too; whole messages inside data; "
+    "packets whose CRC reads as tail or header, or is 00000000 or FFFFFFFF; packets of FF or 00",
     expectation="no false start or end: each one acknowledged once, and stored as it is",
     requires={DESTRUCTIVE},
 )
 def header_in_data(bench: Bench) -> None:
     payloads = dict(_treacherous_payloads(bench))
+    total = len(payloads) + len(_CRCS) + 1  # the probe has some bytes more
+    for wanted in _CRCS:
+        number = len(payloads) + 1
+        data = _data_for_crc(bench, number, total, wanted)
+        payloads[f"CRC {wanted.hex().upper()}"] = data
     probe = Probe(bench, b"".join(payloads.values()))
     probe.begin()
     for name in payloads:
@@ -188,14 +205,17 @@ def broken_off(bench: Bench) -> None:
     "FR-06",
     "lengths that cannot be",
     clause="Welling 2.2.1 (3); Welling 2.2.1 (4, 5)",
-    stimulus="length 0 and 1; length other than the command's second byte + 2; 255 with an "
-    "unknown command; all with the right CRC",
+    stimulus="length 0 and 1; length other than the command's second byte + 2, of update command "
+    "too; 255 with an unknown command; all with the right CRC",
     expectation="discarded, no overflow: the next packet is taken, nothing else is stored",
     requires={DESTRUCTIVE},
 )
 def wrong_length(bench: Bench) -> None:
-    probe = Probe(bench)
-    probe.begin()
+    probe, encoder = Probe(bench), bench.encoder
+    update = encoder.update_text + struct.pack("<I", len(probe.image))
+    with bench.step("update command, length greater by 1 and 4, and less by 1"):
+        wrong = (update + b"\x00", update + bytes(4), update[:-1])
+        probe.enter_past(*(encoder.message(WRITE, UPDATE, data) for data in wrong))
     probe.plain()
     for name, length, make in _WRONG_LENGTHS:
         with bench.step(name):
@@ -357,7 +377,8 @@ def _treacherous_payloads(bench: Bench) -> Iterator[tuple[str, bytes]]:
     encoder, to_device = bench.encoder, bench.encoder.to_device
     yield "55 AA all over", _HEADER * (PACKET_BYTES // 2)
     yield "55 AA all over, odd", (b"\x00" + _HEADER * PACKET_BYTES)[:PACKET_BYTES]
-    yield "F0 all over", b"\xf0" * PACKET_BYTES
+    for byte in (b"\xf0", b"\xff", b"\x00"):
+        yield f"{byte.hex().upper()} all over", byte * PACKET_BYTES
     yield "F0, then 55 AA", b"\xf0\x55\xaa\xf0" * (PACKET_BYTES // 4)
     whole = {
         "end of transfer": joined(encoder.end()),
@@ -372,6 +393,37 @@ def _treacherous_payloads(bench: Bench) -> Iterator[tuple[str, bytes]]:
             where = "at a frame's start" if offset == 5 else "across frames"
             block = bytes(offset) + raw.ljust(24, b"\x00")
             yield f"{name} {where}", block.ljust(64, b"\x00") + block.ljust(64, b"\xf0")
+
+
+def _data_for_crc(bench: Bench, number: int, total: int, wanted: bytes) -> bytes:
+    """The data of a packet with that CRC. A CRC is linear: what each bit of the last bytes changes
+    in it tells which of them have to be turned.
+    """
+    body = bytes((WRITE, 2 + (PACKET & 0xFF))) + _PACKET + struct.pack("<BHH", START, number, total)
+    start = bench.random.randbytes(PACKET_BYTES - _FREE_BYTES)
+
+    def crc_of(free: int) -> int:
+        data = start + free.to_bytes(_FREE_BYTES, "big")
+        return int.from_bytes(message_crc(bench.encoder.to_device, body + data), "big")
+
+    plain = crc_of(0)
+    basis: dict[int, tuple[int, int]] = {}
+    """By its highest bit: a change of the CRC, and the bits that make it."""
+    for bit in range(8 * _FREE_BYTES):
+        change, bits = _reduced(crc_of(1 << bit) ^ plain, 1 << bit, basis)
+        if change:
+            basis[change.bit_length()] = (change, bits)
+    missing, free = _reduced(plain ^ int.from_bytes(wanted, "big"), 0, basis)
+    assert not missing  # noqa: S101  the free bytes reach every CRC
+    return start + free.to_bytes(_FREE_BYTES, "big")
+
+
+def _reduced(change: int, bits: int, basis: Mapping[int, tuple[int, int]]) -> tuple[int, int]:
+    """A change of the CRC without what others make, and the bits that make the rest of it."""
+    for top in sorted(basis, reverse=True):
+        if change.bit_length() == top:
+            change, bits = change ^ basis[top][0], bits ^ basis[top][1]
+    return change, bits
 
 
 def _messages_broken_off(bench: Bench) -> Iterator[tuple[str, bytes]]:

@@ -22,6 +22,7 @@ _FAR_PACKET: Final = 64
 """Beyond it a cut costs so much time on a real bus that only some are made."""
 _FEW_FRAMES: Final = (1, 9, 17, 18)
 _OFF_S: Final = 0.3
+_ERASE_SHARES: Final = (0.1, 0.3, 0.5, 0.7, 0.9)
 _SHARES: Final = (0.0, 0.5, 1.0)
 """Before a flash operation, in its middle, and when it is over."""
 _OPERATIONS_MAX: Final = 24
@@ -44,6 +45,8 @@ class _Upgrade:
     old: bytes
     new: bytes
     end_was_sent: bool = False
+    was_requested: bool = False
+    """True when the last one came as far as request transfer: nothing is erased any more."""
     runs: bool = True
     """True while an application runs, so that the way into the bootloader is a reset."""
 
@@ -56,8 +59,8 @@ class _Upgrade:
     "PW-01",
     "power cuts in an upgrade",
     clause="R14; R19",
-    stimulus="power cut at the frames of reset, update command, packets and end of transfer; "
-    "before, in and after every flash operation",
+    stimulus="power cut at the frames of reset, update command, packets and end of transfer; while "
+    "it erases, just after complete; before, in and after every flash operation",
     expectation="the device announces itself again, starts nothing but a whole image, and can be "
     "upgraded; what was acknowledged is stored",
     requires={DESTRUCTIVE, POWER, LONG},
@@ -78,9 +81,11 @@ def cuts(bench: Bench) -> None:
             _go_to(bench, upgrade, cut)
             _cut(bench)
             _check_after_cut(bench, upgrade)
+    _cut_erase(bench, upgrade)
     _cut_operations(bench, upgrade)
     _cut_after_ack(bench, upgrade)
-    _check_upgrade(bench)
+    _cut_after_complete(bench, upgrade)
+    _check_upgrade(bench, upgrade)
 
 
 @case(
@@ -116,7 +121,7 @@ def second_cut(bench: Bench) -> None:
             _go_to(bench, upgrade, cut)
             _cut(bench)
             _check_after_cut(bench, upgrade)
-    _check_upgrade(bench)
+    _check_upgrade(bench, upgrade)
 
 
 # -- the cuts -------------------------------------------------------------------------------------
@@ -202,10 +207,13 @@ def _cut(bench: Bench) -> None:
     bench.power_cycle(_OFF_S)
 
 
-def _check_upgrade(bench: Bench) -> None:
-    """From a power-up, as a bootloader that only listens ignores the reset of a host (rs_03)."""
+def _check_upgrade(bench: Bench, upgrade: _Upgrade) -> None:
+    """From a power-up where no application runs, as a bootloader that only listens ignores the
+    reset of a host (rs_03).
+    """
     with bench.step("afterwards"):
-        _cut(bench)
+        if not upgrade.runs:
+            _cut(bench)
         bench.check_upgrade()
 
 
@@ -252,7 +260,38 @@ def _check_whole(bench: Bench, upgrade: _Upgrade) -> bool:
     return True
 
 
+def _run_old(bench: Bench, upgrade: _Upgrade) -> None:
+    """Let the old image run, so that what is erased is an application. From a power-up, as a
+    bootloader that only listens ignores the reset of a host (rs_03).
+    """
+    if upgrade.runs:
+        return
+    _cut(bench)
+    done = bench.upgrade(upgrade.old, reset=False)
+    bench.require(done.ok, "the device can be upgraded", done.reason or "it was")
+    upgrade.runs = bench.application_runs()
+
+
 # -- in the flash ---------------------------------------------------------------------------------
+
+
+def _cut_erase(bench: Bench, upgrade: _Upgrade) -> None:
+    """A cut while the application is erased, at shares of the time that it took once."""
+    _run_old(bench, upgrade)
+    upgrade.end_was_sent = upgrade.runs = False
+    bench.reset_to_bootloader()
+    bench.wait_to_be_heard()
+    heard = bench.update(len(upgrade.new))
+    erase_s = heard.at - bench.tester.left_at
+    for share in _ERASE_SHARES:
+        with bench.step(f"at {share:.0%} of the time until request transfer"):
+            _run_old(bench, upgrade)
+            bench.reset_to_bootloader()
+            bench.wait_to_be_heard()
+            bench.send(bench.encoder.update(len(upgrade.new)))
+            bench.wait(share * erase_s)
+            _cut(bench)
+            _check_after_cut(bench, upgrade)
 
 
 def _cut_operations(bench: Bench, upgrade: _Upgrade) -> None:
@@ -266,6 +305,8 @@ def _cut_operations(bench: Bench, upgrade: _Upgrade) -> None:
     for operation in range(_OPERATIONS_MAX):
         for share in _SHARES:
             with bench.step(f"flash operation {operation + 1}, {share:.0%} of it done"):
+                if not upgrade.was_requested:
+                    _run_old(bench, upgrade)
                 if upgrade.runs:
                     bench.reset_to_bootloader()
                 upgrade.end_was_sent = False
@@ -287,6 +328,7 @@ def _upgrade_until_cut(bench: Bench, upgrade: _Upgrade) -> Received | None:
     bench.forget()
     sent = bench.send(bench.encoder.update(len(upgrade.new)))
     heard = bench.host.request_or_version(sent.left_at, limit("erase_s") + back_s)
+    upgrade.was_requested = heard is not None and heard.kind is Kind.REQUEST
     for number in range(1, packet_count(len(upgrade.new)) + 1):
         if heard is None or heard.kind is Kind.BOOT_VERSION:
             return heard
@@ -319,3 +361,18 @@ def _cut_after_ack(bench: Bench, upgrade: _Upgrade) -> None:
         bench.forget()
         bench.power_on()
         _check_after_cut(bench, upgrade)
+
+
+def _cut_after_complete(bench: Bench, upgrade: _Upgrade) -> None:
+    """What was said to be complete runs after a power cut."""
+    _run_old(bench, upgrade)
+    with bench.step("just after complete"):
+        _enter(bench, upgrade)
+        bench.packets(upgrade.new)
+        bench.end_transfer()
+        _cut(bench)
+        bench.wait_for(Kind.BOOT_VERSION)  # without one: RS-05
+        bench.collect(bench.host.burst_s)
+        bench.check_image(upgrade.new)
+        upgrade.runs = True
+        upgrade.turn()

@@ -15,20 +15,27 @@ from flasher.conformance.wire import (
     Kind,
     RawFrame,
     Received,
+    build,
     describe,
+    split,
 )
 
 _SPACING: Final = "boot version to boot version"
 _IGNORED_RESETS: Final = (
-    ("text RESTE", WRITE, RESET, b"RESTE"),
+    *((f"text {text}", WRITE, RESET, text.encode()) for text in ("RESTE", "RESEX", "XESET")),
     ("text reset", WRITE, RESET, b"reset"),
     ("text of zeros", WRITE, RESET, bytes(5)),
+    ("length greater by four", WRITE, RESET, RESET_TEXT + bytes(4)),
     ("text RESE, too short", WRITE, 0x4204, b"RESE"),
     ("text RESETS, too long", WRITE, 0x4206, b"RESETS"),
     ("as a read", READ, RESET, RESET_TEXT),
     ("as a report", REPORT, RESET, RESET_TEXT),
 )
 """Messages that are nearly a reset: step, mode, command, data."""
+_OTHER_SENDERS: Final = (1, 2, 3, 4)
+"""Their digits in an id: motor controller, battery, on-board computer, display."""
+_LISTENS_S: Final = 16.0
+"""255 announcements 50 ms apart take less: a counter of a byte has run over by then."""
 
 
 @case(
@@ -81,7 +88,7 @@ def reset_again(bench: Bench) -> None:
     "RS-03",
     "no update command",
     clause="Welling 5.1, figure 2 (begin); R14; R19",
-    stimulus="silence after the announcements, with an application and without one",
+    stimulus="silence after the announcements, with an application and, for 16 s, without one",
     expectation="a valid application is started; without one the bootloader stays (rs_03)",
     requires={DESTRUCTIVE},
     choices=("rs_03",),
@@ -96,6 +103,7 @@ def no_update(bench: Bench) -> None:
         bench.without_application()
         if bench.choice("rs_03") == "announces":
             _check_announces_on(bench, 2 * count + 1)
+            bench.collect(_LISTENS_S)
             bench.check_upgrade()
         else:
             spacing_s = bench.limit("version_spacing_s")
@@ -110,7 +118,8 @@ def no_update(bench: Bench) -> None:
     "RS-04",
     "what is no reset",
     clause="Welling 3.4, table 7 (4205); Welling 2.2.1 (2); Welling 2.2.2, table 2",
-    stimulus="reset with another text, as a read, as a report, to another target's id",
+    stimulus="reset with another text or length, as a read, as a report, to another target's id, "
+    "from other nodes",
     expectation="no restart; the application runs on",
 )
 def no_reset(bench: Bench) -> None:
@@ -119,6 +128,11 @@ def no_reset(bench: Bench) -> None:
         _check_ignored(bench, step, encoder.message(mode, command, data))
     for other in encoder.others():
         _check_ignored(bench, f"to the {other.target.upper()}", other.reset())
+    for sender in _OTHER_SENDERS:
+        can_id = (encoder.to_device & 0x00F) | 0x700 | sender << 4
+        if can_id & 0x0F0 != encoder.to_all & 0x0F0:
+            raw = build(can_id, WRITE, encoder.reset_command, encoder.reset_data)
+            _check_ignored(bench, f"on id {can_id:03X}", split(can_id, raw))
     bench.check_application()
 
 

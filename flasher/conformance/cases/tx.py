@@ -4,7 +4,7 @@ pauses and resets during a transfer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import Final
 
 from flasher.conformance.bench import Bench
@@ -14,6 +14,7 @@ from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
     PACKET_BYTES,
     Kind,
+    RawFrame,
     Received,
     describe,
     inverted,
@@ -44,6 +45,11 @@ _SHORT: Final = 0.5
 """A pause that is no pause, as a part of limits.pause_s."""
 _LONG: Final = 1.5
 _JUST_NOT: Final = 0.9
+_WRAP_S: Final = 66.0
+"""More than 65.536 s, where a clock of milliseconds in 16 bits wraps."""
+_APART_S: Final = 3.0
+_LEFTOVER_S: Final = 0.03
+"""A boot version so soon after an update command was sent before it (R2)."""
 
 
 def transfer_image(bench: Bench) -> bytes:
@@ -106,6 +112,18 @@ def _check_naks(bench: Bench, numbers: Collection[int] | None, counts: Collectio
     bench.check(len(heard) == len(right) in counts, f"rejected: {wanted}", describe(heard))
 
 
+def check_out_of_turn(bench: Bench, frames: Sequence[RawFrame]) -> None:
+    """Packet or end of transfer to the announcing bootloader: whatever it says, it is none of what
+    answers them in a transfer.
+    """
+    bench.reset_to_bootloader()
+    bench.wait_to_be_heard()
+    bench.send(frames)
+    heard = bench.collect(bench.host.burst_s + bench.limit("inter_frame_s"))
+    positive = [one for one in heard if one.kind in (Kind.ACK, Kind.COMPLETE, Kind.REQUEST)]
+    bench.check(not positive, "neither ACK nor complete", describe(positive or heard))
+
+
 # -- damage ---------------------------------------------------------------------------------------
 
 
@@ -134,11 +152,12 @@ def damaged(bench: Bench) -> None:
 
 def _damages(bench: Bench, image: bytes, number: int) -> Iterator[tuple[str, int, bytes]]:
     """Step, number in the packet, its bytes."""
-    for named in (number, number + 1):
-        if named <= packet_count(len(image)):
+    which = {number: "wrong CRC", number + 1: "the next one came, with a wrong CRC"}
+    which[number - 1] = "the one before came, with a wrong CRC"
+    for named, step in which.items():
+        if 1 <= named <= packet_count(len(image)):
             raw = bytearray(joined(bench.encoder.packet_of(image, named)))
             raw[_CRC_AT] = inverted(raw[_CRC_AT])
-            step = "wrong CRC" if named == number else "the next one came, with a wrong CRC"
             yield step, named, bytes(raw)
     raw = bytearray(joined(bench.encoder.packet_of(image, number)))
     raw[_DATA_AT] ^= 0x10
@@ -217,7 +236,8 @@ def _check_repeated(bench: Bench, number: int, total: int) -> None:
     "packet numbers out of order",
     clause="Welling 5.2, table 8 (A385); R10",
     stimulus="before packet 1, after packet 3 and after the last one: a number skipped, the last "
-    "one, 0, beyond the total, 65535; older ones, with right and with other data",
+    "one, 0, beyond the total, the right one and 256, 65535; older ones, with right and with other "
+    "data; packets to the announcing bootloader",
     expectation="rejected (tx_01), the older ones as the profile says (tx_03); nothing of it is "
     "stored",
     requires={DESTRUCTIVE},
@@ -226,6 +246,9 @@ def _check_repeated(bench: Bench, number: int, total: int) -> None:
 def out_of_order(bench: Bench) -> None:
     image = transfer_image(bench)
     total = packet_count(len(image))
+    with bench.step("without a transfer"):
+        check_out_of_turn(bench, bench.encoder.packet_of(image, 1))
+        bench.check_application()
     for stored in bench.transfer_in_parts(image, (0, _STORED, total)):
         _send_wrong_numbers(bench, total, stored)
         for number in range(1, _STORED) if stored == _STORED else ():
@@ -238,6 +261,7 @@ def out_of_order(bench: Bench) -> None:
 
 def _send_wrong_numbers(bench: Bench, total: int, stored: int) -> None:
     numbers = {stored + 2: True, total: True, 0: False, total + 1: True, _NUMBER_MAX: True}
+    numbers[stored + 1 + 256] = True
     for number, is_plain in numbers.items():
         # The one stored last is a repetition (TX-02), and 65536 cannot be said.
         if 0 < number == stored or number > _NUMBER_MAX:
@@ -264,8 +288,8 @@ def _check_older(bench: Bench, number: int) -> None:
     "TX-04",
     "total that does not fit the size",
     clause="Welling 5.2, table 8 (A385)",
-    stimulus="packet 1, 4 and the last one with a total that is 1 less, 1 more, 0, 65535 or "
-    "high byte first",
+    stimulus="packet 1, 4 and the last one with a total that is 1 less, 1 more, 256 more, 0, 65535 "
+    "or high byte first",
     expectation="rejected (tx_01); accepted with the right total",
     requires={DESTRUCTIVE},
     choices=("tx_01",),
@@ -274,7 +298,7 @@ def wrong_total(bench: Bench) -> None:
     image = transfer_image(bench)
     total = packet_count(len(image))
     swapped = int.from_bytes(total.to_bytes(2, "little"), "big")
-    wrong = dict.fromkeys((total - 1, total + 1, 0, _NUMBER_MAX, swapped))
+    wrong = dict.fromkeys((total - 1, total + 1, total + 256, 0, _NUMBER_MAX, swapped))
     wrong.pop(total, None)
     for number in _stops(bench, image, (1, _STORED + 1, total)):
         for named in wrong:
@@ -376,16 +400,42 @@ def other_filler(bench: Bench) -> None:
     "pause in a transfer",
     clause="R12; R14",
     stimulus="half of limits.pause_s before a packet; more than it before packet 1, amid the "
-    "packets and before the end",
-    expectation="announces again, or waits on (tx_12); reachable in both",
+    "packets and before the end; a transfer of more than 66 s without a pause",
+    expectation="announces again, or waits on (tx_12); reachable in both; the long one goes on",
     requires={DESTRUCTIVE, LONG},
     choices=("tx_12",),
+    limit_s=900.0,
 )
 def pause(bench: Bench) -> None:
+    with bench.step("a long transfer"):
+        _send_slowly(bench)
     if bench.choice("tx_12") == "announces":
         _announces(bench)
     else:
         _waits(bench)
+
+
+def _send_slowly(bench: Bench) -> None:
+    """Packets, half a pause apart at the most, until a clock of 16 bits has wrapped: none of them
+    may be taken for late. The transfer is left.
+    """
+    if needs_power(bench.profile) and not bench.subject.has_power:
+        why = "only power ends a transfer of this product, and none is controlled"
+        bench.unsupported("a long transfer", why)
+        return
+    apart_s = min(_SHORT * bench.limit("pause_s"), _APART_S)
+    count = int(_WRAP_S / max(apart_s, 0.01)) + 2
+    if count > packet_count(bench.number("largest_image_bytes")):
+        bench.unsupported("a long transfer", "the largest image has too few packets")
+        return
+    image = bench.filler(count)
+    bench.start_transfer(len(image))
+    for number in range(1, count + 1):
+        bench.packet(image, number)
+        bench.wait(apart_s)
+    bench.leave_transfer()
+    bench.update(len(bench.good_image))
+    bench.finish(bench.good_image)
 
 
 def _announces(bench: Bench) -> None:
@@ -434,7 +484,7 @@ def _waits(bench: Bench) -> None:
     "TX-13",
     "reset in a transfer",
     clause="R18",
-    stimulus="reset before packet 1, amid the packets and before the end",
+    stimulus="reset while it erases, before packet 1, amid the packets and before the end",
     expectation="ignored, or restarts (tx_13); a new upgrade succeeds",
     requires={DESTRUCTIVE},
     choices=("tx_13",),
@@ -447,6 +497,8 @@ def reset(bench: Bench) -> None:
     if bench.choice("tx_12") == "announces":
         # Later than that, it is the pause that ends the transfer.
         within_s = min(within_s, _JUST_NOT * bench.limit("pause_s"))
+    with bench.step("reset while it erases"):
+        _reset_while_it_erases(bench)
     bench.start_transfer(len(image))
     done = 0
     for stored in (0, 1, total):
@@ -468,6 +520,24 @@ def reset(bench: Bench) -> None:
             bench.reset_to_bootloader()
         bench.update(len(bench.good_image))
         bench.finish(bench.good_image)
+
+
+def _reset_while_it_erases(bench: Bench) -> None:
+    """Whether the bootloader hears it then is open; it requests the transfer, or announces itself,
+    and can be upgraded.
+    """
+    image = bench.good_image
+    bench.reset_to_bootloader()
+    bench.wait_to_be_heard()
+    bench.send(bench.encoder.update(len(image)) + bench.encoder.reset())
+    # Boot versions that were on their way when the update command came do not count (R11).
+    bench.wait(_LEFTOVER_S)
+    within_s = bench.limit("erase_s") + bench.limit("first_version_s")
+    heard = bench.wait_for(Kind.REQUEST, Kind.BOOT_VERSION, within_s=within_s)
+    found = bench.require_received(heard, "request transfer, or boot version", within_s)
+    if found.kind is Kind.BOOT_VERSION:
+        bench.update(len(image))
+    bench.finish(image)
 
 
 def _place(what: str, stored: int) -> str:

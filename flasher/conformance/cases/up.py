@@ -23,8 +23,12 @@ from flasher.conformance.wire import (
 _SIZES: Final = (1, 127, 128, 129, 78351)
 _SENT_WHOLE_PACKETS: Final = 2
 """Images of that many packets are sent too, so that the device shows how many it expects."""
+_SIZE_BITS: Final = (16, 24, 31)
+"""A device that keeps fewer bits of the size takes one for a small image."""
 _EDGE_S: Final = 0.001
 _FIRST_PACKETS: Final = 3
+_MANY: Final = 24
+"""Transfers begun without a restart between them: none may leave something behind."""
 
 
 @case(
@@ -55,14 +59,17 @@ def sizes(bench: Bench) -> None:
     "UP-02",
     "sizes that are rejected",
     clause="Welling 5.2, table 8 (A10B); R9",
-    stimulus="update command for 0 bytes, more than the largest image, 2^32 - 1 bytes",
+    stimulus="update command for 0 bytes, more than the largest image, 2^32 - 1 bytes, the size "
+    "of the good image with a bit more beyond the largest image",
     expectation="rejected before anything is erased: the old application starts",
     requires={DESTRUCTIVE},
     choices=("up_02",),
 )
 def wrong_sizes(bench: Bench) -> None:
     largest = bench.number("largest_image_bytes")
-    for size in (0, largest + 1, 0xFFFF_FFFF):
+    good = len(bench.good_image)
+    more = (good | 1 << bit for bit in _SIZE_BITS)
+    for size in (0, largest + 1, *(size for size in more if size > largest), 0xFFFF_FFFF):
         check_update_rejected(bench, f"{size} bytes", bench.encoder.update(size))
 
 
@@ -162,7 +169,8 @@ def repeated(bench: Bench) -> None:
     "UP-06",
     "update command that is not for this device",
     clause="Welling 5.2, table 8 (A10B); Welling 2.2.2, table 2",
-    stimulus="names of other targets, wrong case, payload too short and too long, as a read",
+    stimulus="names of other targets, each letter another one, small letters; payload too short, "
+    "too long, longer than the command says; as a read",
     expectation="rejected; the old application starts",
     requires={DESTRUCTIVE},
     choices=("up_02",),
@@ -176,7 +184,8 @@ def wrong_names(bench: Bench) -> None:
     "UP-08",
     "update command in the middle of a transfer",
     clause="R2; robustness, not in the document",
-    stimulus="update command of the same size, and of another one, after packet 3",
+    stimulus="update command of the same size, and of another one, after packet 3; 24 in a row, "
+    "each one after packet 1",
     expectation="starts over cleanly or rejects (up_08), and never mixes two images",
     requires={DESTRUCTIVE},
     choices=("up_08",),
@@ -201,6 +210,14 @@ def in_transfer(bench: Bench) -> None:
             else:
                 bench.expect_silence(ignoring=(Kind.NAK,), why="no request transfer")
                 bench.finish(image, _FIRST_PACKETS + 1)
+    if starts_over:
+        with bench.step("many in a row"):
+            bench.start_transfer(len(image))
+            for _ in range(_MANY):
+                bench.packet(image, 1)
+                bench.send(bench.encoder.update(len(image)))
+                bench.expect(Kind.REQUEST)
+            bench.finish(image)
 
 
 def _offer_update(bench: Bench, choice: str) -> None:
@@ -248,10 +265,14 @@ def _wrong_updates(bench: Bench) -> Iterator[tuple[str, list[RawFrame]]]:
     payload = encoder.update_text + size.to_bytes(4, "little")
     for other in encoder.others():
         yield f"name {other.update_text.decode()}", encoder.update(size, other.update_text)
+    for at in range(len(encoder.update_text)):
+        name = encoder.update_text[:at] + b"X" + encoder.update_text[at + 1 :]
+        yield f"name {name.decode()}", encoder.update(size, name)
     yield "name in small letters", encoder.update(size, encoder.update_text.lower())
     yield "name of zeros", encoder.update(size, bytes(7))
     yield "payload too short", encoder.message(WRITE, 0xA10A, payload[:-1])
     yield "payload too long", encoder.message(WRITE, 0xA10C, payload + b"\0")
+    yield "length greater by four", encoder.message(WRITE, UPDATE, payload + bytes(4))
     yield "as a read", encoder.message(READ, UPDATE, payload)
 
 

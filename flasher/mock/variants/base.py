@@ -14,6 +14,7 @@ from flasher.protocol.wire import Damage, Message
 
 __all__ = ["DECLARED", "AnyRow", "HangingDevice", "PlainFlash", "PlainStore", "Variant", "variant"]
 
+_ANY: Final = "*"
 _WrongT = TypeVar("_WrongT", bound=type[object])
 
 
@@ -32,6 +33,10 @@ class Variant:
     """Other cases that it may fail: what it does wrong is part of their stimulus too. Where no
     upgrade works, any case that needs a transfer may fail as well.
     """
+    everywhere: bool = False
+    """True when every transfer meets the fault, so that any case that has one may fail."""
+    unseen: str = ""
+    """Why no case sees it on a bench."""
     upgrade_works: bool = True
     """False when not even an undisturbed upgrade to an ordinary image (of some 1000 bytes, no
     multiple of 128) ends with that image running."""
@@ -51,17 +56,18 @@ def variant(
     summary: str,
     *,
     also: str = "",
+    unseen: str = "",
     upgrade_works: bool = True,
     profile: Mapping[str, object] | None = None,
     timings: Mapping[str, float] | None = None,
 ) -> Callable[[_WrongT], _WrongT]:
     """Declares a class as what is wrong with a `Variant`: a device, or one of the parts that it is
-    made of. The cases in `also` are parted by blanks.
+    made of. The cases in `also` are parted by blanks; "*" stands for `everywhere`.
     """
 
     def declare(wrong: _WrongT) -> _WrongT:
         device_type = wrong if issubclass(wrong, MockDevice) else _device_with(wrong)
-        others = tuple(also.split())
+        others = () if also == _ANY else tuple(also.split())
         DECLARED.append(
             Variant(
                 name,
@@ -69,6 +75,8 @@ def variant(
                 summary,
                 device_type,
                 others,
+                also == _ANY,
+                unseen,
                 upgrade_works,
                 profile or {},
                 timings or {},

@@ -217,7 +217,8 @@ class DarkAfterSecondCut(HangingDevice):
     "runs-new-application-once",
     "EN-01",
     "does not find the new application any more after the next restart",
-    also="CR-03 RS-01 RS-02 RS-03 RS-05 UP-02 UP-03 UP-04 UP-06 TM-05 SE-01 SE-03 SE-04 CO-01",
+    also="CR-03 RS-01 RS-02 RS-03 RS-05 UP-02 UP-03 UP-04 UP-06 TX-03 EN-02 TM-05 PW-01 "
+    "SE-01 SE-03 SE-04 CO-01",
 )
 class RunsOnce(MockDevice):
     _ended = False
@@ -305,6 +306,7 @@ class AnyEndByte(MockDevice):
     "single-packet-image-fails",
     "UP-01",
     "refuses the end of transfer of an image of one packet",
+    unseen="it takes an image of one packet that runs; a part of one is never ended",
 )
 class SinglePacketImageFails(MockDevice):
     """Looks for the last packet where one is stored, not where one comes first."""

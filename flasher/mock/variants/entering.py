@@ -93,7 +93,8 @@ class TwoRestarts(MockDevice):
     "stays-in-bootloader",
     "RS-03",
     "without an update command, waits silently for ever",
-    also="RS-02 RS-05 UP-02 UP-04 UP-03 UP-06 PW-01 EN-01 BU-02 CO-01 SE-01 SE-03 SE-04",
+    also="RS-02 RS-05 UP-02 UP-04 UP-03 UP-06 TX-03 PW-01 EN-01 EN-02 BU-02 CO-01 SE-01 SE-03 "
+    "SE-04",
 )
 class StaysInBootloader(MockDevice):
     def _announce(self, now: float) -> str:
@@ -160,7 +161,7 @@ class SilentPowerUp(MockDevice):
     "full-last-packet-fails",
     "UP-01",
     "wants a packet more when the size is a multiple of 128",
-    also="EN-01 EN-07 EN-08 PW-01 PW-02 TX-07",
+    also="EN-01 EN-07 EN-08 PW-01 PW-02 TX-07 TX-12",
 )
 class FullPacketsFail(Transfer):
     @property
@@ -305,14 +306,19 @@ class ResetFromAnyNode(MockDevice):
 @variant(
     "dies-after-255-announcements",
     "RS-03",
-    "without an application, hangs after 255 announcements until power is cut",
+    "without an application, hangs after 255 announcements",
 )
 class DiesAfter255(HangingDevice):
     def _announce(self, now: float) -> str:
         return self._hang() if self._announced >= _BYTE_MAX else super()._announce(now)
 
 
-@variant("feedback-after-version", "RS-01", "sends general feedback behind the first boot version")
+@variant(
+    "feedback-after-version",
+    "RS-01",
+    "sends general feedback behind the first boot version",
+    also="FR-06 FR-10 CR-03 CR-04 RS-02 UP-02 UP-04 UP-06 SE-04 CO-02 CO-04",
+)
 class FeedbackAfterVersion(MockDevice):
     """Leaves the answer to a reset to the bootloader."""
 
@@ -335,6 +341,7 @@ class FeedbackAfterVersion(MockDevice):
     "leftover-announcement",
     "UP-04",
     "announces itself once more 0.1 s after request transfer",
+    also="*",
 )
 class LeftoverAnnouncement(MockDevice):
     """Does not stop the timer of its announcements at the update command."""
@@ -376,8 +383,9 @@ class SixteenBitSize(MockDevice):
 
 @variant(
     "hangs-at-20th-update",
-    "EN-07",
+    "UP-08",
     "hangs at the 20th update command since power-up until power is cut",
+    also="FR-07 UP-06 TX-12 TM-05",
 )
 class HangsAt20thUpdate(HangingDevice):
     """Allocates a buffer for each transfer, and frees none."""

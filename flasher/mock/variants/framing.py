@@ -255,6 +255,7 @@ class CrcOnesAccepted(Reassembler):
     "long-commands-accepted",
     "FR-06",
     "takes a reset or update command with more data than its command says",
+    also="RS-04 UP-06",
 )
 class LongCommandsAccepted(Reassembler):
     """Goes by the length byte, and looks at as much of the data as it needs."""
@@ -271,7 +272,12 @@ class LongCommandsAccepted(Reassembler):
             found[-1] = last._replace(data=last.data[: data_size(last.command)])
 
 
-@variant("tail-in-crc", "FR-03", "takes F0 in the first byte of a CRC for the tail")
+@variant(
+    "tail-in-crc",
+    "FR-03",
+    "takes F0 in the first byte of a CRC for the tail",
+    also="FR-02 TM-05",
+)
 class TailInCrc(Reassembler):
     """Looks for the tail from the end of the data on: the CRC before it may hold the same byte."""
 
@@ -290,7 +296,12 @@ class AnswersPadded(MockDevice):
             self._transmitter.queue(split(message.can_id, wire.ljust(whole, b"\x00")))
 
 
-@variant("ignores-mode", "FR-10", "takes reset, update command, packet and end with any mode")
+@variant(
+    "ignores-mode",
+    "FR-10",
+    "takes reset, update command, packet and end with any mode",
+    also="RS-04 UP-06",
+)
 class IgnoresMode(MockDevice):
     def _take_message(self, message: Message, now: float) -> None:
         if message.can_id == self.target.request_id and message.command in _WRITTEN:

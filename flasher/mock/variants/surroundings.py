@@ -49,7 +49,10 @@ class ImpatientWithGaps(MockDevice):
 
 
 @variant(
-    "slow-sixteenth-packet", "TM-05", "acknowledges packets 16, 32, ... after 0.6 s", also="TX-07"
+    "slow-sixteenth-packet",
+    "TM-05",
+    "acknowledges packets 16, 32, ... after 0.6 s",
+    also="FR-03 TX-07 TX-12",
 )
 class SlowSixteenth(MockDevice):
     def _store(self, now: float) -> str:
@@ -284,6 +287,7 @@ class AnswersInBootloader(MockDevice):
     "answer-lost-on-busy-bus",
     "CO-01",
     "loses an ACK that is due within 1 ms after a frame of others",
+    also="FR-09",
 )
 class AnswerLostOnBusyBus(MockDevice):
     """Gives up when its transmit mailbox is not free at once."""

@@ -344,7 +344,12 @@ class TotalsModulo256(MockDevice):
         super()._take_row(row, now)
 
 
-@variant("number-zero-is-first", "TX-03", "takes packet 0 for packet 1 at the beginning")
+@variant(
+    "number-zero-is-first",
+    "TX-03",
+    "takes packet 0 for packet 1 at the beginning",
+    also="SE-04",
+)
 class NumberZeroIsFirst(MockDevice):
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.Malformed) and not self._transfer.stored:
@@ -360,6 +365,7 @@ class NumberZeroIsFirst(MockDevice):
     "acks-damaged-repetition",
     "TX-01",
     "acknowledges a damaged packet that names the number stored last",
+    also="CR-01",
 )
 class AcksDamagedRepetition(MockDevice):
     """Looks at the number before the checksum."""
@@ -380,7 +386,7 @@ class AcksDamagedRepetition(MockDevice):
         self._is_damage = False
 
 
-@variant("acks-twice", "TX-07", "sends every ACK of a packet twice")
+@variant("acks-twice", "TX-07", "sends every ACK of a packet twice", also="*")
 class AcksTwice(MockDevice):
     def _acknowledge(self, now: float) -> str:
         detail = super()._acknowledge(now)
@@ -390,7 +396,7 @@ class AcksTwice(MockDevice):
 
 @variant(
     "blank-packet-unanswered",
-    "TX-07",
+    "FR-03",
     "does not acknowledge a packet of nothing but FF until it is repeated",
 )
 class BlankPacketUnanswered(MockDevice):
@@ -407,7 +413,8 @@ class BlankPacketUnanswered(MockDevice):
 @variant(
     "pause-counts-from-start",
     "TX-12",
-    "counts the pause from request transfer on: a transfer that lasts as long is given up",
+    "counts the pause from request transfer on, not from the last packet",
+    also="CR-01 CR-02 TX-07 TM-02 BU-02",
 )
 class PauseCountsFromStart(MockDevice):
     _began_at = 0.0
