@@ -7,9 +7,9 @@ What could grow with a run is cut here; the template `conformance.html` arranges
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import islice
 from typing import Final, NamedTuple
 
+from flasher.conformance.decoded import Excerpt, excerpt, frame_lines
 from flasher.conformance.reports import ByResult, distribution, group_title
 from flasher.conformance.results import (
     CaseResult,
@@ -18,12 +18,9 @@ from flasher.conformance.results import (
     Check,
     CheckOutcome,
     RunReport,
-    TraceEntry,
 )
-from flasher.protocol.frame import Frame
 from flasher.report import chart
 from flasher.report.base import Status, render_page
-from flasher.trace.decoder import BusEvent, Decoder
 from flasher.trace.figures import Distribution
 
 CHECKS_SHOWN: Final = 12
@@ -36,9 +33,11 @@ HISTOGRAM_LEAST: Final = 5
 """Fewer values than this are told by the table alone."""
 TRACES_OPEN: Final = 5
 """With more cases that went wrong, their traces are folded; on paper they are then left out."""
-_FRAMES_A_MESSAGE: Final = 20
-_AFTER_S: Final = 0.02
-"""What came so shortly after a failed check belongs to it."""
+FRAMES_BAD: Final = 300
+"""Frames that a case that went wrong shows as they are, the last ones before its first failed
+check."""
+FRAMES_IN_PART: Final = 60
+"""Frames that another case shows that did not pass in full, from its beginning."""
 _INFOS_SHOWN: Final = 20
 _CLOCK_S: Final = 1e-6
 """No clock tells apart what differs by less: there is nothing to draw."""
@@ -62,13 +61,6 @@ _CHECK_COLOURS: Final = {
 """Outcomes with their colours, in the order in which checks are listed."""
 
 
-class TraceRow(NamedTuple):
-    """A decoded message, and the text of its fields."""
-
-    seen: BusEvent
-    text: str
-
-
 class CaseView(NamedTuple):
     """A result with its case, as far as the page shows them."""
 
@@ -80,9 +72,9 @@ class CaseView(NamedTuple):
     replay: str
     checks: Sequence[tuple[Check, Status]]
     infos: Sequence[str]
-    trace: Sequence[TraceRow]
-    trace_text: str
-    """Which part of the case's frames `trace` is."""
+    trace: Excerpt
+    raw: str
+    """Frames as they were on the bus; of a case that did not pass in full."""
     in_part: bool
 
 
@@ -141,7 +133,12 @@ def _times(report: RunReport) -> Sequence[TimesView]:
 
 def _case(text: CaseText, result: CaseResult, replay: str, trace_file: str) -> CaseView:
     colour = _COLOURS[result.verdict]
-    trace, trace_text = _trace(result, is_bad=colour is not Status.GOOD)
+    is_wrong = colour is not Status.GOOD
+    trace = excerpt(
+        result,
+        MESSAGES_BAD if is_wrong else MESSAGES_GOOD,
+        FRAMES_BAD if is_wrong else FRAMES_IN_PART,
+    )
     repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
     order = list(_CHECK_COLOURS)
     checks = sorted(result.checks, key=lambda check: order.index(check.outcome))
@@ -155,45 +152,6 @@ def _case(text: CaseText, result: CaseResult, replay: str, trace_file: str) -> C
         checks=[(check, _CHECK_COLOURS[check.outcome]) for check in checks[:CHECKS_SHOWN]],
         infos=result.infos[:_INFOS_SHOWN],
         trace=trace,
-        trace_text=trace_text,
+        raw="" if result.verdict is CaseVerdict.PASS else "\n".join(frame_lines(trace.frames)),
         in_part=result.verdict is CaseVerdict.PASS_IN_PART,
     )
-
-
-# -- frames ---------------------------------------------------------------------------------------
-
-
-def _trace(result: CaseResult, *, is_bad: bool) -> tuple[Sequence[TraceRow], str]:
-    """The messages that are shown, and which part of the case they are."""
-    if not result.trace:
-        return (), ""
-    failure = result.first_failure
-    if is_bad and failure is not None:
-        entries = [one for one in result.trace if one.at_s <= failure.at_s + _AFTER_S]
-        rows = _decoded(entries[-MESSAGES_BAD * _FRAMES_A_MESSAGE :])[-MESSAGES_BAD:]
-        text = f"up to the first failed check, {len(rows)} messages"
-    else:
-        found = _decoded(result.trace[: MESSAGES_GOOD * _FRAMES_A_MESSAGE])
-        rows = found[:MESSAGES_GOOD]
-        whole = len(rows) == len(found) and len(result.trace) <= MESSAGES_GOOD * _FRAMES_A_MESSAGE
-        text = f"{'all' if whole else 'the first'} {len(rows)} messages"
-    frames = len(result.trace) + result.trace_dropped
-    return rows, f"{text}; {frames:,} frames in the whole case"
-
-
-def _decoded(entries: Sequence[TraceEntry]) -> list[TraceRow]:
-    """What these frames say, in order; bytes that no message was made of too."""
-    decoder = Decoder()
-    found: list[BusEvent] = []
-    for entry in entries:
-        due = decoder.deadline()
-        if due is not None and due <= entry.at_s:
-            found += decoder.tick(due)
-        found += decoder.feed(Frame(*entry.frame), entry.at_s)
-    due = decoder.deadline()
-    if due is not None:
-        found += decoder.tick(due)
-    return [
-        TraceRow(seen, ", ".join(f"{one.label} {one.text}" for one in islice(seen.fields, 8)))
-        for seen in found
-    ]

@@ -11,7 +11,7 @@ _PACKAGE = Path(flasher.conformance.__file__).parent
 _EDGES = {"mock", "simulated", "real"}
 """Where the suite meets the rest of flasher."""
 _REPORTING = {
-    *("diff", "html_report", "json_report", "reports"),
+    *("decoded", "diff", "html_report", "json_report", "reports"),
     *("opening", "plugin"),
 }
 """What opens a bench, and what tells about a run: neither makes nor judges a byte."""

@@ -1,0 +1,90 @@
+"""The frames of a case as people read them: which of them matter, as messages and as bytes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import islice
+from typing import Final, NamedTuple
+
+from flasher.conformance.results import CaseResult, TraceEntry
+from flasher.protocol.frame import Frame
+from flasher.trace.decoder import BusEvent, Decoder
+
+_FRAMES_A_MESSAGE: Final = 20
+_FIELDS: Final = 8
+_AFTER_S: Final = 0.02
+"""What came so shortly after a failed check belongs to it."""
+
+
+class TraceRow(NamedTuple):
+    """A decoded message, and the text of its fields."""
+
+    seen: BusEvent
+    text: str
+
+    def __str__(self) -> str:
+        """As a line of text."""
+        seen = self.seen
+        sender = seen.sender or f"{seen.can_id:03X}"
+        return f"{seen.at:9.4f} s  {sender} > {seen.receiver}  {seen.title}  {self.text}".rstrip()
+
+
+class Excerpt(NamedTuple):
+    """A part of the frames of a case."""
+
+    messages: Sequence[TraceRow]
+    frames: Sequence[TraceEntry]
+    text: str
+    """Which part it is."""
+
+
+def excerpt(result: CaseResult, messages: int, frames: int) -> Excerpt:
+    """At most so many messages and frames of a case: the last ones before its first failed check,
+    or the first ones where none failed.
+    """
+    if not result.trace:
+        return Excerpt((), (), "")
+    failure = result.first_failure
+    many = messages * _FRAMES_A_MESSAGE
+    if failure is not None:
+        entries = [one for one in result.trace if one.at_s <= failure.at_s + _AFTER_S]
+        rows = _decoded(entries[-many:])[-messages:]
+        text = f"up to the first failed check, {len(rows)} messages"
+        shown = entries[-frames:]
+    else:
+        found = _decoded(result.trace[:many])
+        rows = found[:messages]
+        whole = len(rows) == len(found) and len(result.trace) <= many
+        text = f"{'all' if whole else 'the first'} {len(rows)} messages"
+        shown = list(result.trace[:frames])
+    count = len(result.trace) + result.trace_dropped
+    return Excerpt(rows, shown, f"{text}; {count:,} frames in the whole case")
+
+
+def frame_lines(frames: Sequence[TraceEntry]) -> Iterator[str]:
+    """Frames as lines: time in seconds, `>` for one that the suite sent, id, size, bytes."""
+    for entry in frames:
+        frame = entry.frame
+        can_id = f"{frame.can_id:0{8 if frame.is_extended else 3}X}"
+        kinds = {"remote": frame.is_remote, "error": frame.is_error}
+        kind = "".join(f"  {name}" for name, is_it in kinds.items() if is_it)
+        way, data = ">" if entry.sent else "<", frame.data.hex(" ").upper()
+        yield f"{entry.at_s:10.6f} {way} {can_id} [{len(frame.data)}] {data}{kind}".rstrip()
+
+
+def _decoded(entries: Sequence[TraceEntry]) -> list[TraceRow]:
+    """What these frames say, in order; bytes that no message was made of too."""
+    decoder = Decoder()
+    found: list[BusEvent] = []
+    for entry in entries:
+        due = decoder.deadline()
+        if due is not None and due <= entry.at_s:
+            found += decoder.tick(due)
+        found += decoder.feed(Frame(*entry.frame), entry.at_s)
+    due = decoder.deadline()
+    if due is not None:
+        found += decoder.tick(due)
+    return [
+        TraceRow(seen, ", ".join(f"{one.label} {one.text}" for one in islice(seen.fields, _FIELDS)))
+        for seen in found
+    ]
