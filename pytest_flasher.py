@@ -28,35 +28,43 @@ _MARKERS = (
 )
 
 
+_SEVERAL: dict[str, Any] = {"action": "append", "default": []}
+_FLAG: dict[str, Any] = {"action": "store_true"}
+BENCH_OPTIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "--btl-target": ("wmc|bms|obc", "the device (default without hardware: bms)", {}),
+    "--btl-interface": ("BACKEND", "python-can's back end for the adapter", {}),
+    "--btl-channel": ("CHANNEL", "which adapter or port: can0, ...", {}),
+    "--btl-bitrate": ("BPS", "bits per second (default 250000)", {"type": int}),
+    "--btl-bus-kwarg": ("KEY=VALUE", "one more argument for the back end; repeatable", _SEVERAL),
+    "--btl-profile": ("FILE", "the product's choices and limits (TOML)", {}),
+    "--btl-good-image": ("IMAGE", "an image that runs on the device", {}),
+    "--btl-second-image": ("IMAGE", "another one, smaller, of another version", {}),
+    "--btl-allow-implausible": ("", "whatever these images look like", _FLAG),
+    "--btl-power-cmd": ("COMMAND", "switches the device, as 'relay 3 {on|off}'", {}),
+    "--btl-readback-cmd": ("COMMAND", "dumps the flash, as 'dump {file}'", {}),
+    "--btl-uncertainty": ("SECONDS", "how far times may be off", {"type": float}),
+    "--btl-mock": ("", "test the built-in device model, on a virtual clock", _FLAG),
+    "--btl-subject": ("BOOTLOADER", "test one that is compiled for the computer", {}),
+    "--btl-variant": ("NAME", "with --btl-mock: one that is deliberately wrong", {}),
+    "--btl-set": ("KEY=VALUE", "with --btl-mock: a choice of it; repeatable", _SEVERAL),
+    "--btl-seed": ("SEED", "decides all that is left to chance", {"default": "1"}),
+}
+"""What says which device is tested, and how: metavar (none for a flag), help, and more."""
+_RUN_OPTIONS: dict[str, tuple[str, str, dict[str, Any]]] = {
+    "--btl-suite": ("", "collect the cases of the conformance suite too", _FLAG),
+    "--btl-quick": ("", "of the suite only what takes under a minute", _FLAG),
+    "--btl-strict": ("", "a pass in part fails, and a deviation that is none any more", _FLAG),
+    "--btl-json-report": ("FILE", "the suite's report, for `flasher conformance diff`", {}),
+    "--btl-html": ("FILE", "the same as one self-contained page", {}),
+    "--btl-trace-dir": ("DIR", "folder for the frames (candump) of what does not pass", {}),
+}
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """The options, which all begin with --btl."""
     group = parser.getgroup("btl", "bootloader under test (flasher conformance)")
-
-    def add(name: str, metavar: str, text: str, **more: Any) -> None:
-        group.addoption(name, metavar=metavar, help=text, **more)
-
-    def add_flag(name: str, text: str) -> None:
-        group.addoption(name, action="store_true", help=text)
-
-    several: dict[str, Any] = {"action": "append", "default": []}
-    add("--btl-target", "wmc|bms|obc", "the device (default with --btl-mock: bms)")
-    add("--btl-interface", "BACKEND", "python-can's back end for the adapter")
-    add("--btl-channel", "CHANNEL", "which adapter or port: can0, ...")
-    add("--btl-bitrate", "BPS", "bits per second (default 250000)", type=int)
-    add("--btl-bus-kwarg", "KEY=VALUE", "one more argument for the back end; repeatable", **several)
-    add("--btl-profile", "FILE", "the product's choices and limits (TOML)")
-    add("--btl-good-image", "IMAGE", "an image that runs on the device")
-    add("--btl-second-image", "IMAGE", "another one, smaller, of another version")
-    add_flag("--btl-allow-implausible", "whatever these images look like")
-    add("--btl-power-cmd", "COMMAND", "switches the device, as 'relay 3 {on|off}'")
-    add("--btl-readback-cmd", "COMMAND", "dumps the flash, as 'dump {file}'")
-    add("--btl-uncertainty", "SECONDS", "how far times may be off", type=float)
-    add_flag("--btl-mock", "test the built-in device model, on a virtual clock")
-    add("--btl-variant", "NAME", "with --btl-mock: one that is deliberately wrong")
-    add("--btl-set", "KEY=VALUE", "with --btl-mock: a choice of it; repeatable", **several)
-    add("--btl-seed", "SEED", "decides all that is left to chance", default="1")
-    add_flag("--btl-suite", "collect the cases of the conformance suite too")
-    add_flag("--btl-quick", "of the suite only what takes under a minute")
+    for name, (metavar, text, more) in (BENCH_OPTIONS | _RUN_OPTIONS).items():
+        group.addoption(name, help=text, **({"metavar": metavar} if metavar else {}), **more)
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -68,12 +76,13 @@ def pytest_configure(config: pytest.Config) -> None:
 
         config.pluginmanager.register(Hooks(config), "flasher-conformance-hooks")
     elif config.getoption("btl_suite"):
-        raise pytest.UsageError("--btl-suite needs a device: --btl-target, or --btl-mock")
+        devices = "--btl-target, --btl-mock or --btl-subject"
+        raise pytest.UsageError(f"--btl-suite needs a device: {devices}")
 
 
 def _is_active(config: pytest.Config) -> bool:
     """True when the command line names a device under test."""
-    return bool(config.getoption("btl_mock") or config.getoption("btl_target"))
+    return any(config.getoption(f"btl_{name}") for name in ("mock", "subject", "target"))
 
 
 # -- the bench, once a session --------------------------------------------------------------------

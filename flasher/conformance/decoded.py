@@ -12,6 +12,8 @@ from flasher.trace.decoder import BusEvent, Decoder
 
 _FRAMES_A_MESSAGE: Final = 20
 _FIELDS: Final = 8
+_LINE: Final = 120
+"""Characters of the fields in a line of text."""
 _AFTER_S: Final = 0.02
 """What came so shortly after a failed check belongs to it."""
 
@@ -26,7 +28,8 @@ class TraceRow(NamedTuple):
         """As a line of text."""
         seen = self.seen
         sender = seen.sender or f"{seen.can_id:03X}"
-        return f"{seen.at:9.4f} s  {sender} > {seen.receiver}  {seen.title}  {self.text}".rstrip()
+        text = self.text if len(self.text) <= _LINE else f"{self.text[:_LINE]}..."
+        return f"{seen.at:9.4f} s  {sender} > {seen.receiver}  {seen.title}  {text}".rstrip()
 
 
 class Excerpt(NamedTuple):

@@ -4,8 +4,13 @@ that device, the bench of each test, and the hooks that collect the suite.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import re
+import shlex
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,26 +22,40 @@ from flasher.conformance.catalogue import (
     Case,
     Requirement,
     Selection,
+    case_text,
+    in_order,
     known_cases,
     what_is_missing,
 )
+from flasher.conformance.decoded import excerpt, frame_lines
+from flasher.conformance.json_report import report_document, to_bytes
 from flasher.conformance.opening import BenchOptions, open_bench
 from flasher.conformance.profile import ConformanceProfile, check_deviations
 from flasher.conformance.real import HOST_UNCERTAINTY_S, PowerCommand, ReadbackCommand
-from flasher.conformance.reports import candump, distribution
+from flasher.conformance.reports import (
+    TRACED,
+    candump,
+    distribution,
+    is_traced,
+    told,
+    trace_file_name,
+)
 from flasher.conformance.results import (
     FINAL_IMAGE_OK,
+    CaseResult,
     CaseStopped,
     CaseVerdict,
     CheckOutcome,
     Measurement,
+    RunReport,
     TraceEntry,
     Unsupported,
 )
 from flasher.conformance.runner import Run, RunObserver, RunOptions
 from flasher.conformance.subject import Subject
-from flasher.errors import FlasherError
+from flasher.errors import FlasherError, printable
 from flasher.trace.figures import Distribution
+from pytest_flasher import BENCH_OPTIONS
 
 LIMIT_S: Final = 300.0
 """A test of the user's own is ended after this time on the bench's clock."""
@@ -49,6 +68,10 @@ _MARKS: Final = {
     Requirement.TIMING: "timing",
 }
 _MS: Final = 1000
+_MESSAGES: Final = 20
+_FRAMES: Final = 40
+"""What a report of pytest shows of the frames of a test that did not pass."""
+_NO_FILE_NAME: Final = re.compile(r"[^\w.-]+")
 
 
 class Measurements:
@@ -87,36 +110,74 @@ class BenchTrace:
         path.write_bytes(candump(self.frames))
 
 
+@dataclass(frozen=True)
+class Keeping:
+    """What a run keeps beside the verdicts."""
+
+    trace_dir: Path | None = None
+    json_report: Path | None = None
+    html: Path | None = None
+    replay: Callable[[str], str] = str
+    """From a case id to the command that runs it again."""
+
+
 class PluginRun:
     """The run of a pytest session, on one device."""
 
-    def __init__(self, subject: Subject, profile: ConformanceProfile, seed: str) -> None:
+    def __init__(
+        self,
+        subject: Subject,
+        profile: ConformanceProfile,
+        options: RunOptions,
+        keeping: Keeping,
+    ) -> None:
         self.subject = subject
         self.profile = profile
         self.measurements = Measurements()
-        self._seed = seed
-        options, observer = RunOptions(seed), RunObserver()
-        self._run = Run(subject, profile, options, observer, stopped=lambda: False)
+        self._options = options
+        self._keeping = keeping
+        self._started_at = datetime.now(UTC).isoformat(timespec="seconds")
+        self._run = Run(subject, profile, options, RunObserver(), stopped=lambda: False)
+        self._left_out: list[CaseResult] = []
+        self._judged: dict[str, None] = {}
+        self._traces: dict[tuple[str, int], str] = {}
         self._has_begun = False
 
-    def judge(self, case: Case) -> None:
+    def judge(self, case: Case, node: pytest.Item) -> None:
         """Run a case of the suite; its verdict becomes that of the test."""
         missing = what_is_missing(case, self.subject, self.profile)
         if missing:
+            self._left_out.append(CaseResult(case.id, CaseVerdict.UNSUPPORTED, note=missing))
             pytest.skip(missing)
         self._begin()
+        self._judged[case.id] = None
         result = self._run.take(case)
         self.measurements.add(result.measurements)
-        told = f"{result.verdict.text}: {result.reason}"
+        if is_traced(result):
+            self._traces[result.key] = trace_file_name(result)
+            self._keep_trace(self._traces[result.key], result.trace)
+        _report(node, result)
+        said = f"{result.verdict.text}: {result.reason}"
+        text = case_text(case.id, self.profile)
+        details = told(text, result, self._keeping.replay(case.id))
         match result.verdict:
+            case CaseVerdict.PASS_IN_PART if self._options.strict:
+                pytest.fail(said, pytrace=False)
             case CaseVerdict.PASS | CaseVerdict.PASS_IN_PART | CaseVerdict.INFO:
-                return
+                if self._options.strict and result.deviation_resolved:
+                    pytest.fail(f"passes, but the profile says: {text.deviation}", pytrace=False)
             case CaseVerdict.UNSUPPORTED | CaseVerdict.INCONCLUSIVE:
-                pytest.skip(told)
+                pytest.skip(said)
             case CaseVerdict.DEVIATION:
                 pytest.xfail(f"documented deviation: {result.note}; {result.reason}")
             case _:
-                pytest.fail(f"{told}\nseed: {result.seed}", pytrace=False)
+                pytest.fail(f"{said}\n{details}", pytrace=False)
+
+    def report(self) -> RunReport:
+        """What came of the cases of the suite so far."""
+        ids = {*self._judged, *(result.case_id for result in self._left_out)}
+        report = self._run.report(in_order(ids))
+        return replace(report, results=(*report.results, *self._left_out))
 
     def bench_for(self, node: pytest.Item) -> Iterator[Bench]:
         """The bench of one test, with the device in the known state before and after it."""
@@ -125,7 +186,8 @@ class PluginRun:
         self._begin()
         if self._run.stopped:
             pytest.fail(f"not run: {self._run.stopped}", pytrace=False)
-        bench = Bench(self.subject, self.profile, limit_s=LIMIT_S, seed=f"{self._seed}/{node.name}")
+        seed = f"{self._options.seed}/{node.name}"
+        bench = Bench(self.subject, self.profile, limit_s=LIMIT_S, seed=seed)
         yield bench
         self.measurements.add(bench.judge.measurements)
         erased = node.get_closest_marker("destructive") is not None
@@ -133,11 +195,46 @@ class PluginRun:
         if trouble:
             pytest.fail(f"the device is not reachable afterwards: {trouble}", pytrace=False)
 
+    def keep_failed(self, node: pytest.Item, bench: Bench) -> None:
+        """Keep the frames of a test of the user's own that failed."""
+        result = CaseResult(
+            node.name,
+            CaseVerdict.FAIL,
+            checks=tuple(bench.judge.checks),
+            trace=bench.tester.trace,
+            trace_dropped=bench.tester.trace_dropped,
+        )
+        self._keep_trace(f"{_NO_FILE_NAME.sub('-', node.name)}.log", result.trace)
+        _report(node, result)
+
     def finish(self) -> None:
-        """Flash and verify the good image; fails the last test where that fails."""
+        """Flash and verify the good image and write the reports; fails the last test where the
+        image is not back.
+        """
         final = self._run.finish() if self._has_begun else FINAL_IMAGE_OK
+        self._write_reports()
         if final != FINAL_IMAGE_OK:
             pytest.fail(f"the good image at the end: {final}", pytrace=False)
+
+    def _write_reports(self) -> None:
+        keeping, report = self._keeping, self.report()
+        replays = {result.key: keeping.replay(result.case_id) for result in report.results}
+        if keeping.json_report is not None:
+            document = report_document(
+                report, started_at=self._started_at, replays=replays, trace_files=self._traces
+            )
+            _write(keeping.json_report, to_bytes(document))
+        if keeping.html is not None:
+            from flasher.conformance.html_report import html_page  # noqa: PLC0415  loads jinja2
+
+            page = html_page(
+                report, started_at=self._started_at, replays=replays, trace_files=self._traces
+            )
+            _write(keeping.html, page.encode("utf-8"))
+
+    def _keep_trace(self, name: str, trace: Sequence[TraceEntry]) -> None:
+        if self._keeping.trace_dir is not None:
+            _write(self._keeping.trace_dir / name, candump(trace))
 
     def _begin(self) -> None:
         if not self._has_begun:
@@ -155,11 +252,53 @@ def opened_run(
     try:
         with open_bench(_options(config, power, readback)) as (subject, profile):
             check_deviations(profile, known_cases())
-            run = PluginRun(subject, profile, config.getoption("btl_seed"))
+            options = RunOptions(
+                config.getoption("btl_seed"), strict=config.getoption("btl_strict")
+            )
+            run = PluginRun(subject, profile, options, _keeping(config))
             yield run
             run.finish()
     except FlasherError as error:
         pytest.fail(str(error), pytrace=False)
+
+
+def _report(node: pytest.Item, result: CaseResult) -> None:
+    """Add to the report of a test what was not tried, and the frames of what did not pass."""
+    said = [f"not tried: {part}" for part in result.not_tried]
+    if said:
+        node.add_report_section("call", "conformance", "\n".join([result.verdict.text, *said]))
+    if result.verdict in TRACED:
+        part = excerpt(result, _MESSAGES, _FRAMES)
+        lines = [part.text, *map(str, part.messages), *frame_lines(part.frames)]
+        node.add_report_section("call", "frames", "\n".join(map(printable, lines)))
+
+
+def _write(path: Path, data: bytes) -> None:
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
+    except OSError as error:
+        pytest.fail(f"{path} cannot be written: {error.strerror}", pytrace=False)
+
+
+def _keeping(config: pytest.Config) -> Keeping:
+    def path(name: str) -> Path | None:
+        given = config.getoption(f"btl_{name}")
+        return None if given is None else Path(given)
+
+    def replay(case_id: str) -> str:
+        words = ["pytest"]
+        for name, (_, _, more) in BENCH_OPTIONS.items():
+            value = config.getoption(name[2:].replace("-", "_"))
+            if value is True:
+                words.append(name)
+            elif isinstance(value, list):
+                words += [f"{name}={one}" for one in value]
+            elif value not in (None, False, more.get("default")):
+                words.append(f"{name}={value}")
+        return shlex.join([*words, "--btl-suite", "-k", case_id])
+
+    return Keeping(path("trace_dir"), path("json_report"), path("html"), replay)
 
 
 def _options(
@@ -182,6 +321,7 @@ def _options(
     return BenchOptions(
         target=given("target") or "bms",
         is_mock=given("mock"),
+        subject=given("subject"),
         variant=given("variant"),
         choices=given("set"),
         profile=given("profile"),
@@ -202,8 +342,12 @@ class Hooks:
     """Collects the suite, and lets the checks of a bench decide about its test."""
 
     def __init__(self, config: pytest.Config) -> None:
-        if not config.getoption("btl_mock") and config.getoption("numprocesses", None):
-            raise pytest.UsageError("one device cannot be tested by several processes: give -n 0")
+        if config.getoption("numprocesses", None):
+            if not (config.getoption("btl_mock") or config.getoption("btl_subject")):
+                why = "one device cannot be tested by several processes"
+                raise pytest.UsageError(f"{why}: give -n 0")
+            if config.getoption("btl_json_report") or config.getoption("btl_html"):
+                raise pytest.UsageError("one report has one process that writes it: give -n 0")
         self._run: PluginRun | None = None
 
     @pytest.hookimpl(tryfirst=True)
@@ -232,14 +376,24 @@ class Hooks:
             checks = bench.judge.checks
             failed = [str(check) for check in checks if check.outcome is CheckOutcome.FAIL]
             if failed:
+                if isinstance(run, PluginRun):
+                    run.keep_failed(pyfuncitem, bench)
                 pytest.fail("\n".join(failed), pytrace=False)
         return result
 
     def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """The times that were measured."""
-        if self._run is None or not self._run.measurements.times:
+        """What is known of the device at the end, what the bench could not judge, and the times."""
+        if self._run is None:
             return
-        measurements = self._run.measurements
+        report, measurements = self._run.report(), self._run.measurements
+        said = [report.in_full, *(f"this bench is {gap}" for gap in report.gaps)]
+        said += [f"good image at the end: {report.final_image_text}"] if report.final_image else []
+        if any(said):
+            terminalreporter.section("bootloader under test")
+        for line in filter(None, said):
+            terminalreporter.write_line(printable(line))
+        if not measurements.times:
+            return
         terminalreporter.section("times in ms: count, least, median, p95, most")
         width = max(map(len, measurements.times))
         for name in measurements.times:
@@ -257,11 +411,15 @@ class _Suite(pytest.Collector):
 
 
 def _item(suite: _Suite, case: Case) -> pytest.Item:
-    def test_case(btl_run: PluginRun) -> None:
-        btl_run.judge(case)
+    def test_case(btl_run: PluginRun, request: pytest.FixtureRequest) -> None:
+        node: Any = request.node
+        with warnings.catch_warnings(action="ignore"):  # that the fixture is experimental
+            request.getfixturevalue("record_xml_attribute")("name", f"{case.id} {case.title}")
+        btl_run.judge(case, node)
 
     test_case.__doc__ = case.title
     item: pytest.Item = pytest.Function.from_parent(suite, name=case.id, callobj=test_case)
+    item.user_properties.append(("title", case.title))
     for name in dict.fromkeys(_MARKS[need] for need in case.requires if need in _MARKS):
         item.add_marker(name)
     return item

@@ -9,6 +9,9 @@ from typing import Final
 
 import pytest
 
+from flasher.conformance.mock import GOOD_IMAGE
+from tests.cli.conftest import Flasher
+
 PLUGIN: Final = "pytest_flasher"
 ALONE: Final = ("-p", PLUGIN, "-p", "no:xdist", "-p", "no:cacheprovider", "--strict-markers")
 MOCK: Final = (*ALONE, "--btl-mock")
@@ -84,6 +87,61 @@ def test_the_verdicts_of_the_suite_are_those_of_pytest(pytester: pytest.Pytester
         failed=1, xfailed=1, skipped=1, deselected=done.parseoutcomes()["deselected"]
     )
     done.stdout.fnmatch_lines(["*fail: expected *", "seed: 1/RS-01/1", "XFAIL*by design*"])
+
+
+def test_what_a_run_keeps_is_what_the_command_line_keeps(
+    pytester: pytest.Pytester, flasher: Flasher
+) -> None:
+    words = ("--btl-suite", "-k", "RS-01 or RS-04 or EN-04", "--btl-variant=no-feedback")
+    kept = ("--btl-json-report=r.json", "--btl-html=r.html", "--btl-trace-dir=traces")
+    done = pytester.runpytest_inprocess(*MOCK, *words, *kept, "--junitxml=j.xml")
+    done.stdout.fnmatch_lines(
+        [
+            "clause: Welling 3.2, table 5 (5503): general feedback*",
+            "replay: pytest --btl-mock --btl-variant=no-feedback --btl-suite -k RS-01",
+            "*Captured frames call*",
+            "*CDL > BMS  reset  text RESET",
+            "* > 752 ?8? 55 AA 16 07*",
+            "1 of 1 passes were judged in full",
+            "good image at the end: flashed and verified by version and readback",
+        ]
+    )
+    assert 'name="RS-01 reset of the application"' in Path("j.xml").read_text()
+    cases = ("--case", "RS-01", "--case", "RS-04", "--case", "EN-04")
+    bench = ("conformance", "-t", "bms", "--mock", "--variant", "no-feedback")
+    assert flasher(*bench, *cases, "--json-report", "cli.json", "--trace-dir", "cli").code == 12
+    assert Path("traces/RS-01.log").read_bytes() == Path("cli/RS-01.log").read_bytes()
+    same = flasher("conformance", "diff", "cli.json", "r.json")
+    assert (same.code, "2 unchanged" in same.out) == (0, True)
+    assert "good image at the end" in Path("r.html").read_text(encoding="utf-8")
+
+
+def test_a_pass_in_part_says_what_was_not_tried_and_fails_a_strict_run(
+    pytester: pytest.Pytester,
+) -> None:
+    words = ("--btl-suite", "-k", "EN-07", "--btl-good-image", "good.bin", "-rP")
+    Path("good.bin").write_bytes(GOOD_IMAGE)
+    done = pytester.runpytest_inprocess(*MOCK, *words, "--btl-allow-implausible")
+    done.stdout.fnmatch_lines(
+        ["not tried: a smaller image (the bench has no second good image)", "0 of 1 passes*"]
+    )
+    assert done.ret == 0
+    strict = pytester.runpytest_inprocess(*MOCK, *words, "--btl-allow-implausible", "--btl-strict")
+    strict.stdout.fnmatch_lines(["pass in part: not tried: a smaller image*"])
+    assert strict.parseoutcomes()["failed"] == 1
+
+
+def test_the_frames_of_an_own_test_that_failed_are_kept(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        def test_it(btl_bench):
+            btl_bench.reset_to_bootloader()
+            btl_bench.check(False, "one", "two")
+        """
+    )
+    done = pytester.runpytest_inprocess(*MOCK, "--btl-trace-dir=traces")
+    done.stdout.fnmatch_lines(["*CDL > BMS  reset  text RESET"])
+    assert "752#55AA1607" in Path("traces/test_it.log").read_text()
 
 
 def test_markers_choose_cases_of_the_suite_and_a_wrong_device_fails_in_its_own(
