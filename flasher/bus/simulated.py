@@ -132,10 +132,9 @@ class SimulatedBus:
         self._report_faults()
         now, self._delivered_at = self._delivered_at, None
         self._serve_devices(self.clock.now() if now is None else now)
-        self._arbitrate()
-        moment = limit
-        if (due := self.faults.deadline()) is not None and due < moment:
-            moment = due
+        if self._sending is None:
+            self._arbitrate()
+        moment = min(limit, self.faults.due_at)
         if self._sending is not None and self._sending_ends_at < moment:
             moment = self._sending_ends_at
         for device in self._devices:
@@ -148,8 +147,7 @@ class SimulatedBus:
         self._report_faults()
 
     def _report_faults(self) -> None:
-        due, now = self.faults.deadline(), self.clock.now()
-        if due is not None and due <= now:
+        if self.faults.due_at <= (now := self.clock.now()):
             for report in self.faults.tick(now):
                 for host in self._hosts:
                     host.inbox.append(report)
@@ -183,15 +181,15 @@ class SimulatedBus:
                 device.deadline = device.engine.deadline()
 
     def _arbitrate(self) -> None:
-        if self._sending is not None:
-            return
         waiting = [node for node in self._nodes if node.outbox]
         if waiting and not self.faults.takes_part:
             self._try_in_vain(host for host in self._hosts if host.outbox)
             waiting = [device for device in self._devices if device.outbox]
         if not waiting:
             return
-        winner = min(waiting, key=lambda node: node.outbox[0][1].can_id)
+        winner = waiting[0]
+        if len(waiting) > 1:
+            winner = min(waiting, key=lambda node: node.outbox[0][1].can_id)
         queued_at, frame = winner.outbox.popleft()
         duration_s = frame_bits(frame) / self._bitrate_bps
         # A paced clock wakes a little late, the wire does not: a frame that waited for the one

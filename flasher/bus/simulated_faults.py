@@ -6,6 +6,7 @@ those of Linux's SocketCAN drivers. Pure: time is an argument.
 
 from __future__ import annotations
 
+from math import inf
 from typing import Final
 
 from flasher.bus.health import PASSIVE_LIMIT, WARNING_LIMIT
@@ -39,6 +40,8 @@ class AdapterFaults:
         """True while nobody acknowledges."""
         self.times_unplugged = 0
         """A link opened before the last time is lost until it is opened again."""
+        self.due_at = inf
+        """When something is to happen next; infinite while nothing is."""
         self._back_at: float | None = None
         self._reports: list[tuple[float, Frame]] = []
         self._has_reported = False
@@ -54,12 +57,14 @@ class AdapterFaults:
         self.times_unplugged += 1
         self._back_at = back_at
         self._reports.clear()
+        self._look_ahead()
 
     def go_off(self, now: float, back_at: float | None) -> None:
         """Bus-off, until a time or until it is plugged in anew."""
         self.is_off = True
         self._back_at = back_at
         self._reports = [(now, BUS_OFF)]
+        self._look_ahead()
 
     def come_back(self, now: float) -> None:
         """Plugged in, and its controller started anew."""
@@ -67,12 +72,14 @@ class AdapterFaults:
             self._reports.append((now, RESTARTED))
         self.is_plugged, self.is_off = True, False
         self._back_at = None
+        self._look_ahead()
 
     def be_alone(self, now: float, *, alone: bool) -> None:
         """Cut it off from everybody else, or bring it together with them again."""
         if not alone and self._has_reported:
             self._reports = [(now, ACTIVE_AGAIN)]
         self.is_alone, self._has_reported = alone, False
+        self._look_ahead()
 
     def try_in_vain(self, now: float, frame_s: float, bit_s: float) -> None:
         """It sends a frame over and over: the error counter rises to error-passive and stays."""
@@ -82,15 +89,7 @@ class AdapterFaults:
         try_s = frame_s + _ERROR_BITS * bit_s
         for report, limit in ((TX_WARNING, WARNING_LIMIT), (TX_PASSIVE, PASSIVE_LIMIT)):
             self._reports.append((now + limit // _ERRORS_PER_TRY * try_s, report))
-
-    def deadline(self) -> float | None:
-        """When something is to happen next."""
-        if self._back_at is None and not self._reports:
-            return None
-        times = [at for at, _ in self._reports]
-        if self._back_at is not None:
-            times.append(self._back_at)
-        return min(times)
+        self._look_ahead()
 
     def tick(self, now: float) -> list[Frame]:
         """Come back when it is time; the error frames that the adapter reports now."""
@@ -98,4 +97,9 @@ class AdapterFaults:
             self.come_back(now)
         due = [frame for at, frame in self._reports if at <= now]
         self._reports = [(at, frame) for at, frame in self._reports if at > now]
+        self._look_ahead()
         return due
+
+    def _look_ahead(self) -> None:
+        times = [at for at, _ in self._reports]
+        self.due_at = min(times if self._back_at is None else [*times, self._back_at], default=inf)

@@ -35,14 +35,13 @@ class SimulatedPort:
         self.bus = SimulatedBus(bitrate_bps, VirtualClock(), self._record)
         self._link = self.bus.link()
         self._arrived: deque[tuple[Frame, float]] = deque()
-        self._pending: deque[Frame] = deque()
-
-    def now(self) -> float:
-        return self.bus.clock.now()
+        self._pending: deque[tuple[Frame, RawFrame]] = deque()
+        """What was sent and has not left."""
+        self.now = self.bus.clock.now
 
     def send(self, frame: RawFrame) -> None:
         made = Frame(*frame)
-        self._pending.append(made)
+        self._pending.append((made, frame))
         with CRASHES:
             self._link.send(made)
 
@@ -57,10 +56,9 @@ class SimulatedPort:
                     if seen.is_error:
                         self._arrived.append((seen, self.now()))
         frame, at = self._arrived.popleft()
-        is_echo = bool(self._pending) and frame is self._pending[0]
-        if is_echo:
-            self._pending.popleft()
-        return Arrival(RawFrame(*frame[:5]), at, is_echo)
+        if self._pending and frame is self._pending[0][0]:
+            return Arrival(self._pending.popleft()[1], at, is_echo=True)
+        return Arrival(RawFrame(*frame[:5]), at, is_echo=False)
 
     def _record(self, frame: Frame, at: float) -> Sequence[Frame]:
         """Take note of every frame on the wire, unless the adapter is off the bus."""
