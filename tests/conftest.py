@@ -47,6 +47,7 @@ def pytest_collection_finish() -> None:
         statements.share()
     gc.collect()
     gc.freeze()
+    gc.set_threshold(50_000, 20, 20)  # there is memory for some garbage
 
 
 def pytest_xdist_auto_num_workers() -> int:

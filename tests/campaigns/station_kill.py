@@ -17,14 +17,15 @@ import json
 import os
 import random
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
+from io import StringIO
 from pathlib import Path
 from typing import Final
 
+from flasher.cli.main import main as flasher
 from flasher.image.image import Image
 from flasher.protocol.spec import BMS
 from flasher.settings.manifest import release_of, to_toml
@@ -170,8 +171,7 @@ class Campaign:
 
     def _check_records(self) -> None:
         """What was shown is in the records, and the records hold together."""
-        asked = {action: self._ask(action) for action in ("verify", "report")}
-        said = {action: self._said(action, process) for action, process in asked.items()}
+        said = {action: self._ask(action) for action in ("verify", "report")}
         problems = said["verify"]["problems"]
         self.problems += [f"{each['where']}: {each['what']}" for each in problems]
         runs = {run["run_id"]: run for run in said["report"]["runs"]}
@@ -190,13 +190,10 @@ class Campaign:
         for state in set(states):
             self.counts[f"saved {state}"] = states.count(state)
 
-    def _ask(self, action: str) -> subprocess.Popen[str]:
-        words = [sys.executable, "-m", "flasher", "station", action, "--json", *self._words[2:4]]
-        return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
-
-    def _said(self, action: str, process: subprocess.Popen[str]) -> dict[str, list[dict[str, str]]]:
-        said, _ = process.communicate()
-        document: dict[str, list[dict[str, str]]] = json.loads(said.splitlines()[-1])
+    def _ask(self, action: str) -> dict[str, list[dict[str, str]]]:
+        with redirect_stdout(StringIO()) as said, redirect_stderr(StringIO()):
+            flasher(["station", action, "--json", *self._words[2:4]])
+        document: dict[str, list[dict[str, str]]] = json.loads(said.getvalue().splitlines()[-1])
         if "error" in document:
             self.problems.append(f"station {action}: {document['error']}")
         return {"problems": [], "runs": [], **document}

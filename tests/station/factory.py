@@ -89,12 +89,20 @@ class FakeClock:
 
 
 @cache
-def _empty_records() -> bytes:
-    """A database as a station makes it; made once, since its tables and rules take a while."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "records.sqlite"
-        Store.open(str(path), station="line-2", clock=FakeClock()).close()
-        return path.read_bytes()
+def _begun_records() -> dict[str, bytes]:
+    """A database as a station leaves it that has begun its chain and ended, and its key; made once,
+    since tables, rules and keys take a while.
+    """
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        path, keys = folder / "records.sqlite", folder / "keys"
+        with Store.open(
+            str(path), station="line-2", clock=FakeClock(), keeping=Keeping(keys)
+        ) as store:
+            store.recover()
+        return {
+            str(file.relative_to(folder)): file.read_bytes() for file in (path, *keys.iterdir())
+        }
 
 
 def _do_not_wait_for_the_disk(connection: Any, _record: object) -> None:
@@ -120,7 +128,14 @@ class Bench:
         if self.url is not None:
             self.lock_timeout_s = 5.0  # a server takes a moment to let go what a session held
         else:
-            self.path.write_bytes(_empty_records())
+            self.keys.mkdir()
+            for name, data in _begun_records().items():
+                file = self.folder / name
+                if self.heads is not None and file.suffix == ".heads":
+                    self.heads.mkdir()
+                    file = self.heads / file.name
+                file.touch(0o600)
+                file.write_bytes(data)
         self.store = self.opened()
         self.store.recover()
 
