@@ -20,7 +20,10 @@ if TYPE_CHECKING:  # the profile needs the validation library, which the list of
     from flasher.conformance.bench import Bench
     from flasher.conformance.profile import ConformanceProfile
 
+BRING_UP: Final = "BR-01"
+"""The case that fails, with a diagnosis, when the device cannot be upgraded at all."""
 GROUPS: Final = {
+    "BR": "bring-up",
     "FR": "framing",
     "CR": "checksum",
     "RS": "reset and boot version",
@@ -51,6 +54,7 @@ HOST_CASES: Final = (
 )
 """Cases of the host: they run against flasher's own host, in the project's tests."""
 QUICK: Final = (
+    BRING_UP,
     *("FR-02", "FR-03", "FR-04", "FR-08", "FR-09"),
     "CR-04",
     *("RS-01", "RS-05"),

@@ -7,11 +7,12 @@ device unreachable from one that only leaves an upgrade unfinished.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.results import CaseEnded, CaseLimitReached, RunStopped
+from flasher.conformance.results import CaseEnded, CaseLimitReached, RunStopped, TraceEntry
 from flasher.conformance.subject import Subject
 from flasher.conformance.wire import Kind, told_version
 
@@ -28,6 +29,8 @@ class Restored(NamedTuple):
 
     how: str
     reason: str = ""
+    trace: tuple[TraceEntry, ...] = ()
+    """The frames of all ways that were tried, when none succeeded."""
 
     @property
     def ok(self) -> bool:
@@ -47,6 +50,8 @@ def restore(
     Raises BusError when the adapter fails, RunStopped when somebody wants to end the run.
     """
     reasons: list[str] = []
+    trace: list[TraceEntry] = []
+    began_at = subject.port.now()
     ways: list[tuple[str, Callable[[Bench], str]]] = []
     if not flash:
         ways.append((BY_NOTHING, _runs))
@@ -67,7 +72,9 @@ def restore(
         if not reason:
             return Restored(how)
         reasons.append(f"{how}: {reason}")
-    return Restored("", "; ".join(reasons))
+        later_s = bench.tester.began_at - began_at
+        trace += [replace(entry, at_s=entry.at_s + later_s) for entry in bench.tester.trace]
+    return Restored("", "; ".join(reasons), tuple(trace))
 
 
 def is_reachable(

@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import flasher.conformance.cases  # noqa: F401  registers the cases
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import (
+    BRING_UP,
     CASES,
     DESTRUCTIVE,
     HOST_CASES,
@@ -27,6 +28,7 @@ from flasher.conformance.catalogue import (
     lacking,
     what_is_missing,
 )
+from flasher.conformance.diagnosis import diagnose
 from flasher.conformance.profile import ConformanceProfile, check_deviations, profile_keys
 from flasher.conformance.restore import BY_POWER, Restored, is_reachable, needs_power, restore
 from flasher.conformance.results import (
@@ -158,6 +160,9 @@ class Run:
         self._adapter_failed = False
         self._not_upgradable = ""
         self._killed_by = ""
+        self._no_bring_up: Restored | None = None
+        """How the good image could not be flashed before the first case."""
+        self._diagnosis: list[str] = []
         self._final_image = ""
         self._final_image_seen_by: tuple[str, ...] = ()
 
@@ -193,6 +198,8 @@ class Run:
             self.stopped = "the run's own time limit is over"
         if not self.stopped and self._asked_to_stop():
             self.stopped = "the run was stopped"
+        if case.id == BRING_UP and self._no_bring_up is not None:
+            return self._add(self._failed_bring_up(self._no_bring_up, repeat))
         if self.stopped:
             return self._add(CaseResult(case.id, CaseVerdict.NOT_RUN, repeat, note=self.stopped))
         self._observer.case_began(case, repeat)
@@ -289,6 +296,20 @@ class Run:
             duration_s=port.now() - self._began_at,
         )
 
+    def _failed_bring_up(self, failed: Restored, repeat: int) -> CaseResult:
+        """The result of a bring-up that did not succeed: what was heard, and the likely cause."""
+        at_s = failed.trace[-1].at_s if failed.trace else 0.0
+        got = "; ".join((*self._diagnosis, failed.reason))
+        check = Check("", CheckOutcome.FAIL, "the device can be upgraded", got, at_s)
+        return CaseResult(
+            BRING_UP,
+            CaseVerdict.FAIL,
+            repeat,
+            checks=(check,),
+            duration_s=at_s,
+            trace=failed.trace,
+        )
+
     def _must_stop(self) -> bool:
         return self._asked_to_stop() or self._subject.port.now() >= self._ends_at
 
@@ -310,7 +331,8 @@ class Run:
             self.stopped = f"{when}: {error.what if isinstance(error, BusError) else error}"
             return ""
         if not done.ok:
-            self.stopped = f"{when}, the device could not be brought back: {done.reason}"
+            likely = "".join(f"; {each}" for each in self._diagnosis if not case_id)
+            self.stopped = f"{when}, the device could not be brought back: {done.reason}{likely}"
             self._killed_by = case_id
             return done.reason
         if case_id and done.how == BY_POWER and not needs_power(self._profile):
@@ -327,7 +349,10 @@ class Run:
             is_there = is_reachable(subject, profile, stopped)
             return Restored("reset" if is_there else "", "no boot version")
         done = restore(subject, profile, flash=flash, stopped=stopped)
-        if not done.ok and at_first and is_reachable(subject, profile, stopped):
-            self._not_upgradable = done.reason
-            return Restored("reset", done.reason)
+        if not done.ok and at_first:
+            encoder = Bench(subject, profile, limit_s=0.0).encoder
+            self._no_bring_up, self._diagnosis = done, diagnose(done.trace, encoder)
+            if is_reachable(subject, profile, stopped):
+                self._not_upgradable = done.reason
+                return Restored("reset", done.reason)
         return done

@@ -71,12 +71,14 @@ def _table_entry(index: int) -> int:
 _TABLE: Final = tuple(_table_entry(index) for index in range(256))
 
 
-def crc(covered: bytes) -> int:
-    """Appendix 1: a byte into the low end of the register, then four table steps."""
-    register = 0xFFFFFFFF
+def crc(covered: bytes, *, start: int = 0xFFFFFFFF, steps: int = 4) -> int:
+    """Appendix 1: a byte into the low end of the register, then four table steps. With one step the
+    byte goes into the high end, as CRC-32/MPEG-2 has it.
+    """
+    register = start
     for byte in covered:
-        register ^= byte
-        for _ in range(4):
+        register ^= byte if steps == 4 else byte << 24
+        for _ in range(steps):
             register = (register << 8 & 0xFFFFFFFF) ^ _TABLE[register >> 24]
     return register
 

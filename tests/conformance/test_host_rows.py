@@ -13,6 +13,7 @@ from .host_rows import HOST_ROWS
 
 TESTS = Path(__file__).parents[1]
 ROWS = {
+    "BR": 1,
     "FR": 10,
     "CR": 4,
     "RS": 9,
@@ -27,6 +28,7 @@ ROWS = {
 }
 """How many rows each group of the catalogue has."""
 NO_HOST = {
+    "BR-01",
     *("RS-01", "RS-02", "RS-03", "RS-04", "RS-05"),
     *("UP-01", "UP-02", "UP-03", "UP-04", "UP-06", "UP-08"),
     *("TX-01", "TX-03", "TX-04", "TX-05", "TX-06", "TX-07", "TX-08", "TX-12", "TX-13"),

@@ -36,8 +36,8 @@ def _crc_table() -> list[int]:
 _TABLE = _crc_table()
 
 
-def _crc(covered: bytes) -> bytes:
-    register = 0xFFFFFFFF
+def _crc(covered: bytes, start: int) -> bytes:
+    register = start
     for byte in covered:
         register ^= byte
         for _ in range(4):
@@ -56,6 +56,8 @@ class PythonBootloader:
         application_bytes=_AREA_BYTES,
         name="python bootloader",
     )
+
+    crc_start = 0xFFFFFFFF
 
     def __init__(self) -> None:
         self._buffer = b""
@@ -109,7 +111,7 @@ class PythonBootloader:
                 return
             message = self._buffer[:whole]
             covered = message[:2] + struct.pack(">H", _REQUEST_ID) + message[2 : whole - 5]
-            is_intact = message[-1] == 0xF0 and message[-5:-1] == _crc(covered)
+            is_intact = message[-1] == 0xF0 and message[-5:-1] == _crc(covered, self.crc_start)
             self._buffer = self._buffer[whole if is_intact else 2 :]
             if is_intact:
                 self._act(message[2], message[4:6], message[6 : whole - 5])
@@ -195,7 +197,12 @@ class PythonBootloader:
     def _send(self, command: bytes, data: bytes) -> None:
         body = b"\x0c" + bytes((2 + len(data),)) + command + data
         head = b"\x55\xaa"
-        raw = head + body + _crc(head + struct.pack(">H", _ANSWER_ID) + body) + b"\xf0"
+        raw = (
+            head
+            + body
+            + _crc(head + struct.pack(">H", _ANSWER_ID) + body, self.crc_start)
+            + b"\xf0"
+        )
         self._frames += [CanFrame(_ANSWER_ID, raw[at : at + 8]) for at in range(0, len(raw), 8)]
 
     def next_frame(self) -> CanFrame | None:

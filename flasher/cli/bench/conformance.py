@@ -32,6 +32,7 @@ from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
 from flasher.conformance.catalogue import (
     BARE,
+    BRING_UP,
     CASES,
     FULL_BENCH,
     GROUPS,
@@ -330,6 +331,7 @@ def exit_code(report: RunReport, *, was_stopped: bool) -> ExitCode:
         check.outcome is not CheckOutcome.UNSUPPORTED
         for result in report.results
         for check in result.checks
+        if result.case_id != BRING_UP
     )
     if report.stopped and not was_judged and report.count(CaseVerdict.NOT_RUN):
         return ExitCode.NO_ANSWER

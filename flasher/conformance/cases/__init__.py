@@ -42,6 +42,7 @@ How to write a case
 
 from __future__ import annotations
 
+from flasher.conformance.cases import br as br
 from flasher.conformance.cases import bu as bu
 from flasher.conformance.cases import co as co
 from flasher.conformance.cases import cr as cr

@@ -1,0 +1,22 @@
+"""BR: bring-up, before everything else."""
+
+from __future__ import annotations
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.catalogue import BRING_UP, DESTRUCTIVE, case
+
+
+@case(
+    BRING_UP,
+    "two plain upgrades",
+    clause="Welling 5.1, figure 2 (begin); Welling 5.1, figure 2 (packets)",
+    stimulus="two upgrades from the running application, as a tool does them, to the second good "
+    "image where there is one, and back",
+    expectation="both succeed, and their applications run",
+    requires={DESTRUCTIVE},
+)
+def two_plain_upgrades(bench: Bench) -> None:
+    second = bench.subject.second_image
+    for image in (second or bench.good_image, bench.good_image):
+        with bench.step("to the good image" if image is bench.good_image else "to the second one"):
+            bench.check_upgrade(image)

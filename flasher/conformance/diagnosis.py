@@ -1,0 +1,151 @@
+"""What was heard of a device that could not be upgraded, and which change would make it fit."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from itertools import product
+from typing import Final, NamedTuple
+
+from flasher.conformance.results import TraceEntry
+from flasher.conformance.wire import Decoder, Encoder, Kind, RawFrame, Received, crc
+
+_SHOWN: Final = 6
+_OTHER_HEADER: Final = b"\xaa\x55"
+_CRC_AT: Final = slice(-5, -1)
+
+
+class _Crc(NamedTuple):
+    """A way to compute the CRC field; the defaults are the document's."""
+
+    start: int = 0xFFFF_FFFF
+    is_widened: bool = True
+    has_header: bool = True
+    id_order: str = "big"
+    field_order: str = "big"
+    inverts: bool = False
+
+    def of(self, can_id: int, body: bytes) -> bytes:
+        """The field for a message; `body` is mode to last data byte."""
+        head = b"\x55\xaa" if self.has_header else b""
+        own_id = b"" if self.id_order == "none" else can_id.to_bytes(2, self.id_order)  # type: ignore[arg-type]
+        value = crc(head + own_id + body, start=self.start, steps=4 if self.is_widened else 1)
+        value ^= 0xFFFF_FFFF if self.inverts else 0
+        return value.to_bytes(4, self.field_order)  # type: ignore[arg-type]
+
+    @property
+    def differences(self) -> list[str]:
+        """How it differs from the document's."""
+        differs = {
+            "a start value of 0": self.start == 0,
+            "one step of the table a byte, in the place of four": not self.is_widened,
+            "the header 55 AA left out": not self.has_header,
+            "the CAN id left out": self.id_order == "none",
+            "the CAN id low byte first": self.id_order == "little",
+            "all bits inverted at the end": self.inverts,
+            "the CRC sent low byte first": self.field_order == "little",
+        }
+        return [text for text, is_so in differs.items() if is_so]
+
+
+_CRCS: Final = sorted(
+    (
+        _Crc(*each)
+        for each in product(
+            (0xFFFF_FFFF, 0),
+            (True, False),
+            (True, False),
+            ("big", "little", "none"),
+            ("big", "little"),
+            (False, True),
+        )
+    ),
+    key=lambda each: len(each.differences),
+)
+"""From the document's to those that differ from it most."""
+
+
+def diagnose(trace: Iterable[TraceEntry], encoder: Encoder) -> list[str]:
+    """What was received, and what would make it fit, in sentences; the likeliest cause first."""
+    heard = [(entry.frame, entry.at_s) for entry in trace if not entry.sent]
+    frames = [frame for frame, _ in heard if not frame.is_error]
+    own = f"{encoder.to_tool:03X}"
+    if not frames:
+        errors = f"{len(heard)} error frames and " if heard else ""
+        why = "check the device's power, the wiring and its termination, the bit rate, the channel"
+        return [f"{errors}no frame at all was received: {why}"]
+    if not any(frame.can_id == encoder.to_tool and frame.is_payload for frame in frames):
+        return [_who_speaks(frames, encoder)]
+    decoder = Decoder(encoder)
+    messages = [found for frame, at in heard for found in decoder.feed(frame, at)]
+    to_tool = [message for message in messages if message.can_id == encoder.to_tool]
+    damaged = [message for message in to_tool if message.kind is Kind.DAMAGED]
+    if damaged:
+        return [_what_would_fit(damaged, own)]
+    return _what_is_strange(to_tool, own, encoder) or [
+        f"{own} speaks, and its messages are right: {_counted(map(str, to_tool))}"
+    ]
+
+
+def _counted(texts: Iterable[str]) -> str:
+    """The most frequent ones, with their numbers."""
+    found = Counter(texts).most_common(_SHOWN)
+    return ", ".join(text if count == 1 else f"{text} ({count} times)" for text, count in found)
+
+
+def _who_speaks(frames: Sequence[RawFrame], encoder: Encoder) -> str:
+    """Nothing came on the id that has to answer."""
+    own = f"{encoder.to_tool:03X}"
+    extended = [frame.can_id for frame in frames if frame.is_extended]
+    if any(encoder.to_tool in (can_id, can_id >> 18) for can_id in extended):
+        return f"{own} comes as an extended id of 29 bits: the document has ids of 11 bits"
+    for other in encoder.others():
+        if any(frame.can_id == other.to_tool and frame.is_payload for frame in frames):
+            return (
+                f"{other.to_tool:03X} speaks, and {own} does not: the device is another one, and "
+                f"-t {other.target} fits it"
+            )
+    ids = _counted(f"{frame.can_id:03X}" for frame in frames)
+    return f"nothing was received from {own}; heard were the ids {ids}"
+
+
+def _what_would_fit(damaged: Sequence[Received], own: str) -> str:
+    """Messages came that are none: which other form makes messages of all of them."""
+    raws = [message.raw for message in damaged]
+    if any(raw.startswith(_OTHER_HEADER) for raw in raws):
+        return f"{own} speaks; its messages begin with AA 55, in the place of 55 AA"
+    whole = [raw for raw in raws if raw.startswith(b"\x55\xaa") and len(raw) == 9 + raw[3]]
+    if not whole:
+        shown = raws[0].hex(" ").upper()
+        return f"{own} speaks, but in no whole messages: the first one is {shown}"
+    if any(raw[-1] != 0xF0 for raw in whole):
+        return f"{own} speaks; its messages end with {whole[0][-1]:02X}, in the place of F0"
+    if all(raw[5] != raw[3] - 2 for raw in whole):
+        fits = all(raw[4] == raw[3] - 2 for raw in whole)
+        why = "its command is sent low byte first" if fits else "length and command do not agree"
+        return f"{own} speaks; {why}: {whole[0].hex(' ').upper()}"
+    can_id = damaged[0].can_id
+    for way in _CRCS:
+        if all(way.of(can_id, raw[2:-5]) == raw[_CRC_AT] for raw in whole):
+            return f"{own} speaks; its CRCs fit {' and '.join(way.differences)}"
+    return (
+        f"{own} speaks; its CRCs fit nothing that is known: {whole[0].hex(' ').upper()} has "
+        f"{whole[0][_CRC_AT].hex().upper()}, and {_Crc().of(can_id, whole[0][2:-5]).hex().upper()} "
+        "is right"
+    )
+
+
+def _what_is_strange(messages: Sequence[Received], own: str, encoder: Encoder) -> list[str]:
+    """The messages are whole; what about them does not belong to the protocol."""
+    names = {one.boot_name for one in messages if one.kind is Kind.BOOT_VERSION}
+    for other in encoder.others():
+        if other.boot_name in names:
+            return [f"{own} announces itself as {other.boot_name}: the name of another device"]
+    numbers = {one.number for one in messages if one.kind in (Kind.ACK, Kind.NAK)}
+    if numbers and all(number and not number & 0xFF for number in numbers):
+        shown = ", ".join(str(number) for number in sorted(numbers)[:_SHOWN])
+        return [f"{own} speaks; the numbers of its ACK and NAK are sent high byte first: {shown}"]
+    if names and not any(one.kind is Kind.REQUEST for one in messages):
+        why = "does it check another CRC, or listen elsewhere (up_04_burst in the profile)?"
+        return [f"{own} announces itself, and answers no update command: {why}"]
+    return []
