@@ -193,15 +193,18 @@ def case_text(case_id: str, profile: ConformanceProfile) -> CaseText:
 @dataclass(frozen=True)
 class Selection:
     """Cases to run: those of `cases` and of `groups`, all when both are empty; of a `quick` run,
-    those of `QUICK` and of `cases`.
+    those of `QUICK` and of `cases`. None of `excluded`, cases or groups, is run.
     """
 
     cases: tuple[str, ...] = ()
     groups: tuple[str, ...] = ()
     quick: bool = False
+    excluded: tuple[str, ...] = ()
 
     def has(self, case_id: str) -> bool:
         """True for a case that is to be run; one that is named is, however long it takes."""
+        if case_id in self.excluded or group_of(case_id) in self.excluded:
+            return False
         if case_id in self.cases:
             return True
         is_named = not (self.cases or self.groups) or group_of(case_id) in self.groups
@@ -216,6 +219,7 @@ class Selection:
         for given, known, what in (
             (self.cases, known_cases(), "case"),
             (self.groups, tuple(GROUPS), "group"),
+            (self.excluded, (*GROUPS, *known_cases()), "case or group"),
         ):
             for name in given:
                 if name not in known:

@@ -119,9 +119,9 @@ def compare(
     old: ReportDocument, new: ReportDocument, threshold_percent: float = THRESHOLD_PERCENT
 ) -> Difference:
     """What is different in `new`."""
-    before, after = _verdicts(old), _verdicts(new)
+    before, after = _judged(old), _judged(new)
     titles = {case.id: case.title for case in (*old.cases, *new.cases)}
-    reasons = _reasons(new)
+    reasons = reasons_of(new)
     kinds = ("better", "worse", "new", "gone", "less", "more")
     found: dict[str, list[VerdictChange]] = {kind: [] for kind in kinds}
     unchanged = 0
@@ -153,16 +153,20 @@ def compare(
     )
 
 
-def _verdicts(report: ReportDocument) -> dict[str, CaseVerdict]:
-    """The worst verdict of every case that was judged."""
+def verdicts_of(report: ReportDocument) -> dict[str, CaseVerdict]:
+    """The worst verdict of every case."""
     found: dict[str, list[CaseVerdict]] = {}
     for result in report.results:
         found.setdefault(result.id, []).append(result.status)
-    ranked = {case_id: worst(verdicts) for case_id, verdicts in found.items()}
-    return {case_id: each for case_id, each in ranked.items() if each not in _NOT_JUDGED}
+    return {case_id: worst(verdicts) for case_id, verdicts in found.items()}
 
 
-def _reasons(report: ReportDocument) -> dict[str, str]:
+def _judged(report: ReportDocument) -> dict[str, CaseVerdict]:
+    verdicts = verdicts_of(report)
+    return {case_id: each for case_id, each in verdicts.items() if each not in _NOT_JUDGED}
+
+
+def reasons_of(report: ReportDocument) -> dict[str, str]:
     """What the first result of each case says that has something to say."""
     found: dict[str, str] = {}
     for result in report.results:

@@ -19,6 +19,7 @@ from flasher.conformance.results import (
     CheckOutcome,
     RunReport,
 )
+from flasher.conformance.side_by_side import SideBySide
 from flasher.report import chart
 from flasher.report.base import Status, render_page
 from flasher.trace.figures import Distribution
@@ -114,6 +115,17 @@ def html_page(
         traces_open=TRACES_OPEN,
         others={title: cases for title, cases in others.items() if cases},
         times=_times(report),
+    )
+
+
+def comparison_page(found: SideBySide) -> str:
+    """The page of several runs beside each other."""
+    return render_page(
+        "side_by_side.html",
+        found=found,
+        colours=_COLOURS,
+        in_part=CaseVerdict.PASS_IN_PART,
+        differing=[case for case in found.cases if case.differs],
     )
 
 

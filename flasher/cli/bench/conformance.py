@@ -24,6 +24,7 @@ from flasher.cli.bench.conformance_text import (
     gap_lines,
     list_lines,
     report_lines,
+    side_by_side_lines,
 )
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import argument, group, option, option_set, retyped
@@ -45,6 +46,7 @@ from flasher.conformance.catalogue import (
 from flasher.conformance.diff import THRESHOLD_PERCENT, Difference, compare, read_report
 from flasher.conformance.json_report import ReportDocument
 from flasher.conformance.results import CaseVerdict, CheckOutcome, Gap, RunReport
+from flasher.conformance.side_by_side import SideBySide, side_by_side
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.text import printable
 
@@ -57,6 +59,7 @@ examples:
       --power-cmd 'relay 3 {on|off}' --html report.html --junit report.xml --json-report new.json
   flasher conformance --list --group TX
   flasher conformance diff old.json new.json
+  flasher conformance compare a.json b.json c.json --html side_by_side.html
   flasher conformance profile > p.toml
   flasher conformance header .
   flasher conformance -t bms --subject ./boot
@@ -70,7 +73,7 @@ _FILES: Final = {"junit": "--junit", "json_report": "--json-report", "html": "--
 """Files that are written: their names in the choices, and their options."""
 _RUN_OPTIONS: Final = frozenset(
     {
-        *("--list", "--case", "--group", "--quick", "--seed", "--repeat", "--timeout"),
+        *("--list", "--case", "--group", "--exclude", "--quick", "--seed", "--repeat", "--timeout"),
         *("--junit", "--json-report", "--html", _TRACE_DIR),
         *("--json", "--events", "--verbose", "--quiet", "--log-file"),
     }
@@ -127,7 +130,8 @@ class HeaderDocument:
 
 
 DOCUMENTS: Final = (
-    ConformanceDocument, CaseListDocument, Difference, ProfileKeysDocument, HeaderDocument,
+    ConformanceDocument, CaseListDocument, Difference, SideBySide, ProfileKeysDocument,
+    HeaderDocument,
     *conformance_explore.DOCUMENTS,
 )  # fmt: skip
 
@@ -142,6 +146,7 @@ class Choices:
     is_list: bool
     cases: tuple[str, ...]
     groups: tuple[str, ...]
+    excluded: tuple[str, ...]
     quick: bool
     seed: str
     repeat: int
@@ -155,7 +160,7 @@ class Choices:
     @property
     def selection(self) -> Selection:
         """Which cases are meant."""
-        return Selection(self.cases, self.groups, quick=self.quick)
+        return Selection(self.cases, self.groups, quick=self.quick, excluded=self.excluded)
 
 
 _what = partial(option, panel="what is run, and how")
@@ -171,6 +176,10 @@ _choices = option_set(
     _what(
         "--group", "groups", multiple=True, type=str.upper, metavar="G", brief=True,
         help=f"run this group only: {' '.join(GROUPS)}; may be repeated",
+    ),
+    _what(
+        "--exclude", "excluded", multiple=True, type=str.upper, metavar="ID|G",
+        help="run all but this case or group; may be repeated",
     ),
     _what(
         "--quick", is_flag=True, brief=True,
@@ -399,6 +408,32 @@ def diff(output: Output, *, old: Path, new: Path, threshold: float, strict: bool
     code = ExitCode.PARTIAL if is_worse else ExitCode.OK
     output.document(found, exit_code=code)
     return code
+
+
+@conformance.action("compare", exit_codes=())
+@argument(
+    "reports", nargs=-1, required=True, type=values.FilePath("json", gives=Path),
+    metavar="REPORT...", help="two reports or more",
+)  # fmt: skip
+@_report("--html", help="the comparison as one self-contained page")
+def compare_runs(output: Output, *, reports: tuple[Path, ...], html: Path | None) -> int:
+    """Show reports that --json-report wrote side by side: the cases whose verdicts differ (-v:
+    all), what else differs, and the times.
+    """
+    if len(reports) < 2:
+        raise UsageError("A comparison takes two reports or more.")
+    if html is not None:
+        check_writable(html, "--html")
+    found = side_by_side(reports, [read_report(path) for path in reports])
+    for line in side_by_side_lines(found, verbose=output.verbosity > 0):
+        output.result(line)
+    if html is not None:
+        from flasher.conformance.html_report import comparison_page  # noqa: PLC0415  loads jinja2
+
+        write_whole(html, comparison_page(found).encode("utf-8"), "--html")
+        output.progress(f"html: {printable(str(html))}")
+    output.document(found)
+    return ExitCode.OK
 
 
 @conformance.action("profile", exit_codes=())

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
 from typing import Final
 
@@ -18,9 +18,11 @@ from flasher.conformance.results import (
     RunReport,
     count_text,
 )
+from flasher.conformance.side_by_side import SideBySide
 from flasher.protocol.text import printable
 
 _TEXT_LIMIT: Final = 160
+_CELL: Final = 40
 _NOTES_SHOWN: Final = 12
 _TOLD: Final = (
     CaseVerdict.FAIL,
@@ -239,5 +241,47 @@ def difference_lines(found: Difference) -> Iterator[str]:
     )
 
 
-def _short(text: str) -> str:
-    return text if len(text) <= _TEXT_LIMIT else text[: _TEXT_LIMIT - 3] + "..."
+def side_by_side_lines(found: SideBySide, *, verbose: bool = False) -> Iterator[str]:
+    """Runs beside each other: what differs between them; `verbose` tells all cases."""
+    head = ["", *(run.name for run in found.runs)]
+    rows = [["verdict", *("passed" if run.passed else "NOT PASSED" for run in found.runs)]]
+    rows.append(["passes", *(f"{run.passes}, {run.passes_in_full} in full" for run in found.runs)])
+    rows += [[row.name, *row.values] for row in found.facts]
+    yield from _table([head, *rows])
+    shown = [case for case in found.cases if verbose or case.differs]
+    if shown:
+        yield ""
+        yield from _table(
+            [
+                f"{case.id} {case.title}",
+                *("-" if each is None else each.text for each in case.verdicts),
+            ]
+            for case in shown
+        )
+    if found.times:
+        yield ""
+        yield "median and 95th percentile in ms"
+        yield from _table(
+            [row.name, *map(_median_and_p95, row.medians_s, row.p95s_s)] for row in found.times
+        )
+    differ = sum(case.differs for case in found.cases)
+    yield ""
+    yield f"{differ} of {counted(len(found.cases), 'case')} differ"
+
+
+def _median_and_p95(median_s: float | None, p95_s: float | None) -> str:
+    if median_s is None or p95_s is None:
+        return "-"
+    return f"{median_s * _MS:.1f}, {p95_s * _MS:.1f}"
+
+
+def _table(rows: Iterable[Sequence[str]]) -> Iterator[str]:
+    cells = [[_short(printable(cell), _CELL) for cell in row] for row in rows]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for row in cells:
+        padded = (f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True))
+        yield "  ".join(padded).rstrip()
+
+
+def _short(text: str, limit: int = _TEXT_LIMIT) -> str:
+    return text if len(text) <= limit else text[: limit - 3] + "..."

@@ -1,0 +1,140 @@
+"""Several runs beside each other: the verdict of every case, and the times, a column a run.
+
+`diff` says what got worse between two; this shows how any number of devices, benches or releases
+differ.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from flasher.conformance.diff import reasons_of, verdicts_of
+from flasher.conformance.json_report import ReportDocument
+from flasher.conformance.results import CaseVerdict
+from flasher.protocol.text import printable
+
+_FACTS: Final = (
+    "subject",
+    "target",
+    "started_at",
+    "bitrate_bps",
+    "seed",
+    "timestamp_source",
+    "profile_source",
+    "stopped",
+)
+"""What of a run is shown where it differs between the runs."""
+
+
+@dataclass(frozen=True)
+class RunColumn:
+    """One run."""
+
+    name: str
+    """Of its file."""
+    subject: str
+    passed: bool
+    passes: int
+    passes_in_full: int
+    counts: dict[str, int]
+
+
+@dataclass(frozen=True)
+class CaseRow:
+    """A case in all runs."""
+
+    id: str
+    group: str
+    title: str
+    verdicts: Sequence[CaseVerdict | None]
+    """The worst of each run's repeats; None (null) where the run has not the case."""
+    reasons: Sequence[str]
+    """What each run says of it."""
+
+    @property
+    def differs(self) -> bool:
+        """True when not all runs have the same verdict."""
+        return len(set(self.verdicts)) > 1
+
+
+@dataclass(frozen=True)
+class FactRow:
+    """Something else that differs between the runs."""
+
+    name: str
+    values: Sequence[str]
+
+
+@dataclass(frozen=True)
+class TimeRow:
+    """The times of one name in all runs, None (null) where a run has none."""
+
+    name: str
+    medians_s: Sequence[float | None]
+    p95s_s: Sequence[float | None]
+
+
+@dataclass(frozen=True)
+class SideBySide:
+    """The runs beside each other."""
+
+    runs: Sequence[RunColumn]
+    cases: Sequence[CaseRow]
+    facts: Sequence[FactRow]
+    """What differs between the runs, the keys of their profiles included."""
+    times: Sequence[TimeRow]
+
+
+def side_by_side(paths: Sequence[Path], reports: Sequence[ReportDocument]) -> SideBySide:
+    """The reports, which were read from `paths`, as columns."""
+    columns = [
+        RunColumn(
+            printable(path.name),
+            report.subject,
+            report.passed,
+            report.passes,
+            report.passes_in_full,
+            {name: count for name, count in report.counts.items() if count},
+        )
+        for path, report in zip(paths, reports, strict=True)
+    ]
+    cases = {case.id: case for report in reports for case in report.cases}
+    verdicts = [verdicts_of(report) for report in reports]
+    reasons = [reasons_of(report) for report in reports]
+    rows = [
+        CaseRow(
+            case.id,
+            case.group,
+            case.title,
+            [found.get(case.id) for found in verdicts],
+            [found.get(case.id, "") for found in reasons],
+        )
+        for case in cases.values()
+    ]
+    facts = [FactRow(key, [str(getattr(report, key)) for report in reports]) for key in _FACTS]
+    keys = dict.fromkeys(key for report in reports for key in report.profile)
+    facts += [
+        FactRow(f"profile, {key}", [str(report.profile.get(key, "")) for report in reports])
+        for key in keys
+    ]
+    return SideBySide(
+        columns, rows, [row for row in facts if len(set(row.values)) > 1], _times(reports)
+    )
+
+
+def _times(reports: Sequence[ReportDocument]) -> list[TimeRow]:
+    by_name = [{times.name: times for times in report.times} for report in reports]
+    rows = []
+    for name in dict.fromkeys(name for found in by_name for name in found):
+        measured = [found.get(name) for found in by_name]
+        rows.append(
+            TimeRow(
+                name,
+                [None if one is None else one.median_s for one in measured],
+                [None if one is None else one.p95_s for one in measured],
+            )
+        )
+    return rows
