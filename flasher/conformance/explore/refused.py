@@ -24,6 +24,7 @@ from flasher.conformance.wire import (
     joined,
     packet_count,
     packet_payload,
+    split,
 )
 
 _OTHER_MODE: Final = 0x17
@@ -140,6 +141,9 @@ PACKETS: Final[dict[str, Maker]] = {
     "packet-total": _bytes(
         lambda place: place.packet(place.wanted, total=place.total + 1), write=True
     ),
+    "packet-total-far": _bytes(
+        lambda place: place.packet(place.wanted, total=place.total + 256), write=True
+    ),
     "packet-start": _bytes(lambda place: place.packet(place.wanted, start=0), write=True),
     "packet-lost": _with_frames(lambda all_: all_[:_SPOILT_FRAME] + all_[_SPOILT_FRAME + 1 :]),
     "packet-doubled": _with_frames(lambda all_: all_[:_SPOILT_FRAME] + all_[_SPOILT_FRAME - 1 :]),
@@ -161,6 +165,12 @@ def _small_update(
 ) -> bytes:
     data = (text or place.encoder.update_text) + _SMALL_BYTES.to_bytes(4, "little")
     return spoil(build(place.encoder.to_device, mode, UPDATE, data))
+
+
+def _longer_update(place: Place) -> bytes:
+    """An update command whose length byte and data are longer by one than its command says."""
+    data = place.encoder.update_text + _SMALL_BYTES.to_bytes(4, "little") + b"\0"
+    return build(place.encoder.to_device, WRITE, UPDATE, data)
 
 
 def _for_others(place: Place) -> list[RawFrame]:
@@ -189,6 +199,10 @@ UPDATES: Final[dict[str, Maker]] = {
     "update-name": _bytes(
         lambda place: _small_update(place, text=place.encoder.others()[0].update_text), write=True
     ),
+    "update-name-end": _bytes(
+        lambda place: _small_update(place, text=place.encoder.update_text[:4] + b"XYZ"), write=True
+    ),
+    "update-long": _bytes(_longer_update),
     "update-read": _bytes(lambda place: _small_update(place, mode=READ)),
     "update-others": _frames(_for_others),
 }
@@ -207,6 +221,14 @@ def _reset(mode: int, data: Callable[[Encoder], bytes]) -> Callable[[Place], lis
     )
 
 
+def _resets_of_nodes(place: Place) -> list[RawFrame]:
+    """Resets to this target, but not by the tool: from every other node."""
+    encoder, digit = place.encoder, place.encoder.to_device & 0xF
+    ids = [0x700 | sender << 4 | digit for sender in (1, 2, 3, 4) if sender != digit]
+    reset = (WRITE, encoder.reset_command, encoder.reset_data)
+    return [frame for can_id in ids for frame in split(can_id, build(can_id, *reset))]
+
+
 def _junk(place: Place) -> list[RawFrame]:
     chance = random.Random(7)  # noqa: S311  the same at every replay
     data = [bytes((chance.randrange(0x60, 0xF0),)) + chance.randbytes(7) for _ in range(16)]
@@ -222,6 +244,10 @@ NO_CONCERN: Final[dict[str, Maker]] = {
     "reset-text": _frames(
         _reset(WRITE, lambda encoder: bytes(len(encoder.reset_data))), write=True
     ),
+    "reset-text-end": _frames(
+        _reset(WRITE, lambda encoder: encoder.reset_data[:-1] + b"?"), write=True
+    ),
+    "reset-nodes": _frames(_resets_of_nodes),
     "reset-others": _frames(
         lambda place: [frame for other in place.encoder.others() for frame in other.reset()]
     ),

@@ -13,8 +13,9 @@ _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
     Phase.APPLICATION: {
         "reset": 14,
         **dict.fromkeys(("burst", "burst=twice", "query", "update=384", "packet", "end"), 1),
-        **dict.fromkeys(("wait=0.3", "power", "bus-off", "reset-read", "reset-text", "unknown"), 1),
-        **dict.fromkeys(NO_CONCERN, 0.5),
+        **dict.fromkeys(("wait=0.3", "power", "bus-off"), 1),
+        # No write but a reset goes to an application on purpose: it may keep what is written.
+        **dict.fromkeys([name for name in NO_CONCERN if name != "unknown"], 0.7),
         **dict.fromkeys(("packet-crc", "update-others"), 0.4),
     },
     Phase.ANNOUNCING: {
@@ -31,7 +32,8 @@ _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
         "wait=window": 1,
         "wait=0.3": 0.5,
         "power": 1,
-        **dict.fromkeys(("packet", "end", "query"), 1),
+        **dict.fromkeys(("packet", "end", "query", "update-reset"), 1),
+        **dict.fromkeys(("wait=20", "cut=0", "cut=1", "cut=2"), 0.6),
         **dict.fromkeys(UPDATES, 1),
         **dict.fromkeys((*NO_CONCERN, "bus-off"), 0.5),
     },
@@ -79,7 +81,7 @@ _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
         "reset": 1,
         "wait=pause": 0.5,
         "query": 0.5,
-        **dict.fromkeys(ENDS, 1),
+        **dict.fromkeys((*ENDS, "cut=0", "cut=1"), 1),
         **dict.fromkeys((*PACKETS, *NO_CONCERN), 0.2),
     },
     Phase.UNCLEAR: {
@@ -115,8 +117,12 @@ def parse_step(text: str) -> Step:
 def next_step(walk: Walk, chance: random.Random) -> Step:
     """A step for what the device does, by chance; only what the bench can do."""
     weights, subject = _WEIGHTS[walk.phase], walk.bench.subject
-    lacks = {"power": not subject.has_power, "bus-off": not subject.has_bus_off}
-    texts = [text for text in weights if not lacks.get(text)]
+    lacks = {
+        "power": not subject.has_power,
+        "bus-off": not subject.has_bus_off,
+        "cut": not subject.has_timed_cuts,
+    }
+    texts = [text for text in weights if not lacks.get(text.partition("=")[0])]
     (text,) = chance.choices(texts, [weights[text] for text in texts])
     return parse_step(text)
 

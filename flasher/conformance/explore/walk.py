@@ -77,7 +77,8 @@ def filler(size_bytes: int) -> bytes:
     data = b""
     while len(data) < size_bytes:
         data += chance.choice(parts) if chance.random() < 0.1 else chance.randbytes(7)
-    return data[:size_bytes]
+    blank = b"\xff" * PACKET_BYTES if size_bytes >= 3 * PACKET_BYTES else b""
+    return (data[:PACKET_BYTES] + blank + data[PACKET_BYTES + len(blank) :])[:size_bytes]
 
 
 class Walk:
@@ -106,6 +107,8 @@ class Walk:
         self._may_complete = False
         self._may_break_off = False
         """A message of the device may be cut."""
+        self._nodes_asked: frozenset[int] = frozenset()
+        """Ids by which the device may answer other nodes, in whose name something was sent."""
         self._requested_at = -inf
         self._version_at = -inf
         self._useful_at = bench.now
@@ -214,6 +217,8 @@ class Walk:
             case Kind.COMPLETE:
                 if not self._may_complete:
                     raise Violation("complete", "complete without all packets and a valid end")
+            case Kind.OTHER if heard.can_id in self._nodes_asked:
+                pass
             case Kind.OTHER | Kind.DAMAGED if not self._may_break_off:
                 raise Violation("form", f"{heard}: no message that a device sends")
 
@@ -436,6 +441,78 @@ class Walk:
         elif not self._listen(bench.limit("erase_s"), lambda one: one.kind is Kind.REQUEST):
             self.phase = Phase.UNCLEAR
 
+    def _update_reset(self, _: str) -> None:
+        """An update command, and a reset right behind it: while it erases."""
+        bench = self.bench
+        self._at_version()
+        if self.phase is not Phase.ANNOUNCING:
+            self._reset("")
+            return
+        self._offered = self._named_image("good")
+        self._updates_unanswered += 1
+        self._feedback_due += 2
+        self._may_restart = True
+        bench.send([*bench.encoder.update(len(bench.good_image)), *bench.encoder.reset()])
+        heard = self._listen(
+            bench.limit("erase_s"),
+            lambda one: one.kind in (Kind.REQUEST, Kind.BOOT_VERSION),
+        )
+        if heard is None:
+            raise Violation("no request", "nothing after an update command and a reset behind it")
+        self._quiet()
+        self.phase, self.is_whole, self.was_requested = Phase.UNCLEAR, False, True
+
+    def _cut(self, argument: str) -> None:
+        """Cut the power half-way through a flash operation: of the erasing that an update command
+        begins, or, when all packets are stored, of what the end of transfer writes.
+        """
+        bench, is_end = self.bench, self.phase is Phase.STORED
+        if is_end and self._end_is is not Outcome.RUNS:
+            return
+        if not is_end:
+            self._at_version()
+            if self.phase is not Phase.ANNOUNCING:
+                return
+        before = self.running if self.is_whole else None
+        after = self._image if is_end else None
+        self._may_restart = self._may_break_off = self._may_complete = True
+        self._updates_unanswered += 1
+        self._feedback_due += 1
+        self.was_requested, self.phase = True, Phase.UNCLEAR
+        bench.subject.cut_in_operation(int(argument), 0.5, _GAP_S)
+        bench.send(bench.encoder.end() if is_end else bench.encoder.update(len(bench.good_image)))
+        if not is_end:
+            self._offered = self._named_image("good")
+        within_s = bench.limit("erase_s") + bench.limit("first_version_s")
+        ends = (Kind.BOOT_VERSION, Kind.REQUEST, Kind.COMPLETE)
+        heard = self._listen(within_s, lambda one: one.kind in ends)
+        if not bench.subject.take_cut():  # it does less operations than that
+            self._may_break_off = False
+            if heard is not None and heard.kind is Kind.COMPLETE:
+                self._completed()
+            return
+        self._updates_unanswered = 0
+        self._listen(bench.host.burst_s + _GAP_S)
+        self._check_not_mixed([image for image in (before, after) if image is not None])
+        self._may_break_off = self._may_complete = False
+
+    def _check_not_mixed(self, images: Sequence[bytes]) -> None:
+        """What runs after a power cut is one of the images, whole, or nothing."""
+        bench = self.bench
+        self.phase = Phase.UNCLEAR
+        self.is_whole = False
+        if not bench.encoder.has_version_query:
+            return
+        found = bench.application_version()
+        bench.forget()
+        if found is None:
+            return
+        whole = next((image for image in images if version_in(image) == found), None)
+        if whole is None:
+            raise Violation("mixed", f"application {found!a} runs after a power cut")
+        self.check_stored(whole)
+        self.running, self.is_whole, self.phase = whole, True, Phase.APPLICATION
+
     def _bad_update(self, name: str) -> None:
         self._at_version()
         refused = UPDATES[name](self._place)
@@ -620,6 +697,10 @@ class Walk:
             self._feedback_due += 1
             bench.send(bench.encoder.end())
             self._listen(bench.limit("ack_s"))
+        self._completed()
+
+    def _completed(self) -> None:
+        """The image is complete: its application runs."""
         self.running, self.is_whole = self._image, True
         self.check_application()
         self._may_restart = self._may_complete = False
@@ -629,6 +710,9 @@ class Walk:
 
     def _no_concern(self, name: str) -> None:
         refused = (ENDS.get(name) or NO_CONCERN[name])(self._place)
+        if name == "reset-nodes":  # each of them is answered by general feedback
+            own = self.bench.encoder.to_all
+            self._nodes_asked = frozenset(own | frame.can_id >> 4 & 0xF for frame in refused.frames)
         self._feedback_due += refused.is_intact_write
         self._naks_due, self._nak_numbers = 2, None
         self.bench.send(refused.frames)
@@ -649,6 +733,8 @@ STEPS: Final = {
     "wait": "wait",
     "query": "query",
     "update": "update",
+    "update-reset": "update_reset",
+    "cut": "cut",
     "packet": "packet",
     "packets": "packets",
     "packet-again": "packet_again",
