@@ -57,6 +57,11 @@ def answer_all(talk: Talk, duration_s: float) -> list[tuple[float, int]]:
     return asked
 
 
+def test_an_application_without_a_machine_cannot_talk() -> None:
+    with pytest.raises(LookupError, match="runs on a machine"):
+        _ = ClientApplication(Node.WMC, WELLING).port
+
+
 # -- questions ------------------------------------------------------------------------------------
 
 

@@ -257,6 +257,15 @@ def test_a_frame_that_nobody_gave_out_is_not_missed() -> None:
     assert not system.done
 
 
+def test_power_that_is_on_already_restarts_nobody() -> None:
+    street = Street(WELLING)
+    street.listen(3.0)
+    street.ear.counts.clear()
+    street.system.power_on(street.clock.now())
+    street.listen(3.0)
+    assert [street.ear.counts[can_id, 0xC109] for can_id in (0x715, 0x725, 0x735)] == [0] * 3
+
+
 def test_cancelling_ends_all_members() -> None:
     system = System(WELLING)
     system.tick(1000.0)

@@ -16,6 +16,7 @@ from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.table import State
 from flasher.mock.variants import VARIANTS, HangingDevice, Variant, find, make
+from flasher.mock.variants.base import variant
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Target
 from tests.end_to_end import world
@@ -841,3 +842,20 @@ def test_what_hangs_says_nothing_until_its_power_is_cut() -> None:
     seen.append(device.hangs)
     assert seen == [True, False]
     assert len(tool.heard("version")) > 4
+
+
+def test_what_is_no_part_of_a_device_is_no_variant() -> None:
+    with pytest.raises(TypeError, match="no part of a device"):
+        variant("a name", "RS-01", "a summary")(int)
+
+
+def test_a_device_that_hangs_does_nothing_at_its_time_either() -> None:
+    device = HangingDevice(BMS, bitrate_bps=WELLING.bitrate_bps)
+    device._hang()
+    device.tick(1000.0)
+    assert device.hangs
+    assert device.next_frame(1000.0) is None
+    device.power_cut(1000.0)
+    device.power_on(1000.0)
+    device.tick(1001.0)
+    assert device.next_frame(1001.0) is not None
