@@ -32,6 +32,7 @@ class Bench:
         limit_s: float,
         seed: str = "",
         stopped: Callable[[], bool] = lambda: False,
+        upgrades: int = 0,
     ) -> None:
         self.subject = subject
         self.port = subject.port
@@ -43,6 +44,8 @@ class Bench:
         self.judge = judge = Judge(tester)
         self.host = host = PatientHost(tester)
         self.random = random.Random(seed)  # noqa: S311  chosen by the seed on purpose
+        self.upgrades = upgrades
+        """How often a case that wears the device has it upgraded."""
         self.is_off = False
         """True while the case has the device's power cut."""
 

@@ -35,8 +35,14 @@ GROUPS: Final = {
     "PW": "power",
     "SE": "bad input",
     "CO": "concurrency",
+    "SO": "soak",
+    "SP": "speed",
 }
 """The groups in the order of the catalogue, with their titles."""
+WEAR: Final = {"SO-01": 1000, "SP-01": 50, "SP-02": 60}
+"""Cases of the groups that run only when they, or their groups, are named: how often each one has
+the device upgraded, unless it is told otherwise.
+"""
 NOT_IMPLEMENTED: Final[dict[str, str]] = {
     "BU-07": "frames of one id that begin in the same bit time: it takes an injector on the line",
 }
@@ -192,8 +198,8 @@ def case_text(case_id: str, profile: ConformanceProfile) -> CaseText:
 
 @dataclass(frozen=True)
 class Selection:
-    """Cases to run: those of `cases` and of `groups`, all when both are empty; of a `quick` run,
-    those of `QUICK` and of `cases`. None of `excluded`, cases or groups, is run.
+    """Cases to run: those of `cases` and of `groups`, all but those of `WEAR` when both are empty;
+    of a `quick` run, those of `QUICK` and of `cases`. None of `excluded`, cases or groups, is run.
     """
 
     cases: tuple[str, ...] = ()
@@ -207,12 +213,18 @@ class Selection:
             return False
         if case_id in self.cases:
             return True
-        is_named = not (self.cases or self.groups) or group_of(case_id) in self.groups
+        is_named = group_of(case_id) in self.groups
+        if not (self.cases or self.groups):
+            is_named = case_id not in WEAR
         return is_named and (not self.quick or case_id in QUICK)
 
     def chosen(self) -> list[str]:
         """The ids of all cases to be run, in the order of the catalogue."""
         return [case_id for case_id in in_order(known_cases()) if self.has(case_id)]
+
+    def wears(self, upgrades: int | None = None) -> dict[str, int]:
+        """Those of `WEAR` that are to be run, with how often each one has the device upgraded."""
+        return {case_id: upgrades or count for case_id, count in WEAR.items() if self.has(case_id)}
 
     def check(self) -> None:
         """Raise UsageError for a case or group that does not exist."""
@@ -258,13 +270,13 @@ _LACKS: Final = {
 FULL_BENCH: Final = (Requirement.POWER, Requirement.READBACK, Requirement.SECOND_IMAGE)
 """What can be added to a bench with a real device."""
 _IN_PART: Final = {
-    Requirement.SECOND_IMAGE: ("EN-01", "EN-07"),
+    Requirement.SECOND_IMAGE: ("EN-01", "EN-07", "SO-01"),
     Requirement.TIMED_CUT: ("PW-01",),
     Requirement.ANY_FRAME: ("FR-09",),
-    Requirement.VERSION: ("SE-01",),
+    Requirement.VERSION: ("SE-01", "SP-01"),
 }
 """Cases that are judged in part without something."""
-_WITHOUT_FLASH: Final = ("FR-05", "FR-08", "CR-04", "EN-08", "TM-05", "SE-01")
+_WITHOUT_FLASH: Final = ("FR-05", "FR-08", "CR-04", "EN-08", "TM-05", "SE-01", "SP-01")
 """Destructive cases that do not look into the flash; all others need readback for a part."""
 
 

@@ -56,6 +56,13 @@ class BenchOptions:
     readback: Readback | None = None
     uncertainty_s: float = HOST_UNCERTAINTY_S
 
+    @property
+    def is_simulated(self) -> bool:
+        """True for what takes no time and wears nothing: the mock, or a bootloader on the
+        computer.
+        """
+        return self.is_mock or self.subject is not None
+
 
 @contextmanager
 def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProfile]]:
@@ -128,13 +135,12 @@ def check_bench(options: BenchOptions) -> None:
     """Raises UsageError for a bench that makes no sense."""
     if options.is_mock and options.subject is not None:
         raise UsageError("The mock is no bootloader under test: choose one of the two.")
-    is_simulated = options.is_mock or options.subject is not None
-    if is_simulated and not (options.power is None and options.readback is None):
+    if options.is_simulated and not (options.power is None and options.readback is None):
         what = "The mock" if options.is_mock else "A bootloader on the computer"
         raise UsageError(f"{what} has power control and readback of its own.")
     if not options.is_mock and (options.variant is not None or options.choices):
         raise UsageError("Variants and choices of the device model are for the mock only.")
-    if is_simulated:
+    if options.is_simulated:
         return
     if options.good_image is None:
         raise UsageError(

@@ -19,6 +19,7 @@ from flasher.conformance.catalogue import (
     DESTRUCTIVE,
     HOST_CASES,
     NOT_IMPLEMENTED,
+    WEAR,
     Case,
     Selection,
     case_text,
@@ -55,13 +56,14 @@ from flasher.errors import BusError
 class RunOptions:
     """How to run: `seed` decides every chance, each case is run `repeat` times, `limit_s` ends the
     run after that time on the bench's clock, `strict` makes a deviation that is none any more a
-    failure.
+    failure, `upgrades` is how often a case that wears the device has it upgraded (None: `WEAR`).
     """
 
     seed: str = "1"
     repeat: int = 1
     limit_s: float | None = None
     strict: bool = False
+    upgrades: int | None = None
 
 
 _EVERYTHING: Final = Selection()
@@ -205,7 +207,12 @@ class Run:
         self._observer.case_began(case, repeat)
         seed = f"{self._options.seed}/{case.id}/{repeat}"
         bench = Bench(
-            self._subject, self._profile, limit_s=case.limit_s, seed=seed, stopped=self._must_stop
+            self._subject,
+            self._profile,
+            limit_s=case.limit_s,
+            seed=seed,
+            stopped=self._must_stop,
+            upgrades=self._options.upgrades or WEAR.get(case.id, 0),
         )
         verdict, note, self.stopped = execute(case, bench)
         self._adapter_failed = bool(self.stopped) and verdict is CaseVerdict.ERROR

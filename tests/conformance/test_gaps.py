@@ -4,14 +4,24 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from flasher.conformance.catalogue import BARE, CASES, FULL_BENCH, gaps, in_order, lacking
+from flasher.conformance.catalogue import (
+    BARE,
+    CASES,
+    FULL_BENCH,
+    GROUPS,
+    Selection,
+    gaps,
+    in_order,
+    lacking,
+)
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock
 from flasher.conformance.results import CaseVerdict, Unsupported
-from flasher.conformance.runner import run
+from flasher.conformance.runner import RunOptions, run
 from flasher.conformance.wire import RawFrame
 from tests.loops import each
 
 AREA_BYTES = 34 * 1024
+EVERYTHING = Selection(groups=tuple(GROUPS))
 
 
 def bare(target: str) -> MockSubject:
@@ -37,7 +47,7 @@ def test_what_a_bare_bench_cannot_judge_is_said_beforehand(target: str) -> None:
     subject = bare(target)
     profile = profile_of_mock(subject.device.profile)
     foreseen = gaps(lacking(subject, profile), in_order(CASES))
-    report = run(subject, profile)
+    report = run(subject, profile, selection=EVERYTHING, options=RunOptions(upgrades=4))
     assert report.gaps == foreseen
     verdicts = {result.case_id: result.verdict for result in report.results}
     unsupported = {case_id for gap in foreseen for case_id in gap.unsupported}
@@ -54,7 +64,8 @@ def test_on_a_bench_with_everything_every_pass_is_in_full() -> None:
     subject = MockSubject(
         profile=replace(MOCK_PROFILE, application_area_bytes=AREA_BYTES, image_checksum="crc32")
     )
-    report = run(subject, profile_of_mock(subject.device.profile))
+    judged_by = profile_of_mock(subject.device.profile)
+    report = run(subject, judged_by, selection=EVERYTHING, options=RunOptions(upgrades=4))
     assert report.gaps == ()
     count = len(CASES)
     assert report.in_full == f"{count} of {count} passes were judged in full"

@@ -5,7 +5,7 @@ The table is docs/variants.md; the gate makes all of it anew, with `tests.varian
 
 from __future__ import annotations
 
-from flasher.conformance.catalogue import BRING_UP, CASES
+from flasher.conformance.catalogue import BRING_UP, CASES, WEAR
 from flasher.mock.variants import VARIANTS
 from tests.loops import each
 from tests.variant_matrix import Row, groups_passed, listed_rows, row_of
@@ -43,7 +43,8 @@ def test_every_variant_fails_the_case_of_its_clause() -> None:
 
 def test_every_case_fails_on_a_variant_of_its_own_clause() -> None:
     """None of them is deaf: each is right in everything but its clause."""
-    assert set(CASES) - {BRING_UP} == {VARIANTS[name].clause for name in LISTED}
+    named = {VARIANTS[name].clause for name in LISTED}
+    assert set(CASES).difference(WEAR, {BRING_UP}) == named
 
 
 def test_a_variant_that_takes_no_upgrade_fails_the_bring_up() -> None:

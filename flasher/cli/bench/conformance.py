@@ -16,7 +16,12 @@ import click
 
 from flasher.cli import values
 from flasher.cli.bench import conformance_explore
-from flasher.cli.bench.conformance_bench import BenchChoices, bench_options, set_option
+from flasher.cli.bench.conformance_bench import (
+    BenchChoices,
+    bench_options,
+    confirm_wear,
+    set_option,
+)
 from flasher.cli.bench.conformance_explore import explore
 from flasher.cli.bench.conformance_text import (
     ListedCase,
@@ -37,10 +42,13 @@ from flasher.conformance.catalogue import (
     CASES,
     FULL_BENCH,
     GROUPS,
+    WEAR,
     Selection,
     case_text,
     gaps,
+    in_order,
     in_part_without,
+    known_cases,
     lacking,
 )
 from flasher.conformance.diff import THRESHOLD_PERCENT, Difference, compare, read_report
@@ -152,6 +160,8 @@ class Choices:
     repeat: int
     timeout: float | None
     strict: bool
+    upgrades: int | None
+    yes: bool
     junit: Path | None
     json_report: Path | None
     html: Path | None
@@ -175,7 +185,8 @@ _choices = option_set(
     ),
     _what(
         "--group", "groups", multiple=True, type=str.upper, metavar="G", brief=True,
-        help=f"run this group only: {' '.join(GROUPS)}; may be repeated",
+        help=f"run this group only: {' '.join(GROUPS)}; may be repeated. SO and SP wear the device "
+        "and run only when they are named",
     ),
     _what(
         "--exclude", "excluded", multiple=True, type=str.upper, metavar="ID|G",
@@ -195,6 +206,12 @@ _choices = option_set(
         "--strict", is_flag=True,
         help="a pass in part fails the run, and a deviation of the profile that is none any more",
     ),
+    _what(
+        "--upgrades", type=values.count, metavar="N",
+        help="how often each case of SO and SP has the device upgraded (default: "
+        + ", ".join(f"{case_id} {count}" for case_id, count in WEAR.items()) + ")",
+    ),
+    _what("-y", "--yes", is_flag=True, help="do not ask before SO and SP wear a device on a bus"),
     _report("--junit", help="JUnit XML, for CI servers"),
     _report("--json-report", help="the report as JSON, for `flasher conformance diff`"),
     _report("--html", help="the report as one self-contained page"),
@@ -228,6 +245,10 @@ def conformance(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) 
 
     described = bench.described(bus)
     _check_files(chosen)
+    wear = chosen.selection.wears(chosen.upgrades)
+    if wear and not described.is_simulated:
+        named = ", ".join(f"{case_id} {count} times" for case_id, count in wear.items())
+        confirm_wear(f"the device is erased and written: {named}", is_agreed=chosen.yes)
     stopping = lambda: output.progress(  # noqa: E731
         "stopping: the device gets its good image back; press again to end at once"
     )
@@ -244,7 +265,9 @@ def conformance(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) 
             subject,
             profile,
             selection=chosen.selection,
-            options=RunOptions(chosen.seed, chosen.repeat, chosen.timeout, chosen.strict),
+            options=RunOptions(
+                chosen.seed, chosen.repeat, chosen.timeout, chosen.strict, chosen.upgrades
+            ),
             observer=observer,
             stopped=stopped,
         )
@@ -355,7 +378,8 @@ def _list(selection: Selection, output: Output) -> int:
     from flasher.conformance.profile import ConformanceProfile  # noqa: PLC0415
 
     selection.check()
-    chosen = selection.chosen()
+    # Those that run only when they are named have to be found somewhere.
+    chosen = in_order(known_cases()) if selection == Selection() else selection.chosen()
     texts = [case_text(case_id, ConformanceProfile()) for case_id in chosen]
     found = [
         ListedCase(
@@ -368,6 +392,7 @@ def _list(selection: Selection, output: Output) -> int:
             in_part_without(text.id),
             tuple(text.choices),
             can_be_run=text.id in CASES,
+            only_when_named=text.id in WEAR,
         )
         for text in texts
     ]

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 from flasher.cli import values
 from flasher.cli.framework import option, option_set
 from flasher.cli.options import Bus, allow_implausible_option, target_option
+from flasher.cli.question import agrees, can_ask
 from flasher.conformance.real import HOST_UNCERTAINTY_S
 from flasher.errors import UsageError
 from flasher.protocol.spec import Target
@@ -68,6 +69,18 @@ class BenchChoices:
         )
         check_bench(bench)
         return bench
+
+
+def confirm_wear(said: str, *, is_agreed: bool) -> None:
+    """Say what is done to the device, and ask unless it `is_agreed`. Raises UsageError without a
+    yes.
+    """
+    if is_agreed:
+        return
+    if not can_ask():
+        raise UsageError(f"{said}, and there is no terminal to ask.", remedy="Add --yes.")
+    if not agrees(f"{said}. Begin?", interrupted="nothing was sent to the device."):
+        raise UsageError("Nothing was sent to the device.", remedy="Name less, or agree.")
 
 
 _bench = partial(option, panel="device under test")

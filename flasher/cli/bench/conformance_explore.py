@@ -14,14 +14,13 @@ import click
 
 from flasher.cli import values
 from flasher.cli.bar import Bar
-from flasher.cli.bench.conformance_bench import BenchChoices, bench_options
+from flasher.cli.bench.conformance_bench import BenchChoices, bench_options, confirm_wear
 from flasher.cli.files import write_whole
 from flasher.cli.framework import command, option, option_set, retyped
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
-from flasher.cli.question import agrees, can_ask
 from flasher.cli.stop import stop_on_signal
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ExitCode
 from flasher.protocol.text import printable
 
 if TYPE_CHECKING:
@@ -132,9 +131,10 @@ def explore(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> i
     from flasher.conformance.opening import open_bench  # noqa: PLC0415
 
     described = bench.described(bus)
-    is_simulated = described.is_mock or described.subject is not None
-    if not (is_simulated or chosen.yes or chosen.replay):
-        _ask(chosen.steps)
+    if not (described.is_simulated or chosen.replay):
+        erases = max(1, round(chosen.steps * _WALKS_PER_STEP * _ERASES_A_WALK))
+        said = f"{chosen.steps} steps erase and write the device about {erases} times"
+        confirm_wear(said, is_agreed=chosen.yes)
     with (
         open_bench(described) as (subject, profile),
         stop_on_signal(lambda: output.progress("stopping; press again to end at once")) as stopped,
@@ -157,16 +157,6 @@ def explore(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> i
         code = ExitCode.INTERRUPTED
     _tell(explored, output, chosen.trace_file, code)
     return code
-
-
-def _ask(steps: int) -> None:
-    """Say what the walks cost the device, and ask. Raises UsageError without an answer."""
-    erases = max(1, round(steps * _WALKS_PER_STEP * _ERASES_A_WALK))
-    said = f"{steps} steps erase and write the device about {erases} times"
-    if not can_ask():
-        raise UsageError(f"{said}, and there is no terminal to ask.", remedy="Add --yes.")
-    if not agrees(f"{said}. Begin?", interrupted="nothing was sent to the device."):
-        raise UsageError("Nothing was sent to the device.", remedy="Name fewer steps, or agree.")
 
 
 def _tell(explored: Explored, output: Output, trace_file: Path | None, code: ExitCode) -> None:

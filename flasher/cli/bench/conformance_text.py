@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass
+from math import ceil
 from typing import Final
 
 from flasher.cli.output import counted, duration
@@ -32,6 +33,11 @@ _TOLD: Final = (
 )
 """Verdicts whose cases have a line each; unsupported ones share one for each reason."""
 _MS: Final = 1000
+_BINS: Final = 20
+_SHADES: Final = " .:-=+*#%@"
+_DRAWN_LEAST: Final = 20
+_DRAWN_MS: Final = 0.1
+"""Times that differ by less are one time."""
 
 
 # -- a run ----------------------------------------------------------------------------------------
@@ -141,17 +147,34 @@ def _times(report: RunReport, *, verbose: bool) -> Iterator[str]:
     yield ""
     unsure = f" +- {report.uncertainty_s * _MS:g} ms" if report.uncertainty_s else ""
     yield f"times in ms (time stamps: {printable(report.timestamp_source)}{unsure})"
-    rows: list[tuple[str, ...]] = [("", "count", "least", "median", "p95", "p99", "most")]
+    rows: list[tuple[str, ...]] = [("", "count", "least", "median", "p95", "p99", "most", "")]
     for name, measurements in found.items():
         spread = distribution(measurements)
         if spread.count < 2 and not verbose and len(found) > _NOTES_SHOWN:
             continue
         count, *values_s = astuple(spread)
-        rows.append((printable(name), f"{count}", *(f"{value * _MS:.1f}" for value in values_s)))
+        figures = (f"{value * _MS:.1f}" for value in values_s)
+        drawn = _drawn([one.value_s for one in measurements])
+        rows.append((printable(name), f"{count}", *figures, drawn))
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     for row in rows:
         cells = (f"{cell:>{width}}" for cell, width in zip(row[1:], widths[1:], strict=True))
-        yield f"  {row[0]:<{widths[0]}}  " + "  ".join(cells)
+        yield (f"  {row[0]:<{widths[0]}}  " + "  ".join(cells)).rstrip()
+
+
+def _drawn(values_s: Sequence[float]) -> str:
+    """A histogram in a word, from the least value to the most: the darker, the more; empty where
+    there is nothing to draw.
+    """
+    low_s = min(values_s)
+    width_s = (max(values_s) - low_s) / _BINS
+    if len(values_s) < _DRAWN_LEAST or width_s * _MS < _DRAWN_MS / _BINS:
+        return ""
+    counts = [0] * _BINS
+    for value_s in values_s:
+        counts[min(_BINS - 1, int((value_s - low_s) / width_s))] += 1
+    darkest = len(_SHADES) - 1
+    return f"|{''.join(_SHADES[ceil(count / max(counts) * darkest)] for count in counts)}|"
 
 
 # -- what a bench cannot judge --------------------------------------------------------------------
@@ -192,6 +215,8 @@ class ListedCase:
     choices: tuple[str, ...]
     """Keys of the profile that it depends on."""
     can_be_run: bool
+    only_when_named: bool
+    """It wears the device, and runs only when it or its group is named."""
 
 
 def list_lines(cases: Sequence[ListedCase], *, verbose: bool = False) -> Iterator[str]:
@@ -202,6 +227,8 @@ def list_lines(cases: Sequence[ListedCase], *, verbose: bool = False) -> Iterato
             yield f"{case.id}  cannot be run: {case.title}"
             continue
         notes = [", ".join(case.requires)] if case.requires else []
+        if case.only_when_named:
+            notes.append("only when named")
         if case.in_part_without:
             notes.append(f"in part without {', '.join(case.in_part_without)}")
         needs = f"  ({'; '.join(notes)})" if notes else ""

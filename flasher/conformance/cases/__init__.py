@@ -51,6 +51,8 @@ from flasher.conformance.cases import fr as fr
 from flasher.conformance.cases import pw as pw
 from flasher.conformance.cases import rs as rs
 from flasher.conformance.cases import se as se
+from flasher.conformance.cases import so as so
+from flasher.conformance.cases import sp as sp
 from flasher.conformance.cases import tm as tm
 from flasher.conformance.cases import tx as tx
 from flasher.conformance.cases import up as up

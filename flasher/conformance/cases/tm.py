@@ -85,21 +85,23 @@ def times(bench: Bench) -> None:
         with bench.step("transfer of many packets"):
             filler = (bench.filler(_PACKETS) + _REST)[: bench.number("largest_image_bytes")]
             bench.update(len(filler))
-            _measure_packets(bench, filler)
+            measure_packets(bench, filler)
             bench.leave_transfer()
     with bench.step("upgrade"):
         bench.update(len(image))
-        _measure_packets(bench, image)
-        sent = bench.send(bench.encoder.end())
-        within_s = _PATIENCE * bench.limit("complete_s")
-        heard = bench.await_message(Kind.COMPLETE, within_s=within_s)
-        bench.measure(_COMPLETE, heard.at - sent.left_at)
+        measure_packets(bench, image)
+        end_measured(bench)
     for turn in range(_RESETS):
         # Whether it starts each time is EN-01 and RS-03; what is measured by then is judged.
         if not bench.application_runs():
             break
         with bench.step(f"reset {turn + 1}"):
-            _measure_burst(bench)
+            measure_burst(bench)
+    check_times(bench)
+
+
+def check_times(bench: Bench) -> None:
+    """Judge all that was measured by the profile's limits."""
     check, limit = bench.judge.check_measured, bench.limit
     spacing_s, tolerance_s = limit("version_spacing_s"), limit("version_spacing_tolerance_s")
     check(_FIRST, high_s=limit("first_version_s"))
@@ -125,8 +127,8 @@ def _enter(bench: Bench) -> Received:
     return found
 
 
-def _measure_burst(bench: Bench) -> None:
-    """One reset and the whole burst."""
+def measure_burst(bench: Bench, *, wait: bool = True) -> Received:
+    """One reset and its burst; returns its last boot version, with `wait` when it is over."""
     last = _enter(bench)
     for _ in range(bench.number("versions") - 1):
         within_s = _PATIENCE * bench.limit("version_spacing_s")
@@ -135,15 +137,27 @@ def _measure_burst(bench: Bench) -> None:
             break
         bench.measure(_SPACING, heard.at - last.at)
         last = heard
-    bench.collect(bench.host.burst_s)
+    if wait:
+        bench.collect(bench.host.burst_s)
+    return last
 
 
-def _measure_packets(bench: Bench, image: bytes) -> None:
+def measure_packets(bench: Bench, image: bytes) -> None:
+    """All packets of `image`, each one acknowledged."""
     limit_s = _PATIENCE * bench.limit("ack_s")
     for number in range(1, packet_count(len(image)) + 1):
         sent = bench.send_packet(image, number)
         heard = bench.expect(Kind.ACK, within_s=limit_s, number=number)
         bench.measure(_ANSWER, heard.at - sent.left_at)
+
+
+def end_measured(bench: Bench) -> Received:
+    """End of transfer; returns complete."""
+    sent = bench.send(bench.encoder.end())
+    within_s = _PATIENCE * bench.limit("complete_s")
+    heard = bench.await_message(Kind.COMPLETE, within_s=within_s)
+    bench.measure(_COMPLETE, heard.at - sent.left_at)
+    return heard
 
 
 def _longest_frame_s(bench: Bench) -> float:

@@ -1,0 +1,139 @@
+"""SP: speed. Runs only when it is named: it wears the flash. The times are those of TM-05, often
+enough to see how they are spread, so that a slower bootloader is seen in the comparison of two
+reports.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.cases.tm import (
+    check_times,
+    end_measured,
+    measure_burst,
+    measure_packets,
+)
+from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, WEAR, case
+from flasher.conformance.wire import Kind, told_version
+
+_START: Final = "complete to an application that answers"
+_START_AGAIN: Final = "window's end to an application that answers"
+_TAKEN: Final = "last boot version to an update command that is taken"
+_NOT_TAKEN: Final = "last boot version to an update command that is not taken"
+_END: Final = "last boot version to the window's end"
+_PATIENCE: Final = 3
+_ASK_S: Final = 0.02
+"""The application is asked so often: the measured start is later than the real one by so much."""
+_LATE_S: Final = 0.3
+_BEYOND: Final = 1.2
+"""The last update command, in windows."""
+_AT_THE_END: Final = 0.5
+"""The share of the update commands that come within a tenth of the window around its end."""
+_EDGE_S: Final = 0.001
+
+
+@case(
+    "SP-01",
+    "answer times of many upgrades",
+    clause="Welling 5.1, figure 2 (begin); R12",
+    stimulus=f"{WEAR['SP-01']} times (--upgrades) a reset, a start, and an upgrade to the good "
+    "image",
+    expectation="each time within the profile's limits: reset to the first boot version, their "
+    "spacing, update command to request transfer, packet to ACK, end of transfer to complete, to "
+    "an application that answers",
+    requires={DESTRUCTIVE, TIMING, LONG},
+    limit_s=float("inf"),
+)
+def answer_times(bench: Bench) -> None:
+    image = bench.good_image
+    tells = told_version(bench.subject.target, image) is not None
+    if not tells:
+        why = "the device does not tell which application runs"
+        bench.unsupported("the time to an application that answers", why)
+    for turn in range(1, bench.upgrades + 1):
+        with bench.step(f"upgrade {turn}"):
+            last = measure_burst(bench, wait=False)
+            _measure_start(bench, _START_AGAIN, last.at + bench.limit("window_s"), is_asked=tells)
+            bench.reset_to_bootloader()
+            bench.update(len(image))
+            measure_packets(bench, image)
+            _measure_start(bench, _START, end_measured(bench).at, is_asked=tells)
+    check_times(bench)
+    for name in (_START, _START_AGAIN) if tells else ():
+        bench.judge.check_measured(name, high_s=bench.limit("start_s"))
+    bench.info(f"flash wear: the application was erased and written {bench.upgrades} times")
+
+
+def _measure_start(bench: Bench, name: str, since: float, *, is_asked: bool) -> None:
+    """Ask the application until it answers; if it is not asked, wait as long as it may take."""
+    limit_s = bench.limit("start_s")
+    if not is_asked:
+        bench.wait_until(since + limit_s)
+        return
+    deadline = since + _PATIENCE * limit_s
+    while bench.now < deadline:
+        bench.send(bench.encoder.query_version())
+        heard = bench.wait_for(Kind.VERSION_INFORMATION, within_s=_ASK_S)
+        if heard is not None:
+            bench.measure(name, max(0.0, heard.at - since))
+            break
+    else:
+        bench.require_received(None, "an application that answers", deadline - since)
+    while bench.wait_for(Kind.VERSION_INFORMATION, within_s=_LATE_S) is not None:
+        pass
+
+
+@case(
+    "SP-02",
+    "the window, offset by offset",
+    clause="Welling 5.1, figure 2 (begin); R2",
+    stimulus=f"update command {WEAR['SP-02']} times (--upgrades) behind the last boot version, "
+    "half of them around the window's end; those that are taken are upgrades to the good image",
+    expectation="taken up to the window's end, and behind it as the profile says (up_04)",
+    requires={DESTRUCTIVE, TIMING, LONG},
+    choices=("up_04",),
+    limit_s=float("inf"),
+)
+def window(bench: Bench) -> None:
+    window_s, choice = bench.limit("window_s"), bench.choice("up_04")
+    edge_s = max(bench.limit("window_tolerance_s"), 2 * bench.port.uncertainty_s) + _EDGE_S
+    frames = bench.encoder.update(len(bench.good_image))
+    wire_s = sum(47 + 8 * len(frame.data) for frame in frames) / bench.port.bitrate_bps
+    taken: list[float] = []
+    not_taken: list[float] = []
+    for offset_s in _offsets(window_s, bench.upgrades):
+        with bench.step(f"{offset_s * 1000:.1f} ms behind the last boot version"):
+            heard = bench.reset_to_bootloader()
+            for _ in range(bench.number("versions") - 1):
+                heard = bench.next_version()
+            sent = bench.send(frames, at=heard.at + max(offset_s - wire_s, 0.0))
+            at_s = sent.left_at - heard.at
+            request = bench.wait_for(Kind.REQUEST)
+            (not_taken if request is None else taken).append(at_s)
+            bench.measure(_NOT_TAKEN if request is None else _TAKEN, at_s)
+            got = "not taken" if request is None else "taken"
+            if at_s < window_s - edge_s:
+                bench.check(request is not None, "taken", got)
+            elif at_s > window_s + edge_s and choice != "either":
+                bench.check((request is not None) == (choice == "accepted"), choice, got)
+            if request is None:
+                bench.check_application()
+            else:
+                bench.finish(bench.good_image)
+    if taken and not_taken:
+        bench.measure(_END, (max(taken) + min(not_taken)) / 2)
+        bench.info(
+            f"taken {len(taken)} of {bench.upgrades} times, up to {max(taken) * 1000:.1f} ms; not "
+            f"taken from {min(not_taken) * 1000:.1f} ms on"
+        )
+    bench.info(f"flash wear: the application was erased and written {len(taken)} times")
+
+
+def _offsets(window_s: float, count: int) -> list[float]:
+    """Half of them over the window and behind it, half around its end; in seconds."""
+    close = round(count * _AT_THE_END)
+    wide = max(count - close, 1)
+    found = [_BEYOND * window_s * (at + 0.5) / wide for at in range(wide)]
+    found += [window_s * (0.95 + 0.1 * (at + 0.5) / close) for at in range(close)]
+    return sorted(found)
