@@ -6,12 +6,15 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from typing import Final, NamedTuple
 
-from flasher.conformance.results import CaseResult, TraceEntry
+from flasher.conformance.results import CaseResult, RunReport, TraceEntry
+from flasher.conformance.wire import BOOT_VERSION
 from flasher.protocol.frame import Frame
 from flasher.trace.decoder import BusEvent, Decoder
 
 _FRAMES_A_MESSAGE: Final = 20
 _FIELDS: Final = 8
+_FIRST_FRAMES: Final = 200
+"""Of a case, in which its bootloader has announced itself."""
 _LINE: Final = 120
 """Characters of the fields in a line of text."""
 _AFTER_S: Final = 0.02
@@ -91,3 +94,14 @@ def _decoded(entries: Sequence[TraceEntry]) -> list[TraceRow]:
         TraceRow(seen, ", ".join(f"{one.label} {one.text}" for one in islice(seen.fields, _FIELDS)))
         for seen in found
     ]
+
+
+def boot_versions(report: RunReport) -> tuple[str, ...]:
+    """What the bootloader called itself in the frames of a run, each once."""
+    found: dict[str, None] = {}
+    for result in report.results:
+        heard = [entry for entry in result.trace[:_FIRST_FRAMES] if not entry.sent]
+        for row in _decoded(heard):
+            if row.seen.command == BOOT_VERSION:
+                found[" ".join(field.text for field in row.seen.fields)] = None
+    return tuple(found)

@@ -12,7 +12,7 @@ _EDGES = {"mock", "simulated", "real"}
 """Where the suite meets the rest of flasher."""
 _REPORTING = {
     *("decoded", "diff", "html_report", "json_report", "reports"),
-    *("opening", "plugin", "side_by_side"),
+    *("opening", "plugin", "release", "side_by_side"),
 }
 """What opens a bench, and what tells about a run: neither makes nor judges a byte."""
 

@@ -77,12 +77,16 @@ reported as unsupported. Ctrl-C ends the run with a report of what was run, and 
 back; a second one ends at once.
 """
 _TRACE_DIR: Final = "--trace-dir"
-_FILES: Final = {"junit": "--junit", "json_report": "--json-report", "html": "--html"}
+_FILES: Final = {
+    name: f"--{name.replace('_', '-')}"
+    for name in ("junit", "json_report", "html", "badge", "summary")
+}
 """Files that are written: their names in the choices, and their options."""
 _RUN_OPTIONS: Final = frozenset(
     {
         *("--list", "--case", "--group", "--exclude", "--quick", "--seed", "--repeat", "--timeout"),
-        *("--junit", "--json-report", "--html", _TRACE_DIR),
+        *_FILES.values(),
+        _TRACE_DIR,
         *("--json", "--events", "--verbose", "--quiet", "--log-file"),
     }
 )
@@ -165,6 +169,8 @@ class Choices:
     junit: Path | None
     json_report: Path | None
     html: Path | None
+    badge: Path | None
+    summary: Path | None
     trace_dir: Path | None
 
     @property
@@ -215,6 +221,8 @@ _choices = option_set(
     _report("--junit", help="JUnit XML, for CI servers"),
     _report("--json-report", help="the report as JSON, for `flasher conformance diff`"),
     _report("--html", help="the report as one self-contained page"),
+    _report("--badge", help="a drawing (SVG) that says how the run ended"),
+    _report("--summary", help="the run on one page (HTML) to be printed, for a release"),
     option(
         _TRACE_DIR, type=values.FolderPath(), metavar="DIR", panel="reports",
         help="folder for a trace file (candump) of each case that does not pass",
@@ -294,13 +302,8 @@ def _tell(
     report: RunReport, chosen: Choices, output: Output, started_at: str, code: ExitCode
 ) -> None:
     """Print the summary and write the files."""
-    from flasher.conformance.json_report import report_document, to_bytes  # noqa: PLC0415
-    from flasher.conformance.reports import (  # noqa: PLC0415
-        candump,
-        is_traced,
-        junit_report,
-        trace_file_name,
-    )
+    from flasher.conformance.json_report import report_document  # noqa: PLC0415
+    from flasher.conformance.reports import candump, is_traced, trace_file_name  # noqa: PLC0415
 
     replays = replay_commands(report)
     for line in report_lines(report, replays, verbose=output.verbosity > 0):
@@ -314,10 +317,28 @@ def _tell(
         output.progress(f"traces: {len(traces)} in {printable(str(chosen.trace_dir))}")
     document = report_document(report, started_at=started_at, replays=replays, trace_files=traces)
 
+    _write_files(report, document, chosen, output)
+    if code not in (ExitCode.OK, ExitCode.PARTIAL):
+        output.error_line(f"the run is not complete: {printable(report.stopped)}")
+    output.document(ConformanceDocument(document), exit_code=code)
+
+
+def _write_files(
+    report: RunReport, document: ReportDocument, chosen: Choices, output: Output
+) -> None:
+    """The files that were asked for."""
+    started_at = document.started_at
+    replays = {(one.id, one.repeat): one.replay for one in document.results}
+    traces = {(one.id, one.repeat): one.trace_file for one in document.results if one.trace_file}
+
     def junit() -> bytes:
+        from flasher.conformance.reports import junit_report  # noqa: PLC0415
+
         return junit_report(report, started_at=started_at, replays=replays)
 
     def json_report() -> bytes:
+        from flasher.conformance.json_report import to_bytes  # noqa: PLC0415
+
         return to_bytes(document)
 
     def html() -> bytes:
@@ -326,14 +347,21 @@ def _tell(
         page = html_page(report, started_at=started_at, replays=replays, trace_files=traces)
         return page.encode("utf-8")
 
-    for make in (junit, json_report, html):
+    def badge() -> bytes:
+        from flasher.conformance.release import badge  # noqa: PLC0415  loads jinja2
+
+        return badge(report).encode("utf-8")
+
+    def summary() -> bytes:
+        from flasher.conformance.release import summary_page  # noqa: PLC0415  loads jinja2
+
+        return summary_page(report, started_at=started_at).encode("utf-8")
+
+    for make in (junit, json_report, html, badge, summary):
         path: Path | None = getattr(chosen, make.__name__)
         if path is not None:
             write_whole(path, make(), _FILES[make.__name__])
             output.progress(f"{make.__name__.replace('_', ' ')}: {printable(str(path))}")
-    if code not in (ExitCode.OK, ExitCode.PARTIAL):
-        output.error_line(f"the run is not complete: {printable(report.stopped)}")
-    output.document(ConformanceDocument(document), exit_code=code)
 
 
 def replay_commands(report: RunReport) -> dict[tuple[str, int], str]:
