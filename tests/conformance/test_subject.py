@@ -140,6 +140,17 @@ def test_a_call_that_does_not_return_is_ended_and_is_a_finding(
     assert "did not return from flasher_dut_receive" in found
 
 
+class ReadsForEver(PythonBootloader):
+    def _end(self) -> None:
+        while True:
+            self.host.flash_read(0, 32)
+
+
+def test_a_call_that_reads_flash_for_ever_is_ended_and_is_a_finding() -> None:
+    report = _run(_FLAWS + "ReadsForEver", "EN-01")
+    assert "16 times over in one call" in _failures(report) + report.not_upgradable + report.stopped
+
+
 def test_no_process_is_left_behind() -> None:
     with open_subject(_HERE, "bms", None, good_image=None, second_image=None) as (device, _):
         device.power(on=True)

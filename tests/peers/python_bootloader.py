@@ -21,6 +21,8 @@ _SPACING_US = 50_000
 _WINDOW_US = 200_000
 _PAUSE_US = 5_000_000
 _FRAME_GAP_US = 100_000
+_DRAIN_US = 100_000
+"""Alone on the bus, frames wait for ever; the application does not."""
 
 
 def _crc_table() -> list[int]:
@@ -162,8 +164,11 @@ class PythonBootloader:
         check = zlib.crc32(self.host.flash_read(_AREA, self._size))
         self.host.flash_write(0, struct.pack("<IIII", _MAGIC, self._size, check, 0))
         self._send(b"\xc5\x02", bytes(2))
+        self._start_application()
+
+    def _start_application(self) -> None:
         self._is_starting = True
-        self._due_at = self._now
+        self._due_at = self._now + _DRAIN_US
 
     def _nak(self) -> None:
         wanted = min(self._stored + 1, -(-self._size // 128))
@@ -178,7 +183,8 @@ class PythonBootloader:
     def tick(self, now_us: int) -> int | None:
         self._now = now_us
         if self._is_starting:
-            if not self._frames and not self.host.transmit_pending():
+            all_sent = not self._frames and not self.host.transmit_pending()
+            if all_sent or now_us >= self._due_at:
                 self.host.start_application()
             return now_us
         if now_us < self._due_at:
@@ -186,7 +192,7 @@ class PythonBootloader:
         if self._stored >= 0:
             self._stored, self._size, self._announced = -1, 0, 0
         if self._announced >= _BURST and self._is_whole():
-            self._is_starting = True
+            self._start_application()
             return now_us
         self._send(b"\xc1\x09", b"BMSV1.0.0")
         self._announced += 1

@@ -39,6 +39,8 @@ _HEAD: Final = Struct("<II8sI")
 _STACK: Final = 0x2000_1000
 _ENTRY: Final = AREA_START + 0x101
 _CHECKSUM_SIZE: Final = 4
+_TIMES_OVER: Final = 16
+"""A call that reads, erases and writes more than all flash so many times does not return."""
 
 
 def application_image(version: str, size_bytes: int) -> bytes:
@@ -98,6 +100,8 @@ class CompiledDevice(Machine):
         self._busy_until = -inf
         """The processor is in a call, or waits for the flash."""
         self._tick_at = inf
+        self._handled_bytes = 0
+        """Bytes of flash that this call has read, erased and written."""
         self._operations = 0
         self._cut: tuple[int, float, float] | None = None
         self._cause = POWER_ON
@@ -126,14 +130,15 @@ class CompiledDevice(Machine):
         wanted = [inf if (found := super().deadline()) is None else found]
         if self._process.is_running:
             wanted.append(self._busy_until if self._received else self._next_turn_at)
-        if self._to_send:
+        if self._to_send and not self.is_off_bus:
             wanted.append(self._busy_until)
         due_at = min(wanted)
         return None if due_at == inf else due_at
 
     def next_frame(self, now: float) -> Frame | None:
         if self._to_send:
-            return self._to_send[0] if now >= self._busy_until else None
+            is_ready = now >= self._busy_until and not self.is_off_bus
+            return self._to_send[0] if is_ready else None
         return super().next_frame(now)
 
     def frame_sent(self, now: float) -> None:
@@ -242,6 +247,7 @@ class CompiledDevice(Machine):
         return len(self._to_send) + (now < self._left_at)
 
     def _call(self, kind: Kind, number: int, now: float, frame: bytes = b"") -> None:
+        self._handled_bytes = 0
         try:
             answer = self._process.call(
                 kind, pipes.TURN.pack(round(now * _US), number), frame, during=self._hardware
@@ -268,11 +274,10 @@ class CompiledDevice(Machine):
             if wanted_us != pipes.NEVER:
                 is_later = wanted_us > left_us
                 self._tick_at = wanted_us / _US if is_later else self._busy_until + _TICK_S
-            if self._off_bus_until is None:
-                size = pipes.FRAME.size
-                for at in range(pipes.DONE.size, len(data), size):
-                    made = pipes.unpack_frame(data[at : at + size])
-                    self._to_send.append(Frame(*made[:4]))
+            size = pipes.FRAME.size
+            for at in range(pipes.DONE.size, len(data), size):
+                made = pipes.unpack_frame(data[at : at + size])
+                self._to_send.append(Frame(*made[:4]))
 
     def _hardware(self, asked: Kind, data: bytes) -> bytes | None:
         """What a function of the hardware gives; None for no answer."""
@@ -281,11 +286,13 @@ class CompiledDevice(Machine):
             return None
         if asked is Kind.FLASH_READ:
             offset, size_bytes = pipes.RANGE.unpack(data)
+            self._count(size_bytes)
             return self.flash.read(self.flash.start + offset, size_bytes)
         now_us, offset = pipes.PLACE.unpack_from(data)
         address, content = self.flash.start + offset, data[pipes.PLACE.size :]
         is_erase = asked is Kind.FLASH_ERASE
         units = len(content) // self.facts.write_bytes
+        self._count(self.facts.sector_bytes if is_erase else len(content))
         takes_us = self.facts.erase_us if is_erase else units * self.facts.write_us
         if self._is_cut_here():
             _, share, off_s = self._cut or (0, 0.0, 0.0)
@@ -302,6 +309,14 @@ class CompiledDevice(Machine):
         else:
             self.flash.program(address, content)
         return pipes.TIME.pack(now_us + takes_us)
+
+    def _count(self, size_bytes: int) -> None:
+        self._handled_bytes += size_bytes
+        if self._handled_bytes > _TIMES_OVER * self.facts.flash_bytes:
+            raise BootloaderError(
+                f"the bootloader handled all its flash {_TIMES_OVER} times over in one call, which "
+                "does not seem to return, and was ended"
+            )
 
     def _is_cut_here(self) -> bool:
         """Counts flash operations; True for the one at which the power is to be cut."""
