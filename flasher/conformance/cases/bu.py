@@ -19,6 +19,7 @@ from flasher.conformance.wire import (
     Kind,
     RawFrame,
     Received,
+    describe,
     packet_count,
 )
 
@@ -160,8 +161,10 @@ def disturbed_frames(bench: Bench) -> None:
     "the device goes bus-off",
     clause="robustness, not in the document",
     stimulus="the device's controller leaves the bus for 0.2 s before, between and after the "
-    "frames of every message, and in the middle of its answers",
-    expectation="the device is back, and the upgrade by a patient host completes correctly",
+    "frames of every message, and in the middle of its answers; from a power-up on, for as long "
+    "as its application takes to start",
+    expectation="the device is back, and the upgrade by a patient host completes correctly; alone "
+    "on the bus, where no frame of it is acknowledged, it starts its application too",
     requires={DESTRUCTIVE, Requirement.BUS_OFF},
     limit_s=1800.0,
 )
@@ -175,6 +178,23 @@ def bus_off(bench: Bench) -> None:
         )
 
     _upgrade_disturbed(bench, disturbances)
+    with bench.step("off the bus from a power-up on"):
+        _start_alone(bench)
+
+
+def _start_alone(bench: Bench) -> None:
+    if not bench.subject.has_power:
+        bench.unsupported("the application starts", "needs power control")
+        return
+    off_s = bench.host.burst_s + bench.limit("start_s")
+    bench.power_cycle()
+    bench.subject.bus_off(off_s)
+    bench.wait(off_s / 2)
+    bench.forget()
+    heard = bench.collect(off_s / 2 + bench.host.burst_s)
+    versions = [one for one in heard if one.kind is Kind.BOOT_VERSION]
+    bench.check(not versions, "the application runs by then", describe(versions))
+    bench.check_application()
 
 
 @case(

@@ -45,6 +45,7 @@ _LOADED_PACKETS: Final = 24
 _BABBLE_ID: Final = 0x001
 _BABBLE_S: Final = 1.0
 _BABBLE_BURST: Final = 16
+_BABBLE_SHORTLY: Final = 10 * (RawFrame(_BABBLE_ID, bytes(8)),)
 
 _REPORTS: Final = (
     # Of the motor controller.
@@ -88,7 +89,8 @@ _MEMORY_READ: Final = 0x4308
     "bus load and a babbling node",
     clause="Welling 2.2.2, table 2; robustness, not in the document",
     stimulus="90 % bus load of other ids around reset, update command and packets; a node that "
-    "takes the whole bus with id 001 for 1 s, in the announcements and in the transfer",
+    "takes the whole bus with id 001 for 1 s, in the announcements and in the transfer, and for "
+    "5 ms behind end of transfer",
     expectation="nothing fails under load; what the babbling node delays goes on after it",
     requires={DESTRUCTIVE, LONG},
     choices=("up_04_burst",),
@@ -122,8 +124,11 @@ def load(bench: Bench) -> None:
         if not any(one.kind is Kind.ACK and one.number == loaded for one in heard_all):
             trouble = bench.host.insist_on_packet(image, loaded, began_at)
             bench.require(not trouble, f"ACK {loaded}", trouble or "it")
-    with bench.step("the rest"):
-        bench.finish(image, loaded + 1)
+    with bench.step("end of transfer, the bus taken behind it"):
+        bench.packets(image, loaded + 1)
+        bench.send([*bench.encoder.end(), *_BABBLE_SHORTLY])
+        bench.expect(Kind.COMPLETE)
+        bench.check_image(image)
 
 
 @case(

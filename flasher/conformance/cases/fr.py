@@ -50,6 +50,8 @@ _WRONG_TAILS: Final = (0x00, 0x0F, 0xF1, 0x55, 0xFF)
 _PADDINGS: Final = (0x00, 0xFF, 0xAA, 0x55, 0xF0)
 _UNKNOWN: Final = 0x77FD
 """A command that nobody has, with as many bytes as a message can hold."""
+_LONG_UNKNOWN: Final = (0x77F5, 0x77F7, _UNKNOWN)
+"""Messages of these have 254 bytes, 256, and as many as can be."""
 _UNKNOWN_COMMANDS: Final = (0x0000, 0x0100, 0x7704, 0xA202, 0xC601, 0xFF10, _UNKNOWN)
 _PACKET: Final = PACKET.to_bytes(2, "big")
 _END: Final = END.to_bytes(2, "big") + END_MARK
@@ -298,7 +300,8 @@ def back_to_back(bench: Bench) -> None:
     "FR-09",
     "frames that carry no payload",
     clause="Welling 2.1; Welling 2.2.3, table 3",
-    stimulus="frames of 0 bytes, remote, extended and error frames between the frames of a packet",
+    stimulus="frames of 0 bytes, remote, extended and error frames, and frames of the ids that "
+    "differ in one bit, between the frames of a packet",
     expectation="never taken for payload: the packet is acknowledged",
     requires={DESTRUCTIVE},
 )
@@ -321,7 +324,8 @@ def no_payload(bench: Bench) -> None:
     "FR-10",
     "unknown mode, unknown command",
     clause="Welling 2.2.1 (2); R15",
-    stimulus="packets and update commands with modes that nobody has; commands that nobody has",
+    stimulus="packets and update commands with modes that nobody has; commands that nobody has, "
+    "with a whole packet in their data too",
     expectation="rejected with NAK or silence; update command and packets are taken as before",
     requires={DESTRUCTIVE},
 )
@@ -339,6 +343,10 @@ def unknown(bench: Bench) -> None:
     for command in _UNKNOWN_COMMANDS:
         with bench.step(f"command {command:04X}"):
             probe.discard(_of_command(bench, command))
+    for command in _LONG_UNKNOWN:
+        with bench.step(f"command {command:04X} with a packet at the start of a frame of it"):
+            data = bytes(2) + probe.raw()
+            probe.discard(encoder.message(WRITE, command, data.ljust(command & 0xFF, b"\x00")))
     probe.check_stored()
 
 
@@ -451,3 +459,6 @@ def _strangers(to_device: int) -> Iterator[tuple[str, RawFrame]]:
         RawFrame(to_device << 18, b"\x12" * 8, is_extended=True),
     )
     yield "an error frame", RawFrame(to_device, bytes(8), is_error=True)
+    for bit in range(11):
+        other = to_device ^ 1 << bit
+        yield f"a frame of id {other:03X}", RawFrame(other, b"\x12" * 8)

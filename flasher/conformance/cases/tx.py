@@ -4,6 +4,7 @@ pauses and resets during a transfer.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from typing import Final
 
@@ -45,6 +46,7 @@ _SHORT: Final = 0.5
 """A pause that is no pause, as a part of limits.pause_s."""
 _LONG: Final = 1.5
 _JUST_NOT: Final = 0.9
+_CHECKSUM_BYTES: Final = 4
 _WRAP_S: Final = 66.0
 """More than 65.536 s, where a clock of milliseconds in 16 bits wraps."""
 _APART_S: Final = 3.0
@@ -334,8 +336,9 @@ def wrong_start_byte(bench: Bench) -> None:
     "TX-07",
     "many packets",
     clause="Welling 5.2, table 8 (A385); R4; R9",
-    stimulus="the largest image, all its packets: across 255/256, up to the last one",
-    expectation="every packet is accepted and stored at its place",
+    stimulus="the largest image, all its packets: across 255/256, up to the last one; once more, "
+    "the good image with FF behind it, with the end of transfer",
+    expectation="every packet is accepted and stored at its place; the second one runs",
     requires={DESTRUCTIVE, LONG},
     limit_s=7200.0,
 )
@@ -344,25 +347,57 @@ def many_packets(bench: Bench) -> None:
         raise Unsupported("only power ends a transfer of this product, and none is controlled")
     size = bench.number("largest_image_bytes")
     image = bench.random.randbytes(size)
-    total = packet_count(size)
     bench.start_transfer(size)
-    for number in range(1, total + 1):
-        sent = bench.send_packet(image, number)
-        heard = bench.next_message(bench.limit("ack_s"))
-        # One check for them all: 65535 are too many to read.
-        if heard is None or (heard.kind, heard.number) != (Kind.ACK, number):
-            bench.fail(f"ACK {number}", heard or "nothing")
-            return
-        bench.measure("packet to ACK", heard.at - sent.left_at)
-    bench.succeed(f"ACK 1 to {total}", "all of them")
+    if not _send_all(bench, image):
+        return
     # Never ended, as nobody could start it; what may still be in a buffer is not looked at.
     buffer_bytes = max(_BUFFER_BYTES, bench.number("buffer_bytes"))
     if size > buffer_bytes:
         bench.check_stored(image[:-buffer_bytes])
     else:
         bench.unsupported("the flash holds the image", "all of it may be in a buffer still")
-    if bench.choice("tx_12") == "announces":
+    with bench.step("once more, to its end"):
         bench.leave_transfer()
+        whole = _filled(bench, size)
+        bench.update(len(whole))
+        if not _send_all(bench, whole):
+            return
+        bench.send(bench.encoder.end())
+        within_s = bench.limit("complete_s")
+        heard = bench.wait_for(Kind.COMPLETE, Kind.NAK, within_s=within_s)
+        if heard is not None and heard.kind is Kind.NAK:
+            why = "the device refuses the good image with FF behind it, by a check of its own"
+            bench.unsupported("the largest image runs", why)
+            return
+        bench.require_received(heard, Kind.COMPLETE.value, within_s)
+        bench.check_image(whole)
+
+
+def _send_all(bench: Bench, image: bytes) -> bool:
+    """All packets, in one check, as 65535 are too many to read; False when it failed."""
+    total = packet_count(len(image))
+    for number in range(1, total + 1):
+        sent = bench.send_packet(image, number)
+        heard = bench.next_message(bench.limit("ack_s"))
+        if heard is None or (heard.kind, heard.number) != (Kind.ACK, number):
+            bench.fail(f"ACK {number}", heard or "nothing")
+            return False
+        bench.measure("packet to ACK", heard.at - sent.left_at)
+    bench.succeed(f"ACK 1 to {total}", "all of them")
+    return True
+
+
+def _filled(bench: Bench, size: int) -> bytes:
+    """The good image with FF behind it, as the flash behind it reads else, and with its checksum
+    where the product's images have one.
+    """
+    image = bench.good_image
+    if bench.choice("en_04") == "none":
+        return image.ljust(size, b"\xff")
+    if len(image) > size - _CHECKSUM_BYTES:
+        return image
+    body = image.ljust(size - _CHECKSUM_BYTES, b"\xff")
+    return body + zlib.crc32(body).to_bytes(_CHECKSUM_BYTES, "little")
 
 
 @case(

@@ -218,7 +218,7 @@ class DarkAfterSecondCut(HangingDevice):
     "EN-01",
     "does not find the new application any more after the next restart",
     also="CR-03 RS-01 RS-02 RS-03 RS-05 UP-02 UP-03 UP-04 UP-06 TX-03 EN-02 TM-05 PW-01 "
-    "SE-01 SE-03 SE-04 CO-01",
+    "SE-01 SE-03 SE-04 CO-01 BU-02",
 )
 class RunsOnce(MockDevice):
     _ended = False

@@ -66,6 +66,7 @@ class HeaderAtFrameStart(Reassembler):
     "header-in-data-restarts",
     "FR-03",
     "begins a new message where 55 AA stands at the start of a frame of data",
+    also="FR-10",
 )
 class HeaderRestarts(Reassembler):
     """Begins anew at every frame that starts with a header's bytes."""
@@ -276,7 +277,7 @@ class LongCommandsAccepted(Reassembler):
     "tail-in-crc",
     "FR-03",
     "takes F0 in the first byte of a CRC for the tail",
-    also="FR-02 TM-05",
+    also="FR-02 TX-07 TM-05",
 )
 class TailInCrc(Reassembler):
     """Looks for the tail from the end of the data on: the CRC before it may hold the same byte."""

@@ -52,7 +52,7 @@ class ImpatientWithGaps(MockDevice):
     "slow-sixteenth-packet",
     "TM-05",
     "acknowledges packets 16, 32, ... after 0.6 s",
-    also="FR-03 TX-07 TX-12",
+    also="FR-03 FR-09 TX-07 TX-12",
 )
 class SlowSixteenth(MockDevice):
     def _store(self, now: float) -> str:
@@ -131,7 +131,7 @@ class LogsUseless(HangingDevice):
     "noise-hangs",
     "SE-03",
     "hangs at 64 bytes of junk in a row, or at a report sent to its bootloader",
-    also="SE-01 FR-10 FR-02 TX-01 BU-01 CR-01 CR-02 FR-06",
+    also="SE-01 FR-10 FR-02 FR-09 TX-01 BU-01 CR-01 CR-02 FR-06",
 )
 class NoiseHangs(HangingDevice):
     def _take_message(self, message: Message, now: float) -> None:

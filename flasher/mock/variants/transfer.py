@@ -266,7 +266,7 @@ class BigEndianNak(BigEndianNumbers):
     "damage-ends-transfer",
     "TX-01",
     "announces itself again when a packet was damaged",
-    also="FR-02 FR-04 FR-05 FR-06 CR-01 CR-02 CR-03 CR-04 BU-01",
+    also="FR-02 FR-04 FR-05 FR-06 FR-09 CR-01 CR-02 CR-03 CR-04 BU-01",
 )
 class DamageEndsTransfer(MockDevice):
     def _take_damage(self, damage: Damage, now: float) -> None:
@@ -398,6 +398,7 @@ class AcksTwice(MockDevice):
     "blank-packet-unanswered",
     "FR-03",
     "does not acknowledge a packet of nothing but FF until it is repeated",
+    also="TX-07",
 )
 class BlankPacketUnanswered(MockDevice):
     """Has nothing to program for a blank packet, and forgets to answer it."""
