@@ -311,6 +311,8 @@ class RunReport:
                 f"running application had none: {self.not_upgradable}"
             )
         lines += [f"after {rescue.id}: {rescue.how}" for rescue in self.rescues]
+        if self.strict and self.count(CaseVerdict.PASS_IN_PART):
+            lines.append("a pass in part is none, as the run is strict")
         if self.resolved_deviations:
             named = ", ".join(dict.fromkeys(self.resolved_deviations))
             lines.append(f"deviations in the profile that are none any more: {named}")

@@ -117,7 +117,9 @@ def test_a_part_that_the_bench_cannot_do_is_said_and_the_rest_judged() -> None:
     assert one(report, "FR-00").not_tried == ("a thing (no tool)",)
     assert report.in_full == "0 of 1 passes were judged in full"
     assert report.ok
-    assert not run_case(partly, strict=True).ok
+    strict = run_case(partly, strict=True)
+    assert not strict.ok
+    assert strict.remarks() == ["a pass in part is none, as the run is strict"]
     assert status_of(not_to_its_end) is CaseVerdict.PASS_IN_PART
     assert status_of(only_said) is CaseVerdict.UNSUPPORTED
 
