@@ -43,15 +43,15 @@ def _found(explored: Explored) -> tuple[str, str]:
     ids=lambda choices: next(iter(choices)),
 )
 def test_nothing_is_found_on_a_device_of_other_choices(choices: dict[str, str]) -> None:
-    assert _explorer(**choices).explore(600).finding is None
+    assert _explorer(**choices).explore(250).finding is None
 
 
 @pytest.mark.parametrize("target", ["wmc", "bms", "obc"])
 def test_nothing_is_found_on_a_right_device(target: str) -> None:
-    explored = _explorer(target=target).explore(600)
+    explored = _explorer(target=target).explore(250)
     assert explored.finding is None
     assert explored.stopped == ""
-    assert explored.steps >= 600
+    assert explored.steps >= 250
 
 
 @pytest.mark.parametrize(
