@@ -96,7 +96,9 @@ class PatientHost:
                 return True
             if tester.now >= deadline:
                 return False
-            tester.wait(self.burst_s)
+            # One that restarts at each reset would never come to its application.
+            restarts = self._profile.choice("rs_02") == "restarts"
+            tester.wait(self.burst_s + (self._profile.limit("first_version_s") if restarts else 0))
 
     def send_packet(self, image: bytes, number: int) -> Sent:
         """Send a packet of `image` and wait for nothing."""
@@ -132,7 +134,8 @@ class PatientHost:
             if heard is None and not blind:
                 return False
             sent = self._tester.send(self._encoder.update(size_bytes))
-            within_s = max(limit("erase_s"), limit("pause_s") + limit_s if blind else 0.0)
+            # A boot version may have been the last one before a restart (RS-02).
+            within_s = max(limit("erase_s"), limit("pause_s") + limit_s if blind else limit_s)
             heard = self.request_or_version(sent.left_at, within_s)
             if heard is None or heard.kind is Kind.REQUEST:
                 return heard is not None

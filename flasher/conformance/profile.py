@@ -19,6 +19,7 @@ import os
 import re
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -227,8 +228,10 @@ class ConformanceProfile:
         value: Value = self.given.get(path, _READER.keys[path].default)
         return value
 
-    def to_toml(self) -> str:
-        """The whole profile as a file: every key with its help, defaults as comments."""
+    def to_toml(self, remarks: Mapping[str, str] = MappingProxyType({})) -> str:
+        """The whole profile as a file: every key with its help, defaults as comments; `remarks` say
+        of some keys why they stay open.
+        """
         lines: list[str] = []
         table = ""
         for path, key in profile_keys().items():
@@ -236,7 +239,10 @@ class ConformanceProfile:
             if its_table != table:
                 table = its_table
                 lines += ["", f"[{table}]"]
-            lines += [f"# {key.text} ({key.allowed})", self._line(path, name)]
+            lines.append(f"# {key.text} ({key.allowed})")
+            if path in remarks:
+                lines.append(f"# open: {printable(remarks[path])}")
+            lines.append(self._line(path, name))
         lines += ["", f"[{DEVIATIONS}]", '# "TX-03" = "why the product differs here"']
         lines += [f"{_quoted(name)} = {_quoted(why)}" for name, why in self.deviations.items()]
         return "\n".join(lines) + "\n"

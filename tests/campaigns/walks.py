@@ -25,7 +25,7 @@ from tests.variant_matrix import AREA_BYTES
 
 WANTED: Final = 60
 _STEPS_MAX: Final = 10_000_000
-_CHOICES: Final[dict[str, tuple[Any, ...]]] = {
+CHOICES: Final[dict[str, tuple[Any, ...]]] = {
     "reset_in_bootloader": ("ignored", "restarts"),
     "without_application": ("announces", "listens"),
     "update_in_transfer": ("starts_over", "ignored"),
@@ -73,7 +73,7 @@ def right_choices(seed: str) -> Iterator[dict[str, Any]]:
     """Right devices: every choice by chance."""
     chance = random.Random(seed)
     while True:
-        yield {key: chance.choice(values) for key, values in _CHOICES.items()}
+        yield {key: chance.choice(values) for key, values in CHOICES.items()}
 
 
 def main() -> int:

@@ -15,7 +15,7 @@ from typing import Final
 import click
 
 from flasher.cli import values
-from flasher.cli.bench import conformance_explore
+from flasher.cli.bench import conformance_explore, conformance_init
 from flasher.cli.bench.conformance_bench import (
     BenchChoices,
     bench_options,
@@ -23,6 +23,7 @@ from flasher.cli.bench.conformance_bench import (
     set_option,
 )
 from flasher.cli.bench.conformance_explore import explore
+from flasher.cli.bench.conformance_init import init
 from flasher.cli.bench.conformance_text import (
     ListedCase,
     difference_lines,
@@ -69,6 +70,7 @@ examples:
   flasher conformance diff old.json new.json
   flasher conformance compare a.json b.json c.json --html side_by_side.html
   flasher conformance profile > p.toml
+  flasher conformance init -t bms --subject ./boot -o boot.toml
   flasher conformance header .
   flasher conformance -t bms --subject ./boot
 
@@ -144,7 +146,7 @@ class HeaderDocument:
 DOCUMENTS: Final = (
     ConformanceDocument, CaseListDocument, Difference, SideBySide, ProfileKeysDocument,
     HeaderDocument,
-    *conformance_explore.DOCUMENTS,
+    *conformance_explore.DOCUMENTS, *conformance_init.DOCUMENTS,
 )  # fmt: skip
 
 
@@ -533,3 +535,4 @@ def header(output: Output, *, folder: Path) -> int:
 
 
 conformance.add_command(explore, "explore")
+conformance.add_command(init, "init")

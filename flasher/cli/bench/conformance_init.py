@@ -1,0 +1,191 @@
+"""`flasher conformance init`: asks a device, and writes the profile that it is judged by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from flasher.cli import values
+from flasher.cli.bar import Bar
+from flasher.cli.bench.conformance_bench import BenchChoices, bench_options, confirm_wear
+from flasher.cli.files import check_writable, write_whole
+from flasher.cli.framework import command, option, option_set
+from flasher.cli.options import Bus, adapter_options
+from flasher.cli.output import Output
+from flasher.cli.stop import stop_on_signal
+from flasher.errors import ExitCode, UsageError
+from flasher.protocol.text import printable
+
+if TYPE_CHECKING:
+    from flasher.conformance.init import Asked
+    from flasher.conformance.profile import ConformanceProfile
+
+_EXAMPLES: Final = """\
+examples:
+  flasher conformance init -t bms --subject ./boot -o boot.toml
+  flasher conformance init -t bms --mock --set repeated_packet=nak_next -o mock.toml
+  flasher conformance init -t bms -i socketcan -c can0 --good-image known_good.hex -o p.toml
+
+The device is upgraded to its good image again and again, some hundred times, and what it answers to
+this and that in between is written with how often it was seen. What cannot be found out stays open,
+as a comment with the reason. Read the file before you judge by it: it says what the device does,
+and not what it should do. --profile names what is believed where nothing can be seen.
+"""
+_OUTPUT: Final = "-o/--output"
+_SEEN_SHOWN: Final = 100
+
+
+@dataclass(frozen=True)
+class AnswerDocument:
+    """What is written for a key of the profile."""
+
+    key: str
+    value: str | int | float | None
+    """None (null) where it stays open."""
+    seen: str
+    """What was seen, or why it stays open."""
+
+
+@dataclass(frozen=True)
+class InitDocument:
+    """What a device answered."""
+
+    subject: str
+    target: str
+    answers: list[AnswerDocument]
+    toml: str
+    """The profile; empty when nothing is written."""
+    file: str
+    """Its file; empty when none was written."""
+    stopped: str
+    """Why it ended early; empty when it did not."""
+
+
+DOCUMENTS: Final = (InitDocument,)
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What is written."""
+
+    output: Path | None
+    force: bool
+    yes: bool
+
+
+_what = partial(option, panel="what is written")
+_choices = option_set(
+    "chosen",
+    Choices,
+    _what(
+        "-o", "--output", type=values.FilePath("toml", gives=Path), metavar="FILE", brief=True,
+        help="the profile (default: the name of the target, as bms.toml)",
+    ),
+    _what("--force", is_flag=True, brief=True, help="write over a file that exists"),
+    _what("-y", "--yes", is_flag=True, help="do not ask before a device on a bus is worn"),
+)  # fmt: skip
+
+
+@command(
+    short_help="Ask a device, and write the profile that it is judged by",
+    epilog=_EXAMPLES,
+    exit_codes=(
+        ExitCode.IMAGE, ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.PARTIAL, ExitCode.INTERRUPTED,
+    ),
+)  # fmt: skip
+@bench_options
+@_choices
+@adapter_options
+def init(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> int:
+    """Ask a device everything that a profile says, on the bus alone, and write the profile with
+    what was seen. The good image runs before and after it.
+    """
+    from flasher.conformance.init import UPGRADES, ask  # noqa: PLC0415  much is loaded
+    from flasher.conformance.opening import open_bench  # noqa: PLC0415
+    from flasher.conformance.profile import ConformanceProfile, load_profile  # noqa: PLC0415
+
+    described = bench.described(bus)
+    path = chosen.output or Path(f"{described.target}.toml")
+    _check(path, force=chosen.force)
+    # What the bench knows of its device besides has to be seen like everything else.
+    start = ConformanceProfile() if bench.profile is None else load_profile(bench.profile)
+    if not described.is_simulated:
+        said = f"the questions erase and write the device about {UPGRADES} times"
+        confirm_wear(said, is_agreed=chosen.yes)
+    stopping = lambda: output.progress(  # noqa: E731
+        "stopping: the device gets its good image back; press again to end at once"
+    )
+    with (
+        open_bench(described) as (subject, _),
+        stop_on_signal(stopping) as stopped,
+        Bar(output, leave=False, unit=" questions") as bar,
+    ):
+        asked = ask(subject, start, stopped=stopped, progress=bar.move_to)
+        was_stopped = stopped()
+    return _tell(asked, start, path, output, force=chosen.force, was_stopped=was_stopped)
+
+
+def _check(path: Path, *, force: bool) -> None:
+    """Raises UsageError for a file that cannot, or must not, be written."""
+    check_writable(path, _OUTPUT)
+    if path.exists() and not force:
+        raise UsageError(
+            f"{printable(str(path))} exists already.",
+            where=_OUTPUT,
+            remedy="Name another file, or add --force.",
+        )
+
+
+def _tell(
+    asked: Asked,
+    start: ConformanceProfile,
+    path: Path,
+    output: Output,
+    *,
+    force: bool,
+    was_stopped: bool,
+) -> int:
+    """Print what was seen, and write the file unless the questions ended early."""
+    width = max(len(one.key) for one in asked.answers)
+    broad = max(len(str(_shown(one.value))) for one in asked.answers)
+    for one in asked.answers:
+        seen = one.seen
+        if output.verbosity <= 0 and len(seen) > _SEEN_SHOWN:
+            seen = seen[: _SEEN_SHOWN - 3] + "..."
+        output.result(printable(f"{one.key:<{width}}  {_shown(one.value):<{broad}}  {seen}"))
+    toml, code = "", ExitCode.OK
+    if asked.stopped:
+        code = ExitCode.PARTIAL
+        if was_stopped:
+            code = ExitCode.INTERRUPTED
+        elif not asked.was_brought_up:
+            code = ExitCode.NO_ANSWER
+        output.error_line(f"no profile is written: {printable(asked.stopped)}")
+    else:
+        head = f"# What {printable(asked.subject)} answered, target {asked.target}."
+        toml = head + "\n" + asked.profile(start).to_toml(asked.open)
+        _check(path, force=force)
+        write_whole(path, toml.encode("utf-8"), _OUTPUT)
+        count = len(asked.answers)
+        output.result(
+            f"{printable(str(path))}: {count - len(asked.open)} of {count} keys, each with what "
+            f"was seen; {len(asked.open)} stay open"
+        )
+    output.document(
+        InitDocument(
+            asked.subject,
+            asked.target,
+            [AnswerDocument(one.key, one.value, one.seen) for one in asked.answers],
+            toml,
+            str(path) if toml else "",
+            asked.stopped,
+        ),
+        exit_code=code,
+    )
+    return code
+
+
+def _shown(value: str | int | float | None) -> str:
+    return "open" if value is None else str(value)

@@ -1,0 +1,227 @@
+"""A profile from a device: every key of it is asked on the bus, and is written with what was seen.
+
+The questions are asked in upgrades to the good image alone, which are all brought to their end.
+What cannot be found out stays open, and it is said why.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.diagnosis import diagnose
+from flasher.conformance.init import entering, transferring
+from flasher.conformance.init.answers import Answer, limit
+from flasher.conformance.init.session import (
+    ANSWER,
+    COMPLETE,
+    FEEDBACK,
+    FIRST,
+    GAP,
+    LATE,
+    POWERED,
+    REQUEST,
+    RESTARTED,
+    START,
+    START_AGAIN,
+    Session,
+)
+from flasher.conformance.profile import ConformanceProfile, Value, profile_keys
+from flasher.conformance.restore import restore
+from flasher.conformance.results import CaseEnded, RunStopped
+from flasher.conformance.subject import Subject
+
+UPGRADES: Final = 100
+"""About how often the device is erased: some forty upgrades, sizes, and what goes wrong."""
+Question = Callable[[Session], Iterator[Answer]]
+QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
+    (
+        entering.burst,
+        (
+            "device.reset_command",
+            "device.reset_data",
+            "device.versions",
+            "limits.version_spacing_s",
+            "limits.version_spacing_tolerance_s",
+        ),
+    ),
+    (entering.upgrade, ("en_03",)),
+    (entering.in_burst, ("up_04_burst",)),
+    (entering.window, ("limits.window_s", "limits.window_tolerance_s", "up_04")),
+    (entering.reset_in_bootloader, ("rs_02",)),
+    (entering.rejected_update, ("up_02",)),
+    (entering.application, ("up_03",)),
+    (transferring.repeated_packet, ("tx_02",)),
+    (transferring.pause, ("tx_12", "limits.pause_s")),
+    (transferring.reset_again, ("tx_13",)),
+    (transferring.update_again, ("up_08",)),
+    (transferring.bad_packet, ("tx_01",)),
+    (transferring.lost_frame, ("tx_01_lost_frame",)),
+    (transferring.older_packet, ("tx_03",)),
+    (transferring.filler, ("tx_08",)),
+    (transferring.splits, ("fr_01",)),
+    (transferring.junk, ("fr_02",)),
+    (transferring.wrong_tail, ("fr_04",)),
+    (transferring.padded, ("fr_07",)),
+    (transferring.gaps, ("tm_02",)),
+    (transferring.end_again, ("en_02",)),
+    (entering.without_application, ("rs_03",)),
+    (transferring.buffer, ("device.buffer_bytes",)),
+    (entering.largest_image, ("device.largest_image_bytes",)),
+)
+"""The questions in their order, each with the keys that it answers: a later one may build on what
+an earlier one found.
+"""
+LIMITS: Final[dict[str, tuple[float, tuple[str, ...]]]] = {
+    "limits.feedback_s": (0.2, (FEEDBACK,)),
+    "limits.first_version_s": (0.5, (FIRST, POWERED, GAP, LATE, RESTARTED)),
+    "limits.start_s": (1.0, (START, START_AGAIN)),
+    "limits.erase_s": (0.5, (REQUEST,)),
+    "limits.ack_s": (0.1, (ANSWER,)),
+    "limits.complete_s": (0.5, (COMPLETE,)),
+}
+"""Limits: the least that is written, in seconds, and the times that they are made of."""
+NOT_ASKED: Final = {
+    "en_04": "an image with a wrong checksum would have to be completed; say what the product has",
+    "limits.inter_frame_s": "it is what tm_02 was asked with (R12)",
+    "limits.refused_s": "an image would have to be refused",
+    "limits.silence_s": "it is how long the suite watches, not what the device does",
+    "device.application_bytes": "no message tells it; it is not less than the largest image",
+}
+"""Keys that no question is about, with the reason."""
+_PATIENCE: Final[dict[str, Value]] = {
+    "limits.feedback_s": 2.0,
+    "limits.first_version_s": 10.0,
+    "limits.start_s": 20.0,
+    "limits.erase_s": 60.0,
+    "limits.ack_s": 5.0,
+    "limits.complete_s": 60.0,
+    "limits.window_s": 2.0,
+}
+"""How long is waited before anything is known."""
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What came of the questions. `answers` has every key of the profile, in its order."""
+
+    subject: str
+    target: str
+    answers: tuple[Answer, ...]
+    stopped: str = ""
+    """Why it ended early; the answers are then not to be kept."""
+    was_brought_up: bool = True
+    """False when the good image could not be flashed before the first question."""
+
+    def profile(self, start: ConformanceProfile) -> ConformanceProfile:
+        """What was seen, and for what stays open what `start` says."""
+        found = {one.key: one for one in self.answers if one.value is not None}
+        given = {key: one.value for key, one in found.items() if one.value is not None}
+        why = {key: one.seen for key, one in found.items()}
+        return ConformanceProfile(
+            {**start.given, **given}, {**start.rationales, **why}, start.deviations
+        )
+
+    @property
+    def open(self) -> dict[str, str]:
+        """The keys that stay open, with the reason."""
+        return {one.key: one.seen for one in self.answers if one.value is None}
+
+
+def ask(
+    subject: Subject,
+    start: ConformanceProfile,
+    *,
+    stopped: Callable[[], bool] = lambda: False,
+    progress: Callable[[int, int], None] = lambda _done, _total: None,
+) -> Asked:
+    """Ask a device everything. Raises BusError. The good image runs before and after it; of
+    `start` is believed what no question answers.
+    """
+    return _Asking(subject, start, stopped).go(progress)
+
+
+class _Asking:
+    def __init__(
+        self, subject: Subject, start: ConformanceProfile, stopped: Callable[[], bool]
+    ) -> None:
+        self._subject = subject
+        self._start = start
+        self._stopped = stopped
+        self._answers: dict[str, Answer] = {}
+        self._measured: dict[str, list[float]] = {}
+
+    def go(self, progress: Callable[[int, int], None]) -> Asked:
+        was_brought_up = True
+        try:
+            trouble = self._restored("before the first question", flash=True)
+            was_brought_up = not trouble
+            for done, (question, keys) in enumerate(QUESTIONS):
+                if trouble:
+                    break
+                progress(done, len(QUESTIONS))
+                self._put(question, keys)
+                trouble = self._restored(f"after {keys[0]} was asked", flash=False)
+            if not trouble:
+                trouble = self._restored("at the end", flash=True)
+        except RunStopped as ended:
+            self._stopped = lambda: False
+            lost = self._restored("when it was stopped", flash=True)
+            return self._asked(lost or str(ended))
+        return self._asked(trouble, was_brought_up=was_brought_up)
+
+    def _put(self, question: Question, keys: tuple[str, ...]) -> None:
+        it = Session(self._subject, self._profile(), self._stopped)
+        why = "nothing was seen"
+        try:
+            it.settle()
+            for answer in question(it):
+                self._answers[answer.key] = answer
+        except RunStopped:
+            raise
+        except CaseEnded as ended:
+            failed = [check for check in it.bench.judge.checks if check.outcome.value == "fail"]
+            why = f"the device did something else: {failed[-1]}" if failed else str(ended)
+        if it.bench.is_off:
+            it.bench.power_on()
+        for key in keys:
+            self._answers.setdefault(key, Answer(key, None, why))
+        for one in it.bench.judge.measurements:
+            self._measured.setdefault(one.name, []).append(one.value_s)
+
+    def _limits(self) -> Iterator[Answer]:
+        for key, (least_s, names) in LIMITS.items():
+            values_s = [value_s for name in names for value_s in self._measured.get(name, ())]
+            yield limit(key, values_s, least_s, self._subject.port.uncertainty_s)
+
+    def _profile(self) -> ConformanceProfile:
+        """All that is known by now; where nothing is, with patience."""
+        found = (*self._answers.values(), *self._limits())
+        given = {one.key: one.value for one in found if one.value is not None}
+        return ConformanceProfile({**_PATIENCE, **self._start.given, **given})
+
+    def _restored(self, when: str, *, flash: bool) -> str:
+        """Let the good image run; returns what went wrong, or ""."""
+        profile = self._profile()
+        try:
+            done = restore(self._subject, profile, flash=flash, stopped=self._stopped)
+        except RunStopped:
+            raise
+        except CaseEnded as ended:
+            return f"{when}: {ended}"
+        if done.ok:
+            return ""
+        encoder = Bench(self._subject, profile, limit_s=0.0).encoder
+        said = "; ".join((done.reason, *diagnose(done.trace, encoder)))
+        return f"{when}, the device could not be brought back: {said}"
+
+    def _asked(self, stopped: str, *, was_brought_up: bool = True) -> Asked:
+        self._answers |= {one.key: one for one in self._limits()}
+        found = [
+            self._answers.get(key) or Answer(key, None, NOT_ASKED.get(key, "it was not asked"))
+            for key in profile_keys()
+        ]
+        name, target = self._subject.name, self._subject.target
+        return Asked(name, target, tuple(found), stopped, was_brought_up)

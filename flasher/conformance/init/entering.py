@@ -1,0 +1,393 @@
+"""Questions about reset, announcements, window and update command."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from math import ceil
+from statistics import median
+from typing import Final
+
+from flasher.conformance.init.answers import Answer, Trial, decided
+from flasher.conformance.init.session import (
+    GAP,
+    POWERED,
+    REPEATS,
+    REQUEST,
+    RESTARTED,
+    START,
+    START_AGAIN,
+    Session,
+    told,
+)
+from flasher.conformance.restore import needs_power
+from flasher.conformance.wire import (
+    IMAGE_BYTES_MAX,
+    PACKET_BYTES,
+    Kind,
+    RawFrame,
+    Received,
+    packet_count,
+)
+
+_TOLERANCE_S: Final = 0.005
+"""The least that is written: a boot version may wait for frames of others."""
+_WINDOW_MAX_S: Final = 10.0
+_RESTART_S: Final = 5.0
+"""How long a restart behind complete is waited for."""
+_RESOLUTION_S: Final = 0.001
+_SILENT_S: Final = 5.0
+"""After so long without a boot version a bootloader is taken to listen silently."""
+_ERASE_LEAST_S: Final = 10.0
+_ERASE_MOST_S: Final = 120.0
+_AGAIN: Final = 0.03
+"""Update commands are at least this far apart (R2)."""
+
+
+def burst(it: Session) -> Iterator[Answer]:
+    """The announcements after a reset, and after power-up."""
+    bench = it.bench
+    counts: list[int] = []
+    gaps_s: list[float] = []
+    turns = [*("reset",) * REPEATS, *("power",) * (REPEATS if bench.subject.has_power else 0)]
+    for turn in turns:
+        if turn == "power":
+            bench.power_cycle()
+            on_at = bench.now
+            first = bench.await_message(Kind.BOOT_VERSION)
+            bench.measure(POWERED, first.at - on_at)
+        else:
+            first = it.enter()
+        versions = [first, *it.more_versions()]
+        counts.append(len(versions))
+        gaps_s += [after.at - before.at for before, after in pairwise(versions)]
+        it.await_application()
+    command = f"{bench.encoder.reset_command:04X}"
+    yield Answer(
+        "device.reset_command",
+        bench.encoder.reset_command,
+        f"{command} was followed by boot versions, {REPEATS} of {REPEATS} times",
+    )
+    text = bench.encoder.reset_data.decode()
+    yield Answer("device.reset_data", text, f"{command} was sent with {text}")
+    shown = ", ".join(map(str, counts))
+    alike = len(set(counts)) == 1
+    said = f"{shown} boot versions after {REPEATS} resets"
+    if len(turns) > REPEATS:
+        said += f" and {REPEATS} power cycles"
+    yield Answer("device.versions", counts[0] if alike else None, said)
+    if not gaps_s:
+        why = "a single boot version has no spacing"
+        yield Answer("limits.version_spacing_s", None, why)
+        yield Answer("limits.version_spacing_tolerance_s", None, why)
+        return
+    spacing_s = round(median(gaps_s), 3)
+    seen = f"{len(gaps_s)} times, from {min(gaps_s) * 1000:.1f} to {max(gaps_s) * 1000:.1f} ms"
+    off_s = max(abs(gap_s - spacing_s) for gap_s in gaps_s)
+    tolerance_s = max(_TOLERANCE_S, _up(2 * off_s + 2 * bench.port.uncertainty_s))
+    yield Answer("limits.version_spacing_s", spacing_s, f"measured {seen}; the median")
+    yield Answer(
+        "limits.version_spacing_tolerance_s",
+        tolerance_s,
+        f"measured {seen}; twice the widest difference, {_TOLERANCE_S * 1000:g} ms at the least",
+    )
+
+
+def upgrade(it: Session) -> Iterator[Answer]:
+    """Plain upgrades, for their times and for what follows complete."""
+    bench, trials = it.bench, []
+    for _ in range(REPEATS):
+        it.begin()
+        it.packets()
+        bench.end_transfer()
+        complete_at = bench.now
+        heard = _first_sign(it)
+        if heard is not None and heard.kind is Kind.BOOT_VERSION:
+            bench.measure(RESTARTED, heard.at - complete_at)
+            trials.append(Trial("restarts", "a boot version", "complete", "after"))
+        else:
+            trials.append(Trial("starts", "no boot version", "complete", "after"))
+        it.await_application(START, complete_at)
+        last = it.enter(bench.number("versions"))
+        it.await_application(START_AGAIN, last.at)
+    yield decided("en_03", trials)
+
+
+def _first_sign(it: Session) -> Received | None:
+    """The first boot version after complete, or the first answer of the application."""
+    bench = it.bench
+    if not bench.encoder.has_version_query:
+        within_s = max(bench.limit("first_version_s"), _RESTART_S)
+        return bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
+    deadline = bench.now + bench.limit("start_s")
+    heard: Received | None = None
+    while heard is None and bench.now < deadline:
+        bench.send(bench.encoder.query_version())
+        heard = bench.wait_for(Kind.BOOT_VERSION, Kind.VERSION_INFORMATION, within_s=0.05)
+    return heard
+
+
+# -- the window -----------------------------------------------------------------------------------
+
+
+def in_burst(it: Session) -> Iterator[Answer]:
+    """Update command between the announcements."""
+    bench = it.bench
+    count, trials = bench.number("versions"), []
+    for version in range(1, count):
+        for _ in range(REPEATS):
+            it.enter(version)
+            taken = it.offer_update(bench.encoder.update(len(it.image)))
+            answer = "request transfer" if taken else "no request transfer"
+            stimulus = f"update command at boot version {version} of {count}"
+            trials.append(Trial("accepted" if taken else "rejected", answer, stimulus))
+            it.finish() if taken else it.await_application()
+    if count < 2:
+        yield Answer("up_04_burst", None, "the burst is a single boot version")
+    else:
+        yield decided("up_04_burst", trials)
+
+
+def window(it: Session) -> Iterator[Answer]:
+    """The window's end behind the last announcement, by bisection."""
+    bench = it.bench
+    low_s, high_s = 0.0, 0.1
+    at_s, taken = _offer_at(it, 0.0)
+    if not taken:
+        why = "an update command at the last boot version is not taken"
+        for key in ("limits.window_s", "limits.window_tolerance_s", "up_04"):
+            yield Answer(key, None, why)
+        return
+    low_s, high_s = at_s, max(0.1, 2 * at_s)
+    while True:
+        at_s, taken = _offer_at(it, high_s)
+        if not taken:
+            high_s = at_s
+            break
+        low_s, high_s = at_s, 2 * at_s
+        if high_s > _WINDOW_MAX_S:
+            for key in ("limits.window_s", "limits.window_tolerance_s", "up_04"):
+                yield Answer(key, None, f"an update command is taken {low_s:.1f} s behind the last")
+            return
+    resolution_s = max(_RESOLUTION_S, bench.port.uncertainty_s)
+    while high_s - low_s > resolution_s:
+        at_s, taken = _offer_at(it, (low_s + high_s) / 2)
+        if low_s < at_s < high_s:
+            low_s, high_s = (at_s, high_s) if taken else (low_s, at_s)
+        else:  # the bus is not more exact
+            break
+    inside = [_offer_at(it, low_s - resolution_s) for _ in range(REPEATS)]
+    outside = [_offer_at(it, high_s + resolution_s) for _ in range(REPEATS)]
+    off_s = max(
+        [low_s - at_s for at_s, taken in inside if not taken]
+        + [at_s - high_s for at_s, taken in outside if taken],
+        default=0.0,
+    )
+    window_s = round((low_s + high_s) / 2, 4)
+    seen = (
+        f"update command taken up to {low_s * 1000:.1f} ms behind the last boot version, not from "
+        f"{high_s * 1000:.1f} ms on, by bisection"
+    )
+    yield Answer("limits.window_s", window_s, f"{seen}; the middle")
+    half_s = _up((high_s - low_s) / 2 + off_s + bench.port.uncertainty_s + _RESOLUTION_S / 2)
+    yield Answer("limits.window_tolerance_s", half_s, f"{seen}; half of that, and what is unsure")
+    yield decided(
+        "up_04",
+        [
+            Trial(
+                "accepted" if taken else "rejected",
+                "request transfer" if taken else "no request transfer",
+                f"update command {(high_s + resolution_s) * 1000:.0f} ms behind the last boot "
+                "version",
+            )
+            for at_s, taken in outside
+        ],
+    )
+
+
+def _offer_at(it: Session, offset_s: float) -> tuple[float, bool]:
+    """Update command so long behind the last boot version; when it was there, and if it is taken.
+    The good image runs again afterwards.
+    """
+    bench = it.bench
+    frames = bench.encoder.update(len(it.image))
+    wire_s = sum(47 + 8 * len(frame.data) for frame in frames) / bench.port.bitrate_bps
+    last = it.enter(bench.number("versions"))
+    sent = bench.send(frames, at=last.at + max(offset_s - wire_s, 0.0))
+    heard = bench.wait_for(Kind.REQUEST)
+    if heard is None:
+        it.await_application()
+    else:
+        bench.measure(REQUEST, heard.at - sent.left_at)
+        it.stored = 0
+        it.finish()
+    return sent.left_at - last.at, heard is not None
+
+
+# -- what is not taken ----------------------------------------------------------------------------
+
+
+def reset_in_bootloader(it: Session) -> Iterator[Answer]:
+    """Reset between the announcements."""
+    bench, trials = it.bench, []
+    count = bench.number("versions")
+    place = min(2, count)
+    for _ in range(REPEATS):
+        it.enter(place)
+        bench.send(bench.encoder.reset())
+        more = len(it.more_versions())
+        value = {count - place: "ignored", count: "restarts"}.get(more, "")
+        stimulus = f"reset after boot version {place} of {count}"
+        trials.append(Trial(value, f"{more} boot versions more", stimulus, "after"))
+        it.await_application()
+    yield decided("rs_02", trials)
+
+
+def rejected_update(it: Session) -> Iterator[Answer]:
+    """Update commands that no bootloader takes."""
+    bench, trials = it.bench, []
+    other = next(iter(bench.encoder.others()))
+    stimuli = {
+        "update command for 0 bytes": bench.encoder.update(0),
+        "update command for 2^32 - 1 bytes": bench.encoder.update(0xFFFF_FFFF),
+        f"update command with the name {other.update_text.decode()}": bench.encoder.update(
+            len(it.image), other.update_text
+        ),
+    }
+    for stimulus, frames in stimuli.items():
+        for _ in range(REPEATS):
+            it.enter()
+            bench.send(frames)
+            heard = bench.collect(bench.host.burst_s + bench.limit("ack_s"))
+            answers = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
+            trials.append(Trial(_word(answers), told(answers), stimulus))
+            it.await_application()
+    yield decided("up_02", trials)
+
+
+def application(it: Session) -> Iterator[Answer]:
+    """Messages of the upgrade to the running application."""
+    bench, trials = it.bench, []
+    stimuli = {
+        "update command": bench.encoder.update(len(it.image)),
+        "packet": bench.encoder.packet(1, it.total, bytes(PACKET_BYTES)),
+        "end of transfer": bench.encoder.end(),
+    }
+    for stimulus, frames in stimuli.items():
+        for _ in range(REPEATS):
+            bench.forget()
+            bench.send(frames)
+            heard = bench.collect(bench.limit("silence_s"))
+            trials.append(Trial(_word(heard), told(heard), f"{stimulus} to the application"))
+    it.await_application()
+    yield decided("up_03", trials)
+
+
+def _word(heard: list[Received]) -> str:
+    """The value for one answer, or none."""
+    if not heard:
+        return "silence"
+    names = {Kind.NAK: "nak", Kind.FEEDBACK: "feedback"}
+    return names.get(heard[0].kind, "") if len(heard) == 1 else ""
+
+
+# -- without an application -----------------------------------------------------------------------
+
+
+def _way_out(it: Session) -> str:
+    """Why nothing ends a transfer of this device; empty when something does."""
+    if needs_power(it.bench.profile) and not it.bench.subject.has_power:
+        return "only power would end a transfer, and none is controlled"
+    can_leave = it.bench.choice("tx_13") == "restarts" or it.bench.choice("tx_12") == "announces"
+    if not (can_leave or it.bench.subject.has_power):
+        return "neither a reset nor a pause ends a transfer, and no power is controlled"
+    return ""
+
+
+def without_application(it: Session) -> Iterator[Answer]:
+    """A bootloader that has nothing to start."""
+    bench, trials = it.bench, []
+    why = _way_out(it)
+    if why:
+        yield Answer("rs_03", None, why)
+        return
+    count = bench.number("versions")
+    for _ in range(REPEATS):
+        it.begin()
+        bench.leave_transfer()
+        more, last_at = 0, bench.now
+        while more < 2 * count:
+            heard = bench.wait_for(Kind.BOOT_VERSION, within_s=_SILENT_S)
+            if heard is None:
+                break
+            bench.measure(GAP, heard.at - last_at)
+            more, last_at = more + 1, heard.at
+        value = "listens" if more == count - 1 else "announces" if more >= 2 * count else ""
+        answer = f"{more} boot versions more" + ("" if value == "announces" else ", then silence")
+        stimulus = "the first one, without an application"
+        trials.append(Trial(value, answer, stimulus, "after"))
+        it.update()
+        it.finish()
+    yield decided("rs_03", trials)
+
+
+def largest_image(it: Session) -> Iterator[Answer]:
+    """The largest size that an update command is taken with."""
+    key, bench = "device.largest_image_bytes", it.bench
+    restarts_at_once = bench.choice("up_08") == "starts_over"
+    why = "" if restarts_at_once else _way_out(it)
+    if why:
+        yield Answer(key, None, why)
+        return
+    it.begin()
+    if not restarts_at_once:
+        bench.leave_transfer()
+    erase_s = max(one.value_s for one in bench.judge.measurements if one.name == REQUEST)
+
+    def is_taken(size_bytes: int) -> bool:
+        share = packet_count(size_bytes) / it.total
+        within_s = min(max(_ERASE_LEAST_S, 3 * erase_s * share), _ERASE_MOST_S)
+        taken = _is_size_taken(it, bench.encoder.update(size_bytes), within_s)
+        if taken and not restarts_at_once:
+            bench.leave_transfer()
+        return taken
+
+    low, high = len(it.image), 0
+    while not high and low < IMAGE_BYTES_MAX:
+        size = min(2 * low, IMAGE_BYTES_MAX)
+        if is_taken(size):
+            low = size
+        else:
+            high = size
+    while high - low > 1:
+        size = (low + high) // 2
+        low, high = (size, high) if is_taken(size) else (low, size)
+    it.update()
+    it.finish()
+    said = f"update command for {low} bytes is taken"
+    if high:
+        said += f", and for {high} bytes not, by bisection"
+    yield Answer(key, low, said)
+
+
+def _is_size_taken(it: Session, frames: list[RawFrame], within_s: float) -> bool:
+    """True for request transfer. A NAK, or a bootloader that announces itself on, says no."""
+    bench = it.bench
+    bench.forget()
+    sent = bench.send(frames)
+    deadline, versions = sent.left_at + within_s, 0
+    kinds = (Kind.REQUEST, Kind.NAK, Kind.BOOT_VERSION)
+    while versions < 3:
+        heard = bench.wait_for(*kinds, within_s=deadline - bench.now)
+        if heard is None or heard.kind is Kind.NAK:
+            break
+        if heard.kind is Kind.REQUEST:
+            bench.measure(REQUEST, heard.at - sent.left_at)
+            return True
+        versions += heard.at > sent.left_at + _AGAIN
+    return False
+
+
+def _up(value_s: float) -> float:
+    """To tenths of a millisecond, never less."""
+    return ceil(value_s * 10_000 - 1e-6) / 10_000

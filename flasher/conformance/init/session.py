@@ -1,0 +1,212 @@
+"""A device that is asked: the bench of one question, in upgrades to the good image alone. Whatever
+is tried in such a transfer, the right packets and the end can follow, so that the device runs again
+without a way out of a transfer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Final
+
+from flasher.conformance.bench import Bench
+from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.results import Unsupported
+from flasher.conformance.subject import Subject
+from flasher.conformance.wire import Kind, RawFrame, Received, describe, joined, packet_count
+
+REPEATS: Final = 3
+"""How often a question is asked."""
+FEEDBACK: Final = "reset to general feedback"
+FIRST: Final = "reset to first boot version"
+POWERED: Final = "power to first boot version"
+GAP: Final = "boot version to boot version without an application"
+LATE: Final = "pause to boot version, beyond the shortest one"
+RESTARTED: Final = "complete to boot version"
+REQUEST: Final = "update command to request transfer"
+ANSWER: Final = "packet to ACK"
+COMPLETE: Final = "end of transfer to complete"
+START: Final = "complete to an application that answers"
+START_AGAIN: Final = "last boot version to an application that answers"
+_LIMIT_S: Final = 7200.0
+_ASK_S: Final = 0.05
+_LATE_S: Final = 0.3
+_QUIET_S: Final = 0.1
+_BURST_GAP_S: Final = 1.5
+"""Two boot versions of a burst are not so far apart."""
+_VERSIONS_MAX: Final = 100
+_QUIET_START_S: Final = 2.0
+"""No window is longer, as far as a device is waited for that tells no version."""
+
+
+class Session:
+    """A device whose good image runs, when the question begins and when it ends."""
+
+    def __init__(
+        self, subject: Subject, profile: ConformanceProfile, stopped: Callable[[], bool]
+    ) -> None:
+        self.bench = Bench(subject, profile, limit_s=_LIMIT_S, seed="init", stopped=stopped)
+        self.image = subject.good_image
+        self.total = packet_count(len(self.image))
+        self.stored = 0
+
+    def settle(self) -> None:
+        """Wait until a device that tells no version has certainly left its bootloader: it may have
+        been reset to see whether its application runs.
+        """
+        bench = self.bench
+        if not bench.encoder.has_version_query:
+            quiet_s = max(bench.limit("first_version_s"), _QUIET_START_S)
+            while bench.wait_for(Kind.BOOT_VERSION, within_s=quiet_s) is not None:
+                pass
+
+    # -- the application --------------------------------------------------------------------------
+
+    def await_application(self, name: str = "", since: float = 0.0) -> None:
+        """Wait until the application answers; `name` is what the time since then is recorded as."""
+        bench = self.bench
+        within_s = bench.limit("start_s") + bench.host.burst_s
+        if not bench.encoder.has_version_query:
+            # A reset would be the only question, and begin all anew.
+            self.settle()
+            if name:
+                runs = bench.application_runs()
+                bench.require(runs, "an application that answers", "no answer")
+                bench.measure(name, bench.now - since)
+                self.settle()
+            return
+        deadline = bench.now + within_s
+        heard: Received | None = None
+        while heard is None and bench.now < deadline:
+            bench.send(bench.encoder.query_version())
+            heard = bench.wait_for(Kind.VERSION_INFORMATION, within_s=_ASK_S)
+        found = bench.require_received(heard, "an application that answers", within_s)
+        if name:
+            bench.measure(name, found.at - since)
+        while bench.wait_for(Kind.VERSION_INFORMATION, within_s=_LATE_S) is not None:
+            pass
+        bench.forget()
+
+    # -- the bootloader ---------------------------------------------------------------------------
+
+    def enter(self, version: int = 1) -> Received:
+        """Reset the application; returns that boot version of the burst."""
+        bench = self.bench
+        bench.forget()
+        sent = bench.send(bench.encoder.reset())
+        limit_s = bench.limit("first_version_s")
+        heard = bench.wait_for(Kind.FEEDBACK, Kind.BOOT_VERSION, within_s=limit_s)
+        if heard is not None and heard.kind is Kind.FEEDBACK:
+            bench.measure(FEEDBACK, heard.at - sent.left_at)
+            heard = bench.wait_for(Kind.BOOT_VERSION, within_s=limit_s)
+        found = bench.require_received(heard, Kind.BOOT_VERSION.value, limit_s)
+        bench.measure(FIRST, found.at - sent.left_at)
+        for _ in range(version - 1):
+            found = bench.await_message(Kind.BOOT_VERSION, within_s=_BURST_GAP_S)
+        return found
+
+    def more_versions(self) -> list[Received]:
+        """The boot versions that follow, until none comes any more."""
+        found: list[Received] = []
+        while len(found) < _VERSIONS_MAX:
+            heard = self.bench.wait_for(Kind.BOOT_VERSION, within_s=_BURST_GAP_S)
+            if heard is None:
+                break
+            found.append(heard)
+        return found
+
+    def offer_update(self, frames: Sequence[RawFrame]) -> bool:
+        """Send what may be an update command for the good image; True when it is taken."""
+        bench = self.bench
+        sent = bench.send(frames)
+        heard = bench.wait_for(Kind.REQUEST)
+        if heard is not None:
+            bench.measure(REQUEST, heard.at - sent.left_at)
+            self.stored = 0
+        return heard is not None
+
+    def begin(self) -> None:
+        """From the running application to request transfer."""
+        self.enter()
+        self.update()
+
+    def update(self) -> None:
+        """From a bootloader that listens to request transfer."""
+        self.bench.update(len(self.image))
+        self.stored = 0
+
+    # -- the transfer -----------------------------------------------------------------------------
+
+    def packets(self, last: int | None = None) -> None:
+        """All packets up to the `last` one of these, or of the image."""
+        final = self.total if last is None else last
+        self.bench.forget()
+        self.bench.packets(self.image, self.stored + 1, final)
+        self.stored = max(self.stored, final)
+
+    def finish(self) -> None:
+        """The packets that are left, and the end; the application starts."""
+        self.packets()
+        self.bench.end_transfer()
+        self.await_application()
+
+    def reach(self, stored: int, left: int) -> None:
+        """So many packets stored at the least and so many left, if need be in a new transfer.
+
+        Raises Unsupported for an image that is too small for that.
+        """
+        if self.total < stored + left:
+            raise Unsupported(f"the good image has less than {stored + left} packets")
+        if self.total - self.stored < left:
+            self.finish()
+            self.begin()
+        self.packets(max(stored, self.stored))
+
+    def frames(self) -> list[RawFrame]:
+        """The next packet as it should be."""
+        return self.bench.encoder.packet_of(self.image, self.stored + 1)
+
+    def raw(self) -> bytes:
+        """The next packet, header to tail."""
+        return joined(self.frames())
+
+    def offer(self, frames: Sequence[RawFrame], *, gap_s: float = 0.0, gaps: int = 0) -> bool:
+        """Send frames that hold the next packet; True when it is acknowledged. It is stored
+        afterwards, one way or the other.
+        """
+        bench = self.bench
+        bench.forget()
+        first = gaps + 1 if gap_s else 0
+        if first:
+            bench.send(frames[:first], gap_s=gap_s)
+        bench.send(frames[first:])
+        number = self.stored + 1
+        within_s = max(bench.limit("ack_s"), 2 * bench.limit("inter_frame_s"))
+        deadline = bench.now + within_s
+        heard = bench.wait_for(Kind.ACK, within_s=within_s)
+        while heard is not None and heard.number != number:
+            heard = bench.wait_for(Kind.ACK, within_s=deadline - bench.now)
+        bench.collect(_QUIET_S)
+        if heard is None:
+            self.insist()
+        else:
+            self.stored += 1
+        return heard is not None
+
+    def insist(self) -> None:
+        """The next packet as it should be, more than once if need be."""
+        bench = self.bench
+        bench.forget()
+        trouble = bench.host.insist_on_packet(self.image, self.stored + 1, bench.now)
+        bench.require(not trouble, f"ACK {self.stored + 1}", trouble or "ACK")
+        self.stored += 1
+
+    def answers(self) -> list[Received]:
+        """The answers to what was just sent: the first one, and those that follow it at once."""
+        bench = self.bench
+        first = bench.next_message(bench.limit("ack_s") + bench.limit("inter_frame_s"))
+        return [] if first is None else [first, *bench.collect(_QUIET_S)]
+
+
+def told(heard: Sequence[Received]) -> str:
+    """Some answers in words."""
+    return describe(heard) if heard else "silence"

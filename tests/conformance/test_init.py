@@ -1,0 +1,318 @@
+"""A profile from a device: what is written is what the device does, seen on the bus alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final, get_args, get_type_hints
+
+import pytest
+
+from flasher.conformance.catalogue import Selection
+from flasher.conformance.dut.subject import open_subject
+from flasher.conformance.init import LIMITS, NOT_ASKED, QUESTIONS, Asked, ask
+from flasher.conformance.init.answers import Trial, decided, limit
+from flasher.conformance.mock import GOOD_IMAGE, MOCK_PROFILE, MockSubject, profile_of_mock
+from flasher.conformance.profile import ConformanceProfile, load_profile, profile_keys
+from flasher.conformance.runner import run
+from flasher.conformance.subject import Subject
+from flasher.mock.model import AnyRow, MockDevice
+from flasher.mock.profile import DeviceProfile
+from flasher.mock.table import Event, State
+from flasher.mock.variants import VARIANTS
+from flasher.protocol import messages
+from flasher.protocol.frame import Frame
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from tests.campaigns.profiles import AREA_BYTES, faults
+from tests.cli.conftest import Flasher
+from tests.conformance.bench import DeafDevice, maker
+from tests.conformance.test_other_device import (
+    BurstAnnouncer,
+    ChoosyDevice,
+    LateListener,
+    PageDevice,
+    SlowDevice,
+    bench,
+)
+from tests.loops import each
+from tests.peers.scripted_device import ScriptedDevice
+
+CHOICES: Final = {
+    "rs_02": "reset_in_bootloader",
+    "rs_03": "without_application",
+    "up_03": "upgrade_in_application",
+    "up_08": "update_in_transfer",
+    "tx_01": "bad_packet",
+    "tx_02": "repeated_packet",
+    "tx_03": "older_packet",
+    "tx_12": "pause_in_transfer",
+    "tx_13": "reset_in_transfer",
+    "en_02": "repeated_end",
+    "en_03": "after_complete",
+}
+"""Key of the profile to the option of the device model."""
+OTHER_WORDS: Final = {"general_feedback": "feedback", ("up_08", "ignored"): "rejected"}
+OPEN: Final = {"en_04", "limits.inter_frame_s", "limits.refused_s", "limits.silence_s"} | {
+    "device.application_bytes"
+}
+"""What nobody sees from outside."""
+
+
+class FullFrames(MockDevice):
+    """Takes short frames at the end of a message only."""
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if len(frame.data) == 8 or frame.data.endswith(b"\xf0"):
+            super().receive(frame, now)
+
+
+class OtherDevice(MockDevice):
+    """Answers an update command that it rejects by NAK, rejects a last packet that is not filled
+    with FF, and gives up a message after 50 ms.
+    """
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        timings = replace(DEFAULT_TIMINGS, inter_frame_timeout_s=0.05)
+        super().__init__(*given, **{**named, "timings": timings})
+
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        super()._take_row(row, now)
+        if isinstance(row, messages.UpdateCommand) and self.state is State.ANNOUNCING:
+            self._send(messages.Nak(1))
+
+    def _classify_packet(self, row: messages.Packet) -> Event:
+        rest = self._transfer.size_bytes - (row.number - 1) * len(row.payload)
+        if row.number == self._transfer.total and row.payload[rest:].strip(b"\xff"):
+            return Event.PACKET_BAD
+        return super()._classify_packet(row)
+
+
+class MoodyDevice(MockDevice):
+    """Answers every second older packet, and every second damaged one."""
+
+    asked = 0
+
+    def _answer_older(self, now: float) -> str:
+        self.asked += 1
+        return super()._answer_older(now) if self.asked % 2 else ""
+
+    def _answer_bad(self, now: float) -> str:
+        self.asked += 1
+        return super()._answer_bad(now) if self.asked % 2 else ""
+
+
+class Witness(MockDevice):
+    """Takes note of every image that is completed."""
+
+    completed: set[bytes]
+
+    def _complete(self, now: float) -> str:
+        self.completed.add(self.store.read(self._transfer.size_bytes))
+        return super()._complete(now)
+
+
+class LatePages(LateListener, PageDevice):
+    """Both in one."""
+
+
+class SlowBursts(SlowDevice, BurstAnnouncer):
+    """Both in one."""
+
+
+def mock(kind: type[MockDevice] = MockDevice, target: str = "bms", **choices: Any) -> MockSubject:
+    device = replace(MOCK_PROFILE, application_area_bytes=AREA_BYTES, **choices)
+    return MockSubject(target, profile=device, make_device=maker(kind))
+
+
+def values(asked: Asked) -> dict[str, Any]:
+    assert asked.stopped == ""
+    return {one.key: one.value for one in asked.answers}
+
+
+def test_every_key_is_asked_or_it_is_said_why_not() -> None:
+    asked = [key for _, keys in QUESTIONS for key in keys]
+    assert sorted([*asked, *LIMITS, *NOT_ASKED]) == sorted(profile_keys())
+
+
+@each("turn", range(3))
+def test_each_value_of_each_choice_of_the_device_model_is_seen(turn: int) -> None:
+    """No choice has more than three values."""
+    hints = get_type_hints(DeviceProfile)
+    words = {key: get_args(hints[option]) for key, option in CHOICES.items()}
+    assert max(map(len, words.values())) == 3
+    chosen = {key: each[turn % len(each)] for key, each in words.items()}
+    options: dict[str, Any] = {CHOICES[key]: value for key, value in chosen.items()}
+    asked = ask(mock(**options), ConformanceProfile())
+    wanted = {
+        key: OTHER_WORDS.get((key, value)) or OTHER_WORDS.get(value) or value
+        for key, value in chosen.items()
+    }
+    found = values(asked)
+    assert {key: found[key] for key in wanted} == wanted
+    assert set(asked.open) - {"limits.pause_s"} == OPEN
+
+
+@each(
+    "make, wanted",
+    [
+        (lambda: mock(FullFrames), {"fr_01": "rejected", "fr_07": "ignored"}),
+        (lambda: mock(OtherDevice), {"up_02": "nak", "tx_08": "rejected", "tm_02": "either"}),
+        (lambda: mock(MoodyDevice), {"tx_01": "either", "tx_03": None}),
+        (
+            lambda: bench(ScriptedDevice("bms", capacity_bytes=3000)),
+            {
+                "fr_01": "either",
+                "fr_02": "lost",
+                "fr_04": "dropped",
+                "tx_03": "nak",
+                "tx_12": "waits",
+                "tx_01_lost_frame": "silence",
+                "device.largest_image_bytes": 3000,
+            },
+        ),
+        (
+            lambda: bench(ChoosyDevice("bms", capacity_bytes=3000)),
+            {"tx_01": "either", "tx_03": "silence"},
+        ),
+        (
+            lambda: bench(LatePages("bms", capacity_bytes=3000)),
+            {"up_04_burst": "rejected", "device.buffer_bytes": 768},
+        ),
+    ],
+)
+def test_other_ways_are_seen(make: Callable[[], Subject], wanted: dict[str, Any]) -> None:
+    found = values(ask(make(), ConformanceProfile()))
+    assert {key: found[key] for key in wanted} == wanted
+
+
+def test_no_limit_is_shorter_than_what_the_device_needs() -> None:
+    slow = values(ask(bench(SlowBursts("bms", capacity_bytes=3000)), ConformanceProfile()))
+    assert slow["limits.ack_s"] > 3 * 0.4
+    assert slow["limits.complete_s"] > 3 * 6.0
+    assert slow["limits.first_version_s"] > 3 * 1.0
+    erasing = mock(erase_time_s=0.1, transfer_timeout_s=12.5, window_s=0.321)
+    found = values(ask(erasing, ConformanceProfile()))
+    assert found["limits.erase_s"] > AREA_BYTES / 2048 * 0.1  # the largest image
+    assert found["limits.pause_s"] == 12.5
+    assert found["limits.window_s"] == pytest.approx(0.32, abs=0.002)
+
+
+def test_a_limit_has_its_margin_and_says_it() -> None:
+    found = limit("limits.ack_s", [0.1, 0.21], 0.1, 0.002)
+    assert found.value == 0.64
+    assert found.seen == (
+        "measured 2 times, at most 210.0 ms; the limit is 3 times that, and 0.1 s at the least"
+    )
+    assert limit("limits.ack_s", [], 0.1, 0.0).value is None
+
+
+def test_what_differs_is_either_or_stays_open() -> None:
+    trials = [Trial(value, value.upper(), "it") for value in ("nak", "silence", "nak")]
+    assert decided("up_02", trials).value == "either"
+    assert decided("tx_03", trials).value is None
+    assert decided("tx_03", trials).seen == (
+        "it differs: NAK to it, 2 of 3 times; SILENCE to it, 1 of 3 times"
+    )
+    unheard = decided("tx_03", [Trial("", "COMPLETE", "it")])
+    assert unheard.seen == "no value describes this: COMPLETE to it, 1 of 1 times"
+
+
+@pytest.mark.no_cover
+@each("seed", ["7/0", "7/14"])
+def test_the_whole_suite_passes_by_the_profile_that_is_written(seed: str) -> None:
+    assert faults(seed) == []
+
+
+@pytest.mark.no_cover
+def test_the_bootloader_of_others_passes_by_its_profile() -> None:
+    what, start = "tests.peers.python_bootloader:PythonBootloader", ConformanceProfile()
+    with open_subject(what, "bms", start, good_image=None, second_image=None) as (subject, _):
+        profile = ask(subject, start).profile(start)
+        # It answers each of two update commands in a row (R25), by this profile or by another one.
+        chosen = Selection(groups=("RS", "UP", "EN", "TM"), excluded=("UP-05",))
+        report = run(subject, profile, selection=chosen)
+    assert profile.value("device.largest_image_bytes") == 0xF000
+    assert [str(one.first_failure) for one in report.results if one.first_failure] == []
+
+
+def test_only_the_good_image_is_completed_and_it_is_there_in_the_end() -> None:
+    subject = mock(Witness)
+    assert isinstance(subject.device, Witness)
+    subject.device.completed = set()
+    values(ask(subject, ConformanceProfile()))
+    assert subject.device.completed == {GOOD_IMAGE}
+    assert subject.device.stored_image == GOOD_IMAGE
+
+
+def test_a_device_that_is_not_there_is_told_and_nothing_is_asked() -> None:
+    subject = mock(DeafDevice)
+    assert isinstance(subject.device, DeafDevice)
+    subject.device.hangs = subject.device.hangs_for_good = True
+    asked = ask(subject, ConformanceProfile())
+    assert not asked.was_brought_up
+    assert asked.stopped.startswith("before the first question, the device could not be brought")
+
+
+def test_one_that_is_stopped_has_its_good_image() -> None:
+    subject, calls = mock(), []
+
+    def stopped() -> bool:
+        calls.append(1)
+        return len(calls) > 3000
+
+    asked = ask(subject, ConformanceProfile(), stopped=stopped)
+    assert asked.stopped == "the run was stopped"
+    assert subject.device.stored_image == GOOD_IMAGE
+
+
+# -- the command ----------------------------------------------------------------------------------
+
+
+def test_the_command_writes_a_profile_that_is_read_again(flasher: Flasher, tmp_path: Path) -> None:
+    path = tmp_path / "p.toml"
+    model = ("-t", "bms", "--mock", "--set", "application_area_bytes=34K", "--set", "window_s=0.1")
+    ran = flasher("conformance", "init", *model, "-o", str(path))
+    assert ran.code == 0
+    assert "tx_02" in ran.out
+    assert "ACK 1 to packet 1 again, 3 of 3 times" in ran.out
+    profile = load_profile(path)
+    assert profile.rationales["tx_02"].startswith("ACK 1 to packet 1 again, 3 of 3 times")
+    own = profile_of_mock(replace(MOCK_PROFILE, window_s=0.1)).limit("window_s")
+    assert profile.limit("window_s") == pytest.approx(own, abs=0.001)
+    assert profile.limit("window_s") != own  # it was seen, and not known
+    text = path.read_text(encoding="utf-8")
+    assert "# open: an image with a wrong checksum would have to be completed" in text
+    assert flasher("conformance", *model, "--profile", str(path), "--quick").code == 0
+    written = path.read_bytes()
+    again = flasher("conformance", "init", *model, "-o", str(path))
+    assert again.code == 2
+    assert "exists already" in again.err
+    assert path.read_bytes() == written
+    forced = flasher("--json", "conformance", "init", *model, "-o", str(path), "--force")
+    assert forced.code == 0
+    document = json.loads(forced.out)
+    assert document["toml"] == path.read_text(encoding="utf-8")
+    found = {one["key"]: one["value"] for one in document["answers"]}
+    assert (found["tx_02"], found["en_04"]) == ("ack", None)
+
+
+def test_no_file_is_written_for_a_device_that_does_not_answer(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    path = tmp_path / "p.toml"
+    variant = next(name for name, one in VARIANTS.items() if not one.upgrade_works)
+    ran = flasher(
+        "conformance", "init", "-t", "bms", "--mock", "--variant", variant, "-o", str(path)
+    )
+    assert ran.code == 5
+    assert "no profile is written" in ran.err
+    assert not path.exists()
+
+
+def test_a_device_on_a_bus_is_asked_about(flasher: Flasher, tmp_path: Path) -> None:
+    bus = ("-i", "virtual", "-c", "init", "--good-image", "README.md")
+    ran = flasher("conformance", "init", "-t", "bms", *bus, "-o", str(tmp_path / "p.toml"))
+    assert ran.code == 2
+    assert "erase and write the device about 100 times" in ran.err
