@@ -140,6 +140,22 @@ def test_a_call_that_does_not_return_is_ended_and_is_a_finding(
     assert "did not return from flasher_dut_receive" in found
 
 
+class IsSanitized(PythonBootloader):
+    """Ends as a program ends that AddressSanitizer ends."""
+
+    def _end(self) -> None:
+        os.write(2, b"ERROR: AddressSanitizer: stack-buffer-overflow\nSUMMARY: message.c:70\n")
+        os.write(2, b"Shadow bytes around the buggy address:\n  0x10002bbe8e50: 00 00 f1\n")
+        os._exit(1)
+
+
+def test_the_report_of_a_sanitizer_is_told_without_its_dump() -> None:
+    report = _run(_FLAWS + "IsSanitized", "EN-01")
+    found = _failures(report) + report.not_upgradable + report.stopped
+    assert "stack-buffer-overflow | SUMMARY: message.c:70)" in found
+    assert "Shadow" not in found
+
+
 class ReadsForEver(PythonBootloader):
     def _end(self) -> None:
         while True:

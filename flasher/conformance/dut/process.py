@@ -8,6 +8,7 @@ import signal
 import tempfile
 import traceback
 from collections.abc import Callable
+from itertools import takewhile
 from pathlib import Path
 from typing import Final, Never
 
@@ -19,6 +20,8 @@ WATCHDOG_S: Final = 5.0
 """A call that takes longer on the computer does not return."""
 _WAIT_S: Final = 0.01
 _SAID_SIZE: Final = 4096
+_DUMP: Final = "Shadow bytes around"
+"""Behind what AddressSanitizer says for people."""
 _STDIN, _STDOUT, _STDERR = range(3)
 _LIBRARY: Final = frozenset((".so", ".dylib"))
 
@@ -137,10 +140,13 @@ class BootloaderProcess:
         self._stderr.close()
 
     def said(self) -> str:
-        """What the process printed, the report of a sanitizer for instance; "" for nothing."""
+        """What the process printed, the report of a sanitizer for instance, without its dump of
+        memory; "" for nothing.
+        """
         self._stderr.seek(0)
         lines = self._stderr.read(_SAID_SIZE).decode(errors="replace").splitlines()
-        return " | ".join(printable(line) for line in lines if line.strip(" ="))
+        said = takewhile(lambda line: not line.startswith(_DUMP), lines)
+        return " | ".join(printable(line) for line in said if line.strip(" ="))
 
     def _be_bootloader(self, read_fd: int, write_fd: int) -> Never:
         """In the process of the bootloader: become it."""
