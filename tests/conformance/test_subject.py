@@ -159,7 +159,7 @@ def test_the_report_of_a_sanitizer_is_told_without_its_dump() -> None:
 class ReadsForEver(PythonBootloader):
     def _end(self) -> None:
         while True:
-            self.host.flash_read(0, 32)
+            self.host.flash_read(0, 0x1000)
 
 
 def test_a_call_that_reads_flash_for_ever_is_ended_and_is_a_finding() -> None:
