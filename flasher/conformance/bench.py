@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterable, Iterator
+from typing import Final
 
 from flasher.conformance.host import UPDATES_MAX, PatientHost
 from flasher.conformance.judge import Judge
@@ -19,6 +20,9 @@ from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Subject
 from flasher.conformance.tester import BusTester
 from flasher.conformance.wire import Encoder, Kind, Received, describe, packet_count, told_version
+
+_PAUSES: Final = 4
+"""A pause that nobody knows may be so many times as long as limits.pause_s."""
 
 
 class Bench:
@@ -102,7 +106,11 @@ class Bench:
     def wait_for_window(self) -> None:
         """After the first boot version, wait for the middle of the window behind the last one."""
         gaps = self.number("versions") - 1
-        self.wait(gaps * self.limit("version_spacing_s") + self.limit("window_s") / 2)
+        spacing_s = self.limit("version_spacing_s") + self.limit("version_spacing_tolerance_s")
+        last_at = self.now + gaps * spacing_s
+        for _ in range(gaps):
+            self.wait_for(Kind.BOOT_VERSION, within_s=last_at - self.now)
+        self.wait(self.limit("window_s") / 2)
         self.forget()
 
     def next_version(self) -> Received:
@@ -189,7 +197,7 @@ class Bench:
     def check_upgrade(self, image: bytes | None = None) -> None:
         """The device can be upgraded from where it is: to `image`, or to the good one."""
         chosen = self.good_image if image is None else image
-        done = self.upgrade(chosen)
+        done = self.upgrade(chosen, blind=self.choice("rs_03") == "either")
         self.require(done.ok, "the device can be upgraded", done.reason or "it was")
         self.check_image(chosen)
 
@@ -252,22 +260,44 @@ class Bench:
         self.forget()
         self.power_on()
 
+    def begin_anew(self, size_bytes: int) -> None:
+        """Abandon a transfer and get request transfer for another one: by the update command where
+        the profile says that it starts over (up_08), else as `leave_transfer` does, which raises
+        Unsupported.
+        """
+        if self.choice("up_08") == "either" and not self.subject.has_power:
+            sent = self.send(self.encoder.update(size_bytes))
+            heard = self.host.request_or_version(sent.left_at, self.limit("erase_s"))
+            if heard is not None and heard.kind is Kind.REQUEST:
+                return
+        if self.choice("up_08") != "starts_over":
+            self.leave_transfer()
+        self.update(size_bytes)
+
     def leave_transfer(self) -> None:
         """Abandon a transfer, so that the bootloader announces itself without an application: by
-        reset or by a pause where the profile says that they end a transfer, else by power.
+        reset or by a pause where the profile says that they end a transfer, else by power; without
+        that, by a reset or a pause that may end it.
 
         Raises Unsupported where none of these is possible.
         """
         self.forget()
         within_s = self.limit("first_version_s")
-        if self.choice("tx_13") == "restarts":
+        pause, reset = self.choice("tx_12"), self.choice("tx_13")
+        if reset == "restarts":
             self.send(self.encoder.reset())
-        elif self.choice("tx_12") == "announces":
+        elif pause == "announces":
             within_s += self.limit("pause_s")
-        elif not self.subject.has_power:
-            raise Unsupported("no power control, and nothing else ends a transfer (tx_12, tx_13)")
-        else:
+        elif self.subject.has_power:
             within_s = 0.0
+        elif "either" in (pause, reset):
+            self.send(self.encoder.reset())
+            within_s += _PAUSES * self.limit("pause_s")
+            if self.wait_for(Kind.BOOT_VERSION, within_s=within_s) is None:
+                raise Unsupported("no power control, and neither reset nor a pause ends a transfer")
+            return
+        else:
+            raise Unsupported("no power control, and nothing else ends a transfer (tx_12, tx_13)")
         if not self.subject.has_power:
             self.await_message(Kind.BOOT_VERSION, within_s=within_s)
         elif self.wait_for(Kind.BOOT_VERSION, within_s=within_s) is None:

@@ -25,6 +25,8 @@ _SETTLE_S: Final = 0.3
 _BLIND_S: Final = 1.0
 """A device that was reset and announces nothing for so long may be in the midst of a transfer."""
 UPDATES_MAX: Final = 50
+_WINDOW_MAX_S: Final = 1.0
+"""How long the window lasts at the most where the profile does not know it (up_04)."""
 _LEFTOVER_S: Final = 0.06
 """A boot version so soon after request transfer was sent before it (R11)."""
 _PACKET_ANSWERS: Final = (Kind.ACK, Kind.NAK, Kind.BOOT_VERSION, Kind.COMPLETE)
@@ -50,7 +52,10 @@ class PatientHost:
         """How long announcements and the window last together at the most."""
         limit, count = self._profile.limit, self._profile.number("versions")
         spacing_s = limit("version_spacing_s") + limit("version_spacing_tolerance_s")
-        return (count - 1) * spacing_s + limit("window_s") + limit("window_tolerance_s")
+        window_s = limit("window_s") + limit("window_tolerance_s")
+        if self._profile.choice("up_04") == "either":
+            window_s = max(window_s, _WINDOW_MAX_S)
+        return (count - 1) * spacing_s + window_s
 
     # -- application ------------------------------------------------------------------------------
 
@@ -88,17 +93,20 @@ class PatientHost:
         tester = self._tester
         deadline = tester.now + limit_s
         while True:
-            tester.send(self._encoder.reset())
-            if tester.wait_for(Kind.FEEDBACK) is not None:
+            with tester.hearing_feedback():
+                tester.send(self._encoder.reset())
+                runs = tester.wait_for(Kind.FEEDBACK) is not None
+            if runs:
                 tester.wait_for(Kind.BOOT_VERSION)
                 tester.wait(self.burst_s + _SETTLE_S)
                 tester.forget()
                 return True
             if tester.now >= deadline:
                 return False
-            # One that restarts at each reset would never come to its application.
-            restarts = self._profile.choice("rs_02") == "restarts"
-            tester.wait(self.burst_s + (self._profile.limit("first_version_s") if restarts else 0))
+            # The reset may have begun a burst (RS-02): another one in it would do so again.
+            quiet_s = self.burst_s + _SETTLE_S
+            while tester.wait_for(Kind.BOOT_VERSION, within_s=quiet_s) and tester.now < deadline:
+                pass
 
     def send_packet(self, image: bytes, number: int) -> Sent:
         """Send a packet of `image` and wait for nothing."""
@@ -199,7 +207,7 @@ class PatientHost:
             if heard.kind is Kind.BOOT_VERSION:
                 return last
             is_next = heard.kind is Kind.NAK and heard.number == number + 1
-            by_profile = is_next and tries > 1 and self._profile.choice("tx_02") == "nak_next"
+            by_profile = is_next and tries > 1 and self._profile.choice("tx_02") != "ack"
             if not by_profile and heard.kind is not Kind.ACK:
                 continue
             # The other copies are answered too; the next message waits until that is over.

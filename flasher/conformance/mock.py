@@ -134,11 +134,23 @@ _FROM_MODEL: Final[dict[str, tuple[str, dict[str, str]]]] = {
     "en_04": ("image_checksum", {}),
 }
 """Key of the suite to the model's option and the values that are called differently."""
+_OF_MODEL: Final = {
+    "fr_01": "accepted",
+    "fr_02": "found",
+    "fr_04": "rescanned",
+    "fr_07": "ignored",
+    "fr_10": "silence",
+    "up_02": "silence",
+    "up_04": "rejected",
+    "up_04_burst": "accepted",
+    "tx_08": "ignored",
+}
+"""What the model does whatever its options are."""
 
 
 def profile_of_mock(device: DeviceProfile = MOCK_PROFILE) -> ConformanceProfile:
     """The conformance profile of a device model with these choices."""
-    given: dict[str, Value] = {}
+    given: dict[str, Value] = dict(_OF_MODEL)
     for key, (option, renamed) in _FROM_MODEL.items():
         value = str(getattr(device, option))
         given[key] = renamed.get(value, value)

@@ -99,6 +99,12 @@ def is_reachable(
     return False
 
 
+def may_need_power(profile: ConformanceProfile) -> bool:
+    """True when the profile leaves it possible that nothing but power ends a transfer."""
+    only_power = (("tx_12", "waits"), ("tx_13", "ignored"), ("up_08", "rejected"))
+    return all(profile.choice(key) in (value, "either") for key, value in only_power)
+
+
 def needs_power(profile: ConformanceProfile) -> bool:
     """True when the profile leaves no other way out of a transfer than power."""
     choices = (profile.choice("tx_12"), profile.choice("tx_13"), profile.choice("up_08"))
@@ -129,10 +135,10 @@ def _upgrade(bench: Bench) -> str:
     """Upgrade by the protocol, in a way that does not depend on what a reset (TX-13) or an update
     command (UP-08) does during a transfer; more than once, as a burst may have just begun or ended.
     """
-    blind = bench.choice("up_08") == "starts_over"
+    blind = bench.choice("up_08") != "rejected"
     reason = ""
     for attempt in range(_UPGRADE_TRIES):
-        if attempt and bench.choice("tx_12") == "announces":
+        if attempt and bench.choice("tx_12") != "waits":
             bench.wait(bench.limit("pause_s"))
         reset = not blind or attempt == _UPGRADE_TRIES - 1 or _may_run(bench)
         # Without an application it may listen silently (RS-03).

@@ -31,7 +31,7 @@ from flasher.conformance.catalogue import (
 )
 from flasher.conformance.diagnosis import diagnose
 from flasher.conformance.profile import ConformanceProfile, check_deviations, profile_keys
-from flasher.conformance.restore import BY_POWER, Restored, is_reachable, needs_power, restore
+from flasher.conformance.restore import BY_POWER, Restored, is_reachable, may_need_power, restore
 from flasher.conformance.results import (
     FINAL_IMAGE_OK,
     CaseEnded,
@@ -342,7 +342,7 @@ class Run:
             self.stopped = f"{when}, the device could not be brought back: {done.reason}{likely}"
             self._killed_by = case_id
             return done.reason
-        if case_id and done.how == BY_POWER and not needs_power(self._profile):
+        if case_id and done.how == BY_POWER and not may_need_power(self._profile):
             self._rescues.append(Rescue(case_id, done.how))
             return "not by the protocol; a power cycle brought it back"
         return ""

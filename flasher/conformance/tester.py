@@ -5,11 +5,13 @@ Frames are received whenever time passes, and no wait goes beyond the time limit
 
 from __future__ import annotations
 
+import re
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
+from math import inf
 from typing import Final, NamedTuple
 
 from flasher.conformance.profile import ConformanceProfile
@@ -35,6 +37,8 @@ _ECHO_LIMIT_S: Final = 2.0
 _FRAME_BITS: Final = 47
 """A frame without data and stuff bits, interframe space included."""
 _UPDATE_HEAD: Final = b"\x55\xaa" + bytes((WRITE, 2 + (UPDATE & 0xFF))) + UPDATE.to_bytes(2, "big")
+_NO_READ: Final = re.compile(rb"\x55\xaa[^\x11\x0c]", re.DOTALL)
+"""The beginning of a message that is neither read nor report."""
 _POLL_S: Final = 0.2
 """Longest single wait, so that a request to stop is noticed soon."""
 
@@ -94,6 +98,8 @@ class BusTester:
         self.ends_at = self.began_at + limit_s
         self.update_was_sent = False
         """True once an update command went out: the application may be erased."""
+        self.hears_feedback = profile.choice("fr_10") == "silence"
+        """Else general feedback that a write may be answered by (R15) is in the trace only."""
         self.hears_application = False
         """Set by a case that cares about `Kind.APPLICATION`; else they are in the trace only."""
         self.frames_sent = 0
@@ -106,6 +112,9 @@ class BusTester:
         self._trace: deque[TraceEntry] = deque(maxlen=TRACE_FRAMES)
         self._traced = 0
         self._echoes_due = 0
+        self._feedback_due = 0
+        """Writes that general feedback may still answer."""
+        self._written_at = -inf
         self._faults: dict[tuple[bool, int], Fault] = {}
         self._fault_origin = (0, 0)
         self._swapped: RawFrame | None = None
@@ -142,6 +151,10 @@ class BusTester:
         if at is not None:
             self.wait_until(at)
         began_at = self.now
+        raw = b"".join(frame.data for frame in frames if frame.can_id == self.encoder.to_device)
+        if writes := len(_NO_READ.findall(raw)):
+            self._feedback_due += writes
+            self._written_at = began_at
         for index, frame in enumerate(frames):
             if index and gap_s:
                 self._wait_for_echoes()
@@ -151,7 +164,18 @@ class BusTester:
             frame, self._swapped = self._swapped, None
             self._send_frame(frame)
         self._wait_for_echoes()
+        if writes:
+            self._written_at = self.left_at
         return Sent(began_at, self.left_at)
+
+    @contextmanager
+    def hearing_feedback(self) -> Iterator[None]:
+        """General feedback is heard inside the `with`, as that of an application is waited for."""
+        before, self.hears_feedback = self.hears_feedback, True
+        try:
+            yield
+        finally:
+            self.hears_feedback = before
 
     @contextmanager
     def disturb(self, *faults: Fault) -> Iterator[None]:
@@ -240,11 +264,16 @@ class BusTester:
         self.frames_received += 1
         copies = 1 if fault is None else {FaultKind.DROP: 0, FaultKind.DOUBLE: 2}[fault.kind]
         for _ in range(copies):
-            self._received.extend(
-                heard
-                for heard in self._decoder.feed(arrival.frame, arrival.at)
-                if self.hears_application or heard.kind is not Kind.APPLICATION
-            )
+            heard = self._decoder.feed(arrival.frame, arrival.at)
+            self._received.extend(filter(self._is_heard, heard))
+
+    def _is_heard(self, one: Received) -> bool:
+        if one.kind is Kind.FEEDBACK and not self.hears_feedback:
+            is_late = one.first_at - self._written_at > self.profile.limit("feedback_s")
+            if self._feedback_due and not is_late:
+                self._feedback_due -= 1
+                return False
+        return self.hears_application or one.kind is not Kind.APPLICATION
 
     def _send_disturbed(self, frame: RawFrame) -> None:
         fault = self._faults.get((False, self.frames_sent - self._fault_origin[0]))

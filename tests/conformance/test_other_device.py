@@ -163,14 +163,14 @@ def test_other_ways_that_the_document_leaves_open_pass(
 
 @pytest.mark.no_cover
 @each(
-    "kind, cases",
+    "kind, cases, choices",
     [
-        (LateListener, ("FR-08", "UP-04")),
-        (ChoosyDevice, ("TX-04", "TX-06")),
-        (PageDevice, ("FR-03", "PW-01")),
+        (LateListener, ("FR-08", "UP-04"), {"up_04_burst": "accepted"}),
+        (ChoosyDevice, ("TX-04", "TX-06"), {"tx_01": "nak_expected"}),
+        (PageDevice, ("FR-03", "PW-01"), {}),
     ],
 )
-def test_a_profile_that_does_not_tell_of_them_fails_them(
-    kind: type[ScriptedDevice], cases: Sequence[str]
+def test_a_profile_that_tells_otherwise_fails_them(
+    kind: type[ScriptedDevice], cases: Sequence[str], choices: dict[str, Value]
 ) -> None:
-    assert set(judged(kind, cases)) == set(cases)
+    assert set(judged(kind, cases, **choices)) == set(cases)

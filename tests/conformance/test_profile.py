@@ -25,7 +25,7 @@ def write(tmp_path: Path, text: str) -> Path:
 
 def test_without_a_file_every_key_has_its_default() -> None:
     profile = ConformanceProfile()
-    assert profile.choice("tx_02") == "ack"
+    assert profile.choice("tx_02") == "either"
     assert profile.limit("erase_s") == 10.0
     assert profile.number("largest_image_bytes") == 65535 * 128
 
@@ -74,8 +74,8 @@ def test_a_written_default_profile_gives_nothing(tmp_path: Path) -> None:
     [
         ("tx_01_lost = 'nak'", "Did you mean tx_01_lost_frame?"),
         ("[limits]\nerase = 1", "Did you mean erase_s?"),
-        ("tx_02 = 'never'", "It is ack, nak_next"),
-        ("tx_02 = 1", "It is ack, nak_next"),
+        ("tx_02 = 'never'", "It is either, ack, nak_next"),
+        ("tx_02 = 1", "It is either, ack, nak_next"),
         ("[limits]\nerase_s = -1", "It is seconds from 0 to 3600"),
         ("[limits]\nerase_s = true", "It is seconds"),
         ("[device]\nversions = 2.5", "It is a whole number from 1 to 100"),

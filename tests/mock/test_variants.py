@@ -232,8 +232,15 @@ def the_announcements_of_a_power_up_and_the_application_after_it(tool: Tool) -> 
 
 # -- update command -------------------------------------------------------------------------------
 
-does("queues-updates", right=1, wrong=2)(requests_after(*PARTS, *PARTS))
 does("any-target-name", right=0, wrong=1)(requests_after(*payloads(update_wire(600, b"WMC_UPD"))))
+
+
+@does("queues-updates", right=(1, ["ack 1"]), wrong=(1, ["ack 1", "request"]))
+def two_update_commands_and_packet_1(tool: Tool) -> object:
+    requested = requests_after(*PARTS, *PARTS)(tool)
+    tool.packet(1, IMAGE)
+    tool.run(0.05)
+    return requested, tool.heard()
 
 
 @does("listens-until-third-version", right=(["version"] * 3, 1), wrong=(["version"] * 3, 0))

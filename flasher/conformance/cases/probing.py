@@ -71,6 +71,8 @@ class Probe:
         taken = heard is not None and heard.kind is Kind.REQUEST
         bench.check(is_as(wanted, taken), f"update command {wanted}", heard or "no answer")
         if not taken:
+            if reset and heard is None:  # by now the application was started
+                bench.reset_to_bootloader()
             bench.update(len(self.image))
         self.number, self._taken_at = 1, bench.now
 
@@ -105,8 +107,7 @@ class Probe:
     def frames(self) -> list[RawFrame]:
         """The next packet as it should be; begins a new transfer when all were sent."""
         if self.number > packet_count(len(self.image)):
-            self._bench.leave_transfer()
-            self._bench.update(len(self.image))
+            self._bench.begin_anew(len(self.image))
             self.number = 1
         return self._bench.encoder.packet_of(self.image, self.number)
 

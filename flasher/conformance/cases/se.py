@@ -74,6 +74,14 @@ def endless(bench: Bench) -> None:
             limit_s = bench.limit("pause_s") + bench.limit("first_version_s")
             heard = _drip_until(bench, Kind.BOOT_VERSION, limit_s, [])
             bench.check(heard is not None, f"boot version within {limit_s:g} s", heard or "none")
+        elif bench.choice("tx_12") == "either":
+            limit_s = bench.limit("pause_s") + bench.limit("first_version_s")
+            if _drip_until(bench, Kind.BOOT_VERSION, limit_s, []) is not None:
+                bench.update(len(image))
+                bench.finish(image)
+            else:
+                bench.wait(2 * bench.limit("inter_frame_s"))
+                bench.finish(image, len(floods) + 1)
         else:
             bench.finish(image, len(floods) + 1)
 
@@ -186,7 +194,7 @@ def _carry_on(bench: Bench, image: bytes, stored: int) -> int:
         if bench.wait_for(Kind.COMPLETE) is not None:
             return 0
     bench.info(f"the noise after packet {stored} ended the transfer")
-    done = bench.upgrade(image, blind=bench.choice("up_08") == "starts_over")
+    done = bench.upgrade(image, blind=bench.choice("up_08") != "rejected")
     bench.require(done.ok, "the transfer goes on, or the device can be upgraded", done.reason)
     bench.check_application(image)
     return 0

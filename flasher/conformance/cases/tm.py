@@ -86,9 +86,10 @@ def times(bench: Bench) -> None:
             filler = (bench.filler(_PACKETS) + _REST)[: bench.number("largest_image_bytes")]
             bench.update(len(filler))
             measure_packets(bench, filler)
-            bench.leave_transfer()
-    with bench.step("upgrade"):
+            bench.begin_anew(len(image))
+    else:
         bench.update(len(image))
+    with bench.step("upgrade"):
         measure_packets(bench, image)
         end_measured(bench)
     for turn in range(_RESETS):
@@ -115,9 +116,10 @@ def check_times(bench: Bench) -> None:
 def _enter(bench: Bench) -> Received:
     """Reset the device; returns the first boot version. The times are judged at the end."""
     bench.forget()
-    sent = bench.send(bench.encoder.reset())
     limit_s = _PATIENCE * bench.limit("first_version_s")
-    feedback = bench.next_message(limit_s)
+    with bench.tester.hearing_feedback():
+        sent = bench.send(bench.encoder.reset())
+        feedback = bench.next_message(limit_s)
     if feedback is not None and feedback.kind is Kind.FEEDBACK:
         bench.measure(_FEEDBACK, feedback.at - sent.left_at)
     is_there = feedback is not None and feedback.kind is Kind.BOOT_VERSION

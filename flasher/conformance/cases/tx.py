@@ -220,14 +220,13 @@ def _repeat(bench: Bench, changed: Callable[[bytes], bytes]) -> None:
 
 def _check_repeated(bench: Bench, number: int, total: int) -> None:
     """The packet stored last was answered once more, as tx_02 says."""
-    heard = describe(answers(bench))
-    wanted = f"ACK {number}"
-    allowed = {wanted}
-    if bench.choice("tx_02") == "nak_next":
-        wanted = f"NAK {number + 1}"
-        # Behind the last packet there is no next one to ask for.
-        allowed = {wanted, f"ACK {number}", f"NAK {number}"} if number == total else {wanted}
-    bench.check(heard in allowed, f"{wanted} for the repeated packet", heard)
+    heard, choice = describe(answers(bench)), bench.choice("tx_02")
+    ack, nak = f"ACK {number}", f"NAK {number + 1}"
+    allowed = {"ack": [ack], "nak_next": [nak]}.get(choice, [ack, nak])
+    # Behind the last packet there is no next one to ask for.
+    more = [ack, f"NAK {number}"] if number == total and choice != "ack" else []
+    expected = f"{' or '.join(allowed)} for the repeated packet"
+    bench.check(heard in (*allowed, *more), expected, heard)
 
 
 # -- wrong heads ----------------------------------------------------------------------------------
@@ -279,9 +278,11 @@ def _send_wrong_numbers(bench: Bench, total: int, stored: int) -> None:
 
 def _check_older(bench: Bench, number: int) -> None:
     choice = bench.choice("tx_03")
-    if choice == "ack":
+    if choice in ("ack", "either"):
         heard = describe(answers(bench))
-        bench.check(heard == f"ACK {number}", f"ACK {number}", heard)
+        others = ["nothing", f"NAK {number}", f"NAK {_STORED + 1}"] if choice == "either" else []
+        allowed = [f"ACK {number}", *others]
+        bench.check(heard in allowed, " or ".join(allowed), heard)
     else:
         _check_naks(bench, {number, _STORED + 1}, (1,) if choice == "nak" else (0,))
 
@@ -419,7 +420,13 @@ def other_filler(bench: Bench) -> None:
     bench.start_transfer(len(image))
     bench.packets(image, 1, total - 1)
     bench.send(bench.encoder.packet(total, total, rest.ljust(PACKET_BYTES, b"\x00")))
-    if bench.choice("tx_08") == "ignored":
+    if bench.choice("tx_08") == "either":
+        heard = bench.next_message(bench.limit("ack_s"))
+        is_there = heard is None or heard.kind is Kind.NAK or str(heard) == f"ACK {total}"
+        bench.check(is_there, f"ACK {total}, NAK or silence", heard or "nothing")
+        taken = heard is not None and heard.kind is Kind.ACK
+        bench.finish(image, total + 1 if taken else total)
+    elif bench.choice("tx_08") == "ignored":
         bench.expect(Kind.ACK, number=total)
         bench.finish(image, total + 1)
     else:
@@ -444,10 +451,8 @@ def other_filler(bench: Bench) -> None:
 def pause(bench: Bench) -> None:
     with bench.step("a long transfer"):
         _send_slowly(bench)
-    if bench.choice("tx_12") == "announces":
-        _announces(bench)
-    else:
-        _waits(bench)
+    kinds = {"announces": _announces, "waits": _waits, "either": _announces_or_waits}
+    kinds[bench.choice("tx_12")](bench)
 
 
 def _send_slowly(bench: Bench) -> None:
@@ -468,8 +473,7 @@ def _send_slowly(bench: Bench) -> None:
     for number in range(1, count + 1):
         bench.packet(image, number)
         bench.wait(apart_s)
-    bench.leave_transfer()
-    bench.update(len(bench.good_image))
+    bench.begin_anew(len(bench.good_image))
     bench.finish(bench.good_image)
 
 
@@ -493,6 +497,39 @@ def _announces(bench: Bench) -> None:
     with bench.step("upgrade after the pauses"):
         bench.update(len(bench.good_image))
         bench.finish(bench.good_image)
+
+
+def _announces_or_waits(bench: Bench) -> None:
+    """Whatever it does, the transfer goes on or begins anew, and what ended a transfer before a
+    pause ends it after the pause.
+    """
+    image = transfer_image(bench)
+    pause_s = _LONG * bench.limit("pause_s")
+    bench.start_transfer(len(image))
+    with bench.step("a short pause"):
+        bench.wait(_SHORT * bench.limit("pause_s"))
+        bench.packet(image, 1)
+    for stored in (1, packet_count(len(image))):
+        with bench.step(_place("a pause", stored)):
+            bench.packets(image, 2, stored)
+            heard = bench.wait_for(Kind.BOOT_VERSION, within_s=pause_s)
+            bench.info(f"after {pause_s:g} s: {heard or 'nothing'}")
+            if heard is not None:
+                bench.update(len(image))
+                bench.packets(image, 1, stored)
+    bench.finish(image, packet_count(len(image)) + 1)
+    with bench.step("an update command before a pause, and after one"):
+        bench.start_transfer(len(image))
+        bench.packet(image, 1)
+        bench.send(bench.encoder.update(len(image)))
+        within_s = bench.limit("pause_s") / 2
+        if bench.wait_for(Kind.REQUEST, within_s=within_s) is None:
+            bench.unsupported("a new upgrade after a pause", "an update command starts none")
+            return
+        bench.packet(image, 1)
+        bench.collect(pause_s)
+        bench.update(len(image))
+        bench.finish(image)
 
 
 def _waits(bench: Bench) -> None:
@@ -525,11 +562,10 @@ def _waits(bench: Bench) -> None:
     choices=("tx_13",),
 )
 def reset(bench: Bench) -> None:
-    ignored = bench.choice("tx_13") == "ignored"
-    image = transfer_image(bench) if ignored else bench.filler(_BEGUN)[:-1]
+    choice, image = bench.choice("tx_13"), transfer_image(bench)
     total = packet_count(len(image))
     within_s = bench.limit("first_version_s")
-    if bench.choice("tx_12") == "announces":
+    if bench.choice("tx_12") != "waits":
         # Later than that, it is the pause that ends the transfer.
         within_s = min(within_s, _JUST_NOT * bench.limit("pause_s"))
     with bench.step("reset while it erases"):
@@ -538,23 +574,22 @@ def reset(bench: Bench) -> None:
     done = 0
     for stored in (0, 1, total):
         with bench.step(_place("reset", stored)):
-            if stored and not ignored:
-                bench.update(len(image))
-                done = 0
             bench.packets(image, done + 1, stored)
             done = stored
             bench.send(bench.encoder.reset())
-            if ignored:
+            if choice == "ignored":
                 bench.expect_silence(why="silence, no restart")
-            else:
-                bench.expect(Kind.BOOT_VERSION, within_s=within_s, ignoring=(Kind.FEEDBACK,))
-    if ignored:
-        bench.finish(image, total + 1)
+                continue
+            heard = bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
+            if choice == "restarts":
+                bench.require_received(heard, Kind.BOOT_VERSION.value, within_s)
+            if heard is not None:
+                bench.update(len(image))
+                bench.packets(image, 1, stored)
+    bench.finish(image, total + 1)
     with bench.step("a new upgrade"):
-        if ignored:
-            bench.reset_to_bootloader()
-        bench.update(len(bench.good_image))
-        bench.finish(bench.good_image)
+        bench.start_transfer(len(image))
+        bench.finish(image)
 
 
 def _reset_while_it_erases(bench: Bench) -> None:
@@ -570,7 +605,15 @@ def _reset_while_it_erases(bench: Bench) -> None:
     within_s = bench.limit("erase_s") + bench.limit("first_version_s")
     heard = bench.wait_for(Kind.REQUEST, Kind.BOOT_VERSION, within_s=within_s)
     found = bench.require_received(heard, "request transfer, or boot version", within_s)
-    if found.kind is Kind.BOOT_VERSION:
+    restarts: Received | None = found
+    if found.kind is Kind.REQUEST and bench.choice("tx_13") != "ignored":
+        # It may hear the reset when it has erased; what it announced before does not count.
+        restarts = bench.wait_for(
+            Kind.BOOT_VERSION,
+            within_s=min(bench.limit("first_version_s"), _JUST_NOT * bench.limit("pause_s")),
+            unlike=lambda one: one.at < found.at + 2 * _LEFTOVER_S,
+        )
+    if restarts is not None and restarts.kind is Kind.BOOT_VERSION:
         bench.update(len(image))
     bench.finish(image)
 

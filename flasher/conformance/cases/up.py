@@ -26,6 +26,7 @@ _SENT_WHOLE_PACKETS: Final = 2
 _SIZE_BITS: Final = (16, 24, 31)
 """A device that keeps fewer bits of the size takes one for a small image."""
 _EDGE_S: Final = 0.001
+_SOON_S: Final = 0.1
 _FIRST_PACKETS: Final = 3
 _MANY: Final = 24
 """Transfers begun without a restart between them: none may leave something behind."""
@@ -47,12 +48,13 @@ def sizes(bench: Bench) -> None:
     for index, size in enumerate([*(size for size in _SIZES if size < largest), largest]):
         with bench.step(f"{size} bytes"):
             if index:
-                bench.leave_transfer()
-            bench.update(size)
+                bench.begin_anew(size)
+            else:
+                bench.update(size)
             if packet_count(size) <= _SENT_WHOLE_PACKETS:
                 bench.packets(bench.random.randbytes(size))
-    bench.leave_transfer()
-    bench.check_upgrade()
+    bench.begin_anew(len(bench.good_image))
+    bench.finish(bench.good_image)
 
 
 @case(
@@ -91,7 +93,7 @@ def without_reset(bench: Bench) -> None:
     }
     choice = bench.choice("up_03")
     for step, frames in stimuli.items():
-        with bench.step(step):
+        with bench.step(step), bench.tester.hearing_feedback():
             bench.send(frames)
             _check_answer(bench, bench.collect(bench.limit("silence_s")), Kind.FEEDBACK, choice)
     bench.check_application()
@@ -122,6 +124,12 @@ def window(bench: Bench) -> None:
             _offer_update(bench, choice)
     edge_s = max(bench.limit("window_tolerance_s"), 2 * bench.port.uncertainty_s) + _EDGE_S
     window_s = bench.limit("window_s")
+    if bench.choice("up_04") == "either":
+        with bench.step(f"{window_s * 500:g} ms after the last boot version"):
+            _enter_at(bench, count)
+            bench.wait(window_s / 2)
+            _offer_update(bench, "accepted")
+        return
     with bench.step("just before the window's end"):
         last_at = _enter_at(bench, count)
         frames = bench.encoder.update(len(image))
@@ -139,30 +147,24 @@ def window(bench: Bench) -> None:
     "update command repeated",
     clause="R2; R25; robustness, not in the document",
     stimulus="update command twice before request transfer; again before packet 1",
-    expectation="one transfer, which begins at packet 1 and ends well",
+    expectation="request transfer once, or for each of them (up_05); the transfer begins at packet "
+    "1 and ends well",
     requires={DESTRUCTIVE},
+    choices=("up_05",),
 )
 def repeated(bench: Bench) -> None:
     image = bench.good_image
     update = bench.encoder.update(len(image))
-    quiet_s = bench.limit("silence_s")
     with bench.step("before request transfer"):
         bench.reset_to_bootloader()
         bench.wait_for_window()  # for a device that listens there only (UP-04)
         bench.send(update + update)
         _expect_request(bench)
-        heard = bench.collect(quiet_s)
-        bench.check_only(heard, Kind.BOOT_VERSION, why="one request transfer")
-        bench.finish(image)
+        _finish_requested(bench, bench.choice("up_05"))
     with bench.step("before packet 1"):
         bench.start_transfer(len(image))
         bench.send(update)
-        heard = bench.collect(quiet_s)
-        more = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
-        requests = [one for one in more if one.kind is Kind.REQUEST]
-        ok = len(more) == len(requests) <= 1
-        bench.check(ok, "request transfer once more, or nothing", describe(more))
-        bench.finish(image)
+        _finish_requested(bench, "either")
 
 
 @case(
@@ -192,11 +194,14 @@ def wrong_names(bench: Bench) -> None:
 )
 def in_transfer(bench: Bench) -> None:
     image = bench.good_image
-    starts_over = bench.choice("up_08") == "starts_over"
     total = packet_count(len(image))
     if total <= _FIRST_PACKETS:
         bench.unsupported("a transfer of 4 packets or more", "the good image is too small")
         return
+    starts_over = bench.choice("up_08") == "starts_over"
+    if bench.choice("up_08") == "either":
+        with bench.step("the same image"):
+            starts_over = _starts_over(bench)
     for step, size in (("same size", len(image)), ("one packet less", len(image) - PACKET_BYTES)):
         with bench.step(step):
             begun_size = size if starts_over else len(image)
@@ -218,6 +223,56 @@ def in_transfer(bench: Bench) -> None:
                 bench.send(bench.encoder.update(len(image)))
                 bench.expect(Kind.REQUEST)
             bench.finish(image)
+
+
+def _starts_over(bench: Bench) -> bool:
+    """Whether an update command in the midst of a transfer starts over; the image is the same, so
+    that nothing can be mixed. The application runs in the end.
+    """
+    image, number = bench.good_image, _FIRST_PACKETS + 1
+    bench.start_transfer(len(image))
+    bench.packets(image, 1, _FIRST_PACKETS)
+    bench.send(bench.encoder.update(len(image)))
+    heard = bench.wait_for(Kind.REQUEST, within_s=bench.limit("pause_s") / 2)
+    if heard is None:
+        bench.send_packet(image, number)
+        heard = bench.wait_for(Kind.ACK, Kind.REQUEST, within_s=bench.limit("erase_s"))
+    found = bench.require_received(heard, "request transfer, or the transfer goes on", 0.0)
+    starts_over = found.kind is Kind.REQUEST
+    bench.info("the device starts over" if starts_over else "the device goes on")
+    bench.finish(image, 1 if starts_over else number + 1)
+    return starts_over
+
+
+def _finish_requested(bench: Bench, choice: str) -> None:
+    """The transfer after a second update command: packet 1 is sent at request transfer, and again
+    at another one (R16), of which there may be as many as `choice` says.
+    """
+    image = bench.good_image
+    heard = bench.collect(_SOON_S)
+    bench.check_only(heard, Kind.BOOT_VERSION, Kind.REQUEST, why="request transfer, or nothing")
+    more = sum(one.kind is Kind.REQUEST for one in heard)
+    copies = 0
+    acknowledged: Received | None = None
+    while acknowledged is None:
+        copies += 1
+        sent = bench.send_packet(image, 1)
+        found = bench.wait_for(Kind.ACK, Kind.REQUEST, within_s=bench.limit("erase_s"))
+        found = bench.require_received(found, "ACK 1, or request transfer", bench.limit("erase_s"))
+        if found.kind is Kind.ACK:
+            acknowledged = found
+        else:
+            more += 1
+            bench.require(more <= 1, "request transfer twice at the most", f"{more + 1} times")
+    bench.require(acknowledged.number == 1, "ACK 1", acknowledged)
+    if copies == 1:
+        bench.measure("packet to ACK", acknowledged.at - sent.left_at)
+    else:  # each of them may be answered (R10)
+        late = bench.collect(_SOON_S)
+        bench.check_only(late, Kind.ACK, Kind.NAK, why="answers to packet 1")
+    wanted = {"once": (0,), "each": (1,)}.get(choice, (0, 1))
+    bench.check(more in wanted, f"request transfer more than once: {choice}", f"{more} times more")
+    bench.finish(image, 2)
 
 
 def _offer_update(bench: Bench, choice: str) -> None:

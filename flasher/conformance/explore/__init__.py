@@ -14,7 +14,7 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.explore.steps import Step, next_step, parse_step, reachable_pairs
 from flasher.conformance.explore.walk import ALL_STEPS, Phase, Violation, Walk
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.restore import BY_POWER, needs_power, restore
+from flasher.conformance.restore import BY_POWER, may_need_power, restore
 from flasher.conformance.results import (
     CaseEnded,
     CaseLimitReached,
@@ -155,7 +155,7 @@ class Explorer:
         done = restore(self._subject, self._profile, flash=True, stopped=self._stopped)
         if not done.ok:
             return done.reason
-        if done.how == BY_POWER and self._walks and not needs_power(self._profile):
+        if done.how == BY_POWER and self._walks and not may_need_power(self._profile):
             return "not by the protocol; a power cycle brought it back"
         return ""
 

@@ -219,9 +219,9 @@ class StopsListening(MockDevice):
         return Event.NO_CONCERN if is_deaf and event is Event.UPDATE else event
 
 
-@variant("queues-updates", "UP-05", "erases and requests once for each update command that came")
+@variant("queues-updates", "UP-05", "carries out a second update command after packet 1")
 class QueuesUpdates(MockDevice):
-    """Keeps an update command that comes while it erases, and erases and requests again for it."""
+    """Keeps an update command that comes while it erases, and erases for it in the transfer."""
 
     _waiting_update = False
 
@@ -230,8 +230,8 @@ class QueuesUpdates(MockDevice):
             self._waiting_update = True
         super()._handle(event, now)
 
-    def _request(self, now: float) -> str:
-        detail = super()._request(now)
+    def _acknowledge(self, now: float) -> str:
+        detail = super()._acknowledge(now)
         if self._waiting_update:
             self._due_at = now + _LOOP_S
         return detail

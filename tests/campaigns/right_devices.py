@@ -1,0 +1,306 @@
+"""Makes devices that are right, each with its own choices of what the document leaves open, and
+runs the whole suite on each: `python -m tests.campaigns.right_devices --count 500 --seed 1`.
+
+Each is judged twice: by a profile that tells its choices, and by the default profile, where what is
+open is `either`, with nothing but its sizes. What fails is a fault of the suite, or of the model.
+Device N alone: `--count 1 --seed N`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import random
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from typing import Any, Final, NamedTuple
+
+from flasher.conformance.catalogue import Selection
+from flasher.conformance.mock import MockSubject, profile_of_mock
+from flasher.conformance.profile import ConformanceProfile, Value
+from flasher.conformance.results import CaseVerdict
+from flasher.conformance.runner import run
+from flasher.mock.model import AnyRow, MockDevice
+from flasher.mock.profile import DeviceProfile
+from flasher.mock.table import Event, State
+from flasher.mock.variants.framing import HeaderAtFrameStart, PaddingFatal, ShortFrameEnds
+from flasher.mock.variants.transfer import FillerChecked
+from flasher.protocol import messages
+from flasher.protocol.spec import TARGETS, WELLING, Mode
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.protocol.wire import Damage, DamageReason, Reassembler
+
+_HELD: Final = frozenset(
+    {CaseVerdict.PASS, CaseVerdict.PASS_IN_PART, CaseVerdict.INFO, CaseVerdict.UNSUPPORTED}
+)
+_BOOTLOADER: Final = frozenset(State) - {State.OFF, State.APPLICATION, State.RESTARTING}
+_LOOP_S: Final = 0.005
+
+
+# -- what the device model has no choice for -------------------------------------------------------
+
+
+class _ConfirmsUnknown(MockDevice):
+    """Sends general feedback to a write that it does not know (2.2.1 (2), R15)."""
+
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        is_write = isinstance(row, messages.Unknown) and row.message.mode == Mode.WRITE
+        if is_write and self.state in _BOOTLOADER:
+            self._send(messages.GeneralFeedback())
+        super()._take_row(row, now)
+
+
+class _ConfirmsAll(_ConfirmsUnknown):
+    """Sends general feedback to update command, packet and end of transfer as well (R15)."""
+
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        upgrade = messages.UpdateCommand | messages.Packet | messages.EndOfTransfer
+        if isinstance(row, upgrade) and self.state in _BOOTLOADER:
+            self._send(messages.GeneralFeedback())
+        super()._take_row(row, now)
+
+
+class _RefusesByNak(MockDevice):
+    """Says NAK to a size that it does not take."""
+
+    def _refuse_update(self, now: float) -> str:
+        self._send(messages.Nak(0))
+        return super()._refuse_update(now)
+
+
+class _ListensBehindBurst(MockDevice):
+    """Takes the update command when the burst is over, not between its announcements (R2)."""
+
+    def _classify(self, row: AnyRow) -> Event:
+        event = super()._classify(row)
+        in_burst = self.state is State.ANNOUNCING and self._announced < self.burst
+        is_deaf = in_burst and self._has_whole_application
+        return Event.NO_CONCERN if is_deaf and event is Event.UPDATE else event
+
+
+class _RequestsForEach(MockDevice):
+    """Erases and requests the transfer for each update command that comes before packet 1 (R25)."""
+
+    _waiting_update = False
+
+    def _handle(self, event: Event, now: float) -> None:
+        if event is Event.UPDATE_AGAIN and self.state is State.ERASING:
+            self._waiting_update = True
+        super()._handle(event, now)
+
+    def _request(self, now: float) -> str:
+        detail = super()._request(now)
+        if self._waiting_update:
+            self._due_at = now + _LOOP_S
+        return detail
+
+    def _elapsed(self) -> Event:
+        if self.state is State.TRANSFER and self._waiting_update:
+            self._waiting_update = False
+            return Event.UPDATE
+        return super()._elapsed()
+
+    def _switch_off(self, now: float) -> str:
+        self._waiting_update = False
+        return super()._switch_off(now)
+
+
+class _AsksForDamaged(MockDevice):
+    """Says NAK to a packet that is damaged, and nothing to one that makes no sense (TX-01)."""
+
+    _is_damaged = False
+
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        self._is_damaged = True
+        super()._take_damage(damage, now)
+        self._is_damaged = False
+
+    def _answer_bad(self, now: float) -> str:
+        if self._is_damaged:
+            return super()._answer_bad(now)
+        self._await_host(now)
+        return ""
+
+
+class _SilentToShort(MockDevice):
+    """Says nothing to a packet of which frames are lost (TX-01)."""
+
+    def _take_damage(self, damage: Damage, now: float) -> None:
+        if damage.reason is not DamageReason.INCOMPLETE:
+            super()._take_damage(damage, now)
+
+
+_BEHAVIOURS: Final[tuple[tuple[type[MockDevice], dict[str, Value]], ...]] = (
+    (_ConfirmsUnknown, {"fr_10": "either"}),
+    (_ConfirmsAll, {"fr_10": "either"}),
+    (_RefusesByNak, {"up_02": "either"}),
+    (_ListensBehindBurst, {"up_04_burst": "rejected"}),
+    (_RequestsForEach, {"up_05": "each"}),
+    (_AsksForDamaged, {"tx_01": "either"}),
+    (_SilentToShort, {}),
+    (FillerChecked, {"tx_08": "rejected"}),
+)
+_FRAMINGS: Final[tuple[tuple[type[Reassembler], dict[str, Value]], ...]] = (
+    (ShortFrameEnds, {"fr_01": "rejected"}),
+    (HeaderAtFrameStart, {"fr_02": "lost"}),
+    (PaddingFatal, {"fr_07": "rejected"}),
+)
+"""What a device may do, with what a profile says of it."""
+
+
+# -- a device by its seed --------------------------------------------------------------------------
+
+
+class RightDevice(NamedTuple):
+    """How to make one, and the profiles that it is judged by."""
+
+    seed: int
+    target: str
+    device_type: type[MockDevice]
+    choices: DeviceProfile
+    timings: dict[str, float]
+    is_bare: bool
+    """On a bench without power control and readback."""
+    profiles: dict[str, ConformanceProfile]
+
+    def make(self, target: str, profile: DeviceProfile) -> MockDevice:
+        """As `MockSubject` makes its device."""
+        return self.device_type(
+            TARGETS[target],
+            bitrate_bps=WELLING.bitrate_bps,
+            profile=profile,
+            timings=dataclasses.replace(DEFAULT_TIMINGS, **self.timings),  # type: ignore[arg-type]
+        )
+
+    def __str__(self) -> str:
+        kinds = [kind.__name__ for kind in self.device_type.__mro__[1:] if kind.__name__[0] == "_"]
+        framing = [kind.__name__ for kind in self.device_type.reassembler_type.__mro__[:-2]]
+        default = DeviceProfile()
+        choices = {
+            key: value
+            for key, value in vars(self.choices).items()
+            if value != getattr(default, key, value)
+        }
+        bench = "bare bench" if self.is_bare else "full bench"
+        return f"{self.target}, {bench}, {kinds}, {framing}, {self.timings}, {choices}"
+
+
+def right_device(seed: int) -> RightDevice:
+    """The device of that seed."""
+    chance = random.Random(f"right/{seed}")
+    target = chance.choice(("bms", "bms", "bms", "bms", "wmc", "obc"))
+    choices = _choices(chance)
+    behaviours = [one for one in _BEHAVIOURS if chance.random() < 0.25]
+    framings = [one for one in _FRAMINGS if chance.random() < 0.25]
+    framing = type("Framing", (*(kind for kind, _ in framings), Reassembler), {})
+    kinds = tuple(kind for kind, _ in behaviours if kind is not MockDevice)
+    if {_ConfirmsUnknown, _ConfirmsAll} <= set(kinds):
+        kinds = tuple(kind for kind in kinds if kind is not _ConfirmsUnknown)
+    device_type = type("Right", (*kinds, MockDevice), {"reassembler_type": framing})
+    timings = {
+        "boot_version_spacing_s": round(chance.uniform(0.046, 0.054), 4),
+        "inter_frame_timeout_s": round(chance.uniform(0.1, 0.18), 3),
+    }
+    fitting = dict(profile_of_mock(choices).given)
+    for _, given in (*behaviours, *framings):
+        fitting |= given
+    fitting["limits.version_spacing_s"] = timings["boot_version_spacing_s"]
+    sizes: dict[str, Value] = {
+        "device.application_bytes": choices.application_area_bytes,
+        "device.largest_image_bytes": choices.image_limit_bytes,
+    }
+    only_power = (choices.pause_in_transfer, choices.reset_in_transfer, choices.update_in_transfer)
+    is_bare = chance.random() < 0.3 and only_power != ("waits", "ignored", "ignored")
+    profiles = {
+        "fitting": ConformanceProfile(fitting, source=f"device {seed}"),
+        "default": ConformanceProfile(sizes, source="defaults"),
+    }
+    return RightDevice(seed, target, device_type, choices, timings, is_bare, profiles)
+
+
+def _choices(chance: random.Random) -> DeviceProfile:
+    """Choices of the device model, and times within the limits of the default profile."""
+    page = chance.choice((1024, 2048, 4096))
+    pages = chance.randint(-(-6 * 1024 // page), 40 * 1024 // page)
+    erase_s = chance.choice((0.0, 0.01, 0.3, 3.0)) * chance.random()
+    smallest, area = 1400, page * pages
+    picked: dict[str, Any] = {
+        "reset_in_bootloader": chance.choice(("ignored", "restarts")),
+        "without_application": chance.choice(("announces", "listens")),
+        "window_s": round(chance.uniform(0.06, 0.95), 3),
+        "reset_delay_s": round(chance.choice((0.0, 0.05, 1.5)) * chance.random(), 3),
+        "update_in_transfer": chance.choice(("starts_over", "ignored")),
+        "bad_packet": chance.choice(("nak_expected", "nak_received", "silence")),
+        "repeated_packet": chance.choice(("ack", "nak_next")),
+        "older_packet": chance.choice(("ack", "nak", "silence")),
+        "pause_in_transfer": chance.choice(("announces", "waits")),
+        "transfer_timeout_s": round(chance.uniform(3.0, 15.0), 2),
+        "reset_in_transfer": chance.choice(("ignored", "restarts")),
+        "image_checksum": chance.choice(("none", "none", "crc32")),
+        "repeated_end": chance.choice(("same_answer", "silence")),
+        "refused_hold_s": round(chance.uniform(0.0, 1.5), 3),
+        "after_complete": chance.choice(("starts", "restarts")),
+        "start_delay_s": round(chance.choice((0.01, 0.1, 1.5)) * chance.random(), 3),
+        "upgrade_in_application": chance.choice(("general_feedback", "silence")),
+        "page_size_bytes": page,
+        "application_area_bytes": area,
+        "largest_image_bytes": chance.choice((None, chance.randint(smallest, area))),
+        "program_unit_bytes": chance.choice((2, 4, 8, 16, 32)),
+        "erased_pages": chance.choice(("needed", "all")),
+        "erase_time_s": erase_s / pages,
+        "program_time_s": chance.choice((0.0, 0.001, 0.02, 0.3)) * chance.random(),
+        "boot_version": f"V{chance.randrange(10)}.{chance.randrange(10)}.{chance.randrange(10)}",
+    }
+    return DeviceProfile(**picked)
+
+
+# -- the run ---------------------------------------------------------------------------------------
+
+
+def faults_of(seed: int, selection: Selection = Selection()) -> list[str]:  # noqa: B008  frozen
+    """What the suite holds against the device of that seed: nothing, as it is right."""
+    device = right_device(seed)
+    found: list[str] = []
+    for name, profile in device.profiles.items():
+        subject = MockSubject(device.target, profile=device.choices, make_device=device.make)
+        if device.is_bare:
+            for ability in ("has_power", "has_readback", "has_bus_off", "has_timed_cuts"):
+                setattr(subject, ability, False)
+        report = run(subject, profile, selection=selection)
+        found += [
+            f"{seed} {name} {result.case_id} {result.verdict.value}: {result.reason}"
+            for result in report.results
+            if result.verdict not in _HELD
+        ]
+        if report.final_image != "verified":
+            found.append(f"{seed} {name}: the good image at the end: {report.final_image}")
+    return found
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Run the suite on as many devices as asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--count", type=int, default=500, help="how many devices (500)")
+    parser.add_argument("--seed", type=int, default=1, help="number of the first one (1)")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count(), help="processes")
+    options = parser.parse_args(words)
+    began, bad = time.monotonic(), 0
+    seeds = range(options.seed, options.seed + options.count)
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for seed, faults in zip(seeds, pool.map(faults_of, seeds), strict=True):
+            bad += bool(faults)
+            if faults:
+                sys.stdout.write("\n".join([*faults, f"  {right_device(seed)}", ""]))
+                sys.stdout.flush()
+    took_s = time.monotonic() - began
+    sys.stdout.write(
+        f"{options.count} right devices, each by two profiles: {bad} failed, {took_s:.0f} s\n"
+    )
+    return 1 if bad else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,19 @@
+"""A right device passes, whatever it chooses where the document leaves it open.
+
+`python -m tests.campaigns.right_devices` runs the whole suite on hundreds of them.
+"""
+
+from __future__ import annotations
+
+from flasher.conformance.catalogue import Selection
+from tests.campaigns.right_devices import faults_of, right_device
+from tests.loops import each
+
+
+@each("seed", (2, 3, 7))
+def test_the_quick_suite_holds_nothing_against_a_right_device(seed: int) -> None:
+    assert faults_of(seed, Selection(quick=True)) == []
+
+
+def test_a_seed_makes_the_same_device_again() -> None:
+    assert str(right_device(5)) == str(right_device(5)) != str(right_device(6))
