@@ -127,6 +127,7 @@ class Explorer:
         """Take the steps that `choose` gives, then upgrade the device to the good image."""
         self._walks += 1
         bench = Bench(self._subject, self._profile, limit_s=_LIMIT_S, stopped=self._stopped)
+        bench.tester.hears_feedback = True
         walk = Walk(bench)
         try:
             while (step := choose(walk)) is not None:
