@@ -201,6 +201,10 @@ class PatientHost:
         for tries in range(1, PACKET_TRIES + 1):
             self.send_packet(image, number)
             heard = self._tester.wait_for(*_PACKET_ANSWERS, unlike=is_stale)
+            if heard is None and number == 1 and tries == PACKET_TRIES - 1:
+                # It may erase once more, for an update command that was sent twice (R25, R16).
+                erase_s = self._profile.limit("erase_s")
+                self._tester.wait_for(Kind.REQUEST, within_s=erase_s)
             if heard is None:
                 continue
             last = str(heard)

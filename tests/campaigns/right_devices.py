@@ -103,9 +103,9 @@ class _RequestsForEach(MockDevice):
             return Event.UPDATE
         return super()._elapsed()
 
-    def _switch_off(self, now: float) -> str:
+    def _boot(self, now: float) -> str:
         self._waiting_update = False
-        return super()._switch_off(now)
+        return super()._boot(now)
 
 
 class _AsksForDamaged(MockDevice):

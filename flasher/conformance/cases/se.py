@@ -76,12 +76,15 @@ def endless(bench: Bench) -> None:
             bench.check(heard is not None, f"boot version within {limit_s:g} s", heard or "none")
         elif bench.choice("tx_12") == "either":
             limit_s = bench.limit("pause_s") + bench.limit("first_version_s")
-            if _drip_until(bench, Kind.BOOT_VERSION, limit_s, []) is not None:
+            _drip_until(bench, Kind.BOOT_VERSION, limit_s, [])
+            bench.collect(2 * bench.limit("inter_frame_s"))
+            bench.send_packet(image, len(floods) + 1)
+            heard = bench.wait_for(Kind.ACK, Kind.BOOT_VERSION)
+            if heard is not None and heard.kind is Kind.ACK:
+                bench.finish(image, len(floods) + 2)
+            else:  # it gave the transfer up, and may announce itself or listen silently
                 bench.update(len(image))
                 bench.finish(image)
-            else:
-                bench.wait(2 * bench.limit("inter_frame_s"))
-                bench.finish(image, len(floods) + 1)
         else:
             bench.finish(image, len(floods) + 1)
 

@@ -468,7 +468,7 @@ def _send_slowly(bench: Bench) -> None:
     if count > packet_count(bench.number("largest_image_bytes")):
         bench.unsupported("a long transfer", "the largest image has too few packets")
         return
-    image = bench.filler(count)
+    image = bench.filler(count)[: bench.number("largest_image_bytes")]
     bench.start_transfer(len(image))
     for number in range(1, count + 1):
         bench.packet(image, number)
