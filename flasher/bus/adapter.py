@@ -150,7 +150,8 @@ class CanLink:
         return self._name
 
     def send(self, frame: Frame) -> None:
-        """Hand a frame to the adapter; a full queue is waited for up to `SEND_LIMIT_S`.
+        """Hand a frame to the adapter; a full queue is waited for up to `SEND_LIMIT_S`. Of a remote
+        frame the data are as long as the answer that it asks for.
 
         A controller that is known to be bus-off is an error at once: its driver may take frames
         all the same, and lose them.
@@ -160,7 +161,7 @@ class CanLink:
             raise bus_off_error(str(self), "The adapter failed while sending: it is bus-off.")
         while True:
             # A back end may alter a message: never the same object twice.
-            message = can.Message(arbitration_id=frame[0], data=frame[1], is_extended_id=False)
+            message = _message_of(frame)
             try:
                 self._send_raw(message, **self._send_options)
             except _FAILURES as error:
@@ -175,7 +176,8 @@ class CanLink:
                 self._pause()
             else:
                 self._health.sent += 1
-                self._echoes.sent(frame, time.monotonic())
+                sent = frame._replace(data=b"") if frame[3] else frame  # as it comes back
+                self._echoes.sent(sent, time.monotonic())
                 return
 
     def receive(self, deadline: float) -> Frame | None:
@@ -336,3 +338,13 @@ def _pcan_state(status: int) -> ControllerState:
     if status & _PCAN_PASSIVE:
         return ControllerState.PASSIVE
     return ControllerState.UNKNOWN if status & ~_PCAN_WARNING else ControllerState.ACTIVE
+
+
+def _message_of(frame: Frame) -> can.Message:
+    """The frame as python-can sends it."""
+    can_id, data, is_extended, is_remote = frame[:4]
+    if is_remote:
+        return can.Message(
+            arbitration_id=can_id, is_extended_id=is_extended, is_remote_frame=True, dlc=len(data)
+        )
+    return can.Message(arbitration_id=can_id, data=data, is_extended_id=is_extended)

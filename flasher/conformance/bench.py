@@ -19,8 +19,18 @@ from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Subject
 from flasher.conformance.tester import BusTester
-from flasher.conformance.wire import Encoder, Kind, Received, describe, packet_count, told_version
+from flasher.conformance.wire import (
+    MEMORY_BYTES,
+    Encoder,
+    Kind,
+    Received,
+    describe,
+    packet_count,
+    told_version,
+)
 
+_PIECES: Final = 64
+"""Of an image, so many pieces are read over the bus at the most, which takes about a second."""
 _PAUSES: Final = 4
 """A pause that nobody knows may be so many times as long as limits.pause_s."""
 
@@ -206,7 +216,7 @@ class Bench:
     def check_image(self, image: bytes) -> None:
         """The application of `image` runs, and the flash holds it."""
         self._check_runs(image)
-        self.check_stored(image)
+        self.check_stored(image, runs=True)
 
     def check_application(self, image: bytes | None = None) -> None:
         """The application of `image` (the good one) runs. One that tells no version is known by
@@ -226,8 +236,44 @@ class Bench:
             runs = self.application_runs()
             self.check(runs, "the application runs", "it answers" if runs else "no answer")
 
-    def check_stored(self, image: bytes) -> None:
-        """The flash holds exactly `image`; not tried on a bench without readback."""
+    @property
+    def readback_source(self) -> str:
+        """By what the flash is compared: "readback" past the protocol, "bus" by the memory query of
+        a running BMS where the profile knows the address; empty where it is not.
+        """
+        if self.subject.has_readback:
+            return "readback"
+        is_known = self.encoder.has_version_query and self.number("application_address")
+        return "bus" if is_known else ""
+
+    def _check_told(self, image: bytes) -> None:
+        """The running application reads the bytes of `image` out of its memory; of a large one some
+        pieces are asked for, by the seed.
+        """
+        total = packet_count(len(image))
+        numbers = list(range(total))
+        if total > _PIECES:
+            numbers = sorted({0, total - 1, *self.random.sample(numbers, _PIECES - 2)})
+        for number in numbers:
+            offset = number * MEMORY_BYTES
+            part = image[offset : offset + MEMORY_BYTES]
+            told = self.host.read_memory(self.number("application_address") + offset, len(part))
+            if told is None:
+                self.unsupported("the flash holds the image", "the application tells no memory")
+                return
+            if told != part:
+                self.fail("the flash holds the image", f"other bytes from offset {offset} on")
+                return
+        got = f"{len(numbers)} of {total} pieces of it, read over the bus"
+        self.succeed("the flash holds the image", got)
+
+    def check_stored(self, image: bytes, *, runs: bool = False) -> None:
+        """The flash holds exactly `image`, of which the application `runs`; not tried on a bench
+        without readback.
+        """
+        if runs and self.readback_source == "bus":
+            self._check_told(image)
+            return
         if not self.subject.has_readback:
             tells = told_version(self.subject.target, self.good_image) is not None
             why = "" if tells else ", and the device does not tell which application runs"

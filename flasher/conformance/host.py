@@ -9,13 +9,15 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.results import Unsupported
 from flasher.conformance.tester import BusTester, Sent
-from flasher.conformance.wire import Kind, Received, packet_count, told_version
+from flasher.conformance.wire import MEMORY_BYTES, Kind, Received, packet_count, told_version
 
 PACKET_TRIES: Final = 5
 END_TRIES: Final = 3
 ATTEMPTS: Final = 3
 _QUERY_PERIOD_S: Final = 0.2
 """The tool repeats a query at this interval (4.3)."""
+_QUERY_TRIES: Final = 5
+"""A query stops after 1 s (4.3)."""
 _UPDATE_SPACING_S: Final = 0.03
 """Update commands are at least this far apart (R2)."""
 _QUIET_S: Final = 0.05
@@ -107,6 +109,28 @@ class PatientHost:
             quiet_s = self.burst_s + _SETTLE_S
             while tester.wait_for(Kind.BOOT_VERSION, within_s=quiet_s) and tester.now < deadline:
                 pass
+
+    def read_memory(self, start: int, size_bytes: int) -> bytes | None:
+        """The memory from `start` on, as the application tells it; None when it does not."""
+        tester, found = self._tester, b""
+        end = start + size_bytes
+        while len(found) < size_bytes:
+            at = start + len(found)
+            piece = min(MEMORY_BYTES, end - at)
+            wanted = at.to_bytes(4, "little") + (at + piece).to_bytes(4, "little")
+            for _ in range(_QUERY_TRIES):
+                tester.send(self._encoder.query_memory(at, at + piece))
+                heard = tester.wait_for(
+                    Kind.MEMORY,
+                    within_s=_QUERY_PERIOD_S,
+                    unlike=lambda one, wanted=wanted: not one.data.startswith(wanted),  # type: ignore[misc]
+                )
+                if heard is not None:
+                    break
+            else:
+                return None
+            found += heard.data[len(wanted) :][:piece]
+        return found
 
     def send_packet(self, image: bytes, number: int) -> Sent:
         """Send a packet of `image` and wait for nothing."""

@@ -101,6 +101,10 @@ class DeviceFacts(Table):
     """Size of the application area."""
     largest_image_bytes: Annotated[int, Bounds(ge=1, le=IMAGE_BYTES_MAX)] = IMAGE_BYTES_MAX
     """The largest image that is taken."""
+    application_address: Annotated[int, Bounds(ge=0, le=0xFFFF_FFFF)] = 0
+    """Where the application area begins in the memory that a BMS tells (4308), by which the flash
+    is compared on a bench without readback; 0: unknown.
+    """
     reset_command: Annotated[int, Bounds(ge=0, le=0xFFFF)] = RESET
     """Command that restarts into the bootloader (R3)."""
     reset_data: Ascii = RESET_TEXT.decode()

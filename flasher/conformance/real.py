@@ -68,10 +68,10 @@ class RealPort:
 
     def send(self, frame: RawFrame) -> None:
         """Hand a frame to the adapter. Raises Unsupported for a kind that a link cannot send."""
-        if frame.is_extended or frame.is_remote or frame.is_error:
-            raise Unsupported("the adapter sends standard data frames only")
+        if frame.is_error:
+            raise Unsupported("an adapter sends no error frames")
         made = Frame(*frame)
-        self._own.append(made)
+        self._own.append(made._replace(data=b"") if made.is_remote else made)
         self._link.send(made)
 
     def receive(self, deadline: float) -> Arrival | None:

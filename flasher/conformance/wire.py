@@ -34,6 +34,10 @@ END: Final = 0xA401
 COMPLETE: Final = 0xC502
 QUERY_VERSION: Final = 0x3300
 VERSION_INFORMATION: Final = 0x1540
+QUERY_MEMORY: Final = 0x4308
+MEMORY: Final = 0x5688
+MEMORY_BYTES: Final = 128
+"""What one memory query asks for at the most."""
 
 PACKET_BYTES: Final = 128
 IMAGE_BYTES_MAX: Final = 65535 * PACKET_BYTES
@@ -50,6 +54,7 @@ class RawFrame(NamedTuple):
     data: bytes
     is_extended: bool = False
     is_remote: bool = False
+    """Its data then only tell the length that it asks for."""
     is_error: bool = False
 
     @property
@@ -223,6 +228,10 @@ class Encoder:
         """Ask the application for its version information."""
         return self.message(READ, QUERY_VERSION)
 
+    def query_memory(self, start: int, end: int) -> list[RawFrame]:
+        """Ask the application for the memory from `start` to before `end` (R5)."""
+        return self.message(READ, QUERY_MEMORY, struct.pack("<II", start, end))
+
 
 # -- from the device to the tool -----------------------------------------------------------------
 
@@ -243,6 +252,7 @@ class Kind(Enum):
     NAK = "NAK"
     COMPLETE = "complete"
     VERSION_INFORMATION = "version information"
+    MEMORY = "memory"
     APPLICATION = "a message of the application to other nodes"
     """On another id than the tool's, and none of the upgrade's: mostly of no concern here."""
     OTHER = "another message"
@@ -257,6 +267,7 @@ _KINDS: Final = {
     ACK: (Kind.ACK, None),
     NAK: (Kind.NAK, None),
     COMPLETE: (Kind.COMPLETE, b"\0\0"),
+    MEMORY: (Kind.MEMORY, None),
 }
 """Commands from device to tool, with their data where the document fixes it."""
 

@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
+from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.mock import GOOD_IMAGE, MOCK_PROFILE, profile_of_mock
 from flasher.conformance.real import PowerCommand, ReadbackCommand, RealPort, RealSubject
-from flasher.conformance.results import CaseVerdict, Unsupported
+from flasher.conformance.results import CaseVerdict, CheckOutcome, Unsupported
 from flasher.conformance.runner import run
 from flasher.conformance.wire import RawFrame
 from flasher.errors import BusError, UsageError
 from flasher.mock.model import MockDevice
+from flasher.mock.store import AREA_START
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING
 from tests.loops import each
 
 SCRIPT = "import sys; open(sys.argv[1], 'w').write(sys.argv[2])"
+
+KNOWS_ADDRESS = replace(
+    profile_of_mock(), given={**profile_of_mock().given, "device.application_address": AREA_START}
+)
 
 
 def bench(*, has_power: bool) -> tuple[RealSubject, MockDevice]:
@@ -88,10 +95,45 @@ def test_one_echo_that_is_lost_does_not_hide_those_behind_it() -> None:
     ]
 
 
+def test_the_flash_is_compared_over_the_bus_where_nothing_else_reads_it() -> None:
+    real, _ = bench(has_power=False)
+    report = run(real, KNOWS_ADDRESS, selection=Selection(cases=("UP-03", "UP-08")))
+    for case_id in ("UP-03", "UP-08"):
+        (found,) = (each for each in report.results if each.case_id == case_id)
+        assert found.verdict is CaseVerdict.PASS
+        assert any(check.got.endswith("read over the bus") for check in found.checks)
+
+
+def test_an_image_that_is_torn_in_the_flash_is_seen_over_the_bus() -> None:
+    real, device = bench(has_power=False)
+    device.store.flash.erase_page(AREA_START)
+    device.store.flash.program(AREA_START, GOOD_IMAGE[:-5] + bytes(8))
+    seen = Bench(real, KNOWS_ADDRESS, limit_s=60.0)
+    assert seen.readback_source == "bus"
+    seen.check_stored(GOOD_IMAGE, runs=True)
+    assert [check.outcome for check in seen.judge.checks] == [CheckOutcome.FAIL]
+
+
+def test_remote_and_extended_frames_are_sent_and_known_again() -> None:
+    clock = VirtualClock()
+    bus = SimulatedBus(WELLING.bitrate_bps, clock)
+    port = RealPort(bus.link(), clock, WELLING.bitrate_bps)
+    other = bus.link()
+    for frame in (
+        RawFrame(0x752, bytes(8), is_remote=True),
+        RawFrame(0x752 << 18, b"\x01", is_extended=True),
+    ):
+        port.send(frame)
+        heard = other.receive(1.0)
+        assert heard is not None
+        assert (heard.is_remote, heard.is_extended) == (frame.is_remote, frame.is_extended)
+        assert not heard.is_payload
+
+
 def test_what_a_link_cannot_send_is_unsupported() -> None:
     real, _ = bench(has_power=False)
     with pytest.raises(Unsupported):
-        real.port.send(RawFrame(0x752, b"", is_remote=True))
+        real.port.send(RawFrame(0x752, b"", is_error=True))
     for action in (lambda: real.power(on=True), real.readback, lambda: real.bus_off(1.0)):
         with pytest.raises(Unsupported):
             action()

@@ -454,6 +454,7 @@ def _strangers(to_device: int) -> Iterator[tuple[str, RawFrame]]:
     """Frames with the device's id that carry no payload, by name."""
     yield "a frame of 0 bytes", RawFrame(to_device, b"")
     yield "a remote frame", RawFrame(to_device, b"", is_remote=True)
+    yield "a remote frame of 8 bytes", RawFrame(to_device, bytes(8), is_remote=True)
     yield "an extended frame", RawFrame(to_device, b"\x12" * 8, is_extended=True)
     yield "an extended frame with a header", RawFrame(to_device, _HEADER, is_extended=True)
     yield (

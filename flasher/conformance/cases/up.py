@@ -100,8 +100,7 @@ def without_reset(bench: Bench) -> None:
     with bench.step("after a restart"):
         bench.reset_to_bootloader()
         bench.collect(bench.host.burst_s)
-        bench.check_application()
-        bench.check_stored(image)
+        bench.check_image(image)
 
 
 @case(

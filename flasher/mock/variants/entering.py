@@ -255,6 +255,7 @@ class AnyTargetName(MockDevice):
     "mixes-transfers",
     "UP-08",
     "goes on with what is stored when an update command comes in the midst",
+    also="FR-07 UP-01 TX-12 TM-05",
 )
 class MixesTransfers(MockDevice):
     """On an update command in the midst, requests anew but keeps what is stored, and its count."""
