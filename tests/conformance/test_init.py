@@ -55,7 +55,10 @@ CHOICES: Final = {
 """Key of the profile to the option of the device model."""
 OTHER_WORDS: Final = {"general_feedback": "feedback", ("up_08", "ignored"): "rejected"}
 OPEN: Final = {"en_04", "limits.inter_frame_s", "limits.refused_s", "limits.silence_s"} | {
-    "device.application_bytes"
+    "device.application_bytes",
+    "device.application_address",
+    "fr_10",
+    "up_05",
 }
 """What nobody sees from outside."""
 
@@ -159,7 +162,7 @@ def test_each_value_of_each_choice_of_the_device_model_is_seen(turn: int) -> Non
     [
         (lambda: mock(FullFrames), {"fr_01": "rejected", "fr_07": "ignored"}),
         (lambda: mock(OtherDevice), {"up_02": "nak", "tx_08": "rejected", "tm_02": "either"}),
-        (lambda: mock(MoodyDevice), {"tx_01": "either", "tx_03": None}),
+        (lambda: mock(MoodyDevice), {"tx_01": "either", "tx_03": "either"}),
         (
             lambda: bench(ScriptedDevice("bms", capacity_bytes=3000)),
             {
@@ -211,9 +214,10 @@ def test_a_limit_has_its_margin_and_says_it() -> None:
 def test_what_differs_is_either_or_stays_open() -> None:
     trials = [Trial(value, value.upper(), "it") for value in ("nak", "silence", "nak")]
     assert decided("up_02", trials).value == "either"
-    assert decided("tx_03", trials).value is None
-    assert decided("tx_03", trials).seen == (
-        "it differs: NAK to it, 2 of 3 times; SILENCE to it, 1 of 3 times"
+    two = [Trial(value, value.upper(), "it") for value in ("none", "crc32", "none")]
+    assert decided("en_04", two).value is None
+    assert decided("en_04", two).seen == (
+        "it differs: NONE to it, 2 of 3 times; CRC32 to it, 1 of 3 times"
     )
     unheard = decided("tx_03", [Trial("", "COMPLETE", "it")])
     assert unheard.seen == "no value describes this: COMPLETE to it, 1 of 1 times"

@@ -85,10 +85,13 @@ LIMITS: Final[dict[str, tuple[float, tuple[str, ...]]]] = {
 """Limits: the least that is written, in seconds, and the times that they are made of."""
 NOT_ASKED: Final = {
     "en_04": "an image with a wrong checksum would have to be completed; say what the product has",
+    "fr_10": "a bootloader that was silent so far may still confirm a write",
+    "up_05": "it may depend on how long the erase takes",
     "limits.inter_frame_s": "it is what tm_02 was asked with (R12)",
     "limits.refused_s": "an image would have to be refused",
     "limits.silence_s": "it is how long the suite watches, not what the device does",
     "device.application_bytes": "no message tells it; it is not less than the largest image",
+    "device.application_address": "no message tells it",
 }
 """Keys that no question is about, with the reason."""
 _PATIENCE: Final[dict[str, Value]] = {

@@ -45,6 +45,7 @@ class Session:
         self, subject: Subject, profile: ConformanceProfile, stopped: Callable[[], bool]
     ) -> None:
         self.bench = Bench(subject, profile, limit_s=_LIMIT_S, seed="init", stopped=stopped)
+        self.bench.tester.hears_feedback = True
         self.image = subject.good_image
         self.total = packet_count(len(self.image))
         self.stored = 0
