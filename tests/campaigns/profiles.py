@@ -21,10 +21,23 @@ from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import FINAL_IMAGE_OK, CaseVerdict
 from flasher.conformance.runner import run
 from flasher.mock.profile import DeviceProfile
-from tests.campaigns.walks import CHOICES
 
 AREA_BYTES: Final = 34 * 1024
 """More than 255 packets, and soon sent."""
+_CHOICES: Final[dict[str, tuple[Any, ...]]] = {
+    "reset_in_bootloader": ("ignored", "restarts"),
+    "without_application": ("announces", "listens"),
+    "update_in_transfer": ("starts_over", "ignored"),
+    "bad_packet": ("nak_expected", "nak_received", "silence"),
+    "repeated_packet": ("ack", "nak_next"),
+    "older_packet": ("ack", "nak", "silence"),
+    "pause_in_transfer": ("announces", "waits"),
+    "reset_in_transfer": ("ignored", "restarts"),
+    "image_checksum": ("none", "crc32"),
+    "repeated_end": ("same_answer", "silence"),
+    "after_complete": ("starts", "restarts"),
+    "upgrade_in_application": ("general_feedback", "silence"),
+}
 _FIGURES: Final[dict[str, tuple[Any, ...]]] = {
     "window_s": (0.05, 0.2, 1.0),
     "reset_delay_s": (0.01, 0.05, 0.8),
@@ -45,7 +58,7 @@ _OWN: Final = ("en_04", "fr_10")
 def some_device(seed: str) -> tuple[str, DeviceProfile]:
     """A right device by chance: its target and its choices."""
     chance = random.Random(seed)
-    given = {key: chance.choice(values) for key, values in {**CHOICES, **_FIGURES}.items()}
+    given = {key: chance.choice(values) for key, values in {**_CHOICES, **_FIGURES}.items()}
     device = dataclasses.replace(MOCK_PROFILE, application_area_bytes=AREA_BYTES, **given)
     return chance.choice(_TARGETS), device
 

@@ -9,36 +9,24 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import itertools
 import os
-import random
 import sys
 import time
-from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, Final, NamedTuple
 
 from flasher.conformance.explore import Explorer
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
+from flasher.conformance.profile import ConformanceProfile
 from flasher.mock.variants import VARIANTS
+from tests.campaigns.right_devices import right_device
 from tests.variant_matrix import AREA_BYTES
 
 WANTED: Final = 60
 _STEPS_MAX: Final = 10_000_000
-CHOICES: Final[dict[str, tuple[Any, ...]]] = {
-    "reset_in_bootloader": ("ignored", "restarts"),
-    "without_application": ("announces", "listens"),
-    "update_in_transfer": ("starts_over", "ignored"),
-    "bad_packet": ("nak_expected", "nak_received", "silence"),
-    "repeated_packet": ("ack", "nak_next"),
-    "older_packet": ("ack", "nak", "silence"),
-    "pause_in_transfer": ("announces", "waits"),
-    "reset_in_transfer": ("ignored", "restarts"),
-    "image_checksum": ("none", "crc32"),
-    "repeated_end": ("same_answer", "silence"),
-    "after_complete": ("starts", "restarts"),
-    "upgrade_in_application": ("general_feedback", "silence"),
-}
+_RIGHT_S: Final = 5.0
+"""How long one right device is walked on."""
+_ABILITIES: Final = ("has_power", "has_readback", "has_bus_off", "has_timed_cuts")
 
 
 class Walked(NamedTuple):
@@ -50,14 +38,32 @@ class Walked(NamedTuple):
     found: str
 
 
-def walk(name: str, variant: str, choices: dict[str, Any], seconds: float, seed: str) -> Walked:
-    """Walk on a variant, or on a right device, for so many seconds of the computer's time."""
-    device = dataclasses.replace(MOCK_PROFILE, **choices)
-    subject = MockSubject(profile=device, make_device=variant_maker(variant) if variant else None)
+def walk_on_variant(name: str, seconds: float, seed: str) -> Walked:
+    """Walk on a wrong device."""
+    changes: dict[str, Any] = {"application_area_bytes": AREA_BYTES, **VARIANTS[name].profile}
+    device = dataclasses.replace(MOCK_PROFILE, **changes)
+    subject = MockSubject(profile=device, make_device=variant_maker(name))
+    return _walk(name, subject, profile_of_mock(device), seconds, seed)
+
+
+def walk_on_right_device(number: int, profile_name: str, seconds: float, seed: str) -> Walked:
+    """Walk on the device of that number, judged by the profile of that name."""
+    device = right_device(number)
+    subject = MockSubject(device.target, profile=device.choices, make_device=device.make)
+    for ability in _ABILITIES if device.is_bare else ():
+        setattr(subject, ability, False)
+    name = f"{number} {profile_name}: {device}"
+    return _walk(name, subject, device.profiles[profile_name], seconds, f"{seed}/{number}")
+
+
+def _walk(
+    name: str, subject: MockSubject, profile: ConformanceProfile, seconds: float, seed: str
+) -> Walked:
+    """Walk for so many seconds of the computer's time."""
     began_at = time.monotonic()
     explorer = Explorer(
         subject,
-        profile_of_mock(device),
+        profile,
         seed=seed,
         stopped=lambda: time.monotonic() - began_at > seconds,
     )
@@ -69,13 +75,6 @@ def walk(name: str, variant: str, choices: dict[str, Any], seconds: float, seed:
     return Walked(name, time.monotonic() - began_at, explored.steps, found)
 
 
-def right_choices(seed: str) -> Iterator[dict[str, Any]]:
-    """Right devices: every choice by chance."""
-    chance = random.Random(seed)
-    while True:
-        yield {key: chance.choice(values) for key, values in CHOICES.items()}
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=10.0)
@@ -83,40 +82,27 @@ def main() -> int:
     parser.add_argument("--seed", default="1")
     given = parser.parse_args()
     cores = os.cpu_count() or 1
-    share_s = 5.0
-    count = max(1, round(given.right_seconds * cores / share_s))
+    count = max(1, round(given.right_seconds * cores / (2 * _RIGHT_S)))
     with ProcessPoolExecutor(cores) as pool:
-        wrong = [
-            pool.submit(
-                walk,
-                name,
-                name,
-                {"application_area_bytes": AREA_BYTES, **VARIANTS[name].profile},
-                given.seconds,
-                given.seed,
-            )
-            for name in VARIANTS
-        ]
+        wrong = [pool.submit(walk_on_variant, name, given.seconds, given.seed) for name in VARIANTS]
         found = [one.result() for one in wrong]
         for each in found:
             sys.stdout.write(f"{each.name:30} {each.seconds:5.1f} s  {each.found or 'NOTHING'}\n")
         caught = sum(bool(each.found) for each in found)
-        sys.stdout.write(
-            f"{caught} of {len(found)} wrong devices within {given.seconds:g} s each\n"
-        )
-        choices = itertools.islice(right_choices(given.seed), count)
-        right = [
-            one.result()
-            for one in [
-                pool.submit(walk, str(each), "", each, share_s, f"{given.seed}/{index}")
-                for index, each in enumerate(choices)
-            ]
+        share = f"{caught} of {len(found)}"
+        sys.stdout.write(f"{share} wrong devices within {given.seconds:g} s each\n")
+        began = [
+            pool.submit(walk_on_right_device, number, profile, _RIGHT_S, given.seed)
+            for number in range(1, count + 1)
+            for profile in ("fitting", "default")
         ]
+        right = [one.result() for one in began]
     blamed = [each for each in right if each.found]
     for each in blamed:
         sys.stdout.write(f"RIGHT DEVICE BLAMED {each.name}\n  {each.found}\n")
     steps = sum(each.steps for each in right)
-    sys.stdout.write(f"{len(right)} right devices, {steps:,} steps: {len(blamed)} blamed\n")
+    sys.stdout.write(f"{count} right devices, by two profiles each, {steps:,} steps: ")
+    sys.stdout.write(f"{len(blamed)} times blamed\n")
     return 1 if blamed or caught < WANTED else 0
 
 

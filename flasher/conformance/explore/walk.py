@@ -87,8 +87,8 @@ class Walk:
     def __init__(self, bench: Bench) -> None:
         self.bench = bench
         self.phase = Phase.APPLICATION
-        self.is_whole = True
-        """There is an application to start."""
+        self.is_whole: bool | None = True
+        """There is an application to start; None where that is not certain."""
         self.was_requested = False
         """An update command was accepted in this walk."""
         self.running = bench.good_image
@@ -106,7 +106,7 @@ class Walk:
         self._may_restart = False
         self._may_complete = False
         self._may_break_off = False
-        """A message of the device may be cut."""
+        """Its message under way may have been cut: the next thing that is heard may be the half."""
         self._nodes_asked: frozenset[int] = frozenset()
         """Ids by which the device may answer other nodes, in whose name something was sent."""
         self._requested_at = -inf
@@ -159,14 +159,28 @@ class Walk:
     def _settle(self) -> None:
         """What time alone has changed since the last step."""
         bench = self.bench
-        if self.phase is Phase.ANNOUNCING and self.is_whole:
-            silent_s = bench.now - self._version_at
-            if silent_s > bench.host.burst_s:
-                self.phase = Phase.APPLICATION
+        silent_s = bench.now - self._version_at
+        if self.phase is Phase.ANNOUNCING and silent_s > bench.host.burst_s:
+            if self.is_whole:
+                self._await_start()
+            elif self.is_whole is None:
+                self.phase, self._may_restart = Phase.UNCLEAR, True
         pause_s = bench.now - self._useful_at
         may_end = bench.choice("tx_12") != "waits" and pause_s > 0.8 * bench.limit("pause_s")
         if self.phase in _IN_TRANSFER and may_end:
             self.phase, self._may_restart = Phase.UNCLEAR, True
+
+    def _await_start(self) -> None:
+        """The burst is over: wait for the application, however long the window is."""
+        bench = self.bench
+        start_s = bench.limit("start_s")
+        if bench.encoder.has_version_query:
+            bench.application_version(start_s)
+            bench.forget()
+        else:
+            self._listen(self._version_at + start_s - bench.now)
+        if self.phase is Phase.ANNOUNCING:
+            self.phase = Phase.APPLICATION
 
     def _listen(
         self, within_s: float, until: Callable[[Received], bool] | None = None
@@ -192,7 +206,7 @@ class Walk:
     def _quiet(self) -> None:
         """Listen for as long as an answer may take, and a broken message is kept."""
         bench = self.bench
-        broken_s = 1.5 * bench.limit("inter_frame_s")
+        broken_s = 2 * bench.limit("inter_frame_s")
         if self.phase is Phase.ANNOUNCING:
             self._listen(broken_s)  # and no longer: its window is short
             return
@@ -219,7 +233,9 @@ class Walk:
                     raise Violation("complete", "complete without all packets and a valid end")
             case Kind.OTHER if heard.can_id in self._nodes_asked:
                 pass
-            case Kind.OTHER | Kind.DAMAGED if not self._may_break_off:
+            case Kind.DAMAGED if self._may_break_off:
+                self._may_break_off = False
+            case Kind.OTHER | Kind.DAMAGED:
                 raise Violation("form", f"{heard}: no message that a device sends")
 
     def _judge_number(self, heard: Received) -> None:
@@ -288,7 +304,6 @@ class Walk:
             self._quiet()
             if choice not in ("", "ignored") and self.phase is before:
                 self.phase = Phase.UNCLEAR
-        self._may_break_off = False
 
     def _watch_burst(self, argument: str) -> None:
         """Reset, no update command: the burst is whole, then the application starts. With `twice`,
@@ -333,7 +348,7 @@ class Walk:
         self._updates_unanswered = self._naks_due = self._feedback_due = 0
         self._may_restart = self._may_break_off = True
         self._await(Kind.BOOT_VERSION, bench.limit("first_version_s"), "power-up")
-        self._may_restart = self._may_break_off = False
+        self._may_restart = False
 
     def _wait(self, argument: str) -> None:
         bench = self.bench
@@ -359,7 +374,6 @@ class Walk:
         bench.subject.bus_off(_BUS_OFF_S)
         self._may_break_off = True
         self._listen(4 * _BUS_OFF_S + bench.limit("inter_frame_s"))
-        self._may_break_off = False
 
     def _query(self, _: str) -> None:
         if self.phase is Phase.APPLICATION:
@@ -376,14 +390,13 @@ class Walk:
             return
         bench = self.bench
         within_s = 4 * bench.limit("version_spacing_s")
+        if self.is_whole is False:  # it may restart just now
+            within_s = bench.limit("first_version_s")
         heard = self._listen(within_s, lambda one: one.kind is Kind.BOOT_VERSION)
-        if not self.is_whole:
-            return
-        if heard is None:  # its window is over, or nearly
-            self._listen(self._version_at + bench.host.burst_s + _GAP_S - bench.now)
-        elif bench.choice("up_04_burst") != "accepted":
-            self._listen(bench.host.burst_s - bench.limit("window_s") / 2)
-        self._settle()
+        if heard is None and self.is_whole:  # its window is over, or nearly
+            self._await_start()
+        elif heard is None and self.is_whole is None:
+            self.phase = Phase.UNCLEAR
 
     def _update(self, argument: str) -> None:
         bench = self.bench
@@ -402,6 +415,7 @@ class Walk:
         self._offered = image, outcome
         if is_same or self.phase is Phase.UNCLEAR:
             self._updates_unanswered += 1
+            self._naks_due, self._nak_numbers = 1, None
             bench.send(frames)
             self._listen(bench.limit("erase_s"), lambda one: one.kind is Kind.REQUEST)
             return
@@ -438,7 +452,9 @@ class Walk:
         bench.send(frames)
         if choice == "starts_over":
             self._await(Kind.REQUEST, bench.limit("erase_s"), "an update command in a transfer")
-        elif not self._listen(bench.limit("erase_s"), lambda one: one.kind is Kind.REQUEST):
+            return
+        self._may_restart = True  # one that ignores it has a long pause now
+        if not self._listen(bench.limit("erase_s"), lambda one: one.kind is Kind.REQUEST):
             self.phase = Phase.UNCLEAR
 
     def _update_reset(self, _: str) -> None:
@@ -459,8 +475,9 @@ class Walk:
         )
         if heard is None:
             raise Violation("no request", "nothing after an update command and a reset behind it")
+        self.phase, self.is_whole, self.was_requested = Phase.UNCLEAR, None, True
+        self._may_restart = True
         self._quiet()
-        self.phase, self.is_whole, self.was_requested = Phase.UNCLEAR, False, True
 
     def _cut(self, argument: str) -> None:
         """Cut the power half-way through a flash operation: of the erasing that an update command
@@ -487,20 +504,19 @@ class Walk:
         ends = (Kind.BOOT_VERSION, Kind.REQUEST, Kind.COMPLETE)
         heard = self._listen(within_s, lambda one: one.kind in ends)
         if not bench.subject.take_cut():  # it does less operations than that
-            self._may_break_off = False
             if heard is not None and heard.kind is Kind.COMPLETE:
                 self._completed()
             return
         self._updates_unanswered = 0
         self._listen(bench.host.burst_s + _GAP_S)
         self._check_not_mixed([image for image in (before, after) if image is not None])
-        self._may_break_off = self._may_complete = False
+        self._may_complete = False
 
     def _check_not_mixed(self, images: Sequence[bytes]) -> None:
         """What runs after a power cut is one of the images, whole, or nothing."""
         bench = self.bench
         self.phase = Phase.UNCLEAR
-        self.is_whole = False
+        self.is_whole = None
         if not bench.encoder.has_version_query:
             return
         found = bench.application_version()
@@ -633,7 +649,7 @@ class Walk:
         if self.bench.choice(key) == right:
             self._packet("", frames)
             return
-        if self.phase in (Phase.BEGUN, Phase.TRANSFER):
+        if self.phase in (Phase.BEGUN, Phase.TRANSFER, Phase.UNCLEAR):
             self._acks_due[self.wanted] += 1
         self._naks_due, self._nak_numbers = 4, None
         self._feedback_due += 1
