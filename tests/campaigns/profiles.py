@@ -51,7 +51,7 @@ _TARGETS: Final = ("bms", "bms", "wmc", "obc")
 _HELD: Final = frozenset(
     {CaseVerdict.PASS, CaseVerdict.PASS_IN_PART, CaseVerdict.INFO, CaseVerdict.UNSUPPORTED}
 )
-_OWN: Final = ("en_04", "fr_10")
+_OWN: Final = ("en_04",)
 """Choices that nobody sees from outside."""
 
 

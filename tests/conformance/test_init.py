@@ -57,8 +57,6 @@ OTHER_WORDS: Final = {"general_feedback": "feedback", ("up_08", "ignored"): "rej
 OPEN: Final = {"en_04", "limits.inter_frame_s", "limits.refused_s", "limits.silence_s"} | {
     "device.application_bytes",
     "device.application_address",
-    "fr_10",
-    "up_05",
 }
 """What nobody sees from outside."""
 
@@ -104,6 +102,24 @@ class MoodyDevice(MockDevice):
     def _answer_bad(self, now: float) -> str:
         self.asked += 1
         return super()._answer_bad(now) if self.asked % 2 else ""
+
+
+class Confirming(MockDevice):
+    """Its bootloader confirms every write by general feedback; one ACK is lost."""
+
+    acks = 0
+
+    def _take_row(self, row: AnyRow, now: float) -> None:
+        if self.state is not State.APPLICATION:
+            self._send(messages.GeneralFeedback())
+        super()._take_row(row, now)
+
+    def _acknowledge(self, now: float) -> str:
+        said = super()._acknowledge(now)
+        self.acks += 1
+        if self.acks == 100:
+            self._transmitter.drop_unstarted()
+        return said
 
 
 class Witness(MockDevice):
@@ -162,6 +178,7 @@ def test_each_value_of_each_choice_of_the_device_model_is_seen(turn: int) -> Non
     [
         (lambda: mock(FullFrames), {"fr_01": "rejected", "fr_07": "ignored"}),
         (lambda: mock(OtherDevice), {"up_02": "nak", "tx_08": "rejected", "tm_02": "either"}),
+        (lambda: mock(Confirming), {"fr_10": "either", "tx_02": "ack", "fr_01": "accepted"}),
         (lambda: mock(MoodyDevice), {"tx_01": "either", "tx_03": "either"}),
         (
             lambda: bench(ScriptedDevice("bms", capacity_bytes=3000)),
@@ -214,10 +231,10 @@ def test_a_limit_has_its_margin_and_says_it() -> None:
 def test_what_differs_is_either_or_stays_open() -> None:
     trials = [Trial(value, value.upper(), "it") for value in ("nak", "silence", "nak")]
     assert decided("up_02", trials).value == "either"
-    two = [Trial(value, value.upper(), "it") for value in ("none", "crc32", "none")]
-    assert decided("en_04", two).value is None
-    assert decided("en_04", two).seen == (
-        "it differs: NONE to it, 2 of 3 times; CRC32 to it, 1 of 3 times"
+    own = [Trial(value, value.upper(), "it") for value in ("crc32", "none", "crc32")]
+    assert decided("en_04", own).value is None
+    assert decided("en_04", own).seen == (
+        "it differs: CRC32 to it, 2 of 3 times; NONE to it, 1 of 3 times"
     )
     unheard = decided("tx_03", [Trial("", "COMPLETE", "it")])
     assert unheard.seen == "no value describes this: COMPLETE to it, 1 of 1 times"

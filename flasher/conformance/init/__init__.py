@@ -53,6 +53,8 @@ QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
     (entering.reset_in_bootloader, ("rs_02",)),
     (entering.rejected_update, ("up_02",)),
     (entering.application, ("up_03",)),
+    (entering.feedback, ("fr_10",)),
+    (entering.update_twice, ("up_05",)),
     (transferring.repeated_packet, ("tx_02",)),
     (transferring.pause, ("tx_12", "limits.pause_s")),
     (transferring.reset_again, ("tx_13",)),
@@ -85,13 +87,11 @@ LIMITS: Final[dict[str, tuple[float, tuple[str, ...]]]] = {
 """Limits: the least that is written, in seconds, and the times that they are made of."""
 NOT_ASKED: Final = {
     "en_04": "an image with a wrong checksum would have to be completed; say what the product has",
-    "fr_10": "a bootloader that was silent so far may still confirm a write",
-    "up_05": "it may depend on how long the erase takes",
     "limits.inter_frame_s": "it is what tm_02 was asked with (R12)",
     "limits.refused_s": "an image would have to be refused",
     "limits.silence_s": "it is how long the suite watches, not what the device does",
-    "device.application_bytes": "no message tells it; it is not less than the largest image",
     "device.application_address": "no message tells it",
+    "device.application_bytes": "no message tells it; it is not less than the largest image",
 }
 """Keys that no question is about, with the reason."""
 _PATIENCE: Final[dict[str, Value]] = {
@@ -176,8 +176,17 @@ class _Asking:
         return self._asked(trouble, was_brought_up=was_brought_up)
 
     def _put(self, question: Question, keys: tuple[str, ...]) -> None:
+        """Ask, and once more when the device did something else: a frame may have been late."""
+        why = self._tried(question)
+        if why and not self._restored("before it was asked again", flash=False):
+            why = self._tried(question) or "nothing was seen"
+        for key in keys:
+            self._answers.setdefault(key, Answer(key, None, why))
+
+    def _tried(self, question: Question) -> str:
+        """Ask; returns what the device did else, or ""."""
         it = Session(self._subject, self._profile(), self._stopped)
-        why = "nothing was seen"
+        why = ""
         try:
             it.settle()
             for answer in question(it):
@@ -189,10 +198,9 @@ class _Asking:
             why = f"the device did something else: {failed[-1]}" if failed else str(ended)
         if it.bench.is_off:
             it.bench.power_on()
-        for key in keys:
-            self._answers.setdefault(key, Answer(key, None, why))
         for one in it.bench.judge.measurements:
             self._measured.setdefault(one.name, []).append(one.value_s)
+        return why
 
     def _limits(self) -> Iterator[Answer]:
         for key, (least_s, names) in LIMITS.items():

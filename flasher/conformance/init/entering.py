@@ -24,6 +24,7 @@ from flasher.conformance.restore import needs_power
 from flasher.conformance.wire import (
     IMAGE_BYTES_MAX,
     PACKET_BYTES,
+    WRITE,
     Kind,
     RawFrame,
     Received,
@@ -40,6 +41,8 @@ _SILENT_S: Final = 5.0
 """After so long without a boot version a bootloader is taken to listen silently."""
 _ERASE_LEAST_S: Final = 10.0
 _ERASE_MOST_S: Final = 120.0
+_UNKNOWN: Final = 0x7704
+"""A command that nobody has."""
 _AGAIN: Final = 0.03
 """Update commands are at least this far apart (R2)."""
 
@@ -265,6 +268,45 @@ def rejected_update(it: Session) -> Iterator[Answer]:
     yield decided("up_02", trials)
 
 
+def feedback(it: Session) -> Iterator[Answer]:
+    """General feedback of the bootloader, to an unknown write and to those of an upgrade."""
+    bench, trials = it.bench, []
+    unknown = bench.encoder.message(WRITE, _UNKNOWN, bytes(_UNKNOWN & 0xFF))
+    for _ in range(REPEATS):
+        first = it.enter()
+        bench.send(unknown)
+        it.update()
+        it.packets(1)
+        bench.send(unknown)
+        bench.collect(bench.limit("ack_s") + bench.limit("inter_frame_s"))
+        it.packets()
+        count = it.feedback_since(first.at)
+        answer = f"general feedback {count} times" if count else "no general feedback"
+        stimulus = "an unknown write, update command and packets"
+        trials.append(Trial("either" if count else "silence", answer, stimulus))
+        it.finish()
+    yield decided("fr_10", trials)
+
+
+def update_twice(it: Session) -> Iterator[Answer]:
+    """Two update commands in a row."""
+    bench, trials = it.bench, []
+    update = bench.encoder.update(len(it.image))
+    for _ in range(REPEATS):
+        it.enter()
+        bench.wait_for_window()
+        bench.send(update + update)
+        first = bench.wait_for(Kind.REQUEST)
+        more = [] if first is None else bench.collect(bench.limit("erase_s"))
+        count = (first is not None) + sum(one.kind is Kind.REQUEST for one in more)
+        value = {1: "once", 2: "each"}.get(count, "")
+        answer = f"request transfer {count} times"
+        trials.append(Trial(value, answer, "two update commands in a row"))
+        it.stored = 0
+        it.finish() if count else it.await_application()
+    yield decided("up_05", trials)
+
+
 def application(it: Session) -> Iterator[Answer]:
     """Messages of the upgrade to the running application."""
     bench, trials = it.bench, []
@@ -276,8 +318,9 @@ def application(it: Session) -> Iterator[Answer]:
     for stimulus, frames in stimuli.items():
         for _ in range(REPEATS):
             bench.forget()
-            bench.send(frames)
-            heard = bench.collect(bench.limit("silence_s"))
+            with bench.tester.hearing_feedback():
+                bench.send(frames)
+                heard = bench.collect(bench.limit("silence_s"))
             trials.append(Trial(_word(heard), told(heard), f"{stimulus} to the application"))
     it.await_application()
     yield decided("up_03", trials)

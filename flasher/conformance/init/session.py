@@ -12,7 +12,15 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Subject
-from flasher.conformance.wire import Kind, RawFrame, Received, describe, joined, packet_count
+from flasher.conformance.wire import (
+    Decoder,
+    Kind,
+    RawFrame,
+    Received,
+    describe,
+    joined,
+    packet_count,
+)
 
 REPEATS: Final = 3
 """How often a question is asked."""
@@ -45,7 +53,6 @@ class Session:
         self, subject: Subject, profile: ConformanceProfile, stopped: Callable[[], bool]
     ) -> None:
         self.bench = Bench(subject, profile, limit_s=_LIMIT_S, seed="init", stopped=stopped)
-        self.bench.tester.hears_feedback = True
         self.image = subject.good_image
         self.total = packet_count(len(self.image))
         self.stored = 0
@@ -93,9 +100,10 @@ class Session:
         """Reset the application; returns that boot version of the burst."""
         bench = self.bench
         bench.forget()
-        sent = bench.send(bench.encoder.reset())
         limit_s = bench.limit("first_version_s")
-        heard = bench.wait_for(Kind.FEEDBACK, Kind.BOOT_VERSION, within_s=limit_s)
+        with bench.tester.hearing_feedback():
+            sent = bench.send(bench.encoder.reset())
+            heard = bench.wait_for(Kind.FEEDBACK, Kind.BOOT_VERSION, within_s=limit_s)
         if heard is not None and heard.kind is Kind.FEEDBACK:
             bench.measure(FEEDBACK, heard.at - sent.left_at)
             heard = bench.wait_for(Kind.BOOT_VERSION, within_s=limit_s)
@@ -200,6 +208,17 @@ class Session:
         trouble = bench.host.insist_on_packet(self.image, self.stored + 1, bench.now)
         bench.require(not trouble, f"ACK {self.stored + 1}", trouble or "ACK")
         self.stored += 1
+
+    def feedback_since(self, moment: float) -> int:
+        """How many messages of general feedback came after that time, heard or not."""
+        bench = self.bench
+        decoder, since_s = Decoder(bench.encoder), moment - bench.tester.began_at
+        return sum(
+            heard.kind is Kind.FEEDBACK
+            for entry in bench.tester.trace
+            if not entry.sent and entry.at_s > since_s
+            for heard in decoder.feed(entry.frame, entry.at_s)
+        )
 
     def answers(self) -> list[Received]:
         """The answers to what was just sent: the first one, and those that follow it at once."""

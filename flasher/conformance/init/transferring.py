@@ -394,8 +394,10 @@ def end_again(it: Session) -> Iterator[Answer]:
         it.begin()
         it.packets()
         bench.end_transfer()
-        bench.send(bench.encoder.end())
-        heard = [one for one in bench.collect(bench.limit("ack_s")) if one.kind in _END_ANSWERS]
+        with bench.tester.hearing_feedback():
+            bench.send(bench.encoder.end())
+            heard = bench.collect(bench.limit("ack_s"))
+        heard = [one for one in heard if one.kind in _END_ANSWERS]
         kinds = [one.kind for one in heard]
         # An application that runs already may confirm what it does not know (R17).
         words = {(): "silence", (Kind.FEEDBACK,): "silence", (Kind.COMPLETE,): "same_answer"}
