@@ -6,7 +6,6 @@ import gc
 import os
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
@@ -16,9 +15,6 @@ if TYPE_CHECKING:
 
 POSTGRES_REQUIRED = "FLASHER_TEST_POSTGRES"
 """With this variable a missing server is an error, not a reason to skip."""
-_UNMEASURED = ("examples", "hostile", "report", "station/records")
-"""Folders whose tests reach no line of the engines that others do not. Under coverage Python takes
-twice its time."""
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -39,13 +35,6 @@ def files_elsewhere(tmp_path_factory: pytest.TempPathFactory) -> None:
     os.environ["XDG_DATA_HOME"] = str(tmp_path_factory.mktemp("data"))
     # Locks of adapters.
     os.environ["XDG_STATE_HOME"] = str(tmp_path_factory.mktemp("state"))
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    unmeasured = [Path(__file__).parent / folder for folder in _UNMEASURED]
-    for item in items:
-        if any(map(item.path.is_relative_to, unmeasured)):
-            item.add_marker(pytest.mark.no_cover)
 
 
 def pytest_collection_finish() -> None:
