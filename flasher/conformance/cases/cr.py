@@ -59,7 +59,7 @@ Damage = tuple[str, Callable[[bytes], bytes]]
 @case(
     "CR-01",
     "every single-bit flip",
-    clause="Welling 2.2.1 (6)",
+    clause="Welling 2.2.1 (6); robustness, not in the document",
     stimulus="a packet once for each of its 1152 bits, with that bit the other way round",
     expectation="none accepted; the packet is taken afterwards, and stored as it is",
     requires={DESTRUCTIVE, LONG},

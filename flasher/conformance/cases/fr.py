@@ -323,7 +323,7 @@ def no_payload(bench: Bench) -> None:
 @case(
     "FR-10",
     "unknown mode, unknown command",
-    clause="Welling 2.2.1 (2); R15",
+    clause="Welling 2.2.1 (2); R15; robustness, not in the document",
     stimulus="packets and update commands with modes that nobody has; commands that nobody has, "
     "with a whole packet in their data too",
     expectation="not acted on: NAK, silence or general feedback (fr_10); update command and "
