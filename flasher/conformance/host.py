@@ -224,12 +224,13 @@ class PatientHost:
         last = "no answer"
         for tries in range(1, PACKET_TRIES + 1):
             self.send_packet(image, number)
-            heard = self._tester.wait_for(*_PACKET_ANSWERS, unlike=is_stale)
+            # It may erase once more, for an update command that was sent twice (R25, R16).
+            kinds = (*_PACKET_ANSWERS, Kind.REQUEST) if number == 1 else _PACKET_ANSWERS
+            heard = self._tester.wait_for(*kinds, unlike=is_stale)
             if heard is None and number == 1 and tries == PACKET_TRIES - 1:
-                # It may erase once more, for an update command that was sent twice (R25, R16).
                 erase_s = self._profile.limit("erase_s")
                 self._tester.wait_for(Kind.REQUEST, within_s=erase_s)
-            if heard is None:
+            if heard is None or heard.kind is Kind.REQUEST:
                 continue
             last = str(heard)
             if heard.kind is Kind.BOOT_VERSION:
