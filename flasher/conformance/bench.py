@@ -17,7 +17,7 @@ from flasher.conformance.host import UPDATES_MAX, PatientHost
 from flasher.conformance.judge import Judge
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
-from flasher.conformance.subject import Subject
+from flasher.conformance.subject import BY_BUS, Subject, readback_source
 from flasher.conformance.tester import BusTester
 from flasher.conformance.wire import (
     MEMORY_BYTES,
@@ -225,7 +225,7 @@ class Bench:
         chosen = self.good_image if image is None else image
         self._check_runs(chosen)
         if self.tester.update_was_sent and told_version(self.subject.target, chosen) is None:
-            self.check_stored(chosen)
+            self.check_stored(chosen, runs=True)
 
     def _check_runs(self, image: bytes) -> None:
         wanted = told_version(self.subject.target, image)
@@ -236,19 +236,45 @@ class Bench:
             runs = self.application_runs()
             self.check(runs, "the application runs", "it answers" if runs else "no answer")
 
-    @property
-    def readback_source(self) -> str:
-        """By what the flash is compared: "readback" past the protocol, "bus" by the memory query of
-        a running BMS where the profile knows the address; empty where it is not.
+    def check_stored(self, image: bytes, *, runs: bool = False) -> None:
+        """The flash holds exactly `image`, of which the application `runs`; not tried on a bench
+        that cannot compare it.
         """
-        if self.subject.has_readback:
-            return "readback"
-        is_known = self.encoder.has_version_query and self.number("application_address")
-        return "bus" if is_known else ""
+        expected = "the flash holds the image"
+        try:
+            differs_at = self.difference(image, runs=runs)
+        except Unsupported as lacking:
+            tells = told_version(self.subject.target, self.good_image) is not None
+            why = "" if tells else ", and the device does not tell which application runs"
+            self.unsupported(expected, f"{lacking}{why}")
+            return
+        got = "the image"
+        if differs_at is not None:
+            got = f"other bytes from offset {differs_at} on"
+        elif not self.subject.has_readback:
+            total = packet_count(len(image))
+            got = f"{min(total, _PIECES)} of {total} pieces of it, read over the bus"
+        self.check(differs_at is None, expected, got)
 
-    def _check_told(self, image: bytes) -> None:
-        """The running application reads the bytes of `image` out of its memory; of a large one some
-        pieces are asked for, by the seed.
+    def difference(self, image: bytes, *, runs: bool = False) -> int | None:
+        """The offset from which on the flash holds something else than `image`, of which the
+        application `runs`; None without a difference. Raises Unsupported.
+        """
+        source = readback_source(self.subject, self.profile)
+        if source == BY_BUS and runs:
+            return self._told_difference(image)
+        if source == BY_BUS:
+            raise Unsupported("only a running application tells the memory over the bus")
+        if not source:
+            raise Unsupported("the bench has no readback")
+        stored = self.subject.readback()[: len(image)]
+        pairs = enumerate(zip(stored, image, strict=False))
+        at = next((at for at, (one, other) in pairs if one != other), len(stored))
+        return None if at == len(image) else at
+
+    def _told_difference(self, image: bytes) -> int | None:
+        """As `difference`, out of the memory that the running application tells; of a large image
+        some pieces are asked for, by the seed.
         """
         total = packet_count(len(image))
         numbers = list(range(total))
@@ -259,33 +285,10 @@ class Bench:
             part = image[offset : offset + MEMORY_BYTES]
             told = self.host.read_memory(self.number("application_address") + offset, len(part))
             if told is None:
-                self.unsupported("the flash holds the image", "the application tells no memory")
-                return
+                raise Unsupported("the application tells no memory")
             if told != part:
-                self.fail("the flash holds the image", f"other bytes from offset {offset} on")
-                return
-        got = f"{len(numbers)} of {total} pieces of it, read over the bus"
-        self.succeed("the flash holds the image", got)
-
-    def check_stored(self, image: bytes, *, runs: bool = False) -> None:
-        """The flash holds exactly `image`, of which the application `runs`; not tried on a bench
-        without readback.
-        """
-        if runs and self.readback_source == "bus":
-            self._check_told(image)
-            return
-        if not self.subject.has_readback:
-            tells = told_version(self.subject.target, self.good_image) is not None
-            why = "" if tells else ", and the device does not tell which application runs"
-            self.unsupported("the flash holds the image", f"the bench has no readback{why}")
-            return
-        stored = self.subject.readback()[: len(image)]
-        differs = next(
-            (at for at, pair in enumerate(zip(stored, image, strict=False)) if pair[0] != pair[1]),
-            len(stored),
-        )
-        got = "the image" if stored == image else f"other bytes from offset {differs} on"
-        self.check(stored == image, "the flash holds the image", got)
+                return offset
+        return None
 
     # -- power, and out of a transfer -------------------------------------------------------------
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 from flasher.conformance.clauses import contents
 from flasher.conformance.results import CaseText, Gap
-from flasher.conformance.subject import Subject
+from flasher.conformance.subject import Subject, readback_source
 from flasher.conformance.wire import told_version
 from flasher.errors import UsageError, did_you_mean
 
@@ -79,6 +79,8 @@ class Requirement(Enum):
     """Switches the device off and on."""
     READBACK = "readback"
     """Reads the flash back past the protocol."""
+    IMAGE_READBACK = "image-readback"
+    """Compares the flash with the image that runs, by readback or by the memory over the bus."""
     BUS_OFF = "bus-off"
     """Makes the device's CAN controller go off the bus."""
     TIMED_CUT = "timed-cut"
@@ -93,8 +95,8 @@ class Requirement(Enum):
     """Takes more than some seconds on a real bus."""
     TIMING = "timing"
     """Judges times: what the adapter's time stamps are worth decides."""
-    ANY_FRAME = "any-frame"
-    """Sends extended, remote and error frames."""
+    ERROR_FRAMES = "error-frames"
+    """Sends error frames."""
     VERSION = "version"
     """Needs an application that tells its version."""
 
@@ -246,14 +248,18 @@ class Selection:
 _SIMULATED: Final = "--mock, or --subject"
 BARE: Final = {
     Requirement.POWER: ("power control", "--power-cmd"),
-    Requirement.READBACK: ("readback of the flash", "--readback-cmd"),
+    Requirement.READBACK: ("readback of the flash past the protocol", "--readback-cmd"),
+    Requirement.IMAGE_READBACK: (
+        "any readback of the image that runs",
+        "--readback-cmd; of a BMS that tells its memory, device.application_address in the profile",
+    ),
     Requirement.SECOND_IMAGE: ("a second good image", "--second-image"),
     Requirement.BUS_OFF: ("a way to make the device go bus-off", _SIMULATED),
     Requirement.TIMED_CUT: (
         "power cuts at the moment of a flash operation or a frame",
         _SIMULATED,
     ),
-    Requirement.ANY_FRAME: ("an adapter that sends extended, remote and error frames", _SIMULATED),
+    Requirement.ERROR_FRAMES: ("an adapter that sends error frames", _SIMULATED),
 }
 """What a bench of device, adapter and good image lacks, each with what adds it."""
 _LACKS: Final = {
@@ -267,17 +273,25 @@ _LACKS: Final = {
         "a BMS, with an image that holds one version",
     ),
 }
-FULL_BENCH: Final = (Requirement.POWER, Requirement.READBACK, Requirement.SECOND_IMAGE)
+FULL_BENCH: Final = (
+    *(Requirement.POWER, Requirement.READBACK, Requirement.IMAGE_READBACK),
+    Requirement.SECOND_IMAGE,
+)
 """What can be added to a bench with a real device."""
 _IN_PART: Final = {
     Requirement.SECOND_IMAGE: ("EN-01", "EN-07", "SO-01"),
     Requirement.TIMED_CUT: ("PW-01",),
-    Requirement.ANY_FRAME: ("FR-09",),
+    Requirement.ERROR_FRAMES: ("FR-09",),
+    Requirement.READBACK: (
+        *("FR-01", "FR-02", "FR-03", "FR-04", "FR-06", "FR-09", "FR-10"),
+        *("CR-01", "CR-02", "CR-03"),
+        *("TX-07", "TM-02", "PW-01", "SE-04"),
+    ),
     Requirement.VERSION: ("SE-01", "SP-01"),
 }
 """Cases that are judged in part without something."""
 _WITHOUT_FLASH: Final = ("FR-05", "FR-08", "CR-04", "EN-08", "TM-05", "SE-01", "SP-01")
-"""Destructive cases that do not look into the flash; all others need readback for a part."""
+"""Destructive cases that do not look into the flash; of all others, some part compares it."""
 
 
 def lacking(subject: Subject, profile: ConformanceProfile) -> list[Requirement]:
@@ -285,10 +299,11 @@ def lacking(subject: Subject, profile: ConformanceProfile) -> list[Requirement]:
     has = {
         Requirement.POWER: subject.has_power,
         Requirement.READBACK: subject.has_readback,
+        Requirement.IMAGE_READBACK: bool(readback_source(subject, profile)),
         Requirement.SECOND_IMAGE: subject.second_image is not None,
         Requirement.BUS_OFF: subject.has_bus_off,
         Requirement.TIMED_CUT: subject.has_timed_cuts,
-        Requirement.ANY_FRAME: subject.port.sends_any_frame,
+        Requirement.ERROR_FRAMES: subject.port.sends_error_frames,
         Requirement.CHECKSUM: profile.choice("en_04") != "none",
         Requirement.VERSION: told_version(subject.target, subject.good_image) is not None,
     }
@@ -313,8 +328,9 @@ def in_part_without(case_id: str) -> tuple[str, ...]:
     """What a bench needs to judge all of a case, beside what it needs to run it."""
     case = CASES.get(case_id)
     found = [need for need, case_ids in _IN_PART.items() if case_id in case_ids]
-    if case is not None and DESTRUCTIVE in case.requires and case_id not in _WITHOUT_FLASH:
-        found.append(Requirement.READBACK)
+    compares = case is not None and DESTRUCTIVE in case.requires and case_id not in _WITHOUT_FLASH
+    if compares and Requirement.READBACK not in found:
+        found.append(Requirement.IMAGE_READBACK)
     return tuple(need.value for need in found)
 
 

@@ -41,7 +41,7 @@ class RealPort:
     have the time of the kernel or, where it gives none, of this process.
     """
 
-    sends_any_frame = False
+    sends_error_frames = False
 
     def __init__(
         self,

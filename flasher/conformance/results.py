@@ -220,7 +220,8 @@ class RunReport:
     final_image: str = ""
     """Whether the good image is back at the end: "verified", or what failed."""
     final_image_seen_by: tuple[str, ...] = ()
-    """By what that was seen: "version", "readback"; with neither, some application answers."""
+    """By what that was seen: "version", "readback", "memory over the bus"; with none of them, some
+    application answers."""
     duration_s: float = 0.0
 
     def count(self, verdict: CaseVerdict) -> int:
@@ -263,7 +264,8 @@ class RunReport:
             return self.final_image or "not flashed: no case was run"
         if not self.final_image_seen_by:
             return "flashed, an application answers; nothing here tells which one it is"
-        return f"flashed and verified by {' and '.join(self.final_image_seen_by)}"
+        none = "; no readback was possible" if self.final_image_seen_by == ("version",) else ""
+        return f"flashed and verified by {' and '.join(self.final_image_seen_by)}{none}"
 
     def not_tried(self) -> dict[str, list[str]]:
         """Reasons why parts were not tried, with the cases that passed without them."""

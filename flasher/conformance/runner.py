@@ -47,7 +47,7 @@ from flasher.conformance.results import (
     RunStopped,
     Unsupported,
 )
-from flasher.conformance.subject import Subject
+from flasher.conformance.subject import Subject, readback_source
 from flasher.conformance.wire import told_version
 from flasher.errors import BusError
 
@@ -252,8 +252,8 @@ class Run:
         return self._restore(f"after {what}", flash=erased, case_id=what, is_off=bench.is_off)
 
     def finish(self) -> str:
-        """Flash the good image once more and verify it, by its version and by readback where there
-        are such; returns `FINAL_IMAGE_OK`, or what failed.
+        """Flash the good image once more and verify it, by its version and by readback or over
+        the bus where there are such; returns `FINAL_IMAGE_OK`, or what failed.
         """
         if self._killed_by:
             self._final_image = "not flashed: the device could not be brought back"
@@ -262,17 +262,26 @@ class Run:
         try:
             done = restore(self._subject, self._profile, flash=True)
             self._final_image = FINAL_IMAGE_OK if done.ok else done.reason
-            if done.ok and self._subject.has_readback:
-                image = self._subject.good_image
-                if self._subject.readback()[: len(image)] != image:
-                    self._final_image = "the flash does not hold the good image"
-            if self._final_image == FINAL_IMAGE_OK:
-                told = told_version(self._subject.target, self._subject.good_image)
-                seen = {"version": told is not None, "readback": self._subject.has_readback}
-                self._final_image_seen_by = tuple(name for name, is_seen in seen.items() if is_seen)
+            if done.ok:
+                self._compare_final_image()
         except (BusError, CaseEnded) as error:
             self._final_image = error.what if isinstance(error, BusError) else str(error)
         return self._final_image
+
+    def _compare_final_image(self) -> None:
+        """The good image was flashed: see by what there is whether it is there."""
+        subject, image = self._subject, self._subject.good_image
+        seen_by = [] if told_version(subject.target, image) is None else ["version"]
+        limit_s = CASES[BRING_UP].limit_s
+        bench = Bench(subject, self._profile, limit_s=limit_s, seed=self._options.seed)
+        try:
+            if bench.difference(image, runs=True) is not None:
+                self._final_image = "the flash does not hold the good image"
+                return
+            seen_by.append(readback_source(subject, self._profile))
+        except Unsupported:  # the report says that it was not
+            pass
+        self._final_image_seen_by = tuple(seen_by)
 
     def report(self, chosen: Sequence[str]) -> RunReport:
         """The results so far; `chosen` are the ids of the cases that belong to the run."""

@@ -28,7 +28,7 @@ class SimulatedPort:
     echoes = True
     timestamp_source = "simulated bus"
     uncertainty_s = 0.0
-    sends_any_frame = True
+    sends_error_frames = True
 
     def __init__(self, bitrate_bps: int) -> None:
         self.bitrate_bps = bitrate_bps

@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
-from flasher.conformance.wire import RawFrame
+from flasher.conformance.wire import Encoder, RawFrame
+
+if TYPE_CHECKING:  # the profile needs the validation library, which the list of cases does not
+    from flasher.conformance.profile import ConformanceProfile
+
+READBACK: Final = "readback"
+BY_BUS: Final = "memory over the bus"
 
 
 class Arrival(NamedTuple):
@@ -25,8 +31,8 @@ class Port(Protocol):
     """Who stamps the frames: "simulated bus", "hardware", "kernel" or "host"."""
     uncertainty_s: float
     """How far a time stamp may be off."""
-    sends_any_frame: bool
-    """True when `send` takes extended, remote and error frames too."""
+    sends_error_frames: bool
+    """True when `send` takes error frames too."""
 
     def now(self) -> float:
         """The time in seconds; it never goes back."""
@@ -75,3 +81,13 @@ class Subject(Protocol):
 
     def take_cut(self) -> bool:
         """True when the cut that was set last has happened; one that has not is cancelled."""
+
+
+def readback_source(subject: Subject, profile: ConformanceProfile) -> str:
+    """By what the flash is compared: `READBACK` past the protocol, or `BY_BUS`, the memory query of
+    a running BMS, where the profile knows the address; "" where it is not.
+    """
+    if subject.has_readback:
+        return READBACK
+    is_known = Encoder(subject.target).has_version_query and profile.number("application_address")
+    return BY_BUS if is_known else ""

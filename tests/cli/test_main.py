@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-import runpy
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -53,14 +52,11 @@ def test_the_version_is_the_distributions(flasher: Flasher) -> None:
     assert flasher("--version").out == f"flasher {version('welling-flasher')}\n"
 
 
-def test_python_m_flasher_is_the_same_and_exits_with_the_code(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("sys.argv", ["flasher", "image-info", OBC_BIN])
-    with pytest.raises(SystemExit) as caught:
-        runpy.run_module("flasher", run_name="__main__")
-    assert caught.value.code == ExitCode.OK
-    assert "4,000 bytes to send" in capsys.readouterr().out
+def test_python_m_flasher_is_the_same_and_exits_with_the_code() -> None:
+    words, environment = (*FLASHER, "image-info", OBC_BIN), clean_environment()
+    done = subprocess.run(words, check=False, capture_output=True, text=True, env=environment)
+    assert done.returncode == ExitCode.OK
+    assert "4,000 bytes to send" in done.stdout
 
 
 @each("seconds, text", [(0.0, "0.00 s"), (119.994, "119.99 s"), (3725.0, "62 min 05 s")])

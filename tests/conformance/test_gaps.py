@@ -15,9 +15,11 @@ from flasher.conformance.catalogue import (
     lacking,
 )
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock
+from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import CaseVerdict, Unsupported
 from flasher.conformance.runner import RunOptions, run
 from flasher.conformance.wire import RawFrame
+from flasher.mock.store import AREA_START
 from tests.loops import each
 
 AREA_BYTES = 34 * 1024
@@ -30,25 +32,28 @@ def bare(target: str) -> MockSubject:
     subject.has_power = subject.has_readback = False
     subject.has_bus_off = subject.has_timed_cuts = False
     subject.second_image = None
-    subject.port.sends_any_frame = False
+    subject.port.sends_error_frames = False
     send = subject.port.send
 
     def send_standard(frame: RawFrame) -> None:
-        if frame.is_extended or frame.is_remote or frame.is_error:
-            raise Unsupported("the adapter sends standard data frames only")
+        if frame.is_error:
+            raise Unsupported("an adapter sends no error frames")
         send(frame)
 
     subject.port.send = send_standard  # type: ignore[method-assign]
     return subject
 
 
-@each("target", ["bms", "wmc"])
-def test_what_a_bare_bench_cannot_judge_is_said_beforehand(target: str) -> None:
+@each("target, address", [("bms", 0), ("bms", AREA_START), ("wmc", AREA_START)])
+def test_what_a_bare_bench_cannot_judge_is_said_beforehand(target: str, address: int) -> None:
     subject = bare(target)
-    profile = profile_of_mock(subject.device.profile)
+    given = profile_of_mock(subject.device.profile).given
+    profile = ConformanceProfile({**given, "device.application_address": address})
     foreseen = gaps(lacking(subject, profile), in_order(CASES))
     report = run(subject, profile, selection=EVERYTHING, options=RunOptions(upgrades=4))
     assert report.gaps == foreseen
+    is_told = target == "bms" and address
+    assert is_told != any(gap.lacks.startswith("any readback") for gap in foreseen)
     verdicts = {result.case_id: result.verdict for result in report.results}
     unsupported = {case_id for gap in foreseen for case_id in gap.unsupported}
     in_part = {case_id for gap in foreseen for case_id in gap.in_part}
@@ -74,11 +79,9 @@ def test_on_a_bench_with_everything_every_pass_is_in_full() -> None:
 def test_more_of_a_bench_judges_more() -> None:
     chosen = in_order(CASES)
     bare_bench, full_bench = gaps(BARE, chosen), gaps(set(BARE).difference(FULL_BENCH), chosen)
-    assert [gap.remedy for gap in bare_bench[:3]] == [
-        "--power-cmd",
-        "--readback-cmd",
-        "--second-image",
-    ]
+    assert [gap.requirement for gap in bare_bench[:4]] == [need.value for need in FULL_BENCH]
+    assert [gap.remedy for gap in bare_bench[:2]] == ["--power-cmd", "--readback-cmd"]
+    assert "device.application_address" in bare_bench[2].remedy
     cannot = [{case for gap in one for case in gap.unsupported} for one in (bare_bench, full_bench)]
     assert cannot == [{"RS-05", "PW-01", "PW-02", "EN-08", "BU-02"}, {"BU-02"}]
     assert [gap.in_part for gap in full_bench] == [(), ("PW-01",), ("FR-09",)]

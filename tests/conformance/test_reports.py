@@ -10,6 +10,7 @@ from typing import Any, Final
 import jsonschema
 
 from flasher.cli.bench.conformance import ConformanceDocument
+from flasher.cli.bench.conformance_text import report_lines
 from flasher.cli.schema import schema_of
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import Selection
@@ -17,6 +18,7 @@ from flasher.conformance.html_report import MESSAGES_BAD, html_page
 from flasher.conformance.json_report import BINS, CHECKS_KEPT, report_document, to_bytes, to_json
 from flasher.conformance.mock import MockSubject, variant_maker
 from flasher.conformance.profile import ConformanceProfile
+from flasher.conformance.release import summary_page
 from flasher.conformance.reports import candump, is_traced, junit_report, trace_file_name
 from flasher.conformance.results import (
     CaseResult,
@@ -27,6 +29,7 @@ from flasher.conformance.results import (
     RunReport,
 )
 from flasher.conformance.runner import RunOptions, run
+from flasher.mock.store import AREA_START
 from tests.loops import each
 from tests.report.pages import Page, assert_self_contained, assert_visible
 
@@ -104,6 +107,27 @@ def test_the_document_tells_what_went_wrong_and_how_to_see_it_again() -> None:
     assert first["checks"]["passed"] > 0
     assert (first["replay"], first["trace_file"]) == ("flasher ...", "RS-01.log")
     assert [case["id"] for case in made["cases"]] == ["RS-01", "RS-04", "EN-04"]
+
+
+@each("address, by", [(AREA_START, ["version", "memory over the bus"]), (0, ["version"])])
+def test_all_forms_tell_alike_by_what_the_flash_was_compared(address: int, by: list[str]) -> None:
+    device = MockSubject()
+    device.has_readback = False
+    profile = ConformanceProfile({**PROFILE.given, "device.application_address": address})
+    report = run(device, profile, selection=Selection(cases=("UP-08", "TX-07")))
+    document, how = document_of(report), report.final_image_text
+    assert document["final_image_seen_by"] == by
+    assert how.endswith("no readback was possible" if address == 0 else "memory over the bus")
+    lacks = [gap["requirement"] for gap in document["gaps"]]
+    assert lacks == ["readback", "image-readback"][: 1 if address else 2]
+    junit = junit_of(report).iter("property")
+    properties = {one.get("name", ""): one.get("value", "") for one in junit}
+    assert properties["final_image"] == how
+    pages = (page_of(report), summary_page(report, started_at=AT))
+    texts = ["\n".join(report_lines(report, {})), *(Page(html).text for html in pages)]
+    assert all(how in text for text in texts)
+    for text in (properties["bench_is"], *texts):
+        assert ("any readback of the image that runs" in text) == (address == 0)
 
 
 def test_many_failed_checks_are_counted_and_the_first_ones_told() -> None:

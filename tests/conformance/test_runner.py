@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
 
 import pytest
 
@@ -16,6 +18,7 @@ from flasher.conformance.results import CaseVerdict, Unsupported
 from flasher.conformance.runner import RunOptions, run
 from flasher.conformance.wire import RawFrame
 from flasher.errors import UsageError
+from flasher.mock.store import AREA_START
 from tests.loops import each
 
 from .bench import (
@@ -29,6 +32,8 @@ from .bench import (
     status_of,
     subject,
 )
+
+APPLICATION_ADDRESS: Final = "device.application_address"
 
 
 def passes(bench: Bench) -> None:
@@ -125,15 +130,21 @@ def test_a_part_that_the_bench_cannot_do_is_said_and_the_rest_judged() -> None:
 
 
 def test_the_good_image_is_verified_by_what_there_is_and_the_report_says_how() -> None:
-    def seen(target: str, *, readback: bool) -> str:
+    def seen(target: str, *, readback: bool = False, address: int = 0) -> str:
         device = MockSubject(target)
         device.has_readback = readback
-        return run_case(passes, device=device).final_image_text
+        profile = replace(PROFILE, given={**PROFILE.given, APPLICATION_ADDRESS: address})
+        return run_case(passes, device=device, profile=profile).final_image_text
 
-    assert seen("bms", readback=True) == "flashed and verified by version and readback"
-    assert seen("bms", readback=False) == "flashed and verified by version"
+    by_version = "flashed and verified by version"
+    not_read = f"{by_version}; no readback was possible"
+    assert seen("bms", readback=True) == f"{by_version} and readback"
+    assert seen("bms") == not_read
+    assert seen("bms", address=AREA_START) == f"{by_version} and memory over the bus"
+    assert seen("bms", address=0x1000) == not_read  # it tells nothing from there
+    assert seen("bms", address=AREA_START + 128) == "the flash does not hold the good image"
     assert seen("wmc", readback=True) == "flashed and verified by readback"
-    assert "nothing here tells which one" in seen("wmc", readback=False)
+    assert "nothing here tells which one" in seen("wmc", address=AREA_START)
 
 
 def test_an_application_without_a_version_is_known_by_the_flash_once_it_may_be_another() -> None:

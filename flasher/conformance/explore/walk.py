@@ -146,12 +146,8 @@ class Walk:
     def check_stored(self, image: bytes) -> None:
         """The flash holds `image`, where it can be read. Raises Violation."""
         if self.bench.subject.has_readback:
-            stored = self.bench.subject.readback()[: len(image)]
-            if stored != image:
-                at = next(
-                    (at for at, (a, b) in enumerate(zip(stored, image, strict=False)) if a != b),
-                    len(stored),
-                )
+            at = self.bench.difference(image)
+            if at is not None:
                 raise Violation("flash", f"the flash differs from the image from offset {at} on")
 
     # -- what is heard -----------------------------------------------------------------------------

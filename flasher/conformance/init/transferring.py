@@ -417,12 +417,8 @@ def buffer(it: Session) -> Iterator[Answer]:
     for number in range(1, count + 1):
         it.packets(number)
         wanted = it.image[: number * PACKET_BYTES]
-        stored = bench.subject.readback()[: len(wanted)]
-        same = next(
-            (at for at, pair in enumerate(zip(stored, wanted, strict=False)) if pair[0] != pair[1]),
-            len(stored),
-        )
-        lacking = max(lacking, len(wanted) - same)
+        same = bench.difference(wanted)
+        lacking = max(lacking, 0 if same is None else len(wanted) - same)
     it.finish()
     # The last packet may be on its way into the flash when its ACK comes (PW-01).
     held = max(0, -(-lacking // PACKET_BYTES) * PACKET_BYTES - PACKET_BYTES)
