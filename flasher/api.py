@@ -325,6 +325,12 @@ class Device(_OnBus):
         """
         return self._run(self._steps.identify(), watch)
 
+    def is_heard(self, **watch: Unpack[Watch]) -> bool:
+        """True when it sends a message, or answers a question for its version: nothing else is sent
+        to it. Takes 5 s at the most.
+        """
+        return self._run(self._steps.is_heard(), watch)
+
     def version(self, **watch: Unpack[Watch]) -> Content:
         """Its version information, or the answer to the product's own version query. Raises
         NoAnswerError when it does not answer, or nobody knows how to ask it.

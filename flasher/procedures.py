@@ -291,6 +291,17 @@ class Procedures:
         readings = tuple(_reading(entry, done.get(entry.name)) for entry in asked)
         return DeviceInfo(self.target, self.profile.dialect, readings, survey)
 
+    def is_heard(self) -> Procedure[bool]:
+        """Listen for the device, and ask it for its version where it has a query for that."""
+        request = self.profile.upgrade_options().version_request_for(self.target)
+        survey = yield from self._survey(
+            () if request is None else [request],
+            INFO_LISTEN_ONLY_S if request is None else INFO_LISTEN_S,
+        )
+        _check_no_other_tool(survey)
+        heard = survey.heard.get(self.target.node)
+        return heard is not None and bool(heard.messages)
+
     def scan(self) -> Procedure[Survey]:
         """Listen for a second, then ask the BMS for its version and state."""
         items = readable(BMS, self.profile.dialect)

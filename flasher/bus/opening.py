@@ -80,6 +80,16 @@ def bus_config(given: Mapping[str, Any], *, listen_only: bool = False) -> dict[s
     return merged
 
 
+def names_adapter(given: Mapping[str, Any]) -> bool:
+    """True when what was given, a variable or a file names an adapter, or its channel alone. Raises
+    UsageError as `bus_config`.
+    """
+    try:
+        return bool(bus_config(given))
+    except BusError:
+        return bus_config({**given, "interface": "virtual"}).get("channel") is not None
+
+
 def open_bus(config: Mapping[str, Any]) -> can.BusABC:
     """Open what `bus_config` gave. Raises BusError with cause and remedy."""
     interface, channel = str(config["interface"]), config.get("channel")
@@ -145,7 +155,7 @@ def _no_interface(error: Exception) -> UsageError | BusError:
             cause="neither -i/--interface, nor a python-can configuration file, nor the variable "
             "CAN_INTERFACE names one",
             remedy="Name it, for example `-i socketcan -c can0` or `-i pcan -c PCAN_USBBUS1`; "
-            f"--mock needs none. flasher doctor lists what is plugged in. Interfaces: {known}.",
+            f"--mock needs none. flasher adapters lists what is plugged in. Interfaces: {known}.",
         )
     return UsageError(f"{words_of(error)}.", remedy=f"python-can knows: {known}.")
 

@@ -54,6 +54,10 @@ _PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
         ),
     },
     "when something goes wrong": {
+        "adapters": Entry(
+            "look.adapters:adapters",
+            "what is plugged into this computer, with the arguments that use it",
+        ),
         "doctor": Entry(
             "look.doctor:doctor",
             "look at adapters, bus and traffic, and say what fixes what is wrong",

@@ -14,6 +14,7 @@ import click
 from flasher.api import Connection, as_dialect, connect, connect_mock
 from flasher.api import bit_rate as settle_bit_rate
 from flasher.bus.bit_rate import BitRate
+from flasher.bus.detect import Found
 from flasher.cli import values
 from flasher.cli.framework import Decorator, argument, option, option_set
 from flasher.host.options import FRAME_GAP_SHARE, PACKET_GAP_MAX_S
@@ -175,6 +176,8 @@ class Bus:
     timing: tuple[tuple[str, str], ...] = ()
     can_filters: tuple[dict[str, int], ...] = ()
     bus_kwargs: tuple[tuple[str, str], ...] = ()
+    found: Found | None = None
+    """The adapter, where nothing names one: the only one found (`flasher.cli.adapters`)."""
 
     @property
     def dialect(self) -> Dialect:
@@ -194,6 +197,13 @@ class Bus:
 
             given |= {key: cast_from_string(value) for key, value in self.bus_kwargs}
         return given
+
+    @cached_property
+    def is_named(self) -> bool:
+        """True when an option, a variable or a file names an adapter. Raises UsageError."""
+        from flasher.bus.opening import names_adapter  # noqa: PLC0415  loads python-can
+
+        return names_adapter(self.config)
 
     @cached_property
     def bit_rate(self) -> BitRate:

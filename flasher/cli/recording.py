@@ -22,6 +22,7 @@ from typing import Any, Final
 from platformdirs import user_state_path
 
 from flasher.api import Connection
+from flasher.cli.adapters import settled
 from flasher.cli.files import check_not_read
 from flasher.cli.framework import command_line, option, option_set, typed_values
 from flasher.cli.options import Bus
@@ -145,7 +146,10 @@ def recording(
 def recorded_connection(
     options: RecordingOptions, bus: Bus, output: Output, target: Target
 ) -> Iterator[tuple[Connection, Recording]]:
-    """The bus that the options name, with a recording of it: for commands that ask one thing."""
+    """The bus that the options name, else the only adapter found, and a recording of it: for
+    commands that ask one thing.
+    """
+    bus = settled(bus, output)
     with (
         recording(options, bus, output, target=target) as record,
         bus.connect(target) as connection,

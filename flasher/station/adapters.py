@@ -1,40 +1,30 @@
 """From the sockets of a station's file to what their processes are given: each socket finds its
 adapter by serial number or place on the USB.
 
-`resolve` is a pure function of what was detected; `detect` asks python-can, pyserial and the
-system.
+`resolve` is a pure function of what was detected (`flasher.bus.detect`).
 """
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-import can
-
+from flasher.bus.detect import (
+    SERIAL_PORTS,
+    SOCKETCAN,
+    Detection,
+    Found,
+    network_adapters,
+    serial_ports,
+)
+from flasher.bus.inspect_interface import SYSFS
 from flasher.errors import BusError, UsageError
 from flasher.protocol.text import printable
 from flasher.station.config import SocketConfig
 from flasher.station.messages import VirtualUnits, WorkerSetup
 from flasher.station.recipe_file import LoadedRecipe
-
-_SERIAL_KEYS: Final = ("serial_number", "serial", "unique_hardware_id", "hw_serial", "hwid")
-"""Where back ends of python-can put an adapter's serial number."""
-_SERIAL_PORTS: Final = frozenset({"slcan", "robotell", "seeedstudio", "serial"})
-_NETWORK: Final = Path("/sys/class/net")
-
-
-@dataclass(frozen=True)
-class Detected:
-    """An adapter that is plugged in."""
-
-    interface: str
-    channel: str
-    serial_number: str = ""
-    usb_path: str = ""
 
 
 @dataclass(frozen=True)
@@ -45,7 +35,7 @@ class Resolved:
     bus: Mapping[str, Any] | None
 
 
-def resolve(sockets: Sequence[SocketConfig], detected: Iterable[Detected]) -> tuple[Resolved, ...]:
+def resolve(sockets: Sequence[SocketConfig], detected: Iterable[Found]) -> tuple[Resolved, ...]:
     """Every socket with its adapter.
 
     Raises BusError when an adapter is not there, UsageError when two sockets come to the same one
@@ -68,7 +58,7 @@ def resolve(sockets: Sequence[SocketConfig], detected: Iterable[Detected]) -> tu
     return resolved
 
 
-def _resolve(socket: SocketConfig, detected: Sequence[Detected]) -> Resolved:
+def _resolve(socket: SocketConfig, detected: Sequence[Found]) -> Resolved:
     if socket.mock is not None:
         return Resolved(socket, None)
     bus: dict[str, Any] = {**socket.bus, "interface": socket.interface}
@@ -135,61 +125,24 @@ def worker_setups(
 # -- what is plugged in ---------------------------------------------------------------------------
 
 
-def detect(sockets: Sequence[SocketConfig], *, network: Path = _NETWORK) -> tuple[Detected, ...]:
+def detect(sockets: Sequence[SocketConfig], *, network: Path = SYSFS) -> tuple[Found, ...]:
     """The adapters for the interfaces of sockets that are found by serial number or USB path.
 
-    It may take as long as the back ends take.
+    Raises UsageError where a package is missing that finds them.
     """
     wanted = {s.interface for s in sockets if s.serial_number or s.usb_path}
-    found: list[Detected] = []
-    for interface in sorted(wanted):
-        if interface == "socketcan":
-            found += _network_adapters(network)
-        elif interface in _SERIAL_PORTS:
-            found += _serial_ports(interface)
-        else:
-            found += _of_back_end(interface)
+    found: list[Found] = []
+    for interface in sorted(wanted & SERIAL_PORTS):
+        try:
+            found += serial_ports(interface)
+        except ImportError as error:
+            raise UsageError(
+                f"To find a {interface} adapter by its serial number, pyserial is needed.",
+                remedy="Install python-can with its serial extra: pip install "
+                "'python-can[serial]'.",
+            ) from error
+    if SOCKETCAN in wanted:
+        found += network_adapters(network)
+    with Detection(sorted(wanted - SERIAL_PORTS - {SOCKETCAN})) as detection:
+        found += detection.collect().found
     return tuple(found)
-
-
-def _of_back_end(interface: str) -> Iterator[Detected]:
-    for config in can.detect_available_configs(interface):
-        details: Mapping[str, Any] = config
-        serial = next((str(details[key]) for key in _SERIAL_KEYS if details.get(key)), "")
-        yield Detected(interface, str(details.get("channel", "")), serial)
-
-
-def _serial_ports(interface: str) -> Iterator[Detected]:
-    try:
-        ports: Any = importlib.import_module("serial.tools.list_ports")
-    except ImportError as error:
-        raise UsageError(
-            f"To find a {interface} adapter by its serial number, pyserial is needed.",
-            remedy="Install python-can with its serial extra: pip install 'python-can[serial]'.",
-        ) from error
-    for port in ports.comports():
-        yield Detected(interface, port.device, port.serial_number or "", port.location or "")
-
-
-def _network_adapters(network: Path) -> Iterator[Detected]:
-    """CAN interfaces of Linux with what their USB device says."""
-    for folder in sorted(network.glob("*")):
-        if _text(folder / "type") != "280":  # ARPHRD_CAN
-            continue
-        device = (folder / "device").resolve()
-        # The link leads to the USB interface; the device is above it.
-        serial = _text(device.parent / "serial") or _text(device / "serial")
-        usb_path = (
-            device.name.partition(":")[0]
-            if (device.parent / "serial").exists()
-            or (":" in device.name and (device.parent / "idVendor").exists())
-            else ""
-        )
-        yield Detected("socketcan", folder.name, serial, usb_path)
-
-
-def _text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="ascii", errors="replace").strip()
-    except OSError:
-        return ""

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from flasher.bus.detect import Detected
 from flasher.cli.main import main
 from tests import schema_document
 
@@ -55,9 +56,10 @@ def schema() -> dict[str, Any]:
 
 @pytest.fixture
 def flasher(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Flasher:
-    """Runs `flasher ...`; python-can finds no configuration of the machine."""
+    """Runs `flasher ...` on a computer without adapters and without python-can's configuration."""
     monkeypatch.setattr("can.util.load_file_config", lambda *_args: {})
     monkeypatch.setattr("can.util.load_environment_config", lambda *_args: {})
+    monkeypatch.setattr("flasher.cli.adapters.detected_adapters", lambda **_: Detected())
 
     def run(*arguments: str | Path) -> Run:
         words: Sequence[str] = [str(argument) for argument in arguments]

@@ -14,10 +14,10 @@ import can
 import pytest
 
 from flasher.api import Connection
+from flasher.bus.detect import Detected, Found
 from flasher.bus.inspect_interface import Interface, Unseen
 from flasher.bus.simulated import SimulatedLink
 from flasher.cli.look import doctor
-from flasher.cli.look.detect import Detected, Found
 from flasher.cli.look.doctor import bus_words
 from flasher.cli.look.findings import Finding, Severity, Traffic
 from flasher.errors import ExitCode
@@ -244,16 +244,32 @@ def examine(flasher: Flasher, monkeypatch: pytest.MonkeyPatch) -> Doctor:
 ON_CAN0 = ("-i", "socketcan", "-c", "can0")
 
 
-def test_nothing_configured_lists_what_is_there_and_how_to_choose_it(examine: Doctor) -> None:
+def test_the_only_adapter_is_looked_at_where_none_is_named(examine: Doctor) -> None:
     examine.detected = Detected([Found("pcan", "PCAN_USBBUS1", {"device": 5})], ["kvaser"], {})
     run = examine()
-    assert run.code == ExitCode.BUS
+    assert run.code == ExitCode.OK
+    assert "using the only one found, -i pcan -c PCAN_USBBUS1" in run.err
     assert one(run, "detected pcan PCAN_USBBUS1 device=5")[0] == "ok"
     assert one(run, "no answer in time from the back ends kvaser")[0] == "note"
+    assert one(run, "pcan PCAN_USBBUS1 opens and listens")[0] == "ok"
+    assert [config["channel"] for config in examine.opened] == ["PCAN_USBBUS1"]
+
+
+def test_of_several_none_is_opened_and_how_to_choose_is_said(examine: Doctor) -> None:
+    examine.detected = Detected([Found("pcan", "PCAN_USBBUS1"), Found("kvaser", "0")])
+    run = examine()
+    assert run.code == ExitCode.BUS
     severity, fix = one(run, "no adapter is chosen")
-    assert (severity, fix) == ("problem", ["flasher doctor -i pcan -c PCAN_USBBUS1"])
-    assert run.document["adapters"] == [{"interface": "pcan", "channel": "PCAN_USBBUS1"}]
+    assert severity == "problem"
+    assert fix == ["flasher doctor -i pcan -c PCAN_USBBUS1", "flasher doctor -i kvaser -c 0"]
+    assert run.document["adapters"][0] == {"interface": "pcan", "channel": "PCAN_USBBUS1"}
     assert run.document["traffic"] is None
+    assert examine.opened == []
+
+
+def test_half_an_adapter_that_is_named_is_not_completed_by_a_guess(examine: Doctor) -> None:
+    examine.detected = Detected([Found("pcan", "PCAN_USBBUS1")])
+    assert one(examine("-c", "can0"), "no adapter is chosen")[0] == "problem"
     assert examine.opened == []
 
 

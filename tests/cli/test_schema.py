@@ -95,6 +95,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("profile", "show", "-t", "bms"),
         ("profile", "check", Path("right.toml")),
         ("rescue", OBC, "-t", "obc", "--mock", "--mock-speed", "0", "--events"),
+        ("adapters",),
         ("doctor", "--mock", "--listen", "0.1", "--mock-speed", "0"),
         ("manifest", "create", Path("image.bin"), "-t", "obc"),
         ("manifest", "check", Path("stated.bin"), "-t", "obc"),

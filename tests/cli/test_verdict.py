@@ -67,7 +67,7 @@ def test_a_good_end_says_what_runs_and_is_green_only_where_nothing_is_unknown(
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        ((BMS, "-t", "bms"), f"{RED}FAILED\x1b[0m  No adapter is configured"),
+        ((BMS, "-t", "bms"), f"{RED}FAILED\x1b[0m  No adapter is named, and none was found"),
         ((SAMPLES / "missing.hex", "-t", "bms"), f"{RED}FAILED\x1b[0m  "),
         (
             (BMS, "-t", "wmc", *MOCK),

@@ -13,11 +13,12 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from flasher import api
+from flasher.bus.detect import SLOW, Detected, Detection
 from flasher.bus.health import ControllerState
 from flasher.bus.link import Clock, Link, MonotonicClock
 from flasher.cli import values
+from flasher.cli.adapters import only
 from flasher.cli.framework import command, option
-from flasher.cli.look.detect import Detected, Detection
 from flasher.cli.look.findings import (
     Finding,
     Listened,
@@ -107,8 +108,6 @@ class DoctorDocument:
 
 DOCUMENTS: Final = (DoctorDocument,)
 
-_SLOW: Final = frozenset({"socketcand"})
-"""A back end that waits for servers on the network: asked only when no other one is chosen."""
 _OWN_OPTIONS: Final = frozenset(
     {"interface", "channel", "bitrate", "fd", "data_bitrate", "timing", "can_filters"}
 )
@@ -228,32 +227,40 @@ class Examination:
         from flasher.bus.opening import bus_config  # noqa: PLC0415
 
         self._note(*setup_findings())
-        given = self._bus.config
         config: dict[str, Any] | None = None
         with contextlib.suppress(BusError):  # none is named: no other failure is one of the bus
-            config = bus_config(given)
+            config = bus_config(self._bus.config)
         asked = set(can.VALID_INTERFACES)
         if config is not None:
-            asked = asked - _SLOW | {str(config["interface"])}
+            asked = asked - SLOW | {str(config["interface"])}
         with Detection(sorted(asked)) as detection:
             before, self.findings = self.findings, []
             if config is not None:
-                self._look_at(config, given, stopped)
+                self._look_at(config, stopped)
             self.detected = detection.collect(stopped)
         _check_stopped(is_stopped=stopped())
         looked, self.findings = self.findings, before
         self._note(*adapter_findings(self.detected), *looked)
         if config is None:
-            self._note(unchosen_finding(self.detected))
+            self._look_at_the_only_one(stopped)
 
-    def _look_at(
-        self, config: dict[str, Any], given: dict[str, Any], stopped: Callable[[], bool]
-    ) -> None:
+    def _look_at_the_only_one(self, stopped: Callable[[], bool]) -> None:
+        found = [each for each in self.detected.found if each.channel]
+        if len(found) != 1 or self._bus.is_named:
+            self._note(unchosen_finding(self.detected))
+            return
+        from flasher.bus.opening import bus_config  # noqa: PLC0415  loads python-can
+
+        self._bus = only(found[0], self._bus, self._output)
+        self._look_at(bus_config(self._bus.config), stopped)
+
+    def _look_at(self, config: dict[str, Any], stopped: Callable[[], bool]) -> None:
         from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can
         from flasher.bus.bit_rate import named_bit_rate  # noqa: PLC0415
         from flasher.bus.inspect_interface import Interface, read_interface  # noqa: PLC0415
         from flasher.bus.opening import can_listen_only  # noqa: PLC0415
 
+        given = self._bus.config
         interface, channel = str(config["interface"]), str(config.get("channel") or "")
         named = named_bit_rate(given, config)
         if named is not None:

@@ -6,17 +6,16 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import platform
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Final
 
+from flasher.bus.detect import Detected
 from flasher.bus.health import ControllerState, LinkHealth
 from flasher.bus.inspect_interface import VIRTUAL_KINDS, Interface, Unseen
 from flasher.bus.opening import needed_extra, start_command
-from flasher.cli.look.detect import Detected
 from flasher.cli.output import counted
 from flasher.errors import BusError
 from flasher.host.survey import Survey
@@ -115,9 +114,8 @@ def adapter_findings(detected: Detected) -> Iterator[Finding]:
         yield Finding(
             Severity.NOTE,
             "adapters",
-            "python-can detects no adapter; not every back end can tell (slcan and gs_usb cannot), "
-            "and a SocketCAN interface is listed only while it is up",
-            (_LIST_INTERFACES,) if platform.system() == "Linux" else (),
+            "no adapter is detected; not every back end can tell (slcan and gs_usb cannot)",
+            ("flasher adapters",),
         )
     if detected.hung:
         names = ", ".join(detected.hung)

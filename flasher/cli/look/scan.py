@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 from flasher.bus.bit_rate import BitRate
+from flasher.cli.adapters import settled
 from flasher.cli.documents import HeardDocument
 from flasher.cli.framework import command
 from flasher.cli.look.content import heard_document, heard_lines
@@ -56,6 +57,7 @@ def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOpt
     """Find out who is on the bus, and which dialect is spoken. Sends one round of queries to the
     battery, and nothing else: no bit rate is tried, since a wrong one disturbs a live bus.
     """
+    bus = settled(bus, output)
     dialect, rate = bus.dialect, bus.bit_rate
     bitrate_bps = rate.bps
     with (

@@ -9,6 +9,7 @@ import click
 
 from flasher.api import as_dialect
 from flasher.cli import values
+from flasher.cli.adapters import check_heard, settled
 from flasher.cli.framework import argument, command, option
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output
@@ -133,9 +134,11 @@ def write(
             f"Writing {plan.writable.name} needs a confirmation, and there is no terminal to ask.",
             remedy="Add --yes.",
         )
+    bus = settled(bus, output)
     with recorded_connection(recorded, bus, output, target) as (connection, record):
         device = connection.device(target, dialect=bus.dialect, taps=record.taps)
         with stop_on_signal() as stopped:
+            check_heard(device, bus, output, cancelled=stopped)
             old = device.content_before(plan, cancelled=stopped)
         output.result(f"{target.node.name} {plan.writable.name}")
         output.table(

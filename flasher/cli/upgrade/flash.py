@@ -11,6 +11,7 @@ import click
 
 from flasher import api
 from flasher.cli import values
+from flasher.cli.adapters import check_heard, settled
 from flasher.cli.framework import command, option, option_set, retyped
 from flasher.cli.options import (
     IMPLAUSIBLE,
@@ -306,6 +307,8 @@ class _Upgrade:
         release = api.find_release(self.image.image, choices.manifest)
         image = api.release_checked(self.image.load(force=choices.force), release)
         profile.check_fits(image)
+        if not choices.dry_run:
+            self.bus = settled(self.bus, output)
         plan = api.make_plan(
             image,
             self.target,
@@ -414,6 +417,8 @@ class _Upgrade:
 
             began_at = connection.clock.now()
             device = connection.device(self.target, dialect=self.bus.dialect)
+            if not chosen.at_power_up:  # there its announcement is waited for, and nothing sent
+                check_heard(device, self.bus, output, taps=record.taps, cancelled=stop.asked)
             result = device.upgrade(
                 plan,
                 options=chosen,

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import time
+from pathlib import Path
+from types import SimpleNamespace
 
+import can
 import pytest
 
-from flasher.cli.look import detect
-from flasher.cli.look.detect import Detection, Found
+from flasher.bus import detect
+from flasher.bus.detect import Detection, Found, network_adapters, serial_ports
 
 # Stands for the process that asks: the answer of each back end goes by its name.
 CHILD = """
@@ -20,10 +24,11 @@ for name in sys.argv[1:]:
     if name == "talks":
         print("Vendor library v1.2"); print('detected: {"interface": 1')
     if name == "fails":
-        print('detected: {"interface": "fails", "channels": [], "error": "OSError: no driver"}')
+        print('detected: {"interface": "fails", "channels": [], "sees": "",'
+              ' "error": "OSError: no driver"}')
     if name.startswith("good"):
         print('detected: {"interface": "%s", "channels": [{"channel": "ch0", "serial": 7}],'
-              ' "error": ""}' % name)
+              ' "sees": "", "error": ""}' % name)
     sys.stdout.flush()
 if "hangs" in sys.argv:
     time.sleep(60)
@@ -83,12 +88,53 @@ def test_the_real_process_answers_for_python_cans_back_ends(
     def answer(name: str) -> list[dict[str, object]]:
         if name == "vector":
             raise RuntimeError("no driver")
+        if name != "kvaser":
+            return []
         return [{"interface": name, "channel": 0, "config": object()}]
 
     monkeypatch.setattr("can.detect_available_configs", answer)
-    detect.say_detected(["kvaser", "vector"])
-    lines = sorted(capsys.readouterr().out.splitlines())
-    assert lines == [
-        'detected: {"interface": "kvaser", "channels": [{"channel": 0}], "error": ""}',
-        'detected: {"interface": "vector", "channels": [], "error": "RuntimeError: no driver"}',
+    monkeypatch.setitem(can.interfaces.BACKENDS, "virtual2", ("no_such_module", "Bus"))
+    detect.say_detected(["kvaser", "vector", "slcan", "virtual2"])
+    answers = [json.loads(line.partition(": ")[2]) for line in capsys.readouterr().out.splitlines()]
+    assert sorted(answers, key=lambda answer: str(answer["interface"])) == [
+        {"interface": "kvaser", "channels": [{"channel": 0}], "sees": "", "error": ""},
+        {"interface": "slcan", "channels": [], "sees": "cannot_tell", "error": ""},
+        {"interface": "vector", "channels": [], "sees": "", "error": "RuntimeError: no driver"},
+        {"interface": "virtual2", "channels": [], "sees": "not_loaded", "error": ""},
     ]
+
+
+def test_a_back_end_that_can_list_nothing_is_told_from_one_that_finds_nothing() -> None:
+    child = """
+for name, sees in (("a", "cannot_tell"), ("b", "not_loaded"), ("c", "")):
+    print('detected: {"interface": "%s", "channels": [], "sees": "%s", "error": ""}' % (name, sees))
+"""
+    command = (sys.executable, "-S", "-c", child)
+    with Detection(["a", "b", "c"], command=command, limit_s=20.0) as detection:
+        detected = detection.collect()
+    assert (detected.cannot_tell, detected.not_loaded, detected.hung) == (["a"], ["b"], [])
+
+
+def test_the_kernels_interfaces_are_found_up_or_down(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    for name, kind in (("can0", "280"), ("eth0", "1")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "type").write_text(kind)
+        (tmp_path / name / "flags").write_text("0x0")
+    monkeypatch.setattr(detect, "network_adapters", lambda sysfs=tmp_path: network_adapters(sysfs))
+    with Detection(["socketcan", "slcan"], command=COMMAND) as detection:
+        assert detection._processes == [], "a serial port is not opened to look"
+        assert detection.collect().found == [Found("socketcan", "can0")]
+
+
+def test_a_serial_port_is_one_with_what_its_usb_device_says(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    port = SimpleNamespace(
+        device="/dev/ttyACM0", description="CANable2", serial_number="0042", location="1-1.4"
+    )
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [port])
+    (found,) = serial_ports("slcan")
+    assert (found.serial_number, found.usb_path) == ("0042", "1-1.4")
+    assert found.arguments == "-i slcan -c /dev/ttyACM0"

@@ -1,0 +1,154 @@
+"""Which adapters this computer has, in words, and which one a command uses that names none."""
+
+from __future__ import annotations
+
+import shlex
+from dataclasses import replace
+from typing import Final, Unpack
+
+import click
+
+from flasher.api import Device, Watch
+from flasher.bus.detect import SLOW, SOCKETCAN, Detected, Detection, Found, serial_ports
+from flasher.bus.inspect_interface import VIRTUAL_KINDS, Interface, read_interface
+from flasher.cli.framework import retyped
+from flasher.cli.options import Bus
+from flasher.cli.output import Output
+from flasher.cli.stop import stop_on_signal
+from flasher.cli.values import interface_names
+from flasher.errors import BusError, InterruptedByUserError, NoAnswerError, UsageError
+from flasher.protocol.spec import Dialect
+from flasher.protocol.text import printable
+
+_NAMES: Final = ("device_name", "description")
+"""Where back ends and serial ports say what an adapter is called."""
+
+
+def detected_adapters(*, on_network: bool = False) -> Detected:
+    """What is plugged in; servers on the network only when they are asked for. Takes 5 s at the
+    most. Raises InterruptedByUserError.
+    """
+    asked = set(interface_names()) - (frozenset() if on_network else SLOW)
+    with stop_on_signal() as stopped, Detection(sorted(asked)) as detection:
+        found = detection.collect(stopped)
+        if stopped():
+            raise InterruptedByUserError("Interrupted by the user.")
+    return found
+
+
+def ports() -> list[Found] | None:
+    """The serial ports, as slcan adapters, which they may be; None where pyserial is missing."""
+    try:
+        return list(serial_ports("slcan"))
+    except ImportError:
+        return None
+
+
+def interface_of(found: Found) -> Interface | None:
+    """What the kernel says of a SocketCAN interface; None of any other adapter."""
+    seen = read_interface(found.channel) if found.interface == SOCKETCAN else None
+    return seen if isinstance(seen, Interface) else None
+
+
+def described(found: Found, dialect: Dialect) -> str:
+    """An adapter in words: its state where the kernel tells it, its name, its serial number."""
+    from flasher.bus.opening import start_command  # noqa: PLC0415  loads python-can
+
+    words = []
+    seen = interface_of(found)
+    if seen is not None and seen.is_up:
+        words.append("up")
+        if seen.kind in VIRTUAL_KINDS:
+            words.append("virtual")
+        if seen.bitrate_bps is not None:
+            words.append(f"{seen.bitrate_bps / 1000:g} kbit/s")
+        words += [seen.state_name.lower()] if seen.state_name else []
+    elif seen is not None:
+        words.append(f"down, `{start_command(found.channel, dialect.bitrate_bps)}` starts it")
+    words += [str(found.details[name]) for name in _NAMES if found.details.get(name)]
+    if found.serial_number:
+        words.append(f"serial number {found.serial_number}")
+    return printable(", ".join(words))
+
+
+# -- the one that a command uses -------------------------------------------------------------------
+
+
+def settled(bus: Bus, output: Output) -> Bus:
+    """The bus with an adapter: the only one found where nothing names one, which is said.
+
+    Raises UsageError when several are found, BusError when none is.
+    """
+    if bus.mock or bus.is_named:
+        return bus
+    found = [each for each in detected_adapters().found if each.channel]
+    if not found:
+        raise _none_found()
+    if len(found) > 1:
+        raise _several_found(found, bus.dialect)
+    return only(found[0], bus, output)
+
+
+def only(found: Found, bus: Bus, output: Output) -> Bus:
+    """The bus with the only adapter found."""
+    output.progress(f"no adapter is named: using the only one found, {printable(found.arguments)}")
+    kwargs = tuple((key, str(value)) for key, value in found.bus_kwargs.items())
+    return replace(
+        bus,
+        interface=found.interface,
+        channel=found.channel,
+        bus_kwargs=(*kwargs, *bus.bus_kwargs),
+        found=found,
+    )
+
+
+def check_heard(device: Device, bus: Bus, output: Output, **watch: Unpack[Watch]) -> None:
+    """Before a device is changed through an adapter that nobody named: it has to be heard there.
+
+    Raises NoAnswerError, having sent nothing but a question for its version.
+    """
+    if bus.found is None:
+        return
+    node = device.target.node.name
+    output.progress(f"listening for the {node} ...")
+    if not device.is_heard(**watch):
+        error = NoAnswerError(
+            f"The {node} was not heard, and nobody named the adapter: nothing was changed.",
+            where=f"the only adapter found, {printable(device.connection.name)}",
+            cause="it is off or asleep, it speaks only when it is switched on, or it is on another "
+            "bus than that of this adapter",
+            remedy="Wake it with its key. Where you know that it is on this bus, name the adapter.",
+        )
+        ctx = click.get_current_context()
+        name = ctx.info_name or ""
+        words = retyped(ctx, name)
+        behind = words.index(name) + 1
+        error.command = shlex.join(["flasher", *words[:behind], *bus.found.words, *words[behind:]])
+        raise error
+    output.progress(f"the {node} is there")
+
+
+def _several_found(found: list[Found], dialect: Dialect) -> UsageError:
+    width = max(len(each.arguments) for each in found)
+    listed = "".join(
+        f"\n    {printable(each.arguments):<{width}}   {described(each, dialect)}".rstrip()
+        for each in found
+    )
+    return UsageError(
+        f"{len(found)} adapters are there, and none of them is named.",
+        remedy=f"Add one of these to the command:{listed}",
+    )
+
+
+def _none_found() -> BusError:
+    maybe = ports()
+    listed = "".join(f"\n    {printable(each.arguments)}" for each in maybe or ())
+    if listed:
+        listed = f" One of the serial ports may be an slcan adapter:{listed}"
+    return BusError(
+        "No adapter is named, and none was found.",
+        cause="none is plugged in, its driver is missing, or it is of a kind that cannot be found "
+        "(slcan, gs_usb and others)",
+        remedy="See with `flasher adapters` what is looked for and what is missing, or name an "
+        f"adapter, as in `-i pcan -c PCAN_USBBUS1`; --mock needs none.{listed}",
+    )

@@ -1,0 +1,168 @@
+"""`flasher adapters`: what is plugged into this computer, with the arguments that use it."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from flasher.bus.detect import BUILT_IN, SERIAL_PORTS, SLOW, SOCKETCAN, Detected, Found
+from flasher.cli.adapters import described, detected_adapters, interface_of, ports
+from flasher.cli.framework import command, option
+from flasher.cli.output import Output
+from flasher.cli.values import interface_names
+from flasher.errors import ExitCode
+from flasher.protocol.spec import WELLING
+from flasher.protocol.text import printable
+
+_EXAMPLES: Final = """\
+examples:
+  flasher adapters
+  flasher adapters --network            listens for socketcand servers too, 4 s
+  flasher adapters --json | jq -r '.adapters[].arguments | join(" ")'
+
+Opens no adapter and no serial port. Where one adapter alone is found, commands that look use it
+without being told, and flash and write do so once they have heard the device on it.
+"""
+
+
+@dataclass(frozen=True)
+class FoundAdapter:
+    """An adapter, or a serial port that may be one."""
+
+    interface: str
+    channel: str
+    """Empty where its back end does not tell."""
+    arguments: list[str]
+    """What chooses it on the command line."""
+    serial_number: str | None
+    usb_path: str | None
+    is_up: bool | None
+    """Of a SocketCAN interface; null of others."""
+    bitrate_bps: int | None
+    """What the kernel has set; null where it does not tell."""
+    description: str
+
+
+@dataclass(frozen=True)
+class NotSeen:
+    """A back end whose adapters are not among those found, if there are any."""
+
+    interface: str
+    why: Literal["package_missing", "not_loaded", "cannot_tell", "no_answer", "failed", "not_asked"]
+    """`not_loaded`: its driver is missing, or it is for another operating system."""
+    text: str
+    fix: str
+    """The command that helps; empty where none does."""
+
+
+@dataclass(frozen=True)
+class AdaptersDocument:
+    """What is plugged in."""
+
+    adapters: list[FoundAdapter]
+    serial_ports: list[FoundAdapter] | None
+    """Each may be an slcan adapter; null where the package is missing that lists them."""
+    not_seen: list[NotSeen]
+
+
+DOCUMENTS: Final = (AdaptersDocument,)
+
+
+@command(epilog=_EXAMPLES, exit_codes=(ExitCode.INTERRUPTED,))
+@option(
+    "--network", is_flag=True, brief=True,
+    help="listen for socketcand servers on the network too",
+)  # fmt: skip
+def adapters(output: Output, *, network: bool) -> int:
+    """List what is plugged into this computer, each with the arguments that use it, and say what
+    cannot be seen.
+    """
+    detected = detected_adapters(on_network=network)
+    serial = ports()
+    unseen = list(_unseen(detected, on_network=network, lists_ports=serial is not None))
+    if detected.found:
+        output.table(_rows(detected.found))
+    else:
+        output.result("no adapter found")
+    if serial:
+        output.result("")
+        output.result("serial ports; with an slcan adapter behind it, one is used by")
+        output.table(_rows(serial))
+    output.result("")
+    output.result("not seen, even when plugged in:")
+    output.table(_unseen_rows(unseen), indent=2)
+    output.document(
+        AdaptersDocument(
+            adapters=[_document(each) for each in detected.found],
+            serial_ports=None if serial is None else [_document(each) for each in serial],
+            not_seen=unseen,
+        )
+    )
+    return ExitCode.OK
+
+
+def _rows(found: Iterable[Found]) -> list[tuple[str, str]]:
+    return [(printable(each.arguments), described(each, WELLING)) for each in found]
+
+
+def _document(found: Found) -> FoundAdapter:
+    seen = interface_of(found)
+    return FoundAdapter(
+        interface=found.interface,
+        channel=found.channel,
+        arguments=found.words,
+        serial_number=found.serial_number or None,
+        usb_path=found.usb_path or None,
+        is_up=None if seen is None else seen.is_up,
+        bitrate_bps=None if seen is None else seen.bitrate_bps,
+        description=described(found, WELLING),
+    )
+
+
+# -- what cannot be seen ---------------------------------------------------------------------------
+
+
+def _unseen(detected: Detected, *, on_network: bool, lists_ports: bool) -> Iterable[NotSeen]:
+    """The back ends of which nothing is known, each with the reason."""
+    from flasher.bus.opening import needed_extra  # noqa: PLC0415  loads python-can
+
+    found = {each.interface for each in detected.found}
+    for name in interface_names():
+        if name in BUILT_IN or name in found or name == SOCKETCAN:
+            continue
+        needed = needed_extra(name)
+        if name in SERIAL_PORTS:
+            if not lists_ports and needed is not None:
+                yield _missing(name, needed[0])
+        elif needed is not None and importlib.util.find_spec(needed[1]) is None:
+            yield _missing(name, needed[0])
+        elif name in SLOW and not on_network:
+            text = "servers on the network"
+            yield NotSeen(name, "not_asked", text, "flasher adapters --network")
+        elif name in detected.hung:
+            yield NotSeen(name, "no_answer", "the library did not answer in time", "")
+        elif name in detected.failed:
+            yield NotSeen(name, "failed", printable(detected.failed[name]), "")
+        elif name in detected.not_loaded:
+            text = "driver missing, or for another operating system"
+            yield NotSeen(name, "not_loaded", text, "")
+        elif name in detected.cannot_tell:
+            yield NotSeen(name, "cannot_tell", "no way to list adapters: -i and -c name one", "")
+
+
+def _missing(name: str, extra: str) -> NotSeen:
+    fix = f"pip install 'python-can[{extra}]'"
+    return NotSeen(name, "package_missing", "Python package missing", fix)
+
+
+def _unseen_rows(unseen: Sequence[NotSeen]) -> Iterable[tuple[str, str]]:
+    """The same in as few rows as tell it: back ends with the same reason stand together."""
+    groups: dict[str, list[str]] = {}
+    for each in unseen:
+        reason = f"{each.text}: {each.fix}" if each.fix else each.text
+        groups.setdefault(reason, []).append(each.interface)
+    for reason, names in groups.items():
+        yield ", ".join(names), reason
+    yield "any other", "as long as its maker's driver is not installed"
