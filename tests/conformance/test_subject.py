@@ -6,11 +6,13 @@ import os
 import shutil
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
 from flasher.conformance.catalogue import Selection
+from flasher.conformance.dut import CanFrame
 from flasher.conformance.dut.pipes import FACTS, HEADER, Kind
 from flasher.conformance.dut.subject import open_subject
 from flasher.conformance.results import CaseVerdict, RunReport
@@ -79,6 +81,16 @@ class LosesComplete(PythonBootloader):
     def _end(self) -> None:
         super()._end()
         self.host.start_application()
+
+
+class SendsWithoutEnd(PythonBootloader):
+    """Has always another frame, which tells how many are in the controller, and waits for none."""
+
+    def tick(self, now_us: int) -> None:
+        pass
+
+    def next_frame(self) -> CanFrame:
+        return CanFrame(0x725, bytes((self.host.transmit_pending(),)))
 
 
 class Restarts(PythonBootloader):
@@ -165,6 +177,22 @@ class ReadsForEver(PythonBootloader):
 def test_a_call_that_reads_flash_for_ever_is_ended_and_is_a_finding() -> None:
     report = _run(_FLAWS + "ReadsForEver", "EN-01")
     assert "16 times over in one call" in _failures(report) + report.not_upgradable + report.stopped
+
+
+def test_the_controller_takes_three_frames_and_asks_for_more_when_it_has_room() -> None:
+    with open_subject(
+        _FLAWS + "SendsWithoutEnd", "bms", None, good_image=None, second_image=None
+    ) as (device, _):
+        heard = []
+        for off_bus_at in (0.05, 0.1):
+            while (arrival := device.port.receive(off_bus_at)) is not None:
+                heard.append(arrival)
+            device.bus_off(0.01)
+    assert max(arrival.frame.data[0] for arrival in heard) == 2  # it is asked while one has room
+    times = [arrival.at for arrival in heard]
+    gaps = [late - early for early, late in pairwise(times)]
+    assert len(times) > 150
+    assert [gap > 0.001 for gap in gaps].count(True) == 1  # back to back, except for the bus-off
 
 
 def test_no_process_is_left_behind() -> None:

@@ -14,8 +14,6 @@ from typing import Any, ClassVar, Final, Never, cast
 from flasher.conformance.dut import Bootloader, CanFrame, Facts, pipes
 from flasher.conformance.dut.pipes import Kind, Pipe
 
-_FRAMES_MAX: Final = 512
-
 
 class _ProcessHost:
     """The hardware, at the other end of the pipe."""
@@ -175,7 +173,10 @@ def serve(subject: str, pipe: Pipe) -> Never:
                 bootloader.receive(pipes.unpack_frame(data[pipes.TURN.size :]))
         wanted = bootloader.tick(host.now)
         frames: list[bytes] = []
-        while len(frames) < _FRAMES_MAX and (frame := bootloader.next_frame()) is not None:
+        while host.pending + len(frames) < pipes.TRANSMIT_FRAMES:
+            frame = bootloader.next_frame()
+            if frame is None:
+                break
             frames.append(pipes.pack_frame(frame))
         done = pipes.DONE.pack(host.now, pipes.NEVER if wanted is None else wanted)
         pipe.write(Kind.DONE, done, *frames)

@@ -97,6 +97,8 @@ class CompiledDevice(Machine):
         self._to_send: deque[Frame] = deque()
         self._left_at = -inf
         """When the frame that the bus has taken last is through."""
+        self._is_full = False
+        """The bootloader may have more to send than the controller has taken."""
         self._busy_until = -inf
         """The processor is in a call, or waits for the flash."""
         self._tick_at = inf
@@ -144,6 +146,8 @@ class CompiledDevice(Machine):
     def frame_sent(self, now: float) -> None:
         if self._to_send:
             self._left_at = now + frame_bits(self._to_send.popleft()) / self._bitrate_bps
+            if self._is_full:
+                self._tick_at = min(self._tick_at, self._left_at)
         else:
             super().frame_sent(now)
 
@@ -178,6 +182,7 @@ class CompiledDevice(Machine):
         super().bus_off(now, off_s)
         self._to_send.clear()
         self._received.clear()
+        self._tick_at = min(self._tick_at, now)  # the controller has room again
 
     def readback(self) -> bytes:
         """The application area."""
@@ -278,6 +283,7 @@ class CompiledDevice(Machine):
             for at in range(pipes.DONE.size, len(data), size):
                 made = pipes.unpack_frame(data[at : at + size])
                 self._to_send.append(Frame(*made[:4]))
+            self._is_full = self._pending(now) >= pipes.TRANSMIT_FRAMES
 
     def _hardware(self, asked: Kind, data: bytes) -> bytes | None:
         """What a function of the hardware gives; None for no answer."""

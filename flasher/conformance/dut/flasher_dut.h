@@ -27,6 +27,10 @@ extern "C" {
 
 #define FLASHER_DUT_ABI 1u
 
+/* The CAN controller takes so many frames before the first of them is on the bus, as the mailboxes of
+ * most do. What more there is to send waits in the memory of the bootloader. */
+enum { FLASHER_TRANSMIT_FRAMES = 3 };
+
 /* A classical CAN data or remote frame. */
 typedef struct {
     uint32_t id;      /* 11 bits, 29 when extended */
@@ -84,7 +88,8 @@ void flasher_dut_receive(const flasher_frame *frame);
  * frame can change anything. A time that is not later than `now_us` means 1 ms from now. */
 uint64_t flasher_dut_tick(uint64_t now_us);
 
-/* The next frame to send: fills `frame` and returns 1, or returns 0. Called until it returns 0. */
+/* The next frame to send: fills `frame` and returns 1, or returns 0. Called behind each turn, until it
+ * returns 0 or the controller is full; a turn follows when that has room again. */
 int flasher_dut_next_frame(flasher_frame *frame);
 
 #ifdef __cplusplus

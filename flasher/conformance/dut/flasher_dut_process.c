@@ -29,8 +29,6 @@
 #error "written for little-endian computers"
 #endif
 
-enum { FRAMES_MAX = 512 };
-
 static int to_suite;
 static uint64_t now;
 static uint32_t pending;
@@ -147,11 +145,11 @@ static const flasher_host host = {
 
 static void turn(void)
 {
-    static flasher_frame frames[FRAMES_MAX];
+    flasher_frame frames[FLASHER_TRANSMIT_FRAMES];
     size_t count = 0;
     uint64_t times[2];
     times[1] = flasher_dut_tick(now);
-    while (count < FRAMES_MAX && flasher_dut_next_frame(&frames[count]))
+    while (pending + count < FLASHER_TRANSMIT_FRAMES && flasher_dut_next_frame(&frames[count]))
         ++count;
     times[0] = now;
     tell('.', times, sizeof times, frames, count * sizeof frames[0]);

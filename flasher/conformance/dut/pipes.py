@@ -12,6 +12,8 @@ from typing import Final
 from flasher.conformance.dut import CanFrame, Facts
 
 ABI: Final = 1
+TRANSMIT_FRAMES: Final = 3
+"""As FLASHER_TRANSMIT_FRAMES of the header."""
 HEADER: Final = Struct("<B3xI")
 FACTS: Final = Struct("<9I")
 START: Final = Struct("<QI")
