@@ -31,6 +31,7 @@ from flasher.conformance.wire import (
 
 _PIECES: Final = 64
 """Of an image, so many pieces are read over the bus at the most, which takes about a second."""
+_EDGE_S: Final = 0.001
 _PAUSES: Final = 4
 """A pause that nobody knows may be so many times as long as limits.pause_s."""
 
@@ -122,6 +123,11 @@ class Bench:
             self.wait_for(Kind.BOOT_VERSION, within_s=last_at - self.now)
         self.wait(self.limit("window_s") / 2)
         self.forget()
+
+    @property
+    def window_edge_s(self) -> float:
+        """Nearer to the window's end nobody can tell whether a message came before or behind it."""
+        return max(self.limit("window_tolerance_s"), 2 * self.port.uncertainty_s) + _EDGE_S
 
     def next_version(self) -> Received:
         """The next boot version of the burst."""

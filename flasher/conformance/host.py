@@ -66,13 +66,20 @@ class PatientHost:
 
         Raises Unsupported for a target without such a query.
         """
+        heard = self.version_answer(within_s)
+        return None if heard is None else heard.firmware
+
+    def version_answer(
+        self, within_s: float, *, every_s: float = _QUERY_PERIOD_S
+    ) -> Received | None:
+        """The first answer to the version query, which is sent `every_s`. Raises as above."""
         if not self._encoder.has_version_query:
             raise Unsupported("the document has no version query for this target")
         tester, kind = self._tester, Kind.VERSION_INFORMATION
         deadline, unanswered = tester.now + within_s, 0
         while tester.now < deadline:
             tester.send(self._encoder.query_version())
-            heard = tester.wait_for(kind, within_s=min(_QUERY_PERIOD_S, deadline - tester.now))
+            heard = tester.wait_for(kind, within_s=min(every_s, deadline - tester.now))
             if heard is None:
                 unanswered += 1
                 continue
@@ -80,7 +87,7 @@ class PatientHost:
             late_s = _QUERY_PERIOD_S + _QUIET_S
             while unanswered and tester.wait_for(kind, within_s=late_s) is not None:
                 unanswered -= 1
-            return heard.firmware
+            return heard
         return None
 
     def application_runs(self, within_s: float | None = None) -> bool:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from enum import Enum
@@ -36,6 +36,8 @@ _ECHO_LIMIT_S: Final = 2.0
 """A frame that has not left by then is taken as sent: its echo was lost."""
 _FRAME_BITS: Final = 47
 """A frame without data and stuff bits, interframe space included."""
+_STUFFED_BITS: Final = 33
+"""Of these, what can be stuffed."""
 _UPDATE_HEAD: Final = b"\x55\xaa" + bytes((WRITE, 2 + (UPDATE & 0xFF))) + UPDATE.to_bytes(2, "big")
 _NO_READ: Final = re.compile(rb"\x55\xaa[^\x11\x0c]", re.DOTALL)
 """The beginning of a message that is neither read nor report."""
@@ -143,10 +145,15 @@ class BusTester:
     # -- sending ----------------------------------------------------------------------------------
 
     def send(
-        self, frames: Sequence[RawFrame], *, gap_s: float = 0.0, at: float | None = None
+        self,
+        frames: Sequence[RawFrame],
+        *,
+        gap_s: float = 0.0,
+        gaps: int | None = None,
+        at: float | None = None,
     ) -> Sent:
-        """Send frames, `gap_s` of silence between them, from the time `at` on; returns when the
-        last one has left.
+        """Send frames, `gap_s` of silence behind each of the first `gaps` of them (None: between
+        all), from the time `at` on; returns when the last one has left.
         """
         if at is not None:
             self.wait_until(at)
@@ -156,7 +163,7 @@ class BusTester:
             self._feedback_due += writes
             self._written_at = began_at
         for index, frame in enumerate(frames):
-            if index and gap_s:
+            if index and gap_s and (gaps is None or index <= gaps):
                 self._wait_for_echoes()
                 self.wait(gap_s)
             self._send_disturbed(frame)
@@ -167,6 +174,12 @@ class BusTester:
         if writes:
             self._written_at = self.left_at
         return Sent(began_at, self.left_at)
+
+    def wire_s(self, frames: Iterable[RawFrame], *, is_stuffed: bool = False) -> float:
+        """How long frames take on the wire: at the least, or with all stuff bits there can be."""
+        sizes = [8 * len(frame.data) for frame in frames]
+        stuff_bits = sum((_STUFFED_BITS + size) // 4 for size in sizes) if is_stuffed else 0
+        return (len(sizes) * _FRAME_BITS + sum(sizes) + stuff_bits) / self.port.bitrate_bps
 
     @contextmanager
     def hearing_feedback(self) -> Iterator[None]:
@@ -300,7 +313,7 @@ class BusTester:
         if self.port.echoes:
             self._echoes_due += 1
             return
-        wire_s = (_FRAME_BITS + 8 * len(frame.data)) / self.port.bitrate_bps
+        wire_s = self.wire_s([frame])
         self.left_at = max(self.left_at, self.now) + wire_s
         self._record(self.left_at, frame, sent=True)
 

@@ -26,6 +26,7 @@ from flasher.conformance.runner import run
 from flasher.mock.model import AnyRow, MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.table import Event, State
+from flasher.mock.variants.entering import LOOP_S, QueuesUpdates
 from flasher.mock.variants.framing import HeaderAtFrameStart, PaddingFatal, ShortFrameEnds
 from flasher.mock.variants.transfer import FillerChecked
 from flasher.protocol import messages
@@ -37,7 +38,6 @@ _HELD: Final = frozenset(
     {CaseVerdict.PASS, CaseVerdict.PASS_IN_PART, CaseVerdict.INFO, CaseVerdict.UNSUPPORTED}
 )
 _BOOTLOADER: Final = frozenset(State) - {State.OFF, State.APPLICATION, State.RESTARTING}
-_LOOP_S: Final = 0.005
 
 
 # -- what the device model has no choice for -------------------------------------------------------
@@ -81,27 +81,14 @@ class _ListensBehindBurst(MockDevice):
         return Event.NO_CONCERN if is_deaf and event is Event.UPDATE else event
 
 
-class _RequestsForEach(MockDevice):
+class _RequestsForEach(QueuesUpdates):
     """Erases and requests the transfer for each update command that comes before packet 1 (R25)."""
-
-    _waiting_update = False
-
-    def _handle(self, event: Event, now: float) -> None:
-        if event is Event.UPDATE_AGAIN and self.state is State.ERASING:
-            self._waiting_update = True
-        super()._handle(event, now)
 
     def _request(self, now: float) -> str:
         detail = super()._request(now)
         if self._waiting_update:
-            self._due_at = now + _LOOP_S
+            self._due_at = now + LOOP_S
         return detail
-
-    def _elapsed(self) -> Event:
-        if self.state is State.TRANSFER and self._waiting_update:
-            self._waiting_update = False
-            return Event.UPDATE
-        return super()._elapsed()
 
     def _boot(self, now: float) -> str:
         self._waiting_update = False

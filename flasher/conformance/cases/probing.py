@@ -151,10 +151,7 @@ class Probe:
         """
         bench = self._bench
         bench.forget()
-        first = gaps + 1 if gap_s else 0
-        if first:
-            bench.send(frames[:first], gap_s=gap_s)
-        bench.send(frames[first:])
+        bench.send(frames, gap_s=gap_s, gaps=gaps)
         heard = self._answers()
         taken = any(self._is_taken(one) for one in heard)
         allowed = (Kind.NAK, *ignoring)

@@ -25,12 +25,10 @@ _END: Final = "last boot version to the window's end"
 _PATIENCE: Final = 3
 _ASK_S: Final = 0.02
 """The application is asked so often: the measured start is later than the real one by so much."""
-_LATE_S: Final = 0.3
 _BEYOND: Final = 1.2
 """The last update command, in windows."""
 _AT_THE_END: Final = 0.5
 """The share of the update commands that come within a tenth of the window around its end."""
-_EDGE_S: Final = 0.001
 
 
 @case(
@@ -71,17 +69,10 @@ def _measure_start(bench: Bench, name: str, since: float, *, is_asked: bool) -> 
     if not is_asked:
         bench.wait_until(since + limit_s)
         return
-    deadline = since + _PATIENCE * limit_s
-    while bench.now < deadline:
-        bench.send(bench.encoder.query_version())
-        heard = bench.wait_for(Kind.VERSION_INFORMATION, within_s=_ASK_S)
-        if heard is not None:
-            bench.measure(name, max(0.0, heard.at - since))
-            break
-    else:
-        bench.require_received(None, "an application that answers", deadline - since)
-    while bench.wait_for(Kind.VERSION_INFORMATION, within_s=_LATE_S) is not None:
-        pass
+    within_s = _PATIENCE * limit_s
+    heard = bench.host.version_answer(since + within_s - bench.now, every_s=_ASK_S)
+    found = bench.require_received(heard, "an application that answers", within_s)
+    bench.measure(name, max(0.0, found.at - since))
 
 
 @case(
@@ -97,9 +88,9 @@ def _measure_start(bench: Bench, name: str, since: float, *, is_asked: bool) -> 
 )
 def window(bench: Bench) -> None:
     window_s, choice = bench.limit("window_s"), bench.choice("up_04")
-    edge_s = max(bench.limit("window_tolerance_s"), 2 * bench.port.uncertainty_s) + _EDGE_S
+    edge_s = bench.window_edge_s
     frames = bench.encoder.update(len(bench.good_image))
-    wire_s = sum(47 + 8 * len(frame.data) for frame in frames) / bench.port.bitrate_bps
+    wire_s = bench.tester.wire_s(frames)
     taken: list[float] = []
     not_taken: list[float] = []
     for offset_s in _offsets(window_s, bench.upgrades):

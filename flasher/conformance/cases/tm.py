@@ -47,7 +47,8 @@ def gaps(bench: Bench) -> None:
     wanted = ACCEPTED if bench.choice("tm_02") == "accepted" else EITHER
     probe = Probe(bench)
     probe.begin()
-    frame_s, pause_s = _longest_frame_s(bench), bench.limit("pause_s")
+    frame_s = bench.tester.wire_s(probe.frames()[:1], is_stuffed=True)
+    pause_s = bench.limit("pause_s")
     edge_s = frame_s + 2 * bench.port.uncertainty_s + _EDGE_S
     for gap_s in (*(share * limit_s for share in _SHARES), max(limit_s - edge_s, 0.0)):
         with bench.step(f"{gap_s * 1000:.1f} ms"):
@@ -160,11 +161,6 @@ def end_measured(bench: Bench) -> Received:
     heard = bench.await_message(Kind.COMPLETE, within_s=within_s)
     bench.measure(_COMPLETE, heard.at - sent.left_at)
     return heard
-
-
-def _longest_frame_s(bench: Bench) -> float:
-    """A frame of 8 bytes on the wire, every stuff bit included."""
-    return (47 + 64 + 24) / bench.port.bitrate_bps
 
 
 def _widest_s(bench: Bench, since_s: float) -> float:

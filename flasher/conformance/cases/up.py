@@ -25,7 +25,6 @@ _SENT_WHOLE_PACKETS: Final = 2
 """Images of that many packets are sent too, so that the device shows how many it expects."""
 _SIZE_BITS: Final = (16, 24, 31)
 """A device that keeps fewer bits of the size takes one for a small image."""
-_EDGE_S: Final = 0.001
 _SOON_S: Final = 0.1
 _FIRST_PACKETS: Final = 3
 _MANY: Final = 24
@@ -121,7 +120,7 @@ def window(bench: Bench) -> None:
             _enter_at(bench, version)
             choice = bench.choice("up_04_burst") if version < count else "accepted"
             _offer_update(bench, choice)
-    edge_s = max(bench.limit("window_tolerance_s"), 2 * bench.port.uncertainty_s) + _EDGE_S
+    edge_s = bench.window_edge_s
     window_s = bench.limit("window_s")
     if bench.choice("up_04") == "either":
         with bench.step(f"{window_s * 500:g} ms after the last boot version"):
@@ -132,7 +131,8 @@ def window(bench: Bench) -> None:
     with bench.step("just before the window's end"):
         last_at = _enter_at(bench, count)
         frames = bench.encoder.update(len(image))
-        bench.send(frames, at=last_at + window_s - edge_s - _wire_s(bench, frames))
+        wire_s = bench.tester.wire_s(frames, is_stuffed=True)
+        bench.send(frames, at=last_at + window_s - edge_s - wire_s)
         _expect_request(bench)
         bench.finish(image)
     with bench.step("just after the window's end"):
@@ -306,12 +306,6 @@ def _enter_at(bench: Bench, version: int) -> float:
     for _ in range(version - 1):
         heard = bench.next_version()
     return heard.at
-
-
-def _wire_s(bench: Bench, frames: list[RawFrame]) -> float:
-    """How long frames take on the wire at the most, every stuff bit included."""
-    bits = sum(47 + 8 * len(frame.data) + (33 + 8 * len(frame.data)) // 4 for frame in frames)
-    return bits / bench.port.bitrate_bps
 
 
 def _wrong_updates(bench: Bench) -> Iterator[tuple[str, list[RawFrame]]]:

@@ -214,7 +214,7 @@ def _offer_at(it: Session, offset_s: float) -> tuple[float, bool]:
     """
     bench = it.bench
     frames = bench.encoder.update(len(it.image))
-    wire_s = sum(47 + 8 * len(frame.data) for frame in frames) / bench.port.bitrate_bps
+    wire_s = bench.tester.wire_s(frames)
     last = it.enter(bench.number("versions"))
     sent = bench.send(frames, at=last.at + max(offset_s - wire_s, 0.0))
     heard = bench.wait_for(Kind.REQUEST)

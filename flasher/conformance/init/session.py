@@ -37,7 +37,6 @@ START: Final = "complete to an application that answers"
 START_AGAIN: Final = "last boot version to an application that answers"
 _LIMIT_S: Final = 7200.0
 _ASK_S: Final = 0.05
-_LATE_S: Final = 0.3
 _QUIET_S: Final = 0.1
 _BURST_GAP_S: Final = 1.5
 """Two boot versions of a burst are not so far apart."""
@@ -82,16 +81,10 @@ class Session:
                 bench.measure(name, bench.now - since)
                 self.settle()
             return
-        deadline = bench.now + within_s
-        heard: Received | None = None
-        while heard is None and bench.now < deadline:
-            bench.send(bench.encoder.query_version())
-            heard = bench.wait_for(Kind.VERSION_INFORMATION, within_s=_ASK_S)
+        heard = bench.host.version_answer(within_s, every_s=_ASK_S)
         found = bench.require_received(heard, "an application that answers", within_s)
         if name:
             bench.measure(name, found.at - since)
-        while bench.wait_for(Kind.VERSION_INFORMATION, within_s=_LATE_S) is not None:
-            pass
         bench.forget()
 
     # -- the bootloader ---------------------------------------------------------------------------
@@ -184,10 +177,7 @@ class Session:
         """
         bench = self.bench
         bench.forget()
-        first = gaps + 1 if gap_s else 0
-        if first:
-            bench.send(frames[:first], gap_s=gap_s)
-        bench.send(frames[first:])
+        bench.send(frames, gap_s=gap_s, gaps=gaps)
         number = self.stored + 1
         within_s = max(bench.limit("ack_s"), 2 * bench.limit("inter_frame_s"))
         deadline = bench.now + within_s

@@ -289,7 +289,7 @@ def gaps(it: Session) -> Iterator[Answer]:
     """Packets with gaps between their frames."""
     bench, trials = it.bench, []
     limit_s, pause_s = bench.limit("inter_frame_s"), bench.limit("pause_s")
-    frame_s = (47 + 64 + 24) / bench.port.bitrate_bps
+    frame_s = bench.tester.wire_s(it.frames()[:1], is_stuffed=True)
     edge_s = frame_s + 2 * bench.port.uncertainty_s + _EDGE_S
     it.begin()
     for gap_s in (*(share * limit_s for share in _SHARES), max(limit_s - edge_s, 0.0)):

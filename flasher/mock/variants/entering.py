@@ -17,7 +17,7 @@ from flasher.protocol.wire import Message, Reassembler
 _PATIENCE: Final = 8
 """Announcements after which a device without an application gives up."""
 _LISTENS_UNTIL: Final = 3
-_LOOP_S: Final = 0.005
+LOOP_S: Final = 0.005
 """Until the bootloader looks into its queue again."""
 _POINTER_BYTES: Final = 4
 _BYTE_MAX: Final = 0xFF
@@ -233,7 +233,7 @@ class QueuesUpdates(MockDevice):
     def _acknowledge(self, now: float) -> str:
         detail = super()._acknowledge(now)
         if self._waiting_update:
-            self._due_at = now + _LOOP_S
+            self._due_at = now + LOOP_S
         return detail
 
     def _elapsed(self) -> Event:
