@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import lru_cache
 from itertools import groupby
+from random import Random
 from typing import Final, NamedTuple
 
 READ: Final = 0x11
@@ -39,7 +40,10 @@ MEMORY: Final = 0x5688
 MEMORY_BYTES: Final = 128
 """What one memory query asks for at the most."""
 
+FRAME_BYTES: Final = 8
 PACKET_BYTES: Final = 128
+PACKET_FRAMES: Final = 18
+"""CAN frames of a packet, all of them full."""
 IMAGE_BYTES_MAX: Final = 65535 * PACKET_BYTES
 START: Final = 0x01
 END_MARK: Final = b"\x04"
@@ -138,6 +142,12 @@ def version_in(image: bytes) -> str | None:
     return found.pop().decode("ascii") if len(found) == 1 else None
 
 
+def filled_up(frames: Sequence[RawFrame], filler: int = 0) -> list[RawFrame]:
+    """The frames, the last one filled up to 8 bytes."""
+    last = frames[-1]
+    return [*frames[:-1], last._replace(data=last.data.ljust(FRAME_BYTES, bytes((filler,))))]
+
+
 # -- from the tool to the device -----------------------------------------------------------------
 
 
@@ -192,6 +202,15 @@ class Encoder:
     def frames(self, raw: bytes, size_bytes: int = 8) -> list[RawFrame]:
         """Any bytes to this target."""
         return split(self.to_device, raw, size_bytes)
+
+    def frames_by_chance(self, raw: bytes, chance: Random) -> list[RawFrame]:
+        """Any bytes in frames of 1 to 8 bytes."""
+        found: list[RawFrame] = []
+        while raw:
+            size = chance.randint(1, FRAME_BYTES)
+            found.append(RawFrame(self.to_device, raw[:size]))
+            raw = raw[size:]
+        return found
 
     def message(self, mode: int, command: int, data: bytes = b"") -> list[RawFrame]:
         """Any message to this target."""

@@ -58,6 +58,13 @@ def does(variant: str, *, right: object, wrong: object) -> Callable[[Act], Act]:
     return keep
 
 
+def requests_for(tool: Tool, size_bytes: int) -> int:
+    """How many request transfers an update command brings."""
+    tool.update(size_bytes)
+    tool.run(0.03)
+    return len(tool.heard("request"))
+
+
 def requests_after(*parts: bytes, gap_s: float = 0.0) -> Act:
     """Payloads to the announcing bootloader: how many request transfers come."""
 
@@ -131,9 +138,7 @@ def a_message_broken_off_and_an_update_command_later(tool: Tool) -> object:
     tool.boot()
     tool.put_payloads([FIRST[:8]])
     tool.run(0.12)
-    tool.update(600)
-    tool.run(0.03)
-    return len(tool.heard("request"))
+    return requests_for(tool, 600)
 
 
 @does("every-frame-is-payload", right=1, wrong=0)
@@ -356,9 +361,7 @@ def a_transfer_that_was_left_and_an_update_command(tool: Tool) -> object:
     tool.transfer(IMAGE, 1)
     tool.run(6.0)
     tool.reset()
-    tool.update(600)
-    tool.run(0.03)
-    return len(tool.heard("request"))
+    return requests_for(tool, 600)
 
 
 # -- end and power --------------------------------------------------------------------------------
@@ -546,17 +549,13 @@ def the_end_of_transfer_again(tool: Tool) -> object:
 def an_update_command_after_a_refused_image(tool: Tool) -> object:
     assert tool.upgrade(IMAGE) == ["nak 5"]
     tool.run(2.0)
-    tool.update(600)
-    tool.run(0.03)
-    return len(tool.heard("request"))
+    return requests_for(tool, 600)
 
 
 @does("size-rounds-to-small", right=0, wrong=1)
 def a_size_of_nearly_2_to_the_32(tool: Tool) -> object:
     tool.boot()
-    tool.update(0xFFFF_FFFF)
-    tool.run(0.03)
-    return len(tool.heard("request"))
+    return requests_for(tool, 0xFFFF_FFFF)
 
 
 @does("any-message-is-life", right=True, wrong=False)
@@ -674,9 +673,7 @@ def a_moment_after_request_transfer(tool: Tool) -> object:
 @does("sixteen-bit-size", right=0, wrong=1)
 def a_size_beyond_64_kib(tool: Tool) -> object:
     tool.boot()
-    tool.update(0x10000 + 600)
-    tool.run(0.03)
-    return len(tool.heard("request"))
+    return requests_for(tool, 0x10000 + 600)
 
 
 @does("hangs-at-20th-update", right=20, wrong=19)

@@ -7,13 +7,14 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.probing import PACKET_FRAMES, Probe
+from flasher.conformance.cases.probing import Probe
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
 from flasher.conformance.host import UPDATES_MAX
 from flasher.conformance.tester import Fault, FaultKind
 from flasher.conformance.wire import (
     BOOT_VERSION,
     PACKET_BYTES,
+    PACKET_FRAMES,
     REPORT,
     RESET,
     RESET_TEXT,

@@ -13,6 +13,7 @@ from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
     END,
     END_MARK,
+    FRAME_BYTES,
     PACKET,
     PACKET_BYTES,
     QUERY_VERSION,
@@ -23,13 +24,13 @@ from flasher.conformance.wire import (
     Kind,
     RawFrame,
     build,
+    filled_up,
     joined,
     message_crc,
 )
 
-_FRAME_BYTES: Final = 8
 _HEADER: Final = b"\x55\xaa"
-_SIZES: Final = range(1, _FRAME_BYTES)
+_SIZES: Final = range(1, FRAME_BYTES)
 _RANDOM_SPLITS: Final = 7
 _JUNK_FRAMES: Final = (b"\x12", bytes(8), b"\xaa\x55\xf0", b"\xf0" * 8 + b"\xaa" * 8 + b"\x16" * 3)
 """None of them holds a header, nor the beginning of one at its end."""
@@ -100,7 +101,7 @@ def splits(bench: Bench) -> None:
         probe.offer(probe.frames(), ACCEPTED)
     for turn in range(_RANDOM_SPLITS):
         with bench.step(f"packet split by chance, {turn + 1}"):
-            probe.offer(list(_split_by_chance(bench, probe.raw())), choice)
+            probe.offer(bench.encoder.frames_by_chance(probe.raw(), bench.random), choice)
     probe.check_stored()
 
 
@@ -244,13 +245,13 @@ def padded(bench: Bench) -> None:
             if index and bench.choice("up_08") != "starts_over":
                 bench.leave_transfer()
             update = bench.encoder.update(len(probe.image))
-            probe.enter(_pad(update, filler), choice, reset=not index)
+            probe.enter(filled_up(update, filler), choice, reset=not index)
             probe.plain()
     image = bench.good_image
     with bench.step("end of transfer padded with 00"):
         bench.begin_anew(len(image))
         bench.packets(image)
-        sent = bench.send(_pad(bench.encoder.end(), 0x00))
+        sent = bench.send(filled_up(bench.encoder.end()))
         within_s = bench.limit("complete_s")
         if choice != ACCEPTED:  # what follows needs a transfer that still lasts (TX-12)
             within_s = min(within_s, bench.limit("pause_s") / 2)
@@ -365,21 +366,6 @@ def _of_command(bench: Bench, command: int) -> list[RawFrame]:
 
 
 # -- stimuli --------------------------------------------------------------------------------------
-
-
-def _split_by_chance(bench: Bench, raw: bytes) -> Iterator[RawFrame]:
-    """The bytes in frames of 1 to 8 bytes, by the seed."""
-    at = 0
-    while at < len(raw):
-        size = bench.random.randint(1, _FRAME_BYTES)
-        yield RawFrame(bench.encoder.to_device, raw[at : at + size])
-        at += size
-
-
-def _pad(frames: list[RawFrame], filler: int) -> list[RawFrame]:
-    """The frames, the last one filled up to 8 bytes."""
-    last = frames[-1]
-    return [*frames[:-1], last._replace(data=last.data.ljust(_FRAME_BYTES, bytes((filler,))))]
 
 
 def _treacherous_payloads(bench: Bench) -> Iterator[tuple[str, bytes]]:

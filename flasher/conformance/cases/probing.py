@@ -21,8 +21,6 @@ from flasher.conformance.wire import (
 ACCEPTED: Final = "accepted"
 REJECTED: Final = "rejected"
 EITHER: Final = "either"
-PACKET_FRAMES: Final = 18
-"""CAN frames of a packet, all of them full."""
 _PACKETS: Final = 48
 """More than any case here needs; a device that takes smaller images begins again."""
 _REST: Final = bytes(5)
@@ -142,12 +140,13 @@ class Probe:
         wanted: str,
         *,
         gap_s: float = 0.0,
-        gaps: int = PACKET_FRAMES,
+        gaps: int | None = None,
         ignoring: Sequence[Kind] = (),
     ) -> bool:
         """Send `frames`, which hold the next packet, `gap_s` behind each of the first `gaps` of
-        them, and judge whether it is taken as `wanted`; sends it as it should be when it was not.
-        Messages of the kinds `ignoring` do not count. Returns whether it was taken.
+        them (None: between all), and judge whether it is taken as `wanted`; sends it as it should
+        be when it was not. Messages of the kinds `ignoring` do not count. Returns whether it was
+        taken.
         """
         bench = self._bench
         bench.forget()

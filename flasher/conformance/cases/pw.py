@@ -10,10 +10,15 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, POWER, case
-from flasher.conformance.wire import PACKET_BYTES, Kind, Received, packet_count, version_in
+from flasher.conformance.wire import (
+    PACKET_BYTES,
+    PACKET_FRAMES,
+    Kind,
+    Received,
+    packet_count,
+    version_in,
+)
 
-_PACKET_FRAMES: Final = 18
-"""CAN frames of one packet."""
 _ALL_PACKETS: Final = 8
 """Up to so many packets, an upgrade is cut at each of its frames."""
 _BETWEEN_MAX: Final = 6
@@ -105,9 +110,9 @@ def second_cut(bench: Bench) -> None:
     _say_what_is_not_judged(bench, upgrade)
     total = packet_count(len(upgrade.new))
     update, end = len(bench.encoder.update(1)), len(bench.encoder.end())
-    second = [_Cut(0, 1), _Cut(0, update), _Cut(1, 9), _Cut(1, _PACKET_FRAMES)]
+    second = [_Cut(0, 1), _Cut(0, update), _Cut(1, 9), _Cut(1, PACKET_FRAMES)]
     if total <= _FAR_PACKET:
-        second += [_Cut(total, _PACKET_FRAMES), _Cut(total + 1, end - 1), _Cut(total + 1, end)]
+        second += [_Cut(total, PACKET_FRAMES), _Cut(total + 1, end - 1), _Cut(total + 1, end)]
     else:
         why = f"the image has more than {_FAR_PACKET} packets"
         bench.unsupported("a second cut in the last packet and at end of transfer", why)
@@ -134,16 +139,16 @@ def _cuts_at_frames(bench: Bench, image: bytes) -> Iterator[_Cut]:
     for frames in range(1, len(bench.encoder.update(len(image))) + 1):
         yield _Cut(0, frames)
     total = packet_count(len(image))
-    for frames in range(1, _PACKET_FRAMES + 1):
+    for frames in range(1, PACKET_FRAMES + 1):
         yield _Cut(1, frames)
     if total <= _ALL_PACKETS:
-        between = [_Cut(at, one) for at in range(2, total) for one in range(1, _PACKET_FRAMES + 1)]
+        between = [_Cut(at, one) for at in range(2, total) for one in range(1, PACKET_FRAMES + 1)]
     else:
         numbers = sorted(bench.random.sample(range(2, min(total, _FAR_PACKET)), _BETWEEN_MAX))
-        between = [_Cut(at, bench.random.randint(1, _PACKET_FRAMES)) for at in numbers]
+        between = [_Cut(at, bench.random.randint(1, PACKET_FRAMES)) for at in numbers]
     yield from between
     if total > 1:
-        for frames in _FEW_FRAMES if total > _FAR_PACKET else range(1, _PACKET_FRAMES + 1):
+        for frames in _FEW_FRAMES if total > _FAR_PACKET else range(1, PACKET_FRAMES + 1):
             yield _Cut(total, frames)
     for frames in range(1, len(bench.encoder.end()) + 1):
         yield _Cut(total + 1, frames)

@@ -6,9 +6,10 @@ from itertools import pairwise
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.probing import ACCEPTED, EITHER, PACKET_FRAMES, Probe
+from flasher.conformance.cases.probing import ACCEPTED, EITHER, Probe
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, case
 from flasher.conformance.wire import (
+    PACKET_FRAMES,
     Kind,
     Received,
     packet_count,

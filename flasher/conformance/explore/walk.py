@@ -24,6 +24,7 @@ from flasher.conformance.wire import (
     RawFrame,
     Received,
     describe,
+    filled_up,
     joined,
     packet_count,
     packet_payload,
@@ -352,16 +353,16 @@ class Walk:
             seconds = bench.host.burst_s + _GAP_S if argument == "window" else float(argument)
             self._listen(seconds)
             return
-        choice, within_s = bench.choice("tx_12"), bench.limit("pause_s")
-        within_s += bench.limit("first_version_s")
+        choice = bench.choice("tx_12")
+        within_s = bench.limit("pause_s") + bench.limit("first_version_s")
         if self.phase not in _IN_TRANSFER or choice == "waits":
             self._may_restart = self._may_restart or self.phase is Phase.UNCLEAR
             self._listen(1.2 * bench.limit("pause_s"))
-        elif choice == "announces":
-            self._may_restart = True
+            return
+        self._may_restart = True
+        if choice == "announces":
             self._await(Kind.BOOT_VERSION, within_s, "the last packet")
         else:
-            self._may_restart = True
             self.phase = Phase.UNCLEAR
             self._listen(within_s)
 
@@ -696,7 +697,7 @@ class Walk:
         self._may_complete = not refused
         frames = bench.encoder.end()
         if argument == "padded" and bench.choice("fr_07") == "ignored":
-            frames = [*frames[:-1], frames[-1]._replace(data=frames[-1].data.ljust(8, b"\x00"))]
+            frames = filled_up(frames)
         bench.send(frames)
         if refused:
             self._may_restart = True

@@ -9,17 +9,18 @@ from typing import Final
 from flasher.conformance.init.answers import Answer, Trial, decided
 from flasher.conformance.init.session import COMPLETE, LATE, REPEATS, Session, told
 from flasher.conformance.wire import (
+    FRAME_BYTES,
     PACKET_BYTES,
+    PACKET_FRAMES,
     Kind,
     RawFrame,
     Received,
+    filled_up,
     inverted,
     joined,
     packet_payload,
 )
 
-_FRAME_BYTES: Final = 8
-_PACKET_FRAMES: Final = 18
 _CRC_AT: Final = slice(-5, -1)
 _LOST_FRAMES: Final = (1, 9, 17)
 _JUNK: Final = (b"\x12", b"\x55", b"\x55\x55", b"\xaa", b"\xf0\x00\x34", b"\x12" * 7)
@@ -196,25 +197,16 @@ def splits(it: Session) -> Iterator[Answer]:
         if not taken:  # the window is over by now
             it.await_application()
             it.begin()
-        for size in range(1, _FRAME_BYTES):
+        for size in range(1, FRAME_BYTES):
             it.reach(0, 1)
             taken = it.offer(bench.encoder.frames(it.raw(), size))
             trials.append(_taken(taken, f"a packet in frames of {size} bytes"))
         for _ in range(_RANDOM_SPLITS):
             it.reach(0, 1)
-            taken = it.offer(_split_by_chance(it))
+            taken = it.offer(bench.encoder.frames_by_chance(it.raw(), bench.random))
             trials.append(_taken(taken, "a packet in frames of 1 to 8 bytes"))
         it.finish()
     yield decided("fr_01", trials)
-
-
-def _split_by_chance(it: Session) -> list[RawFrame]:
-    raw, frames = it.raw(), []
-    while raw:
-        size = it.bench.random.randint(1, _FRAME_BYTES)
-        frames.append(RawFrame(it.bench.encoder.to_device, raw[:size]))
-        raw = raw[size:]
-    return frames
 
 
 def junk(it: Session) -> Iterator[Answer]:
@@ -252,7 +244,7 @@ def padded(it: Session) -> Iterator[Answer]:
     for byte in _PADDINGS:
         it.enter()
         bench.wait_to_be_heard()
-        taken = it.offer_update(_pad(bench.encoder.update(len(it.image)), byte))
+        taken = it.offer_update(filled_up(bench.encoder.update(len(it.image)), byte))
         said = f"padded with {byte:02X}"
         trials.append(_taken(taken, f"update command {said}", "ignored", "rejected"))
         if not taken:  # the window is over by now
@@ -260,7 +252,7 @@ def padded(it: Session) -> Iterator[Answer]:
             it.begin()
         it.packets()
         bench.forget()
-        sent = bench.send(_pad(bench.encoder.end(), byte))
+        sent = bench.send(filled_up(bench.encoder.end(), byte))
         heard = bench.wait_for(Kind.COMPLETE, within_s=_end_s(it))
         trials.append(_taken(heard is not None, f"end {said}", "ignored", "rejected"))
         if heard is None:
@@ -280,11 +272,6 @@ def _end_s(it: Session) -> float:
     return within_s
 
 
-def _pad(frames: Sequence[RawFrame], filler: int) -> list[RawFrame]:
-    last = frames[-1]
-    return [*frames[:-1], last._replace(data=last.data.ljust(_FRAME_BYTES, bytes((filler,))))]
-
-
 def gaps(it: Session) -> Iterator[Answer]:
     """Packets with gaps between their frames."""
     bench, trials = it.bench, []
@@ -295,7 +282,7 @@ def gaps(it: Session) -> Iterator[Answer]:
     for gap_s in (*(share * limit_s for share in _SHARES), max(limit_s - edge_s, 0.0)):
         for _ in range(REPEATS):
             it.reach(0, 1)
-            count = min(int(pause_s / 2 / max(gap_s, frame_s)), _PACKET_FRAMES) or 1
+            count = min(int(pause_s / 2 / max(gap_s, frame_s)), PACKET_FRAMES) or 1
             taken = it.offer(it.frames(), gap_s=gap_s, gaps=count)
             stimulus = f"a packet with {gap_s * 1000:.1f} ms between its frames"
             trials.append(_taken(taken, stimulus, "accepted", "either"))
