@@ -161,16 +161,11 @@ def _update(size_bytes: Callable[[Place], int]) -> Maker:
 
 
 def _small_update(
-    place: Place, *, mode: int = WRITE, text: bytes = b"", spoil: Callable[[bytes], bytes] = bytes
+    place: Place, *, mode: int = WRITE, text: bytes = b"", more: bytes = b""
 ) -> bytes:
-    data = (text or place.encoder.update_text) + _SMALL_BYTES.to_bytes(4, "little")
-    return spoil(build(place.encoder.to_device, mode, UPDATE, data))
-
-
-def _longer_update(place: Place) -> bytes:
-    """An update command whose length byte and data are longer by one than its command says."""
-    data = place.encoder.update_text + _SMALL_BYTES.to_bytes(4, "little") + b"\0"
-    return build(place.encoder.to_device, WRITE, UPDATE, data)
+    """An update command; with `more` data, length byte and data are longer than it says."""
+    data = (text or place.encoder.update_text) + _SMALL_BYTES.to_bytes(4, "little") + more
+    return build(place.encoder.to_device, mode, UPDATE, data)
 
 
 def _for_others(place: Place) -> list[RawFrame]:
@@ -192,17 +187,15 @@ UPDATES: Final[dict[str, Maker]] = {
     "update-huge": _update(lambda _: -1),
     "update-large": _update(lambda place: place.largest_bytes + 1),
     "update-wraps": _update(lambda place: (place.largest_bytes & ~0xFFFF) + 0x10000 + _SMALL_BYTES),
-    "update-crc": _bytes(
-        lambda place: _small_update(place, spoil=lambda raw: raw[:-5] + bytes(4) + raw[-1:])
-    ),
-    "update-tail": _bytes(lambda place: _small_update(place, spoil=lambda raw: raw[:-1] + b"\0")),
+    "update-crc": _bytes(lambda place: _small_update(place)[:-5] + bytes(4) + b"\xf0"),
+    "update-tail": _bytes(lambda place: _small_update(place)[:-1] + b"\0"),
     "update-name": _bytes(
         lambda place: _small_update(place, text=place.encoder.others()[0].update_text), write=True
     ),
     "update-name-end": _bytes(
         lambda place: _small_update(place, text=place.encoder.update_text[:4] + b"XYZ"), write=True
     ),
-    "update-long": _bytes(_longer_update),
+    "update-long": _bytes(lambda place: _small_update(place, more=b"\0")),
     "update-read": _bytes(lambda place: _small_update(place, mode=READ)),
     "update-others": _frames(_for_others),
 }
