@@ -65,15 +65,17 @@ _CRCS: Final = sorted(
 """From the document's to those that differ from it most."""
 
 
-def diagnose(trace: Iterable[TraceEntry], encoder: Encoder) -> list[str]:
-    """What was received, and what would make it fit, in sentences; the likeliest cause first."""
+def diagnose(trace: Iterable[TraceEntry], encoder: Encoder, *, has_wires: bool = True) -> list[str]:
+    """What was received, and what would make it fit, in sentences; the likeliest cause first. A
+    device that `has_wires` may be silent because of them.
+    """
     heard = [(entry.frame, entry.at_s) for entry in trace if not entry.sent]
     frames = [frame for frame, _ in heard if not frame.is_error]
     own = f"{encoder.to_tool:03X}"
     if not frames:
         errors = f"{len(heard)} error frames and " if heard else ""
         why = "check the device's power, the wiring and its termination, the bit rate, the channel"
-        return [f"{errors}no frame at all was received: {why}"]
+        return [f"{errors}no frame at all was received{f': {why}' if has_wires else ''}"]
     if not any(frame.can_id == encoder.to_tool and frame.is_payload for frame in frames):
         return [_who_speaks(frames, encoder)]
     decoder = Decoder(encoder)

@@ -11,8 +11,15 @@ from dataclasses import replace
 from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
+from flasher.conformance.diagnosis import diagnose
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.results import CaseEnded, CaseLimitReached, RunStopped, TraceEntry
+from flasher.conformance.results import (
+    CaseEnded,
+    CaseLimitReached,
+    DeviceCrashed,
+    RunStopped,
+    TraceEntry,
+)
 from flasher.conformance.subject import Subject
 from flasher.conformance.wire import Kind, told_version
 
@@ -31,6 +38,8 @@ class Restored(NamedTuple):
     reason: str = ""
     trace: tuple[TraceEntry, ...] = ()
     """The frames of all ways that were tried, when none succeeded."""
+    diagnosis: tuple[str, ...] = ()
+    """What was heard then, and what would fit; nothing for a device that stopped by itself."""
 
     @property
     def ok(self) -> bool:
@@ -51,6 +60,7 @@ def restore(
     """
     reasons: list[str] = []
     trace: list[TraceEntry] = []
+    crashed = False
     began_at = subject.port.now()
     ways: list[tuple[str, Callable[[Bench], str]]] = []
     if not flash:
@@ -69,12 +79,15 @@ def restore(
             reason = f"not at an end after {limit_s:g} s"
         except CaseEnded as ended:
             reason = str(ended)
+            crashed = crashed or isinstance(ended, DeviceCrashed)
         if not reason:
             return Restored(how)
         reasons.append(f"{how}: {reason}")
         later_s = bench.tester.began_at - began_at
         trace += [replace(entry, at_s=entry.at_s + later_s) for entry in bench.tester.trace]
-    return Restored("", "; ".join(reasons), tuple(trace))
+    has_wires = subject.port.timestamp_source != "simulated bus"
+    diagnosis = [] if crashed else diagnose(trace, bench.encoder, has_wires=has_wires)
+    return Restored("", "; ".join(reasons), tuple(trace), tuple(diagnosis))
 
 
 def is_reachable(

@@ -29,7 +29,6 @@ from flasher.conformance.catalogue import (
     lacking,
     what_is_missing,
 )
-from flasher.conformance.diagnosis import diagnose
 from flasher.conformance.profile import ConformanceProfile, check_deviations, profile_keys
 from flasher.conformance.restore import BY_POWER, Restored, is_reachable, may_need_power, restore
 from flasher.conformance.results import (
@@ -164,7 +163,6 @@ class Run:
         self._killed_by = ""
         self._no_bring_up: Restored | None = None
         """How the good image could not be flashed before the first case."""
-        self._diagnosis: list[str] = []
         self._final_image = ""
         self._final_image_seen_by: tuple[str, ...] = ()
 
@@ -315,7 +313,7 @@ class Run:
     def _failed_bring_up(self, failed: Restored, repeat: int) -> CaseResult:
         """The result of a bring-up that did not succeed: what was heard, and the likely cause."""
         at_s = failed.trace[-1].at_s if failed.trace else 0.0
-        got = "; ".join((*self._diagnosis, failed.reason))
+        got = "; ".join((*failed.diagnosis, failed.reason))
         check = Check("", CheckOutcome.FAIL, "the device can be upgraded", got, at_s)
         return CaseResult(
             BRING_UP,
@@ -347,7 +345,7 @@ class Run:
             self.stopped = f"{when}: {error.what if isinstance(error, BusError) else error}"
             return ""
         if not done.ok:
-            likely = "".join(f"; {each}" for each in self._diagnosis if not case_id)
+            likely = "".join(f"; {each}" for each in done.diagnosis if not case_id)
             self.stopped = f"{when}, the device could not be brought back: {done.reason}{likely}"
             self._killed_by = case_id
             return done.reason
@@ -366,8 +364,7 @@ class Run:
             return Restored("reset" if is_there else "", "no boot version")
         done = restore(subject, profile, flash=flash, stopped=stopped)
         if not done.ok and at_first:
-            encoder = Bench(subject, profile, limit_s=0.0).encoder
-            self._no_bring_up, self._diagnosis = done, diagnose(done.trace, encoder)
+            self._no_bring_up = done
             if is_reachable(subject, profile, stopped):
                 self._not_upgradable = done.reason
                 return Restored("reset", done.reason)

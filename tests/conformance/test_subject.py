@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from itertools import pairwise
@@ -12,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from flasher.conformance.catalogue import Selection
-from flasher.conformance.dut import CanFrame
+from flasher.conformance.dut import CanFrame, Facts
 from flasher.conformance.dut.pipes import FACTS, HEADER, Kind
 from flasher.conformance.dut.subject import open_subject
 from flasher.conformance.results import CaseVerdict, RunReport
@@ -23,6 +24,10 @@ from tests.peers.python_bootloader import PythonBootloader
 
 _HERE = "tests.peers.python_bootloader:PythonBootloader"
 _FLAWS = "tests.conformance.test_subject:"
+_NULL = """
+void *flasher_dut_about(void) { return 0; }
+int flasher_dut_start, flasher_dut_receive, flasher_dut_tick, flasher_dut_next_frame;
+"""
 
 
 class Hangs(PythonBootloader):
@@ -47,6 +52,42 @@ class WritesTwice(PythonBootloader):
 class ReadsOutside(PythonBootloader):
     def _end(self) -> None:
         self.host.flash_read(0xFFF0, 32)
+
+
+class EndsAtOnce(PythonBootloader):
+    def start(self, host: object, cause: int) -> None:
+        os._exit(3)
+
+
+class SaysNothing(PythonBootloader):
+    def next_frame(self) -> None:
+        return None
+
+
+class LogsForEver(PythonBootloader):
+    def _end(self) -> None:
+        while True:
+            self.host.log("x" * 4096)
+
+
+class EndsItsGroup(PythonBootloader):
+    """Gets what `timeout` and a cancelled build send to all processes of the group."""
+
+    def _begin(self, size: int) -> None:
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            os.kill(os.getpid(), number)
+        super()._begin(size)
+
+
+def raises() -> PythonBootloader:
+    raise RuntimeError("no hardware today")
+
+
+def returns_nothing() -> None:
+    pass
+
+
+NOT_CALLABLE = 5
 
 
 class StartsWhatIsTorn(PythonBootloader):
@@ -132,7 +173,8 @@ def test_time_passes_for_one_that_polls_the_clock() -> None:
         ("Raises", "EN-01", "ended with status 1 in flasher_dut_receive; it had logged: about to"),
         ("Raises", "EN-01", "ZeroDivisionError"),
         ("WritesTwice", "EN-01", "programmed without having been erased"),
-        ("ReadsOutside", "EN-01", "32 bytes at 0x08016FF0 lie outside"),
+        ("ReadsOutside", "EN-01", "flash_read at offset 0xFFF0: 32 bytes at 0x08016FF0 lie out"),
+        ("EndsAtOnce", "BR-01", "the bootloader ended with status 3 in flasher_dut_start"),
         ("StartsWhatIsTorn", "PW-01", "an application that is not whole"),
         ("LosesComplete", "EN-01", "expected complete"),
         ("Restarts", "EN-01", "boot version"),
@@ -174,8 +216,9 @@ class ReadsForEver(PythonBootloader):
             self.host.flash_read(0, 0x1000)
 
 
-def test_a_call_that_reads_flash_for_ever_is_ended_and_is_a_finding() -> None:
-    report = _run(_FLAWS + "ReadsForEver", "EN-01")
+@pytest.mark.parametrize("flaw", ["ReadsForEver", "LogsForEver"])
+def test_a_call_that_asks_its_hardware_for_ever_is_ended_and_is_a_finding(flaw: str) -> None:
+    report = _run(_FLAWS + flaw, "EN-01")
     assert "16 times over in one call" in _failures(report) + report.not_upgradable + report.stopped
 
 
@@ -195,6 +238,17 @@ def test_the_controller_takes_three_frames_and_asks_for_more_when_it_has_room() 
     assert [gap > 0.001 for gap in gaps].count(True) == 1  # back to back, except for the bus-off
 
 
+@pytest.mark.parametrize("flaw", ["EndsAtOnce", "SaysNothing"])
+def test_nobody_is_sent_to_look_for_wires_of_a_bootloader_on_the_computer(flaw: str) -> None:
+    report = _run(_FLAWS + flaw, "BR-01")
+    assert "could not be brought back" in report.stopped
+    assert "wiring" not in report.stopped + _failures(report)
+
+
+def test_signals_to_the_group_of_processes_are_for_the_suite() -> None:
+    assert _run(_FLAWS + "EndsItsGroup", "EN-01").ok
+
+
 def test_no_process_is_left_behind() -> None:
     with open_subject(_HERE, "bms", None, good_image=None, second_image=None) as (device, _):
         device.power(on=True)
@@ -209,6 +263,9 @@ def test_no_process_is_left_behind() -> None:
         ("missing", "There is no bootloader missing"),
         ("nowhere:make", "No module named 'nowhere'"),
         (_FLAWS + "nothing", "has no attribute 'nothing'"),
+        (_FLAWS + "raises", f"RuntimeError: no hardware today ({__file__}, line "),
+        (_FLAWS + "returns_nothing", "it returns None, which has no `facts`"),
+        (_FLAWS + "NOT_CALLABLE", "'int' object is not callable"),
         ("README.md", "no program and no shared library"),
         (shutil.which("true") or "", "ended with status 0 in flasher_dut_about"),
     ],
@@ -217,6 +274,55 @@ def test_what_is_no_bootloader_is_said_at_once(subject: str, said: str) -> None:
     with pytest.raises(UsageError) as raised:
         _run(subject, "RS-01")
     assert said in f"{raised.value} {raised.value.cause}"
+    assert "Traceback" not in raised.value.cause
+
+
+def test_a_factory_is_not_to_be_built_from_c() -> None:
+    with pytest.raises(UsageError) as raised:
+        _run(_FLAWS + "raises", "RS-01")
+    assert raised.value.remedy.startswith("Name a function without arguments")
+
+
+def test_a_file_for_another_processor_is_refused(tmp_path: Path) -> None:
+    program = tmp_path / "boot"
+    program.write_bytes(b"\x7fELF for another one")
+    program.chmod(0o755)
+    with pytest.raises(UsageError) as raised:
+        _run(str(program), "RS-01")
+    assert raised.value.cause == "this computer cannot run it: Exec format error"
+
+
+@pytest.mark.parametrize("numbers", [(0, 0, 0), (4096, 0, 8), (4096, 1024, 0)])
+def test_sizes_of_nothing_are_refused(numbers: tuple[int, int, int]) -> None:
+    with pytest.raises(ValueError, match="each has to be a multiple of the next"):
+        Facts(*numbers, application_offset=0, application_bytes=1024)
+
+
+def test_what_is_written_to_the_pipe_and_is_no_message_is_said(tmp_path: Path) -> None:
+    program = tmp_path / "boot"
+    program.write_text("#!/bin/sh\necho hello, I am a bootloader\nread line\n")
+    program.chmod(0o755)
+    with pytest.raises(UsageError, match="which is no message"):
+        _run(str(program), "RS-01")
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("int another;", "undefined symbol: flasher_dut_about"),
+        (_NULL, "flasher_dut_about gives NULL"),
+    ],
+)
+def test_a_library_in_the_working_directory_says_what_it_lacks(
+    code: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("boot.c").write_text(code)
+    subprocess.run(["cc", "-shared", "-fPIC", "boot.c", "-o", "boot.so"], check=True)
+    with pytest.raises(UsageError) as raised:
+        _run("boot.so", "RS-01")
+    assert raised.value.cause.endswith(said)
 
 
 def test_a_program_of_another_version_of_the_header_is_refused(tmp_path: Path) -> None:

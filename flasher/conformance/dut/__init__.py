@@ -9,7 +9,12 @@ called once for each start, as RAM is lost with the power.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import NamedTuple, Protocol
+
+
+class SubjectError(Exception):
+    """What was named is no bootloader; the text says why."""
 
 
 class CanFrame(NamedTuple):
@@ -40,8 +45,8 @@ class Facts:
     name: str = ""
 
     def __post_init__(self) -> None:
-        units = self.write_bytes and self.sector_bytes % self.write_bytes == 0
-        if not units or self.flash_bytes <= 0 or self.flash_bytes % self.sector_bytes:
+        sizes = (self.flash_bytes, self.sector_bytes, self.write_bytes)
+        if min(sizes) <= 0 or any(more % less for more, less in pairwise(sizes)):
             raise ValueError(
                 f"a flash of {self.flash_bytes} bytes, sectors of {self.sector_bytes} and units "
                 f"of {self.write_bytes}: each has to be a multiple of the next"

@@ -8,11 +8,16 @@ import ctypes
 import importlib
 import os
 import sys
+import traceback
 from collections.abc import Callable
 from typing import Any, ClassVar, Final, Never, cast
 
-from flasher.conformance.dut import Bootloader, CanFrame, Facts, pipes
+from flasher.conformance.dut import Bootloader, CanFrame, Facts, SubjectError, pipes
 from flasher.conformance.dut.pipes import Kind, Pipe
+
+_FUNCTIONS: Final = tuple(
+    f"flasher_dut_{name}" for name in ("about", "start", "receive", "tick", "next_frame")
+)
 
 
 class _ProcessHost:
@@ -92,11 +97,20 @@ class _Library:
     """A shared library with the functions of the header, as a `Bootloader`."""
 
     def __init__(self, path: str) -> None:
-        self._library = library = ctypes.CDLL(path)
+        try:
+            # Without a folder the loader would look in those of the system.
+            self._library = library = ctypes.CDLL(os.path.abspath(path))  # noqa: PTH100
+            for name in _FUNCTIONS:
+                getattr(library, name)
+        except (OSError, AttributeError) as error:
+            raise SubjectError(str(error)) from error
         library.flasher_dut_about.restype = ctypes.POINTER(_Facts)
         library.flasher_dut_tick.restype = ctypes.c_uint64
         library.flasher_dut_tick.argtypes = [ctypes.c_uint64]
-        found = library.flasher_dut_about().contents
+        about = library.flasher_dut_about()
+        if not about:
+            raise SubjectError("flasher_dut_about gives NULL")
+        found = about.contents
         if found.abi != pipes.ABI:
             raise ValueError(
                 f"it was built with version {found.abi} of flasher_dut.h, and not {pipes.ABI}"
@@ -142,10 +156,19 @@ def _make(subject: str) -> Bootloader:
         return cast("Bootloader", _Library(subject))
     name, _, attribute = subject.partition(":")
     sys.path.insert(0, os.getcwd())  # noqa: PTH109  as for `python -m`
-    found = importlib.import_module(name)
-    for part in attribute.split("."):
-        found = getattr(found, part)
-    return cast("Callable[[], Bootloader]", found)()
+    try:
+        found = importlib.import_module(name)
+        for part in attribute.split("."):
+            found = getattr(found, part)
+        made = cast("Callable[[], Bootloader]", found)()
+    except (Exception, SystemExit) as error:  # whatever the code of a user raises
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        is_its = last.filename != __file__ and not last.filename.startswith("<")
+        where = f" ({last.filename}, line {last.lineno})" if is_its else ""
+        raise SubjectError(f"{type(error).__name__}: {error}{where}") from error
+    if not isinstance(getattr(made, "facts", None), Facts):
+        raise SubjectError(f"it returns {made!r}, which has no `facts`")
+    return made
 
 
 def _next(pipe: Pipe) -> tuple[Kind, bytes]:

@@ -17,7 +17,7 @@ from flasher.errors import FlasherError
 from flasher.mock.application import Application
 from flasher.mock.bms import BmsApplication
 from flasher.mock.machine import Machine
-from flasher.mock.memory import Flash
+from flasher.mock.memory import Flash, FlashError
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import AREA_START, MemoryMap
 from flasher.protocol import messages
@@ -40,7 +40,7 @@ _STACK: Final = 0x2000_1000
 _ENTRY: Final = AREA_START + 0x101
 _CHECKSUM_SIZE: Final = 4
 _TIMES_OVER: Final = 16
-"""A call that reads, erases and writes more than all flash so many times does not return."""
+"""A call that reads, erases, writes and logs more than all flash so many times does not return."""
 
 
 def application_image(version: str, size_bytes: int) -> bytes:
@@ -103,7 +103,7 @@ class CompiledDevice(Machine):
         """The processor is in a call, or waits for the flash."""
         self._tick_at = inf
         self._handled_bytes = 0
-        """Bytes of flash that this call has read, erased and written."""
+        """Bytes that this call has read, erased, written and logged."""
         self._operations = 0
         self._cut: tuple[int, float, float] | None = None
         self._cause = POWER_ON
@@ -288,8 +288,20 @@ class CompiledDevice(Machine):
     def _hardware(self, asked: Kind, data: bytes) -> bytes | None:
         """What a function of the hardware gives; None for no answer."""
         if asked is Kind.LOG:
+            self._count(pipes.HEADER.size + len(data))
             self._log.append(data.decode(errors="replace"))
             return None
+        try:
+            return self._in_flash(asked, data)
+        except FlashError as error:
+            row = pipes.RANGE if asked is Kind.FLASH_READ else pipes.PLACE
+            offset = row.unpack_from(data)[asked is not Kind.FLASH_READ]
+            raise FlashError(
+                f"{asked.name.lower()} at offset 0x{offset:X}: {error.what}", where=error.where
+            ) from error
+
+    def _in_flash(self, asked: Kind, data: bytes) -> bytes | None:
+        """Read, erase or write; None when the power was cut."""
         if asked is Kind.FLASH_READ:
             offset, size_bytes = pipes.RANGE.unpack(data)
             self._count(size_bytes)
@@ -320,8 +332,8 @@ class CompiledDevice(Machine):
         self._handled_bytes += size_bytes
         if self._handled_bytes > _TIMES_OVER * self.facts.flash_bytes:
             raise BootloaderError(
-                f"the bootloader handled all its flash {_TIMES_OVER} times over in one call, which "
-                "does not seem to return, and was ended"
+                "the bootloader read, erased, wrote and logged as much as all its flash "
+                f"{_TIMES_OVER} times over in one call, and was ended: it does not seem to return"
             )
 
     def _is_cut_here(self) -> bool:

@@ -160,7 +160,8 @@ int main(void)
     const flasher_dut_facts *facts = flasher_dut_about();
     to_suite = dup(STDOUT_FILENO);
     dup2(STDERR_FILENO, STDOUT_FILENO);
-    tell('f', facts, 9 * sizeof(uint32_t), facts->name, strlen(facts->name));
+    const char *name = facts->name ? facts->name : "";
+    tell('f', facts, 9 * sizeof(uint32_t), name, strlen(name));
     for (;;) {
         uint8_t type;
         flasher_frame frame;

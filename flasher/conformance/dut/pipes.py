@@ -68,12 +68,17 @@ class Pipe:
         if len(self._buffer) < HEADER.size:
             return None
         kind, size = HEADER.unpack_from(self._buffer)
+        try:
+            found = Kind(kind)
+        except ValueError:
+            wrote = bytes(self._buffer[:16])
+            raise ValueError(f"it wrote {wrote!r}, which is no message") from None
         end = HEADER.size + size
         if len(self._buffer) < end:
             return None
         data = bytes(self._buffer[HEADER.size : end])
         del self._buffer[:end]
-        return Kind(kind), data
+        return found, data
 
     def fill(self) -> bool:
         """Wait for more bytes; False when the other side has ended."""

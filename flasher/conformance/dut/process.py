@@ -12,7 +12,7 @@ from itertools import takewhile
 from pathlib import Path
 from typing import Final, Never
 
-from flasher.conformance.dut import Facts, pipes
+from flasher.conformance.dut import Facts, SubjectError, pipes
 from flasher.conformance.dut.pipes import Kind, Pipe
 from flasher.errors import FlasherError, UsageError, printable
 
@@ -91,11 +91,7 @@ class BootloaderProcess:
             return pipes.unpack_facts(data)
         except ValueError as error:
             self.kill()
-            raise UsageError(
-                f"{printable(self.subject)} is no bootloader for the suite: {error}.",
-                cause=self.said(),
-                remedy="Build it with the two files that `flasher conformance header` writes.",
-            ) from error
+            raise self.refused(f"is no bootloader for the suite: {error}", self.said()) from error
 
     def call(
         self, kind: Kind, *parts: bytes, during: Callable[[Kind, bytes], bytes | None]
@@ -134,6 +130,17 @@ class BootloaderProcess:
         os.kill(process, signal.SIGKILL)  # until it is waited for, its number is its own
         return os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
 
+    def refused(self, why: str, cause: str) -> UsageError:
+        """That it cannot be tested."""
+        return UsageError(
+            f"{printable(self.subject)} {why}.",
+            cause=cause,
+            remedy="Build it with the two files that `flasher conformance header` writes."
+            if Path(self.subject).is_file()
+            else "Name a function without arguments that returns a bootloader: an object with "
+            "`facts` and the methods of flasher.conformance.dut.Bootloader.",
+        )
+
     def close(self) -> None:
         """End the process, and forget what it printed."""
         self.kill()
@@ -151,16 +158,23 @@ class BootloaderProcess:
     def _be_bootloader(self, read_fd: int, write_fd: int) -> Never:
         """In the process of the bootloader: become it."""
         try:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the suite
+            # Ctrl-C and what ends a group of processes are for the suite, which ends this one.
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+                signal.signal(number, signal.SIG_IGN)
             os.dup2(self._stderr.fileno(), _STDERR)
             if self._is_program:
                 os.dup2(read_fd, _STDIN)
                 os.dup2(write_fd, _STDOUT)
-                os.execv(self.subject, [self.subject])  # noqa: S606  what the user named
+                try:
+                    os.execv(self.subject, [self.subject])  # noqa: S606  what the user named
+                except OSError as error:
+                    raise SubjectError(f"this computer cannot run it: {error.strerror}") from error
             os.dup2(_STDERR, _STDOUT)  # what it prints is no message
             from flasher.conformance.dut.child import serve  # noqa: PLC0415  only here
 
             serve(self.subject, Pipe(read_fd, write_fd))
+        except SubjectError as error:
+            os.write(_STDERR, str(error).encode(errors="replace"))
         except BaseException:  # noqa: BLE001  nothing of the suite may go on in this process
             os.write(_STDERR, traceback.format_exc(limit=-2).encode())
         finally:

@@ -12,7 +12,6 @@ from flasher.conformance.dut.process import BootloaderError, BootloaderProcess
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.simulated import CRASHES, SimulatedPort
-from flasher.errors import UsageError, printable
 from flasher.protocol.spec import TARGETS, WELLING
 
 _GOOD: Final = ("V2r0r1_20240131", 10 * 128 - 3)
@@ -87,11 +86,7 @@ def open_subject(
                 process, target, good_image=good_image, second_image=second_image
             )
         except BootloaderError as error:
-            raise UsageError(
-                f"{printable(what)} does not start: {error.what}.",
-                cause=error.cause,
-                remedy="Build it with the two files that `flasher conformance header` writes.",
-            ) from error
+            raise process.refused(f"does not start: {error.what}", error.cause) from error
         profile = profile or ConformanceProfile()
         size_bytes = subject.device.facts.application_bytes
         area_bytes = profile.given.get("device.application_bytes", size_bytes)

@@ -10,8 +10,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Final
 
-from flasher.conformance.bench import Bench
-from flasher.conformance.diagnosis import diagnose
 from flasher.conformance.init import entering, transferring
 from flasher.conformance.init.answers import Answer, limit
 from flasher.conformance.init.session import (
@@ -224,8 +222,7 @@ class _Asking:
             return f"{when}: {ended}"
         if done.ok:
             return ""
-        encoder = Bench(self._subject, profile, limit_s=0.0).encoder
-        said = "; ".join((done.reason, *diagnose(done.trace, encoder)))
+        said = "; ".join((done.reason, *done.diagnosis))
         return f"{when}, the device could not be brought back: {said}"
 
     def _asked(self, stopped: str, *, was_brought_up: bool = True) -> Asked:
