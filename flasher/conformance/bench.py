@@ -237,7 +237,11 @@ class Bench:
         wanted = told_version(self.subject.target, image)
         if wanted is not None:
             found = self.application_version(self.limit("start_s"))
-            self.check(found == wanted, f"application {wanted} runs", f"{found!a}")
+            self.check(
+                found == wanted,
+                f"application {wanted} runs",
+                "no answer" if found is None else f"{found!a}",
+            )
         else:
             runs = self.application_runs()
             self.check(runs, "the application runs", "it answers" if runs else "no answer")

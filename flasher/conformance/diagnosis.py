@@ -74,8 +74,9 @@ def diagnose(trace: Iterable[TraceEntry], encoder: Encoder, *, has_wires: bool =
     own = f"{encoder.to_tool:03X}"
     if not frames:
         errors = f"{len(heard)} error frames and " if heard else ""
-        why = "check the device's power, the wiring and its termination, the bit rate, the channel"
-        return [f"{errors}no frame at all was received{f': {why}' if has_wires else ''}"]
+        parts = "the device's power, the wiring and its termination, the bit rate, the channel"
+        why = f": check {parts}, and whether the device is a {encoder.target}" if has_wires else ""
+        return [f"{errors}no frame at all was received{why}"]
     if not any(frame.can_id == encoder.to_tool and frame.is_payload for frame in frames):
         return [_who_speaks(frames, encoder)]
     decoder = Decoder(encoder)

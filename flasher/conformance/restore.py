@@ -141,6 +141,8 @@ def _runs(bench: Bench) -> str:
     if wanted is None:
         return "" if bench.application_runs() else "no application answers"
     found = bench.application_version(bench.limit("start_s"))
+    if found is None:
+        return "no application answers"
     return "" if found == wanted else f"version {found!a}, not {wanted}"
 
 

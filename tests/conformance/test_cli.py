@@ -129,6 +129,59 @@ def test_a_terminal_shows_which_case_runs_and_what_fails_at_once(
     assert "0/2 " in run.err
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a device that is full")
+def test_a_file_that_cannot_be_written_keeps_no_other_one_from_it(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    report, html = tmp_path / "report.json", tmp_path / "report.html"
+    run = flasher(*WRONG, "--junit", "/dev/full", "--json-report", report, "--html", html)
+    assert run.code == 2
+    assert "/dev/full cannot be written: No space left on device." in run.err
+    assert "FAIL RS-01" in run.out
+    assert json.loads(report.read_text())["results"]
+    assert html.exists()
+
+
+def test_traces_that_cannot_be_written_keep_no_report_from_it(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    traces, report = tmp_path / "traces", tmp_path / "report.json"
+    first = flasher(*WRONG, "--trace-dir", traces, "--json-report", report)
+    assert first.code == 12
+    (one, *_) = traces.iterdir()
+    one.unlink()
+    one.mkdir()
+    run = flasher(*WRONG, "--trace-dir", traces, "--json-report", report)
+    assert run.code == 2
+    assert "--trace-dir" in run.err
+    written = {each["trace_file"] for each in json.loads(report.read_text())["results"]}
+    assert one.name not in written
+
+
+@pytest.mark.parametrize("option", ["--html", "--json-report"])
+def test_no_file_of_the_command_is_written_over(
+    option: str, flasher: Flasher, tmp_path: Path
+) -> None:
+    image = tmp_path / "good.bin"
+    image.write_bytes(b"what runs")
+    run = flasher(*MOCK, "--good-image", image, option, image, "--case", "RS-01")
+    assert run.code == 2
+    assert "is a file of the command itself" in run.err
+    run = flasher(*MOCK, "--junit", tmp_path / "a", option, tmp_path / "a", "--case", "RS-01")
+    assert run.code == 2
+    assert not (tmp_path / "a").exists()
+    assert image.read_bytes() == b"what runs"
+
+
+def test_a_walk_tells_before_it_begins_that_its_trace_cannot_be_written(
+    flasher: Flasher, tmp_path: Path
+) -> None:
+    walk = ("conformance", "explore", "-t", "bms", "--mock", "--steps", "3")
+    run = flasher(*walk, "--trace-file", tmp_path / "nowhere" / "walk.log")
+    assert run.code == 2
+    assert run.out == ""
+
+
 def test_all_files_are_written_with_what_they_are_for(flasher: Flasher, tmp_path: Path) -> None:
     names = {"--junit": "a.xml", "--json-report": "a.json", "--html": "a.html"}
     words = [word for option, name in names.items() for word in (option, str(tmp_path / name))]

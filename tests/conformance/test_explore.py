@@ -14,6 +14,7 @@ from flasher.conformance.explore.refused import ENDS, NO_CONCERN, PACKETS, UPDAT
 from flasher.conformance.explore.steps import parse_step, reachable_pairs
 from flasher.conformance.explore.walk import ALL_STEPS, filler
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
+from flasher.conformance.restore import BY_NOTHING, restore
 from flasher.conformance.wire import Encoder, joined
 from flasher.errors import UsageError
 from tests.cli.conftest import Flasher
@@ -100,21 +101,54 @@ def test_what_is_transferred_and_does_not_run_is_never_completed() -> None:
     assert explored.steps == 5
 
 
-def test_a_walk_can_be_stopped() -> None:
-    explorer = Explorer(MockSubject(), profile_of_mock(), stopped=lambda: True)
-    explored = explorer.explore(100)
+@pytest.mark.parametrize("words", [None, ["reset", "update=384", "packet", "wait=20"]])
+@pytest.mark.parametrize("stops_at_s", [0.0, 5.0])
+def test_a_walk_that_is_stopped_leaves_the_good_image(
+    words: list[str] | None, stops_at_s: float
+) -> None:
+    subject = MockSubject()
+    explorer = Explorer(
+        subject, profile_of_mock(), stopped=lambda: subject.port.now() >= stops_at_s
+    )
+    explored = explorer.explore(10_000) if words is None else explorer.replay(words)
     assert explored.stopped == "it was stopped"
     assert explored.finding is None
+    assert restore(subject, profile_of_mock(), flash=False).how == BY_NOTHING
 
 
-def test_a_step_that_does_not_exist_is_said() -> None:
-    with pytest.raises(UsageError, match="no step 'pocket'"):
-        _explorer().replay(["reset", "pocket"])
+def test_a_stop_while_the_walk_is_cut_down_keeps_what_was_found() -> None:
+    subject = MockSubject(make_device=variant_maker("repeat-unanswered"))
+    whole = Explorer(subject, profile_of_mock()).explore(4000)
+    stops_at_s = subject.port.now() - 20
+    again = MockSubject(make_device=variant_maker("repeat-unanswered"))
+    explored = Explorer(
+        again, profile_of_mock(), stopped=lambda: again.port.now() >= stops_at_s
+    ).explore(4000)
+    assert whole.finding is not None
+    assert explored.finding is not None
+    assert explored.finding.rule == whole.finding.rule
+    assert len(explored.finding.steps) > len(whole.finding.steps)
+    assert explored.stopped == "it was stopped"
+    assert restore(again, profile_of_mock(), flash=False).how == BY_NOTHING
+
+
+def test_a_replay_that_finds_something_leaves_the_good_image() -> None:
+    subject = MockSubject(make_device=variant_maker("accepts-skipped-number"))
+    explorer = Explorer(subject, profile_of_mock())
+    assert explorer.replay(["reset", "update=good", "packet-skip"]).finding is not None
+    assert restore(subject, profile_of_mock(), flash=False).how == BY_NOTHING
+
+
+@pytest.mark.parametrize(
+    "step", ["pocket", "update=abc", "packets", "packets=-1", "packets=0.5", "cut=good", "wait="]
+)
+def test_a_step_that_does_not_exist_is_said(step: str) -> None:
+    with pytest.raises(UsageError, match=f"no step '{step}'"):
+        _explorer().replay(["reset", step])
 
 
 def test_every_step_is_written_and_read() -> None:
-    for name in ALL_STEPS:
-        assert str(parse_step(name)) == name
+    assert {name for _, name in reachable_pairs()} == set(ALL_STEPS)
     assert str(parse_step("packet-again=older-other")) == "packet-again=older-other"
 
 

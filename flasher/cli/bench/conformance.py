@@ -32,8 +32,8 @@ from flasher.cli.bench.conformance_text import (
     report_lines,
     side_by_side_lines,
 )
-from flasher.cli.files import check_writable, write_whole
-from flasher.cli.framework import argument, group, option, option_set, retyped
+from flasher.cli.files import check_not_read, check_writable, write_whole
+from flasher.cli.framework import argument, group, option, option_set, retyped, typed_values
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
@@ -292,34 +292,48 @@ def _check_files(chosen: Choices) -> None:
     for name, option_name in _FILES.items():
         if getattr(chosen, name) is not None:
             check_writable(getattr(chosen, name), option_name)
+            check_not_read(getattr(chosen, name), option_name, typed_values(but=name))
     if chosen.trace_dir is not None:
         try:
             chosen.trace_dir.mkdir(parents=True, exist_ok=True)
+            check_writable(chosen.trace_dir / "trace", _TRACE_DIR)
         except OSError as error:
-            said = f"{printable(str(chosen.trace_dir))} cannot be made: {error.strerror}."
-            raise UsageError(said, where=_TRACE_DIR) from error
+            raise UsageError(
+                f"{printable(str(chosen.trace_dir))} cannot be made: {error.strerror}.",
+                where=_TRACE_DIR,
+                remedy="Name a folder that exists, or a new one in a folder that does.",
+            ) from error
 
 
 def _tell(
     report: RunReport, chosen: Choices, output: Output, started_at: str, code: ExitCode
 ) -> None:
-    """Print the summary and write the files."""
+    """Print the summary and write the files. What cannot be written keeps nothing else from it.
+    Raises UsageError.
+    """
     from flasher.conformance.json_report import report_document  # noqa: PLC0415
     from flasher.conformance.reports import candump, is_traced, trace_file_name  # noqa: PLC0415
 
     replays = replay_commands(report)
     for line in report_lines(report, replays, verbose=output.verbosity > 0):
         output.result(line)
-    traces = {}
+    traces: dict[tuple[str, int], str] = {}
+    failed: list[UsageError] = []
     if chosen.trace_dir is not None:
         for result in filter(is_traced, report.results):
-            name = traces[result.key] = trace_file_name(result)
-            write_whole(chosen.trace_dir / name, candump(result.trace), _TRACE_DIR)
+            name = trace_file_name(result)
+            try:
+                write_whole(chosen.trace_dir / name, candump(result.trace), _TRACE_DIR)
+                traces[result.key] = name
+            except UsageError as error:
+                failed.append(error)
     if traces:
         output.progress(f"traces: {len(traces)} in {printable(str(chosen.trace_dir))}")
     document = report_document(report, started_at=started_at, replays=replays, trace_files=traces)
 
-    _write_files(report, document, chosen, output)
+    failed += _write_files(report, document, chosen, output)
+    if failed:
+        raise failed[0]
     if code not in (ExitCode.OK, ExitCode.PARTIAL):
         output.error_line(f"the run is not complete: {printable(report.stopped)}")
     output.document(ConformanceDocument(document), exit_code=code)
@@ -327,8 +341,9 @@ def _tell(
 
 def _write_files(
     report: RunReport, document: ReportDocument, chosen: Choices, output: Output
-) -> None:
-    """The files that were asked for."""
+) -> list[UsageError]:
+    """Write the files that were asked for; returns why some could not be."""
+    failed: list[UsageError] = []
     started_at = document.started_at
     replays = {(one.id, one.repeat): one.replay for one in document.results}
     traces = {(one.id, one.repeat): one.trace_file for one in document.results if one.trace_file}
@@ -361,9 +376,14 @@ def _write_files(
 
     for make in (junit, json_report, html, badge, summary):
         path: Path | None = getattr(chosen, make.__name__)
-        if path is not None:
+        if path is None:
+            continue
+        try:
             write_whole(path, make(), _FILES[make.__name__])
             output.progress(f"{make.__name__.replace('_', ' ')}: {printable(str(path))}")
+        except UsageError as error:
+            failed.append(error)
+    return failed
 
 
 def replay_commands(report: RunReport) -> dict[tuple[str, int], str]:

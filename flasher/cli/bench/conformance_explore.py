@@ -15,8 +15,8 @@ import click
 from flasher.cli import values
 from flasher.cli.bar import Bar
 from flasher.cli.bench.conformance_bench import BenchChoices, bench_options, confirm_wear
-from flasher.cli.files import write_whole
-from flasher.cli.framework import command, option, option_set, retyped
+from flasher.cli.files import check_not_read, check_writable, write_whole
+from flasher.cli.framework import command, option, option_set, retyped, typed_values
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
@@ -37,11 +37,12 @@ what is valid may be answered positively, and what is valid has to be answered. 
 down to the shortest walk that finds the same; --replay takes that walk again. Exit code 12 for a
 finding. A device on a bus is erased about twice a walk (12 steps on average).
 """
+_TRACE_FILE: Final = "--trace-file"
 _WALKS_PER_STEP: Final = 1 / 12
 _ERASES_A_WALK: Final = 2
 _REPLACED: Final = frozenset(
     {
-        *("--steps", "--seed", "--replay", "--trace-file", "--yes"),
+        *("--steps", "--seed", "--replay", _TRACE_FILE, "--yes"),
         *("--json", "--events", "--verbose", "--quiet", "--log-file"),
     }
 )
@@ -109,7 +110,7 @@ _choices = option_set(
     _what("--replay", metavar="STEPS", help="take these steps instead, as a finding tells them"),
     _what("-y", "--yes", is_flag=True, help="do not ask before a device on a bus is worn"),
     option(
-        "--trace-file", type=values.FilePath("log", gives=Path), metavar="FILE", panel="reports",
+        _TRACE_FILE, type=values.FilePath("log", gives=Path), metavar="FILE", panel="reports",
         help="the frames of the walk that found something (candump)",
     ),
 )  # fmt: skip
@@ -131,13 +132,19 @@ def explore(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> i
     from flasher.conformance.opening import open_bench  # noqa: PLC0415
 
     described = bench.described(bus)
+    if chosen.trace_file is not None:
+        check_writable(chosen.trace_file, _TRACE_FILE)
+        check_not_read(chosen.trace_file, _TRACE_FILE, typed_values(but="trace_file"))
     if not (described.is_simulated or chosen.replay):
         erases = max(1, round(chosen.steps * _WALKS_PER_STEP * _ERASES_A_WALK))
         said = f"{chosen.steps} steps erase and write the device about {erases} times"
         confirm_wear(said, is_agreed=chosen.yes)
+    stopping = lambda: output.progress(  # noqa: E731
+        "stopping: the device gets its good image back; press again to end at once"
+    )
     with (
         open_bench(described) as (subject, profile),
-        stop_on_signal(lambda: output.progress("stopping; press again to end at once")) as stopped,
+        stop_on_signal(stopping) as stopped,
         Bar(output, leave=False, unit=" steps") as bar,
     ):
         explorer = Explorer(
@@ -182,8 +189,10 @@ def _tell(explored: Explored, output: Output, trace_file: Path | None, code: Exi
         if trace_file is not None:
             from flasher.conformance.reports import candump  # noqa: PLC0415
 
-            write_whole(trace_file, candump(finding.trace), "--trace-file")
+            write_whole(trace_file, candump(finding.trace), _TRACE_FILE)
             output.progress(f"trace: {printable(str(trace_file))}")
+        if explored.stopped:
+            output.result(printable(explored.stopped))
     else:
         output.result(explored.stopped or "nothing was found")
     output.document(

@@ -7,6 +7,7 @@ from __future__ import annotations
 import random
 from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -24,7 +25,7 @@ from flasher.conformance.results import (
     Unsupported,
 )
 from flasher.conformance.subject import Subject
-from flasher.errors import UsageError, did_you_mean
+from flasher.errors import BusError, UsageError, did_you_mean
 
 WALK_STEPS: Final = 24
 """The longest walk."""
@@ -98,9 +99,10 @@ class Explorer:
                 found = self._walk(_by_chance(chance, length), taken)
                 self._progress(self._steps)
                 if found is not None:
-                    return self._explored(self._shrunk(found, taken))
+                    finding = self._shrunk(found, taken)
+                    return self._explored(finding, self._stop() if self._stopped() else "")
         except RunStopped:
-            pass
+            return self._explored(stopped=self._stop())
         return self._explored(stopped="it was stopped" if self._steps < steps else "")
 
     def replay(self, texts: Sequence[str]) -> Explored:
@@ -112,12 +114,17 @@ class Explorer:
             raise UsageError(
                 f"There is no step {word!a}.", remedy=did_you_mean(word, ALL_STEPS).rstrip()
             ) from error
-        trouble = self._restored()
-        if trouble:
-            return self._explored(_first_trouble(trouble))
         taken: list[Step] = []
-        found = self._walk(_these(steps), taken)
-        return self._explored(found and self._finding(found, taken, taken))
+        try:
+            trouble = self._restored()
+            if trouble:
+                return self._explored(_first_trouble(trouble))
+            found = self._walk(_these(steps), taken)
+        except RunStopped:
+            return self._explored(stopped=self._stop())
+        if found is None:
+            return self._explored()
+        return self._explored(self._finding(found, taken, taken), self._put_back())
 
     # -- one walk ----------------------------------------------------------------------------------
 
@@ -155,32 +162,47 @@ class Explorer:
         """Flash the good image, by the protocol alone; returns what went wrong, or ""."""
         done = restore(self._subject, self._profile, flash=True, stopped=self._stopped)
         if not done.ok:
-            return done.reason
+            return "; ".join((done.reason, *(() if self._walks else done.diagnosis)))
         if done.how == BY_POWER and self._walks and not may_need_power(self._profile):
             return "not by the protocol; a power cycle brought it back"
         return ""
 
+    def _stop(self) -> str:
+        """Why it ended early, once the good image is put back or cannot be."""
+        return "; ".join(filter(None, ("it was stopped", self._put_back())))
+
+    def _put_back(self) -> str:
+        """Let the good image run, whoever wants to stop; returns what went wrong, or ""."""
+        try:
+            why = restore(self._subject, self._profile, flash=False).reason
+        except BusError as error:
+            why = error.what
+        return why and f"the good image could not be flashed: {why}"
+
     # -- shrinking ---------------------------------------------------------------------------------
 
     def _shrunk(self, found: tuple[Violation, Bench], taken: list[Step]) -> Finding:
-        """The shortest walk, by leaving steps out, that ends with the same rule."""
+        """The shortest walk, by leaving steps out, that ends with the same rule; the shortest until
+        then when somebody stops it, or the adapter fails.
+        """
         best, rule = list(taken), found[0].rule
         size, tries = max(len(best) // 2, 1), 0
-        while size and tries < SHRINK_TRIES and not self._is_lost():
-            start, was_shorter = 0, False
-            while start < len(best) and tries < SHRINK_TRIES:
-                shorter = best[:start] + best[start + size :]
-                again_taken: list[Step] = []
-                tries += 1
-                again = self._walk(_these(shorter), again_taken) if shorter or rule else None
-                if again is not None and again[0].rule == rule:
-                    best, found, was_shorter = again_taken, again, True
-                else:
-                    start += size
-                if again is not None and self._is_lost():
-                    break
-            if not was_shorter:
-                size //= 2
+        with suppress(RunStopped, BusError):
+            while size and tries < SHRINK_TRIES and not self._is_lost():
+                start, was_shorter = 0, False
+                while start < len(best) and tries < SHRINK_TRIES:
+                    shorter = best[:start] + best[start + size :]
+                    again_taken: list[Step] = []
+                    tries += 1
+                    again = self._walk(_these(shorter), again_taken) if shorter or rule else None
+                    if again is not None and again[0].rule == rule:
+                        best, found, was_shorter = again_taken, again, True
+                    else:
+                        start += size
+                    if again is not None and self._is_lost():
+                        break
+                if not was_shorter:
+                    size //= 2
         return self._finding(found, best, taken)
 
     def _is_lost(self) -> bool:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import random
+import re
 from typing import Final, NamedTuple
 
 from flasher.conformance.explore.refused import ENDS, NO_CONCERN, PACKETS, UPDATES
 from flasher.conformance.explore.walk import ALL_STEPS, Phase, Walk
 
+_NUMBER: Final = re.compile("[0-9]{1,9}")
 _SHARE: Final = 12 / len(PACKETS)
 _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
     Phase.APPLICATION: {
@@ -106,10 +108,20 @@ class Step(NamedTuple):
         return f"{self.name}={self.argument}" if self.argument else self.name
 
 
+_ARGUMENTS: Final = {
+    name: {text.partition("=")[2] for weights in _WEIGHTS.values() for text in weights
+           if text.partition("=")[0] == name}
+    for name in ALL_STEPS
+}  # fmt: skip
+"""What may stand behind each step; where a number does, another one may too."""
+
+
 def parse_step(text: str) -> Step:
     """A step as it is written. Raises ValueError for one that does not exist."""
     name, _, argument = text.partition("=")
-    if name not in ALL_STEPS:
+    known = _ARGUMENTS.get(name, set())
+    is_number = _NUMBER.fullmatch(argument) and any(map(_NUMBER.fullmatch, known))
+    if argument not in known and not is_number:
         raise ValueError(f"there is no step {text!a}")
     return Step(name, argument)
 
