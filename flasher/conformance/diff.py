@@ -98,7 +98,7 @@ def read_report(path: Path) -> ReportDocument:
     if document["report_schema"] != SCHEMA_VERSION:
         found = printable(str(document["report_schema"])[:20])
         why = f"its schema is version {found}, and this program reads {SCHEMA_VERSION}"
-        raise _no_report(path, why)
+        raise _no_report(path, why, "Run the suite again, and compare what one version wrote.")
     try:
         return adapter().validate_python(document)
     except ValidationError as error:
@@ -108,10 +108,13 @@ def read_report(path: Path) -> ReportDocument:
         raise _no_report(path, why) from error
 
 
-def _no_report(path: Path, why: str) -> UsageError:
+def _no_report(
+    path: Path,
+    why: str,
+    remedy: str = "Compare files that `flasher conformance --json-report FILE` wrote.",
+) -> UsageError:
     return UsageError(
-        f"{printable(str(path))} is no report of the conformance suite: {why}.",
-        remedy="Compare files that `flasher conformance --json-report FILE` wrote.",
+        f"{printable(str(path))} is no report of the conformance suite: {why}.", remedy=remedy
     )
 
 

@@ -173,6 +173,15 @@ def test_no_file_of_the_command_is_written_over(
     assert image.read_bytes() == b"what runs"
 
 
+def test_a_comparison_is_not_written_over_a_report(flasher: Flasher, tmp_path: Path) -> None:
+    report = tmp_path / "report.json"
+    assert flasher(*MOCK, "--case", "RS-01", "--json-report", report).code == 0
+    before = report.read_bytes()
+    run = flasher("conformance", "compare", report, report, "--html", report)
+    assert run.code == 2
+    assert report.read_bytes() == before
+
+
 def test_a_walk_tells_before_it_begins_that_its_trace_cannot_be_written(
     flasher: Flasher, tmp_path: Path
 ) -> None:

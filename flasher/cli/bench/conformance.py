@@ -499,6 +499,7 @@ def compare_runs(output: Output, *, reports: tuple[Path, ...], html: Path | None
         raise UsageError("A comparison takes two reports or more.")
     if html is not None:
         check_writable(html, "--html")
+        check_not_read(html, "--html", reports)
     found = side_by_side(reports, [read_report(path) for path in reports])
     for line in side_by_side_lines(found, verbose=output.verbosity > 0):
         output.result(line)

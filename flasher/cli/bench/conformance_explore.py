@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 _EXAMPLES: Final = """\
 examples:
   flasher conformance explore -t bms --subject ./boot --steps 5000
-  flasher conformance explore -t bms --mock --variant queues-updates --seed 7
+  flasher conformance explore -t bms --mock --variant accepts-early-end --seed 7
   flasher conformance explore -t bms --mock --replay 'reset update=384 packet packet-crc'
 
 A walk begins with a running good image, and ends with an upgrade to it, which has to succeed. Only
