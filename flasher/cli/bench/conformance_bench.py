@@ -80,7 +80,9 @@ def confirm_wear(said: str, *, is_agreed: bool) -> None:
     if not can_ask():
         raise UsageError(f"{said}, and there is no terminal to ask.", remedy="Add --yes.")
     if not agrees(f"{said}. Begin?", interrupted="nothing was sent to the device."):
-        raise UsageError("Nothing was sent to the device.", remedy="Name less, or agree.")
+        raise UsageError(
+            "Nothing was sent to the device.", remedy="Answer y to begin, or add --yes."
+        )
 
 
 _bench = partial(option, panel="device under test")
