@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import unicodedata
 from enum import Enum
+from pathlib import Path
 from typing import Any, Final
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import BaseLoader, Environment, PackageLoader, StrictUndefined
 
 from flasher.prose import prose
 from flasher.report import scale
@@ -22,6 +23,8 @@ TEXT_LIMIT: Final = 400
 _UNSAFE_CATEGORIES: Final = ("C", "M", "Zl", "Zp")
 """Unicode: control, format (text direction), surrogates, unassigned; combining marks; separators
 of lines and paragraphs."""
+PAGE_STYLE: Final = Path(__file__).parent / "templates" / "page.css"
+"""The style sheet of every page that is read."""
 _ELLIPSIS: Final = "\N{HORIZONTAL ELLIPSIS}"
 
 
@@ -75,22 +78,23 @@ def _finalize(value: object) -> object:
     return visible(value) if isinstance(value, str) and not hasattr(value, "__html__") else value
 
 
-def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("flasher.report"),
+def environment(loader: BaseLoader) -> Environment:
+    """What makes pages of the templates that `loader` finds; raises what `render_page` does."""
+    made = Environment(
+        loader=loader,
         autoescape=True,
         undefined=StrictUndefined,
         finalize=_finalize,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters["duration"] = scale.duration_text
-    environment.filters["counted"] = counted
-    environment.filters["prose"] = prose
-    environment.filters["percent"] = percent
-    environment.filters["shortened"] = shortened
-    environment.globals["Status"] = Status
-    return environment
+    made.filters["duration"] = scale.duration_text
+    made.filters["counted"] = counted
+    made.filters["prose"] = prose
+    made.filters["percent"] = percent
+    made.filters["shortened"] = shortened
+    made.globals["Status"] = Status
+    return made
 
 
-_ENVIRONMENT: Final = _environment()
+_ENVIRONMENT: Final = environment(PackageLoader("flasher.report"))

@@ -22,6 +22,7 @@ from __future__ import annotations
 import re
 import shlex
 from collections import Counter
+from datetime import time
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -31,6 +32,7 @@ from flasher.errors import UsageError
 from flasher.settings.reading import Reader, Table
 from flasher.station.recipe import ShortText
 from flasher.station.records.model import DEFAULT_LOCK_TIMEOUT_S
+from flasher.station.tally import DEFAULT_SHIFTS
 
 SOCKETS_MAX: Final = 64
 _SWITCH: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
@@ -121,6 +123,8 @@ class StationConfig(Table):
     """The folder in which the signed heads of the audit trail are kept; empty: beside the key."""
     lock_timeout_s: float = Field(default=DEFAULT_LOCK_TIMEOUT_S, gt=0, le=60)
     """How long a record waits for another program that holds the database."""
+    shifts: tuple[time, ...] = Field(default=DEFAULT_SHIFTS, min_length=1, max_length=8)
+    """When each shift begins, as "06:00"."""
     socket: tuple[SocketConfig, ...] = Field(min_length=1, max_length=SOCKETS_MAX)
 
     @model_validator(mode="after")

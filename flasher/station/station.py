@@ -108,6 +108,7 @@ class Station:
         operator: str,
         lot: str = "",
         on_event: EventHandler = lambda _event: None,
+        on_turn: Callable[[], None] = lambda: None,
         options: StationOptions | None = None,
         clock: Clock | None = None,
         launch: Launch = ProcessPort,
@@ -117,6 +118,7 @@ class Station:
         self.options = options or StationOptions()
         self.clock: Clock = clock or SystemClock()
         self._on_event = on_event
+        self._on_turn = on_turn
         setups = tuple(setups)
         self.line = Line(
             [Socket(each.socket, is_virtual=each.virtual is not None) for each in setups],
@@ -216,6 +218,7 @@ class Station:
             self._abort_running()
         self.line.tick(self._now)
         self._carry_out()
+        self._on_turn()
 
     def close(self) -> None:
         """End all processes. Runs that go on are stopped, and saved if they say their end in time;

@@ -15,11 +15,11 @@ from rich.console import Console
 
 from flasher.cli.documents import to_json
 from flasher.cli.output import Output
-from flasher.cli.station.board import Board
 from flasher.cli.station.documents import LINES
 from flasher.cli.station.scans import LineReader, ScanFile, Typing
 from flasher.cli.station.views import Table, draw
 from flasher.errors import UsageError
+from flasher.station.board import Board
 from flasher.station.events import (
     FiguresChanged,
     LineStopped,

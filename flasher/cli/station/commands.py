@@ -20,11 +20,13 @@ from flasher.errors import ExitCode, UsageError
 DEFAULT_RECORDS: Final = "records.sqlite"
 _EXTRA: Final = ("cryptography", "sqlalchemy", "stdnum")
 """Packages of the extra."""
+_WEB_EXTRA: Final = ("babel", "itsdangerous", "starlette", "uvicorn")
 _EXAMPLES: Final = """\
 examples:
   flasher station check recipe.toml
   flasher station run --recipe recipe.toml --sockets sockets.toml --operator Jo
   flasher station run --recipe recipe.toml --mock-sockets 4 --units 8
+  flasher station run --recipe recipe.toml --mock-sockets 4 --web
   flasher station report --lot L17 --csv runs.csv --certificates pages
   flasher station unit W2605002 --certificate W2605002.html
   flasher station backup /mnt/plant/records.sqlite
@@ -67,16 +69,21 @@ def _call(action: str, *args: object, **named: object) -> int:
     """Run an action ("module.function"); returns the exit code. Raises UsageError without the
     extra.
     """
-    missing = [name for name in _EXTRA if importlib.util.find_spec(name) is None]
-    if missing:
-        raise UsageError(
-            f"The station needs packages that are not installed: {', '.join(missing)}.",
-            remedy="In the checkout: pip install -c .ci/constraints.txt '.[station]'",
-        )
+    _need("The station", "station", _EXTRA)
     module, _, name = action.partition(".")
     run = getattr(importlib.import_module(f"flasher.cli.station.{module}"), name)
     code: int = run(*args, **named)
     return code
+
+
+def _need(what: str, extra: str, packages: tuple[str, ...]) -> None:
+    """Raises UsageError without the packages of an extra."""
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    if missing:
+        raise UsageError(
+            f"{what} needs packages that are not installed: {', '.join(missing)}.",
+            remedy=f"In the checkout: pip install -c .ci/constraints.txt '.[{extra}]'",
+        )
 
 
 # -- options that actions share --------------------------------------------------------------------
@@ -140,6 +147,21 @@ def _share(text: str) -> float:
     return value
 
 
+@dataclass(frozen=True)
+class Address:
+    """Where pages are served."""
+
+    host: str
+    port: int
+
+
+def _address(text: str) -> Address:
+    host, _, port = text.rpartition(":")
+    if not (port.isascii() and port.isdigit() and int(port) < 65536):
+        raise click.BadParameter("is no address: PORT or HOST:PORT")
+    return Address(host.removeprefix("[").removesuffix("]") or "127.0.0.1", int(port))
+
+
 def _mock_share_option(name: str, share: float, what: str) -> Decorator:
     return option(
         f"--mock-{name}", type=_share, default=share, metavar="SHARE", panel=_VIRTUAL,
@@ -149,6 +171,8 @@ def _mock_share_option(name: str, share: float, what: str) -> Decorator:
 
 # -- actions ---------------------------------------------------------------------------------------
 
+_PAGES: Final = "pages"
+DEFAULT_WEB: Final = "8740"
 _VIRTUAL: Final = "virtual units, for training and demonstration"
 _WHICH: Final = "which runs (default: all)"
 _WRITTEN: Final = "what is written"
@@ -171,6 +195,12 @@ class RunOptions:
     lot: str
     scans: Path | None
     lines: bool
+    web: Address | None
+    web_password: Path | None
+    web_certificate: Path | None
+    web_key: Path | None
+    web_insecure: bool
+    language: str | None
     mix_virtual: bool
     mock_sockets: int | None
     units: int | None
@@ -191,6 +221,28 @@ class RunOptions:
     option("--lot", default="", metavar="NAME", show_default=False, help="the lot of the units"),
     _path_option("--scans", help="labels in the order of the units; it ends behind the last"),
     option("--lines", is_flag=True, help="a line for each happening, on a terminal too"),
+    option(
+        "--web", type=_address, is_flag=False, flag_value=DEFAULT_WEB, metavar="[[HOST:]PORT]",
+        panel=_PAGES, brief=True, show_default=False,
+        help=f"serve the operator page (alone: on this computer only, port {DEFAULT_WEB})",
+    ),
+    _path_option(
+        "--web-password", panel=_PAGES,
+        help="a file whose first line is the password of the pages",
+    ),
+    _path_option(
+        "--web-certificate", panel=_PAGES,
+        help="serve them by TLS with this certificate (PEM)",
+    ),
+    _path_option("--web-key", panel=_PAGES, help="the key of the certificate (PEM)"),
+    option(
+        "--web-insecure", is_flag=True, panel=_PAGES,
+        help="let other computers in without TLS: whoever listens on the network can read along",
+    ),
+    option(
+        "--language", type=click.Choice(("en", "de", "zh")), panel=_PAGES,
+        help="of the pages (default: the browser's)",
+    ),
     option(
         "--mix-virtual", is_flag=True, panel="records",
         help="let real and virtual units share the records (no serial number is both)",
@@ -222,6 +274,8 @@ class RunOptions:
 @_records_options
 def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
     """Flash unit after unit."""
+    if options.web is not None:
+        _need("The operator page", "web", _WEB_EXTRA)
     return _call("run.run", output, options, records)
 
 

@@ -14,7 +14,6 @@ from urllib.parse import quote
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.look.explain_text import story_lines
 from flasher.cli.output import Output, counted, duration
-from flasher.cli.station.board import figures_line
 from flasher.cli.station.commands import RecordsOptions, ReportOptions
 from flasher.cli.station.documents import (
     StationReportDocument,
@@ -24,6 +23,7 @@ from flasher.cli.station.documents import (
     run_document,
 )
 from flasher.cli.station.place import open_to_read
+from flasher.cli.station.views import figures_line
 from flasher.errors import ExitCode, FlasherError, UsageError
 from flasher.prose import prose
 from flasher.protocol.text import printable

@@ -9,10 +9,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from flasher.cli.output import Output
-from flasher.cli.station.board import figures_line
 from flasher.cli.station.commands import RecordsOptions, RunOptions
 from flasher.cli.station.documents import (
     FiguresDocument,
@@ -21,13 +20,14 @@ from flasher.cli.station.documents import (
 )
 from flasher.cli.station.place import operator_of, records_of
 from flasher.cli.station.scans import LineReader, ScanFile, Typing, keyboard, read_scans
-from flasher.cli.station.views import JsonLines, Lines, Table, View
+from flasher.cli.station.views import JsonLines, Lines, Table, View, figures_line
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import BusError, ExitCode, FlasherError, InterruptedByUserError, UsageError
 from flasher.protocol.text import printable
 from flasher.station import codes
 from flasher.station.adapters import Resolved, detect, resolve, worker_setups
 from flasher.station.config import MockUnits, StationConfig, load_config, mock_config
+from flasher.station.events import StationEvent
 from flasher.station.recipe_file import load_checked
 from flasher.station.records.errors import RecordError
 from flasher.station.records.keys import Keeping
@@ -35,6 +35,9 @@ from flasher.station.records.store import Store
 from flasher.station.station import Station, StationOptions
 from flasher.station.supervisor import Launch, ProcessPort
 from flasher.station.virtual_units import next_number
+
+if TYPE_CHECKING:
+    from flasher.cli.station.operator_page import OperatorView
 
 LAUNCH: Launch = ProcessPort
 """How a socket's process is made."""
@@ -66,6 +69,7 @@ def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
             rows, part = store.read.table(), recipe.recipe.part
             known = {str(row["serial"]) for row in rows if row["part"] == part}
             first = next_number(recipe.recipe.serial_number, known)
+        session.config = config
         session.station = Station(
             store,
             recipe,
@@ -79,7 +83,8 @@ def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
             ),
             operator=operator_of(options.operator),
             lot=options.lot,
-            on_event=session.view,
+            on_event=session.show,
+            on_turn=session.turn,
             options=StationOptions(
                 scans_labels=session.scans_itself,
                 end_limit_s=END_LIMIT_S,
@@ -157,6 +162,7 @@ class _Session:
     """A station at work, from its start to its end."""
 
     station: Station
+    config: StationConfig
 
     def __init__(
         self,
@@ -179,6 +185,7 @@ class _Session:
         self._is_used_up = False
         self._is_stopped = False
         self._failure: FlasherError | None = None
+        self._page: OperatorView | None = None
         self.is_temporary = False
         """The records are gone afterwards."""
 
@@ -191,11 +198,45 @@ class _Session:
         try:
             with ExitStack() as stack:
                 stopped = stack.enter_context(stop_on_signal(self._say_stop, self._stop_now))
+                self._open_page(stack)
                 stack.enter_context(self.view.on_screen())
                 self._open_scans(stack)
                 self.station.run(until=lambda: self._is_over(is_stopped=stopped()))
         except KeyboardInterrupt:
             self._failure = _stopped_now()
+
+    def _open_page(self, stack: ExitStack) -> None:
+        """Serve the operator page, where it is asked for. Raises UsageError."""
+        address = self._options.web
+        if address is None:
+            return
+        from flasher.cli.station.operator_page import operator_page  # noqa: PLC0415  an extra
+
+        page = operator_page(
+            self._options,
+            address,
+            self.station,
+            self.view.board,
+            self.config,
+            keeping=None if self.is_temporary else self._store.signer.keeping,
+        )
+        self._page, url = stack.enter_context(page)
+        self.view.board.said = text = f"The operator page: {url}"
+        self._output.progress(text)
+
+    def show(self, event: StationEvent) -> None:
+        """Show one event; called in the station's thread."""
+        self.view(event)
+        if self._page is not None:
+            self._page.show(event)
+
+    def turn(self) -> None:
+        """Once in each turn of the station's loop."""
+        if self._typing is not None:
+            self.view.typed = self._typing.text
+        self.view.refresh()
+        if self._page is not None:
+            self._page.turn()
 
     def _open_scans(self, stack: ExitStack) -> None:
         """Listen to the keyboard, or to the pipe where that is where the scans come from."""
@@ -207,7 +248,7 @@ class _Session:
                 stack.enter_context(keyboard(self._typing))
             else:
                 LineReader(sys.stdin, self.station.submit).start()
-        elif self.file is None and not self.scans_itself:
+        elif self.file is None and not self.scans_itself and self._page is None:
             self._pipe = LineReader(sys.stdin, self.station.submit)
             self._pipe.start()
 
@@ -226,9 +267,6 @@ class _Session:
 
     def _is_over(self, *, is_stopped: bool) -> bool:
         """Asked once a turn, in the station's thread."""
-        if self._typing is not None:
-            self.view.typed = self._typing.text
-        self.view.refresh()
         if is_stopped:
             return True
         try:

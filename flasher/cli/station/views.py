@@ -19,11 +19,12 @@ from rich.table import Table as Grid
 from rich.text import Text
 
 from flasher.cli.documents import to_json
-from flasher.cli.output import Output
-from flasher.cli.station.board import Board, Row, figures_line
+from flasher.cli.output import Output, counted, duration
 from flasher.protocol.text import printable
 from flasher.station import events
+from flasher.station.board import Board, Row
 from flasher.station.events import LineStopped, SocketState, StationEvent
+from flasher.station.records.model import Figures
 
 WIDE: Final = 140
 """From this width on, what to do stands in the row; else below it."""
@@ -237,6 +238,25 @@ def _stopped_lines(stop: LineStopped, width: int, room: int) -> list[str]:
 
 def _cut(line: str, style: str = "") -> Text:
     return Text(line, style=style, no_wrap=True, overflow="ellipsis")
+
+
+def percent(share: float | None) -> str:
+    """A share of 1; never 100 % for a little less."""
+    if share is None:
+        return "-"
+    return f"{int(share * 1000) / 10:g} %"
+
+
+def figures_line(figures: Figures) -> str:
+    failed = figures.units - figures.passed
+    first = percent(figures.first_pass_share)
+    line = (
+        f"{counted(figures.units, 'unit')}: {figures.passed:,} passed, {failed:,} failed; "
+        f"yield {percent(figures.yield_share)}, first pass {first}"
+    )
+    if figures.duration_median_s is not None:
+        line += f"; median {duration(figures.duration_median_s)}"
+    return line
 
 
 # -- lines ----------------------------------------------------------------------------------------

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from flasher.cli.output import counted, duration
 from flasher.protocol.text import printable
+from flasher.said import say
 from flasher.station.events import (
     FiguresChanged,
     LineResumed,
@@ -57,8 +57,14 @@ class Board:
 
     rows: dict[str, Row] = field(default_factory=dict)
     title: str = ""
+    station: str = ""
+    recipe: str = ""
+    """Name and revision."""
+    part: str = ""
     figures: Figures | None = None
     stopped: LineStopped | None = None
+    records_fault: str = ""
+    """Why the last record was not saved; empty when the last one was."""
     said: str = ""
     """The answer to the last scan, or what somebody has to do."""
     prompt: str = ""
@@ -80,6 +86,8 @@ class Board:
     def apply(self, event: StationEvent) -> None:
         match event:
             case StationStarted(_, recipe, revision, part, sockets):
+                self.recipe = printable(f"{recipe}, {revision}")
+                self.station, self.part = printable(event.station), printable(part)
                 self.title = printable(f"{event.station}: {recipe}, revision {revision}, {part}")
                 self.virtual_sockets = virtual = event.virtual_sockets
                 self.rows = {n: Row(printable(n), is_virtual=n in virtual) for n in sockets}
@@ -90,12 +98,12 @@ class Board:
             case LineStopped():
                 self.stopped = event
             case LineResumed():
-                self.stopped = None
+                self.stopped, self.records_fault = None, ""
             case ScanAccepted() | ScanRefused():
                 self._scanned(event)
             case OperatorPrompted("", text, _):
                 # It comes just before the scan that it belongs to is accepted.
-                self.said = self.prompt = printable(text)
+                self.said = self.prompt = shown(text)
                 self.is_refusal = False
             case UnitArrived(socket, _, label):
                 self.labels[socket] = label
@@ -111,27 +119,40 @@ class Board:
                 self._socket(event)
 
     def _scanned(self, event: ScanAccepted | ScanRefused) -> None:
+        text = printable(event.text)
         if isinstance(event, ScanRefused):
             self.refused.append(event)
             self.waiting.discard(event.text)
-            text, self.is_refusal = f"{event.text}: {event.reason} {event.remedy}", True
+            reason, remedy = shown(event.reason), shown(event.remedy)
+            self.is_refusal = True
+            self.said = say("{text}: {reason} {remedy}", text=text, reason=reason, remedy=remedy)
         else:
-            where = f" for socket {event.socket}" if event.socket else ""
-            text, self.is_refusal = f"{event.text}: {event.meaning}{where}", False
+            self.is_refusal = False
+            meaning = shown(event.meaning)
+            if event.socket:
+                socket = printable(event.socket)
+                self.said = say(
+                    "{text}: {meaning} for socket {socket}",
+                    text=text, meaning=meaning, socket=socket,
+                )  # fmt: skip
+            else:
+                self.said = say("{text}: {meaning}", text=text, meaning=meaning)
             if event.meaning == "label" and not event.socket:
                 self.waiting.add(event.text)
-                text = f"{text}. {self.prompt}".rstrip(". ") + "."
+                self.said = say("{said}. {prompt}", said=self.said, prompt=self.prompt)
             elif event.meaning == Word.CANCEL.value.lower():
                 self.waiting.clear()
-        self.said, self.prompt = printable(text), ""
+        self.prompt = ""
 
     def _socket(self, event: StationEvent) -> None:
+        if isinstance(event, RecordNotSaved):
+            self.records_fault = shown(event.reason)
         row = self.rows.get(getattr(event, "socket", ""))
         if row is None:
             return
         match event:
             case SocketChanged(_, state, serial, text):
-                row.state, row.serial, row.note = state, printable(serial), printable(text)
+                row.state, row.serial, row.note = state, printable(serial), shown(text)
                 if state not in (SocketState.RUNNING, SocketState.SAVING):
                     row.step, row.share, row.left_s = "", None, None
                 if not state.is_verdict:
@@ -146,9 +167,9 @@ class Board:
             case Progressed(_, _, _, share, left_s):
                 row.share, row.left_s = share, left_s
             case OperatorPrompted(_, text, _):
-                row.note = printable(text)
+                row.note = shown(text)
             case RecordNotSaved(_, _, _, reason):
-                row.note = printable(reason)
+                row.note = shown(reason)
             case RunEnded():
                 self.ended[event.serial] = event
                 row.code = "" if event.outcome is RunState.PASS else event.code
@@ -161,9 +182,9 @@ class Board:
         if not self.virtual_sockets:
             return ""
         if len(self.virtual_sockets) == len(self.rows):
-            return "VIRTUAL UNITS, no products."
+            return say("VIRTUAL UNITS, no products.")
         names = ", ".join(map(printable, self.virtual_sockets))
-        return f"VIRTUAL UNITS in {names}, no products."
+        return say("VIRTUAL UNITS in {names}, no products.", names=names)
 
     @property
     def bad_units(self) -> tuple[RunEnded, ...]:
@@ -171,20 +192,7 @@ class Board:
         return tuple(each for each in self.ended.values() if each.outcome is not RunState.PASS)
 
 
-def percent(share: float | None) -> str:
-    """A share of 1; never 100 % for a little less."""
-    if share is None:
-        return "-"
-    return f"{int(share * 1000) / 10:g} %"
-
-
-def figures_line(figures: Figures) -> str:
-    failed = figures.units - figures.passed
-    first = percent(figures.first_pass_share)
-    line = (
-        f"{counted(figures.units, 'unit')}: {figures.passed:,} passed, {failed:,} failed; "
-        f"yield {percent(figures.yield_share)}, first pass {first}"
-    )
-    if figures.duration_median_s is not None:
-        line += f"; median {duration(figures.duration_median_s)}"
-    return line
+def shown(text: str) -> str:
+    """A text that is safe to show; a sentence keeps what it is translated by."""
+    safe = printable(text)
+    return text if safe == text else safe

@@ -1,0 +1,74 @@
+"""Whether a station can keep what it makes: its records, the space for them, its clock."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Final
+
+from flasher.said import say
+
+LITTLE_BYTES: Final = 500 * 1024 * 1024
+"""Less free space is told."""
+CLOCK_SHIFT_MAX_S: Final = 5.0
+"""Between the clock on the wall and the one that only goes forward, since the station started."""
+LOOK_EVERY_S: Final = 5.0
+
+
+@dataclass(frozen=True)
+class Check:
+    """One thing that was looked at."""
+
+    name: str
+    is_good: bool
+    text: str
+    """What was seen."""
+
+
+@dataclass(frozen=True)
+class Health:
+    """All of them."""
+
+    checks: tuple[Check, ...]
+
+
+class Watch:
+    """Looks at the disk and the clock every few seconds. `folder`: where the records' files are;
+    `utc` and `monotonic_s`: the two clocks.
+    """
+
+    def __init__(
+        self, folder: Path, utc: Callable[[], datetime], monotonic_s: Callable[[], float]
+    ) -> None:
+        self._folder = folder
+        self._utc = utc
+        self._monotonic_s = monotonic_s
+        self._offset_s = utc().timestamp() - monotonic_s()
+        self._looked_at = float("-inf")
+        self._seen: tuple[Check, ...] = ()
+
+    def look(self, *, records_fault: str) -> Health:
+        """What is so now; `records_fault`: why records are not saved, empty when they are."""
+        now = self._monotonic_s()
+        if now - self._looked_at >= LOOK_EVERY_S:
+            self._looked_at, self._seen = now, (self._disk(), self._clock())
+        text = records_fault or say("every run is saved")
+        return Health((Check(say("records"), is_good=not records_fault, text=text), *self._seen))
+
+    def _disk(self) -> Check:
+        try:
+            free = shutil.disk_usage(self._folder).free
+        except OSError as error:
+            return Check(say("disk"), is_good=False, text=error.strerror or str(error))
+        size = f"{free / 1024**3:.1f} GiB"
+        return Check(say("disk"), is_good=free >= LITTLE_BYTES, text=say("{size} free", size=size))
+
+    def _clock(self) -> Check:
+        shift_s = self._utc().timestamp() - self._monotonic_s() - self._offset_s
+        if abs(shift_s) <= CLOCK_SHIFT_MAX_S:
+            return Check(say("clock"), is_good=True, text=say("not set since the start"))
+        text = say("set by {seconds} s since the start", seconds=f"{shift_s:+.0f}")
+        return Check(say("clock"), is_good=False, text=text)

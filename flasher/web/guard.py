@@ -1,0 +1,221 @@
+"""Who may use the pages, and what a browser may do with them.
+
+Every request names this server as its host, so that no foreign name leads here (DNS rebinding).
+What changes something is a POST from a page of this server that knows the token of its session.
+Answers forbid scripts, styles and connections from anywhere else. Where a password is set, nothing
+but the page that asks for it is shown without it.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from collections import deque
+from collections.abc import Callable, Collection
+from typing import Any, Final
+from urllib.parse import parse_qs
+
+from starlette.applications import Starlette
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.middleware import Middleware
+from starlette.middleware.sessions import SessionMiddleware
+from starlette.requests import Request
+from starlette.responses import FileResponse, PlainTextResponse, RedirectResponse, Response
+from starlette.routing import BaseRoute, Mount, Route
+from starlette.staticfiles import StaticFiles
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from flasher.report.base import PAGE_STYLE
+from flasher.web.pages import Pages
+
+TOKEN_HEADER: Final = "x-flasher-token"  # noqa: S105  its name
+BODY_MAX: Final = 64 * 1024
+"""In bytes, of a request that is no upload."""
+_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+    "font-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
+)
+_HEADERS: Final = {
+    "content-security-policy": _POLICY,
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "same-origin",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "permissions-policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=()",
+    "cache-control": "no-store",
+}
+_TRIES_MAX: Final = 5
+_TRIES_WITHIN_S: Final = 60.0
+_OPEN: Final = ("/static/", "/login")
+"""Paths that need no password."""
+
+
+class Tries:
+    """Limits how often somebody may guess: `_TRIES_MAX` wrong ones in `_TRIES_WITHIN_S`."""
+
+    def __init__(self, now: Callable[[], float]) -> None:
+        self._now = now
+        self._wrong: deque[float] = deque()
+
+    @property
+    def are_used_up(self) -> bool:
+        """True while no other try is allowed."""
+        while self._wrong and self._now() - self._wrong[0] > _TRIES_WITHIN_S:
+            self._wrong.popleft()
+        return len(self._wrong) >= _TRIES_MAX
+
+    def was_wrong(self) -> None:
+        self._wrong.append(self._now())
+
+
+def application(
+    routes: Collection[BaseRoute],
+    *,
+    pages: Pages,
+    hosts: Collection[str],
+    secret: str,
+    now: Callable[[], float],
+    password: str = "",
+    is_tls: bool = False,
+    uploads: Callable[[str], int] = lambda _path: BODY_MAX,
+) -> ASGIApp:
+    """The pages behind the guard. `hosts`: names by which this server is addressed, without port;
+    `secret` signs the cookies; `uploads` gives the limit of a path's body in bytes.
+    """
+    login = _Login(pages, password, now)
+    own: list[BaseRoute] = [
+        Route("/static/page.css", FileResponse(PAGE_STYLE)),
+        Mount("/static", StaticFiles(packages=[("flasher.web", "static")])),
+        Route("/login", login.show, methods=["GET"]),
+        Route("/login", login.take, methods=["POST"]),
+    ]
+    session = Middleware(
+        SessionMiddleware,
+        secret_key=secret,
+        session_cookie="flasher",
+        same_site="strict",
+        https_only=is_tls,
+    )
+    inner = Starlette(
+        routes=[*own, *routes],
+        middleware=[session, Middleware(_Sessions, has_password=bool(password))],
+    )
+    return _Guard(inner, hosts, uploads)
+
+
+class _Guard:
+    """The outermost layer: hosts, origins, sizes, headers."""
+
+    def __init__(
+        self, app: ASGIApp, hosts: Collection[str], limit_of: Callable[[str], int]
+    ) -> None:
+        self._app = app
+        self._hosts = frozenset(host.lower() for host in hosts)
+        self._limit_of = limit_of
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            return
+
+        async def send_guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in _HEADERS.items():
+                    headers.setdefault(name, value)
+                if scope["path"].startswith("/static/"):
+                    headers["cache-control"] = "no-cache"
+            await send(message)
+
+        refusal = self._refusal(scope)
+        if refusal is not None:
+            await refusal(scope, receive, send_guarded)
+            return
+        await self._app(scope, _limited(receive, self._limit_of(scope["path"])), send_guarded)
+
+    def _refusal(self, scope: Scope) -> Response | None:
+        headers = Headers(scope=scope)
+        host = headers.get("host", "")
+        if _name_of(host) not in self._hosts:
+            return PlainTextResponse("This server is not known by that name.", 421)
+        if scope["method"] in ("GET", "HEAD"):
+            return None
+        if scope["method"] != "POST":
+            return PlainTextResponse("Only GET and POST.", 405)
+        if headers.get("origin", "") != f"{scope['scheme']}://{host}":
+            return PlainTextResponse("The request comes from another page.", 403)
+        length = headers.get("content-length", "0")
+        if not length.isdigit() or int(length) > self._limit_of(scope["path"]):
+            return PlainTextResponse("It is too large.", 413)
+        return None
+
+
+def _name_of(host: str) -> str:
+    if host.startswith("["):
+        return host.partition("]")[0].lower() + "]"
+    return host.partition(":")[0].lower()
+
+
+def _limited(receive: Receive, limit: int) -> Receive:
+    """Ends a body that is larger than allowed, whatever its header said."""
+    taken = 0
+
+    async def receive_limited() -> Message:
+        nonlocal taken
+        message = await receive()
+        taken += len(message.get("body", b""))
+        return {"type": "http.disconnect"} if taken > limit else message
+
+    return receive_limited
+
+
+class _Sessions:
+    """Every session has a token, which a POST has to say; and has said the password, if there is
+    one.
+    """
+
+    def __init__(self, app: ASGIApp, *, has_password: bool) -> None:
+        self._app = app
+        self._has_password = has_password
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        session: dict[str, Any] = scope["session"]
+        session.setdefault("token", secrets.token_urlsafe(24))
+        is_open = scope["path"].startswith(_OPEN)
+        if self._has_password and not is_open and not session.get("is_in"):
+            is_stream = scope["path"].endswith("/events")
+            refusal = Response(status_code=401) if is_stream else RedirectResponse("/login", 303)
+            await refusal(scope, receive, send)
+            return
+        if scope["method"] == "POST" and scope["path"] != "/login":
+            said = Headers(scope=scope).get(TOKEN_HEADER, "")
+            if not hmac.compare_digest(said.encode(), session["token"].encode()):
+                await PlainTextResponse("Load the page again.", 403)(scope, receive, send)
+                return
+        await self._app(scope, receive, send)
+
+
+class _Login:
+    """The page that asks for the password."""
+
+    def __init__(self, pages: Pages, password: str, now: Callable[[], float]) -> None:
+        self._pages = pages
+        self._password = password
+        self._tries = Tries(now)
+
+    async def show(self, request: Request) -> Response:
+        return self._pages.show(request, "login.html", trouble="")
+
+    async def take(self, request: Request) -> Response:
+        fields = parse_qs((await request.body()).decode("utf-8", "replace"))
+        token, said = fields.get("token", [""])[0], fields.get("password", [""])[0]
+        if not hmac.compare_digest(token.encode(), request.session["token"].encode()):
+            return RedirectResponse("/login", 303)
+        if self._tries.are_used_up:
+            trouble = "Too many wrong passwords: wait a minute."
+            return self._pages.show(request, "login.html", status=429, trouble=trouble)
+        if not self._password or not hmac.compare_digest(said.encode(), self._password.encode()):
+            self._tries.was_wrong()
+            return self._pages.show(request, "login.html", status=403, trouble="That is not it.")
+        request.session["is_in"] = True
+        return RedirectResponse("/", 303)

@@ -1,0 +1,263 @@
+"""The operator page: a tile a socket, a header, a footer, and what covers them when the line is
+stopped or the station says nothing.
+
+`Screen` takes the station's events, in the station's thread; the page follows its `Feed`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from collections.abc import AsyncIterator, Callable
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from typing import Any, Final
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
+from starlette.routing import BaseRoute, Route
+
+from flasher.said import say
+from flasher.station.board import Board, Row
+from flasher.station.events import LineStopped, RunEnded, SocketState, StationEvent
+from flasher.station.health import Health, Watch
+from flasher.station.tally import EndedRun, Output, Tally
+from flasher.web.feed import Feed
+from flasher.web.pages import Pages
+from flasher.web.words import Words
+
+TAIL_DIGITS: Final = 6
+"""Of a serial number, shown large: enough to tell the units on a bench apart."""
+SCAN_MAX: Final = 300
+"""Characters of a scan from a page."""
+HEAD_EVERY_S: Final = 0.1
+SILENCE_LIMIT_S: Final = 1.5
+"""A station whose loop turns more slowly is not at work for the page."""
+_HEAD: Final = "head"
+
+WORDS: Final = {
+    SocketState.STARTING: say("STARTING"),
+    SocketState.EMPTY: say("EMPTY"),
+    SocketState.SILENT: say("NO UNIT?"),
+    SocketState.SCAN: say("SCAN"),
+    SocketState.RUNNING: say("RUNNING"),
+    SocketState.SAVING: say("SAVING"),
+    SocketState.PASS: say("PASS"),
+    SocketState.FAIL: say("FAIL"),
+    SocketState.RECHECK: say("RECHECK"),
+    SocketState.ERROR: say("ERROR"),
+    SocketState.STOPPED: say("STOPPED"),
+}
+"""What a tile says in large letters."""
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One socket as the page shows it."""
+
+    row: Row
+    state: SocketState
+    """PASS only when the run's end with PASS was told, which is after it is on disk."""
+
+    def said(self, words: Words) -> dict[str, Any]:
+        """The tile in a language, for the page's script."""
+        row = self.row
+        serial = row.serial or row.borne
+        return {
+            "socket": row.socket,
+            "state": self.state.value.lower(),
+            "word": words(WORDS[self.state]),
+            "serial": serial,
+            "tail": serial[-TAIL_DIGITS:],
+            "is_label": bool(row.serial),
+            "share": row.share,
+            "left": "" if row.left_s is None else _left(row.left_s, words),
+            "step": row.step,
+            "code": row.code,
+            "line": words(row.note),
+            "virtual": words(say("virtual unit: no product")) if row.is_virtual else "",
+        }
+
+
+@dataclass(frozen=True)
+class Lot:
+    """The lot that is made; `size` is how many units it has, 0 for not known."""
+
+    name: str
+    size: int = 0
+    good: int = 0
+
+
+@dataclass(frozen=True)
+class Head:
+    """All that the page shows beside the sockets."""
+
+    station: str
+    recipe: str
+    part: str
+    operator: str
+    lot: Lot
+    virtual: str
+    output: Output
+    health: Health
+    stopped: LineStopped | None
+    spoken: str
+    is_refusal: bool
+
+    def said(self, words: Words) -> dict[str, Any]:
+        """The head in a language, for the page's script."""
+        stopped, lot = self.stopped, self.lot
+        name = lot.name or words(say("no lot"))
+        left = max(lot.size - lot.good, 0)
+        return {
+            "station": self.station,
+            "recipe": self.recipe,
+            "part": self.part,
+            "operator": self.operator,
+            "lot": words(say("{name}, {left} left"), name=name, left=left) if lot.size else name,
+            "virtual": words(self.virtual),
+            "spoken": words(self.spoken),
+            "is_refusal": self.is_refusal,
+            "stopped": None
+            if stopped is None
+            else {
+                "code": stopped.code,
+                "reason": words(stopped.reason),
+                "remedy": words(stopped.remedy),
+            },
+            "hour": _counted(self.output.hour, words),
+            "shift": _counted(self.output.shift, words),
+            "first": "-"
+            if self.output.first_pass_share is None
+            else f"{int(self.output.first_pass_share * 1000) / 10:g} %",
+            "causes": [f"{code} {count}" for code, count in self.output.causes],
+            "health": [
+                {"name": words(check.name), "is_good": check.is_good, "text": words(check.text)}
+                for check in self.health.checks
+            ],
+        }
+
+
+def _counted(count: tuple[int, int], words: Words) -> str:
+    return words(say("{good} good, {bad} bad"), good=count[0], bad=count[1])
+
+
+def _left(left_s: float, words: Words) -> str:
+    whole = round(max(left_s, 0.0))
+    text = f"{whole} s" if whole < 100 else f"{whole // 60}:{whole % 60:02d} min"
+    return words(say("{time} left"), time=text)
+
+
+class Screen:
+    """What the page shows, from the events of a station. Its methods are called in the station's
+    thread.
+    """
+
+    def __init__(self, tally: Tally, watch: Watch) -> None:
+        self.feed = Feed(time.monotonic, silence_limit_s=SILENCE_LIMIT_S)
+        self._tally = tally
+        self._watch = watch
+        self._turned_at = float("-inf")
+        self._passed: dict[str, RunEnded] = {}
+        """Runs that ended with PASS, whose units are in their sockets."""
+
+    def show(self, event: StationEvent, board: Board) -> None:
+        """The board after it has applied an event."""
+        if isinstance(event, RunEnded):
+            at = datetime.fromisoformat(event.at) if event.at else datetime.now(UTC)
+            self._tally.add(EndedRun(at, event.serial, event.outcome, event.code))
+            self._passed.pop(event.socket, None)
+            if event.outcome.value == SocketState.PASS.value:
+                self._passed[event.socket] = event
+        socket = getattr(event, "socket", "")
+        for name in (socket,) if socket in board.rows else tuple(board.rows):
+            self._put(name, board.rows[name])
+
+    def _put(self, name: str, row: Row) -> None:
+        state, passed = row.state, self._passed.get(name)
+        if state is SocketState.PASS and (passed is None or passed.serial != row.serial):
+            state = SocketState.SAVING
+        tile = Tile(Row(**vars(row)), state)
+        word = (state, row.serial, row.code, row.note, row.step)
+        self.feed.put(f"socket {name}", tile, word=word)
+
+    def turn(self, board: Board, *, station: tuple[str, str, str], operator: str, lot: Lot) -> None:
+        """Once in each turn of the station's loop. `station`: its name, recipe and part."""
+        self.feed.beat()
+        now = time.monotonic()
+        if now - self._turned_at < HEAD_EVERY_S:
+            return
+        self._turned_at = now
+        head = Head(
+            *station,
+            operator,
+            lot,
+            board.virtual_words,
+            self._tally.output(datetime.now().astimezone()),
+            self._watch.look(records_fault=board.records_fault),
+            board.stopped,
+            board.said,
+            board.is_refusal,
+        )
+        self.feed.put(_HEAD, head, word=(head.stopped, head.spoken))
+
+
+class OperatorPage:
+    """The routes of the page. `submit` hands a scan to the station."""
+
+    def __init__(self, pages: Pages, feed: Feed, submit: Callable[[str], None]) -> None:
+        self._pages = pages
+        self._feed = feed
+        self._submit = submit
+
+    @property
+    def routes(self) -> list[BaseRoute]:
+        return [
+            Route("/", self._start),
+            Route("/line", self._page),
+            Route("/line/events", self._events),
+            Route("/line/scan", self._scan, methods=["POST"]),
+        ]
+
+    async def _start(self, request: Request) -> Response:
+        query = f"?{request.url.query}" if request.url.query else ""
+        return RedirectResponse(f"/line{query}", 303)
+
+    async def _page(self, request: Request) -> Response:
+        return self._pages.show(request, "line.html")
+
+    async def _events(self, request: Request) -> Response:
+        words = self._pages.words_of(request)
+        return StreamingResponse(
+            _stream(self._feed, words),
+            media_type="text/event-stream",
+            headers={"x-accel-buffering": "no"},
+        )
+
+    async def _scan(self, request: Request) -> Response:
+        try:
+            said = json.loads(await request.body())
+            text = said["text"]
+        except (ValueError, TypeError, KeyError):
+            return JSONResponse({"error": "no scan"}, 400)
+        if not isinstance(text, str) or not text.strip() or len(text) > SCAN_MAX:
+            return JSONResponse({"error": "no scan"}, 400)
+        # The station answers it by an event, which every page shows.
+        await asyncio.to_thread(self._submit, text)
+        return JSONResponse({})
+
+
+async def _stream(feed: Feed, words: Words) -> AsyncIterator[str]:
+    yield "retry: 500\n\n"
+    async for batch in feed.follow():
+        message: dict[str, Any] = {}
+        if batch.is_all:
+            message["all"] = True
+        tiles = [state.said(words) for _, state in batch.changes if isinstance(state, Tile)]
+        heads = [state for _, state in batch.changes if isinstance(state, Head)]
+        if tiles:
+            message["tiles"] = tiles
+        if heads:
+            message["head"] = heads[-1].said(words)
+        yield f"data: {json.dumps(message, ensure_ascii=False)}\n\n"

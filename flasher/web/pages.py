@@ -1,0 +1,45 @@
+"""From data to a page: the templates of `flasher.report` and those of this package, with escaping,
+the language and the session's token.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from jinja2 import ChoiceLoader, Environment, PackageLoader
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response
+
+from flasher import __version__
+from flasher.report.base import environment
+from flasher.web.words import NAMES, Words, chosen
+
+
+class Pages:
+    """Renders pages. `language`: of who did not choose one; None: what the browser asks for."""
+
+    def __init__(self, language: str | None = None) -> None:
+        self._language = language
+        self._environment: Environment = environment(
+            ChoiceLoader([PackageLoader("flasher.web"), PackageLoader("flasher.report")])
+        )
+
+    def words_of(self, request: Request) -> Words:
+        """The language of a request."""
+        accepted = request.headers.get("accept-language", "").replace(" ", "").split(",")
+        return chosen(request.query_params.get("lang") or self._language, accepted)
+
+    def show(
+        self, request: Request, template: str, *, status: int = 200, **context: Any
+    ) -> Response:
+        """A page. Templates know `_` (the language), `token`, `languages` and `version`."""
+        words = self.words_of(request)
+        text = self._environment.get_template(template).render(
+            _=words,
+            lang=words.code,
+            languages=NAMES,
+            token=request.session.get("token", ""),
+            version=__version__,
+            **context,
+        )
+        return HTMLResponse(text, status)

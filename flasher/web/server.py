@@ -1,0 +1,89 @@
+"""A web server in a thread of its own, for the life of a program."""
+
+from __future__ import annotations
+
+import socket
+import threading
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Final, NamedTuple
+
+import uvicorn
+
+from flasher.errors import UsageError
+from flasher.protocol.text import printable
+
+LOOPBACK: Final = frozenset({"127.0.0.1", "::1", "localhost"})
+"""Addresses that no other computer reaches."""
+_END_LIMIT_S: Final = 1.0
+"""Streams that are still open are cut after this time."""
+
+
+class Tls(NamedTuple):
+    """Files of a certificate and its key (PEM)."""
+
+    certificate: Path
+    key: Path
+
+
+class Server:
+    """Serves an ASGI application while the block runs; `url` is its address, with the port that it
+    got. Raises UsageError for an address that cannot be used.
+    """
+
+    def __init__(self, app: Any, host: str, port: int, tls: Tls | None = None) -> None:
+        self._listener = _listen(host, port)
+        scheme, name = "http" if tls is None else "https", f"[{host}]" if ":" in host else host
+        self.url = f"{scheme}://{name}:{self._listener.getsockname()[1]}/"
+        config = uvicorn.Config(
+            app,
+            log_config=None,
+            access_log=False,
+            lifespan="off",
+            server_header=False,
+            timeout_graceful_shutdown=1,
+            h11_max_incomplete_event_size=16 * 1024,
+            limit_concurrency=200,
+            ssl_certfile=None if tls is None else str(tls.certificate),
+            ssl_keyfile=None if tls is None else str(tls.key),
+        )
+        try:
+            config.load()
+        except (OSError, ValueError) as error:  # no file, or no certificate
+            self._listener.close()
+            raise UsageError(
+                f"The certificate or its key cannot be used: {printable(str(error))}",
+                remedy="Give the certificate and its key as PEM files.",
+            ) from error
+        self._server = uvicorn.Server(config)
+        self._thread = threading.Thread(
+            target=self._server.run, args=([self._listener],), name="web", daemon=True
+        )
+
+    def __enter__(self) -> Server:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        _kind: type[BaseException] | None,
+        _error: BaseException | None,
+        _trace: TracebackType | None,
+    ) -> None:
+        self._server.should_exit = True
+        self._thread.join(_END_LIMIT_S)
+        self._server.force_exit = True
+        self._thread.join(_END_LIMIT_S)
+        self._listener.close()
+
+
+def _listen(host: str, port: int) -> socket.socket:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    try:
+        return socket.create_server((host, port), family=family)
+    except OSError as error:
+        raise UsageError(
+            f"Port {port} of {printable(host)} cannot be used: {error.strerror or error}.",
+            cause="another program uses it, or the address is none of this computer",
+            remedy="Give another port, or 0 for any.",
+        ) from error

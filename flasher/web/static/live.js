@@ -1,0 +1,60 @@
+"use strict";
+// The stream of a page, and its dead man's switch. The cover of the page is let down by an animation
+// of the style sheet three seconds after the last message; only a message puts it off. It needs no
+// script to come down: neither a lost connection, a dead station nor a broken script leaves an old
+// state in sight.
+
+const token = document.querySelector("meta[name=flasher-token]").content;
+const byId = (id) => document.getElementById(id);
+
+function follow(path, apply) {
+  let source;
+  let beats = 0;
+  let opened = 0;
+  const isHeard = () => {
+    document.body.dataset.beat = beats = 1 - beats;
+    document.body.classList.remove("lost");
+  };
+  const isLost = () => document.body.classList.add("lost");
+  const open = () => {
+    opened = Date.now();
+    source = new EventSource(path);
+    source.onmessage = (event) => {
+      apply(JSON.parse(event.data));
+      isHeard();
+    };
+    source.onerror = () => {
+      isLost();
+      if (source.readyState === EventSource.CLOSED) {
+        setTimeout(again, 1000);
+      }
+    };
+  };
+  // An answer that is no stream ends it: the password is wanted again, or the server is starting.
+  const again = async () => {
+    const answer = await fetch(location.href, { method: "HEAD" }).catch(() => null);
+    if (answer && answer.redirected) {
+      location.reload();
+    }
+    open();
+  };
+  open();
+  // A browser may stop pages that nobody sees; what it kept is old when somebody looks again.
+  addEventListener("pageshow", (event) => event.persisted && (isLost(), source.close(), open()));
+  return () => Date.now() - opened;
+}
+
+async function post(path, body) {
+  const answer = await fetch(path, {
+    method: "POST",
+    headers: { "content-type": "application/json", "x-flasher-token": token },
+    body: JSON.stringify(body),
+  });
+  if (answer.status === 403) {
+    location.reload(); // the server was started anew, with other tokens
+  }
+  if (!answer.ok) {
+    throw new Error(String(answer.status));
+  }
+  return answer.json();
+}

@@ -1,0 +1,54 @@
+"""The languages of the pages: catalogues of Babel in `locale`, by their English sentences."""
+
+from __future__ import annotations
+
+import gettext
+import io
+from collections.abc import Callable, Iterable
+from functools import cache
+from importlib import resources
+from typing import Final
+
+from babel.messages.mofile import write_mo
+from babel.messages.pofile import read_po
+
+from flasher.said import in_language
+
+NAMES: Final = {"en": "English", "de": "Deutsch", "zh": "\u4e2d\u6587"}
+"""The languages by their codes, each by its own name. English needs no catalogue."""
+
+
+class Words:
+    """One language. `code` is what a page's `lang` attribute has."""
+
+    def __init__(self, code: str, translate: Callable[[str], str]) -> None:
+        self.code = code
+        self._translate = translate
+
+    def __call__(self, text: str, **values: object) -> str:
+        """A text of a page or of the station in this language; `values` for a page's own."""
+        said = in_language(text, self._translate)
+        return said.format(**values) if values else said
+
+
+@cache
+def words(code: str) -> Words:
+    """The language of a code. Raises KeyError for one that there is not."""
+    if code not in NAMES:
+        raise KeyError(code)
+    if code == "en":
+        return Words(code, str)
+    source = resources.files("flasher.web").joinpath("locale", f"{code}.po")
+    compiled = io.BytesIO()
+    with source.open("rb") as file:
+        write_mo(compiled, read_po(file, locale=code))
+    compiled.seek(0)
+    return Words(code, gettext.GNUTranslations(compiled).gettext)
+
+
+def chosen(wanted: str | None, accepted: Iterable[str]) -> Words:
+    """The language that an address asks for, else the first that the browser takes."""
+    for code in (wanted or "", *accepted):
+        if code.split("-")[0].lower() in NAMES:
+            return words(code.split("-")[0].lower())
+    return words("en")

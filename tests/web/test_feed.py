@@ -1,0 +1,130 @@
+"""States reach a page whole, in order, and none that somebody must see is left out."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from typing import Any
+
+import pytest
+
+from flasher.web import feed as module
+from flasher.web.feed import Batch, Feed
+
+
+@pytest.fixture(autouse=True)
+def _at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "GATHER_S", 0.0)
+    monkeypatch.setattr(module, "BEAT_S", 0.01)
+
+
+class Clock:
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def _followed(feed: Feed, *steps: Any) -> list[Batch]:
+    """What a page gets: one batch at its start, and one after each step."""
+
+    async def follow() -> list[Batch]:
+        stream: AsyncIterator[Batch] = feed.follow()
+        batches = [await anext(stream)]
+        for step in steps:
+            step()
+            batches.append(await anext(stream))
+        return batches
+
+    return asyncio.run(follow())
+
+
+def _feed() -> Feed:
+    return Feed(Clock(), silence_limit_s=1.0)
+
+
+def test_a_page_that_connects_gets_all_states() -> None:
+    feed = _feed()
+    feed.put("A", 1, word="empty")
+    feed.put("B", 2, word="empty")
+    feed.put("A", 3, word="pass")
+    (first,) = _followed(feed)
+    assert first == Batch((("A", 3), ("B", 2)), is_all=True)
+
+
+def test_a_change_of_the_word_is_never_left_out() -> None:
+    feed = _feed()
+
+    def change() -> None:
+        for word in ("running", "saving", "pass", "empty"):
+            feed.put("A", word.upper(), word=word)
+
+    _, then = _followed(feed, change)
+    assert [state for _, state in then.changes] == ["RUNNING", "SAVING", "PASS", "EMPTY"]
+
+
+def test_of_mere_progress_the_newest_is_sent() -> None:
+    feed = _feed()
+
+    def change() -> None:
+        for share in (0.1, 0.2, 0.3):
+            feed.put("A", share, word="running")
+
+    _, then = _followed(feed, change)
+    assert then.changes == (("A", 0.3),)
+
+
+def test_what_did_not_change_is_not_sent_again() -> None:
+    feed = _feed()
+    feed.put("A", 1, word="empty")
+    _, then = _followed(feed, lambda: feed.put("A", 1, word="empty"))
+    assert then == Batch(())
+
+
+def test_without_changes_there_are_beats() -> None:
+    _, second, third = _followed(_feed(), lambda: None, lambda: None)
+    assert second == third == Batch(())
+
+
+def test_a_page_that_is_too_slow_gets_all_states_anew(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "PENDING_MAX", 3)
+    feed = _feed()
+    feed.put("B", 0, word=0)
+
+    def change() -> None:
+        for number in range(1, 10):
+            feed.put("A", number, word=number)
+
+    _, then = _followed(feed, change)
+    assert then == Batch((("B", 0), ("A", 9)), is_all=True)
+
+
+def test_a_program_that_hangs_is_not_vouched_for() -> None:
+    """No beat comes from a server whose program does not turn: pages must not look alive."""
+    clock = Clock()
+    feed = Feed(clock, silence_limit_s=1.0)
+    clock.now = 5.0
+
+    async def follow() -> tuple[bool, Batch]:
+        waiting = asyncio.ensure_future(anext(feed.follow()))
+        heard, _ = await asyncio.wait({waiting}, timeout=0.1)
+        feed.put("A", 1, word=1)  # something may come from another thread
+        feed.beat()
+        return bool(heard), await waiting
+
+    was_heard, then = asyncio.run(follow())
+    assert not was_heard
+    assert then.changes == (("A", 1),)
+
+
+def test_a_closed_feed_ends_its_streams() -> None:
+    feed = _feed()
+
+    async def follow() -> int:
+        count = 0
+        async for _ in feed.follow():
+            count += 1
+            feed.close()
+        return count
+
+    assert asyncio.run(follow()) == 1
