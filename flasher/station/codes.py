@@ -9,11 +9,12 @@ from collections.abc import Mapping
 from typing import Final, NamedTuple
 
 from flasher.host.table import Ending
+from flasher.said import say
 from flasher.station.records.model import RunState
 
-_NEXT: Final = "Take the unit out."
-_REPAIR: Final = "Put the unit aside as bad, with this code on its tag."
-_TECHNICIAN: Final = "Call the technician; the unit is not judged."
+_NEXT: Final = say("Take the unit out.")
+_REPAIR: Final = say("Put the unit aside as bad, with this code on its tag.")
+_TECHNICIAN: Final = say("Call the technician; the unit is not judged.")
 
 
 class Code(NamedTuple):
@@ -35,96 +36,108 @@ def _error(name: str, meaning: str, action: str = _TECHNICIAN, *, may_retry: boo
 
 
 OK: Final = Code(
-    "OK", RunState.PASS, "done and verified as the recipe asks", _NEXT, may_retry=False
+    "OK", RunState.PASS, say("done and verified as the recipe asks"), _NEXT, may_retry=False
 )
 OPERATOR_ABORT: Final = Code(
     "OPERATOR_ABORT",
     RunState.ABORTED,
-    "a person stopped the run",
-    "Scan the unit again to finish it.",
+    say("a person stopped the run"),
+    say("Scan the unit again to finish it."),
     may_retry=False,
 )
 
 # -- the unit -------------------------------------------------------------------------------------
 
 NO_ANSWER: Final = _fail(
-    "NO_ANSWER", "the unit does not answer", "Check its plug and its key, then scan it again."
+    "NO_ANSWER",
+    say("the unit does not answer"),
+    say("Check its plug and its key, then scan it again."),
 )
 WRONG_HARDWARE: Final = _fail(
     "WRONG_HARDWARE",
-    "the hardware is not one that the recipe lists",
-    "Put the unit aside: it belongs to another recipe.",
+    say("the hardware is not one that the recipe lists"),
+    say("Put the unit aside: it belongs to another recipe."),
     may_retry=False,
 )
 OLD_VERSION: Final = _fail(
     "OLD_VERSION",
-    "the version that runs now must not be replaced by this one",
-    "Put the unit aside: it belongs to another recipe.",
+    say("the version that runs now must not be replaced by this one"),
+    say("Put the unit aside: it belongs to another recipe."),
     may_retry=False,
 )
 IN_USE: Final = _fail(
-    "IN_USE", "the battery gives current", "Switch its loads off, then scan again."
+    "IN_USE", say("the battery gives current"), say("Switch its loads off, then scan again.")
 )
 NOT_FOR_DEVICE: Final = _fail(
     "NOT_FOR_DEVICE",
-    "the image is not meant for this device, or its bootloader is not the right one",
-    "Put the unit aside: it belongs to another recipe.",
+    say("the image is not meant for this device, or its bootloader is not the right one"),
+    say("Put the unit aside: it belongs to another recipe."),
     may_retry=False,
 )
-NO_BOOTLOADER: Final = _fail("NO_BOOTLOADER", "its bootloader does not announce itself")
-ERASE_FAILED: Final = _fail("ERASE_FAILED", "the bootloader does not begin the transfer")
-TRANSFER_FAILED: Final = _fail("TRANSFER_FAILED", "the transfer failed")
-REFUSED: Final = _fail("REFUSED", "the device refused the image at the end", may_retry=False)
-UNCONFIRMED: Final = _fail("UNCONFIRMED", "the final answer of the bootloader never came")
-OTHER_VERSION: Final = _fail("OTHER_VERSION", "the device runs another version than it was given")
-NOT_RUNNING: Final = _fail("NOT_RUNNING", "the new application does not answer")
-MEMORY_DIFFERS: Final = _fail("MEMORY_DIFFERS", "the memory differs from the image")
-WRITE_FAILED: Final = _fail("WRITE_FAILED", "the device does not confirm a write")
-WRITE_DIFFERS: Final = _fail("WRITE_DIFFERS", "a field reads back differently than written")
-CHANGED: Final = _fail("CHANGED", "a field that must not change has changed", may_retry=False)
+NO_BOOTLOADER: Final = _fail("NO_BOOTLOADER", say("its bootloader does not announce itself"))
+ERASE_FAILED: Final = _fail("ERASE_FAILED", say("the bootloader does not begin the transfer"))
+TRANSFER_FAILED: Final = _fail("TRANSFER_FAILED", say("the transfer failed"))
+REFUSED: Final = _fail("REFUSED", say("the device refused the image at the end"), may_retry=False)
+UNCONFIRMED: Final = _fail("UNCONFIRMED", say("the final answer of the bootloader never came"))
+OTHER_VERSION: Final = _fail(
+    "OTHER_VERSION", say("the device runs another version than it was given")
+)
+NOT_RUNNING: Final = _fail("NOT_RUNNING", say("the new application does not answer"))
+MEMORY_DIFFERS: Final = _fail("MEMORY_DIFFERS", say("the memory differs from the image"))
+WRITE_FAILED: Final = _fail("WRITE_FAILED", say("the device does not confirm a write"))
+WRITE_DIFFERS: Final = _fail("WRITE_DIFFERS", say("a field reads back differently than written"))
+CHANGED: Final = _fail("CHANGED", say("a field that must not change has changed"), may_retry=False)
 UNCHANGED_UNKNOWN: Final = _fail(
     "UNCHANGED_UNKNOWN",
-    "a field that must not change could not be read before the first write",
-    "Put the unit aside: nothing was written, but it has no application to read from.",
+    say("a field that must not change could not be read before the first write"),
+    say("Put the unit aside: nothing was written, but it has no application to read from."),
     may_retry=False,
 )
-LIMIT: Final = _fail("LIMIT", "a measurement is out of its limits")
-TOO_SLOW: Final = _fail("TOO_SLOW", "a step took longer than the recipe allows")
-NO_RESTART: Final = _fail("NO_RESTART", "the device did not restart")
+LIMIT: Final = _fail("LIMIT", say("a measurement is out of its limits"))
+TOO_SLOW: Final = _fail("TOO_SLOW", say("a step took longer than the recipe allows"))
+NO_RESTART: Final = _fail("NO_RESTART", say("the device did not restart"))
 
 # -- the station ----------------------------------------------------------------------------------
 
 WRONG_UNIT: Final = _error(
     "WRONG_UNIT",
-    "the unit's own serial number is not the one on the label",
-    "Compare label and unit: scan the label of the unit that is in the socket.",
+    say("the unit's own serial number is not the one on the label"),
+    say("Compare label and unit: scan the label of the unit that is in the socket."),
 )
 TWO_DEVICES: Final = _error(
-    "TWO_DEVICES", "two devices of one kind answer", "Connect one unit to this socket only."
+    "TWO_DEVICES",
+    say("two devices of one kind answer"),
+    say("Connect one unit to this socket only."),
 )
 SECOND_TOOL: Final = _error(
-    "SECOND_TOOL", "a second tool speaks on the bus", "Disconnect the other tool, then scan again."
+    "SECOND_TOOL",
+    say("a second tool speaks on the bus"),
+    say("Disconnect the other tool, then scan again."),
 )
 BUS: Final = _error(
     "BUS",
-    "the adapter or the bus failed",
-    "Check the plugs of adapter and unit, then scan again.",
+    say("the adapter or the bus failed"),
+    say("Check the plugs of adapter and unit, then scan again."),
     may_retry=True,
 )
-POWER: Final = _error("POWER", "the power command failed", may_retry=True)
+POWER: Final = _error("POWER", say("the power command failed"), may_retry=True)
 CANNOT_VERIFY: Final = _error(
-    "CANNOT_VERIFY", "a target cannot be asked, so it cannot be verified without a new flash"
+    "CANNOT_VERIFY", say("a target cannot be asked, so it cannot be verified without a new flash")
 )
-RECIPE: Final = _error("RECIPE", "the recipe does not fit its own images or this unit")
-RECORD_NOT_SAVED: Final = _error("RECORD_NOT_SAVED", "the records could not be written")
-TRACE_NOT_SAVED: Final = _error("TRACE_NOT_SAVED", "the trace of the bus could not be written")
+RECIPE: Final = _error("RECIPE", say("the recipe does not fit its own images or this unit"))
+RECORD_NOT_SAVED: Final = _error("RECORD_NOT_SAVED", say("the records could not be written"))
+TRACE_NOT_SAVED: Final = _error("TRACE_NOT_SAVED", say("the trace of the bus could not be written"))
 PROCESS_DIED: Final = _error(
-    "PROCESS_DIED", "the process of the socket ended", "Scan the unit again; it is not judged."
+    "PROCESS_DIED",
+    say("the process of the socket ended"),
+    say("Scan the unit again; it is not judged."),
 )
 PROCESS_HUNG: Final = _error(
-    "PROCESS_HUNG", "the process of the socket hung", "Scan the unit again; it is not judged."
+    "PROCESS_HUNG",
+    say("the process of the socket hung"),
+    say("Scan the unit again; it is not judged."),
 )
-INTERNAL: Final = _error("INTERNAL", "an internal error: a bug of flasher")
+INTERNAL: Final = _error("INTERNAL", say("an internal error: a bug of flasher"))
 
 CODES: Final[Mapping[str, Code]] = {
     value.name: value for value in tuple(globals().values()) if isinstance(value, Code)

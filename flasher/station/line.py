@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, Final
 
 from flasher.protocol.text import printable
+from flasher.said import say
 from flasher.station import codes
 from flasher.station.events import (
     LineResumed,
@@ -62,6 +63,9 @@ REACH_S: Final = 2.0
 IDENTIFY_S: Final = 3.0
 """A unit with an application reports its serial number within this time after power-on."""
 _RESUME: Final = Word.RESUME.value.lower()
+_FORGOTTEN: Final = "FORGOTTEN"
+_AGAIN: Final = say("Scan it again.")
+_NOTHING: Final = say("Nothing to do.")
 
 
 # -- inputs and effects ---------------------------------------------------------------------------
@@ -226,8 +230,9 @@ class Line:
     def _down(self, socket: Socket, what: AdapterDown, now: float) -> None:
         if socket.can_work or not socket.out_since_s:
             socket.out_since_s = now
-        socket.out_of_service = what.reason or "It cannot work."
-        self._drop_label(socket, f"Socket {socket.name} is out of service.", "when it works again")
+        socket.out_of_service = what.reason or say("It cannot work.")
+        reason = say("Socket {socket} is out of service.", socket=socket.name)
+        self._drop_label(socket, reason, say("Scan it again when it works again."))
         # What happens in it cannot be seen now. What was silent before stays doubtful.
         socket.own, socket.is_own_known = None, False
         if socket.occupancy is not Occupancy.SILENT:
@@ -263,18 +268,22 @@ class Line:
             socket.begin_at_s = None  # the one that arrived was not the one
         else:
             # It was meant for the unit that was there.
-            self._drop_label(socket, "Its unit is not heard any more.", "when it is connected")
+            reason = say("Its unit is not heard any more.")
+            self._drop_label(socket, reason, say("Scan it again when it is connected."))
 
     def _arrived_where_named(self, socket: Socket, borne: str, now: float) -> None:
         if not borne and now < socket.bound_at_s + REACH_S:
             self._drop_label(
                 socket,
-                f"A unit was in socket {socket.name} already.",
-                "with the card of its socket",
+                say("A unit was in socket {socket} already.", socket=socket.name),
+                say("Scan it again with the card of its socket."),
             )
         elif borne and borne != socket.label:
-            label, reason = socket.let_go(), f"The unit in socket {socket.name} bears {borne}."
-            self._refuse(label, "OTHER_UNIT", reason, f"Scan {borne}.", socket)
+            reason = say(
+                "The unit in socket {socket} bears {label}.", socket=socket.name, label=borne
+            )
+            remedy = say("Scan {label}.", label=borne)
+            self._refuse(socket.let_go(), "OTHER_UNIT", reason, remedy, socket)
         else:
             # It may be one that woke up: it is asked who it is before anything begins.
             socket.begin_at_s = now if borne else now + IDENTIFY_S
@@ -284,9 +293,12 @@ class Line:
             (e for e in self.sockets.values() if e.label and e.binding is Binding.NAMED), None
         )
         if named is not None and socket.awaits_label:
-            text = (
-                f"Wrong socket: {printable(named.label)} goes into socket {named.name}. "
-                f"If it stays here, scan SOCKET {socket.name}, then its label."
+            text = say(
+                "Wrong socket: {label} goes into socket {socket}. If it stays here, scan SOCKET"
+                " {here}, then its label.",
+                label=printable(named.label),
+                socket=named.name,
+                here=socket.name,
             )
             self._tell(OperatorPrompted(socket.name, text))
 
@@ -301,7 +313,7 @@ class Line:
     def _not_claimed(self, socket: Socket, what: NotClaimed, _now: float) -> None:
         serial, socket.phase, socket.serial = socket.serial, Phase.REST, ""
         self._refuse(serial, what.code, what.reason, what.remedy, socket)
-        socket.note = f"{what.reason} {what.remedy}"
+        socket.note = say("{reason} {remedy}", reason=what.reason, remedy=what.remedy)
         if what.stops_line:
             self.stop(what.code, what.reason, what.remedy)
 
@@ -351,14 +363,14 @@ class Line:
                 if was_refused:
                     raise Refused(
                         "NO_SOCKET",
-                        "The socket that was scanned before it cannot take it.",
-                        "Scan the card of a socket that can, then the label again.",
+                        say("The socket that was scanned before it cannot take it."),
+                        say("Scan the card of a socket that can, then the label again."),
                     )
                 return "label", self._take_label(serial, now)
             case Command(word, argument):
                 return word.value.lower(), self._COMMANDS[word](self, argument, now)
             case NotUnderstood(why):
-                raise Refused("NOT_UNDERSTOOD", why, "Scan the label again.")
+                raise Refused("NOT_UNDERSTOOD", why, say("Scan the label again."))
 
     def _take_label(self, serial: str, now: float) -> Socket | None:
         """The socket that a label is for; None while it waits for one. Raises Refused."""
@@ -399,8 +411,9 @@ class Line:
 
     def _check_line(self) -> None:
         if self.stopped is not None:
-            reason = f"The line stands: {self.stopped.reason}"
-            raise Refused("LINE_STOPPED", reason, f"{self.stopped.remedy} Then scan RESUME.")
+            reason = say("The line stands: {reason}", reason=self.stopped.reason)
+            remedy = say("{remedy} Then scan RESUME.", remedy=self.stopped.remedy)
+            raise Refused("LINE_STOPPED", reason, remedy)
 
     def _check_label(self, serial: str) -> None:
         """Raises Refused for what is no label of this recipe, or can be run by nobody now."""
@@ -410,23 +423,27 @@ class Line:
         except ValueError as error:
             raise Refused(
                 Refusal.WRONG_SERIAL.value,
-                f"No serial number of this recipe: {error}.",
-                "Scan the label of the unit.",
+                say("No serial number of this recipe: {why}.", why=str(error)),
+                say("Scan the label of the unit."),
             ) from error
         check_known(self.sockets, serial)
 
     def _keep_waiting(self, serial: str, now: float) -> None:
         if not any(each.can_work for each in self.sockets.values()):
             raise Refused(
-                "SOCKET_BROKEN", "No socket works.", "Mend one of them, then scan it again."
+                "SOCKET_BROKEN",
+                say("No socket works."),
+                say("Mend one of them, then scan it again."),
             )
         self._label, self._forget_at_s = serial, now + self._scan_limit_s
         shown, before = printable(serial), was_in(self.sockets, serial)
-        words = f"Scan the card of the socket that {shown} is in, or goes into."
+        words = say("Scan the card of the socket that {label} is in, or goes into.", label=shown)
         if before is not None:
-            words = (
-                f"{shown} was in socket {before.name}. "
-                f"If it is still there, scan SOCKET {before.name}; else the card of its socket."
+            words = say(
+                "{label} was in socket {socket}. If it is still there, scan SOCKET {socket}; else"
+                " the card of its socket.",
+                label=shown,
+                socket=before.name,
             )
         self._tell(OperatorPrompted("", words))
 
@@ -455,14 +472,15 @@ class Line:
     def _named(self, name: str) -> Socket:
         found = next((e for e in self.sockets.values() if e.name.lower() == name.lower()), None)
         if found is None:
-            remedy = f"There are: {', '.join(self.sockets)}."
-            raise Refused("NO_SUCH_SOCKET", "There is no such socket.", remedy)
+            remedy = say("There are: {sockets}.", sockets=", ".join(self.sockets))
+            raise Refused("NO_SUCH_SOCKET", say("There is no such socket."), remedy)
         return found
 
     def _abort(self, argument: str, _now: float) -> Socket:
         socket = self._named(argument)
         if socket.phase is not Phase.RUN:
-            raise Refused("NOT_RUNNING", f"Nothing runs in socket {socket.name}.", "Nothing to do.")
+            reason = say("Nothing runs in socket {socket}.", socket=socket.name)
+            raise Refused("NOT_RUNNING", reason, _NOTHING)
         self._audit(AuditEvent.ABORT, socket=socket.name, serial=socket.serial)
         self._effects.append(AbortRun(socket.name))
         return socket
@@ -470,7 +488,8 @@ class Line:
     def _free(self, argument: str, _now: float) -> Socket:
         socket = self._named(argument)
         check_free(socket)
-        self._drop_label(socket, f"Socket {socket.name} is free.", "when it is connected")
+        reason = say("Socket {socket} is free.", socket=socket.name)
+        self._drop_label(socket, reason, say("Scan it again when it is connected."))
         socket.last, socket.is_last_there, socket.interrupted, socket.note = None, False, "", ""
         if socket.can_work and not (socket.is_there and socket.sees_units):
             socket.occupancy = Occupancy.EMPTY
@@ -496,7 +515,7 @@ class Line:
 
     def _resume(self, _argument: str, _now: float) -> None:
         if self.stopped is None:
-            raise Refused("NOT_STOPPED", "The line is not stopped.", "Nothing to do.")
+            raise Refused("NOT_STOPPED", say("The line is not stopped."), _NOTHING)
         self._audit(AuditEvent.RESUME, code=self.stopped.code)
         unsaved = [each.name for each in self.sockets.values() if each.phase is Phase.SAVE]
         self._effects.append(SaveAgain(tuple(unsaved)))
@@ -510,7 +529,10 @@ class Line:
             self._tell(LineResumed())
         else:
             self._refuse(
-                word, "STILL_NOT_SAVED", "It still cannot be saved.", "Mend the cause first."
+                word,
+                "STILL_NOT_SAVED",
+                say("It still cannot be saved."),
+                say("Mend the cause first."),
             )
         self._go_on(now)
 
@@ -519,16 +541,18 @@ class Line:
     def tick(self, now: float) -> None:
         if self._forget_at_s is not None and now >= self._forget_at_s:
             if self._label:
-                reason = "No card of a socket was scanned for it."
-                self._refuse(self._label, "FORGOTTEN", reason, "Scan it again.")
+                reason = say("No card of a socket was scanned for it.")
+                self._refuse(self._label, _FORGOTTEN, reason, _AGAIN)
             elif self._chosen is not None:
                 text = f"SOCKET {self._chosen.name}"
-                self._refuse(text, "FORGOTTEN", "No label was scanned for it.", "Scan it again.")
+                reason = say("No label was scanned for it.")
+                self._refuse(text, _FORGOTTEN, reason, _AGAIN)
             self._forget_scans()
         for socket in self.sockets.values():
             waits = socket.label and socket.begin_at_s is None and socket.phase is Phase.REST
             if waits and now >= socket.bound_at_s + self._scan_limit_s:
-                self._drop_label(socket, "Its unit did not come.", "with its unit")
+                reason = say("Its unit did not come.")
+                self._drop_label(socket, reason, say("Scan it again with its unit."))
         self._go_on(now)
 
     def _go_on(self, now: float) -> None:
@@ -561,16 +585,16 @@ class Line:
         elif why is Binding.SAID or (why is Binding.ONLY and was_here):
             socket.begin_at_s = now + self._arrival_limit_s
 
-    def _drop_label(self, socket: Socket, reason: str, when: str) -> None:
+    def _drop_label(self, socket: Socket, reason: str, remedy: str) -> None:
         label = socket.let_go()
         if label:
-            self._refuse(label, "FORGOTTEN", reason, f"Scan it again {when}.", socket)
+            self._refuse(label, _FORGOTTEN, reason, remedy, socket)
 
     def _forget_scans(self) -> None:
         if self._chosen is not None:
             self._chosen.is_chosen = False
-            why = f"SOCKET {self._chosen.name} was scanned, and not its label."
-            self._drop_label(self._chosen, why, "with the card")
+            why = say("SOCKET {socket} was scanned, and not its label.", socket=self._chosen.name)
+            self._drop_label(self._chosen, why, say("Scan it again with the card."))
         self._label, self._chosen, self._forget_at_s = "", None, None
 
     def stop(self, code: str, reason: str, remedy: str) -> None:
@@ -580,10 +604,11 @@ class Line:
         self.stopped = LineStopped(code, reason, remedy)
         self._tell(self.stopped)
         if self._label:
-            self._refuse(self._label, "FORGOTTEN", "The line was stopped.", "Scan it again.")
+            self._refuse(self._label, _FORGOTTEN, say("The line was stopped."), _AGAIN)
         self._forget_scans()
         for socket in self.sockets.values():
-            self._drop_label(socket, "The line was stopped.", "when it goes on")
+            remedy = say("Scan it again when it goes on.")
+            self._drop_label(socket, say("The line was stopped."), remedy)
 
     def _is_serial(self, text: str) -> bool:
         try:

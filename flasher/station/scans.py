@@ -28,6 +28,7 @@ from enum import StrEnum
 from typing import Final
 
 from flasher.protocol.text import printable
+from flasher.said import say
 from flasher.station import codes
 from flasher.station.pattern import TEXT_MAX
 from flasher.station.records.errors import Refusal
@@ -80,23 +81,25 @@ def understand(text: str) -> Label | Command | NotUnderstood:
     """Parse a scan. Whether a label fits the recipe is checked later."""
     scanned = text.strip()
     if not scanned:
-        return NotUnderstood("Nothing was scanned.")
+        return NotUnderstood(say("Nothing was scanned."))
     if not scanned.isprintable() or len(scanned) > _COMMAND_MAX:
-        return NotUnderstood("It holds characters that no label has, or too many.")
+        return NotUnderstood(say("It holds characters that no label has, or too many."))
     first, _, rest = scanned.partition(" ")
     word = next((each for each in Word if each.value == first.upper()), None)
     if word is not None and (word in ALONE) == (not rest.strip()):
         return Command(word, rest.strip())
     if word is not None:
         return NotUnderstood(
-            f"{word.value} stands alone." if word in ALONE else f"{word.value} what?"
+            say("{word} stands alone.", word=word.value)
+            if word in ALONE
+            else say("{word} what?", word=word.value)
         )
     if len(scanned) > TEXT_MAX:
-        return NotUnderstood(f"It is longer than {TEXT_MAX} characters.")
+        return NotUnderstood(say("It is longer than {most} characters.", most=TEXT_MAX))
     return Label(scanned)
 
 
-WAIT: Final = "Wait for its end."
+WAIT: Final = say("Wait for its end.")
 Sockets = Mapping[str, Socket]
 
 
@@ -125,8 +128,11 @@ def place(sockets: Sockets, serial: str) -> tuple[Socket, Binding] | None:
     if starting is not None:
         raise Refused(
             "STARTING",
-            f"Socket {starting.name} is still starting: it is not known what is in it.",
-            "Scan the card of the unit's socket, then the label; or wait for it.",
+            say(
+                "Socket {socket} is still starting: it is not known what is in it.",
+                socket=starting.name,
+            ),
+            say("Scan the card of the unit's socket, then the label; or wait for it."),
         )
     may_be_in = (each.awaits_label and not each.is_of_another(serial) for each in sockets.values())
     if was_in(sockets, serial) is not None or any(may_be_in):
@@ -159,8 +165,12 @@ def _why_only(only: Socket, serial: str) -> Binding:
         # It may sit in its bootloader, and announce itself at any time.
         raise Refused(
             "TAKE_OUT",
-            f"{printable(last.serial)} may still be in socket {only.name}.",
-            f"Take it out, scan FREE {only.name}, then the label again.",
+            say(
+                "{serial} may still be in socket {socket}.",
+                serial=printable(last.serial),
+                socket=only.name,
+            ),
+            say("Take it out, scan FREE {socket}, then the label again.", socket=only.name),
         )
     return Binding.ONLY
 
@@ -175,41 +185,50 @@ def _where_it_is(sockets: Sockets, serial: str) -> Socket | None:
 def check_free(socket: Socket) -> None:
     """Raises Refused while a run of the socket goes on, or is not saved."""
     if socket.phase is not Phase.REST:
-        reason = f"Socket {socket.name} is busy with {printable(socket.serial)}."
+        serial = printable(socket.serial)
+        reason = say("Socket {socket} is busy with {serial}.", socket=socket.name, serial=serial)
         raise Refused(Refusal.SOCKET_BUSY.value, reason, WAIT)
 
 
 def check_service(socket: Socket) -> None:
     """Raises Refused for a socket that cannot work; one that starts will."""
     if socket.out_of_service:
-        reason = f"Socket {socket.name} is out of service: {socket.out_of_service}"
-        raise Refused("SOCKET_BROKEN", reason, "Use another socket, or mend this one.")
+        reason = say(
+            "Socket {socket} is out of service: {why}",
+            socket=socket.name,
+            why=socket.out_of_service,
+        )
+        raise Refused("SOCKET_BROKEN", reason, say("Use another socket, or mend this one."))
 
 
 def check_known(sockets: Sockets, serial: str) -> None:
     """Raises Refused for the label of a unit that runs, or has just passed."""
     for each in sockets.values():
         if each.phase is not Phase.REST and each.serial == serial:
-            reason = f"It runs in socket {each.name}."
+            reason = say("It runs in socket {socket}.", socket=each.name)
             raise Refused(Refusal.UNIT_RUNNING.value, reason, WAIT)
         last = each.verdict
         if last is not None and last.serial == serial and last.outcome is RunState.PASS:
-            reason = f"It has just passed in socket {each.name}."
-            raise Refused("JUST_PASSED", reason, "Take it out, and scan the next unit.")
+            reason = say("It has just passed in socket {socket}.", socket=each.name)
+            raise Refused("JUST_PASSED", reason, say("Take it out, and scan the next unit."))
 
 
 def check_first(sockets: Sockets, serial: str, waiting: str) -> None:
     """Raises Refused for a label that was scanned already, or behind one that still waits."""
     for each in sockets.values():
         if each.label == serial:
-            again = f"If it is there, scan SOCKET {each.name}, then the label."
-            raise Refused("DOUBLE_SCAN", "It was scanned already.", f"{each.wanted} {again}")
+            remedy = say(
+                "{wanted} If it is there, scan SOCKET {socket}, then the label.",
+                wanted=each.wanted,
+                socket=each.name,
+            )
+            raise Refused("DOUBLE_SCAN", say("It was scanned already."), remedy)
         if each.label and each.binding is Binding.NAMED:
             raise one_at_a_time(each.label, each.wanted)
     if waiting:
-        remedy = f"Scan the card of the socket that {printable(waiting)} is in."
+        remedy = say("Scan the card of the socket that {label} is in.", label=printable(waiting))
         if waiting == serial:
-            raise Refused("DOUBLE_SCAN", "It was scanned already.", remedy)
+            raise Refused("DOUBLE_SCAN", say("It was scanned already."), remedy)
         raise one_at_a_time(waiting, remedy)
 
 
@@ -221,15 +240,27 @@ def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
     if socket.is_of_another(serial):
         raise Refused(
             codes.WRONG_UNIT.name,
-            f"The unit in socket {socket.name} says that it is {printable(socket.own or '')}.",
-            "Compare label and unit: scan the label of the unit that is in the socket.",
+            say(
+                "The unit in socket {socket} says that it is {own}.",
+                socket=socket.name,
+                own=printable(socket.own or ""),
+            ),
+            codes.WRONG_UNIT.action,
         )
     for each in sockets.values():
         if each is not socket and each.is_there and each.own == serial:
             raise Refused(
                 codes.WRONG_UNIT.name,
-                f"The unit in socket {each.name} says that it is {printable(serial)}.",
-                f"Compare the labels of the units in the sockets {each.name} and {socket.name}.",
+                say(
+                    "The unit in socket {socket} says that it is {own}.",
+                    socket=each.name,
+                    own=printable(serial),
+                ),
+                say(
+                    "Compare the labels of the units in the sockets {one} and {other}.",
+                    one=each.name,
+                    other=socket.name,
+                ),
             )
 
 
@@ -237,20 +268,25 @@ def check_one_socket(sockets: Sockets, socket: Socket, serial: str) -> None:
     """Raises Refused for a label that a person gave to another socket."""
     for each in sockets.values():
         if each is not socket and each.label == serial and each.binding is not Binding.NAMED:
-            reason = f"It was scanned for socket {each.name}."
-            raise Refused("DOUBLE_SCAN", reason, f"{each.wanted} Or scan CANCEL.")
+            reason = say("It was scanned for socket {socket}.", socket=each.name)
+            remedy = say("{wanted} Or scan CANCEL.", wanted=each.wanted)
+            raise Refused("DOUBLE_SCAN", reason, remedy)
 
 
 def one_at_a_time(label: str, remedy: str) -> Refused:
     """For a label that is scanned while another one waits."""
-    reason = f"{printable(label)} was scanned before and waits for its unit."
-    return Refused("LABEL_WAITS", reason, f"{remedy} Or scan CANCEL.")
+    reason = say("{label} was scanned before and waits for its unit.", label=printable(label))
+    return Refused("LABEL_WAITS", reason, say("{wanted} Or scan CANCEL.", wanted=remedy))
 
 
 def still_there(socket: Socket, last: LastRun) -> Refused:
     """For a scan that means another unit than the one that is heard."""
     return Refused(
         "TAKE_OUT",
-        f"{printable(last.serial)} is still in socket {socket.name}.",
-        f"Take it out first. If it is out, scan FREE {socket.name}.",
+        say(
+            "{serial} is still in socket {socket}.",
+            serial=printable(last.serial),
+            socket=socket.name,
+        ),
+        say("Take it out first. If it is out, scan FREE {socket}.", socket=socket.name),
     )

@@ -11,6 +11,7 @@ from enum import Enum
 from typing import Final
 
 from flasher.protocol.text import printable
+from flasher.said import say
 from flasher.station.events import LineStopped, SocketState
 from flasher.station.messages import PresenceChanged
 from flasher.station.records.model import RunState
@@ -236,10 +237,11 @@ class Socket:
         """What its label waits for."""
         shown = printable(self.label)
         if self.binding is not Binding.NAMED:
-            return f"Connect {shown}."
+            return say("Connect {label}.", label=shown)
         if self.verdict is not None:
-            return f"Take {printable(self.verdict.serial)} out, then connect {shown}."
-        return f"Put {shown} into socket {self.name}."
+            before = printable(self.verdict.serial)
+            return say("Take {before} out, then connect {label}.", before=before, label=shown)
+        return say("Put {label} into socket {socket}.", label=shown, socket=self.name)
 
     def view(self, stopped: LineStopped | None, *, is_only: bool) -> Shown:
         """What it shows; `stopped` is why the line is stopped, `is_only`: there is no other one."""
@@ -248,7 +250,7 @@ class Socket:
         if self.phase is Phase.SAVE:
             return SocketState.ERROR if self.note else SocketState.SAVING, self.serial, self.note
         if self.is_chosen:
-            words = "Scan the label of the unit that is in this socket, or goes into it."
+            words = say("Scan the label of the unit that is in this socket, or goes into it.")
             return SocketState.SCAN, self.label, words
         last = self.verdict
         if last is not None and last.outcome is not None:
@@ -260,31 +262,48 @@ class Socket:
             return SocketState.STOPPED, "", stopped.reason
         if self.label:
             own = printable(self.own or "")
-            other = f"The unit in it says that it is {own}. " * self.is_of_another(self.label)
-            return SocketState.SCAN, self.label, other + self.wanted
+            wanted = self.wanted
+            if self.is_of_another(self.label):
+                wanted = say(
+                    "The unit in it says that it is {own}. {wanted}", own=own, wanted=self.wanted
+                )
+            return SocketState.SCAN, self.label, wanted
         if self.is_starting:
-            return SocketState.STARTING, "", "Listening for a unit."
-        return self._view_free("" if is_only else f" and SOCKET {self.name}")
+            return SocketState.STARTING, "", say("Listening for a unit.")
+        card = "" if is_only else say(" and SOCKET {socket}", socket=self.name)
+        return self._view_free(card)
 
     def _view_free(self, card: str) -> Shown:
         """Without a label; `card` is what has to be scanned with it."""
-        borne = f" It bears {printable(self.borne)}." if self.borne else ""
+        borne = say(" It bears {label}.", label=printable(self.borne)) if self.borne else ""
         if self.interrupted:
-            text = f"{printable(self.interrupted)} was interrupted here: scan its label{card}."
-            return SocketState.SCAN, self.interrupted, text + borne
+            text = say(
+                "{serial} was interrupted here: scan its label{card}.{borne}",
+                serial=printable(self.interrupted),
+                card=card,
+                borne=borne,
+            )
+            return SocketState.SCAN, self.interrupted, text
         if self.note:
-            return SocketState.SCAN, "", self.note + borne
+            return SocketState.SCAN, "", say("{said}{borne}", said=self.note, borne=borne)
         if self.is_there:
-            return SocketState.SCAN, "", self._asked_for(card) + borne
+            asked = self._asked_for(card)
+            return SocketState.SCAN, "", say("{said}{borne}", said=asked, borne=borne)
         if self.occupancy is Occupancy.EMPTY:
             return SocketState.EMPTY, "", ""
-        return SocketState.SILENT, "", "Nothing is heard: no unit, or one that sleeps."
+        return SocketState.SILENT, "", say("Nothing is heard: no unit, or one that sleeps.")
 
     def _asked_for(self, card: str) -> str:
         if self.is_own_known:
-            return f"It says that it is {printable(self.own or '')}: scan its label."
+            own = printable(self.own or "")
+            return say("It says that it is {own}: scan its label.", own=own)
         last = self.last
         if last is None or last.outcome is None:
-            return f"Scan the label of the unit{card}."
-        was = f"After {_STATES[last.outcome].value} of {printable(last.serial)} nothing was heard"
-        return f"{was}. If this is another unit, scan its label{card}."
+            return say("Scan the label of the unit{card}.", card=card)
+        return say(
+            "After {state} of {serial} nothing was heard. If this is another unit, scan its"
+            " label{card}.",
+            state=_STATES[last.outcome].value,
+            serial=printable(last.serial),
+            card=card,
+        )

@@ -21,6 +21,7 @@ from flasher.host.verify import Level, Verdict, memory_check
 from flasher.host.write import WritePlan
 from flasher.prose import prose
 from flasher.protocol.fields import Content
+from flasher.said import say
 from flasher.station import codes
 from flasher.station.messages import Journal, RunOrder, flash_value, write_key
 from flasher.station.power import PowerControl
@@ -228,7 +229,8 @@ class UnitSteps:
                         self._power.begin_cycle()
                     else:
                         name = target.name.upper()
-                        self._prompt(f"Switch the {name} off, wait 3 s, and on again.", wait_s)
+                        text = say("Switch the {target} off, wait 3 s, and on again.", target=name)
+                        self._prompt(text, wait_s)
 
         result = target.device.upgrade(
             target.plan,

@@ -13,6 +13,7 @@ from sqlalchemy import func, select
 
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
+from flasher.said import say
 from flasher.station.recipe import Duplicate, Golden
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import chain, schema
@@ -65,15 +66,15 @@ class Order:
         except ValueError as error:
             raise ClaimRefusedError(
                 Refusal.WRONG_SERIAL,
-                f"No serial number of this recipe: {error}.",
-                remedy="Scan the label of the unit again.",
+                say("No serial number of this recipe: {why}.", why=str(error)),
+                remedy=say("Scan the label of the unit again."),
             ) from error
         if not self.loaded.is_unchanged():
             path = printable(str(self.loaded.path))
             raise ClaimRefusedError(
                 Refusal.RECIPE_CHANGED,
-                f"The recipe {path}, or a file that it names, was changed.",
-                remedy="Check it with `flasher station check`, then start the station again.",
+                say("The recipe {path}, or a file that it names, was changed.", path=path),
+                remedy=say("Check it with `flasher station check`, then start the station again."),
             )
         if not self.operator.strip() or not self.socket.strip():
             raise UsageError("A run needs an operator and a socket.")
@@ -172,10 +173,16 @@ class Claiming:
         if last is not None and self._now < utc_moment(last) - CLOCK_TOLERANCE:
             raise ClaimRefusedError(
                 Refusal.CLOCK,
-                f"The clock says {utc_text(self._now)[:19]} UTC, but {self._trail.station} has"
-                f" records of {last[:19]} UTC.",
-                remedy="Set the clock of this computer. If the clock is right and that record is"
-                " not: end the station, then flasher station accept clock.",
+                say(
+                    "The clock says {now} UTC, but {station} has records of {last} UTC.",
+                    now=utc_text(self._now)[:19],
+                    station=self._trail.station,
+                    last=last[:19],
+                ),
+                remedy=say(
+                    "Set the clock of this computer. If the clock is right and that record is"
+                    " not: end the station, then flasher station accept clock."
+                ),
             )
 
     def _check_free(self) -> None:
@@ -191,17 +198,25 @@ class Claiming:
         if by_unit is not None:
             raise ClaimRefusedError(
                 Refusal.UNIT_RUNNING,
-                f"{self._order.serial} is running on socket {by_unit.socket_name} of"
-                f" {by_unit.name}.",
-                remedy="Wait for its end. If it is not there, check the label of this unit.",
+                say(
+                    "{serial} is running on socket {socket} of {station}.",
+                    serial=self._order.serial,
+                    socket=by_unit.socket_name,
+                    station=by_unit.name,
+                ),
+                remedy=say("Wait for its end. If it is not there, check the label of this unit."),
             )
         on_socket = running.where(run.c.socket_id == self._socket_id)
         by_socket: Any = self._connection.execute(on_socket).first()
         if by_socket is not None:
             raise ClaimRefusedError(
                 Refusal.SOCKET_BUSY,
-                f"Socket {self._order.socket} is busy with {by_socket.serial}.",
-                remedy="Wait for its end.",
+                say(
+                    "Socket {socket} is busy with {serial}.",
+                    socket=self._order.socket,
+                    serial=by_socket.serial,
+                ),
+                remedy=say("Wait for its end."),
             )
 
     def _check_nature(self) -> None:
@@ -214,8 +229,12 @@ class Claiming:
             known = "real" if is_virtual else "virtual"
             raise ClaimRefusedError(
                 Refusal.OTHER_NATURE,
-                f"{self._order.serial} is a {known} unit in these records.",
-                remedy="Keep records of virtual units apart, in a database of their own.",
+                say(
+                    "{serial} is a {nature} unit in these records.",
+                    serial=self._order.serial,
+                    nature=known,
+                ),
+                remedy=say("Keep records of virtual units apart, in a database of their own."),
             )
 
     def _unit_before(self) -> tuple[UnitState, int]:
@@ -256,8 +275,10 @@ class Claiming:
         if is_due(rule, utc_moment(last) if last else None, self._now.astimezone()):
             raise ClaimRefusedError(
                 Refusal.GOLDEN_DUE,
-                f"A golden unit has to pass on socket {order.socket} first.",
-                remedy=f"Scan and connect one of: {', '.join(rule.serial_numbers)}.",
+                say("A golden unit has to pass on socket {socket} first.", socket=order.socket),
+                remedy=say(
+                    "Scan and connect one of: {serials}.", serials=", ".join(rule.serial_numbers)
+                ),
             )
 
     def _repeated(self) -> RunKind:
@@ -268,14 +289,17 @@ class Claiming:
         if rule is Duplicate.BLOCK:
             raise ClaimRefusedError(
                 Refusal.DUPLICATE,
-                f"{order.serial} has passed already.",
-                remedy="Check the label: another unit may carry the same number.",
+                say("{serial} has passed already.", serial=order.serial),
+                remedy=say("Check the label: another unit may carry the same number."),
             )
         if not order.reason.strip():
             raise ClaimRefusedError(
                 Refusal.REASON_NEEDED,
-                f"{order.serial} has passed already, and is done again only for a reason.",
-                remedy="Give the reason, then scan it again.",
+                say(
+                    "{serial} has passed already, and is done again only for a reason.",
+                    serial=order.serial,
+                ),
+                remedy=say("Give the reason, then scan it again."),
             )
         return RunKind.REFLASH
 
@@ -283,7 +307,9 @@ class Claiming:
         order, rule = self._order, self._order.loaded.recipe.lot
         if self._lot_id is None and rule.required:
             raise ClaimRefusedError(
-                Refusal.LOT_NEEDED, "The unit has no lot.", remedy="Give the station the lot."
+                Refusal.LOT_NEEDED,
+                say("The unit has no lot."),
+                remedy=say("Give the station the lot."),
             )
         if self._lot_id is None or rule.quantity_max is None:
             return
@@ -298,8 +324,13 @@ class Claiming:
         if used >= rule.quantity_max:
             raise ClaimRefusedError(
                 Refusal.LOT_FULL,
-                f"Lot {order.lot} is full: {used} of {rule.quantity_max} units.",
-                remedy="Begin the next lot.",
+                say(
+                    "Lot {lot} is full: {used} of {most} units.",
+                    lot=order.lot,
+                    used=used,
+                    most=rule.quantity_max,
+                ),
+                remedy=say("Begin the next lot."),
             )
 
 

@@ -1,0 +1,82 @@
+"""Brings the catalogues of the pages up to date with what the code says:
+`python -m tests.catalogue`. A new sentence is added without a translation, and the test fails until
+it has one; a sentence that nobody says any more is dropped.
+"""
+
+from __future__ import annotations
+
+import string
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+from babel.messages.catalog import Catalog, Message
+from babel.messages.extract import extract_from_dir
+from babel.messages.pofile import read_po, write_po
+
+from flasher.station.scans import Word
+from flasher.web.words import NAMES
+
+ROOT: Final = Path(__file__).parent.parent / "flasher"
+FOLDER: Final = ROOT / "web" / "locale"
+LANGUAGES: Final = tuple(code for code in NAMES if code != "en")
+_METHODS: Final = [("**.py", "python"), ("web/templates/**.html", "jinja2.ext:babel_extract")]
+_OPTIONS: Final = {"web/templates/**.html": {"trimmed": "true"}}
+
+
+def said() -> Iterator[str]:
+    """Every sentence that the code or a page says in the language of who reads it."""
+    found = extract_from_dir(
+        ROOT, method_map=_METHODS, options_map=_OPTIONS, keywords={"say": None, "_": None}
+    )
+    for _, _, message, _, _ in found:
+        assert isinstance(message, str)
+        yield message
+    yield from ("label", *(word.value.lower() for word in Word))  # what a scan means
+
+
+def path_of(language: str) -> Path:
+    return FOLDER / f"{language}.po"
+
+
+def catalogue(language: str) -> Catalog:
+    """The catalogue as it is; empty where there is none."""
+    path = path_of(language)
+    if not path.exists():
+        return Catalog(locale=language)
+    with path.open("rb") as file:
+        return read_po(file, locale=language)
+
+
+def fields(text: str) -> set[str]:
+    """The names in braces of a sentence."""
+    return {name for _, name, _, _ in string.Formatter().parse(text) if name}
+
+
+def messages(language: str) -> dict[str, str]:
+    """Sentences with their translations."""
+    found: dict[str, str] = {}
+    for each in catalogue(language):
+        if isinstance(each, Message) and each.id:
+            found[str(each.id)] = str(each.string)
+    return found
+
+
+def main() -> int:
+    """Write the catalogues; returns 1 when a translation is missing."""
+    missing = 0
+    for language in LANGUAGES:
+        known, wanted = messages(language), sorted(set(said()))
+        made = Catalog(locale=language, project="flasher", copyright_holder="", fuzzy=False)
+        for each in wanted:
+            made.add(each, known.get(each, ""))
+            missing += not known.get(each)
+        with path_of(language).open("wb") as file:
+            write_po(file, made, width=100, omit_header=True)
+    sys.stdout.write(f"{missing} translations are missing\n")
+    return 1 if missing else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

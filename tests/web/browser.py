@@ -1,0 +1,34 @@
+"""A real browser: Debian's chromium, driven by Playwright. Where it is missing, its tests are
+skipped, unless the gate requires it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+from playwright.sync_api import Browser, sync_playwright
+
+_CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+REQUIRED = os.environ.get("FLASHER_TEST_BROWSER") == "required"
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """A browser while the block runs; skips the test where there is none."""
+    if _CHROMIUM is None:
+        if REQUIRED:
+            raise RuntimeError("chromium is required and not installed")
+        pytest.skip("needs chromium (Debian: apt-get install chromium)")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=_CHROMIUM,
+            args=["--no-sandbox", "--autoplay-policy=no-user-gesture-required"],
+        )
+        try:
+            yield browser
+        finally:
+            browser.close()

@@ -1,0 +1,105 @@
+"""An operator page without a station: a test says what happens, and sees what is made of it."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from flasher.station.board import Board
+from flasher.station.events import (
+    RunEnded,
+    SocketChanged,
+    SocketState,
+    StationEvent,
+    StationStarted,
+)
+from flasher.station.health import Watch
+from flasher.station.records.model import RunId, RunKind, RunState
+from flasher.station.tally import Tally
+from flasher.web.guard import application
+from flasher.web.operator import Lot, OperatorPage, Screen
+from flasher.web.pages import Pages
+from flasher.web.server import Server
+
+_KEY = "of the test"
+AT = "2026-05-17T09:00:00.000Z"
+
+
+class LineScreen:
+    """A station of which only the events are there. It turns in a thread until `hang`."""
+
+    def __init__(self, *sockets: str) -> None:
+        self.board = Board()
+        self.scans: list[str] = []
+        self.screen = Screen(Tally(), Watch(Path("/"), lambda: datetime.now(UTC), lambda: 0.0))
+        self.lot = Lot("L17", 500, 12)
+        self._lock = threading.Lock()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._turn, daemon=True)
+        self.say(StationStarted("line-2", "Battery 36 V", "7", "BAT-36-10", sockets, (), at=AT))
+        for name in sockets:
+            self.state(name, SocketState.EMPTY)
+        self._thread.start()
+
+    def say(self, event: StationEvent) -> None:
+        with self._lock:
+            self.board.apply(event)
+            self.screen.show(event, self.board)
+
+    def state(self, socket: str, state: SocketState, serial: str = "", text: str = "") -> None:
+        """A socket shows a state; PASS and FAIL with the end of their run."""
+        if state.is_verdict:
+            self.say(
+                ended(socket, serial, RunState.PASS if state.value == "PASS" else RunState.FAIL)
+            )
+        self.say(SocketChanged(socket, state, serial, text, at=AT))
+
+    def hang(self) -> None:
+        """The station's loop turns no more."""
+        self._ended.set()
+        self._thread.join()
+
+    def _turn(self) -> None:
+        names = (self.board.station, self.board.recipe, self.board.part)
+        while not self._ended.wait(0.05):
+            with self._lock:
+                self.screen.turn(self.board, station=names, operator="Jo", lot=self.lot)
+
+
+def ended(socket: str, serial: str, outcome: RunState, code: str = "REFUSED") -> RunEnded:
+    return RunEnded(
+        socket, serial, RunId(1), RunKind.PRODUCTION, outcome,
+        "OK" if outcome is RunState.PASS else code, "", "Take the unit out.", 5.0, at=AT,
+    )  # fmt: skip
+
+
+@contextmanager
+def served(line: LineScreen, port: int = 0) -> Iterator[str]:
+    """The page of a line while the block runs; gives its address."""
+    pages = Pages()
+    app = application(
+        OperatorPage(pages, line.screen.feed, line.scans.append).routes,
+        pages=pages, hosts={"127.0.0.1"}, secret=_KEY, now=lambda: 0.0,
+    )  # fmt: skip
+    with Server(app, "127.0.0.1", port) as server:
+        yield server.url
+
+
+def tile(page: Any, socket: str) -> SimpleNamespace:
+    """What the page shows of a socket."""
+    shown = page.evaluate(
+        """(socket) => {
+          const article = [...document.querySelectorAll("article")]
+            .find((each) => each.querySelector(".name").textContent === socket);
+          const text = (name) => article.querySelector("." + name).textContent;
+          return {state: article.dataset.state, word: text("word"), tail: text("tail"),
+                  what: text("what")};
+        }""",
+        socket,
+    )
+    return SimpleNamespace(**shown)

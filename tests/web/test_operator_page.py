@@ -1,0 +1,269 @@
+"""The operator page in a real browser: what it shows, when it shows nothing, and scans."""
+
+from __future__ import annotations
+
+import io
+import itertools
+import random
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from PIL import Image, ImageChops, ImageStat
+from playwright.sync_api import Browser, Page, expect
+
+from flasher.station.events import LineResumed, LineStopped, ScanRefused, SocketChanged, SocketState
+from flasher.station.records.model import RunState
+from tests.web.line_screen import AT, LineScreen, ended, served, tile
+
+STATES = tuple(SocketState)
+SIZES = {
+    "screen": (1920, 1080),
+    "laptop": (1280, 800),
+    "tablet": (820, 1180),
+    "phone": (390, 844),
+}
+LONGEST = "Take BAT2620-0005 out, then connect BAT2620-0006. Or scan CANCEL."
+_MM_PER_PX = 531.0 / 1920
+"""On a screen of 24 inches."""
+
+
+@pytest.fixture
+def line() -> Iterator[LineScreen]:
+    made = LineScreen("A", "B", "C", "D")
+    yield made
+    made.hang()
+
+
+@pytest.fixture
+def page(browser: Browser, line: LineScreen) -> Iterator[Page]:
+    """The page of `line`; it asks for nothing from elsewhere, and its script makes no error."""
+    with served(line) as url:
+        context = browser.new_context(viewport={"width": 1920, "height": 1080}, locale="en")
+        opened = context.new_page()
+        asked: list[str] = []
+        wrong: list[str] = []
+        opened.on("request", lambda request: asked.append(request.url))
+        opened.on("pageerror", lambda error: wrong.append(str(error)))
+        opened.on("console", lambda said: wrong.extend([said.text] * (said.type == "error")))
+        opened.goto(f"{url}line")
+        expect(opened.locator("article")).to_have_count(4)
+        yield opened
+        assert all(each.startswith(url) for each in asked)
+        assert [each for each in wrong if "ERR_" not in each] == []
+        context.close()
+
+
+def _shows(page: Page, socket: int, word: str) -> None:
+    expect(page.locator("article .word").nth(socket)).to_have_text(word)
+
+
+# -- verdicts --------------------------------------------------------------------------------------
+
+
+def test_pass_is_shown_when_it_is_committed_and_not_before(page: Page, line: LineScreen) -> None:
+    line.say(SocketChanged("A", SocketState.PASS, "BAT2620-0005", "Take the unit out.", at=AT))
+    _shows(page, 0, "SAVING")
+    line.say(ended("A", "BAT2620-0005", RunState.PASS))
+    _shows(page, 0, "PASS")
+    assert tile(page, "A").tail == "0-0005"
+
+
+def test_the_pass_of_another_unit_is_not_this_ones(page: Page, line: LineScreen) -> None:
+    line.state("A", SocketState.PASS, "BAT2620-0005")
+    _shows(page, 0, "PASS")
+    line.say(SocketChanged("A", SocketState.PASS, "BAT2620-0006", "", at=AT))
+    _shows(page, 0, "SAVING")
+
+
+def test_every_page_shows_the_same_after_it_was_loaded(page: Page, line: LineScreen) -> None:
+    line.state("B", SocketState.FAIL, "BAT2620-0007", "Put the unit aside as bad.")
+    _shows(page, 1, "FAIL")
+    page.reload()
+    _shows(page, 1, "FAIL")
+    assert tile(page, "B").what == "Put the unit aside as bad."
+
+
+# -- the page dies honestly ------------------------------------------------------------------------
+
+
+def test_a_station_that_is_gone_covers_the_page_and_it_comes_back_by_itself(
+    browser: Browser, line: LineScreen
+) -> None:
+    page = browser.new_page()
+    with served(line) as url:
+        page.goto(f"{url}line")
+        line.state("A", SocketState.PASS, "BAT2620-0005")
+        expect(page.locator("#cover")).to_be_hidden()
+        _shows(page, 0, "PASS")
+    expect(page.locator("#cover")).to_be_visible(timeout=3000)
+    again = LineScreen("A", "B", "C", "D")
+    with served(again, port=int(url.rstrip("/").rpartition(":")[2])):
+        expect(page.locator("#cover")).to_be_hidden(timeout=10_000)
+        _shows(page, 0, "EMPTY")
+    again.hang()
+    page.close()
+
+
+def test_a_station_that_hangs_covers_the_page(page: Page, line: LineScreen) -> None:
+    expect(page.locator("#cover")).to_be_hidden()
+    line.hang()
+    expect(page.locator("#cover")).to_be_visible(timeout=6000)
+
+
+def test_a_page_whose_script_died_is_covered(page: Page) -> None:
+    """The cover comes down by the style sheet alone."""
+    expect(page.locator("#cover")).to_be_hidden()
+    page.evaluate("() => void setTimeout(() => { JSON.parse = () => { throw 'ERR_TEST' } })")
+    expect(page.locator("#cover")).to_be_visible(timeout=6000)
+
+
+def test_a_stopped_line_covers_everything(page: Page, line: LineScreen) -> None:
+    line.say(LineStopped("RECORD_NOT_SAVED", "The disk is full.", "Make room.", at=AT))
+    expect(page.locator("#stopped")).to_be_visible()
+    expect(page.locator("#stopped")).to_contain_text("RESUME")
+    expect(page.locator("#stopped")).to_contain_text("The disk is full.")
+    line.say(LineResumed(at=AT))
+    expect(page.locator("#stopped")).to_be_hidden()
+
+
+# -- scans -----------------------------------------------------------------------------------------
+
+
+def test_no_scan_is_lost_or_split_while_tiles_change(page: Page, line: LineScreen) -> None:
+    chance = random.Random(3)
+    scans = [f"BAT2620-{number:04}" for number in range(40)]
+    page.locator("#sounds").focus()
+    for at, scan in enumerate(scans):
+        page.keyboard.type(scan)
+        page.keyboard.press("Enter")
+        if at % 2 == 0:  # tiles change under the hands
+            name = chance.choice("ABCD")
+            line.state(name, chance.choice(STATES), scan)
+    page.wait_for_function("() => waiting.length === 0 && !isSending")
+    assert line.scans == scans
+
+
+def test_a_scan_that_did_not_reach_the_station_is_said_and_forgotten(
+    page: Page, line: LineScreen
+) -> None:
+    page.route("**/line/scan", lambda route: route.abort())
+    page.keyboard.type("BAT2620-0001")
+    page.keyboard.press("Enter")
+    expect(page.locator("#spoken")).to_contain_text("did not reach the station")
+    page.unroute("**/line/scan")
+    page.keyboard.type("BAT2620-0002")
+    page.keyboard.press("Enter")
+    page.wait_for_function("() => waiting.length === 0 && !isSending")
+    assert line.scans == ["BAT2620-0002"]
+
+
+def test_a_refused_scan_is_said(page: Page, line: LineScreen) -> None:
+    line.say(ScanRefused("X1", "WRONG_SERIAL", "No serial number.", "Scan the label.", at=AT))
+    expect(page.locator("#spoken")).to_have_text("X1: No serial number. Scan the label.")
+
+
+# -- to be read from afar, by everybody ------------------------------------------------------------
+
+
+def test_words_can_be_read_from_three_metres(page: Page, line: LineScreen) -> None:
+    """26 mm high on a screen of 24 inches with four sockets."""
+    for state in STATES:
+        line.state("A", state, "BAT2620-0005")
+        page.wait_for_function(
+            "s => document.querySelector('article').dataset.state === s", arg=state.value.lower()
+        )
+        height_px = page.evaluate(
+            """() => {
+              const word = document.querySelector("article .word");
+              const context = new OffscreenCanvas(1, 1).getContext("2d");
+              const style = getComputedStyle(word);
+              context.font = `${style.fontWeight} ${style.fontSize} ${style.fontFamily}`;
+              return context.measureText(word.textContent).actualBoundingBoxAscent;
+            }"""
+        )
+        assert height_px * _MM_PER_PX >= 26, state
+
+
+def _grey_shapes(page: Page, line: LineScreen) -> dict[SocketState, Image.Image]:
+    shapes = {}
+    for state in STATES:
+        line.state("A", state, "BAT2620-0005")
+        page.wait_for_function(
+            "s => document.querySelector('article').dataset.state === s", arg=state.value.lower()
+        )
+        picture = Image.open(io.BytesIO(page.locator("article .shape").first.screenshot()))
+        shapes[state] = picture.convert("L").resize((48, 48))
+    return shapes
+
+
+def test_states_are_told_apart_without_colour(page: Page, line: LineScreen) -> None:
+    """By their shapes alone, in grey; the verdicts besides by their brightness to the others."""
+    shapes = _grey_shapes(page, line)
+    for one, other in itertools.combinations(shapes, 2):
+        inks = []
+        for state in (one, other):
+            grey = shapes[state]
+            paper = grey.getpixel((0, 0))
+            inks.append(
+                ImageChops.difference(grey, Image.new("L", grey.size, paper)).point(
+                    lambda value: 255 if value > 40 else 0
+                )
+            )
+        differing = ImageStat.Stat(ImageChops.difference(*inks)).mean[0] / 255
+        assert differing > 0.08, (one, other)
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_no_barrier_is_found_by_axe(page: Page, line: LineScreen, scheme: Any) -> None:
+    page.emulate_media(color_scheme=scheme)
+    for state, socket in zip(STATES, itertools.cycle("ABCD")):
+        line.state(socket, state, "BAT2620-0005", LONGEST)
+        found = Axe().run(page)
+        assert found.violations_count == 0, found.generate_report()
+
+
+# -- room ------------------------------------------------------------------------------------------
+
+_TOO_LARGE = """() => {
+  const bad = [];
+  if (document.scrollingElement.scrollHeight > innerHeight) bad.push("the page scrolls");
+  if (document.scrollingElement.scrollWidth > innerWidth) bad.push("the page is too wide");
+  for (const article of document.querySelectorAll("article")) {
+    const box = article.getBoundingClientRect();
+    for (const part of article.querySelectorAll(".word, .tail, .what, .shape, .name")) {
+      const own = part.getBoundingClientRect();
+      if (own.right > box.right + 1 || own.bottom > box.bottom + 1)
+        bad.push(`${article.dataset.state} ${part.className.baseVal ?? part.className}`);
+      if (part.matches(".what, .word") && part.scrollWidth > part.clientWidth + 1)
+        bad.push(`${article.dataset.state} ${part.className} is cut`);
+      if (part.matches(".what") && part.scrollHeight > part.clientHeight + 2)
+        bad.push(`${article.dataset.state} ${part.className} is cut`);
+    }
+  }
+  return bad;
+}"""
+
+
+@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize("count", [1, 4, 8, 16])
+def test_everything_fits(browser: Browser, count: int, size: str) -> None:
+    names = [f"{number + 1}" for number in range(count)]
+    line = LineScreen(*names)
+    width, height = SIZES[size]
+    with served(line) as url:
+        page = browser.new_page(viewport={"width": width, "height": height})
+        for language in ("en", "de", "zh"):
+            page.goto(f"{url}line?lang={language}")
+            expect(page.locator("article")).to_have_count(count)
+            for state, name in zip(STATES, itertools.cycle(names)):
+                line.state(name, state, "BAT2620-0005", LONGEST)
+                page.wait_for_function(
+                    "([at, s]) => document.querySelectorAll('article')[at].dataset.state === s",
+                    arg=[names.index(name), state.value.lower()],
+                )
+                if names.index(name) == count - 1 or state is STATES[-1]:
+                    assert page.evaluate(_TOO_LARGE) == [], language
+        page.close()
+    line.hang()
