@@ -28,6 +28,9 @@ function put(element, text) {
   }
 }
 
+// In Latin capitals; a Chinese character is as wide as its height.
+const widthOf = (word) => [...word].reduce((sum, char) => sum + (char > "\u2e80" ? 1.4 : 1), 0);
+
 function sound(tones) {
   if (!audio || audio.state !== "running") {
     return;
@@ -62,7 +65,7 @@ function show(tile) {
   put(part("name"), tile.socket);
   put(part("virtual"), tile.virtual);
   put(part("word"), tile.word);
-  part("verdict").style.setProperty("--letters", Math.max([...tile.word].length, 4));
+  part("verdict").style.setProperty("--letters", Math.max(widthOf(tile.word), 4));
   put(part("tail"), tile.tail);
   part("tail").title = tile.serial;
   const bar = article.querySelector("progress");
