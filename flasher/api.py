@@ -39,6 +39,7 @@ from flasher.settings.profile import Profile
 
 if TYPE_CHECKING:
     from flasher.bus.bit_rate import BitRate
+    from flasher.bus.fallback import Fallback
     from flasher.bus.link import Clock, Link
     from flasher.mock.profile import DeviceProfile
 
@@ -164,20 +165,25 @@ def _default_profile(target: str | Target, dialect: str | Dialect) -> Profile:
 
 @contextmanager
 def connect(
-    dialect: str | Dialect = "welling", *, holder: str | None = "a program", **bus: Any
+    dialect: str | Dialect = "welling",
+    *,
+    holder: str | None = "a program",
+    fallback: Fallback | None = None,
+    **bus: Any,
 ) -> Iterator[Connection]:
     """Open an adapter through python-can and close it at the end.
 
     `bus` are python-can's own keywords (`interface`, `channel`, `bitrate`, ...); its configuration
-    files and CAN_* variables hold too. The bit rate is the dialect's unless `bus` itself names
-    another one. Meanwhile no other program of this user may speak as the tool on this adapter:
-    `holder` names this program to them; None does not lock the adapter, for programs that never
-    speak as the tool (a device model, a monitor). Raises UsageError or BusError.
+    files and CAN_* variables hold too, and behind them the `fallback`. The bit rate is the
+    dialect's unless `bus` itself names another one. Meanwhile no other program of this user may
+    speak as the tool on this adapter: `holder` names this program to them; None does not lock the
+    adapter, for programs that never speak as the tool (a device model, a monitor). Raises
+    UsageError or BusError.
     """
     from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can
     from flasher.bus.link import MonotonicClock  # noqa: PLC0415
 
-    link = open_adapter(as_dialect(dialect).bitrate_bps, holder=holder, **bus)
+    link = open_adapter(as_dialect(dialect).bitrate_bps, holder=holder, fallback=fallback, **bus)
     try:
         yield Connection(link, MonotonicClock(), str(link), link.bit_rate)
     finally:
@@ -240,8 +246,10 @@ def connect_mock(
     yield Connection(bus.link(), clock, "the built-in mock", rate)
 
 
-def bit_rate(dialect: str | Dialect = "welling", **bus: Any) -> BitRate:
-    """The bit rate that `connect` would open with; `bus` are its keywords. Opens nothing.
+def bit_rate(
+    dialect: str | Dialect = "welling", *, fallback: Fallback | None = None, **bus: Any
+) -> BitRate:
+    """The bit rate that `connect` would open with; all arguments are its own. Opens nothing.
 
     Raises UsageError and BusError as `connect` does for a bit rate; where no adapter is configured,
     the one that `bus` or else the dialect names.
@@ -250,10 +258,10 @@ def bit_rate(dialect: str | Dialect = "welling", **bus: Any) -> BitRate:
     from flasher.bus.opening import bus_config  # noqa: PLC0415
 
     try:
-        merged = bus_config(bus)
+        merged = bus_config(bus, fallback)
     except FlasherError:  # none is named, or none that there is: who opens it says so
         merged = bus
-    return settling.bit_rate(as_dialect(dialect).bitrate_bps, bus, merged)
+    return settling.bit_rate(as_dialect(dialect).bitrate_bps, bus, merged, fallback)
 
 
 # -- a device -------------------------------------------------------------------------------------

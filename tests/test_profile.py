@@ -348,6 +348,6 @@ def test_all_faults_are_told_at_once(tmp_path: Path) -> None:
         "timings.packet_tries cannot be 0. It is a whole number from 1 to 1000: How often",
         "wmc.cpu cannot be 'cortex'. Did you mean cortex-m? It is cortex-m, other: The device's",
         "wmc.timings.ack_timeout_s cannot be datetime.date(1979, 5, 27). It is seconds above 0",
-        "atempts: unknown key. Did you mean attempts? Known are: wmc, bms, obc, has_upgrade",
+        "atempts: unknown key. Did you mean attempts? Known are: wmc, bms, obc, bus, has_upgrade",
     ):
         assert f"{path}: {fault}" in error.where

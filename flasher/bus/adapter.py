@@ -20,6 +20,7 @@ import can
 
 from flasher.bus.bit_rate import BitRate, bit_rate
 from flasher.bus.echoes import Echoes
+from flasher.bus.fallback import Fallback
 from flasher.bus.health import (
     LAYOUTS,
     ControllerState,
@@ -67,9 +68,11 @@ def open_adapter(
     *,
     holder: str | None = None,
     listen_only: bool = False,
+    fallback: Fallback | None = None,
     **config: Any,
 ) -> CanLink:
-    """Open the adapter that `config` (python-can's keywords), its files and variables describe.
+    """Open the adapter that `config` (python-can's keywords), its variables and files, and the
+    `fallback` describe.
 
     `default_bitrate_bps` is the dialect's, and what holds unless `config` itself names another bit
     rate. As `holder` it is locked until it is closed (`lock.hold`). `listen_only` keeps the adapter
@@ -78,13 +81,13 @@ def open_adapter(
     Raises UsageError for an interface that python-can does not know or a value that is no bit rate,
     BusError when the bit rate is another one, the adapter cannot be opened, or somebody holds it.
     """
-    merged = bus_config(config, listen_only=listen_only)
-    rate = bit_rate(default_bitrate_bps, config, merged)
+    merged = bus_config(config, fallback, listen_only=listen_only)
+    rate = bit_rate(default_bitrate_bps, config, merged, fallback)
     settled = merged if "timing" in merged else {**merged, "bitrate": rate.bps}
 
     def open_again() -> can.BusABC:
         # An interface that is back may have been set up anew, and otherwise.
-        bit_rate(default_bitrate_bps, config, merged)
+        bit_rate(default_bitrate_bps, config, merged, fallback)
         return open_bus(settled)
 
     interface = str(merged["interface"])

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from flasher.bus.fallback import Fallback
 from flasher.bus.inspect_interface import Interface, read_interface
 from flasher.errors import BusError, UsageError
 from flasher.protocol.text import printable
@@ -25,6 +26,13 @@ _TOLERANCE: Final = 0.005
 """A kernel that reaches a bit rate with its own clock tells the one that it reaches."""
 _NAMES: Final = ("timing", "bitrate", "nom_tseg1", "tseg1")
 """What decides the bit rate in a configuration; python-can makes a timing of the last two."""
+DECIDING: Final = frozenset(
+    {
+        "timing", "f_clock", "f_clock_mhz", "brp", "tseg1", "tseg2", "sjw", "nof_samples",
+        "nom_brp", "nom_tseg1", "nom_tseg2", "nom_sjw", "btr0", "btr1", "bitrate",
+    }
+)  # fmt: skip
+"""All keywords of back ends that set it, or a part of it."""
 _BY_OPTION: Final = {"bitrate": "-b", "timing": "--timing"}
 
 
@@ -39,14 +47,20 @@ class BitRate:
         return f"{self.bps / 1000:g} kbit/s ({self.source})"
 
 
-def bit_rate(dialect_bps: int, given: Mapping[str, Any], merged: Mapping[str, Any]) -> BitRate:
+def bit_rate(
+    dialect_bps: int,
+    given: Mapping[str, Any],
+    merged: Mapping[str, Any],
+    fallback: Fallback | None = None,
+) -> BitRate:
     """The bit rate that a bus has, or is opened with.
 
-    `given` are the options, `merged` what they come to with python-can's variables and files.
+    `given` are the options, `merged` what they come to with python-can's variables and files, and
+    with the `fallback`.
     Raises UsageError for a value that is no bit rate, BusError when the bit rate is not the
     dialect's and no option says so, or when the kernel has set a SocketCAN interface otherwise.
     """
-    named = named_bit_rate(given, merged)
+    named = named_bit_rate(given, merged, fallback)
     wanted = BitRate(dialect_bps, "the dialect's") if named is None else named
     is_chosen = any(name in given for name in _NAMES)
     kernel = _of_kernel(merged)
@@ -58,7 +72,9 @@ def bit_rate(dialect_bps: int, given: Mapping[str, Any], merged: Mapping[str, An
     return wanted
 
 
-def named_bit_rate(given: Mapping[str, Any], merged: Mapping[str, Any]) -> BitRate | None:
+def named_bit_rate(
+    given: Mapping[str, Any], merged: Mapping[str, Any], fallback: Fallback | None = None
+) -> BitRate | None:
     """The bit rate that an option, a variable or a file names; None where none does. Raises
     UsageError for a value that is no bit rate.
     """
@@ -66,7 +82,7 @@ def named_bit_rate(given: Mapping[str, Any], merged: Mapping[str, Any]) -> BitRa
     if name is None:
         return None
     value = merged[name]
-    source = _BY_OPTION[name] if name in given else _configured_by()
+    source = _BY_OPTION[name] if name in given else _configured_by(fallback)
     if name == "timing":
         value = getattr(value, "nom_bitrate", None) or value.bitrate
     if isinstance(value, str) and value.isdigit():
@@ -81,7 +97,7 @@ def named_bit_rate(given: Mapping[str, Any], merged: Mapping[str, Any]) -> BitRa
     return BitRate(value, source)
 
 
-def _configured_by() -> str:
+def _configured_by(fallback: Fallback | None) -> str:
     """The variable or file that names a bit rate where no option does."""
     import can.util  # noqa: PLC0415  slow, and not needed for a mock
 
@@ -93,6 +109,8 @@ def _configured_by() -> str:
         path = Path(name).expanduser()
         if path.is_file() and any(each in can.util.load_file_config(path) for each in _NAMES):
             return printable(str(path))
+    if fallback is not None and "bitrate" in fallback.bus:
+        return fallback.source
     return "python-can's configuration"
 
 

@@ -11,6 +11,7 @@ from typing import Any, Final
 import can
 import can.util
 
+from flasher.bus.fallback import Fallback
 from flasher.bus.health import bus_off_error
 from flasher.bus.inspect_interface import Unseen, look_up
 from flasher.errors import BusError, UsageError
@@ -55,22 +56,16 @@ def can_listen_only(interface: str) -> bool:
     return interface in _LISTEN_ONLY
 
 
-def bus_config(given: Mapping[str, Any], *, listen_only: bool = False) -> dict[str, Any]:
-    """All keywords for `can.Bus`, from what was given, variables and files, but for a bit rate that
-    none of them names (`flasher.bus.bit_rate`).
+def bus_config(
+    given: Mapping[str, Any], fallback: Fallback | None = None, *, listen_only: bool = False
+) -> dict[str, Any]:
+    """All keywords for `can.Bus`, from what was given, variables, files and the `fallback`, in this
+    order, but for a bit rate that none of them names (`flasher.bus.bit_rate`).
 
     `listen_only` adds what keeps the adapter silent, where its back end can be told. Raises
     UsageError for a configuration that makes no sense, BusError when there is none.
     """
-    try:
-        merged: dict[str, Any] = dict(can.util.load_config(config=dict(given)))
-    except can.CanInterfaceNotImplementedError as error:
-        raise _no_interface(error) from error
-    except (ValueError, TypeError, configparser.Error) as error:
-        raise UsageError(
-            f"The adapter's configuration makes no sense: {printable(words_of(error))}.",
-            remedy="Check the bus arguments, python-can's configuration file and CAN_* variables.",
-        ) from error
+    merged = _configured(given, fallback)
     if "timing" in given:
         merged.pop("bitrate", None)
     elif "bitrate" in given:
@@ -80,12 +75,39 @@ def bus_config(given: Mapping[str, Any], *, listen_only: bool = False) -> dict[s
     return merged
 
 
-def names_adapter(given: Mapping[str, Any]) -> bool:
+def _configured(given: Mapping[str, Any], fallback: Fallback | None) -> dict[str, Any]:
+    if fallback is None:
+        return _by_python_can(given)
+    try:
+        merged = _by_python_can(given)
+    except BusError:  # nobody else names an interface
+        merged = _by_python_can({**given, "interface": fallback.bus["interface"]})
+    if merged["interface"] != fallback.bus["interface"]:
+        return merged
+    more = {key: value for key, value in fallback.bus.items() if merged.get(key) is None}
+    if "timing" in merged:
+        more.pop("bitrate", None)
+    return _by_python_can({**given, "interface": merged["interface"], **more})
+
+
+def _by_python_can(given: Mapping[str, Any]) -> dict[str, Any]:
+    try:
+        return dict(can.util.load_config(config=dict(given)))
+    except can.CanInterfaceNotImplementedError as error:
+        raise _no_interface(error) from error
+    except (ValueError, TypeError, configparser.Error) as error:
+        raise UsageError(
+            f"The adapter's configuration makes no sense: {printable(words_of(error))}.",
+            remedy="Check the bus arguments, python-can's configuration file and CAN_* variables.",
+        ) from error
+
+
+def names_adapter(given: Mapping[str, Any], fallback: Fallback | None = None) -> bool:
     """True when what was given, a variable or a file names an adapter, or its channel alone. Raises
     UsageError as `bus_config`.
     """
     try:
-        return bool(bus_config(given))
+        return bool(bus_config(given, fallback))
     except BusError:
         return bus_config({**given, "interface": "virtual"}).get("channel") is not None
 
@@ -152,8 +174,8 @@ def _no_interface(error: Exception) -> UsageError | BusError:
     if '"None"' in str(error):
         return BusError(
             "No adapter is configured.",
-            cause="neither -i/--interface, nor a python-can configuration file, nor the variable "
-            "CAN_INTERFACE names one",
+            cause="neither -i/--interface, nor the variable CAN_INTERFACE, nor a python-can "
+            "configuration file, nor [bus] of flasher.toml names one",
             remedy="Name it, for example `-i socketcan -c can0` or `-i pcan -c PCAN_USBBUS1`; "
             f"--mock needs none. flasher adapters lists what is plugged in. Interfaces: {known}.",
         )

@@ -50,6 +50,8 @@ _READ_FOR: Final = {
     "--interface": """\
   CAN_INTERFACE, CAN_CHANNEL, ...    the adapter, where -i and -c do not name it
   can.conf, ~/.canrc, /etc/can.conf  the same in python-can's configuration files
+  flasher.toml                       the same in its table [bus], where nothing above names it:
+                                     of the working directory, else of the user's configuration
 """,
     "--profile": """\
   flasher.toml                       target profile, where --profile names none: of the

@@ -15,6 +15,7 @@ from flasher.api import Connection, as_dialect, connect, connect_mock
 from flasher.api import bit_rate as settle_bit_rate
 from flasher.bus.bit_rate import BitRate
 from flasher.bus.detect import Found
+from flasher.bus.fallback import Fallback
 from flasher.cli import values
 from flasher.cli.framework import Decorator, argument, option, option_set
 from flasher.host.options import FRAME_GAP_SHARE, PACKET_GAP_MAX_S
@@ -23,7 +24,7 @@ from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, FORMATS, load
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import DIALECTS, TARGET_ALIASES, TARGETS, WELLING, Dialect, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
-from flasher.settings.profile import FILE_NAME
+from flasher.settings.profile import FILE_NAME, find_bus
 
 IMPLAUSIBLE: Final = "bytes that do not look like a program for the device"
 """What --allow-implausible lets through."""
@@ -176,6 +177,8 @@ class Bus:
     timing: tuple[tuple[str, str], ...] = ()
     can_filters: tuple[dict[str, int], ...] = ()
     bus_kwargs: tuple[tuple[str, str], ...] = ()
+    profile: str | None = None
+    """The file after --profile, which may name the adapter."""
     found: Found | None = None
     """The adapter, where nothing names one: the only one found (`flasher.cli.adapters`)."""
 
@@ -199,18 +202,23 @@ class Bus:
         return given
 
     @cached_property
+    def fallback(self) -> Fallback | None:
+        """What a file of settings names. Raises UsageError for a file that is wrong."""
+        return None if self.mock else find_bus(self.profile)
+
+    @cached_property
     def is_named(self) -> bool:
         """True when an option, a variable or a file names an adapter. Raises UsageError."""
         from flasher.bus.opening import names_adapter  # noqa: PLC0415  loads python-can
 
-        return names_adapter(self.config)
+        return names_adapter(self.config, self.fallback)
 
     @cached_property
     def bit_rate(self) -> BitRate:
         """Asked once: what is planned, said and recorded. Raises UsageError, BusError."""
         if self.mock:
             return BitRate(self.dialect.bitrate_bps, "the dialect's")
-        return settle_bit_rate(self.dialect, **self.config)
+        return settle_bit_rate(self.dialect, fallback=self.fallback, **self.config)
 
     def connect(
         self, target: Target, *, asks: bool = True
@@ -223,7 +231,9 @@ class Bus:
             return connect_mock(
                 target, self.dialect, speed=self.mock_speed, system=True, profile=riding
             )
-        return connect(self.dialect, holder=holder() if asks else None, **self.config)
+        return connect(
+            self.dialect, holder=holder() if asks else None, fallback=self.fallback, **self.config
+        )
 
 
 def holder() -> str:

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from flasher import api
+from flasher.bus.fallback import Fallback
 from flasher.conformance.profile import ConformanceProfile, load_profile
 from flasher.conformance.real import (
     HOST_UNCERTAINTY_S,
@@ -37,8 +38,8 @@ times then begin at the echo. Elsewhere the end of a frame is reckoned from its 
 
 @dataclass(frozen=True)
 class BenchOptions:
-    """A bench as a user describes it; files by their names. `bus` are python-can's keywords,
-    `choices` are KEY=VALUE of the device model.
+    """A bench as a user describes it; files by their names. `bus` and `fallback` are those of
+    `api.connect`, `choices` are KEY=VALUE of the device model.
     """
 
     target: str
@@ -52,6 +53,7 @@ class BenchOptions:
     second_image: str | None = None
     allow_implausible: bool = False
     bus: Mapping[str, Any] = field(default_factory=dict)
+    fallback: Fallback | None = None
     power: PowerControl | None = None
     readback: Readback | None = None
     uncertainty_s: float = HOST_UNCERTAINTY_S
@@ -95,10 +97,15 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
     assert good is not None  # noqa: S101  check_bench
     profile = profile or ConformanceProfile()
     _check_size(good, profile)
-    asked = _ECHOING.get(options.bus.get("interface", ""))
+    from flasher.bus.opening import bus_config  # noqa: PLC0415  loads python-can
+
+    named = bus_config(options.bus, options.fallback)
+    asked = _ECHOING.get(named["interface"])
     bus = {**(asked or {}), **options.bus}
     echoes = asked is not None and bus.get("receive_own_messages", True) is True
-    with api.connect(WELLING, holder="flasher conformance", **bus) as connection:
+    with api.connect(
+        WELLING, holder="flasher conformance", fallback=options.fallback, **bus
+    ) as connection:
         connection.listen_first(WELLING)
         port = RealPort(
             connection.link,

@@ -9,6 +9,8 @@ A file holds values for every device, and tables for single ones that go before 
     frame_gap_s = 0.001
     [wmc.version_query]
     command = 0x3300
+
+The table [bus] beside them names the computer's adapter (`flasher.settings.bus`).
 """
 
 from __future__ import annotations
@@ -54,9 +56,12 @@ from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings, Tries
 
 if TYPE_CHECKING:
+    from flasher.bus.fallback import Fallback
     from flasher.settings.reading import Reader
 
 FILE_NAME: Final = "flasher.toml"
+_BUS: Final = "bus"
+"""The table of the adapter, which is no part of the profile (`flasher.settings.bus`)."""
 DEFAULT: Final = "default"
 DOCUMENT: Final = "document"
 _DOCUMENTED: Final = frozenset({"command_repeat_s", "command_timeout_s", "boot_version_spacing_s"})
@@ -329,11 +334,32 @@ def check_profile(path: str | os.PathLike[str]) -> tuple[Target, ...]:
 
 def find_profile(working_directory: str | os.PathLike[str] | None = None) -> Path | None:
     """The `flasher.toml` of the working directory, else the one of the user; None without any."""
+    return next(_found(working_directory), None)
+
+
+def _found(working_directory: str | os.PathLike[str] | None = None) -> Iterator[Path]:
     here = Path.cwd() if working_directory is None else Path(working_directory)
     for directory in (here, user_config_path("flasher", appauthor=False, roaming=True)):
         path = directory / FILE_NAME
         if path.is_file():
-            return path
+            yield path
+
+
+def find_bus(path: str | os.PathLike[str] | None = None) -> Fallback | None:
+    """The adapter that the first file with a table [bus] names: the file `path`, the `flasher.toml`
+    of the working directory, the one of the user; None without any. With os.devnull as `path` no
+    file is looked for. What else a file says is not looked at.
+
+    Raises UsageError with everything that is wrong with the table.
+    """
+    if path is not None and Path(path) == Path(os.devnull):
+        return None
+    for place in (*([] if path is None else [Path(path)]), *_found()):
+        document = read_toml(place, what="profile")
+        if _BUS in document:
+            from flasher.settings.bus import read_bus  # noqa: PLC0415  loads python-can
+
+            return read_bus(document[_BUS], place)
     return None
 
 
@@ -342,7 +368,7 @@ def reader() -> Reader[Profile]:
     """Reads profiles, and knows every key of one."""
     from flasher.settings.reading import Reader  # noqa: PLC0415
 
-    return Reader(Profile, "profile", beside=_BESIDE, also=tuple(TARGETS))
+    return Reader(Profile, "profile", beside=_BESIDE, also=(*TARGETS, _BUS))
 
 
 class _File:
@@ -356,7 +382,11 @@ class _File:
         faults: list[Fault] = []
         for key, value in read_toml(path, what="profile").items():
             target = find_target(key)
-            if target is None:
+            if key == _BUS:
+                from flasher.settings.bus import bus_faults  # noqa: PLC0415  loads python-can
+
+                faults += bus_faults(value)
+            elif target is None:
                 self._common[key] = value
             elif not isinstance(value, dict):
                 faults.append(reader().fault((key,), f"is a table, [{key}]."))

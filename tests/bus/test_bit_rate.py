@@ -14,8 +14,8 @@ from flasher.bus.inspect_interface import Interface
 from flasher.errors import BusError, ExitCode, UsageError
 from tests.loops import each
 
-CAN0 = {"interface": "socketcan", "channel": "can0"}
-PCAN = {"interface": "pcan", "channel": "PCAN_USBBUS1"}
+CAN0: dict[str, Any] = {"interface": "socketcan", "channel": "can0"}
+PCAN: dict[str, Any] = {"interface": "pcan", "channel": "PCAN_USBBUS1"}
 
 
 @pytest.fixture(autouse=True)

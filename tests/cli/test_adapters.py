@@ -46,7 +46,9 @@ class Machine:
         return self.detected
 
     @contextmanager
-    def open(self, _dialect: object, *, holder: object, **bus: Any) -> Iterator[Connection]:
+    def open(
+        self, _dialect: object, *, holder: object, fallback: object = None, **bus: Any
+    ) -> Iterator[Connection]:
         self.opened.append(bus)
         yield self.wire
 

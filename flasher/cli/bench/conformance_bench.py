@@ -63,6 +63,7 @@ class BenchChoices:
             second_image=self.second_image,
             allow_implausible=self.allow_implausible,
             bus=bus.config,
+            fallback=None if without else bus.fallback,
             power=None if self.power_cmd is None else PowerCommand(self.power_cmd),
             readback=None if self.readback_cmd is None else ReadbackCommand(self.readback_cmd),
             uncertainty_s=self.uncertainty,

@@ -226,10 +226,10 @@ class Examination:
 
         from flasher.bus.opening import bus_config  # noqa: PLC0415
 
-        self._note(*setup_findings())
+        self._note(*setup_findings(self._bus.fallback))
         config: dict[str, Any] | None = None
         with contextlib.suppress(BusError):  # none is named: no other failure is one of the bus
-            config = bus_config(self._bus.config)
+            config = bus_config(self._bus.config, self._bus.fallback)
         asked = set(can.VALID_INTERFACES)
         if config is not None:
             asked = asked - SLOW | {str(config["interface"])}
@@ -252,7 +252,7 @@ class Examination:
         from flasher.bus.opening import bus_config  # noqa: PLC0415  loads python-can
 
         self._bus = only(found[0], self._bus, self._output)
-        self._look_at(bus_config(self._bus.config), stopped)
+        self._look_at(bus_config(self._bus.config, self._bus.fallback), stopped)
 
     def _look_at(self, config: dict[str, Any], stopped: Callable[[], bool]) -> None:
         from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can
@@ -262,7 +262,7 @@ class Examination:
 
         given = self._bus.config
         interface, channel = str(config["interface"]), str(config.get("channel") or "")
-        named = named_bit_rate(given, config)
+        named = named_bit_rate(given, config, self._bus.fallback)
         if named is not None:
             self.bitrate_bps = named.bps
         self._note(*package_findings(interface))
@@ -280,7 +280,12 @@ class Examination:
             ):
                 return
         try:
-            link = open_adapter(self.dialect.bitrate_bps, listen_only=True, **given)
+            link = open_adapter(
+                self.dialect.bitrate_bps,
+                listen_only=True,
+                fallback=self._bus.fallback,
+                **given,
+            )
         except BusError as error:
             self._note(opening_finding(error))
             return

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from flasher.bus.detect import Detected
+from flasher.bus.fallback import Fallback
 from flasher.bus.health import ControllerState, LinkHealth
 from flasher.bus.inspect_interface import VIRTUAL_KINDS, Interface, Unseen
 from flasher.bus.opening import needed_extra, start_command
@@ -63,7 +64,7 @@ class Finding:
 # -- python-can ------------------------------------------------------------------------------------
 
 
-def setup_findings() -> Iterator[Finding]:
+def setup_findings(fallback: Fallback | None) -> Iterator[Finding]:
     """python-can's version, and what configures it besides the command line."""
     import can  # noqa: PLC0415  slow
     import can.util  # noqa: PLC0415
@@ -78,6 +79,12 @@ def setup_findings() -> Iterator[Finding]:
         if os.environ.get(variable):
             what = f"{variable}={printable(os.environ[variable])} is set"
             yield Finding(Severity.NOTE, "python-can", what)
+    if fallback is not None:
+        named = " ".join(
+            str(fallback.bus[k]) for k in ("interface", "channel") if k in fallback.bus
+        )
+        what = f"{fallback.source} names {printable(named)}"
+        yield Finding(Severity.NOTE, "python-can", what)
 
 
 def package_findings(interface: str) -> Iterator[Finding]:
@@ -144,8 +151,8 @@ def unchosen_finding(detected: Detected) -> Finding:
     return Finding(
         Severity.PROBLEM,
         "adapter",
-        "no adapter is chosen: neither -i, nor a configuration file of python-can, nor the "
-        "variable CAN_INTERFACE names one",
+        "no adapter is chosen: neither -i, nor the variable CAN_INTERFACE, nor a configuration "
+        "file of python-can, nor [bus] of flasher.toml names one",
         tuple(ways[:_SHOWN_AT_MOST]) or _EXAMPLES,
     )
 

@@ -38,6 +38,13 @@ is for one:
   [wmc.application_area]
   start = 0x08004000
   size_bytes = 0x1C000
+
+The table [bus] of the same file names the adapter for commands that are given none: no option, no
+CAN_* variable, no configuration file of python-can:
+
+  [bus]
+  interface = "pcan"
+  channel = "PCAN_USBBUS1"
 """
 _HEXADECIMAL: Final = frozenset(
     {"command", "answer_command", "answer_id", "reset_command", "start"}
