@@ -49,6 +49,9 @@ _PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
         "write": Entry(
             "look.write:write", "write an item of a device by its name, and read it back"
         ),
+        "backup": Entry(
+            "look.backup:backup", "save a device's memory and everything it tells to a file"
+        ),
         "monitor": Entry(
             "look.monitor:monitor", "show decoded traffic, live or of a recorded trace"
         ),

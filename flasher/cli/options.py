@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Final
 
@@ -177,8 +177,8 @@ class Bus:
     timing: tuple[tuple[str, str], ...] = ()
     can_filters: tuple[dict[str, int], ...] = ()
     bus_kwargs: tuple[tuple[str, str], ...] = ()
-    profile: str | None = None
-    """The file after --profile, which may name the adapter."""
+    settings: str | None = None
+    """A file that may name the adapter, as --profile names one."""
     found: Found | None = None
     """The adapter, where nothing names one: the only one found (`flasher.cli.adapters`)."""
 
@@ -204,7 +204,7 @@ class Bus:
     @cached_property
     def fallback(self) -> Fallback | None:
         """What a file of settings names. Raises UsageError for a file that is wrong."""
-        return None if self.mock else find_bus(self.profile)
+        return None if self.mock else find_bus(self.settings)
 
     @cached_property
     def is_named(self) -> bool:
@@ -212,6 +212,10 @@ class Bus:
         from flasher.bus.opening import names_adapter  # noqa: PLC0415  loads python-can
 
         return names_adapter(self.config, self.fallback)
+
+    def with_profile(self, file: str | None) -> Bus:
+        """The same, but a table [bus] of the file after --profile goes before those of others."""
+        return replace(self, settings=file)
 
     @cached_property
     def bit_rate(self) -> BitRate:

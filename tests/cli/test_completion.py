@@ -239,7 +239,11 @@ def test_help_lists_the_commands_by_purpose(flasher: Flasher) -> None:
     ("command", "told", "untold"),
     [
         ("image-info", ["3 image rejected"], ["5 no answer", "CAN_INTERFACE"]),
-        ("scan", ["5 no answer", "CAN_INTERFACE", "can.conf"], ["3 image", "flasher.toml"]),
+        (
+            "scan",
+            ["5 no answer", "CAN_INTERFACE", "can.conf", "flasher.toml"],
+            ["3 image", "target profile"],
+        ),
         ("profile", [], ["4 adapter"]),
         (None, [f"{int(code)} " for code in ExitCode], []),
     ],

@@ -90,6 +90,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("read", "memory", "0x8008000", "0x8008020", *MOCK, "--events"),
         ("read", "--list"),
         ("write", "user-string-1", "RACK 7", "--yes", *MOCK),
+        ("backup", "-o", Path("b.zip"), "--force", *MOCK),
         ("write", "--list"),
         ("monitor", "--mock", "--mock-speed", "0", "--duration", "3", "--raw"),
         ("profile", "show", "-t", "bms"),

@@ -9,7 +9,7 @@ from typing import Final
 
 import click
 
-from flasher import events
+from flasher import api, events
 from flasher.cli import values
 from flasher.cli.documents import to_json
 from flasher.cli.files import check_writable, write_whole
@@ -167,7 +167,7 @@ def mock(
     output.shown_events = SHOWN
     tool = _Tool(target)
     with (
-        bus.connect(target, asks=False) as connection,
+        api.connect(dialect, holder=None, fallback=bus.fallback, **bus.config) as connection,
         stop_on_signal() as stopped,
     ):
         if not dialect.has_upgrade:

@@ -63,18 +63,19 @@ def info(output: Output, target: Target, bus: Bus, recorded: RecordingOptions) -
         device = connection.device(target, dialect=bus.dialect)
         found = device.identify(taps=record.taps, cancelled=stopped)
         if not found.is_there:
-            record.failed(_silent(found))
+            record.failed(silence(found))
     if not found.is_there:
-        error = _silent(found)
-        output.failure(error, _document(found))
+        error = silence(found)
+        output.failure(error, info_document(found))
         return error.exit_code
     for line in _lines(found):
         output.result(line)
-    output.document(_document(found))
+    output.document(info_document(found))
     return ExitCode.OK
 
 
-def _silent(found: DeviceInfo) -> NoAnswerError:
+def silence(found: DeviceInfo) -> NoAnswerError:
+    """The error for a device that is not there."""
     node = found.target.node.name
     if found.readings:
         return NoAnswerError(
@@ -135,7 +136,8 @@ def _why(reading: Reading) -> str:
     return "no answer"
 
 
-def _document(found: DeviceInfo) -> InfoDocument:
+def info_document(found: DeviceInfo) -> InfoDocument:
+    """What it told, as JSON."""
     faults = found.survey.faults
     heard = found.survey.heard.get(found.target.node)
     return InfoDocument(

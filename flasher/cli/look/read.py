@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal
@@ -11,25 +10,22 @@ import click
 
 from flasher.api import as_dialect
 from flasher.cli import values
-from flasher.cli.bar import Bar
 from flasher.cli.documents import FieldValue, content_document
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import argument, command, option
 from flasher.cli.look.content import content_lines
+from flasher.cli.look.memory import MEMORY, intel_hex, read_shown
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
 from flasher.cli.stop import stop_on_signal
-from flasher.errors import ExitCode, NoAnswerError, UsageError
-from flasher.events import QueryAnswered
+from flasher.errors import ExitCode, UsageError
 from flasher.host.items import find, meaningful_fields, readable
-from flasher.host.query import check_range, piece_of
-from flasher.protocol.contents import Memory
+from flasher.host.query import check_range
 from flasher.protocol.fields import label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target
 from flasher.protocol.text import printable
 
-MEMORY: Final = "memory"
 _OUTPUT: Final = "--output"
 _HEX_SUFFIXES: Final = frozenset({".hex", ".ihex", ".ihx"})
 _DUMP_WIDTH: Final = 16
@@ -132,10 +128,15 @@ def read(
         raise UsageError("--format needs --output FILE.")
     if file is not None:
         check_writable(file, _OUTPUT)
-    data = _read_memory(first, behind, bus, recorded, output)
+    with (
+        recorded_connection(recorded, bus, output, BMS) as (connection, record),
+        stop_on_signal() as stopped,
+    ):
+        device = connection.device(BMS, dialect=bus.dialect)
+        data = read_shown(device, first, behind, output, record, stopped)
     if file is not None:
         is_hex = format == "hex" or (format is None and file.suffix.lower() in _HEX_SUFFIXES)
-        write_whole(file, _intel_hex(first, data) if is_hex else data, _OUTPUT)
+        write_whole(file, intel_hex(first, data) if is_hex else data, _OUTPUT)
         output.result(f"{byte_count(len(data))} from 0x{first:08X} in {printable(str(file))}")
         name: Literal["hex", "bin"] = "hex" if is_hex else "bin"
         document = MemoryDocument(target.name, first, behind, file=str(file), format=name)
@@ -169,33 +170,6 @@ def _read_item(
 # -- memory ---------------------------------------------------------------------------------------
 
 
-def _read_memory(
-    start: int, end: int, bus: Bus, recorded: RecordingOptions, output: Output
-) -> bytes:
-    done = 0
-
-    def show(event: object) -> None:
-        nonlocal done
-        output.event(event)
-        if isinstance(event, QueryAnswered) and isinstance(event.content, Memory):
-            done += len(piece_of(event.content))
-            bar.move_to(done, end - start)
-
-    with (
-        recorded_connection(recorded, bus, output, BMS) as (connection, record),
-        stop_on_signal() as stopped,
-        Bar(output, unit="B", unit_scale=True, desc=MEMORY) as bar,
-    ):
-        try:
-            device = connection.device(BMS, dialect=bus.dialect)
-            return device.read_memory(
-                start, end, taps=record.taps, on_event=show, cancelled=stopped
-            )
-        except NoAnswerError as error:
-            error.remedy = f"{error.remedy} No file was written."
-            raise
-
-
 def _range(start: str | None, end: str | None) -> tuple[int, int]:
     if start is None or end is None:
         raise UsageError("Reading memory takes START and END.", remedy="END is exclusive.")
@@ -210,16 +184,6 @@ def _range(start: str | None, end: str | None) -> tuple[int, int]:
 def _dump_line(address: int, data: bytes) -> str:
     text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in data)
     return f"{address:08X}  {data.hex(' '):<{_DUMP_WIDTH * 3 - 1}}  {text}"
-
-
-def _intel_hex(start: int, data: bytes) -> bytes:
-    from intelhex import IntelHex  # noqa: PLC0415  only where it is asked for
-
-    image = IntelHex()
-    image.frombytes(data, offset=start)
-    text = io.StringIO()
-    image.write_hex_file(text)
-    return text.getvalue().encode("ascii")
 
 
 def _list(target: Target, dialect: Dialect, output: Output) -> int:

@@ -19,6 +19,7 @@ from flasher.cli.options import (
     ImageOptions,
     bus_options,
     gap_options,
+    holder,
     image_options,
     profile_option,
     target_option,
@@ -306,7 +307,7 @@ class _Upgrade:
         release = api.find_release(self.image.image, choices.manifest)
         image = api.release_checked(self.image.load(force=choices.force), release)
         profile.check_fits(image)
-        self.bus = replace(self.bus, profile=choices.profile)
+        self.bus = self.bus.with_profile(choices.profile)
         if not choices.dry_run:
             self.bus = settled(self.bus, output)
         plan = api.make_plan(
@@ -437,7 +438,7 @@ class _Upgrade:
             return api.connect_mock(
                 self.target, bus.dialect, speed=bus.mock_speed, has_application=not at_power_up
             )
-        return bus.connect(self.target)
+        return api.connect(bus.dialect, holder=holder(), fallback=bus.fallback, **bus.config)
 
     def _add_repair(self, error: FlasherError) -> None:
         """The exact command that repairs a device that was left without an application."""

@@ -1,0 +1,280 @@
+"""`flasher backup`: the memory of a device, and everything that it tells, in one file."""
+
+from __future__ import annotations
+
+import datetime
+import hashlib
+import io
+import json
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from flasher import __version__
+from flasher.cli import values
+from flasher.cli.documents import as_json
+from flasher.cli.files import check_writable, write_whole
+from flasher.cli.framework import command, option
+from flasher.cli.look.info import InfoDocument, info_document, silence
+from flasher.cli.look.memory import intel_hex, read_shown
+from flasher.cli.options import Bus, bus_options, profile_option, target_option
+from flasher.cli.output import Output, byte_count
+from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
+from flasher.cli.stop import stop_on_signal
+from flasher.errors import ExitCode, UsageError
+from flasher.host.query import READ_MEMORY, check_range
+from flasher.image.load import load
+from flasher.mock.store import AREA_START
+from flasher.procedures import DeviceInfo
+from flasher.protocol.contents import VersionInformation
+from flasher.protocol.spec import Target
+from flasher.protocol.text import printable
+from flasher.settings.profile import load_profile
+
+FORMAT: Final = 1
+"""Of `backup.json`."""
+_DATA: Final = "backup.json"
+_MEMORY: Final = "memory.hex"
+_OUTPUT: Final = "--output"
+_MOCK_AREA_BYTES: Final = 16 * 1024
+_EXAMPLES: Final = """\
+examples:
+  flasher backup -t bms -o battery.zip --image running.hex -i socketcan -c can0
+  flasher backup -t bms -o battery.zip --profile bench.toml
+  flasher backup -t bms -o battery.zip --no-memory       what it tells, without its memory
+  flasher backup -t bms -o battery.zip --mock
+
+The documents let a tool read memory by address, and give no addresses. So the application's are
+those of application_area in the profile (flasher.toml), or those of an image like the one that
+runs; nothing is guessed, since an address that does not exist may crash a device.
+
+FILE is a zip archive, written whole or not at all: memory.hex (Intel HEX; the CRC of each message
+was right) and backup.json (identity, state, faults, history, strings).
+"""
+
+
+@dataclass(frozen=True)
+class MemoryInBackup:
+    """Memory that was read, `end` exclusive."""
+
+    start: int
+    end: int
+    sha256: str
+    range_from: str
+    """Where the addresses come from."""
+    names_running_version: bool | None
+    """True when the version that the device answers stands in it; null when it answers none."""
+
+
+@dataclass(frozen=True)
+class BackupDocument:
+    """What is in a backup, and what is not."""
+
+    target: str
+    file: str
+    size_bytes: int
+    sha256: str
+    """Of the file."""
+    taken_at: str
+    """With the offset of local time."""
+    memory: MemoryInBackup | None
+    items: list[str]
+    """What the device answered."""
+    not_in_it: dict[str, str]
+    """What is missing, each with the reason."""
+
+
+@dataclass(frozen=True)
+class DataInBackup:
+    """`backup.json`."""
+
+    format: int
+    flasher: str
+    """The version that wrote it."""
+    taken_at: str
+    connection: str
+    memory: MemoryInBackup | None
+    info: InfoDocument
+    """As `flasher info --json` has it."""
+
+
+DOCUMENTS: Final = (BackupDocument,)
+
+
+@dataclass(frozen=True)
+class _Area:
+    """Where the application lies."""
+
+    start: int
+    end: int
+    source: str
+
+
+@command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.INTERRUPTED))
+@target_option()
+@option(
+    "-o", _OUTPUT, "file", metavar="FILE", type=values.FilePath("zip", gives=Path), required=True,
+    panel="backup", help="the archive to write",
+)  # fmt: skip
+@option(
+    "--image", metavar="IMAGE", type=values.FilePath(*values.IMAGE_SUFFIXES), panel="backup",
+    brief=True, help="read the addresses of this image, which is like the one that runs",
+)  # fmt: skip
+@option("--no-memory", is_flag=True, panel="backup", brief=True, help="leave the memory out")
+@option("--force", is_flag=True, panel="backup", brief=True, help="write over a file that exists")
+@profile_option
+@bus_options()
+@recording_options
+def backup(
+    output: Output,
+    target: Target,
+    bus: Bus,
+    recorded: RecordingOptions,
+    *,
+    file: Path,
+    image: str | None,
+    no_memory: bool,
+    force: bool,
+    profile: str | None,
+) -> int:
+    """Save the application's memory of a device, and everything that it tells, to a file. Nothing
+    is written to the device. The documents let a tool read the BMS only.
+    """
+    if READ_MEMORY.receiver is not target.node:
+        raise UsageError(
+            f"The {target.node.name} has nothing to back up: the documents give no way to read its "
+            "memory, and no question to ask it.",
+            remedy="Use -t bms; keep the image file that was flashed.",
+        )
+    check_writable(file, _OUTPUT)
+    if file.exists() and not force:
+        raise UsageError(
+            f"{printable(str(file))} is there already.",
+            where=_OUTPUT,
+            remedy="Name another file, or add --force.",
+        )
+    area = None if no_memory else _area(image, profile, target, bus)
+    bus = bus.with_profile(profile)
+    with (
+        recorded_connection(recorded, bus, output, target) as (connection, record),
+        stop_on_signal() as stopped,
+    ):
+        output.progress(f"asking the {target.node.name} on {connection.name} ...")
+        device = connection.device(target, dialect=bus.dialect)
+        found = device.identify(taps=record.taps, cancelled=stopped)
+        if not found.is_there:
+            raise silence(found)
+        data = b""
+        if area is not None:
+            data = read_shown(device, area.start, area.end, output, record, stopped)
+    memory = None if area is None else _memory(area, data, found)
+    taken_at = datetime.datetime.now().astimezone()
+    info = info_document(found)
+    inside = DataInBackup(
+        FORMAT, __version__, taken_at.isoformat(timespec="seconds"), connection.name, memory, info
+    )
+    archive = _archive(inside, data, taken_at)
+    write_whole(file, archive, _OUTPUT)
+    document = BackupDocument(
+        target=target.name,
+        file=str(file),
+        size_bytes=len(archive),
+        sha256=hashlib.sha256(archive).hexdigest(),
+        taken_at=inside.taken_at,
+        memory=memory,
+        items=[*(name for name, answer in info.items.items() if answer is not None), "faults"],
+        not_in_it=dict(_missing(info, memory)),
+    )
+    for line in _lines(document):
+        output.result(line)
+    output.table(document.not_in_it.items(), indent=2)
+    if memory is not None and memory.names_running_version is False:
+        output.error_line(
+            f"warning: the version that runs, {_running_version(found)}, does not stand in this "
+            "memory: these may not be the addresses of the application"
+        )
+    output.document(document)
+    return ExitCode.OK
+
+
+def _area(image: str | None, profile: str | None, target: Target, bus: Bus) -> _Area:
+    """Where the application lies. Raises UsageError where nobody says so."""
+    if image is not None:
+        loaded = load(image)
+        if loaded.base is None:
+            raise UsageError(
+                f"{printable(image)} has no addresses: it is a raw binary.",
+                where="--image",
+                remedy="Name an Intel HEX, S-record or ELF file of it, or a profile with its area.",
+            )
+        end = loaded.base + loaded.size_bytes
+        check_range(loaded.base, end)
+        return _Area(loaded.base, end, f"the image {printable(image)}")
+    area = load_profile(profile, target, bus.dialect).application_area
+    if area is not None:
+        check_range(area.start, area.end)
+        return _Area(area.start, area.end, "application_area of the profile")
+    if bus.mock:
+        return _Area(AREA_START, AREA_START + _MOCK_AREA_BYTES, "the device model")
+    raise UsageError(
+        f"Nobody says where the application of the {target.node.name} lies.",
+        cause="the documents give no addresses, and a wrong one may crash a device",
+        remedy=f"Name an image like the one that runs (--image), or write [{target.name}"
+        ".application_area] with start and size_bytes into flasher.toml; --no-memory saves the "
+        "rest.",
+    )
+
+
+def _memory(area: _Area, data: bytes, found: DeviceInfo) -> MemoryInBackup:
+    running = _running_version(found)
+    return MemoryInBackup(
+        start=area.start,
+        end=area.end,
+        sha256=hashlib.sha256(data).hexdigest(),
+        range_from=area.source,
+        names_running_version=running.encode("ascii") in data if running else None,
+    )
+
+
+def _running_version(found: DeviceInfo) -> str:
+    answers = (reading.answer for reading in found.readings)
+    version = next((each for each in answers if isinstance(each, VersionInformation)), None)
+    return "" if version is None else printable(str(version.firmware_version))
+
+
+def _archive(inside: DataInBackup, data: bytes, taken_at: datetime.datetime) -> bytes:
+    files = {_DATA: f"{json.dumps(as_json(inside), indent=2)}\n".encode()}
+    if inside.memory is not None:
+        files[_MEMORY] = intel_hex(inside.memory.start, data)
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in files.items():
+            entry = zipfile.ZipInfo(name, taken_at.timetuple()[:6])
+            entry.compress_type = zipfile.ZIP_DEFLATED
+            entry.external_attr = 0o644 << 16
+            archive.writestr(entry, content)
+    return packed.getvalue()
+
+
+def _missing(info: InfoDocument, memory: MemoryInBackup | None) -> Iterator[tuple[str, str]]:
+    if memory is None:
+        yield "memory", "left out on request"
+    else:
+        yield "other memory", "bootloader, settings, RAM: the documents give no addresses"
+    yield from info.unanswered.items()
+
+
+def _lines(document: BackupDocument) -> Iterator[str]:
+    memory = document.memory
+    yield f"{printable(document.file)}, {byte_count(document.size_bytes)}, has"
+    if memory is not None:
+        size = byte_count(memory.end - memory.start)
+        yield f"  {_MEMORY}   0x{memory.start:08X}..0x{memory.end - 1:08X}, {size}"
+        yield f"               addresses of {printable(memory.range_from)}"
+        yield f"               sha256 {memory.sha256}"
+        if memory.names_running_version:
+            yield "               names the version that runs"
+    yield f"  {_DATA}  {', '.join(name.replace('-', ' ') for name in document.items)}"
+    yield "and has not"

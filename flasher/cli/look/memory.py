@@ -1,0 +1,56 @@
+"""Memory of a device: read with a bar, and as a file holds it."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+
+from flasher.api import Device
+from flasher.cli.bar import Bar
+from flasher.cli.output import Output
+from flasher.cli.recording import Recording
+from flasher.errors import NoAnswerError
+from flasher.events import QueryAnswered
+from flasher.host.query import piece_of
+from flasher.protocol.contents import Memory
+
+MEMORY = "memory"
+
+
+def read_shown(
+    device: Device,
+    start: int,
+    end: int,
+    output: Output,
+    record: Recording,
+    cancelled: Callable[[], bool],
+) -> bytes:
+    """Read memory while a bar shows how far it is. Raises as `Device.read_memory`."""
+    done = 0
+
+    def show(event: object) -> None:
+        nonlocal done
+        output.event(event)
+        if isinstance(event, QueryAnswered) and isinstance(event.content, Memory):
+            done += len(piece_of(event.content))
+            bar.move_to(done, end - start)
+
+    with Bar(output, unit="B", unit_scale=True, desc=MEMORY) as bar:
+        try:
+            return device.read_memory(
+                start, end, taps=record.taps, on_event=show, cancelled=cancelled
+            )
+        except NoAnswerError as error:
+            error.remedy = f"{error.remedy} No file was written."
+            raise
+
+
+def intel_hex(start: int, data: bytes) -> bytes:
+    """The bytes from address `start` on as Intel HEX."""
+    from intelhex import IntelHex  # noqa: PLC0415  only where it is asked for
+
+    image = IntelHex()
+    image.frombytes(data, offset=start)
+    text = io.StringIO()
+    image.write_hex_file(text)
+    return text.getvalue().encode("ascii")
