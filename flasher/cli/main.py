@@ -36,6 +36,7 @@ _PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
             "upgrade.image_info:image_info",
             "what is in a file, what would be sent, how long it takes",
         ),
+        "history": Entry("upgrade.history:history", "what this computer has flashed"),
         "manifest": Entry(
             "upgrade.manifest:manifest", "create or check the release manifest of an image"
         ),

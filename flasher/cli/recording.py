@@ -101,6 +101,8 @@ class Recording:
         self.taps: tuple[Tap, ...] = (Unechoed(lambda: self.recorders),)
         """For the driver."""
         self.failure: BaseException | None = None
+        self.bundle: Path | None = None
+        """Where it was left, if one was."""
         self.is_alone = False
         """The terminal is gone: the verdict is left in a bundle, a good one too."""
 
@@ -197,7 +199,7 @@ def _leave_bundle(
     try:
         if is_own:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        path = write_bundle(folder, record.flight, facts)
+        record.bundle = path = write_bundle(folder, record.flight, facts)
         if is_own:
             keep_last(folder, _BUNDLES_KEPT)
     except Exception as problem:  # noqa: BLE001  the command's own failure is what matters

@@ -82,6 +82,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("image-info", OBC),
         ("flash", OBC, "-t", "obc", "--dry-run"),
         ("flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0", "--events"),
+        ("history",),
         ("info", *MOCK),
         ("info", "-t", "wmc", "--mock", "--mock-speed", "0"),
         ("scan", "--mock", "--mock-speed", "0"),

@@ -272,9 +272,9 @@ def _lines(document: BackupDocument) -> Iterator[str]:
     if memory is not None:
         size = byte_count(memory.end - memory.start)
         yield f"  {_MEMORY}   0x{memory.start:08X}..0x{memory.end - 1:08X}, {size}"
+        yield f"    sha256     {memory.sha256}"
         yield f"               addresses of {printable(memory.range_from)}"
-        yield f"               sha256 {memory.sha256}"
         if memory.names_running_version:
-            yield "               names the version that runs"
+            yield "               it names the version that runs"
     yield f"  {_DATA}  {', '.join(name.replace('-', ' ') for name in document.items)}"
     yield "and has not"

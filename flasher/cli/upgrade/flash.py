@@ -27,6 +27,7 @@ from flasher.cli.options import (
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording, recording_options
 from flasher.cli.stop import stop_on_signal
+from flasher.cli.upgrade.kept import Keeper, kept
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.text import (
     DryRunDocument,
@@ -350,14 +351,21 @@ class _Upgrade:
         self, plan: Plan, chosen: UpgradeOptions, level: Level, identity: api.Identity
     ) -> int:
         checks: list[CheckMade] = []
-        with recording(self.recorded, self.bus, self.output, target=plan.target) as record:
+        with (
+            kept(self.output) as keeper,
+            recording(self.recorded, self.bus, self.output, target=plan.target) as record,
+        ):
+            keeper.record = record
             record.facts["plan"] = plan_document(plan, chosen)
             record.facts["image_sha256"] = plan.image.sha256
             try:
-                result, took_s = self._upgrade(record, checks, plan, chosen, level, identity)
+                result, took_s = self._upgrade(
+                    keeper, record, checks, plan, chosen, level, identity
+                )
             except FlasherError as failure:
                 self._add_repair(failure)
                 raise
+            keeper.result = result
             link, error = record.link_report(), result.error()
             document = upgrade_document(plan, chosen, result, checks, link)
             record.facts["outcome"] = document.outcome
@@ -385,6 +393,7 @@ class _Upgrade:
 
     def _upgrade(
         self,
+        keeper: Keeper,
         record: Recording,
         checks: list[CheckMade],
         plan: Plan,
@@ -413,6 +422,7 @@ class _Upgrade:
                 if isinstance(event, CheckMade):
                     checks.append(event)
                     record.facts["checks"] = checks
+                keeper.heard(event)
                 output.event(event)
                 progress(event)
 
@@ -420,6 +430,8 @@ class _Upgrade:
             device = connection.device(self.target, dialect=self.bus.dialect)
             if not chosen.at_power_up:  # there its announcement is waited for, and nothing sent
                 check_heard(device, self.bus, output, taps=record.taps, cancelled=stop.asked)
+            name = "rescue" if chosen.at_power_up else "flash"
+            keeper.began(name, plan, connection.name, is_mock=self.bus.mock)
             result = device.upgrade(
                 plan,
                 options=chosen,

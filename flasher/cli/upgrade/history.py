@@ -1,0 +1,109 @@
+"""`flasher history`: what this computer has flashed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import islice
+from typing import Final
+
+from flasher.cli import values
+from flasher.cli.framework import command, option
+from flasher.cli.options import target_option
+from flasher.cli.output import Output, byte_count, counted
+from flasher.errors import ExitCode
+from flasher.history import Ended, Flash, History, matching
+from flasher.protocol.spec import Target
+from flasher.protocol.text import printable
+
+_EXAMPLES: Final = """\
+examples:
+  flasher history
+  flasher history --serial W2605001
+  flasher history -t bms --limit 5 --json | jq '.flashes[].ended.exit_code'
+
+flash and rescue keep it, dry runs and stations do not. "No end recorded": the program was killed,
+the computer lost power, or the flash is still running.
+"""
+
+
+@dataclass(frozen=True)
+class HistoryDocument:
+    """What this computer has flashed."""
+
+    file: str
+    flashes: list[Flash]
+    """The latest first."""
+    total: int
+    """All that fit, shown or not."""
+    damaged_lines: int
+    """Lines of the file that could not be read."""
+
+
+DOCUMENTS: Final = (HistoryDocument,)
+
+
+@command(epilog=_EXAMPLES)
+@target_option(required=False)
+@option("--serial", metavar="TEXT", brief=True, help="only devices with TEXT in the serial number")
+@option(
+    "--limit", type=values.count, default="20", metavar="N", brief=True,
+    help="show the latest N",
+)  # fmt: skip
+def history(output: Output, *, target: Target | None, serial: str | None, limit: int) -> int:
+    """Show what this computer has flashed: when, what onto which device, and how it ended. The
+    latest first.
+    """
+    kept = History()
+    flashes, damaged = kept.flashes()
+    name = None if target is None else target.name
+    found = list(matching(flashes, target=name, serial_number=serial))
+    latest = list(islice(reversed(found), limit))
+    for each in latest:
+        for line in _lines(each):
+            output.result(line)
+        output.result("")
+    if not latest:
+        output.result("nothing flashed" + (" that fits" if flashes else " yet"))
+    elif len(found) > len(latest):
+        output.progress(f"the latest {len(latest)} of {len(found):,}; --limit shows more")
+    if damaged:
+        path = printable(str(kept.path))
+        output.error_line(f"warning: {counted(damaged, 'line')} of {path} cannot be read")
+    output.document(
+        HistoryDocument(
+            file=str(kept.path), flashes=latest, total=len(found), damaged_lines=damaged
+        )
+    )
+    return ExitCode.OK
+
+
+def _lines(flash: Flash) -> Iterator[str]:
+    began, ended = flash.began, flash.ended
+    serial = f" {ended.serial_number}" if ended and ended.serial_number else ""
+    virtual = ", virtual" if began.is_virtual else ""
+    when = printable(began.at.replace("T", " "))
+    yield printable(f"{when}  {began.command} {began.target.upper()}{serial}{virtual}")
+    version = f", {began.image_version}" if began.image_version else ""
+    yield printable(f"  image    {began.image}, {byte_count(began.image_size_bytes)}{version}")
+    yield printable(f"  sha256   {began.image_sha256}")
+    yield printable(f"  adapter  {began.adapter}")
+    if ended is None:
+        yield "  end      began, no end recorded"
+        return
+    if ended.previous_version:
+        yield printable(f"  before   {ended.previous_version}")
+    yield printable(f"  claims   {', '.join(_claims(ended))}")
+    code = f"exit code {ended.exit_code}"
+    yield printable(f"  end      {f'{code}: {ended.what}' if ended.what else code}")
+    if ended.needs_rescue:
+        yield "           the device had no application then, or perhaps none: flasher rescue"
+    if ended.bundle:
+        yield printable(f"  bundle   {ended.bundle}")
+
+
+def _claims(ended: Ended) -> Iterator[str]:
+    """The three claims, of which none stands for another."""
+    for name, claim in (("transferred", ended.transferred), ("completed", ended.completed)):
+        yield name if claim else f"{name} not known" if claim is None else f"not {name}"
+    yield f"running {ended.running_version}" if ended.running_version else "running not known"
