@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Final
 
 from flasher.protocol.text import printable
 from flasher.said import say
@@ -11,6 +12,8 @@ from flasher.station.events import (
     LineResumed,
     LineStopped,
     OperatorPrompted,
+    PinAwaited,
+    PinEnded,
     Progressed,
     RecordNotSaved,
     RunEnded,
@@ -28,6 +31,8 @@ from flasher.station.events import (
 )
 from flasher.station.records.model import Figures, RunState
 from flasher.station.scans import Word
+
+NO_BADGES: Final = say("No badge table: people are taken at their word.")
 
 
 @dataclass
@@ -71,6 +76,10 @@ class Board:
     """What somebody has to do about the label that was scanned last."""
     is_refusal: bool = False
     """True when `said` is a refusal."""
+    pin_of: str = ""
+    """Whose PIN is typed next: what is typed must not be shown. Empty: no PIN is awaited."""
+    has_badges: bool = True
+    """False once a station without a badge table has begun."""
     labels: dict[str, str] = field(default_factory=dict)
     """Label of the virtual unit in a socket."""
     ended: dict[str, RunEnded] = field(default_factory=dict)
@@ -85,14 +94,8 @@ class Board:
 
     def apply(self, event: StationEvent) -> None:
         match event:
-            case StationStarted(_, recipe, revision, part, sockets):
-                self.recipe = printable(f"{recipe}, {revision}")
-                self.station, self.part = printable(event.station), printable(part)
-                self.title = printable(f"{event.station}: {recipe}, revision {revision}, {part}")
-                self.virtual_sockets = virtual = event.virtual_sockets
-                self.rows = {n: Row(printable(n), is_virtual=n in virtual) for n in sockets}
-                if virtual:
-                    self.title = f"{self.virtual_words} {self.title}"
+            case StationStarted():
+                self._begun(event)
             case FiguresChanged(figures):
                 self.figures = figures
             case LineStopped():
@@ -101,6 +104,8 @@ class Board:
                 self.stopped, self.records_fault = None, ""
             case ScanAccepted() | ScanRefused():
                 self._scanned(event)
+            case PinAwaited() | PinEnded():
+                self._asked(event)
             case OperatorPrompted("", text, _):
                 # It comes just before the scan that it belongs to is accepted.
                 self.said = self.prompt = shown(text)
@@ -117,6 +122,28 @@ class Board:
                     self.broken[socket] = reason
             case _:
                 self._socket(event)
+
+    def _begun(self, event: StationStarted) -> None:
+        recipe, revision, part = event.recipe, event.revision, event.part
+        self.recipe = printable(f"{recipe}, {revision}")
+        self.station, self.part = printable(event.station), printable(part)
+        self.title = printable(f"{event.station}: {recipe}, revision {revision}, {part}")
+        self.virtual_sockets = virtual = event.virtual_sockets
+        self.rows = {n: Row(printable(n), is_virtual=n in virtual) for n in event.sockets}
+        self.has_badges = event.has_badges
+        if not self.has_badges:
+            self.said = NO_BADGES
+        if virtual:
+            self.title = f"{self.virtual_words} {self.title}"
+
+    def _asked(self, event: PinAwaited | PinEnded) -> None:
+        self.pin_of = printable(event.person) if isinstance(event, PinAwaited) else ""
+        if isinstance(event, PinAwaited):
+            self.is_refusal = False
+            text = printable(event.text)
+            self.said = say(
+                "{text}: type the PIN of {name}, or scan CANCEL.", text=text, name=self.pin_of
+            )
 
     def _scanned(self, event: ScanAccepted | ScanRefused) -> None:
         text = printable(event.text)

@@ -123,29 +123,32 @@ class StationConfig(Table):
     """The folder in which the signed heads of the audit trail are kept; empty: beside the key."""
     lock_timeout_s: float = Field(default=DEFAULT_LOCK_TIMEOUT_S, gt=0, le=60)
     """How long a record waits for another program that holds the database."""
+    badges: str = ""
+    """The table of the badges (TOML): who may work here; empty: there are none."""
     shifts: tuple[time, ...] = Field(default=DEFAULT_SHIFTS, min_length=1, max_length=8)
     """When each shift begins, as "06:00"."""
     socket: tuple[SocketConfig, ...] = Field(min_length=1, max_length=SOCKETS_MAX)
 
     @model_validator(mode="after")
     def _check_sockets(self) -> StationConfig:
-        _no_two("name", [socket.name for socket in self.socket])
+        no_two("sockets", "name", [socket.name for socket in self.socket])
         real = [socket for socket in self.socket if socket.mock is None]
         for first in ("serial_number", "usb_path"):
             named = [socket for socket in real if getattr(socket, first)]
-            _no_two(first, [f"{getattr(s, first)} {s.channel}".strip() for s in named])
+            no_two("sockets", first, [f"{getattr(s, first)} {s.channel}".strip() for s in named])
         plain = [s for s in real if not (s.serial_number or s.usb_path)]
-        _no_two("adapter", [f"{s.interface} {s.channel}" for s in plain])
+        no_two("sockets", "adapter", [f"{s.interface} {s.channel}" for s in plain])
         return self
 
 
 CONFIG: Final = Reader(StationConfig, "station file")
 
 
-def _no_two(what: str, values: list[str]) -> None:
+def no_two(which: str, what: str, values: list[str]) -> None:
+    """Raises ValueError for a value that occurs twice."""
     twice = [value for value, count in Counter(values).items() if count > 1]
     if twice:
-        raise ValueError(f"two sockets have the same {what} {twice[0]!a:.60}")
+        raise ValueError(f"two {which} have the same {what} {twice[0]!a:.60}")
 
 
 def load_config(path: Path) -> StationConfig:
@@ -157,7 +160,7 @@ def load_config(path: Path) -> StationConfig:
     changes: dict[str, str] = {}
     if "://" not in config.records:
         changes["records"] = str(here / config.records)
-    for key in ("files", "keys", "heads"):
+    for key in ("files", "keys", "heads", "badges"):
         if getattr(config, key):
             changes[key] = str(here / getattr(config, key))
     return config.model_copy(update=changes)

@@ -72,6 +72,8 @@ class StationStarted(Timed):
     recovered: tuple[RunId, ...]
     virtual_sockets: tuple[str, ...] = ()
     """Sockets whose units are virtual: no product comes out of them."""
+    has_badges: bool = False
+    """People scan badges, and their roles say what they may override."""
 
 
 @dataclass(frozen=True)
@@ -120,6 +122,25 @@ class ScanRefused(Timed):
     reason: str
     remedy: str
     socket: str = ""
+
+
+@dataclass(frozen=True)
+class PinAwaited(Timed):
+    """What is scanned or typed next is the PIN of this person: it must not be shown."""
+
+    person: str
+    text: str
+    """The scan that needs it."""
+    limit_s: float
+
+
+@dataclass(frozen=True)
+class PinEnded(Timed):
+    """No PIN is awaited any more."""
+
+    person: str
+    is_right: bool
+    """False when none came, the last try was wrong, or CANCEL was scanned."""
 
 
 @dataclass(frozen=True)
@@ -256,6 +277,8 @@ StationEvent = (
     | UnitRemoved
     | ScanAccepted
     | ScanRefused
+    | PinAwaited
+    | PinEnded
     | OperatorPrompted
     | RunStarted
     | StepStarted

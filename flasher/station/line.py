@@ -23,6 +23,8 @@ from flasher.station.events import (
     LineResumed,
     LineStopped,
     OperatorPrompted,
+    PinAwaited,
+    PinEnded,
     ScanAccepted,
     ScanRefused,
     SocketChanged,
@@ -31,6 +33,8 @@ from flasher.station.events import (
     UnitRemoved,
 )
 from flasher.station.messages import AdapterDown, PresenceChanged, Ready
+from flasher.station.people import HIDDEN, Crew, Person
+from flasher.station.pins import FORM_WORDS, Pin, is_form
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import AuditEvent, RunState
 from flasher.station.scans import (
@@ -63,6 +67,7 @@ REACH_S: Final = 2.0
 IDENTIFY_S: Final = 3.0
 """A unit with an application reports its serial number within this time after power-on."""
 _RESUME: Final = Word.RESUME.value.lower()
+_PIN: Final = "pin"
 _FORGOTTEN: Final = "FORGOTTEN"
 _AGAIN: Final = say("Scan it again.")
 _NOTHING: Final = say("Nothing to do.")
@@ -138,6 +143,14 @@ class AbortRun:
 
 
 @dataclass(frozen=True)
+class CheckPin:
+    """Hold a PIN against its hash; then call `Line.pin_checked`."""
+
+    pin: Pin
+    pin_hash: str
+
+
+@dataclass(frozen=True)
 class Tell:
     """Publish an event."""
 
@@ -152,7 +165,7 @@ class Audit:
     data: Mapping[str, str]
 
 
-Effect = ClaimRun | SaveAgain | AbortRun | Tell | Audit
+Effect = ClaimRun | SaveAgain | AbortRun | CheckPin | Tell | Audit
 
 
 # -- the line -------------------------------------------------------------------------------------
@@ -167,7 +180,8 @@ class Line:
 
     `arrival_limit_s`: a label with a scanned socket waits this long for its unit; then the run
     starts all the same and reports the fault. `scan_limit_s`: after this time a label without its
-    unit, or a socket without its label, is forgotten.
+    unit, or a socket without its label, is forgotten. `crew`: who has a badge; None: people are
+    taken at their word.
     """
 
     def __init__(
@@ -180,6 +194,7 @@ class Line:
         arrival_limit_s: float = ARRIVAL_LIMIT_S,
         scan_limit_s: float = SCAN_LIMIT_S,
         scans_labels: bool = False,
+        crew: Crew | None = None,
     ) -> None:
         self.sockets = {socket.name: socket for socket in sockets}
         self.operator = operator
@@ -192,6 +207,7 @@ class Line:
         self._arrival_limit_s = arrival_limit_s
         self._scan_limit_s = scan_limit_s
         self._scans_labels = scans_labels
+        self._crew = crew
         self._effects: list[Effect] = []
         self._label = ""
         """The label that waits for the card of its socket."""
@@ -344,19 +360,36 @@ class Line:
 
     def scan(self, text: str, now: float) -> None:
         """Something was scanned."""
-        shown = printable(text.strip())[:80]
+        scanned = text.strip()
+        crew = self._crew
+        person = None if crew is None else crew.find(scanned)
+        if crew is not None and crew.asked is not None:
+            self._take_pin(crew, scanned)
+        elif person is not None:
+            self._log_in(person)
+        elif crew is not None and crew.may_be_pin(scanned) and not self._is_serial(scanned):
+            # Typed too late, or too often: it must not be shown in what is said of it.
+            reason = say("No PIN is awaited, and it is no serial number of this recipe.")
+            self._refuse(HIDDEN, "NO_PIN_AWAITED", reason, say("Scan first what needs the PIN."))
+        else:
+            self._answer(printable(scanned)[:80], lambda: self._understand(text, now))
+        self._go_on(now)
+
+    def _answer(self, shown: str, understand: Callable[[], tuple[str, Socket | None]]) -> None:
+        """Tell what came of a scan that is `shown` so."""
         try:
-            meaning, socket = self._understand(text, now)
+            meaning, socket = understand()
         except Refused as refused:
             self._refuse(shown, refused.code, refused.reason, refused.remedy)
         else:
-            if meaning != _RESUME:  # `resumed` says what came of it
+            if meaning not in (_RESUME, _PIN):  # what came of it is said by other events
                 name = "" if socket is None else socket.name
                 self._tell(ScanAccepted(shown, meaning, name))
-        self._go_on(now)
 
     def _understand(self, text: str, now: float) -> tuple[str, Socket | None]:
         """What a scan means, and for which socket. Raises Refused."""
+        if self._crew is not None and isinstance(understand(text), Label):
+            self._crew.check_somebody()
         was_refused, self._is_choice_refused = self._is_choice_refused, False
         match understand(text):
             case Label(serial):
@@ -368,9 +401,73 @@ class Line:
                     )
                 return "label", self._take_label(serial, now)
             case Command(word, argument):
+                person = None if self._crew is None else self._crew.check_role(word)
+                if self._crew is not None and person is not None and person.pin:
+                    asked = self._crew.ask(person, word, argument, now)
+                    self._tell(PinAwaited(person.name, asked.text, asked.until_s - now))
+                    return _PIN, None
                 return word.value.lower(), self._COMMANDS[word](self, argument, now)
             case NotUnderstood(why):
                 raise Refused("NOT_UNDERSTOOD", why, say("Scan the label again."))
+
+    # -- badges and PINs --------------------------------------------------------------------------
+
+    def _log_in(self, person: Person) -> None:
+        if self._crew is None:
+            return
+        self._crew.person = person
+        before, self.operator = self.operator, person.name
+        self._audit(AuditEvent.OPERATOR, before=before, now=person.name, role=person.role.value)
+        self._tell(ScanAccepted(printable(person.name), "badge"))
+
+    def _take_pin(self, crew: Crew, scanned: str) -> None:
+        """What was scanned while a PIN is awaited: it is never shown."""
+        asked = crew.asked
+        if asked is None:
+            return
+        if scanned.upper() == Word.CANCEL.value:
+            self._end_pin(crew, "CANCELLED", say("It was cancelled."), _NOTHING)
+        elif is_form(scanned):
+            self._effects.append(CheckPin(Pin(scanned), asked.person.pin))
+        else:
+            self._refuse(
+                HIDDEN,
+                "NO_PIN",
+                say("That is no PIN: it has {form}.", form=FORM_WORDS),
+                say("Type the PIN of {name}, or scan CANCEL.", name=printable(asked.person.name)),
+            )
+
+    def pin_checked(self, now: float, *, is_right: bool) -> None:
+        """Result of `CheckPin`."""
+        crew = self._crew
+        asked = None if crew is None else crew.asked
+        if crew is None or asked is None:
+            return
+        has_tries = crew.take_answer(asked.person.name, is_right=is_right, now=now)
+        if is_right:
+            crew.asked = None
+            word, argument = asked.word, asked.argument
+            self._tell(PinEnded(asked.person.name, is_right=True))
+            self._answer(
+                printable(asked.text)[:80],
+                lambda: (word.value.lower(), self._COMMANDS[word](self, argument, now)),
+            )
+        elif has_tries:
+            remedy = say("Type it again, or scan CANCEL.")
+            self._refuse(HIDDEN, "WRONG_PIN", say("The PIN is wrong."), remedy)
+        else:
+            remedy = say("Wait a minute, then scan it again.")
+            self._end_pin(crew, "PIN_LOCKED", say("Too many wrong PINs."), remedy)
+        self._go_on(now)
+
+    def _end_pin(self, crew: Crew, code: str, reason: str, remedy: str) -> None:
+        """The override that waited for its PIN is refused."""
+        if crew.asked is not None:
+            asked, crew.asked = crew.asked, None
+            self._tell(PinEnded(asked.person.name, is_right=False))
+            self._refuse(printable(asked.text)[:80], code, reason, remedy)
+
+    # -- labels and commands ----------------------------------------------------------------------
 
     def _take_label(self, serial: str, now: float) -> Socket | None:
         """The socket that a label is for; None while it waits for one. Raises Refused."""
@@ -506,6 +603,8 @@ class Line:
         self.lot = argument
 
     def _set_operator(self, argument: str, _now: float) -> None:
+        if self._crew is not None:
+            raise Refused("BADGES", say("Here a badge says who works."), say("Scan your badge."))
         self._audit(AuditEvent.OPERATOR, before=self.operator, now=argument)
         self.operator = argument
 
@@ -548,6 +647,9 @@ class Line:
                 reason = say("No label was scanned for it.")
                 self._refuse(text, _FORGOTTEN, reason, _AGAIN)
             self._forget_scans()
+        crew = self._crew
+        if crew is not None and crew.asked is not None and now >= crew.asked.until_s:
+            self._end_pin(crew, "NO_PIN", say("No PIN came."), _AGAIN)
         for socket in self.sockets.values():
             waits = socket.label and socket.begin_at_s is None and socket.phase is Phase.REST
             if waits and now >= socket.bound_at_s + self._scan_limit_s:
@@ -630,6 +732,8 @@ class Line:
         self._audit(AuditEvent.REFUSED_SCAN, text=text, code=code, socket=name)
 
     def _audit(self, what: AuditEvent, **data: str) -> None:
+        if self._crew is not None:
+            data["by"] = "" if self._crew.person is None else self._crew.person.name
         self._effects.append(Audit(what, data))
 
     def _scan_borne(self, socket: Socket, label: str, now: float) -> None:

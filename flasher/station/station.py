@@ -21,7 +21,8 @@ from typing import Final
 
 from flasher.errors import UsageError
 from flasher.log import log_event
-from flasher.station import codes, line
+from flasher.said import say
+from flasher.station import codes, line, pins
 from flasher.station.codes import CODES
 from flasher.station.events import (
     FiguresChanged,
@@ -56,6 +57,7 @@ from flasher.station.messages import (
     StepReport,
     WorkerSetup,
 )
+from flasher.station.people import Crew
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.errors import ClaimRefusedError, RecordError, Refusal
 from flasher.station.records.model import (
@@ -107,6 +109,7 @@ class Station:
         *,
         operator: str,
         lot: str = "",
+        crew: Crew | None = None,
         on_event: EventHandler = lambda _event: None,
         on_turn: Callable[[], None] = lambda: None,
         options: StationOptions | None = None,
@@ -128,7 +131,9 @@ class Station:
             arrival_limit_s=self.options.arrival_limit_s,
             scan_limit_s=self.options.scan_limit_s,
             scans_labels=self.options.scans_labels,
+            crew=crew,
         )
+        self._has_badges = crew is not None
         self.supervisor = Supervisor(
             setups, self.clock.monotonic_s, launch=launch, hang_s=self.options.hang_s
         )
@@ -149,7 +154,7 @@ class Station:
         Raises RecordError; UsageError for records of the other kind of units.
         """
         sockets = self.line.sockets
-        _check_natures(
+        are_mixed = _check_natures(
             self.store.read.natures(),
             frozenset(each.is_virtual for each in sockets.values()),
             self.options,
@@ -168,8 +173,15 @@ class Station:
                 tuple(sockets),
                 recovered,
                 tuple(each.name for each in sockets.values() if each.is_virtual),
+                self._has_badges,
             )
         )
+        if are_mixed and self._has_badges:
+            self.line.stop(
+                "VIRTUAL_MIXED",
+                say("Real and virtual units share these records."),
+                say("A supervisor has to allow it."),
+            )
         self.turn(0.0)
 
     def submit(self, text: str) -> None:
@@ -292,6 +304,9 @@ class Station:
                         saved = [self._save(socket) for socket in sockets]  # every one is tried
                         all_saved = self._end_unknown() and all(saved)
                         self.line.resumed(self._now, all_saved=all_saved)
+                    case line.CheckPin(pin, pin_hash):
+                        is_right = pins.is_right(pin, pin_hash)
+                        self.line.pin_checked(self._now, is_right=is_right)
                     case line.Audit(what, data):
                         self._audit(what, data)
 
@@ -514,14 +529,15 @@ def _said(error: RecordError) -> str:
     return f"{error.what.rstrip('.')}{where}."
 
 
-def _check_natures(known: frozenset[bool], own: frozenset[bool], options: StationOptions) -> None:
+def _check_natures(known: frozenset[bool], own: frozenset[bool], options: StationOptions) -> bool:
     """Whether sockets may use records that know virtual units (True), real ones (False); `own`:
-    the same of the sockets.
+    the same of the sockets. True when both kinds are in the records from now on.
 
     Raises UsageError: a PASS of a virtual unit must not be taken for one of a product.
     """
-    if options.mixes_virtual or len(own | known) < len((True, False)):
-        return
+    are_mixed = len(own | known) == len((True, False))
+    if options.mixes_virtual or not are_mixed:
+        return are_mixed
     if len(own) > 1:
         what = "Some sockets of this station have adapters, others have virtual units."
     elif True in own:

@@ -104,6 +104,8 @@ class Head:
     stopped: LineStopped | None
     spoken: str
     is_refusal: bool
+    is_secret: bool
+    """What is typed now must not be shown."""
 
     def said(self, words: Words) -> dict[str, Any]:
         """The head in a language, for the page's script."""
@@ -114,11 +116,12 @@ class Head:
             "station": self.station,
             "recipe": self.recipe,
             "part": self.part,
-            "operator": self.operator,
+            "operator": words(self.operator),
             "lot": words(say("{name}, {left} left"), name=name, left=left) if lot.size else name,
             "virtual": words(self.virtual),
             "spoken": words(self.spoken),
             "is_refusal": self.is_refusal,
+            "is_secret": self.is_secret,
             "stopped": None
             if stopped is None
             else {
@@ -199,8 +202,9 @@ class Screen:
             board.stopped,
             board.said,
             board.is_refusal,
+            bool(board.pin_of),
         )
-        self.feed.put(_HEAD, head, word=(head.stopped, head.spoken))
+        self.feed.put(_HEAD, head, word=(head.stopped, head.spoken, head.is_secret))
 
 
 class OperatorPage:

@@ -6,16 +6,19 @@ import io
 import json
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import pytest
+from argon2 import PasswordHasher
 from rich.console import Console
 
 from flasher.cli.documents import to_json
 from flasher.cli.output import Output
 from flasher.cli.station.documents import LINES
+from flasher.cli.station.run import _Session
 from flasher.cli.station.scans import LineReader, ScanFile, Typing
 from flasher.cli.station.views import Table, draw
 from flasher.errors import UsageError
@@ -313,6 +316,53 @@ def test_on_a_terminal_the_table_is_refreshed_and_the_summary_stays(
     assert "PASS" in shown
     assert "NONSENSE" in shown, "what is typed is a scan"
     assert "2 units: 2 passed, 0 failed; yield 100 %" in behind
+
+
+@pytest.mark.skipif(os.name == "nt", reason="terminals of POSIX")
+@pytest.mark.parametrize("more", [(), ("--lines",)])
+def test_a_pin_is_not_shown_on_the_terminal(
+    flasher: Flasher, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, more: tuple[str, ...]
+) -> None:
+    master, slave = os.openpty()
+    screen = io.StringIO()
+    monkeypatch.setattr(screen, "isatty", lambda: True)
+    monkeypatch.setattr("flasher.cli.station.run.LAUNCH", ThreadPort)
+    monkeypatch.setattr("flasher.cli.station.views.REFRESH_S", 0.0)
+    badges = tmp_path / "badges.toml"
+    pin = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1).hash("470815")
+    person = f'name = "Sue"\ncode = "BADGE-1"\nrole = "supervisor"\npin = "{pin}"\n'
+    badges.write_text(f"[[person]]\n{person}", "utf-8")
+    script: list[tuple[Callable[[_Session], bool], bytes]] = [
+        (lambda _: True, b"BADGE-1\n"),
+        (lambda session: "badge" in session.view.board.said, b"REASON x\n"),
+        (lambda session: bool(session.view.board.pin_of), b"4708"),
+        (lambda session: session.view.typed == "****", b"15\n"),
+    ]
+
+    def turn(session: _Session) -> None:
+        """Each is typed when the one before was understood."""
+        real_turn(session)
+        if script and script[0][0](session):
+            os.write(master, script.pop(0)[1])
+        if session.view.board.said == "REASON x: reason":
+            session.station.stop()
+
+    real_turn = _Session.turn
+    monkeypatch.setattr(_Session, "turn", turn)
+    recipe = write_recipe(tmp_path, USUAL + WRITE)
+    words = ("--mock-sockets", "1", "--badges", badges, "--mock-bad", "0", *FAST, *more)
+    with os.fdopen(slave, "r") as keys:
+        monkeypatch.setattr(sys, "stdin", keys)
+        monkeypatch.setattr(sys, "stdout", screen)
+        flasher("station", "run", "--recipe", recipe, *words)
+        echoed = b""
+        os.set_blocking(master, False)
+        with suppress(BlockingIOError):
+            echoed = os.read(master, 4096)
+    os.close(master)
+    assert not script
+    assert "4708" not in screen.getvalue()
+    assert b"4708" not in echoed
 
 
 # -- JSON ------------------------------------------------------------------------------------------

@@ -24,6 +24,7 @@ from flasher.station.messages import (
     TraceFile,
     WorkerSetup,
 )
+from flasher.station.people import Crew
 from flasher.station.records.model import Measurement, RunState, StepName, StepState, Verified
 from flasher.station.station import Station, StationOptions
 from tests.station.factory import Bench
@@ -76,6 +77,8 @@ class LineBench:
         sees_units: bool = True,
         are_empty: bool = True,
         scans_labels: bool = False,
+        mixes_virtual: bool = False,
+        crew: Crew | None = None,
     ) -> None:
         self.bench = bench
         self.sees_units = sees_units
@@ -86,10 +89,15 @@ class LineBench:
             bench.store,
             bench.recipe,
             setups,
-            operator="jo",
+            operator="jo" if crew is None else "",
+            crew=crew,
             on_event=self.events.append,
             options=StationOptions(
-                arrival_limit_s=5.0, hang_s=10.0, end_limit_s=0.0, scans_labels=scans_labels
+                arrival_limit_s=5.0,
+                hang_s=10.0,
+                end_limit_s=0.0,
+                scans_labels=scans_labels,
+                mixes_virtual=mixes_virtual,
             ),
             clock=bench.clock,
             launch=self._launch,

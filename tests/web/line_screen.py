@@ -37,6 +37,7 @@ class LineScreen:
         self.board = Board()
         self.scans: list[str] = []
         self.screen = Screen(Tally(), Watch(Path("/"), lambda: datetime.now(UTC), lambda: 0.0))
+        self.operator = "Jo"
         self.lot = Lot("L17", 500, 12)
         self._lock = threading.Lock()
         self._ended = threading.Event()
@@ -68,7 +69,7 @@ class LineScreen:
         names = (self.board.station, self.board.recipe, self.board.part)
         while not self._ended.wait(0.05):
             with self._lock:
-                self.screen.turn(self.board, station=names, operator="Jo", lot=self.lot)
+                self.screen.turn(self.board, station=names, operator=self.operator, lot=self.lot)
 
 
 def ended(socket: str, serial: str, outcome: RunState, code: str = "REFUSED") -> RunEnded:

@@ -13,7 +13,15 @@ from axe_playwright_python.sync_playwright import Axe
 from PIL import Image, ImageChops, ImageStat
 from playwright.sync_api import Browser, Page, expect
 
-from flasher.station.events import LineResumed, LineStopped, ScanRefused, SocketChanged, SocketState
+from flasher.station.events import (
+    LineResumed,
+    LineStopped,
+    PinAwaited,
+    PinEnded,
+    ScanRefused,
+    SocketChanged,
+    SocketState,
+)
 from flasher.station.records.model import RunState
 from tests.web.line_screen import AT, LineScreen, ended, served, tile
 
@@ -162,6 +170,29 @@ def test_a_scan_that_did_not_reach_the_station_is_said_and_forgotten(
 def test_a_refused_scan_is_said(page: Page, line: LineScreen) -> None:
     line.say(ScanRefused("X1", "WRONG_SERIAL", "No serial number.", "Scan the label.", at=AT))
     expect(page.locator("#spoken")).to_have_text("X1: No serial number. Scan the label.")
+
+
+def test_a_pin_is_hidden_while_it_is_typed(page: Page, line: LineScreen) -> None:
+    field = page.locator("#scan")
+    page.keyboard.type("47")
+    line.say(PinAwaited("Sue", "RESUME", 30.0, at=AT))
+    expect(page.locator("#spoken")).to_have_text("RESUME: type the PIN of Sue, or scan CANCEL.")
+    expect(field).to_have_attribute("type", "password")
+    page.keyboard.type("11")
+    assert Axe().run(page).violations_count == 0
+    page.keyboard.press("Enter")
+    page.wait_for_function("() => waiting.length === 0 && !isSending")
+    assert line.scans == ["4711"]
+    assert "4711" not in page.content()
+    line.say(PinEnded("Sue", is_right=True, at=AT))
+    expect(field).to_have_attribute("type", "text")
+
+
+def test_a_page_that_comes_while_a_pin_is_awaited_hides_it(page: Page, line: LineScreen) -> None:
+    line.say(PinAwaited("Sue", "RESUME", 30.0, at=AT))
+    expect(page.locator("#scan")).to_have_attribute("type", "password")
+    page.reload()
+    expect(page.locator("#scan")).to_have_attribute("type", "password")
 
 
 # -- to be read from afar, by everybody ------------------------------------------------------------

@@ -18,7 +18,7 @@ from flasher.cli.output import Output
 from flasher.errors import ExitCode, UsageError
 
 DEFAULT_RECORDS: Final = "records.sqlite"
-_EXTRA: Final = ("cryptography", "sqlalchemy", "stdnum")
+_EXTRA: Final = ("argon2", "cryptography", "sqlalchemy", "stdnum")
 """Packages of the extra."""
 _WEB_EXTRA: Final = ("babel", "itsdangerous", "starlette", "uvicorn")
 _EXAMPLES: Final = """\
@@ -32,12 +32,14 @@ examples:
   flasher station backup /mnt/plant/records.sqlite
   flasher station verify --heads /mnt/plant/heads
   flasher station key
+  flasher station pin
   flasher station roles --database postgresql://flasher_owner@plant-db/flasher
 """
 _RUN_NOTES: Final = """\
 A scan is the label of a unit, or a command: SOCKET A, CANCEL, ABORT A, FREE A, LOT 4711,
 OPERATOR Jo, REASON text, RESUME. They are read from stdin, a line each: a scanner is a keyboard.
-With --scans each label of the file goes to the next socket in which a unit waits.
+With --scans each label of the file goes to the next socket in which a unit waits. With --badges a
+scanned badge says who works here, and REASON, ABORT and RESUME need a role that may.
 
 Ctrl-C: no further unit is begun, and those that run are finished. A second one stops them at their
 next safe place; they have to be scanned again. Exit code 12 when a unit did not pass.
@@ -193,6 +195,7 @@ class RunOptions:
     recipe: Path
     operator: str | None
     lot: str
+    badges: Path | None
     scans: Path | None
     lines: bool
     web: Address | None
@@ -219,6 +222,9 @@ class RunOptions:
     _path_option("--recipe", required=True, help="what is done to each unit"),
     option("--operator", metavar="NAME", brief=True, help="who works here (default: the login)"),
     option("--lot", default="", metavar="NAME", show_default=False, help="the lot of the units"),
+    _path_option(
+        "--badges", help="the table of the badges: who may work here (default: of --sockets)"
+    ),
     _path_option("--scans", help="labels in the order of the units; it ends behind the last"),
     option("--lines", is_flag=True, help="a line for each happening, on a terminal too"),
     option(
@@ -277,6 +283,12 @@ def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
     if options.web is not None:
         _need("The operator page", "web", _WEB_EXTRA)
     return _call("run.run", output, options, records)
+
+
+@station.action("pin")
+def pin(output: Output) -> int:
+    """Print the hash of a PIN, for the badge table. The PIN is typed, and not shown."""
+    return _call("badges.pin", output)
 
 
 @dataclass(frozen=True)

@@ -219,6 +219,13 @@ class AcceptedDocument:
     what: str
 
 
+@dataclass(frozen=True)
+class PinDocument:
+    """The hash of a PIN that was typed, for the badge table."""
+
+    pin: str
+
+
 DOCUMENTS: Final = (
     StationCheckDocument,
     FindingsDocument,
@@ -230,6 +237,7 @@ DOCUMENTS: Final = (
     StationRolesDocument,
     SigningKeyDocument,
     AcceptedDocument,
+    PinDocument,
     Migrated,
 )
 LINES: Final[tuple[type, ...]] = get_args(StationEvent)

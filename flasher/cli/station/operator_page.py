@@ -15,6 +15,7 @@ from typing import Final
 from flasher.cli.station.commands import Address, RunOptions
 from flasher.errors import UsageError
 from flasher.files import read
+from flasher.said import say
 from flasher.station.board import Board
 from flasher.station.config import StationConfig
 from flasher.station.events import RunEnded, StationEvent
@@ -62,7 +63,10 @@ class OperatorView:
         self._lot = line.lot
         lot = Lot(line.lot, rule.lot.quantity_max or 0, sum(self._good.values()))
         names = (board.station, board.recipe, board.part)
-        self._screen.turn(board, station=names, operator=line.operator, lot=lot)
+        operator = line.operator or say("nobody: scan a badge")
+        if not board.has_badges:
+            operator = say("{name} (no badges)", name=line.operator)
+        self._screen.turn(board, station=names, operator=operator, lot=lot)
 
 
 @contextmanager

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from flasher.cli.output import Output
+from flasher.cli.station.badges import crew_of
 from flasher.cli.station.commands import RecordsOptions, RunOptions
 from flasher.cli.station.documents import (
     FiguresDocument,
@@ -28,6 +29,7 @@ from flasher.station import codes
 from flasher.station.adapters import Resolved, detect, resolve, worker_setups
 from flasher.station.config import MockUnits, StationConfig, load_config, mock_config
 from flasher.station.events import StationEvent
+from flasher.station.people import Crew
 from flasher.station.recipe_file import load_checked
 from flasher.station.records.errors import RecordError
 from flasher.station.records.keys import Keeping
@@ -55,6 +57,7 @@ def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
     scans = None if options.scans is None else read_scans(options.scans)
     recipe = load_checked(options.recipe, datetime.now().astimezone().date())
     config, sockets = _find_sockets(options, records.sockets)
+    crew = crew_of(options, config, recipe.recipe.serial_number)
     is_virtual = all(socket.bus is None for socket in sockets)
     view: View = Table(output)
     if output.json_wanted:
@@ -62,7 +65,7 @@ def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
     elif options.lines or os.environ.get("TERM") == "dumb":
         view = Lines(output)
     with _opened_records(options, records, config) as store:
-        session = _Session(options, output, store, view, is_virtual=is_virtual)
+        session = _Session(options, output, store, view, crew, is_virtual=is_virtual)
         session.is_temporary = _is_temporary(options, records)
         first = 1
         if is_virtual:  # numbers that these records do not know yet
@@ -81,8 +84,9 @@ def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
                 speed=options.mock_speed,
                 leave_after_s=_LEAVE_S,
             ),
-            operator=operator_of(options.operator),
+            operator=operator_of(options.operator) if crew is None else "",
             lot=options.lot,
+            crew=crew,
             on_event=session.show,
             on_turn=session.turn,
             options=StationOptions(
@@ -94,7 +98,10 @@ def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
         )
         if scans is not None:
             session.file = ScanFile(
-                scans, [each.name for each in session.station.sockets], session.station.submit
+                scans,
+                [each.name for each in session.station.sockets],
+                session.station.submit,
+                badges=frozenset() if crew is None else crew.codes,
             )
         session.work()
         return session.report()
@@ -170,12 +177,15 @@ class _Session:
         output: Output,
         store: Store,
         view: View,
+        crew: Crew | None,
         *,
         is_virtual: bool,
     ) -> None:
         self.view = view
         self.file: ScanFile | None = None
-        self.scans_itself = is_virtual and options.scans is None and not options.scan_by_hand
+        by_hand = options.scan_by_hand or crew is not None
+        self.scans_itself = is_virtual and options.scans is None and not by_hand
+        self._has_pins = crew is not None and crew.has_pins
         self._options = options
         self._output = output
         self._store = store
@@ -233,7 +243,8 @@ class _Session:
     def turn(self) -> None:
         """Once in each turn of the station's loop."""
         if self._typing is not None:
-            self.view.typed = self._typing.text
+            typed = self._typing.text
+            self.view.typed = "*" * len(typed) if self.view.board.pin_of else typed
         self.view.refresh()
         if self._page is not None:
             self._page.turn()
@@ -243,7 +254,7 @@ class _Session:
         if sys.stdin is None:
             return
         if sys.stdin.isatty():
-            if isinstance(self.view, Table):
+            if isinstance(self.view, Table) or self._has_pins:  # what is typed is not echoed
                 self._typing = Typing(self.station.submit)
                 stack.enter_context(keyboard(self._typing))
             else:
@@ -271,7 +282,8 @@ class _Session:
             return True
         try:
             self._check_sockets()
-            if self.file is not None and not self.station.is_line_stopped:
+            is_held = self.station.is_line_stopped or bool(self.view.board.pin_of)
+            if self.file is not None and not is_held:
                 self.file.turn(self.station.sockets, self.view.board.labels)
         except FlasherError as error:
             self._failure = error

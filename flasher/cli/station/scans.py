@@ -62,8 +62,15 @@ class ScanFile:
     Units are waited for without end: the line is the clock.
     """
 
-    def __init__(self, scans: list[str], sockets: Collection[str], submit: Submit) -> None:
-        """Raises UsageError for a socket that there is not."""
+    def __init__(
+        self,
+        scans: list[str],
+        sockets: Collection[str],
+        submit: Submit,
+        *,
+        badges: Collection[str] = (),
+    ) -> None:
+        """`badges`: scans that are no labels. Raises UsageError for a socket that there is not."""
         names = {name.lower() for name in sockets}
         for each in map(understand, scans):
             if not isinstance(each, Command) or each.word is not Word.SOCKET:
@@ -74,9 +81,8 @@ class ScanFile:
                     where=OPTION,
                     remedy=f"There are: {', '.join(map(printable, sockets))}.",
                 )
-        self.labels = frozenset(
-            label.serial for label in map(understand, scans) if isinstance(label, Label)
-        )
+        self._badges = badges
+        self.labels = frozenset(filter(self._is_label, scans))
         self._left = deque(scans)
         self._submit = submit
 
@@ -100,7 +106,7 @@ class ScanFile:
                 remedy="Scan each unit when it is in its socket.",
             )
         scan = understand(self._left[0])
-        if isinstance(scan, Label):
+        if self._is_label(self._left[0]):
             self._label(sockets, borne)
         elif isinstance(scan, Command) and scan.word is Word.SOCKET and len(self._left) > 1:
             named = next(e for e in sockets if e.name.lower() == scan.argument.lower())
@@ -129,10 +135,13 @@ class ScanFile:
         """The labels up to the next command."""
         ahead: list[str] = []
         for text in self._left:
-            if not isinstance(understand(text), Label):
+            if not self._is_label(text):
                 break
             ahead.append(text)
         return ahead
+
+    def _is_label(self, text: str) -> bool:
+        return isinstance(understand(text), Label) and text not in self._badges
 
 
 # -- keys and lines --------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from flasher.cli.documents import to_json
 from flasher.cli.output import Output, counted, duration
 from flasher.protocol.text import printable
 from flasher.station import events
-from flasher.station.board import Board, Row
+from flasher.station.board import NO_BADGES, Board, Row
 from flasher.station.events import LineStopped, SocketState, StationEvent
 from flasher.station.records.model import Figures
 
@@ -269,10 +269,14 @@ def _words(event: StationEvent) -> Iterator[str]:
             yield f"{event.station}: {event.recipe}, revision {event.revision}"
             if event.virtual_sockets:
                 yield f"VIRTUAL UNITS, no products: socket {', '.join(event.virtual_sockets)}"
+            if not event.has_badges:
+                yield NO_BADGES
             for run_id in event.recovered:
                 yield f"run {run_id} was interrupted: its unit has to be checked"
         case events.ScanRefused(text, code, reason, remedy):
             yield f"refused {code}: {text}: {reason} {remedy}"
+        case events.PinAwaited(person, text, limit_s):
+            yield f">>> {text}: type the PIN of {person} within {limit_s:.0f} s, or scan CANCEL"
         case events.OperatorPrompted(socket, text):
             yield f">>> {f'socket {socket}: ' if socket else ''}{text}"
         case events.LineStopped(code, reason, remedy):

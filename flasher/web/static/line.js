@@ -90,6 +90,7 @@ function showHead(head) {
   }
   put(byId("spoken"), head.spoken);
   byId("spoken").classList.toggle("refused", head.is_refusal);
+  byId("scan").type = head.is_secret ? "password" : "text";
   byId("health").replaceChildren(...head.health.map((check) => {
     const item = document.createElement("li");
     item.textContent = `${check.name}: ${check.text}`;

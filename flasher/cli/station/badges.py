@@ -1,0 +1,53 @@
+"""Badges: the table that the options name, and `flasher station pin`."""
+
+from __future__ import annotations
+
+import getpass
+import sys
+from pathlib import Path
+
+from flasher.cli.output import Output
+from flasher.cli.station.commands import RunOptions
+from flasher.cli.station.documents import PinDocument
+from flasher.errors import ExitCode, UsageError
+from flasher.station.config import StationConfig
+from flasher.station.people import Crew, load_badges
+from flasher.station.pins import FORM_WORDS, Pin, hash_of, is_form
+from flasher.station.recipe import SerialNumber
+
+
+def crew_of(options: RunOptions, config: StationConfig, serial_number: SerialNumber) -> Crew | None:
+    """Who has a badge; None without a table. Raises UsageError."""
+    table = options.badges or (Path(config.badges) if config.badges else None)
+    if table is None:
+        return None
+    given = [name for name in ("operator", "units") if getattr(options, name)]
+    if given:
+        raise UsageError(
+            f"--{given[0]} does not go with a badge table: "
+            + ("a badge says who works." if given == ["operator"] else "people scan the labels."),
+            remedy="Leave it out.",
+        )
+    return Crew(load_badges(table, serial_number))
+
+
+def pin(output: Output) -> int:
+    typed = _typed("PIN: ")
+    if not is_form(typed):
+        raise UsageError(f"A PIN has {FORM_WORDS}.", remedy="Type another one.")
+    if sys.stdin.isatty() and _typed("The same again: ") != typed:
+        raise UsageError("The two were not the same.", remedy="Begin again.")
+    document = PinDocument(pin=hash_of(Pin(typed)))
+    output.result(document.pin)
+    output.document(document)
+    return ExitCode.OK
+
+
+def _typed(prompt: str) -> str:
+    """A line without echo; from a pipe its first line."""
+    if sys.stdin is None or not sys.stdin.isatty():
+        return "" if sys.stdin is None else sys.stdin.readline().strip()
+    try:
+        return getpass.getpass(prompt).strip()
+    except EOFError:
+        return ""

@@ -1,0 +1,210 @@
+"""Who works at a station: badges, what a role may override, and PINs.
+
+    [[person]]
+    name = "Jo"
+    code = "BADGE-0017"                # what the badge's barcode says
+    role = "rework"
+    pin = "$argon2id$..."              # printed by `flasher station pin`
+
+`Crew` decides, and does nothing else: times are arguments, and the slow check of a PIN is made by
+the station.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any, Final
+
+from pydantic import Field, field_validator, model_validator
+
+from flasher.errors import Fault
+from flasher.protocol.text import printable
+from flasher.said import say
+from flasher.settings.reading import Reader, Table
+from flasher.station import pins
+from flasher.station.config import no_two
+from flasher.station.pattern import pattern_of
+from flasher.station.recipe import SerialNumber, ShortText
+from flasher.station.scans import Command, Label, Refused, Word, understand
+
+PIN_LIMIT_S: Final = 30.0
+"""The PIN has to follow what it is for within this time."""
+TRIES_MAX: Final = 3
+LOCKED_S: Final = 60.0
+"""After so many wrong PINs nothing that needs one is accepted from that person for this time."""
+HIDDEN: Final = "****"
+"""Stands for what was scanned or typed and may be a PIN."""
+
+
+class Role(StrEnum):
+    """What a person may do."""
+
+    OPERATOR = "operator"
+    REWORK = "rework"
+    SUPERVISOR = "supervisor"
+
+
+_REWORK: Final = frozenset({Role.REWORK, Role.SUPERVISOR})
+_ROLES: Final[Mapping[Word, frozenset[Role]]] = {
+    Word.REASON: _REWORK,
+    Word.ABORT: _REWORK,
+    Word.RESUME: frozenset({Role.SUPERVISOR}),
+}
+"""Who may give a command that overrides the station. The others are for everybody."""
+
+
+class Person(Table):
+    """Somebody with a badge."""
+
+    name: ShortText
+    """As it stands in the records."""
+    code: ShortText
+    """What the barcode of the badge says."""
+    role: Role
+    """What this person may do."""
+    pin: str = Field(default="", repr=False)
+    """A hash of the PIN that overrides ask for; without it the badge is enough."""
+
+    @field_validator("code")
+    @classmethod
+    def _check_code(cls, value: str) -> str:
+        meaning = understand(value)
+        if meaning != Label(value):
+            what = "is a command" if isinstance(meaning, Command) else "cannot be scanned"
+            raise ValueError(f"{value!a:.60} {what}")
+        return value
+
+    @field_validator("pin", mode="before")
+    @classmethod
+    def _check_pin(cls, value: Any) -> Any:
+        # Before its type is looked at: a message about that would show a PIN that stands there.
+        if value != "":
+            pins.check_hash(value if isinstance(value, str) else "")
+        return value
+
+
+class BadgeTable(Table):
+    """The whole file."""
+
+    person: tuple[Person, ...] = Field(min_length=1, max_length=1000)
+
+    @model_validator(mode="after")
+    def _check_people(self) -> BadgeTable:
+        no_two("people", "name", [each.name for each in self.person])
+        no_two("badges", "code", [each.code for each in self.person])
+        return self
+
+
+BADGES: Final = Reader(BadgeTable, "badge table")
+
+
+def load_badges(path: Path, serial_number: SerialNumber) -> tuple[Person, ...]:
+    """The people of a badge table. Raises UsageError with all that is wrong, and for badges that
+    could be labels of this recipe.
+    """
+    table = BADGES.load(path)
+    # A misread label may have a wrong check digit: its form is enough.
+    is_label = pattern_of(serial_number.pattern).match
+    faults = [
+        Fault(
+            f"person[{number}].code",
+            f"{printable(person.code)} could be a label: it fits the pattern of the recipe's"
+            " serial numbers.",
+            "Give the badge another code.",
+        )
+        for number, person in enumerate(table.person)
+        if is_label(person.code) is not None
+    ]
+    if faults:
+        raise BADGES.refusal(path, faults)
+    return table.person
+
+
+@dataclass(frozen=True)
+class Asked:
+    """An override that waits for the PIN of its person."""
+
+    person: Person
+    word: Word
+    argument: str
+    until_s: float
+
+    @property
+    def text(self) -> str:
+        """As it was scanned."""
+        return f"{self.word.value} {self.argument}".strip()
+
+
+class Crew:
+    """Everybody with a badge, who works here, and the override that waits for a PIN."""
+
+    def __init__(self, people: Iterable[Person]) -> None:
+        self._people = {each.code: each for each in people}
+        self.has_pins = any(each.pin for each in self._people.values())
+        self.person: Person | None = None
+        """Who works here; None before the first badge."""
+        self.asked: Asked | None = None
+        self._wrong: dict[str, int] = {}
+        """Wrong PINs by the person's name, since the last right one or the last lock."""
+        self._locked_until_s: dict[str, float] = {}
+
+    @property
+    def codes(self) -> frozenset[str]:
+        """What the badges say."""
+        return frozenset(self._people)
+
+    def find(self, text: str) -> Person | None:
+        """Whose badge it is."""
+        return self._people.get(text)
+
+    def may_be_pin(self, text: str) -> bool:
+        """True for a text that may be a PIN, which somebody has typed too late."""
+        return self.has_pins and pins.is_form(text)
+
+    def check_somebody(self) -> Person:
+        """Who works here. Raises Refused before the first badge."""
+        if self.person is None:
+            raise Refused(
+                "NOBODY", say("Nobody has scanned a badge yet."), say("Scan your badge first.")
+            )
+        return self.person
+
+    def check_role(self, word: Word) -> Person | None:
+        """Who says a command that overrides the station; None for the other commands. Raises
+        Refused for a person whose role is another one.
+        """
+        if word not in _ROLES:
+            return None
+        person = self.check_somebody()
+        if person.role not in _ROLES[word]:
+            raise Refused(
+                "NOT_ALLOWED",
+                say("{name} may not do that.", name=printable(person.name)),
+                say("Somebody of rework, or a supervisor, has to scan the badge first.")
+                if Role.REWORK in _ROLES[word]
+                else say("A supervisor has to scan the badge first."),
+            )
+        return person
+
+    def ask(self, person: Person, word: Word, argument: str, now: float) -> Asked:
+        """Wait for the PIN. Raises Refused for a person with too many wrong ones."""
+        if now < self._locked_until_s.get(person.name, now):
+            raise Refused(
+                "PIN_LOCKED",
+                say("Too many wrong PINs of {name}.", name=printable(person.name)),
+                say("Wait a minute, then scan it again."),
+            )
+        self.asked = Asked(person, word, argument, now + PIN_LIMIT_S)
+        return self.asked
+
+    def take_answer(self, name: str, *, is_right: bool, now: float) -> bool:
+        """A PIN of this person was right or wrong. False when no other try is left."""
+        wrong = 0 if is_right else self._wrong.get(name, 0) + 1
+        is_locked = wrong >= TRIES_MAX
+        if is_locked:
+            self._locked_until_s[name] = now + LOCKED_S
+        self._wrong[name] = 0 if is_locked else wrong
+        return not is_locked

@@ -1,0 +1,54 @@
+"""PINs of badges: their form, and their hashes by argon2."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from typing import Final
+
+from argon2 import PasswordHasher, extract_parameters
+from argon2.exceptions import InvalidHashError, VerificationError
+from argon2.low_level import Type
+
+_FORM: Final = re.compile(r"[0-9]{4,12}", re.ASCII)
+FORM_WORDS: Final = "4 to 12 digits"
+_MEMORY_MAX_KIB: Final = 1024 * 1024
+_ROUNDS_MAX: Final = 20
+"""A hash that takes more would hold the line up."""
+
+
+@dataclass(frozen=True)
+class Pin:
+    """What was typed as a PIN; nothing that shows an object shows it."""
+
+    text: str = field(repr=False)
+
+
+def is_form(text: str) -> bool:
+    """True for a text that may be a PIN."""
+    return _FORM.fullmatch(text) is not None
+
+
+def hash_of(pin: Pin) -> str:
+    """The hash for the badge table."""
+    return PasswordHasher().hash(pin.text)
+
+
+def is_right(pin: Pin, pin_hash: str) -> bool:
+    """True when the hash is of this PIN. It takes some 50 ms: it shall be slow to guess."""
+    try:
+        return PasswordHasher().verify(pin_hash, pin.text)
+    except VerificationError:
+        return False
+
+
+def check_hash(pin_hash: str) -> None:
+    """Raises ValueError for a text that is no hash of a PIN; the message does not show it."""
+    try:
+        parameters = extract_parameters(pin_hash)
+    except InvalidHashError:
+        parameters = None
+    if parameters is None or parameters.type is not Type.ID:
+        raise ValueError("it is no argon2id hash; flasher station pin makes one")
+    if parameters.memory_cost > _MEMORY_MAX_KIB or parameters.time_cost > _ROUNDS_MAX:
+        raise ValueError("its hash takes too long; flasher station pin makes another one")
