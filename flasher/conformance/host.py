@@ -105,13 +105,12 @@ class PatientHost:
             with tester.hearing_feedback():
                 tester.send(self._encoder.reset())
                 runs = tester.wait_for(Kind.FEEDBACK) is not None
-            if runs:
-                tester.wait_for(Kind.BOOT_VERSION)
-                tester.wait(self.burst_s + _SETTLE_S)
-                tester.forget()
-                return True
-            if tester.now >= deadline:
-                return False
+            if runs or tester.now >= deadline:
+                # What is sent before the burst that the reset may have begun is over would be lost.
+                if tester.wait_for(Kind.BOOT_VERSION) is not None:
+                    tester.wait(self.burst_s + _SETTLE_S)
+                    tester.forget()
+                return runs
             # The reset may have begun a burst (RS-02): another one in it would do so again.
             quiet_s = self.burst_s + _SETTLE_S
             while tester.wait_for(Kind.BOOT_VERSION, within_s=quiet_s) and tester.now < deadline:
