@@ -26,6 +26,7 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from flasher.report.base import PAGE_STYLE
+from flasher.said import say
 from flasher.web.pages import Pages
 
 TOKEN_HEADER: Final = "x-flasher-token"  # noqa: S105  its name
@@ -212,10 +213,12 @@ class _Login:
         if not hmac.compare_digest(token.encode(), request.session["token"].encode()):
             return RedirectResponse("/login", 303)
         if self._tries.are_used_up:
-            trouble = "Too many wrong passwords: wait a minute."
+            trouble = say("Too many wrong passwords: wait a minute.")
             return self._pages.show(request, "login.html", status=429, trouble=trouble)
         if not self._password or not hmac.compare_digest(said.encode(), self._password.encode()):
             self._tries.was_wrong()
-            return self._pages.show(request, "login.html", status=403, trouble="That is not it.")
+            return self._pages.show(
+                request, "login.html", status=403, trouble=say("That is not it.")
+            )
         request.session["is_in"] = True
         return RedirectResponse("/", 303)

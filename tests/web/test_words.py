@@ -1,0 +1,74 @@
+"""Every sentence that an operator reads is there in each language, with the same values in it."""
+
+from __future__ import annotations
+
+import pickle
+import re
+
+import pytest
+
+from flasher.said import Said, in_language, say
+from flasher.station.scans import Word
+from flasher.web.words import chosen, words
+from tests import catalogue
+from tests.loops import each
+
+_CARDS = re.compile(rf"\b({'|'.join(Word)})\b")
+"""What stands on the operator's cards is the same in every language."""
+
+
+@each("language", catalogue.LANGUAGES)
+def test_nothing_is_left_untranslated(language: str) -> None:
+    """`python -m tests.catalogue` adds what is missing."""
+    known = catalogue.messages(language)
+    assert set(catalogue.said()) == known.keys()
+    assert [english for english, said in known.items() if not said] == []
+
+
+@each("language", catalogue.LANGUAGES)
+def test_values_and_scans_stand_in_every_language(language: str) -> None:
+    for english, said in catalogue.messages(language).items():
+        assert catalogue.fields(said) == catalogue.fields(english), english
+        if "." in english:  # a sentence, not the name of a state
+            assert set(_CARDS.findall(said)) == set(_CARDS.findall(english)), english
+
+
+def test_a_sentence_is_said_by_its_template() -> None:
+    wanted = say("Put {label} into socket {socket}.", label="W1", socket="A")
+    assert wanted == "Put W1 into socket A."
+    assert words("de")(wanted) == "W1 auf Platz A setzen."
+    both = say("{wanted} Or scan CANCEL.", wanted=wanted)
+    assert words("de")(both) == "W1 auf Platz A setzen. Oder CANCEL scannen."
+    assert words("en")(both) == both == "Put W1 into socket A. Or scan CANCEL."
+
+
+def test_a_value_is_never_taken_for_a_template() -> None:
+    said = say("Scan {label}.", label="{socket} %s {0}")
+    assert words("de")(said) == "{socket} %s {0} scannen."
+
+
+def test_a_sentence_passes_from_process_to_process() -> None:
+    said = pickle.loads(pickle.dumps(say("Connect {label}.", label="W1")))  # noqa: S301  our own
+    assert isinstance(said, Said)
+    assert words("de")(said) == "W1 anschließen."
+
+
+def test_what_no_catalogue_knows_stays_as_it_is() -> None:
+    assert in_language("relay 3: no such file", lambda text: text) == "relay 3: no such file"
+    assert words("zh")("relay 3: no such file") == "relay 3: no such file"
+
+
+@pytest.mark.parametrize(
+    ("wanted", "accepted", "code"),
+    [
+        ("de", ["en"], "de"),
+        (None, ["de-AT", "en"], "de"),
+        (None, ["zh-CN;q=0.9"], "zh"),
+        (None, ["fr", "zh"], "zh"),
+        (None, ["fr"], "en"),
+        ("xx", [], "en"),
+        ("../../etc", [], "en"),
+    ],
+)
+def test_the_language_of_a_page(wanted: str | None, accepted: list[str], code: str) -> None:
+    assert chosen(wanted, accepted).code == code
