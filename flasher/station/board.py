@@ -155,7 +155,7 @@ class Board:
             self.said = say("{text}: {reason} {remedy}", text=text, reason=reason, remedy=remedy)
         else:
             self.is_refusal = False
-            meaning = shown(event.meaning)
+            meaning = say(event.meaning)
             if event.socket:
                 socket = printable(event.socket)
                 self.said = say(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import socket
 import threading
 from pathlib import Path
@@ -15,6 +16,8 @@ from flasher.protocol.text import printable
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "::1", "localhost"})
 """Addresses that no other computer reaches."""
+# Nothing of the server is printed into a terminal that shows something else; a log takes it.
+logging.getLogger("uvicorn").addHandler(logging.NullHandler())
 _END_LIMIT_S: Final = 1.0
 """Streams that are still open are cut after this time."""
 

@@ -27,7 +27,7 @@ from flasher.web.pages import Pages
 from flasher.web.server import Server
 
 _KEY = "of the test"
-AT = "2026-05-17T09:00:00.000Z"
+AT = datetime.now(UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 class LineScreen:
@@ -88,7 +88,10 @@ def served(line: LineScreen, port: int = 0) -> Iterator[str]:
         pages=pages, hosts={"127.0.0.1"}, secret=_KEY, now=lambda: 0.0,
     )  # fmt: skip
     with Server(app, "127.0.0.1", port) as server:
-        yield server.url
+        try:
+            yield server.url
+        finally:
+            line.screen.feed.close()
 
 
 def tile(page: Any, socket: str) -> SimpleNamespace:

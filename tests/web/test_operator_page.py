@@ -257,7 +257,7 @@ def test_no_barrier_is_found_by_axe(page: Page, line: LineScreen, scheme: Any) -
 
 # -- room ------------------------------------------------------------------------------------------
 
-_TOO_LARGE = """() => {
+TOO_LARGE = """() => {
   const bad = [];
   if (document.scrollingElement.scrollHeight > innerHeight) bad.push("the page scrolls");
   if (document.scrollingElement.scrollWidth > innerWidth) bad.push("the page is too wide");
@@ -297,6 +297,6 @@ def test_everything_fits(browser: Browser, count: int, size: str) -> None:
                     arg=[names.index(name), state.value.lower()],
                 )
                 if names.index(name) == count - 1 or state is STATES[-1]:
-                    assert page.evaluate(_TOO_LARGE) == [], language
+                    assert page.evaluate(TOO_LARGE) == [], language
         page.close()
     line.hang()
