@@ -127,6 +127,8 @@ class StationConfig(Table):
     """The table of the badges (TOML): who may work here; empty: there are none."""
     shifts: tuple[time, ...] = Field(default=DEFAULT_SHIFTS, min_length=1, max_length=8)
     """When each shift begins, as "06:00"."""
+    sound_volume: float = Field(default=0.3, ge=0, le=1)
+    """Of the operator page; 0 is silent."""
     socket: tuple[SocketConfig, ...] = Field(min_length=1, max_length=SOCKETS_MAX)
 
     @model_validator(mode="after")

@@ -210,8 +210,11 @@ class Screen:
 class OperatorPage:
     """The routes of the page. `submit` hands a scan to the station."""
 
-    def __init__(self, pages: Pages, feed: Feed, submit: Callable[[str], None]) -> None:
+    def __init__(
+        self, pages: Pages, feed: Feed, submit: Callable[[str], None], *, sound_volume: float
+    ) -> None:
         self._pages = pages
+        self._sound_volume = sound_volume
         self._feed = feed
         self._submit = submit
 
@@ -229,7 +232,7 @@ class OperatorPage:
         return RedirectResponse(f"/line{query}", 303)
 
     async def _page(self, request: Request) -> Response:
-        return self._pages.show(request, "line.html")
+        return self._pages.show(request, "line.html", sound_volume=self._sound_volume)
 
     async def _events(self, request: Request) -> Response:
         words = self._pages.words_of(request)

@@ -80,18 +80,19 @@ def ended(socket: str, serial: str, outcome: RunState, code: str = "REFUSED") ->
 
 
 @contextmanager
-def served(line: LineScreen, port: int = 0) -> Iterator[str]:
+def served(line: LineScreen, port: int = 0, *, closes_feed: bool = True) -> Iterator[str]:
     """The page of a line while the block runs; gives its address."""
     pages = Pages()
     app = application(
-        OperatorPage(pages, line.screen.feed, line.scans.append).routes,
+        OperatorPage(pages, line.screen.feed, line.scans.append, sound_volume=0.3).routes,
         pages=pages, hosts={"127.0.0.1"}, secret=_KEY, now=lambda: 0.0,
     )  # fmt: skip
     with Server(app, "127.0.0.1", port) as server:
         try:
             yield server.url
         finally:
-            line.screen.feed.close()
+            if closes_feed:
+                line.screen.feed.close()
 
 
 def tile(page: Any, socket: str) -> SimpleNamespace:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 import random
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -111,6 +112,18 @@ def test_a_station_that_is_gone_covers_the_page_and_it_comes_back_by_itself(
         expect(page.locator("#cover")).to_be_hidden(timeout=10_000)
         _shows(page, 0, "EMPTY")
     again.hang()
+    page.close()
+
+
+def test_the_server_ends_within_two_seconds_though_a_stream_is_open(
+    browser: Browser, line: LineScreen
+) -> None:
+    page = browser.new_page()
+    with served(line, closes_feed=False) as url:
+        page.goto(f"{url}line")
+        expect(page.locator("article")).to_have_count(4)
+        began = time.monotonic()
+    assert time.monotonic() - began < 2.0
     page.close()
 
 

@@ -98,10 +98,10 @@ def operator_page(
     screen = Screen(tally, watch)
     pages = Pages(options.language)
     app = application(
-        OperatorPage(pages, screen.feed, station.submit).routes,
+        OperatorPage(pages, screen.feed, station.submit, sound_volume=config.sound_volume).routes,
         pages=pages,
         hosts=_hosts(address),
-        secret=secrets.token_urlsafe(32) if keeping is None else _kept_secret(keeping),
+        secret=secrets.token_urlsafe(32) if keeping is None else kept_secret(keeping),
         now=time.monotonic,
         password=password,
         is_tls=tls is not None,
@@ -164,7 +164,7 @@ def _password(options: RunOptions) -> str:
     return text
 
 
-def _kept_secret(keeping: Keeping) -> str:
+def kept_secret(keeping: Keeping) -> str:
     """What signs the sessions of the pages, for this user alone; made where there is none."""
     path: Path = keeping.keys_folder / "pages.secret"
     try:

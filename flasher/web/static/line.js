@@ -18,7 +18,6 @@ const TONES = { pass: [660, 880], fail: [220, 160], recheck: [440, 330], error: 
 const REFUSED = [330, 330, 330];
 const tiles = new Map();
 const said = new Map();
-let volume = 0.3;
 let audio = null;
 let isFirst = true;
 
@@ -37,7 +36,7 @@ function sound(tones) {
   }
   tones.forEach((pitch, at) => {
     const tone = new OscillatorNode(audio, { frequency: pitch, type: "triangle" });
-    const gain = new GainNode(audio, { gain: volume });
+    const gain = new GainNode(audio, { gain: Number(document.body.dataset.volume) });
     tone.connect(gain).connect(audio.destination);
     tone.start(audio.currentTime + at * 0.2);
     tone.stop(audio.currentTime + at * 0.2 + 0.16);

@@ -1,0 +1,143 @@
+"""`flasher station run --web`: who may see the pages, and what is refused before a start."""
+
+from __future__ import annotations
+
+import io
+import json
+import socket
+import stat
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import httpx2
+import pytest
+
+from flasher.cli.station import operator_page
+from flasher.errors import ExitCode
+from flasher.station.records.keys import Keeping
+from flasher.web.server import Server
+from tests.cli.conftest import SAMPLES, Flasher
+from tests.cli.station_threads import ThreadPort
+from tests.loops import each
+
+RECIPE = SAMPLES / "station" / "recipe.toml"
+RUN = ("station", "run", "--recipe", RECIPE, "--mock-sockets", "2", "--mock-speed", "0")
+
+
+@pytest.fixture(autouse=True)
+def threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No processes, and nobody at a keyboard."""
+    monkeypatch.setattr("flasher.cli.station.run.LAUNCH", ThreadPort)
+    monkeypatch.setattr(sys, "stdin", io.StringIO())
+
+
+@pytest.fixture
+def password(tmp_path: Path) -> Path:
+    path = tmp_path / "password"
+    path.write_text("long enough\n")
+    return path
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
+    """What the page and its stream said while the station ran."""
+    found: list[Any] = []
+    threads: list[threading.Thread] = []
+
+    class Asked(Server):
+        def __enter__(self) -> Any:
+            entered = super().__enter__()
+            threads.append(threading.Thread(target=look, args=(self.url,)))
+            threads[0].start()
+            return entered
+
+    def look(url: str) -> None:
+        with httpx2.Client(follow_redirects=True, timeout=10) as client:
+            found.append(client.get(f"{url}line").text)
+            with client.stream("GET", f"{url}line/events") as stream:
+                if stream.status_code != httpx2.codes.OK:
+                    found.append(stream.status_code)
+                    return
+                with suppress(httpx2.HTTPError):  # the server has ended
+                    data = (line for line in stream.iter_lines() if line.startswith("data: "))
+                    found.extend(json.loads(line.removeprefix("data: ")) for line in data)
+
+    monkeypatch.setattr(operator_page, "Server", Asked)
+    yield found
+    for thread in threads:
+        thread.join(10)
+
+
+def test_the_page_shows_what_the_station_does(flasher: Flasher, asked: list[Any]) -> None:
+    run = flasher(*RUN, "--units", "4", "--web", "0", "--mock-bad", "0", "--mock-dead", "0")
+    assert run.code == ExitCode.OK
+    assert "The operator page: http://127.0.0.1:" in run.err
+    page, first, *rest = asked
+    assert "<html" in page
+    assert first["all"]
+    assert [tile["socket"] for tile in first["tiles"]] == ["1", "2"]
+    passed = {
+        tile["serial"]
+        for message in rest
+        for tile in message.get("tiles", ())
+        if tile["state"] == "pass"
+    }
+    lines = [json.loads(line) for line in run.out.splitlines()]
+    ended = {each["serial"] for each in lines if each.get("event") == "RunEnded"}
+    assert passed
+    assert passed <= ended
+
+
+@each(
+    "more, what",
+    [
+        (("--web", "0.0.0.0:0"), "Other computers could reach"),
+        (("--web", "0.0.0.0:0", "--web-insecure"), "without a password"),
+        (("--web", "0", "--web-key", RECIPE), "belong together"),
+        (("--web", "0", "--web-key", RECIPE, "--web-certificate", RECIPE), "cannot be used"),
+        (("--web", "0", "--web-password", RECIPE.parent / "none"), "none"),
+        (("--web", "70000"), "no address"),
+        (("--web", "203.0.113.7:0", "--web-insecure"), "without a password"),
+    ],
+)
+def test_pages_that_others_could_read_are_refused(
+    flasher: Flasher, more: tuple[object, ...], what: str
+) -> None:
+    run = flasher(*RUN, "--units", "1", *more)
+    assert run.code == ExitCode.USAGE
+    assert what in run.err
+
+
+def test_a_short_password_is_refused(flasher: Flasher, tmp_path: Path) -> None:
+    (tmp_path / "short").write_text("1234\n")
+    run = flasher(*RUN, "--units", "1", "--web", "0", "--web-password", tmp_path / "short")
+    assert run.code == ExitCode.USAGE
+    assert "less than 8 characters" in run.err
+
+
+def test_a_port_that_is_taken_is_said(flasher: Flasher) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        run = flasher(*RUN, "--units", "1", "--web", other.getsockname()[1])
+    assert run.code == ExitCode.USAGE
+    assert "another program uses it" in run.err
+
+
+def test_a_password_is_asked_for(flasher: Flasher, asked: list[Any], password: Path) -> None:
+    run = flasher(*RUN, "--units", "1", "--web", "0", "--web-password", password)
+    assert run.code in (ExitCode.OK, ExitCode.PARTIAL)
+    page, refused = asked
+    assert "asks for its password" in page
+    assert refused == httpx2.codes.UNAUTHORIZED
+
+
+def test_the_secret_of_the_sessions_is_kept_for_this_user_alone(tmp_path: Path) -> None:
+    keeping = Keeping(tmp_path / "keys")
+    first = operator_page.kept_secret(keeping)
+    assert len(first) > 30
+    assert operator_page.kept_secret(keeping) == first
+    (path,) = (tmp_path / "keys").iterdir()
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
