@@ -68,6 +68,8 @@ class Board:
     part: str = ""
     figures: Figures | None = None
     stopped: LineStopped | None = None
+    page: str = ""
+    """Address of the operator page, where there is one."""
     records_fault: str = ""
     """Why the last record was not saved; empty when the last one was."""
     said: str = ""
@@ -156,7 +158,7 @@ class Board:
         else:
             self.is_refusal = False
             meaning = say(event.meaning)
-            if event.socket:
+            if event.socket and event.meaning != Word.SOCKET.value.lower():
                 socket = printable(event.socket)
                 self.said = say(
                     "{text}: {meaning} for socket {socket}",

@@ -231,8 +231,8 @@ class _Session:
             keeping=None if self.is_temporary else self._store.signer.keeping,
         )
         self._page, url = stack.enter_context(page)
-        self.view.board.said = text = f"The operator page: {url}"
-        self._output.progress(text)
+        self.view.board.page = url
+        self._output.progress(f"The operator page: {url}")
 
     def show(self, event: StationEvent) -> None:
         """Show one event; called in the station's thread."""

@@ -221,7 +221,8 @@ def _foot(board: Board, typed: str | None, width: int, height: int) -> list[Text
     lines += [_cut(line, "bold red" if board.is_refusal else "") for line in said]
     if typed is not None:
         lines.append(_cut(f"scan> {printable(typed)}_"))
-    return [*lines, _cut(_KEYS, "dim")]
+    page = f"; the operator page: {board.page}" if board.page else ""
+    return [*lines, _cut(_KEYS + page, "dim")]
 
 
 def _stopped_lines(stop: LineStopped, width: int, room: int) -> list[str]:
