@@ -196,7 +196,7 @@ def test_what_to_do_with_a_label_stands_behind_it() -> None:
     board = board_of(OperatorPrompted("", "Scan the socket."), ScanAccepted("W2", "label"))
     assert board.said == "W2: label. Scan the socket."
     board.apply(ScanAccepted("SOCKET 1", "socket", "1"))
-    assert board.said == "SOCKET 1: socket for socket 1"
+    assert board.said == "SOCKET 1: socket"
 
 
 def test_the_label_of_a_virtual_unit_is_shown_to_be_typed() -> None:
