@@ -10,7 +10,8 @@ bounded size however long the series is.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from statistics import median
@@ -266,19 +267,21 @@ class Histogram:
     description: str
 
 
-def histogram(values: Sequence[float], width: float) -> Histogram:
-    """How these times (in seconds) are spread, in bins of one width on paper: on a logarithmic axis
-    they grow with the values. `width` is in CSS pixels. Raises ValueError for none.
+def histogram(values: Iterable[float] | Mapping[float, int], width: float) -> Histogram:
+    """How these times (in seconds; or how often each came) are spread, in bins of one width on
+    paper: on a logarithmic axis they grow with the values. `width` is in CSS pixels. Raises
+    ValueError for none.
     """
-    if not values:
+    times = Counter(values)
+    if not times:
         raise ValueError("no values")
     bottom = _TOP + _HISTOGRAM_HEIGHT
     frame = Frame(width, bottom + _AXIS_HEIGHT, _LEFT, _TOP, width - _RIGHT - 10, bottom)
-    x_axis = Axis.over(values, frame.left, frame.right, intervals=_intervals_for(width))
+    x_axis = Axis.over(times, frame.left, frame.right, intervals=_intervals_for(width))
     bin_width = (frame.right - frame.left) / _BINS
     counts = [0] * _BINS
-    for value in values:
-        counts[min(_BINS - 1, int((x_axis.at(value) - frame.left) / bin_width))] += 1
+    for value, count in times.items():
+        counts[min(_BINS - 1, int((x_axis.at(value) - frame.left) / bin_width))] += count
     places = [place for place in linear_ticks(0, max(counts), 4) if place == int(place)]
     top_count = places[-1]
     y_ticks = tuple(
@@ -292,10 +295,10 @@ def histogram(values: Sequence[float], width: float) -> Histogram:
             edges = (_value_at(x_axis, index / _BINS), _value_at(x_axis, (index + 1) / _BINS))
             tip = f"{duration_text(edges[0])} to {duration_text(edges[1])}: {count:,}"
             bars.append(Bar(round(begin + 1, 1), bottom - tall, round(bin_width - 2, 1), tall, tip))
-    ordered = sorted(values)
+    ordered = sorted(times.elements())
     description = (
-        f"{len(values):,} values from {duration_text(ordered[0])} to {duration_text(ordered[-1])}, "
-        f"median {duration_text(median(values))}."
+        f"{len(ordered):,} values from {duration_text(ordered[0])} to"
+        f" {duration_text(ordered[-1])}, median {duration_text(median(ordered))}."
     )
     return Histogram(frame, x_axis, y_ticks, tuple(bars), description)
 

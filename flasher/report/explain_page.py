@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from flasher.prose import prose
 from flasher.protocol.spec import Node
@@ -117,24 +117,28 @@ class UpgradeView:
 
 def render(story: Story) -> str:
     """The whole page as HTML text."""
+    return render_page("explain.html", **told(story))
+
+
+def told(story: Story) -> dict[str, Any]:
+    """What the template of the page needs."""
     shown = story.upgrades[:UPGRADES_SHOWN]
     room = _Room.for_upgrades(len(shown))
     status = status_of(story.verdict.cause)
-    return render_page(
-        "explain.html",
-        story=story,
-        status=status,
-        word=_WORDS[status],
-        started=_wall_text(story.started_at),
-        upgrades=[_view(upgrade, room) for upgrade in shown],
-        more_upgrades=[
+    return {
+        "story": story,
+        "status": status,
+        "word": _WORDS[status],
+        "started": _wall_text(story.started_at),
+        "upgrades": [_view(upgrade, room) for upgrade in shown],
+        "more_upgrades": [
             (upgrade, status_of(upgrade.verdict.cause))
             for upgrade in story.upgrades[UPGRADES_SHOWN:]
         ],
-        outside=_drawn(story.steps, "", room.items),
-        talkers=story.talkers[:TALKERS_SHOWN],
-        talkers_left_out=story.talkers_left_out + max(0, len(story.talkers) - TALKERS_SHOWN),
-    )
+        "outside": _drawn(story.steps, "", room.items),
+        "talkers": story.talkers[:TALKERS_SHOWN],
+        "talkers_left_out": story.talkers_left_out + max(0, len(story.talkers) - TALKERS_SHOWN),
+    }
 
 
 def status_of(cause: Cause) -> Status:

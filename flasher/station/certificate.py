@@ -7,12 +7,15 @@ A unit that did not pass gets a page as well, and the page says so in its first 
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Final
+from typing import Any, Final
 
 from flasher.errors import UsageError
+from flasher.protocol.text import printable
 from flasher.report.base import Status, render_page
+from flasher.station.records.errors import UnprovenError
 from flasher.station.records.keys import Head, fingerprint
 from flasher.station.records.model import (
+    Examination,
     Measurement,
     RunDetails,
     RunKind,
@@ -20,6 +23,7 @@ from flasher.station.records.model import (
     UnitLife,
     UnitState,
 )
+from flasher.station.records.store import Store
 
 EARLIER_SHOWN: Final = 50
 """Earlier runs in the table; the page says how many more there are."""
@@ -44,14 +48,40 @@ _RUN_STATUS: Final = {
 }
 
 
+def proven(
+    store: Store, life: UnitLife, examined: Examination | None = None
+) -> tuple[Head | None, bool]:
+    """The signed audit row that vouches for the last run of a unit, None while it goes on; and
+    whether the chain was held against heads that are kept elsewhere.
+
+    Raises UnprovenError where the records were changed.
+    """
+    last = life.runs[-1].run if life.runs else None
+    if last is None or last.state is RunState.RUNNING:
+        return None, examined is not None and examined.is_checked_elsewhere
+    examined = examined or store.examine({last.run_id})
+    problems = examined.of_run(last.run_id)
+    if problems:
+        raise UnprovenError(
+            f"No certificate for {printable(life.serial)}: its records were changed.",
+            cause=f"{problems[0].where}: {problems[0].what}",
+            remedy="Look at all of it with flasher station verify.",
+        )
+    return store.read.head_of(last.run_id), examined.is_checked_elsewhere
+
+
 def render_certificate(
     life: UnitLife, made_at: datetime, head: Head | None, *, is_kept: bool
 ) -> str:
-    """The page. `head` is the signed audit row that vouches for the last run, None while it goes
-    on; `is_kept` when the chain was held against heads that are kept elsewhere.
+    """The page. `head` and `is_kept` as `proven` gives them.
 
     Raises UsageError for a unit without any run.
     """
+    return render_page("certificate.html", **sheet(life, made_at, head, is_kept=is_kept))
+
+
+def sheet(life: UnitLife, made_at: datetime, head: Head | None, *, is_kept: bool) -> dict[str, Any]:
+    """What the template of the page needs. Raises UsageError for a unit without any run."""
     last = life.last
     if last is None:
         raise UsageError(f"Nothing was done to {life.serial}: there is nothing to certify.")
@@ -59,55 +89,55 @@ def render_certificate(
     if life.is_virtual:
         status = Status.WARNING  # never the colour of a product that passed
     earlier = life.runs[:-1]
-    return render_page(
-        "certificate.html",
-        life=life,
-        last=last,
-        status=status,
-        word=word,
-        sentence=sentence,
-        is_virtual=life.is_virtual,
-        head=head,
-        key=fingerprint(head.key) if head else "",
-        is_kept=is_kept,
-        writes=last.writes[:_WRITES_ON_SHEET],
-        text_limit=_TEXT_ON_SHEET,
-        has_more_writes=len(last.writes) > _WRITES_ON_SHEET
+    return {
+        "life": life,
+        "last": last,
+        "status": status,
+        "word": word,
+        "sentence": sentence,
+        "is_virtual": life.is_virtual,
+        "head": head,
+        "key": fingerprint(head.key) if head else "",
+        "is_kept": is_kept,
+        "writes": last.writes[:_WRITES_ON_SHEET],
+        "text_limit": _TEXT_ON_SHEET,
+        "has_more_writes": len(last.writes) > _WRITES_ON_SHEET
         or any(
             len(text or "") > _TEXT_ON_SHEET
             for write in last.writes
             for text in (write.value, write.read_back)
         ),
-        is_golden=last.run.kind is RunKind.GOLDEN,
-        measurements=[
-            (step, each, _limits(each), _verdict(each))
+        "is_golden": last.run.kind is RunKind.GOLDEN,
+        "measurements": [
+            (step, each, limits_of(each), verdict_of(each))
             for step in last.steps
             for each in step.measurements
         ],
-        earlier=[(details.run, _run_status(details)) for details in earlier[-EARLIER_SHOWN:]],
-        earlier_left_out=max(0, len(earlier) - EARLIER_SHOWN),
-        moment=_moment,
-        number=_number,
-        made_at=_moment(made_at),
-    )
+        "earlier": [(details.run, _run_status(details)) for details in earlier[-EARLIER_SHOWN:]],
+        "earlier_left_out": max(0, len(earlier) - EARLIER_SHOWN),
+        "moment": _moment,
+        "number": number,
+        "made_at": _moment(made_at),
+    }
 
 
 def _run_status(details: RunDetails) -> Status:
     return _RUN_STATUS.get(details.run.state, Status.WARNING)
 
 
-def _limits(each: Measurement) -> str:
+def limits_of(each: Measurement) -> str:
+    """What a measurement may be, in words."""
     if each.value is None:
         return each.expected if each.expected is not None else "any"
     bounds = [
-        f"{word} {_number(bound)}"
+        f"{word} {number(bound)}"
         for word, bound in (("from", each.low), ("to", each.high))
         if bound is not None
     ]
     return f"{' '.join(bounds)} {each.unit}".strip() if bounds else "any"
 
 
-def _verdict(each: Measurement) -> str:
+def verdict_of(each: Measurement) -> str:
     """Whether it is within its limits, where it has any."""
     if not each.is_within:
         return "outside"
@@ -115,7 +145,7 @@ def _verdict(each: Measurement) -> str:
     return "within" if has_limits else ""
 
 
-def _number(value: float) -> str:
+def number(value: float) -> str:
     """To a thousandth: times are not measured closer."""
     return f"{round(value, 3):,.10g}"
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Final
@@ -43,13 +44,17 @@ class Report:
             "runs": self.runs,
         }
 
+    def to_json(self) -> str:
+        """The report as a JSON document."""
+        return json.dumps(self.to_dict(), indent=1) + "\n"
+
     def to_csv(self) -> str:
         """One row a run under a line of headings, for a spreadsheet; empty without runs."""
         out = io.StringIO()
         writer = csv.writer(out, lineterminator="\r\n")
         if self.runs:
             writer.writerow(self.runs[0])
-        writer.writerows(map(_cell, run.values()) for run in self.runs)
+        writer.writerows(map(csv_cell, run.values()) for run in self.runs)
         return out.getvalue()
 
     def to_junit(self) -> str:
@@ -69,7 +74,7 @@ def make_report(records: Records, chosen: RunFilter) -> Report:
     return Report(chosen, records.figures(chosen), records.table(chosen))
 
 
-def _cell(value: object) -> str:
+def csv_cell(value: object) -> str:
     """A cell that a spreadsheet takes for what it is."""
     if isinstance(value, str):
         return f"'{value}" if value.startswith(_FORMULA_STARTS) else value

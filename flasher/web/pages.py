@@ -32,14 +32,17 @@ class Pages:
     def show(
         self, request: Request, template: str, *, status: int = 200, **context: Any
     ) -> Response:
+        """A page, in the language of its request."""
+        token = request.session.get("token", "")
+        return HTMLResponse(self.text(template, self.words_of(request), token, **context), status)
+
+    def text(self, template: str, words: Words, token: str, **context: Any) -> str:
         """A page. Templates know `_` (the language), `token`, `languages` and `version`."""
-        words = self.words_of(request)
-        text = self._environment.get_template(template).render(
+        return self._environment.get_template(template).render(
             _=words,
             lang=words.code,
             languages=NAMES,
-            token=request.session.get("token", ""),
+            token=token,
             version=__version__,
             **context,
         )
-        return HTMLResponse(text, status)

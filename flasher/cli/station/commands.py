@@ -18,15 +18,16 @@ from flasher.cli.output import Output
 from flasher.errors import ExitCode, UsageError
 
 DEFAULT_RECORDS: Final = "records.sqlite"
-_EXTRA: Final = ("argon2", "cryptography", "sqlalchemy", "stdnum")
+_EXTRA: Final = ("argon2", "cryptography", "segno", "sqlalchemy", "stdnum")
 """Packages of the extra."""
-_WEB_EXTRA: Final = ("babel", "itsdangerous", "starlette", "uvicorn")
+_WEB_EXTRA: Final = ("babel", "itsdangerous", "pygal", "starlette", "uvicorn")
 _EXAMPLES: Final = """\
 examples:
   flasher station check recipe.toml
   flasher station run --recipe recipe.toml --sockets sockets.toml --operator Jo
   flasher station run --recipe recipe.toml --mock-sockets 4 --units 8
   flasher station run --recipe recipe.toml --mock-sockets 4 --web
+  flasher station pages --sockets sockets.toml
   flasher station report --lot L17 --csv runs.csv --certificates pages
   flasher station unit W2605002 --certificate W2605002.html
   flasher station backup /mnt/plant/records.sqlite
@@ -43,6 +44,11 @@ scanned badge says who works here, and REASON, ABORT and RESUME need a role that
 
 Ctrl-C: no further unit is begun, and those that run are finished. A second one stops them at their
 next safe place; they have to be scanned again. Exit code 12 when a unit did not pass.
+"""
+
+_PAGES_NOTES: Final = """\
+Open the address that is shown: /runs, /units, /yield, /times, /images, /audit. A station that runs
+with --web serves them too, beside its operator page.
 """
 
 
@@ -175,9 +181,44 @@ def _mock_share_option(name: str, share: float, what: str) -> Decorator:
 
 _PAGES: Final = "pages"
 DEFAULT_WEB: Final = "8740"
+DEFAULT_DESK: Final = "8741"
 _VIRTUAL: Final = "virtual units, for training and demonstration"
 _WHICH: Final = "which runs (default: all)"
 _WRITTEN: Final = "what is written"
+
+
+@dataclass(frozen=True)
+class PagesOptions:
+    """Who may see the pages, and in which language."""
+
+    web_password: Path | None
+    web_certificate: Path | None
+    web_key: Path | None
+    web_insecure: bool
+    language: str | None
+
+
+_pages_options: Final = option_set(
+    "pages",
+    PagesOptions,
+    _path_option(
+        "--web-password", panel=_PAGES,
+        help="a file whose first line is the password of the pages",
+    ),
+    _path_option(
+        "--web-certificate", panel=_PAGES,
+        help="serve them by TLS with this certificate (PEM)",
+    ),
+    _path_option("--web-key", panel=_PAGES, help="the key of the certificate (PEM)"),
+    option(
+        "--web-insecure", is_flag=True, panel=_PAGES,
+        help="let other computers in without TLS: whoever listens on the network can read along",
+    ),
+    option(
+        "--language", type=click.Choice(("en", "de", "zh")), panel=_PAGES,
+        help="of the pages (default: the browser's)",
+    ),
+)  # fmt: skip
 
 
 @station.action("check")
@@ -199,11 +240,6 @@ class RunOptions:
     scans: Path | None
     lines: bool
     web: Address | None
-    web_password: Path | None
-    web_certificate: Path | None
-    web_key: Path | None
-    web_insecure: bool
-    language: str | None
     mix_virtual: bool
     mock_sockets: int | None
     units: int | None
@@ -230,24 +266,8 @@ class RunOptions:
     option(
         "--web", type=_address, is_flag=False, flag_value=DEFAULT_WEB, metavar="[[HOST:]PORT]",
         panel=_PAGES, brief=True, show_default=False,
-        help=f"serve the operator page (alone: on this computer only, port {DEFAULT_WEB})",
-    ),
-    _path_option(
-        "--web-password", panel=_PAGES,
-        help="a file whose first line is the password of the pages",
-    ),
-    _path_option(
-        "--web-certificate", panel=_PAGES,
-        help="serve them by TLS with this certificate (PEM)",
-    ),
-    _path_option("--web-key", panel=_PAGES, help="the key of the certificate (PEM)"),
-    option(
-        "--web-insecure", is_flag=True, panel=_PAGES,
-        help="let other computers in without TLS: whoever listens on the network can read along",
-    ),
-    option(
-        "--language", type=click.Choice(("en", "de", "zh")), panel=_PAGES,
-        help="of the pages (default: the browser's)",
+        help="serve the pages of the operator and the supervisor (alone: on this computer only, "
+        f"port {DEFAULT_WEB})",
     ),
     option(
         "--mix-virtual", is_flag=True, panel="records",
@@ -277,12 +297,28 @@ class RunOptions:
         help="times as fast as a real bus; 0 takes no time",
     ),
 )  # fmt: skip
+@_pages_options
 @_records_options
-def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
+def run(output: Output, options: RunOptions, pages: PagesOptions, records: RecordsOptions) -> int:
     """Flash unit after unit."""
     if options.web is not None:
         _need("The operator page", "web", _WEB_EXTRA)
-    return _call("run.run", output, options, records)
+    return _call("run.run", output, options, pages, records)
+
+
+@station.action("pages", epilog=_PAGES_NOTES)
+@option(
+    "--web", type=_address, default=DEFAULT_DESK, metavar="[HOST:]PORT", panel=_PAGES, brief=True,
+    help="where they are served; a port alone: on this computer only",
+)  # fmt: skip
+@_pages_options
+@_records_options
+def pages(output: Output, web: Address, pages: PagesOptions, records: RecordsOptions) -> int:
+    """Serve the supervisor pages of records, until Ctrl-C: runs, units, yield, causes, times,
+    images, audit trail. Nothing of the records is changed, and no station has to run here.
+    """
+    _need("The supervisor pages", "web", _WEB_EXTRA)
+    return _call("desk.serve", output, web, pages, records)
 
 
 @station.action("pin")

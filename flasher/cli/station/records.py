@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
@@ -24,10 +22,10 @@ from flasher.cli.station.documents import (
 )
 from flasher.cli.station.place import open_to_read
 from flasher.cli.station.views import figures_line
-from flasher.errors import ExitCode, FlasherError, UsageError
+from flasher.errors import ExitCode, UsageError
 from flasher.prose import prose
 from flasher.protocol.text import printable
-from flasher.station.records.errors import RecordError, UnprovenError
+from flasher.station.records.errors import UnprovenError
 from flasher.station.records.model import (
     TORN_TRACE,
     TRACE,
@@ -44,7 +42,7 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.store import Store
 from flasher.station.reports import Report, make_report
-from flasher.trace.source import explain_path
+from flasher.station.stories import explained
 from flasher.trace.story import Story
 
 _NO_VERDICT: Final = (RunState.ERROR, RunState.ABORTED, RunState.INTERRUPTED)
@@ -57,7 +55,7 @@ def report(output: Output, options: ReportOptions, records: RecordsOptions) -> i
     with closing(open_to_read(records)) as store:
         wanted: dict[str, tuple[Path | None, Callable[[Report], str]]] = {
             "--csv": (options.csv, Report.to_csv),
-            "--json-report": (options.json_report, _report_json),
+            "--json-report": (options.json_report, Report.to_json),
             "--junit": (options.junit, Report.to_junit),
         }
         for option, (path, _) in wanted.items():
@@ -81,10 +79,6 @@ def report(output: Output, options: ReportOptions, records: RecordsOptions) -> i
         )
         output.document(document, exit_code=code)
         return code
-
-
-def _report_json(report: Report) -> str:
-    return json.dumps(report.to_dict(), indent=1) + "\n"
 
 
 def _filter(options: ReportOptions) -> RunFilter:
@@ -144,21 +138,9 @@ def _certificates(folder: Path, report: Report, store: Store, output: Output) ->
 
 def certificate(store: Store, life: UnitLife, examined: Examination | None = None) -> bytes:
     """The page of a unit. Raises UnprovenError where its records were changed."""
-    from flasher.station.certificate import render_certificate  # noqa: PLC0415  loads jinja2
+    from flasher.station.certificate import proven, render_certificate  # noqa: PLC0415  loads jinja2
 
-    last = life.runs[-1].run if life.runs else None
-    head = None
-    if last is not None and last.state is not RunState.RUNNING:
-        examined = examined or store.examine({last.run_id})
-        problems = examined.of_run(last.run_id)
-        if problems:
-            raise UnprovenError(
-                f"No certificate for {printable(life.serial)}: its records were changed.",
-                cause=f"{problems[0].where}: {problems[0].what}",
-                remedy="Look at all of it with flasher station verify.",
-            )
-        head = store.read.head_of(last.run_id)
-    is_kept = examined is not None and examined.is_checked_elsewhere
+    head, is_kept = proven(store, life, examined)
     return render_certificate(life, datetime.now(UTC), head, is_kept=is_kept).encode("utf-8")
 
 
@@ -183,7 +165,7 @@ def unit(
         for details in life.runs:
             for file in details.attachments:
                 if file.kind in (TRACE, TORN_TRACE):
-                    found = explained(store, file)
+                    found = explained(store.files, file)
                     told.setdefault(details.run.run_id, []).append(found)
                     traces.append(_trace_document(details.run.run_id, file, found, full=full))
         for line in unit_lines(life, told, full=full):
@@ -193,19 +175,6 @@ def unit(
             output.progress(f"page: {printable(str(page))}")
         output.document(UnitDocument(unit=life, traces=traces))
         return ExitCode.OK
-
-
-def explained(store: Store, file: AttachmentFile) -> Story | str:
-    """The story of a trace in the records; or in words why there is none."""
-    try:
-        with store.files.named(file) as path:
-            return replace(explain_path(path), source=printable(file.name))
-    except RecordError as error:
-        return error.what
-    except FlasherError as error:
-        return f"The trace cannot be explained: {error.cause or error.what}"
-    except OSError as error:
-        return f"The trace cannot be explained: {error.strerror or error}."
 
 
 def _trace_document(

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from flasher.cli.output import Output
 from flasher.cli.station.badges import crew_of
-from flasher.cli.station.commands import RecordsOptions, RunOptions
+from flasher.cli.station.commands import PagesOptions, RecordsOptions, RunOptions
 from flasher.cli.station.documents import (
     FiguresDocument,
     StationRunDocument,
@@ -49,7 +49,7 @@ _LEAVE_S: Final = 2.0
 """A verdict on a virtual unit can be read so long."""
 
 
-def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
+def run(output: Output, options: RunOptions, pages: PagesOptions, records: RecordsOptions) -> int:
     """Run the command; returns the exit code. Without a terminal it speaks JSON."""
     is_terminal = sys.stdout.isatty()
     if not (is_terminal or options.lines):
@@ -65,7 +65,9 @@ def run(output: Output, options: RunOptions, records: RecordsOptions) -> int:
     elif options.lines or os.environ.get("TERM") == "dumb":
         view = Lines(output)
     with _opened_records(options, records, config) as store:
-        session = _Session(options, output, store, view, crew, is_virtual=is_virtual)
+        session = _Session(
+            options, pages, output, store, view, crew, is_virtual=is_virtual
+        )
         session.is_temporary = _is_temporary(options, records)
         first = 1
         if is_virtual:  # numbers that these records do not know yet
@@ -174,6 +176,7 @@ class _Session:
     def __init__(
         self,
         options: RunOptions,
+        pages: PagesOptions,
         output: Output,
         store: Store,
         view: View,
@@ -187,6 +190,7 @@ class _Session:
         self.scans_itself = is_virtual and options.scans is None and not by_hand
         self._has_pins = crew is not None and crew.has_pins
         self._options = options
+        self._pages = pages
         self._output = output
         self._store = store
         self._pipe: LineReader | None = None
@@ -216,14 +220,14 @@ class _Session:
             self._failure = _stopped_now()
 
     def _open_page(self, stack: ExitStack) -> None:
-        """Serve the operator page, where it is asked for. Raises UsageError."""
+        """Serve the pages, where they are asked for. Raises UsageError."""
         address = self._options.web
         if address is None:
             return
         from flasher.cli.station.operator_page import operator_page  # noqa: PLC0415  an extra
 
         page = operator_page(
-            self._options,
+            self._pages,
             address,
             self.station,
             self.view.board,

@@ -329,6 +329,11 @@ class RunFilter:
     """Begun before this moment."""
     serial: str | None = None
     part: str | None = None
+    search: str | None = None
+    """Part of the serial number; large and small letters are one."""
+    state: RunState | None = None
+    code: str | None = None
+    socket: str | None = None
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ from flasher.station.records.model import (
 from flasher.station.records.rows import batches, grouped
 
 _EVERYTHING: Final = RunFilter()
-_JUDGED: Final = (RunState.PASS.value, RunState.FAIL.value)
+JUDGED: Final = (RunState.PASS.value, RunState.FAIL.value)
 """Runs that say something about the unit; the others are about the station."""
 _DETAILS: Final = TypeAdapter(list[RunDetails])
 
@@ -49,7 +49,7 @@ class Records:
         """
         words = {int(level): level.name.lower() for level in Verified}
         verified = case(words, value=schema.run.c.verification_reached).label("verified")
-        query = _filtered(_run_query(verified), chosen).order_by(schema.run.c.id)
+        query = filtered(run_query(verified), chosen).order_by(schema.run.c.id)
         with self._database.reading() as connection:
             return [dict(row) for row in connection.execute(query).mappings()]
 
@@ -90,8 +90,8 @@ class Records:
     def figures(self, chosen: RunFilter = _EVERYTHING) -> Figures:
         run = schema.run.c
         duration_s = run.ended_monotonic_s - run.begun_monotonic_s
-        query = _joined(run.unit_id, run.state, run.code, duration_s, run.is_virtual)
-        query = _filtered(query, chosen).where(run.kind != RunKind.GOLDEN.value)
+        query = joined(run.unit_id, run.state, run.code, duration_s, run.is_virtual)
+        query = filtered(query, chosen).where(run.kind != RunKind.GOLDEN.value)
         with self._database.reading() as connection:
             return _figures_of(connection.execute(query.order_by(run.id)))
 
@@ -116,7 +116,7 @@ def details_of(connection: Connection, chosen: Any) -> Iterator[RunDetails]:
     """The runs that a condition chooses, with their parts, in the order of their ids; one that
     names what is not there is left out. Raises ValidationError for what no station writes.
     """
-    query = _run_query(schema.run.c.verification_reached.label("verified")).where(chosen)
+    query = run_query(schema.run.c.verification_reached.label("verified")).where(chosen)
     runs = connection.execute(query.order_by(schema.run.c.id)).mappings()
     by_id = {row["run_id"]: row for row in runs}
     artifact, measurement = schema.artifact.c, schema.measurement
@@ -155,7 +155,8 @@ def details_of(connection: Connection, chosen: Any) -> Iterator[RunDetails]:
         )
 
 
-def _joined(*columns: Any) -> Select[Any]:
+def joined(*columns: Any) -> Select[Any]:
+    """Columns of runs with what `filtered` asks for."""
     return (
         select(*columns)
         .join_from(schema.run, schema.unit, schema.run.c.unit_id == schema.unit.c.id)
@@ -164,11 +165,11 @@ def _joined(*columns: Any) -> Select[Any]:
     )
 
 
-def _run_query(verified: Any) -> Select[Any]:
+def run_query(verified: Any) -> Select[Any]:
     """Runs with the columns of `RunRecord`."""
     run = schema.run.c
     return (
-        _joined(
+        joined(
             run.id.label("run_id"),
             schema.unit.c.serial,
             schema.unit.c.part,
@@ -197,16 +198,24 @@ def _run_query(verified: Any) -> Select[Any]:
     )
 
 
-def _filtered(query: Select[Any], chosen: RunFilter) -> Select[Any]:
+def filtered(query: Select[Any], chosen: RunFilter) -> Select[Any]:
+    """A query of `joined` or `run_query` for the runs of a filter."""
     bounds: Mapping[Any, str | None] = {
         schema.lot.c.name: chosen.lot,
         schema.recipe.c.name: chosen.recipe,
         schema.unit.c.serial: chosen.serial,
         schema.unit.c.part: chosen.part,
+        schema.run.c.state: chosen.state,
+        schema.run.c.code: chosen.code,
     }
     for column, value in bounds.items():
         if value is not None:
             query = query.where(column == value)
+    if chosen.search is not None:
+        query = query.where(schema.unit.c.serial.icontains(chosen.search, autoescape=True))
+    if chosen.socket is not None:
+        named = select(schema.socket.c.id).where(schema.socket.c.name == chosen.socket)
+        query = query.where(schema.run.c.socket_id.in_(named))
     if chosen.since is not None:
         query = query.where(schema.run.c.begun_at >= utc_text(chosen.since))
     if chosen.until is not None:
@@ -226,7 +235,7 @@ def _figures_of(rows: Iterable[Any]) -> Figures:
     for unit_id, state, code, duration_s, is_virtual in rows:
         virtual_runs += bool(is_virtual)
         by_state[state] += 1
-        if state in _JUDGED:
+        if state in JUDGED:
             first.setdefault(unit_id, state)
             last[unit_id] = state
         if state == passed:

@@ -1,0 +1,472 @@
+"""The records as a supervisor looks at them: pages of runs and of the audit trail, the units that
+hold an image, figures over time.
+
+The database counts; what is fetched has a bounded size, however many runs there are.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from enum import StrEnum
+from typing import Any, Final, Generic, TypeVar
+
+from pydantic import TypeAdapter
+from sqlalchemy import Select, and_, case, exists, func, literal, or_, select, union_all
+from sqlalchemy.sql.expression import ColumnElement
+
+from flasher.station.records import schema
+from flasher.station.records.chain import data_of
+from flasher.station.records.database import Database
+from flasher.station.records.model import (
+    RunDetails,
+    RunFilter,
+    RunId,
+    RunKind,
+    RunRecord,
+    RunState,
+    StepState,
+    utc_moment,
+    utc_text,
+)
+from flasher.station.records.proof import FLASH
+from flasher.station.records.queries import JUDGED, details_of, filtered, joined, run_query
+
+PAGE_SIZE: Final = 50
+LIFE_SIZE: Final = 10
+IMAGES_MAX: Final = 100
+_SPANS_AT_ONCE: Final = 400
+"""Spans in one query: SQLite takes 500 parts."""
+_RUNS: Final = TypeAdapter(tuple[RunRecord, ...])
+_Row = TypeVar("_Row")
+
+
+@dataclass(frozen=True)
+class Cut:
+    """Where a page begins: below or above the row with an id; neither: the newest rows."""
+
+    before: int | None = None
+    after: int | None = None
+
+
+@dataclass(frozen=True)
+class Page(Generic[_Row]):
+    """Some rows, the newest first. `older` and `newer`: the cuts to the pages beside it; None where
+    there is none.
+    """
+
+    rows: tuple[_Row, ...]
+    older: Cut | None
+    newer: Cut | None
+
+
+@dataclass(frozen=True)
+class ImageRecord:
+    """An image that some run was to flash."""
+
+    target: str
+    name: str
+    version: str
+    sha256: str
+    size_bytes: int
+
+
+@dataclass(frozen=True)
+class Holder:
+    """A unit whose last transfer to the target was that of an image."""
+
+    serial: str
+    part: str
+    is_virtual: bool
+    run_id: RunId
+    state: RunState
+    """How that run ended."""
+    begun_at: datetime
+    target: str
+    is_confirmed: bool
+    """The device confirmed the transfer; else it holds the image, a part of it, or none."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """A stretch of time."""
+
+    begin: datetime
+    end: datetime
+
+
+@dataclass(frozen=True)
+class SpanYield:
+    """Units with a run of a span that told PASS from FAIL. Golden units count in none."""
+
+    span: Span
+    units: int = 0
+    passed: int = 0
+    """Units whose last such run is a PASS."""
+    first_passed: int = 0
+
+
+class By(StrEnum):
+    """What causes are told apart by."""
+
+    SOCKET = "socket"
+    RECIPE = "recipe"
+    LOT = "lot"
+    SHIFT = "shift"
+
+
+@dataclass(frozen=True)
+class AuditRow:
+    """A row of the audit trail."""
+
+    row_id: int
+    station: str
+    number: int
+    at: datetime
+    event: str
+    run_id: RunId | None
+    data: dict[str, Any]
+    hash: str
+
+
+class Overview:
+    """Every method raises RecordError when the records cannot be read."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def runs(self, chosen: RunFilter, cut: Cut, size: int = PAGE_SIZE) -> Page[RunRecord]:
+        """A page of the runs of a filter."""
+        run_id = schema.run.c.id
+        query = filtered(run_query(schema.run.c.verification_reached.label("verified")), chosen)
+        rows, older, newer = self._cut(query, run_id, cut, size)
+        # What no station writes is shown nowhere else: reports and `verify` name it.
+        return Page(_RUNS.validate_python(rows), older, newer)
+
+    def parts(self, serial: str) -> tuple[str, ...]:
+        """The parts of the units with this serial number."""
+        unit = schema.unit.c
+        query = select(unit.part).where(unit.serial == serial).order_by(unit.part)
+        with self._database.reading() as connection:
+            return tuple(connection.execute(query).scalars())
+
+    def life(self, serial: str, part: str, cut: Cut, size: int = LIFE_SIZE) -> Page[RunDetails]:
+        """A page of the runs of a unit, with their parts."""
+        run_id = schema.run.c.id
+        query = filtered(joined(run_id), RunFilter(serial=serial, part=part))
+        rows, older, newer = self._cut(query, run_id, cut, size)
+        with self._database.reading() as connection:
+            found = tuple(details_of(connection, run_id.in_([row["id"] for row in rows])))
+        return Page(found[::-1], older, newer)
+
+    def recipes(self) -> tuple[tuple[str, str], ...]:
+        """Names and parts of the recipes."""
+        recipe = schema.recipe.c
+        query = select(recipe.name, recipe.part).distinct().order_by(recipe.name, recipe.part)
+        with self._database.reading() as connection:
+            return tuple((name, part) for name, part in connection.execute(query))
+
+    def sockets(self) -> tuple[str, ...]:
+        name = schema.socket.c.name
+        with self._database.reading() as connection:
+            return tuple(connection.execute(select(name).distinct().order_by(name)).scalars())
+
+    def last_begin(self, chosen: RunFilter) -> datetime | None:
+        """When the last run of a filter began; None without runs."""
+        begun_at = schema.run.c.begun_at
+        query = filtered(joined(begun_at), chosen).order_by(begun_at.desc()).limit(1)
+        with self._database.reading() as connection:
+            found = connection.execute(query).scalar_one_or_none()
+        return None if found is None else utc_moment(found)
+
+    # -- images -----------------------------------------------------------------------------------
+
+    def images(self, wanted: str = "") -> tuple[ImageRecord, ...]:
+        """The images with this text in their names or at the beginning of their hashes, the newest
+        first.
+        """
+        artifact = schema.artifact.c
+        query = (
+            select(
+                artifact.target,
+                artifact.name,
+                artifact.version,
+                artifact.sha256,
+                artifact.size_bytes,
+            )
+            .order_by(artifact.id.desc())
+            .limit(IMAGES_MAX)
+        )
+        if wanted:
+            query = query.where(
+                or_(
+                    artifact.name.icontains(wanted, autoescape=True),
+                    artifact.sha256.istartswith(wanted, autoescape=True),
+                )
+            )
+        with self._database.reading() as connection:
+            return tuple(ImageRecord(**row) for row in connection.execute(query).mappings())
+
+    def holders(self, sha256: str, cut: Cut, size: int = PAGE_SIZE) -> Page[Holder]:
+        """A page of the units whose last transfer was that of the image with this hash."""
+        rows, older, newer = self._cut(_holders(sha256), schema.run_target.c.id, cut, size)
+        return Page(tuple(map(_holder, rows)), older, newer)
+
+    def all_holders(self, sha256: str) -> list[Holder]:
+        """All of them, in the order in which they were made."""
+        query = _holders(sha256).order_by(schema.run_target.c.id)
+        with self._database.reading() as connection:
+            return [_holder(dict(row)) for row in connection.execute(query).mappings()]
+
+    def holder_count(self, sha256: str) -> int:
+        """How many units that are."""
+        query = _holders(sha256).with_only_columns(func.count(), maintain_column_froms=True)
+        with self._database.reading() as connection:
+            return int(connection.execute(query).scalar_one())
+
+    # -- figures over time ------------------------------------------------------------------------
+
+    def yields(self, chosen: RunFilter, spans: Sequence[Span]) -> list[SpanYield]:
+        """The yield in each of these spans."""
+        run, first, last = schema.run.c, schema.run.alias(), schema.run.alias()
+        found: dict[int, SpanYield] = {}
+        for begin in range(0, len(spans), _SPANS_AT_ONCE):
+            span = _table(spans[begin : begin + _SPANS_AT_ONCE], begin)
+            of_unit = (
+                _counting(chosen, span.c.number, run.unit_id)
+                .add_columns(func.min(run.id).label("first"), func.max(run.id).label("last"))
+                .join(span, _within(span))
+                .where(run.state.in_(JUDGED))
+                .group_by(span.c.number, run.unit_id)
+                .subquery()
+            )
+            passed = RunState.PASS.value
+            query = (
+                select(
+                    of_unit.c.number,
+                    func.count(),
+                    func.sum(case((last.c.state == passed, 1), else_=0)),
+                    func.sum(case((first.c.state == passed, 1), else_=0)),
+                )
+                .join_from(of_unit, first, first.c.id == of_unit.c.first)
+                .join(last, last.c.id == of_unit.c.last)
+                .group_by(of_unit.c.number)
+            )
+            with self._database.reading() as connection:
+                for number, *counts in connection.execute(query):
+                    found[number] = SpanYield(spans[number], *map(int, counts))
+        return [found.get(number, SpanYield(span)) for number, span in enumerate(spans)]
+
+    def causes(
+        self, chosen: RunFilter, by: By, shifts: Sequence[tuple[Span, str]] = ()
+    ) -> dict[str, Counter[str]]:
+        """How often each code ended a run without PASS, in each group; for BY.SHIFT `shifts` are
+        the spans with their names.
+        """
+        found: dict[str, Counter[str]] = defaultdict(Counter)
+        with self._database.reading() as connection:
+            for query, named in self._causes(chosen, by, shifts):
+                for code, group, count in connection.execute(query):
+                    found[code][named(group)] += count
+        return dict(found)
+
+    def _causes(
+        self, chosen: RunFilter, by: By, shifts: Sequence[tuple[Span, str]]
+    ) -> Iterator[tuple[Select[Any], Any]]:
+        run = schema.run.c
+        bad = run.state.not_in((RunState.PASS.value, RunState.RUNNING.value))
+        if by is By.SHIFT:
+            spans = [span for span, _ in shifts]
+            for begin in range(0, len(spans), _SPANS_AT_ONCE):
+                span = _table(spans[begin : begin + _SPANS_AT_ONCE], begin)
+                query = _counting(chosen, run.code, span.c.number, func.count())
+                query = query.join(span, _within(span)).where(bad)
+                yield query.group_by(run.code, span.c.number), lambda at: shifts[at][1]
+            return
+        recipe, socket = schema.recipe.c, schema.socket
+        column: ColumnElement[Any] = {
+            By.SOCKET: socket.c.name,
+            By.RECIPE: recipe.name + literal(", ") + recipe.revision,
+            By.LOT: func.coalesce(schema.lot.c.name, ""),
+        }[by]
+        query = _counting(chosen, run.code, column, func.count()).where(bad)
+        if by is By.SOCKET:
+            query = query.join(socket, run.socket_id == socket.c.id)
+        yield query.group_by(run.code, column), str
+
+    def step_times(self, chosen: RunFilter) -> dict[str, Counter[float]]:
+        """How often each duration in seconds was that of a step that passed, by the step's name.
+        Durations are rounded to three digits, no finer than a millisecond.
+        """
+        step = schema.step.c
+        rounded = case(
+            (step.duration_s < 1, func.round(step.duration_s * 1000) / 1000),
+            (step.duration_s < 10, func.round(step.duration_s * 100) / 100),
+            else_=func.round(step.duration_s * 10) / 10,
+        )
+        query = (
+            _counting(chosen, step.name, rounded, func.count())
+            .join(schema.step, step.run_id == schema.run.c.id)
+            .where(step.state == StepState.PASS.value)
+            .group_by(step.name, rounded)
+        )
+        found: dict[str, Counter[float]] = defaultdict(Counter)
+        with self._database.reading() as connection:
+            for name, seconds, count in connection.execute(query):
+                found[name][float(seconds)] += count
+        return dict(found)
+
+    # -- the audit trail --------------------------------------------------------------------------
+
+    def audit(
+        self,
+        cut: Cut,
+        *,
+        event: str | None = None,
+        since: datetime | None = None,
+        until: datetime | None = None,
+        size: int = PAGE_SIZE,
+    ) -> Page[AuditRow]:
+        """A page of the audit trails of all stations."""
+        audit = schema.audit.c
+        query = select(schema.audit, schema.station.c.name.label("station")).join_from(
+            schema.audit, schema.station
+        )
+        if event is not None:
+            query = query.where(audit.event == event)
+        if since is not None:
+            query = query.where(audit.at >= utc_text(since))
+        if until is not None:
+            query = query.where(audit.at < utc_text(until))
+        rows, older, newer = self._cut(query, audit.id, cut, size)
+        return Page(
+            tuple(
+                AuditRow(
+                    row["id"],
+                    row["station"],
+                    row["number"],
+                    utc_moment(row["at"]),
+                    row["event"],
+                    row["run_id"],
+                    data_of(row["data"]),
+                    row["hash"],
+                )
+                for row in rows
+            ),
+            older,
+            newer,
+        )
+
+    def audit_events(self) -> tuple[str, ...]:
+        """The events that there are."""
+        event = schema.audit.c.event
+        with self._database.reading() as connection:
+            return tuple(connection.execute(select(event).distinct().order_by(event)).scalars())
+
+    def _cut(
+        self, query: Select[Any], row_id: Any, cut: Cut, size: int
+    ) -> tuple[list[dict[str, Any]], Cut | None, Cut | None]:
+        query = query.add_columns(row_id.label("row_id"))
+        if cut.after is not None:
+            query = query.where(row_id > cut.after).order_by(row_id)
+        else:
+            query = query.order_by(row_id.desc())
+            if cut.before is not None:
+                query = query.where(row_id < cut.before)
+        with self._database.reading() as connection:
+            rows = [dict(row) for row in connection.execute(query.limit(size + 1)).mappings()]
+        has_more = len(rows) > size
+        rows = rows[:size]
+        ids = [row.pop("row_id") for row in rows]
+        has_older, has_newer = has_more, cut.before is not None
+        if cut.after is not None:
+            rows, ids = rows[::-1], ids[::-1]
+            has_older, has_newer = True, has_more
+        return (
+            rows,
+            Cut(before=ids[-1]) if ids and has_older else None,
+            Cut(after=ids[0]) if ids and has_newer else None,
+        )
+
+
+def _counting(chosen: RunFilter, *columns: Any) -> Select[Any]:
+    """Columns of the runs of a filter that count in figures."""
+    return filtered(joined(*columns), chosen).where(schema.run.c.kind != RunKind.GOLDEN.value)
+
+
+def _table(spans: Sequence[Span], first: int) -> Any:
+    """Spans as a table: `number` from `first` on, `begin` and `end`."""
+    return union_all(
+        *(
+            select(
+                literal(number).label("number"),
+                literal(utc_text(span.begin)).label("begin"),
+                literal(utc_text(span.end)).label("end"),
+            )
+            for number, span in enumerate(spans, first)
+        )
+    ).cte()
+
+
+def _within(span: Any) -> ColumnElement[bool]:
+    begun_at = schema.run.c.begun_at
+    return and_(begun_at >= span.c.begin, begun_at < span.c.end)
+
+
+def _holders(sha256: str) -> Select[Any]:
+    """The runs that made the last transfer to a target of their unit, with this image."""
+    run, target, artifact = schema.run.c, schema.run_target, schema.artifact.c
+    write, later_write = schema.device_write.c, schema.device_write.alias()
+    later = schema.run.alias()
+    of_run = and_(write.run_id == run.id, write.target == target.c.target, write.what == FLASH)
+    confirmed_at = (
+        select(write.verified_at)
+        .where(of_run)
+        .order_by(write.id.desc())
+        .limit(1)
+        .correlate(schema.run, target)
+        .scalar_subquery()
+    )
+    overwritten = (
+        select(later.c.id)
+        .join(later_write, later_write.c.run_id == later.c.id)
+        .where(
+            later.c.unit_id == run.unit_id,
+            later.c.id > run.id,
+            later_write.c.target == target.c.target,
+            later_write.c.what == FLASH,
+        )
+        .correlate(schema.run, target)
+    )
+    return (
+        select(
+            schema.unit.c.serial,
+            schema.unit.c.part,
+            run.is_virtual,
+            run.id.label("run_id"),
+            run.state,
+            run.begun_at,
+            target.c.target,
+            confirmed_at.label("confirmed_at"),
+        )
+        .join_from(target, schema.run, target.c.run_id == run.id)
+        .join(schema.unit, run.unit_id == schema.unit.c.id)
+        .where(target.c.artifact_id.in_(select(artifact.id).where(artifact.sha256 == sha256)))
+        .where(exists(select(write.id).where(of_run).correlate(schema.run, target)))
+        .where(~exists(overwritten))
+    )
+
+
+def _holder(row: dict[str, Any]) -> Holder:
+    return Holder(
+        row["serial"],
+        row["part"],
+        bool(row["is_virtual"]),
+        row["run_id"],
+        RunState(row["state"]),
+        utc_moment(row["begun_at"]),
+        row["target"],
+        row["confirmed_at"] is not None,
+    )

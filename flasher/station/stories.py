@@ -1,0 +1,26 @@
+"""What the traces of runs tell, in words."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from flasher.errors import FlasherError
+from flasher.protocol.text import printable
+from flasher.station.records.errors import RecordError
+from flasher.station.records.files import FileStore
+from flasher.station.records.model import AttachmentFile
+from flasher.trace.source import explain_path
+from flasher.trace.story import Story
+
+
+def explained(files: FileStore, file: AttachmentFile) -> Story | str:
+    """The story of a trace in the records; or in words why there is none."""
+    try:
+        with files.named(file) as path:
+            return replace(explain_path(path), source=printable(file.name))
+    except RecordError as error:
+        return error.what
+    except FlasherError as error:
+        return f"The trace cannot be explained: {error.cause or error.what}"
+    except OSError as error:
+        return f"The trace cannot be explained: {error.strerror or error}."

@@ -1,0 +1,91 @@
+"""Charts as markup inside of a page, drawn by pygal.
+
+What pygal adds for a page of its own is taken away (styles, scripts, names), so that no policy has
+to allow it: the style sheet of the pages paints a chart, in light and dark. Two drawings, one of
+which the style sheet shows: text has its full size on a desk and on a phone.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+from xml.etree import ElementTree
+
+import pygal
+from markupsafe import Markup
+from pygal.style import Style
+
+from flasher.report.base import shortened, visible
+from flasher.report.chart import WIDTHS
+
+# pygal's finder of maps, which are not used here: Python 3.11 warns of its like at every import.
+sys.meta_path[:] = [each for each in sys.meta_path if not isinstance(each, pygal.PluginImportFixer)]
+
+SERIES_MAX: Final = 8
+"""The style sheet has so many colours."""
+_HEIGHT: Final = 300
+_PX_PER_LABEL: Final = {"upright": 36, "level": 70}
+_LABEL_MAX: Final = 18
+_STYLE: Final = Style(
+    label_font_size=12, major_label_font_size=12, font_family="system-ui, sans-serif"
+)
+_DROPPED: Final = frozenset({"style", "script", "defs", "title", "desc"})
+_OVERLAYS: Final = frozenset({"tooltip", "text-overlay", "tooltip-overlay", "titles"})
+_KEPT: Final = frozenset(
+    ["viewBox", "x", "y", "x1", "x2", "y1", "y2", "width", "height", "d", "cx", "cy", "r", "rx",
+     "ry", "points", "transform", "class"]
+)  # fmt: skip
+
+Series = Mapping[str, Sequence[float | None]]
+
+
+def lines(title: str, labels: Sequence[str], series: Series, unit: str) -> Markup:
+    """Lines over the same labels, for shares of 100: from the ten below the least one."""
+    least = min(value for values in series.values() for value in values if value is not None)
+    low = min(90, least // 10 * 10)
+    return _drawn(title, labels, series, pygal.Line, range=(low, 100), formatter=_with(unit))
+
+
+def stacked_bars(title: str, labels: Sequence[str], series: Series) -> Markup:
+    """A bar a label, made of the series."""
+    return _drawn(title, labels, series, pygal.StackedBar, formatter=_with(""))
+
+
+def _with(unit: str) -> Callable[[float], str]:
+    return lambda value: f"{value:,.0f}{unit}"
+
+
+def _drawn(title: str, labels: Sequence[str], series: Series, kind: Any, **options: Any) -> Markup:
+    drawings = []
+    shown = [visible(shortened(label, _LABEL_MAX)) for label in labels]
+    for name, width in WIDTHS.items():
+        is_level = len(labels) * _PX_PER_LABEL["level"] <= width
+        upright_room = max(1, int(width // _PX_PER_LABEL["upright"]))
+        chart = kind(
+            width=width, height=_HEIGHT, style=_STYLE, css=(), js=(), show_legend=False,
+            margin=8, dots_size=3, x_label_rotation=0 if is_level else 50,
+            show_minor_x_labels=False, truncate_label=-1,
+            x_labels_major_every=max(1, -(-len(labels) // upright_room)), **options,
+        )  # fmt: skip
+        chart.x_labels = shown
+        for label, values in series.items():
+            chart.add(visible(label), list(values))
+        tree = chart.render_tree()
+        _strip(tree)
+        tree.attrib.update({"role": "img", "aria-label": visible(title)})
+        svg = ElementTree.tostring(tree, encoding="unicode")
+        drawings.append(f'<div class="chart {name}">{svg}</div>')
+    return Markup("".join(drawings))  # noqa: S704  ElementTree has escaped every text
+
+
+def _strip(element: Any) -> None:
+    """Leave shapes, texts, places and classes."""
+    for child in list(element):
+        names = set((child.get("class") or "").split())
+        if not isinstance(child.tag, str) or child.tag in _DROPPED or names & _OVERLAYS:
+            element.remove(child)
+            continue
+        _strip(child)
+    for name in set(element.attrib) - _KEPT:
+        del element.attrib[name]

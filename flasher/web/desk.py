@@ -1,0 +1,143 @@
+"""Answers questions to the records in processes of their own, so that a page takes no time from the
+station that serves it.
+
+A question and its answer are plain data. The processes begin with the first question.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing
+import os
+import signal
+from collections.abc import Awaitable, Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Final, Protocol
+
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+from starlette.routing import BaseRoute, Route
+
+from flasher.web.pages import Pages
+
+PROCESSES: Final = 2
+ANSWER_LIMIT_S: Final = 120.0
+FIELD_MAX: Final = 200
+"""Characters of one field of a form."""
+_NICENESS: Final = 10
+HTML: Final = "text/html; charset=utf-8"
+
+
+@dataclass(frozen=True)
+class Question:
+    """What a page is asked for."""
+
+    path: str
+    """As its route is written."""
+    fields: Mapping[str, str] = field(default_factory=dict)
+    """Of the form in the address, without empty ones."""
+    run: int = 0
+    """Of a page about one run."""
+    language: str = "en"
+    token: str = ""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A page, a file to save, or where to go instead."""
+
+    body: bytes = b""
+    media_type: str = HTML
+    status: int = 200
+    file_name: str = ""
+    """Of a file to save."""
+    location: str = ""
+    """Another page of this server."""
+
+
+class Answering(Protocol):
+    """Who answers questions."""
+
+    def answer(self, question: Question) -> Answer: ...
+
+
+Ask = Callable[[Question], Awaitable[Answer]]
+
+
+class Desk:
+    """Processes that answer. `make` makes who answers in each of them; it and what it makes of are
+    sent there. `close` ends them.
+    """
+
+    def __init__(self, make: Callable[[], Answering]) -> None:
+        self._make = make
+        self._pool: Any = None
+
+    async def ask(self, question: Question) -> Answer:
+        """The answer to a question. Raises TimeoutError, or what the process raised."""
+        if self._pool is None:
+            context = multiprocessing.get_context("spawn")
+            self._pool = context.Pool(PROCESSES, _begin, (self._make,))
+        loop = asyncio.get_running_loop()
+        answered: asyncio.Future[Answer] = loop.create_future()
+
+        def tell(set_result: Callable[[Any], None], result: Any) -> None:
+            if not answered.done():
+                set_result(result)
+
+        self._pool.apply_async(
+            _answer,
+            (question,),
+            callback=lambda found: loop.call_soon_threadsafe(tell, answered.set_result, found),
+            error_callback=lambda error: loop.call_soon_threadsafe(
+                tell, answered.set_exception, error
+            ),
+        )
+        return await asyncio.wait_for(answered, ANSWER_LIMIT_S)
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._pool.terminate()
+            self._pool.join()
+
+
+_answering: Answering
+
+
+def _begin(make: Callable[[], Answering]) -> None:
+    """Called once in each process."""
+    global _answering  # noqa: PLW0603  a process has one
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the station, which ends this one
+    if hasattr(os, "nice"):
+        os.nice(_NICENESS)
+    _answering = make()
+
+
+def _answer(question: Question) -> Answer:
+    return _answering.answer(question)
+
+
+class DeskPages:
+    """The routes of pages that are answered by `ask`."""
+
+    def __init__(self, pages: Pages, ask: Ask, paths: Iterable[str]) -> None:
+        self._pages = pages
+        self._ask = ask
+        self.routes: list[BaseRoute] = [Route(path, partial(self._page, path)) for path in paths]
+
+    async def _page(self, path: str, request: Request) -> Response:
+        fields = {
+            name: value.strip()[:FIELD_MAX]
+            for name, value in request.query_params.items()
+            if value.strip()
+        }
+        run = int(request.path_params.get("run", 0))
+        language, token = self._pages.words_of(request).code, request.session.get("token", "")
+        answer = await self._ask(Question(path, fields, run, language, token))
+        if answer.location:
+            return RedirectResponse(answer.location, 303)
+        headers = {}
+        if answer.file_name:
+            headers["content-disposition"] = f'attachment; filename="{answer.file_name}"'
+        return Response(answer.body, answer.status, headers, answer.media_type)

@@ -1,0 +1,597 @@
+"""The pages of the supervisor: what the records say, from the form in the address to a page.
+
+Times are those of the clock on the wall where the server is; the pages name its zone.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, time, timedelta
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+from urllib.parse import urlencode
+
+from flasher.errors import FlasherError, UsageError
+from flasher.report.base import Status
+from flasher.report.chart import WIDTHS, histogram
+from flasher.report.explain_page import status_of, told
+from flasher.said import say
+from flasher.station import codes
+from flasher.station.certificate import limits_of, number, proven, sheet, verdict_of
+from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
+from flasher.station.records.keys import Keeping
+from flasher.station.records.model import (
+    TORN_TRACE,
+    TRACE,
+    AttachmentFile,
+    RunDetails,
+    RunFilter,
+    RunId,
+    RunState,
+    StepName,
+    UnitState,
+)
+from flasher.station.records.overview import By, Cut, Overview, Span
+from flasher.station.records.store import Store
+from flasher.station.reports import Report, csv_cell, make_report
+from flasher.station.stories import explained
+from flasher.station.tally import DEFAULT_SHIFTS
+from flasher.trace.figures import Distribution
+from flasher.trace.story import Story
+from flasher.web.charts import SERIES_MAX, lines, stacked_bars
+from flasher.web.desk import Answer, Question
+from flasher.web.pages import Pages
+from flasher.web.words import Words, words
+
+USUAL_DAYS: Final = 30
+"""Figures are of the last so many days that have runs, unless the form says another time."""
+CAUSES_DRAWN: Final = 12
+_HOURS_UP_TO: Final = timedelta(days=2)
+_DAYS_UP_TO: Final = timedelta(days=62)
+_WEEKS_UP_TO: Final = timedelta(days=430)
+SPANS_MAX: Final = 400
+_NAMES: Final = {
+    "/runs": say("Runs"),
+    "/units": say("Units"),
+    "/yield": say("Yield and causes"),
+    "/times": say("Times"),
+    "/images": say("Images"),
+    "/audit": say("Audit trail"),
+}
+"""The menu."""
+OUTCOMES: Final = {
+    RunState.RUNNING: (say("RUNNING"), Status.NEUTRAL),
+    RunState.PASS: (say("PASS"), Status.GOOD),
+    RunState.FAIL: (say("FAIL"), Status.BAD),
+    RunState.ERROR: (say("ERROR"), Status.WARNING),
+    RunState.ABORTED: (say("ABORTED"), Status.WARNING),
+    RunState.INTERRUPTED: (say("INTERRUPTED"), Status.WARNING),
+}
+UNIT_WORDS: Final = {
+    UnitState.NEW: (say("NEW"), Status.NEUTRAL),
+    UnitState.RUNNING: (say("RUNNING"), Status.NEUTRAL),
+    UnitState.PASS: (say("PASS"), Status.GOOD),
+    UnitState.FAIL: (say("FAIL"), Status.BAD),
+    UnitState.RECHECK: (say("RECHECK"), Status.WARNING),
+}
+BY_WORDS: Final = {
+    By.SOCKET: say("socket"),
+    By.RECIPE: say("recipe"),
+    By.LOT: say("lot"),
+    By.SHIFT: say("shift"),
+}
+_FILES: Final[dict[str, tuple[str, Callable[[Report], str]]]] = {
+    "/runs.csv": ("text/csv; charset=utf-8", Report.to_csv),
+    "/runs.json": ("application/json", Report.to_json),
+    "/runs.xml": ("application/xml", Report.to_junit),
+}
+
+
+class PartOfYield(NamedTuple):
+    """A row of the table of yields."""
+
+    name: str
+    units: int
+    share: float | None
+    first_share: float | None
+
+
+class PartOfCauses(NamedTuple):
+    """A row of the table of causes. `share`: of it and those before it, of 1."""
+
+    code: str
+    meaning: str
+    counts: tuple[int, ...]
+    total: int
+    share: float
+
+
+@dataclass(frozen=True)
+class Supervisor:
+    """Answers the questions of the pages. `shifts`: when each begins, in local time."""
+
+    store: Store
+    shifts: Sequence[time] = DEFAULT_SHIFTS
+    now: Callable[[], datetime] = lambda: datetime.now().astimezone()
+
+    @cached_property
+    def overview(self) -> Overview:
+        return Overview(self.store.database)
+
+    @cached_property
+    def _pages(self) -> Pages:
+        return Pages()
+
+    def answer(self, question: Question) -> Answer:
+        """The page of a question; a page with what is wrong when there is none."""
+        try:
+            return PAGES[question.path](self, question)
+        except NotFoundError as error:
+            return self._trouble(question, 404, error)
+        except (UsageError, UnprovenError) as error:
+            return self._trouble(question, 400, error)
+        except RecordError as error:
+            return self._trouble(question, 503, error)
+
+    def _trouble(self, question: Question, status: int, error: FlasherError) -> Answer:
+        return self._page(question, "trouble.html", http=status, error=error, path="")
+
+    def _page(
+        self, question: Question, template: str, *, http: int = 200, **context: Any
+    ) -> Answer:
+        said = words(question.language)
+        now = self.now()
+        context.setdefault("path", question.path)
+        text = self._pages.text(
+            template,
+            said,
+            question.token,
+            layout="supervise.html",
+            menu=_NAMES,
+            fields=question.fields,
+            here=_Addresses(question),
+            zone=_zone(now),
+            at=lambda moment: "" if moment is None else f"{moment.astimezone():%Y-%m-%d %H:%M:%S}",
+            outcomes=OUTCOMES,
+            **context,
+        )
+        return Answer(text.encode("utf-8", "backslashreplace"), status=http)
+
+    # -- runs -------------------------------------------------------------------------------------
+
+    def runs(self, question: Question) -> Answer:
+        chosen = filter_of(question)
+        page = self.overview.runs(chosen, _cut(question))
+        return self._page(
+            question,
+            "runs.html",
+            page=page,
+            recipes=self.overview.recipes(),
+            sockets=self.overview.sockets(),
+            codes=list(codes.CODES),
+        )
+
+    def file_of_runs(self, question: Question) -> Answer:
+        media_type, make = _FILES[question.path]
+        report = make_report(self.store.read, filter_of(question))
+        name = question.path.lstrip("/")
+        return Answer(make(report).encode("utf-8"), media_type, file_name=name)
+
+    def run(self, question: Question) -> Answer:
+        """Its unit's page, at this run."""
+        run = self.store.read.run(RunId(question.run)).run
+        unit = {"serial": run.serial, "part": run.part, "before": str(run.run_id + 1)}
+        return Answer(location=f"/units?{urlencode(unit)}")
+
+    def trace(self, question: Question) -> Answer:
+        """What the bus trace of a run tells, in full."""
+        details = self.store.read.run(RunId(question.run))
+        found = self._story(details)
+        if not isinstance(found, Story):
+            raise NotFoundError(f"There is no story of run {question.run}.", cause=found)
+        return self._page(question, "explain.html", path="/units", **told(found))
+
+    def _story(self, details: RunDetails) -> Story | str:
+        for file in details.attachments:
+            if _is_trace(file):
+                return explained(self.store.files, file)
+        return "it has no trace"
+
+    # -- units ------------------------------------------------------------------------------------
+
+    def units(self, question: Question) -> Answer:
+        serial = question.fields.get("serial", "")
+        parts = self.overview.parts(serial) if serial else ()
+        if serial and not parts:
+            return Answer(location=f"/runs?{urlencode({'search': serial})}")
+        part = question.fields.get("part", "")
+        if part not in parts:
+            part = parts[0] if len(parts) == 1 else ""
+        if not part:
+            return self._page(question, "units.html", serial=serial, parts_found=parts)
+        page = self.overview.life(serial, part, _cut(question))
+        if not page.rows:
+            raise NotFoundError(f"There is no such run of {serial}.")
+        newest = self.overview.life(serial, part, Cut(), 1).rows[0]
+        shown = page.rows[0]
+        story = self._story(shown)
+        state, state_status = UNIT_WORDS[UnitState.after(newest.run.state)]
+        return self._page(
+            question,
+            "unit.html",
+            serial=serial,
+            part=part,
+            state=state,
+            state_status=state_status,
+            is_virtual=newest.run.is_virtual,
+            is_over=newest.run.state is not RunState.RUNNING,
+            page=page,
+            shown=shown,
+            story=story if isinstance(story, Story) else None,
+            no_story=story if isinstance(story, str) else "",
+            drawn=None if isinstance(story, str) else told(story),
+            story_status=status_of(story.verdict.cause) if isinstance(story, Story) else None,
+            has_trace=lambda details: any(map(_is_trace, details.attachments)),
+            limits_of=limits_of,
+            verdict_of=verdict_of,
+            number=number,
+        )
+
+    def certificate(self, question: Question) -> Answer:
+        fields = question.fields
+        life = self.store.read.unit(fields.get("serial", ""), fields.get("part"))
+        head, is_kept = proven(self.store, life)
+        made = sheet(life, self.now(), head, is_kept=is_kept)
+        return self._page(question, "certificate.html", path="/units", **made)
+
+    # -- images -----------------------------------------------------------------------------------
+
+    def images(self, question: Question) -> Answer:
+        wanted, sha256 = question.fields.get("image", ""), question.fields.get("sha256", "")
+        images = self.overview.images(wanted)
+        if not sha256 and wanted and len({each.sha256 for each in images}) == 1:
+            sha256 = images[0].sha256
+        chosen = [each for each in self.overview.images(sha256) if each.sha256 == sha256]
+        return self._page(
+            question,
+            "images.html",
+            images=images,
+            chosen=chosen[0] if chosen else None,
+            page=self.overview.holders(sha256, _cut(question)) if chosen else None,
+            count=self.overview.holder_count(sha256) if chosen else 0,
+        )
+
+    def file_of_holders(self, question: Question) -> Answer:
+        out = io.StringIO()
+        writer = csv.writer(out, lineterminator="\r\n")
+        writer.writerow(["serial", "part", "target", "confirmed", "run", "outcome", "begun_at"])
+        for each in self.overview.all_holders(question.fields.get("sha256", "")):
+            row = (each.serial, each.part, each.target, each.is_confirmed, each.run_id)
+            moment = each.begun_at.isoformat(timespec="seconds")
+            writer.writerow(map(csv_cell, (*row, each.state.value, moment)))
+        return Answer(out.getvalue().encode("utf-8"), "text/csv", file_name="units.csv")
+
+    # -- figures ----------------------------------------------------------------------------------
+
+    def _figured(self, question: Question) -> tuple[RunFilter, Span]:
+        """The filter of a page of figures, and the time that they are of."""
+        chosen = filter_of(question)
+        end = chosen.until or self.overview.last_begin(chosen) or self.now()
+        if chosen.until is None:
+            end += timedelta(microseconds=1)
+        begin = chosen.since or end - timedelta(days=USUAL_DAYS)
+        return replace(chosen, since=begin, until=end), Span(begin, end)
+
+    def yields(self, question: Question) -> Answer:
+        chosen, span = self._figured(question)
+        said = words(question.language)
+        spans = list(spans_of(span))
+        found = self.overview.yields(chosen, spans)
+        rows = [
+            PartOfYield(_name_of(each.span), each.units, _share(each.passed, each.units),
+                        _share(each.first_passed, each.units))
+            for each in found
+        ]  # fmt: skip
+        drawn = [row for row in rows if row.units]
+        whole = self.overview.yields(chosen, [span])[0]
+        by = By(question.fields["by"]) if question.fields.get("by") in set(By) else By.SOCKET
+        groups, causes = self._causes(chosen, span, by, said)
+        return self._page(
+            question,
+            "yield.html",
+            span=span,
+            rows=rows,
+            whole=PartOfYield(
+                "",
+                whole.units,
+                _share(whole.passed, whole.units),
+                _share(whole.first_passed, whole.units),
+            ),
+            chart=lines(
+                said(say("Yield over time")),
+                [row.name.removeprefix(f"{span.end.astimezone():%Y-}") for row in drawn],
+                {
+                    "end": [_percent(row.share) for row in drawn],
+                    "first": [_percent(row.first_share) for row in drawn],
+                },
+                " %",
+            )
+            if drawn
+            else "",
+            by=by,
+            by_words=BY_WORDS,
+            groups=groups,
+            causes=causes,
+            causes_chart=stacked_bars(
+                said(say("Causes")),
+                [row.code for row in causes[:CAUSES_DRAWN]],
+                {
+                    f"{at} {group}": [row.counts[at] for row in causes[:CAUSES_DRAWN]]
+                    for at, group in enumerate(groups)
+                },
+            )
+            if causes
+            else "",
+            sockets=self.overview.sockets(),
+            recipes=self.overview.recipes(),
+        )
+
+    def _causes(
+        self, chosen: RunFilter, span: Span, by: By, said: Words
+    ) -> tuple[list[str], list[PartOfCauses]]:
+        """The groups, and the codes from the most frequent one on."""
+        shifts = list(shifts_of(span, self.shifts)) if by is By.SHIFT else []
+        found = self.overview.causes(chosen, by, shifts)
+        sizes: Counter[str] = sum(found.values(), Counter())
+        groups = [name for name, _ in sizes.most_common()]
+        kept = groups if len(groups) <= SERIES_MAX else groups[: SERIES_MAX - 1]
+        has_others = len(kept) < len(groups)
+        everything, so_far = sizes.total(), 0
+        rows = []
+        for code, counts in sorted(found.items(), key=lambda item: (-item[1].total(), item[0])):
+            so_far += counts.total()
+            shown = [counts[name] for name in sorted(kept)]
+            if has_others:
+                shown.append(counts.total() - sum(shown))
+            meaning = codes.CODES[code].meaning if code in codes.CODES else ""
+            share = so_far / everything
+            rows.append(PartOfCauses(code, meaning, tuple(shown), counts.total(), share))
+        names = [name or said(say("no lot")) for name in sorted(kept)]
+        return [*names, *([said(say("others"))] if has_others else [])], rows
+
+    def times(self, question: Question) -> Answer:
+        chosen, span = self._figured(question)
+        found = self.overview.step_times(chosen)
+        order = {step.value: at for at, step in enumerate(StepName)}
+        rows = []
+        for name, counts in sorted(found.items(), key=lambda item: order.get(item[0], 99)):
+            ranked = Counter(dict(sorted(counts.items())))
+            rows.append(
+                (
+                    name,
+                    Distribution.of(ranked.elements()),
+                    {kind: histogram(counts, width) for kind, width in WIDTHS.items()},
+                )
+            )
+        return self._page(
+            question,
+            "times.html",
+            span=span,
+            rows=rows,
+            sockets=self.overview.sockets(),
+            recipes=self.overview.recipes(),
+        )
+
+    # -- the audit trail --------------------------------------------------------------------------
+
+    def audit(self, question: Question) -> Answer:
+        page = self.overview.audit(
+            _cut(question),
+            event=question.fields.get("event"),
+            since=_moment(question, "from"),
+            until=_moment(question, "to"),
+        )
+        return self._page(
+            question,
+            "audit.html",
+            page=page,
+            events=self.overview.audit_events(),
+            told=lambda row: ", ".join(_facts(row.data)),
+        )
+
+
+Place = tuple[str, Path, Keeping]
+
+
+def place_of(store: Store) -> Place:
+    """Where these records are: their URL, the folder of their files, what is kept outside."""
+    url = store.database.location.url.render_as_string(hide_password=False)
+    return url, store.files.folder, store.signer.keeping
+
+
+def open_supervisor(url: str, folder: Path, keeping: Keeping, shifts: Sequence[time]) -> Supervisor:
+    """Answers of the records of a place, which are only read. Raises what `Store.open` does."""
+    store = Store.open(url, station="pages", folder=folder, read_only=True, keeping=keeping)
+    return Supervisor(store, shifts)
+
+
+PAGES: Final[dict[str, Callable[[Supervisor, Question], Answer]]] = {
+    "/runs": Supervisor.runs,
+    **dict.fromkeys(_FILES, Supervisor.file_of_runs),
+    "/runs/{run:int}": Supervisor.run,
+    "/runs/{run:int}/trace": Supervisor.trace,
+    "/units": Supervisor.units,
+    "/units/certificate": Supervisor.certificate,
+    "/images": Supervisor.images,
+    "/images.csv": Supervisor.file_of_holders,
+    "/yield": Supervisor.yields,
+    "/times": Supervisor.times,
+    "/audit": Supervisor.audit,
+}
+"""By their routes."""
+
+
+# -- from the form ---------------------------------------------------------------------------------
+
+
+def filter_of(question: Question) -> RunFilter:
+    """The filter that a form says. Raises UsageError for a time that is none, or an outcome."""
+    fields = question.fields
+    outcome = fields.get("outcome")
+    if outcome is not None and outcome not in set(RunState):
+        raise UsageError("There is no such outcome.", remedy="Choose one of the form.")
+    return RunFilter(
+        lot=fields.get("lot"),
+        recipe=fields.get("recipe"),
+        since=_moment(question, "from"),
+        until=_moment(question, "to"),
+        serial=fields.get("serial"),
+        part=fields.get("part"),
+        search=fields.get("search"),
+        state=None if outcome is None else RunState(outcome),
+        code=fields.get("code"),
+        socket=fields.get("socket"),
+    )
+
+
+def _moment(question: Question, name: str) -> datetime | None:
+    text = question.fields.get(name)
+    if text is None:
+        return None
+    try:
+        return datetime.fromisoformat(text).astimezone()
+    except (ValueError, OverflowError) as error:
+        raise UsageError(
+            f"{text!a:.40} is no time.", remedy="Write 2026-05-17 or 2026-05-17T06:00."
+        ) from error
+
+
+def _cut(question: Question) -> Cut:
+    def at(name: str) -> int | None:
+        text = question.fields.get(name, "")
+        return int(text) if text.isascii() and text.isdigit() and len(text) < 19 else None
+
+    return Cut(at("before"), at("after"))
+
+
+class _Addresses:
+    """Addresses of this server with the fields of the form that is shown."""
+
+    def __init__(self, question: Question) -> None:
+        self._fields = {
+            name: value
+            for name, value in question.fields.items()
+            if name not in ("before", "after")
+        }
+
+    def with_cut(self, path: str, cut: Cut | None = None, **more: str) -> str:
+        """The same list from a cut on."""
+        fields = self._fields | more
+        if cut is not None and cut.before is not None:
+            fields["before"] = str(cut.before)
+        if cut is not None and cut.after is not None:
+            fields["after"] = str(cut.after)
+        return f"{path}?{urlencode(fields)}" if fields else path
+
+    def of(self, path: str, **fields: object) -> str:
+        """Another page, in the language of this one."""
+        lang = {"lang": self._fields["lang"]} if "lang" in self._fields else {}
+        return f"{path}?{urlencode(fields | lang)}" if fields or lang else path
+
+
+# -- spans of time ---------------------------------------------------------------------------------
+
+
+def spans_of(whole: Span) -> Iterator[Span]:
+    """Hours, days, weeks or months of the clock on the wall, as many as can be looked at."""
+    length = whole.end - whole.begin
+    begin = whole.begin.astimezone()
+    midnight = datetime.combine(begin, time())
+    if length <= _HOURS_UP_TO:
+        at = begin.replace(minute=0, second=0, microsecond=0, tzinfo=None)
+        starts = (at + timedelta(hours=count) for count in range(SPANS_MAX))
+    elif length <= _DAYS_UP_TO:
+        starts = (midnight + timedelta(days=count) for count in range(SPANS_MAX))
+    elif length <= _WEEKS_UP_TO:
+        monday = midnight - timedelta(days=midnight.weekday())
+        starts = (monday + timedelta(weeks=count) for count in range(SPANS_MAX))
+    else:
+        starts = (
+            midnight.replace(
+                year=midnight.year + (midnight.month - 1 + count) // 12,
+                month=(midnight.month - 1 + count) % 12 + 1,
+                day=1,
+            )
+            for count in range(SPANS_MAX)
+        )
+    yield from _between((start.astimezone() for start in starts), whole.end)
+
+
+def _between(starts: Iterable[datetime], end: datetime) -> Iterator[Span]:
+    """From each start to the next one, up to the one that holds `end`."""
+    before: datetime | None = None
+    for start in starts:
+        if before is not None:
+            yield Span(before, start)
+            if start >= end:
+                return
+        before = start
+
+
+def shifts_of(whole: Span, shifts: Sequence[time]) -> Iterator[tuple[Span, str]]:
+    """The shifts of a time, each with when its like begins."""
+    day = datetime.combine(whole.begin.astimezone(), time()) - timedelta(days=1)
+    days = (whole.end - whole.begin).days + 3
+    starts = [
+        datetime.combine(day + timedelta(days=count), each)
+        for count in range(days)
+        for each in sorted(shifts)
+    ]
+    for begin, end in pairwise(starts):
+        span = Span(begin.astimezone(), end.astimezone())
+        if span.end > whole.begin and span.begin < whole.end:
+            yield span, f"{begin:%H:%M}"
+
+
+def _name_of(span: Span) -> str:
+    begin = span.begin.astimezone()
+    if span.end - span.begin < timedelta(hours=20):
+        return f"{begin:%m-%d %H:%M}"
+    return f"{begin:%Y-%m-%d}"
+
+
+def _zone(now: datetime) -> str:
+    offset = f"{now:%z}"
+    return f"{now.tzname()} (UTC{offset[:3]}:{offset[3:5]})"
+
+
+# -- words -----------------------------------------------------------------------------------------
+
+
+def _share(part: int, whole: int) -> float | None:
+    return part / whole if whole else None
+
+
+def _percent(share: float | None) -> float | None:
+    return None if share is None else share * 100
+
+
+def _is_trace(file: AttachmentFile) -> bool:
+    return file.kind in (TRACE, TORN_TRACE)
+
+
+def _facts(data: dict[str, Any]) -> Iterator[str]:
+    """What an audit row says, without the digests that only a program reads."""
+    for name, value in data.items():
+        if name == "digests" or value in ("", None):
+            continue
+        if isinstance(value, dict | list):
+            yield f"{name}: {len(value)}"
+        else:
+            yield f"{name}: {value}"

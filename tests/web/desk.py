@@ -1,0 +1,42 @@
+"""The supervisor pages of records, answered in this process."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+from starlette.testclient import TestClient
+from starlette.types import ASGIApp
+
+from flasher.station.records.keys import Keeping
+from flasher.station.tally import DEFAULT_SHIFTS
+from flasher.web.desk import Answer, DeskPages, Question
+from flasher.web.guard import application
+from flasher.web.pages import Pages
+from flasher.web.supervisor import PAGES, open_supervisor
+
+_KEY = "of the test"
+
+
+def app_of(database: Path, keys: Path) -> ASGIApp:
+    """The pages of the records in a file."""
+    folder = database.with_name(f"{database.name}.files")
+    supervisor = open_supervisor(str(database), folder, Keeping(keys), DEFAULT_SHIFTS)
+
+    async def ask(question: Question) -> Answer:
+        return await asyncio.to_thread(supervisor.answer, question)
+
+    pages = Pages()
+    return application(
+        DeskPages(pages, ask, PAGES).routes,
+        pages=pages,
+        hosts={"127.0.0.1"},
+        secret=_KEY,
+        now=lambda: 0.0,
+    )
+
+
+def client_of(database: Path, keys: Path) -> TestClient:
+    return TestClient(
+        app_of(database, keys), base_url="http://127.0.0.1:8741", follow_redirects=False
+    )
