@@ -8,7 +8,7 @@ which the style sheet shows: text has its full size on a desk and on a phone.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 from xml.etree import ElementTree
 
@@ -18,6 +18,7 @@ from pygal.style import Style
 
 from flasher.report.base import shortened, visible
 from flasher.report.chart import WIDTHS
+from flasher.report.scale import linear_ticks
 
 # pygal's finder of maps, which are not used here: Python 3.11 warns of its like at every import.
 sys.meta_path[:] = [each for each in sys.meta_path if not isinstance(each, pygal.PluginImportFixer)]
@@ -25,7 +26,10 @@ sys.meta_path[:] = [each for each in sys.meta_path if not isinstance(each, pygal
 SERIES_MAX: Final = 8
 """The style sheet has so many colours."""
 _HEIGHT: Final = 300
-_PX_PER_LABEL: Final = {"upright": 36, "level": 70}
+_PX_PER_LABEL: Final = 36
+_PX_PER_CHARACTER: Final = 8
+_LEFT: Final = 60
+_Y_INTERVALS: Final = 5
 _LABEL_MAX: Final = 18
 _STYLE: Final = Style(
     label_font_size=12, major_label_font_size=12, font_family="system-ui, sans-serif"
@@ -43,32 +47,38 @@ Series = Mapping[str, Sequence[float | None]]
 def lines(title: str, labels: Sequence[str], series: Series, unit: str) -> Markup:
     """Lines over the same labels, for shares of 100: from the ten below the least one."""
     least = min(value for values in series.values() for value in values if value is not None)
-    low = min(90, least // 10 * 10)
-    return _drawn(title, labels, series, pygal.Line, range=(low, 100), formatter=_with(unit))
+    return _drawn(title, labels, series, pygal.Line, (min(90, least // 10 * 10), 100), unit)
 
 
 def stacked_bars(title: str, labels: Sequence[str], series: Series) -> Markup:
     """A bar a label, made of the series."""
-    return _drawn(title, labels, series, pygal.StackedBar, formatter=_with(""))
+    most = max(sum(each or 0 for each in bar) for bar in zip(*series.values(), strict=True))
+    return _drawn(title, labels, series, pygal.StackedBar, (0, most))
 
 
-def _with(unit: str) -> Callable[[float], str]:
-    return lambda value: f"{value:,.0f}{unit}"
-
-
-def _drawn(title: str, labels: Sequence[str], series: Series, kind: Any, **options: Any) -> Markup:
+def _drawn(
+    title: str,
+    labels: Sequence[str],
+    series: Series,
+    kind: Any,
+    span: tuple[float, float],
+    unit: str = "",
+) -> Markup:
     drawings = []
     shown = [visible(shortened(label, _LABEL_MAX)) for label in labels]
+    ticks = [each for each in linear_ticks(*span, _Y_INTERVALS) if each == int(each)]
+    longest = max(map(len, shown))
     for name, width in WIDTHS.items():
-        is_level = len(labels) * _PX_PER_LABEL["level"] <= width
-        upright_room = max(1, int(width // _PX_PER_LABEL["upright"]))
+        is_level = len(shown) * longest * _PX_PER_CHARACTER <= width - _LEFT
+        upright_room = max(1, (width - _LEFT) // _PX_PER_LABEL)
         chart = kind(
             width=width, height=_HEIGHT, style=_STYLE, css=(), js=(), show_legend=False,
             margin=8, dots_size=3, x_label_rotation=0 if is_level else 50,
-            show_minor_x_labels=False, truncate_label=-1,
-            x_labels_major_every=max(1, -(-len(labels) // upright_room)), **options,
+            show_minor_x_labels=False, truncate_label=-1, range=(ticks[0], ticks[-1]),
+            x_labels_major_every=1 if is_level else max(1, -(-len(shown) // upright_room)),
         )  # fmt: skip
         chart.x_labels = shown
+        chart.y_labels = [{"value": each, "label": f"{each:,.0f}{unit}"} for each in ticks]
         for label, values in series.items():
             chart.add(visible(label), list(values))
         tree = chart.render_tree()

@@ -370,7 +370,9 @@ class Supervisor:
         found = self.overview.step_times(chosen)
         order = {step.value: at for at, step in enumerate(StepName)}
         rows = []
-        for name, counts in sorted(found.items(), key=lambda item: order.get(item[0], 99)):
+        for name, counts in sorted(
+            found.items(), key=lambda item: order.get(item[0].split()[0], 99)
+        ):
             ranked = Counter(dict(sorted(counts.items())))
             rows.append(
                 (

@@ -18,6 +18,7 @@ from xml.etree import ElementTree
 import pytest
 from starlette.testclient import TestClient
 
+from flasher.protocol.spec import BMS as TARGET
 from flasher.station.records.model import (
     Measurement,
     RunFilter,
@@ -27,7 +28,6 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.overview import By, Cut, Overview, Span
 from flasher.web.supervisor import shifts_of, spans_of
-from tests.station.factory import BMS as TARGET
 from tests.station.factory import BMS_VERSION, IMAGES, Bench
 from tests.web.desk import client_of
 

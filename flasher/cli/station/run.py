@@ -65,9 +65,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
     elif options.lines or os.environ.get("TERM") == "dumb":
         view = Lines(output)
     with _opened_records(options, records, config) as store:
-        session = _Session(
-            options, pages, output, store, view, crew, is_virtual=is_virtual
-        )
+        session = _Session(options, pages, output, store, view, crew, is_virtual=is_virtual)
         session.is_temporary = _is_temporary(options, records)
         first = 1
         if is_virtual:  # numbers that these records do not know yet
