@@ -16,7 +16,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from flasher.cli.station import operator_page
+from flasher.cli.station import serving
 from flasher.errors import ExitCode
 from flasher.station.records.keys import Keeping
 from flasher.web.server import Server
@@ -66,7 +66,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
                     data = (line for line in stream.iter_lines() if line.startswith("data: "))
                     found.extend(json.loads(line.removeprefix("data: ")) for line in data)
 
-    monkeypatch.setattr(operator_page, "Server", Asked)
+    monkeypatch.setattr(serving, "Server", Asked)
     yield found
     for thread in threads:
         thread.join(10)
@@ -136,8 +136,8 @@ def test_a_password_is_asked_for(flasher: Flasher, asked: list[Any], password: P
 
 def test_the_secret_of_the_sessions_is_kept_for_this_user_alone(tmp_path: Path) -> None:
     keeping = Keeping(tmp_path / "keys")
-    first = operator_page.kept_secret(keeping)
+    first = serving.kept_secret(keeping)
     assert len(first) > 30
-    assert operator_page.kept_secret(keeping) == first
+    assert serving.kept_secret(keeping) == first
     (path,) = (tmp_path / "keys").iterdir()
     assert stat.S_IMODE(path.stat().st_mode) == 0o600

@@ -84,9 +84,7 @@ def operator_page(
     watch = Watch(store.files.folder, station.clock.utc, station.clock.monotonic_s)
     screen = Screen(tally, watch)
     pages = Pages(options.language)
-    operator = OperatorPage(
-        pages, screen.feed, station.submit, sound_volume=config.sound_volume
-    )
+    operator = OperatorPage(pages, screen.feed, station.submit, sound_volume=config.sound_volume)
     view = OperatorView(screen, station, board)
     # In processes of their own: a page takes no time from the station.
     desk = Desk(partial(open_supervisor, *place_of(store), config.shifts))
