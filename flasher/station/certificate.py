@@ -6,8 +6,12 @@ A unit that did not pass gets a page as well, and the page says so in its first 
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Final
+
+import segno
+from markupsafe import Markup
 
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
@@ -30,6 +34,7 @@ EARLIER_SHOWN: Final = 50
 _WRITES_ON_SHEET: Final = 4
 """With more of them, or longer ones, all stand in the annex in full."""
 _TEXT_ON_SHEET: Final = 40
+_TEXT_IN_CODE: Final = 80
 _WORDS: Final = {
     UnitState.PASS: (Status.GOOD, "PASS", "This unit passed."),
     UnitState.FAIL: (Status.BAD, "FAIL", "This unit did not pass: it is no good unit."),
@@ -48,17 +53,23 @@ _RUN_STATUS: Final = {
 }
 
 
-def proven(
-    store: Store, life: UnitLife, examined: Examination | None = None
-) -> tuple[Head | None, bool]:
-    """The signed audit row that vouches for the last run of a unit, None while it goes on; and
-    whether the chain was held against heads that are kept elsewhere.
+@dataclass(frozen=True)
+class Proof:
+    """What vouches for the last run of a unit."""
 
-    Raises UnprovenError where the records were changed.
-    """
+    head: Head | None = None
+    """The signed audit row; None while the run goes on."""
+    record_sha256: str = ""
+    """Over the run and all that belongs to it."""
+    is_kept: bool = False
+    """The chain was held against heads that are kept elsewhere."""
+
+
+def proven(store: Store, life: UnitLife, examined: Examination | None = None) -> Proof:
+    """What vouches for the last run. Raises UnprovenError where the records were changed."""
     last = life.runs[-1].run if life.runs else None
     if last is None or last.state is RunState.RUNNING:
-        return None, examined is not None and examined.is_checked_elsewhere
+        return Proof()
     examined = examined or store.examine({last.run_id})
     problems = examined.of_run(last.run_id)
     if problems:
@@ -67,20 +78,16 @@ def proven(
             cause=f"{problems[0].where}: {problems[0].what}",
             remedy="Look at all of it with flasher station verify.",
         )
-    return store.read.head_of(last.run_id), examined.is_checked_elsewhere
+    head, record_sha256 = store.read.head_of(last.run_id), store.read.record_sha256(last.run_id)
+    return Proof(head, record_sha256, examined.is_checked_elsewhere)
 
 
-def render_certificate(
-    life: UnitLife, made_at: datetime, head: Head | None, *, is_kept: bool
-) -> str:
-    """The page. `head` and `is_kept` as `proven` gives them.
-
-    Raises UsageError for a unit without any run.
-    """
-    return render_page("certificate.html", **sheet(life, made_at, head, is_kept=is_kept))
+def render_certificate(life: UnitLife, made_at: datetime, proof: Proof) -> str:
+    """The page. Raises UsageError for a unit without any run."""
+    return render_page("certificate.html", **sheet(life, made_at, proof))
 
 
-def sheet(life: UnitLife, made_at: datetime, head: Head | None, *, is_kept: bool) -> dict[str, Any]:
+def sheet(life: UnitLife, made_at: datetime, proof: Proof) -> dict[str, Any]:
     """What the template of the page needs. Raises UsageError for a unit without any run."""
     last = life.last
     if last is None:
@@ -96,9 +103,11 @@ def sheet(life: UnitLife, made_at: datetime, head: Head | None, *, is_kept: bool
         "word": word,
         "sentence": sentence,
         "is_virtual": life.is_virtual,
-        "head": head,
-        "key": fingerprint(head.key) if head else "",
-        "is_kept": is_kept,
+        "head": proof.head,
+        "key": fingerprint(proof.head.key) if proof.head else "",
+        "is_kept": proof.is_kept,
+        "record_sha256": proof.record_sha256,
+        "code": "" if proof.head is None else _code(last, proof.record_sha256, proof.head),
         "writes": last.writes[:_WRITES_ON_SHEET],
         "text_limit": _TEXT_ON_SHEET,
         "has_more_writes": len(last.writes) > _WRITES_ON_SHEET
@@ -119,6 +128,24 @@ def sheet(life: UnitLife, made_at: datetime, head: Head | None, *, is_kept: bool
         "number": number,
         "made_at": _moment(made_at),
     }
+
+
+def _code(last: RunDetails, record_sha256: str, head: Head) -> Markup:
+    """What a reader of the paper can hold against the records, as a QR code."""
+    run = last.run
+    lines = (
+        "flasher record 1",
+        f"unit {printable(run.serial)[:_TEXT_IN_CODE]}",
+        f"part {printable(run.part)[:_TEXT_IN_CODE]}",
+        f"run {run.run_id} {run.state.value}{' virtual' if run.is_virtual else ''}",
+        f"record {record_sha256}",
+        f"row {head.number} {printable(head.station)[:_TEXT_IN_CODE]}",
+        f"hash {head.hash}",
+        f"signature {head.signature}",
+        f"key {head.key}",
+    )
+    drawn = segno.make("\n".join(lines), error="m", micro=False, boost_error=False)
+    return Markup(drawn.svg_inline(omitsize=True, svgclass=None, lineclass=None))  # noqa: S704
 
 
 def _run_status(details: RunDetails) -> Status:

@@ -10,7 +10,7 @@ import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from datetime import datetime, time, timedelta
+from datetime import UTC, datetime, time, timedelta
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
@@ -246,8 +246,7 @@ class Supervisor:
     def certificate(self, question: Question) -> Answer:
         fields = question.fields
         life = self.store.read.unit(fields.get("serial", ""), fields.get("part"))
-        head, is_kept = proven(self.store, life)
-        made = sheet(life, self.now(), head, is_kept=is_kept)
+        made = sheet(life, datetime.now(UTC), proven(self.store, life))
         return self._page(question, "certificate.html", path="/units", **made)
 
     # -- images -----------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import pytest
 
 from flasher.cli.documents import as_json
 from flasher.errors import UsageError
-from flasher.station.certificate import render_certificate
+from flasher.station.certificate import Proof, proven, render_certificate
 from flasher.station.records.model import (
     Measurement,
     RunFilter,
@@ -62,8 +62,7 @@ def report(plant: Bench) -> Report:
 
 def page(bench: Bench, serial: str) -> str:
     life = bench.store.read.unit(serial)
-    head = bench.store.read.head_of(life.runs[-1].run.run_id)
-    return render_certificate(life, bench.clock.utc(), head, is_kept=True)
+    return render_certificate(life, bench.clock.utc(), proven(bench.store, life))
 
 
 def test_a_report_s_rows_are_the_runs(plant: Bench, report: Report) -> None:
@@ -201,6 +200,4 @@ def test_earlier_runs_are_on_the_page(plant: Bench) -> None:
 def test_nothing_is_certified_for_a_unit_without_runs(plant: Bench, tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
     with pytest.raises(UsageError, match="nothing to certify"):
-        render_certificate(
-            UnitLife("W1", "P", UnitState.NEW, ()), plant.clock.utc(), None, is_kept=True
-        )
+        render_certificate(UnitLife("W1", "P", UnitState.NEW, ()), plant.clock.utc(), Proof())

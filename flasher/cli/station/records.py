@@ -140,8 +140,8 @@ def certificate(store: Store, life: UnitLife, examined: Examination | None = Non
     """The page of a unit. Raises UnprovenError where its records were changed."""
     from flasher.station.certificate import proven, render_certificate  # noqa: PLC0415  loads jinja2
 
-    head, is_kept = proven(store, life, examined)
-    return render_certificate(life, datetime.now(UTC), head, is_kept=is_kept).encode("utf-8")
+    proof = proven(store, life, examined)
+    return render_certificate(life, datetime.now(UTC), proof).encode("utf-8")
 
 
 # -- one unit -------------------------------------------------------------------------------------

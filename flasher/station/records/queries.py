@@ -105,6 +105,13 @@ class Records:
         with self._database.reading() as connection:
             return chain.head_of(connection, run_id)
 
+    def record_sha256(self, run_id: RunId) -> str:
+        """The hash of a run with all that belongs to it: over the digests that its audit row has.
+        Raises KeyError for a run that is not there.
+        """
+        with self._database.reading() as connection:
+            return chain.digest(chain.digests_of(connection, [run_id])[run_id])
+
     def natures(self) -> frozenset[bool]:
         """Whose runs there are: True for virtual units, False for real ones."""
         with self._database.reading() as connection:

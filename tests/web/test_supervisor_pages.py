@@ -1,0 +1,99 @@
+"""The supervisor pages in a real browser: no barrier, nothing too wide, nothing from elsewhere."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser
+
+from flasher.station.records.model import Measurement, RunState, StepState
+from flasher.web.server import Server
+from tests.station.factory import Bench
+from tests.web.desk import app_of
+
+LONG = "W" * 90
+PAGES = (
+    "/runs", "/runs?from=yesterday", "/units", "/units?serial=W2605001", "/runs/2/trace",
+    "/units/certificate?serial=W2605001", "/yield?by=lot", "/times", "/images", "/audit",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    """The pages of records with good and bad units, and texts as long as they may be."""
+    with tempfile.TemporaryDirectory() as folder:
+        bench = Bench(Path(folder))
+        for number in range(1, 9):
+            serial = f"W26050{number:02}"
+            if number % 3 == 0:
+                bench.make(RunState.FAIL, serial, lot=LONG, code="TRANSFER_FAILED")
+            bench.make(RunState.PASS, serial, lot=f"L{number}")
+        run_id = bench.claim("W2605009", lot=LONG, reason=LONG).run_id
+        bench.work(run_id)
+        out = Measurement("voltage", 29.0, "V", 30.0, 42.0)
+        bench.store.step(
+            run_id, "check", StepState.FAIL, duration_s=0.5, text=LONG, measurements=[out]
+        )
+        bench.store.finish(run_id, bench.ending(RunState.FAIL, "LIMIT"))
+        with Server(app_of(bench.path, bench.keys), "127.0.0.1", 0) as server:
+            yield server.url
+        bench.store.close()
+
+
+@pytest.mark.parametrize(
+    ("width", "scheme"), [(1280, "light"), (390, "dark")], ids=["desk", "phone"]
+)
+def test_every_page_is_for_everybody(browser: Browser, url: str, width: int, scheme: Any) -> None:
+    page = browser.new_page(
+        viewport={"width": width, "height": 844}, color_scheme=scheme, locale="en"
+    )
+    asked: list[str] = []
+    wrong: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.on("console", lambda said: wrong.extend([said.text] * (said.type == "error")))
+    for path in PAGES:
+        page.goto(url + path.removeprefix("/"))
+        found = Axe().run(page)
+        assert found.violations_count == 0, f"{path}\n{found.generate_report()}"
+        too_wide = page.evaluate("document.scrollingElement.scrollWidth - innerWidth")
+        assert too_wide <= 0, path
+        assert page.locator("main").inner_text().strip(), path
+    assert all(each.startswith(url) for each in asked)
+    assert [each for each in wrong if "400" not in each] == []
+    page.close()
+
+
+def test_the_keyboard_alone_finds_a_unit(browser: Browser, url: str) -> None:
+    page = browser.new_page(locale="en")
+    page.goto(f"{url}runs")
+    page.keyboard.press("Tab")  # over the menu
+    page.keyboard.press("Enter")
+    page.keyboard.press("Tab")
+    page.keyboard.type("05003")
+    page.keyboard.press("Enter")
+    page.wait_for_url("**search=05003**")
+    assert page.locator("tbody tr").count() == 2
+    page.close()
+
+
+def test_a_certificate_is_one_sheet_with_an_annex(browser: Browser, url: str) -> None:
+    page = browser.new_page(locale="en")
+    page.goto(f"{url}units/certificate?serial=W2605001")
+    assert page.locator(".qr svg path").count() == 1
+    page.emulate_media(media="print")
+    assert not page.locator("nav").first.is_visible()
+    heights = page.evaluate(
+        """() => {
+          const annex = document.querySelector(".annex").getBoundingClientRect();
+          return annex.top * 25.4 / 96;
+        }"""
+    )
+    assert heights < 297 - 28  # mm of A4 between its margins
+    pages = page.pdf(format="A4", prefer_css_page_size=True).count(b"/Type /Page\n")
+    assert pages == 2
+    page.close()
