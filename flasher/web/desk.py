@@ -16,7 +16,7 @@ from functools import partial
 from typing import Any, Final, Protocol
 
 from starlette.requests import Request
-from starlette.responses import RedirectResponse, Response
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from flasher.web.pages import Pages
@@ -74,11 +74,15 @@ class Desk:
         self._make = make
         self._pool: Any = None
 
-    async def ask(self, question: Question) -> Answer:
-        """The answer to a question. Raises TimeoutError, or what the process raised."""
+    def begin(self) -> None:
+        """Start the processes, which the first question does else."""
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
             self._pool = context.Pool(PROCESSES, _begin, (self._make,))
+
+    async def ask(self, question: Question) -> Answer:
+        """The answer to a question. Raises TimeoutError, or what the process raised."""
+        self.begin()
         loop = asyncio.get_running_loop()
         answered: asyncio.Future[Answer] = loop.create_future()
 
@@ -134,7 +138,10 @@ class DeskPages:
         }
         run = int(request.path_params.get("run", 0))
         language, token = self._pages.words_of(request).code, request.session.get("token", "")
-        answer = await self._ask(Question(path, fields, run, language, token))
+        try:
+            answer = await self._ask(Question(path, fields, run, language, token))
+        except TimeoutError:
+            return PlainTextResponse("That took too long: narrow it down.", 503)
         if answer.location:
             return RedirectResponse(answer.location, 303)
         headers = {}

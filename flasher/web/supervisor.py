@@ -24,6 +24,7 @@ from flasher.report.explain_page import status_of, told
 from flasher.said import say
 from flasher.station import codes
 from flasher.station.certificate import limits_of, number, proven, sheet, verdict_of
+from flasher.station.records import chain
 from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
 from flasher.station.records.keys import Keeping
 from flasher.station.records.model import (
@@ -402,7 +403,7 @@ class Supervisor:
             question,
             "audit.html",
             page=page,
-            events=self.overview.audit_events(),
+            events=chain.EVENTS,
             told=lambda row: ", ".join(_facts(row.data)),
         )
 

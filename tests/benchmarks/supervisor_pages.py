@@ -212,6 +212,7 @@ def measure_station(bench: Bench) -> None:
     )
     desk = Desk(partial(open_supervisor, *place_of(store), DEFAULT_SHIFTS))
     with closing(store), closing(desk):
+        store.recover()
         _commits(store, "alone")
         ended = threading.Event()
         asking = threading.Thread(target=lambda: asyncio.run(_ask(desk, ended)))

@@ -11,10 +11,12 @@ from typing import Any
 from xml.etree import ElementTree as Xml
 
 import pytest
+import segno
 
 from flasher.cli.documents import as_json
 from flasher.errors import UsageError
 from flasher.station.certificate import Proof, proven, render_certificate
+from flasher.station.records.keys import is_signed
 from flasher.station.records.model import (
     Measurement,
     RunFilter,
@@ -147,6 +149,30 @@ def test_a_certificate_tells_what_was_written_and_how_far_it_was_verified(plant:
     ):
         assert text in html, text
     assert "Earlier runs" not in html
+
+
+def test_the_code_on_the_paper_says_record_and_signed_row(
+    plant: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    said: list[str] = []
+    make = segno.make
+
+    def listening(text: str, **options: Any) -> Any:
+        said.append(text)
+        return make(text, **options)
+
+    monkeypatch.setattr("segno.make", listening)
+    html = page(plant, "W2605003")
+    lines = dict(line.split(" ", 1) for line in said[0].splitlines())
+    run_id = plant.store.read.unit("W2605003").runs[-1].run.run_id
+    head = plant.store.read.head_of(run_id)
+    assert head is not None
+    assert lines["unit"] == "W2605003"
+    assert lines["record"] == plant.store.read.record_sha256(run_id)
+    assert is_signed(lines["hash"], lines["signature"], lines["key"])
+    assert lines["hash"] == head.hash
+    assert lines["record"] in html
+    assert 'class="qr"' in html
 
 
 def test_a_unit_that_did_not_pass_has_no_certificate(plant: Bench) -> None:

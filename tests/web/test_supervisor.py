@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from contextlib import closing
 from datetime import UTC, datetime, time, timedelta
 from html.parser import HTMLParser
-from itertools import chain, pairwise
+from itertools import pairwise
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -19,6 +19,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from flasher.protocol.spec import BMS as TARGET
+from flasher.station.records import chain
 from flasher.station.records.model import (
     Measurement,
     RunFilter,
@@ -127,12 +128,12 @@ def test_pages_hold_every_run_once_in_both_directions(overview: Overview, size: 
     while page.older is not None:
         page = overview.runs(RunFilter(), page.older, size)
         down.append([run.run_id for run in page.rows])
-    assert list(chain(*down)) == every
+    assert [run for some in down for run in some] == every
     up = [down[-1]]
     while page.newer is not None:
         page = overview.runs(RunFilter(), page.newer, size)
         up.append([run.run_id for run in page.rows])
-    assert sorted(set(chain(*up)), reverse=True) == every
+    assert sorted({run for some in up for run in some}, reverse=True) == every
 
 
 def test_the_form_of_the_runs_narrows_them_and_its_files_are_of_the_same(
@@ -381,6 +382,10 @@ def test_the_audit_trail_in_pages(client: TestClient, overview: Overview) -> Non
     second = overview.audit(first.older, size=10)
     assert first.rows[-1].row_id == second.rows[0].row_id + 1
     assert "begun" in client.get("/audit?event=begun").text
+
+
+def test_every_event_of_the_trail_can_be_chosen(overview: Overview) -> None:
+    assert {row.event for row in overview.audit(Cut(), size=500).rows} <= set(chain.EVENTS)
 
 
 # -- what must not do harm -------------------------------------------------------------------------

@@ -38,6 +38,7 @@ def serve(output: Output, address: Address, options: PagesOptions, records: Reco
         stop_on_signal() as stopped,
         served(options, address, routes, pages=pages, keeping=None) as url,
     ):
+        desk.begin()
         output.progress(f"The supervisor pages: {url}; Ctrl-C ends them")
         while not stopped():
             time.sleep(_TURN_S)

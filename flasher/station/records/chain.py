@@ -17,7 +17,7 @@ from sqlalchemy import Connection, Table, func, select, true
 
 from flasher.station.records import schema
 from flasher.station.records.keys import Head, SigningKey
-from flasher.station.records.model import utc_text
+from flasher.station.records.model import AuditEvent, utc_text
 from flasher.station.records.rows import grouped, named
 from flasher.station.records.schema import audit, station
 
@@ -38,9 +38,16 @@ CLOCK: Final = "clock"
 """An operator confirmed the clock, although records of a later time exist."""
 RESTORED: Final = "restored"
 """An operator accepted an older copy of the records; the missing rows are lost."""
+RECIPE: Final = "recipe"
+"""A recipe was used for the first time."""
 ENDINGS: Final = (FINISHED, INTERRUPTED, MIGRATED_RUN)
 """Rows that vouch for a run as it ended."""
 _KEYS: Final = (BEGUN, KEY_ROTATED, KEY_LOST)
+EVENTS: Final = (
+    BEGUN, CLAIMED, FINISHED, INTERRUPTED, RECIPE, *(event.value for event in AuditEvent), CLOCK,
+    RESTORED, KEY_ROTATED, KEY_LOST, MIGRATED, MIGRATED_RUN,
+)  # fmt: skip
+"""All that a row may be about."""
 
 
 class Trail:

@@ -154,7 +154,7 @@ class Claiming:
         if found is not None:
             return int(found)
         facts = {"name": rule.name, "revision": rule.revision, "sha256": loaded.sha256}
-        self._trail.append(self._now, "recipe", facts)
+        self._trail.append(self._now, chain.RECIPE, facts)
         return insert(
             self._connection,
             recipe,

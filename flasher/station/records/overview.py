@@ -359,12 +359,6 @@ class Overview:
             newer,
         )
 
-    def audit_events(self) -> tuple[str, ...]:
-        """The events that there are."""
-        event = schema.audit.c.event
-        with self._database.reading() as connection:
-            return tuple(connection.execute(select(event).distinct().order_by(event)).scalars())
-
     def _cut(
         self, query: Select[Any], row_id: Any, cut: Cut, size: int
     ) -> tuple[list[dict[str, Any]], Cut | None, Cut | None]:
