@@ -19,6 +19,7 @@ from starlette.requests import Request
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 
+from flasher.errors import FlasherError
 from flasher.web.pages import Pages
 
 PROCESSES: Final = 2
@@ -106,20 +107,26 @@ class Desk:
             self._pool.join()
 
 
-_answering: Answering
+_make: Callable[[], Answering]
+_answering: Answering | None = None
 
 
 def _begin(make: Callable[[], Answering]) -> None:
-    """Called once in each process."""
-    global _answering  # noqa: PLW0603  a process has one
+    """Called once in each process. It does not fail: another process would be started at once."""
+    global _make  # noqa: PLW0603  a process has one
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the station, which ends this one
     if hasattr(os, "nice"):
         os.nice(_NICENESS)
-    _answering = make()
+    _make = make
 
 
 def _answer(question: Question) -> Answer:
-    return _answering.answer(question)
+    global _answering  # noqa: PLW0603  a process has one
+    try:
+        _answering = _answering or _make()
+        return _answering.answer(question)
+    except FlasherError as error:
+        return Answer(str(error).encode("utf-8", "replace"), "text/plain; charset=utf-8", 503)
 
 
 class DeskPages:

@@ -1,0 +1,35 @@
+"""Answers from processes of their own."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import closing
+from functools import partial
+
+from flasher.errors import UsageError
+from flasher.web.desk import Answer, Answering, Desk, Question
+
+
+class Echo:
+    def answer(self, question: Question) -> Answer:
+        return Answer(question.path.encode())
+
+
+def _echo() -> Answering:
+    return Echo()
+
+
+def _broken(what: str) -> Answering:
+    raise UsageError(what, remedy="Correct it.")
+
+
+def test_a_question_is_answered_and_what_is_wrong_is_said() -> None:
+    """A place that cannot be opened is an answer, and no process that dies again and again."""
+    with closing(Desk(_echo)) as desk, closing(Desk(partial(_broken, "no such place"))) as broken:
+
+        async def ask() -> list[Answer]:
+            return [await each.ask(Question("/runs")) for each in (desk, broken, broken)]
+
+        good, *bad = asyncio.run(ask())
+    assert good.body == b"/runs"
+    assert [(each.status, b"no such place" in each.body) for each in bad] == [(503, True)] * 2
