@@ -9,6 +9,8 @@ from flasher.protocol.text import printable
 from flasher.said import say
 from flasher.station.events import (
     FiguresChanged,
+    LabelFailed,
+    LabelPrinted,
     LineResumed,
     LineStopped,
     OperatorPrompted,
@@ -89,6 +91,8 @@ class Board:
     refused: list[ScanRefused] = field(default_factory=list)
     waiting: set[str] = field(default_factory=set)
     """Labels that were accepted, and have no socket yet."""
+    unprinted: dict[str, LabelFailed] = field(default_factory=dict)
+    """Labels that were not printed, by the serial numbers of their units."""
     arrivals: int = 0
     virtual_sockets: tuple[str, ...] = ()
     broken: dict[str, str] = field(default_factory=dict)
@@ -106,8 +110,8 @@ class Board:
                 self.stopped, self.records_fault = None, ""
             case ScanAccepted() | ScanRefused():
                 self._scanned(event)
-            case PinAwaited() | PinEnded():
-                self._asked(event)
+            case PinAwaited() | PinEnded() | LabelPrinted() | LabelFailed():
+                self._beside(event)
             case OperatorPrompted("", text, _):
                 # It comes just before the scan that it belongs to is accepted.
                 self.said = self.prompt = shown(text)
@@ -138,7 +142,11 @@ class Board:
         if virtual:
             self.title = f"{self.virtual_words} {self.title}"
 
-    def _asked(self, event: PinAwaited | PinEnded) -> None:
+    def _beside(self, event: PinAwaited | PinEnded | LabelPrinted | LabelFailed) -> None:
+        """What stands beside the way of a unit."""
+        if isinstance(event, LabelPrinted | LabelFailed):
+            self._labelled(event)
+            return
         self.pin_of = printable(event.person) if isinstance(event, PinAwaited) else ""
         if isinstance(event, PinAwaited):
             self.is_refusal = False
@@ -146,6 +154,16 @@ class Board:
             self.said = say(
                 "{text}: type the PIN of {name}, or scan CANCEL.", text=text, name=self.pin_of
             )
+
+    def _labelled(self, event: LabelPrinted | LabelFailed) -> None:
+        if isinstance(event, LabelPrinted):
+            self.unprinted.pop(event.serial, None)
+            return
+        self.unprinted[event.serial] = event
+        self.said, self.is_refusal = label_words(event), True
+        row = self.rows.get(event.socket)
+        if row is not None and row.serial == printable(event.serial):
+            row.note = self.said
 
     def _scanned(self, event: ScanAccepted | ScanRefused) -> None:
         text = printable(event.text)
@@ -219,6 +237,15 @@ class Board:
     def bad_units(self) -> tuple[RunEnded, ...]:
         """Units whose last run is no PASS."""
         return tuple(each for each in self.ended.values() if each.outcome is not RunState.PASS)
+
+
+def label_words(event: LabelFailed) -> str:
+    return say(
+        "No label for {serial}: {reason} {remedy}",
+        serial=printable(event.serial),
+        reason=shown(event.reason),
+        remedy=shown(event.remedy),
+    )
 
 
 def shown(text: str) -> str:

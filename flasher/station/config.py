@@ -24,7 +24,7 @@ import shlex
 from collections import Counter
 from datetime import time
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, field_validator, model_validator
 
@@ -37,6 +37,7 @@ from flasher.station.tally import DEFAULT_SHIFTS
 SOCKETS_MAX: Final = 64
 _SWITCH: Final = re.compile(r"\{([^{}|]*)\|([^{}|]*)\}")
 _NOT_FOR_BUS: Final = frozenset({"interface", "channel", "serial_number", "usb_path"})
+_PRINTER: Final = re.compile(r"file:.+|tcp://(?:\[[0-9A-Fa-f:.]+\]|[^:/\s\[\]]+):[1-9][0-9]{0,4}")
 Share = Annotated[float, Field(ge=0, le=1)]
 BusValue = bool | int | float | str
 
@@ -109,6 +110,29 @@ class SocketConfig(Table):
         return self
 
 
+class LabelConfig(Table):
+    """The label that a unit gets when it has passed."""
+
+    template: str = Field(min_length=1)
+    """A file with ZPL, in which values stand as {{ serial }}."""
+    printer: str = ""
+    """As "tcp://192.168.1.7:9100", or "file:/dev/usb/lp0"."""
+    command: tuple[str, ...] = ()
+    """In place of printer: a program that reads the label on its standard input."""
+    on: Literal["pass", "reprint"] = "pass"
+    """Print for every unit that passes, or only what REPRINT asks for."""
+    time_limit_s: float = Field(default=10.0, gt=0, le=60)
+    """How long the printer may take for a label."""
+
+    @model_validator(mode="after")
+    def _check_printer(self) -> LabelConfig:
+        if bool(self.printer) == bool(self.command):
+            raise ValueError("give printer or command, one of them")
+        if self.printer and not _PRINTER.fullmatch(self.printer):
+            raise ValueError(f"{self.printer!a:.60} is no printer: tcp://HOST:PORT or file:PATH")
+        return self
+
+
 class StationConfig(Table):
     """The whole file."""
 
@@ -129,6 +153,7 @@ class StationConfig(Table):
     """When each shift begins, as "06:00"."""
     sound_volume: float = Field(default=0.3, ge=0, le=1)
     """Of the operator page; 0 is silent."""
+    label: LabelConfig | None = None
     socket: tuple[SocketConfig, ...] = Field(min_length=1, max_length=SOCKETS_MAX)
 
     @model_validator(mode="after")
@@ -165,7 +190,13 @@ def load_config(path: Path) -> StationConfig:
     for key in ("files", "keys", "heads", "badges"):
         if getattr(config, key):
             changes[key] = str(here / getattr(config, key))
-    return config.model_copy(update=changes)
+    label = config.label
+    if label is not None:
+        places = {"template": str(here / label.template)}
+        if label.printer.startswith("file:"):
+            places["printer"] = f"file:{here / label.printer.removeprefix('file:')}"
+        label = label.model_copy(update=places)
+    return config.model_copy(update={**changes, "label": label})
 
 
 def mock_config(

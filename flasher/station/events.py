@@ -222,6 +222,25 @@ class RunEnded(Timed):
 
 
 @dataclass(frozen=True)
+class LabelPrinted(Timed):
+    """The label of a unit that has passed went to the printer."""
+
+    socket: str
+    serial: str
+    is_reprint: bool = False
+
+
+@dataclass(frozen=True)
+class LabelFailed(Timed):
+    """The label of a unit was not printed. Its PASS stands."""
+
+    socket: str
+    serial: str
+    reason: str
+    remedy: str
+
+
+@dataclass(frozen=True)
 class RecordNotSaved(Timed):
     """The outcome could not be saved: PASS must not be shown. RESUME tries again."""
 
@@ -285,6 +304,8 @@ StationEvent = (
     | Progressed
     | StepEnded
     | RunEnded
+    | LabelPrinted
+    | LabelFailed
     | RecordNotSaved
     | LineStopped
     | LineResumed

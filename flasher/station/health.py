@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Final
 
+from flasher.protocol.text import printable
 from flasher.said import say
 
 LITTLE_BYTES: Final = 500 * 1024 * 1024
@@ -16,6 +17,7 @@ LITTLE_BYTES: Final = 500 * 1024 * 1024
 CLOCK_SHIFT_MAX_S: Final = 5.0
 """Between the clock on the wall and the one that only goes forward, since the station started."""
 LOOK_EVERY_S: Final = 5.0
+UNPRINTED_SHOWN: Final = 3
 
 
 @dataclass(frozen=True)
@@ -50,13 +52,23 @@ class Watch:
         self._looked_at = float("-inf")
         self._seen: tuple[Check, ...] = ()
 
-    def look(self, *, records_fault: str) -> Health:
-        """What is so now; `records_fault`: why records are not saved, empty when they are."""
+    def look(self, *, records_fault: str, unprinted: Collection[str] = ()) -> Health:
+        """What is so now; `records_fault`: why records are not saved, empty when they are;
+        `unprinted`: units without their labels.
+        """
         now = self._monotonic_s()
         if now - self._looked_at >= LOOK_EVERY_S:
             self._looked_at, self._seen = now, (self._disk(), self._clock())
         text = records_fault or say("every run is saved")
-        return Health((Check(say("records"), is_good=not records_fault, text=text), *self._seen))
+        records = Check(say("records"), is_good=not records_fault, text=text)
+        if not unprinted:
+            return Health((records, *self._seen))
+        units = ", ".join(map(printable, list(unprinted)[:UNPRINTED_SHOWN]))
+        more = len(unprinted) - UNPRINTED_SHOWN
+        text = say("not printed: {units}", units=units)
+        if more > 0:
+            text = say("not printed: {units} and {more} more", units=units, more=more)
+        return Health((records, Check(say("labels"), is_good=False, text=text), *self._seen))
 
     def _disk(self) -> Check:
         try:

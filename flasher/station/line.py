@@ -67,6 +67,7 @@ REACH_S: Final = 2.0
 IDENTIFY_S: Final = 3.0
 """A unit with an application reports its serial number within this time after power-on."""
 _RESUME: Final = Word.RESUME.value.lower()
+_REPRINT: Final = Word.REPRINT.value.lower()
 _PIN: Final = "pin"
 _FORGOTTEN: Final = "FORGOTTEN"
 _AGAIN: Final = say("Scan it again.")
@@ -151,6 +152,16 @@ class CheckPin:
 
 
 @dataclass(frozen=True)
+class Reprint:
+    """Print the label of this unit once more, if it has passed, when that is in the audit trail
+    with `data`; then call `Line.reprinted`.
+    """
+
+    serial: str
+    data: Mapping[str, str]
+
+
+@dataclass(frozen=True)
 class Tell:
     """Publish an event."""
 
@@ -165,7 +176,7 @@ class Audit:
     data: Mapping[str, str]
 
 
-Effect = ClaimRun | SaveAgain | AbortRun | CheckPin | Tell | Audit
+Effect = ClaimRun | SaveAgain | AbortRun | CheckPin | Reprint | Tell | Audit
 
 
 # -- the line -------------------------------------------------------------------------------------
@@ -382,7 +393,7 @@ class Line:
         except Refused as refused:
             self._refuse(shown, refused.code, refused.reason, refused.remedy)
         else:
-            if meaning not in (_RESUME, _PIN):  # what came of it is said by other events
+            if meaning not in (_RESUME, _REPRINT, _PIN):  # what came of it is said by other events
                 name = "" if socket is None else socket.name
                 self._tell(ScanAccepted(shown, meaning, name))
 
@@ -612,6 +623,19 @@ class Line:
         self._audit(AuditEvent.REASON, text=argument)
         self._reason = argument
 
+    def _reprint(self, argument: str, _now: float) -> None:
+        if self._crew is not None:
+            self._crew.check_somebody()
+        self._effects.append(Reprint(argument, self._with_author({"serial": argument})))
+
+    def reprinted(self, serial: str, refused: Refused | None) -> None:
+        """Result of `Reprint`."""
+        text = printable(f"{Word.REPRINT.value} {serial}")[:80]
+        if refused is None:
+            self._tell(ScanAccepted(text, _REPRINT))
+        else:
+            self._refuse(text, refused.code, refused.reason, refused.remedy)
+
     def _resume(self, _argument: str, _now: float) -> None:
         if self.stopped is None:
             raise Refused("NOT_STOPPED", say("The line is not stopped."), _NOTHING)
@@ -732,9 +756,13 @@ class Line:
         self._audit(AuditEvent.REFUSED_SCAN, text=text, code=code, socket=name)
 
     def _audit(self, what: AuditEvent, **data: str) -> None:
-        if self._crew is not None:
-            data["by"] = "" if self._crew.person is None else self._crew.person.name
-        self._effects.append(Audit(what, data))
+        self._effects.append(Audit(what, self._with_author(data)))
+
+    def _with_author(self, data: dict[str, str]) -> dict[str, str]:
+        """What goes into the audit trail: with badges, who it is by."""
+        if self._crew is None:
+            return data
+        return {**data, "by": "" if self._crew.person is None else self._crew.person.name}
 
     def _scan_borne(self, socket: Socket, label: str, now: float) -> None:
         """Assign the label of a virtual unit, as an operator does with card and label."""
@@ -775,6 +803,7 @@ class Line:
         Word.LOT: _set_lot,
         Word.OPERATOR: _set_operator,
         Word.REASON: _give_reason,
+        Word.REPRINT: _reprint,
         Word.RESUME: _resume,
     }
     """Handlers of the commands."""

@@ -7,6 +7,7 @@ FREE A        the unit is out of socket A, where the station cannot see it
 LOT 4711      the lot of the units that follow
 OPERATOR Jo   who works here now
 REASON text   why units that have passed are done again; holds for the next label
+REPRINT W1    print the label of a unit that has passed once more
 RESUME        what stopped the line is mended: save what is open, and go on
 
 `place` is the rule by which a label is never given to a unit that reports first. A label that is
@@ -48,6 +49,7 @@ class Word(StrEnum):
     LOT = "LOT"
     OPERATOR = "OPERATOR"
     REASON = "REASON"
+    REPRINT = "REPRINT"
     RESUME = "RESUME"
 
 

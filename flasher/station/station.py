@@ -21,11 +21,14 @@ from typing import Final
 
 from flasher.errors import UsageError
 from flasher.log import log_event
+from flasher.protocol.text import printable
 from flasher.said import say
 from flasher.station import codes, line, pins
 from flasher.station.codes import CODES
 from flasher.station.events import (
     FiguresChanged,
+    LabelFailed,
+    LabelPrinted,
     OperatorPrompted,
     Progressed,
     RecordNotSaved,
@@ -38,6 +41,8 @@ from flasher.station.events import (
     StepStarted,
     WorkerFailed,
 )
+from flasher.station.label_printer import LabelJob, LabelPrinter
+from flasher.station.label_template import values_of
 from flasher.station.line import ARRIVAL_LIMIT_S, SCAN_LIMIT_S, Line
 from flasher.station.messages import (
     Abort,
@@ -67,10 +72,13 @@ from flasher.station.records.model import (
     Figures,
     RunFilter,
     RunId,
+    RunKind,
+    RunRecord,
     RunState,
 )
 from flasher.station.records.store import Store, SystemClock
 from flasher.station.runs import ActiveRun, save, verified_words, with_history
+from flasher.station.scans import Refused
 from flasher.station.socket import Phase, Socket
 from flasher.station.supervisor import HANG_S, Launch, ProcessPort, Supervisor, WorkerLost
 
@@ -110,6 +118,7 @@ class Station:
         operator: str,
         lot: str = "",
         crew: Crew | None = None,
+        labels: LabelPrinter | None = None,
         on_event: EventHandler = lambda _event: None,
         on_turn: Callable[[], None] = lambda: None,
         options: StationOptions | None = None,
@@ -134,6 +143,7 @@ class Station:
             crew=crew,
         )
         self._has_badges = crew is not None
+        self._labels = labels
         self.supervisor = Supervisor(
             setups, self.clock.monotonic_s, launch=launch, hang_s=self.options.hang_s
         )
@@ -163,6 +173,8 @@ class Station:
         self._find_interrupted(recovered)
         self.store.files.spool.mkdir(parents=True, exist_ok=True)
         self._is_open = True
+        if self._labels is not None:
+            self._labels.start(self._wake)
         rule = self.recipe.recipe
         self.tell(
             StationStarted(
@@ -230,6 +242,7 @@ class Station:
             self._abort_running()
         self.line.tick(self._now)
         self._carry_out()
+        self._tell_labels()
         self._on_turn()
 
     def close(self) -> None:
@@ -245,6 +258,9 @@ class Station:
         while self.is_running and self._now < give_up_at:
             self.turn(TURN_S)
         self.supervisor.close()
+        if self._labels is not None:
+            self._labels.close()
+            self._tell_labels()
         self.tell(StationStopped(self.store.station))
 
     @property
@@ -307,6 +323,8 @@ class Station:
                     case line.CheckPin(pin, pin_hash):
                         is_right = pins.is_right(pin, pin_hash)
                         self.line.pin_checked(self._now, is_right=is_right)
+                    case line.Reprint(serial, data):
+                        self.line.reprinted(serial, self._reprint(serial, data))
                     case line.Audit(what, data):
                         self._audit(what, data)
 
@@ -515,12 +533,79 @@ class Station:
         self.line.feed(socket, line.Saved(result.outcome, code.action), self._now)
         with suppress(RecordError):
             self.tell(FiguresChanged(self.figures))
+        if result.outcome is RunState.PASS:
+            self._print(socket, claim)
         return True
+
+    # -- labels: nothing of them touches a verdict ------------------------------------------------
+
+    def _print(self, socket: str, claim: Claim) -> None:
+        """Print the label of a unit whose PASS is on disk."""
+        if self._labels is None or not self._labels.prints_each:
+            return
+        try:
+            run = self.store.read.run(claim.run_id).run
+        except RecordError as error:
+            self._label_failed(socket, claim.serial, _said(error))
+            return
+        if _not_labelled(run) is None and run.kind is not RunKind.VERIFY_ONLY:
+            self._labels.submit(self._label(socket, run))
+
+    def _reprint(self, serial: str, data: Mapping[str, str]) -> Refused | None:
+        """Print a label once more; why not, if it is refused."""
+        if self._labels is None:
+            reason = say("This station has no printer.")
+            return Refused("NO_PRINTER", reason, say("Set it up in the station's file."))
+        try:
+            lives = self.store.read.units(serial)
+            life = next((e for e in lives if e.part == self.recipe.recipe.part), None)
+            last = None if life is None else life.last
+            refused = _NOT_PASSED if last is None else _not_labelled(last.run)
+            if refused is not None or last is None:
+                return refused
+            self.store.note(AuditEvent.REPRINT, data)
+        except RecordError as error:
+            return Refused(codes.RECORD_NOT_SAVED.name, _said(error), error.remedy)
+        self._labels.submit(self._label("", last.run, is_reprint=True))
+        return None
+
+    def _label(self, socket: str, run: RunRecord, *, is_reprint: bool = False) -> LabelJob:
+        try:
+            groups = self.recipe.recipe.serial_number.read(run.serial)
+        except ValueError:  # of a recipe with another pattern
+            groups = {}
+        return LabelJob(socket, run.serial, values_of(run, groups), is_reprint)
+
+    def _tell_labels(self) -> None:
+        for done in () if self._labels is None else self._labels.take():
+            job = done.job
+            if done.reason:
+                self._label_failed(job.socket, job.serial, done.reason)
+            else:
+                self.tell(LabelPrinted(job.socket, job.serial, job.is_reprint))
+
+    def _label_failed(self, socket: str, serial: str, reason: str) -> None:
+        remedy = say("Mend it, then scan REPRINT {serial}.", serial=printable(serial))
+        self.tell(LabelFailed(socket, serial, reason, remedy))
 
     def _not_saved(
         self, socket: str, serial: str, run_id: RunId | None, error: RecordError
     ) -> None:
         self.tell(RecordNotSaved(socket, serial, run_id, _said(error), error.remedy))
+
+
+_NOT_PASSED: Final = Refused(
+    "NOT_PASSED", say("The unit has not passed."), say("It gets a label when it has.")
+)
+
+
+def _not_labelled(run: RunRecord) -> Refused | None:
+    """Why a unit with this last run gets no label."""
+    if run.state is not RunState.PASS:
+        return _NOT_PASSED
+    if run.is_virtual or run.kind is RunKind.GOLDEN:
+        return Refused("NO_PRODUCT", say("It is no product."), say("It gets no label."))
+    return None
 
 
 def _said(error: RecordError) -> str:

@@ -198,7 +198,7 @@ class Screen:
             lot,
             board.virtual_words,
             self._tally.output(datetime.now().astimezone()),
-            self._watch.look(records_fault=board.records_fault),
+            self._watch.look(records_fault=board.records_fault, unprinted=tuple(board.unprinted)),
             board.stopped,
             board.said,
             board.is_refusal,

@@ -111,6 +111,18 @@ def test_the_sockets_are_checked_with_the_recipe(
     assert (
         "socket A: virtual units" in flasher("station", "check", recipe, "--sockets", sockets).out
     )
+    beside = {
+        '[label]\ntemplate = "label.zpl"\nprinter = "file:x"\n': "cannot be filled in",
+        'badges = "badges.toml"\n': "could be a label",
+    }
+    (tmp_path / "label.zpl").write_text("{{ serail }}", "utf-8")
+    badge = f'[[person]]\nname = "Jo"\ncode = "{SERIAL}"\nrole = "operator"\n'
+    (tmp_path / "badges.toml").write_text(badge, "utf-8")
+    for text, said in beside.items():
+        sockets.write_text(f'{text}[[socket]]\nname = "A"\nmock = {{}}\n', "utf-8")
+        run = flasher("station", "check", recipe, "--sockets", sockets)
+        assert run.code == ExitCode.USAGE
+        assert said in run.err
     missing = 'interface = "socketcan"\nserial_number = "none-like-this"\n'
     sockets.write_text(f'[[socket]]\nname = "A"\n{missing}', "utf-8")
     run = flasher("station", "check", recipe, "--sockets", sockets)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from flasher.station.events import SocketState, StationEvent
+from flasher.station.label_printer import LabelPrinter
 from flasher.station.messages import (
     Ask,
     Begin,
@@ -79,6 +80,7 @@ class LineBench:
         scans_labels: bool = False,
         mixes_virtual: bool = False,
         crew: Crew | None = None,
+        labels: LabelPrinter | None = None,
     ) -> None:
         self.bench = bench
         self.sees_units = sees_units
@@ -91,6 +93,7 @@ class LineBench:
             setups,
             operator="jo" if crew is None else "",
             crew=crew,
+            labels=labels,
             on_event=self.events.append,
             options=StationOptions(
                 arrival_limit_s=5.0,

@@ -13,10 +13,12 @@ from flasher.cli.station.documents import (
     RecipeFindingDocument,
     StationCheckDocument,
 )
+from flasher.cli.station.setup import labels_of
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.text import printable
 from flasher.station.adapters import Resolved, detect, resolve
 from flasher.station.config import load_config
+from flasher.station.people import load_badges
 from flasher.station.recipe import fill
 from flasher.station.recipe_file import LoadedRecipe, load_checked
 
@@ -39,7 +41,7 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
         return error.exit_code
     for line in _lines(recipe, day):
         output.result(line)
-    sockets = {} if station_file is None else _adapters_of(station_file)
+    sockets = {} if station_file is None else _check_station(station_file, recipe)
     for name, adapter in sockets.items():
         output.result(f"socket {printable(name)}: {printable(adapter)}")
     output.result("nothing speaks against it")
@@ -47,9 +49,16 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
     return ExitCode.OK
 
 
-def _adapters_of(station_file: Path) -> dict[str, str]:
-    """The adapter of each socket of a station. Raises UsageError, BusError."""
-    sockets = load_config(station_file).socket
+def _check_station(station_file: Path, recipe: LoadedRecipe) -> dict[str, str]:
+    """The adapter of each socket of a station, when its badges and its label fit the recipe.
+
+    Raises UsageError, BusError.
+    """
+    config = load_config(station_file)
+    if config.badges:
+        load_badges(Path(config.badges), recipe.recipe.serial_number)
+    labels_of(config, recipe)
+    sockets = config.socket
     return {each.config.name: _adapter(each) for each in resolve(sockets, detect(sockets))}
 
 

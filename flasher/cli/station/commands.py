@@ -38,9 +38,9 @@ examples:
 """
 _RUN_NOTES: Final = """\
 A scan is the label of a unit, or a command: SOCKET A, CANCEL, ABORT A, FREE A, LOT 4711,
-OPERATOR Jo, REASON text, RESUME. They are read from stdin, a line each: a scanner is a keyboard.
-With --scans each label of the file goes to the next socket in which a unit waits. With --badges a
-scanned badge says who works here, and REASON, ABORT and RESUME need a role that may.
+OPERATOR Jo, REASON text, REPRINT SERIAL, RESUME. They are read from stdin, a line each: a scanner
+is a keyboard. With --scans each label of the file goes to the next socket in which a unit waits.
+With --badges a scanned badge says who works here; REASON, ABORT and RESUME need a role that may.
 
 Ctrl-C: no further unit is begun, and those that run are finished. A second one stops them at their
 next safe place; they have to be scanned again. Exit code 12 when a unit did not pass.
@@ -324,7 +324,7 @@ def pages(output: Output, web: Address, pages: PagesOptions, records: RecordsOpt
 @station.action("pin")
 def pin(output: Output) -> int:
     """Print the hash of a PIN, for the badge table. The PIN is typed, and not shown."""
-    return _call("badges.pin", output)
+    return _call("setup.pin", output)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from flasher.cli.output import Output
-from flasher.cli.station.badges import crew_of
 from flasher.cli.station.commands import PagesOptions, RecordsOptions, RunOptions
 from flasher.cli.station.documents import (
     FiguresDocument,
@@ -21,6 +20,7 @@ from flasher.cli.station.documents import (
 )
 from flasher.cli.station.place import operator_of, records_of
 from flasher.cli.station.scans import LineReader, ScanFile, Typing, keyboard, read_scans
+from flasher.cli.station.setup import crew_of, labels_of
 from flasher.cli.station.views import JsonLines, Lines, Table, View, figures_line
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import BusError, ExitCode, FlasherError, InterruptedByUserError, UsageError
@@ -87,6 +87,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
             operator=operator_of(options.operator) if crew is None else "",
             lot=options.lot,
             crew=crew,
+            labels=labels_of(config, recipe),
             on_event=session.show,
             on_turn=session.turn,
             options=StationOptions(

@@ -87,6 +87,8 @@ class AuditEvent(StrEnum):
     """A run was stopped by hand."""
     REASON = "reason"
     """Why a unit is done again."""
+    REPRINT = "reprint"
+    """The label of a unit is printed once more."""
     REFUSED_SCAN = "refused scan"
 
 

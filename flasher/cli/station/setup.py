@@ -1,4 +1,4 @@
-"""Badges: the table that the options name, and `flasher station pin`."""
+"""What belongs to a station beside its sockets: badges, `flasher station pin`, labels."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from flasher.cli.station.commands import RunOptions
 from flasher.cli.station.documents import PinDocument
 from flasher.errors import ExitCode, UsageError
 from flasher.station.config import StationConfig
+from flasher.station.label_printer import LabelPrinter, printer_of
+from flasher.station.label_template import LabelTemplate, sample_of
 from flasher.station.people import Crew, load_badges
 from flasher.station.pins import FORM_WORDS, Pin, hash_of, is_form
 from flasher.station.recipe import SerialNumber
+from flasher.station.recipe_file import LoadedRecipe
 
 
 def crew_of(options: RunOptions, config: StationConfig, serial_number: SerialNumber) -> Crew | None:
@@ -29,6 +32,19 @@ def crew_of(options: RunOptions, config: StationConfig, serial_number: SerialNum
             remedy="Leave it out.",
         )
     return Crew(load_badges(table, serial_number))
+
+
+def labels_of(config: StationConfig, recipe: LoadedRecipe) -> LabelPrinter | None:
+    """The printer of the labels; None without one. Raises UsageError."""
+    label = config.label
+    if label is None:
+        return None
+    return LabelPrinter(
+        LabelTemplate(Path(label.template), sample_of(recipe.recipe, config.name)),
+        printer_of(label),
+        limit_s=label.time_limit_s,
+        prints_each=label.on == "pass",
+    )
 
 
 def pin(output: Output) -> int:

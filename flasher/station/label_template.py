@@ -1,0 +1,117 @@
+"""What stands on a unit's label: a ZPL template, filled in from a run that is in the records.
+
+    ^XA
+    ^FO40,40^BQN,2,6^FDQA,{{ serial }}^FS
+    ^FO40,220^FH^FD{{ recipe | fh }}^FS
+    ^XZ
+
+The template runs in a sandbox. A value can never be a command of the printer: `^`, `~` and control
+characters in it become `?`. In a field with ^FH, `fh` prints every character as it is.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+from jinja2 import StrictUndefined, TemplateError
+from jinja2.sandbox import ImmutableSandboxedEnvironment
+
+from flasher.errors import UsageError
+from flasher.files import read
+from flasher.protocol.text import printable
+from flasher.station.recipe import Recipe
+from flasher.station.records.model import RunRecord
+
+FILE_MAX_SIZE: Final = 64 * 1024
+"""In bytes."""
+LABEL_MAX_SIZE: Final = 1024 * 1024
+_COMMANDS: Final = "^~"
+_PLAIN: Final = frozenset("0123456789ABCDEFGHIJKLMNOPQRSTUVWXYZabcdefghijklmnopqrstuvwxyz-. ")
+
+
+def _neutral(value: object) -> str:
+    return "".join(
+        "?" if char in _COMMANDS or not char.isprintable() else char for char in str(value)
+    )
+
+
+def _hex(value: object) -> str:
+    """For a field with ^FH: what is not plain as its bytes in UTF-8, `_5E`."""
+    return "".join(
+        char if char in _PLAIN else "".join(f"_{byte:02X}" for byte in char.encode())
+        for char in str(value)
+    )
+
+
+class LabelTemplate:
+    """A template that was tried with the values of a sample. Raises UsageError."""
+
+    def __init__(self, path: Path, sample: dict[str, object]) -> None:
+        raw = read(path, FILE_MAX_SIZE, what="label template")
+        environment = ImmutableSandboxedEnvironment(
+            undefined=StrictUndefined,
+            finalize=_neutral,
+            autoescape=False,
+            keep_trailing_newline=True,
+        )
+        environment.filters["fh"] = _hex
+        where = printable(str(path))
+        known = f"It knows: {', '.join(sample)}."
+        try:
+            self._template = environment.from_string(raw.decode("utf-8-sig"))
+            self.fill(sample)
+        except UnicodeDecodeError as error:
+            raise UsageError("The label template is no text.", where=where) from error
+        except Exception as error:
+            what = f"The label template cannot be filled in: {printable(str(error))}."
+            raise UsageError(what, where=where, remedy=known) from error
+
+    def fill(self, values: dict[str, object]) -> bytes:
+        """The label. Raises whatever a template does that is wrong."""
+        made: list[str] = []
+        size = 0
+        for part in self._template.generate(values):
+            size += len(part)
+            if size > LABEL_MAX_SIZE:
+                raise TemplateError("the label is too large")
+            made.append(part)
+        return "".join(made).encode()
+
+
+def values_of(run: RunRecord, groups: dict[str, str]) -> dict[str, object]:
+    """What a template knows of a run; `groups` are those of its serial number."""
+    ended_at = (run.ended_at or run.begun_at).astimezone()
+    return {
+        "serial": run.serial,
+        "part": run.part,
+        "lot": run.lot or "",
+        "recipe": run.recipe,
+        "revision": run.recipe_revision,
+        "operator": run.operator,
+        "station": run.station,
+        "socket": run.socket,
+        "run": int(run.run_id),
+        "date": f"{ended_at:%Y-%m-%d}",
+        "time": f"{ended_at:%H:%M:%S}",
+        "match": groups,
+    }
+
+
+def sample_of(recipe: Recipe, station: str) -> dict[str, object]:
+    """As `values_of`, for the example of a recipe."""
+    example = recipe.serial_number.example
+    return {
+        "serial": example,
+        "part": recipe.part,
+        "lot": "LOT1",
+        "recipe": recipe.name,
+        "revision": recipe.revision,
+        "operator": "Jo",
+        "station": station,
+        "socket": "A",
+        "run": 1,
+        "date": "2026-05-17",
+        "time": "09:00:00",
+        "match": recipe.serial_number.read(example),
+    }
