@@ -21,6 +21,7 @@ from flasher.station.events import (
     RunEnded,
     RunStarted,
     ScanAccepted,
+    ScannerChanged,
     ScanRefused,
     SocketChanged,
     SocketState,
@@ -91,6 +92,8 @@ class Board:
     refused: list[ScanRefused] = field(default_factory=list)
     waiting: set[str] = field(default_factory=set)
     """Labels that were accepted, and have no socket yet."""
+    lost_scanners: dict[str, ScannerChanged] = field(default_factory=dict)
+    """Scanners that cannot be read, by their names."""
     unprinted: dict[str, LabelFailed] = field(default_factory=dict)
     """Labels that were not printed, by the serial numbers of their units."""
     arrivals: int = 0
@@ -110,7 +113,7 @@ class Board:
                 self.stopped, self.records_fault = None, ""
             case ScanAccepted() | ScanRefused():
                 self._scanned(event)
-            case PinAwaited() | PinEnded() | LabelPrinted() | LabelFailed():
+            case PinAwaited() | PinEnded() | LabelPrinted() | LabelFailed() | ScannerChanged():
                 self._beside(event)
             case OperatorPrompted("", text, _):
                 # It comes just before the scan that it belongs to is accepted.
@@ -142,8 +145,13 @@ class Board:
         if virtual:
             self.title = f"{self.virtual_words} {self.title}"
 
-    def _beside(self, event: PinAwaited | PinEnded | LabelPrinted | LabelFailed) -> None:
+    def _beside(
+        self, event: PinAwaited | PinEnded | LabelPrinted | LabelFailed | ScannerChanged
+    ) -> None:
         """What stands beside the way of a unit."""
+        if isinstance(event, ScannerChanged):
+            self._scanner(event)
+            return
         if isinstance(event, LabelPrinted | LabelFailed):
             self._labelled(event)
             return
@@ -155,12 +163,19 @@ class Board:
                 "{text}: type the PIN of {name}, or scan CANCEL.", text=text, name=self.pin_of
             )
 
+    def _scanner(self, event: ScannerChanged) -> None:
+        name = printable(event.scanner)
+        self.lost_scanners.pop(name, None)
+        self.said, self.is_refusal = beside_words(event), not event.is_ready
+        if not event.is_ready:
+            self.lost_scanners[name] = event
+
     def _labelled(self, event: LabelPrinted | LabelFailed) -> None:
         if isinstance(event, LabelPrinted):
             self.unprinted.pop(event.serial, None)
             return
         self.unprinted[event.serial] = event
-        self.said, self.is_refusal = label_words(event), True
+        self.said, self.is_refusal = beside_words(event), True
         row = self.rows.get(event.socket)
         if row is not None and row.serial == printable(event.serial):
             row.note = self.said
@@ -239,13 +254,19 @@ class Board:
         return tuple(each for each in self.ended.values() if each.outcome is not RunState.PASS)
 
 
-def label_words(event: LabelFailed) -> str:
-    return say(
-        "No label for {serial}: {reason} {remedy}",
-        serial=printable(event.serial),
-        reason=shown(event.reason),
-        remedy=shown(event.remedy),
-    )
+def beside_words(event: LabelFailed | ScannerChanged) -> str:
+    """What happened to a label or a scanner, and what to do."""
+    if isinstance(event, LabelFailed):
+        return say(
+            "No label for {serial}: {reason} {remedy}",
+            serial=printable(event.serial),
+            reason=shown(event.reason),
+            remedy=shown(event.remedy),
+        )
+    name = printable(event.scanner)
+    if event.is_ready:
+        return say("Scanner {name} is ready.", name=name)
+    return say("Scanner {name} cannot be read: {why}", name=name, why=shown(event.reason))
 
 
 def shown(text: str) -> str:

@@ -110,6 +110,28 @@ class SocketConfig(Table):
         return self
 
 
+class ScannerConfig(Table):
+    """A scanner that the station reads itself."""
+
+    name: ShortText
+    input: str = ""
+    """A Linux input device, as "/dev/input/by-id/usb-..."."""
+    usb_path: str = ""
+    """In place of input: where it is plugged in, as "1-1.4"."""
+    port: str = ""
+    """In place of both: a serial port."""
+    baudrate: int = Field(default=9600, ge=300, le=4_000_000)
+    """Of the serial port."""
+    socket: str = ""
+    """The socket that it is mounted at: the labels that it scans are for that one."""
+
+    @model_validator(mode="after")
+    def _check_place(self) -> ScannerConfig:
+        if sum(map(bool, (self.input, self.usb_path, self.port))) != 1:
+            raise ValueError("give input, usb_path or port, one of them")
+        return self
+
+
 class LabelConfig(Table):
     """The label that a unit gets when it has passed."""
 
@@ -154,11 +176,19 @@ class StationConfig(Table):
     sound_volume: float = Field(default=0.3, ge=0, le=1)
     """Of the operator page; 0 is silent."""
     label: LabelConfig | None = None
+    scanner: tuple[ScannerConfig, ...] = Field(default=(), max_length=SOCKETS_MAX)
     socket: tuple[SocketConfig, ...] = Field(min_length=1, max_length=SOCKETS_MAX)
 
     @model_validator(mode="after")
     def _check_sockets(self) -> StationConfig:
         no_two("sockets", "name", [socket.name for socket in self.socket])
+        no_two("scanners", "name", [each.name for each in self.scanner])
+        places = [each.input or each.usb_path or each.port for each in self.scanner]
+        no_two("scanners", "place", places)
+        names = [socket.name for socket in self.socket]
+        for each in self.scanner:
+            if each.socket and each.socket not in names:
+                raise ValueError(f"there is no socket {each.socket!a:.60} for scanner {each.name}")
         real = [socket for socket in self.socket if socket.mock is None]
         for first in ("serial_number", "usb_path"):
             named = [socket for socket in real if getattr(socket, first)]

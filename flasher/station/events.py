@@ -125,6 +125,15 @@ class ScanRefused(Timed):
 
 
 @dataclass(frozen=True)
+class ScannerChanged(Timed):
+    """A scanner of the station can be read, or cannot."""
+
+    scanner: str
+    is_ready: bool
+    reason: str = ""
+
+
+@dataclass(frozen=True)
 class PinAwaited(Timed):
     """What is scanned or typed next is the PIN of this person: it must not be shown."""
 
@@ -296,6 +305,7 @@ StationEvent = (
     | UnitRemoved
     | ScanAccepted
     | ScanRefused
+    | ScannerChanged
     | PinAwaited
     | PinEnded
     | OperatorPrompted

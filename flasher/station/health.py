@@ -17,7 +17,7 @@ LITTLE_BYTES: Final = 500 * 1024 * 1024
 CLOCK_SHIFT_MAX_S: Final = 5.0
 """Between the clock on the wall and the one that only goes forward, since the station started."""
 LOOK_EVERY_S: Final = 5.0
-UNPRINTED_SHOWN: Final = 3
+NAMES_SHOWN: Final = 3
 
 
 @dataclass(frozen=True)
@@ -52,23 +52,28 @@ class Watch:
         self._looked_at = float("-inf")
         self._seen: tuple[Check, ...] = ()
 
-    def look(self, *, records_fault: str, unprinted: Collection[str] = ()) -> Health:
+    def look(
+        self,
+        *,
+        records_fault: str,
+        unprinted: Collection[str] = (),
+        lost_scanners: Collection[str] = (),
+    ) -> Health:
         """What is so now; `records_fault`: why records are not saved, empty when they are;
-        `unprinted`: units without their labels.
+        `unprinted`: units without their labels; `lost_scanners`: those that cannot be read.
         """
         now = self._monotonic_s()
         if now - self._looked_at >= LOOK_EVERY_S:
             self._looked_at, self._seen = now, (self._disk(), self._clock())
         text = records_fault or say("every run is saved")
-        records = Check(say("records"), is_good=not records_fault, text=text)
-        if not unprinted:
-            return Health((records, *self._seen))
-        units = ", ".join(map(printable, list(unprinted)[:UNPRINTED_SHOWN]))
-        more = len(unprinted) - UNPRINTED_SHOWN
-        text = say("not printed: {units}", units=units)
-        if more > 0:
-            text = say("not printed: {units} and {more} more", units=units, more=more)
-        return Health((records, Check(say("labels"), is_good=False, text=text), *self._seen))
+        checks = [Check(say("records"), is_good=not records_fault, text=text)]
+        if unprinted:
+            text = say("not printed: {names}", names=_few(unprinted))
+            checks.append(Check(say("labels"), is_good=False, text=text))
+        if lost_scanners:
+            text = say("cannot be read: {names}", names=_few(lost_scanners))
+            checks.append(Check(say("scanners"), is_good=False, text=text))
+        return Health((*checks, *self._seen))
 
     def _disk(self) -> Check:
         try:
@@ -84,3 +89,10 @@ class Watch:
             return Check(say("clock"), is_good=True, text=say("not set since the start"))
         text = say("set by {seconds} s since the start", seconds=f"{shift_s:+.0f}")
         return Check(say("clock"), is_good=False, text=text)
+
+
+def _few(names: Collection[str]) -> str:
+    """The first of them, and how many there are more."""
+    first = ", ".join(map(printable, list(names)[:NAMES_SHOWN]))
+    more = len(names) - NAMES_SHOWN
+    return say("{first} and {more} more", first=first, more=more) if more > 0 else first

@@ -369,12 +369,17 @@ class Line:
 
     # -- scans ------------------------------------------------------------------------------------
 
-    def scan(self, text: str, now: float) -> None:
-        """Something was scanned."""
+    def scan(self, text: str, now: float, mounted: str = "") -> None:
+        """Something was scanned; `mounted`: by the scanner of this socket."""
         scanned = text.strip()
         crew = self._crew
         person = None if crew is None else crew.find(scanned)
-        if crew is not None and crew.asked is not None:
+        if mounted and self._is_serial(scanned):  # not the PIN that a person may be typing
+            socket = self.sockets[mounted]
+            self._answer(
+                printable(scanned)[:80], lambda: ("label", self._take_mounted(socket, scanned, now))
+            )
+        elif crew is not None and crew.asked is not None:
             self._take_pin(crew, scanned)
         elif person is not None:
             self._log_in(person)
@@ -498,24 +503,45 @@ class Line:
             self._tell(OperatorPrompted(socket.name, socket.wanted))
         return socket
 
+    def _take_mounted(self, socket: Socket, serial: str, now: float) -> Socket:
+        """A label of the scanner at a socket: as its card and the label. Raises Refused. What waits
+        of another scanner goes on waiting.
+        """
+        if self._crew is not None:
+            self._crew.check_somebody()
+        self._check_label(serial)
+        self._check_takes(socket)
+        self._check_for(socket, serial)
+        if socket.label == serial:  # it scans by itself: nobody says that the unit is there
+            raise Refused("DOUBLE_SCAN", say("It was scanned already."), socket.wanted)
+        self._take_for(socket, serial, now)
+        return socket
+
     def _take_for_chosen(self, chosen: Socket, serial: str, now: float) -> None:
         """A label behind the card of its socket. Raises Refused: the card was for this label."""
         try:
             self._check_label(serial)
-            check_free(chosen)
-            check_fits(self.sockets, chosen, serial)
-            check_one_socket(self.sockets, chosen, serial)
+            self._check_for(chosen, serial)
         except Refused:
             self._forget_scans()
             raise
-        was_here = chosen.label == serial
+        self._take_for(chosen, serial, now)
+
+    def _check_for(self, socket: Socket, serial: str) -> None:
+        check_free(socket)
+        check_fits(self.sockets, socket, serial)
+        check_one_socket(self.sockets, socket, serial)
+
+    def _take_for(self, socket: Socket, serial: str, now: float) -> None:
+        was_here = socket.label == serial
         for each in self.sockets.values():
-            if each is chosen or each.label == serial:
+            if each is socket or each.label == serial:
                 each.let_go()  # what was scanned for it before, or it was put elsewhere
-        self._forget_scans()
-        self._bind(chosen, serial, Binding.SAID, now)
+        if socket is self._chosen or serial == self._label:
+            self._forget_scans()
+        self._bind(socket, serial, Binding.SAID, now)
         if was_here:
-            chosen.begin_at_s = now  # said twice: do not wait until it is heard
+            socket.begin_at_s = now  # said twice: do not wait until it is heard
 
     def _check_line(self) -> None:
         if self.stopped is not None:
@@ -559,11 +585,7 @@ class Line:
         self._is_choice_refused = True  # until nothing speaks against it
         socket = self._named(argument)
         self._check_line()
-        check_free(socket)
-        check_service(socket)
-        last = socket.holds
-        if last is not None and last.outcome is RunState.PASS:
-            raise still_there(socket, last)
+        self._check_takes(socket)
         if self._label:
             check_fits(self.sockets, socket, self._label)
             serial = self._label
@@ -576,6 +598,15 @@ class Line:
             socket.is_chosen = True
         self._is_choice_refused = False
         return socket
+
+    @staticmethod
+    def _check_takes(socket: Socket) -> None:
+        """Raises Refused for a socket that can take no unit now."""
+        check_free(socket)
+        check_service(socket)
+        last = socket.holds
+        if last is not None and last.outcome is RunState.PASS:
+            raise still_there(socket, last)
 
     def _named(self, name: str) -> Socket:
         found = next((e for e in self.sockets.values() if e.name.lower() == name.lower()), None)

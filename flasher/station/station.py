@@ -106,7 +106,7 @@ class StationOptions:
 class Station:
     """A station with one recipe. Methods raise nothing for what happens on the line: events tell.
 
-    `submit`, `stop` and `abort_all` may be called from any thread, the others from one.
+    `submit`, `publish`, `stop` and `abort_all` may be called from any thread, the others from one.
     """
 
     def __init__(  # noqa: PLR0913  what a station is made of
@@ -149,7 +149,8 @@ class Station:
         )
         self._runs: dict[str, ActiveRun] = {}
         """Runs that are claimed and not saved yet, by their sockets."""
-        self._scans: deque[str] = deque()
+        self._scans: deque[tuple[str, str]] = deque()
+        self._published: deque[StationEvent] = deque()
         self._wake_receiver, self._wake_sender = multiprocessing.Pipe(duplex=False)
         self._started_at = self.clock.utc()
         self._is_stopping = False
@@ -196,9 +197,14 @@ class Station:
             )
         self.turn(0.0)
 
-    def submit(self, text: str) -> None:
-        """Something was scanned."""
-        self._scans.append(text)
+    def submit(self, text: str, socket: str = "") -> None:
+        """Something was scanned; `socket`: by the scanner that is mounted at that one."""
+        self._scans.append((text, socket))
+        self._wake()
+
+    def publish(self, event: StationEvent) -> None:
+        """Something happened beside the line, as to a scanner; told in the station's turn."""
+        self._published.append(event)
         self._wake()
 
     def stop(self) -> None:
@@ -235,8 +241,11 @@ class Station:
         self.line.is_closing = self._is_stopping
         for socket, message in self.supervisor.poll():
             self._hear(socket, message)
+        while self._published:
+            self.tell(self._published.popleft())
         while self._scans:
-            self.line.scan(self._scans.popleft(), self._now)
+            text, mounted = self._scans.popleft()
+            self.line.scan(text, self._now, mounted)
             self._carry_out()
         if self._is_aborting:
             self._abort_running()

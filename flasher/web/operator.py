@@ -198,7 +198,11 @@ class Screen:
             lot,
             board.virtual_words,
             self._tally.output(datetime.now().astimezone()),
-            self._watch.look(records_fault=board.records_fault, unprinted=tuple(board.unprinted)),
+            self._watch.look(
+                records_fault=board.records_fault,
+                unprinted=tuple(board.unprinted),
+                lost_scanners=tuple(board.lost_scanners),
+            ),
             board.stopped,
             board.said,
             board.is_refusal,

@@ -20,7 +20,7 @@ from flasher.cli.station.documents import (
 )
 from flasher.cli.station.place import operator_of, records_of
 from flasher.cli.station.scans import LineReader, ScanFile, Typing, keyboard, read_scans
-from flasher.cli.station.setup import crew_of, labels_of
+from flasher.cli.station.setup import crew_of, labels_of, scanners_of
 from flasher.cli.station.views import JsonLines, Lines, Table, View, figures_line
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import BusError, ExitCode, FlasherError, InterruptedByUserError, UsageError
@@ -34,6 +34,7 @@ from flasher.station.recipe_file import load_checked
 from flasher.station.records.errors import RecordError
 from flasher.station.records.keys import Keeping
 from flasher.station.records.store import Store
+from flasher.station.scanners import ScannerThread
 from flasher.station.station import Station, StationOptions
 from flasher.station.supervisor import Launch, ProcessPort
 from flasher.station.virtual_units import next_number
@@ -65,14 +66,13 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
     elif options.lines or os.environ.get("TERM") == "dumb":
         view = Lines(output)
     with _opened_records(options, records, config) as store:
-        session = _Session(options, pages, output, store, view, crew, is_virtual=is_virtual)
+        session = _Session(options, pages, output, store, view, crew, config, is_virtual=is_virtual)
         session.is_temporary = _is_temporary(options, records)
         first = 1
         if is_virtual:  # numbers that these records do not know yet
             rows, part = store.read.table(), recipe.recipe.part
             known = {str(row["serial"]) for row in rows if row["part"] == part}
             first = next_number(recipe.recipe.serial_number, known)
-        session.config = config
         session.station = Station(
             store,
             recipe,
@@ -170,7 +170,6 @@ class _Session:
     """A station at work, from its start to its end."""
 
     station: Station
-    config: StationConfig
 
     def __init__(
         self,
@@ -180,12 +179,14 @@ class _Session:
         store: Store,
         view: View,
         crew: Crew | None,
+        config: StationConfig,
         *,
         is_virtual: bool,
     ) -> None:
+        self.config = config
         self.view = view
         self.file: ScanFile | None = None
-        by_hand = options.scan_by_hand or crew is not None
+        by_hand = options.scan_by_hand or crew is not None or bool(config.scanner)
         self.scans_itself = is_virtual and options.scans is None and not by_hand
         self._has_pins = crew is not None and crew.has_pins
         self._options = options
@@ -253,7 +254,11 @@ class _Session:
             self._page.turn()
 
     def _open_scans(self, stack: ExitStack) -> None:
-        """Listen to the keyboard, or to the pipe where that is where the scans come from."""
+        """Listen to the scanners; to the keyboard, or to the pipe where that is where the scans
+        come from. Raises UsageError.
+        """
+        for scanner in scanners_of(self.config, self.station):
+            stack.enter_context(ScannerThread(scanner))
         if sys.stdin is None:
             return
         if sys.stdin.isatty():
@@ -262,7 +267,7 @@ class _Session:
                 stack.enter_context(keyboard(self._typing))
             else:
                 LineReader(sys.stdin, self.station.submit).start()
-        elif self.file is None and not self.scans_itself and self._page is None:
+        elif not (self.file or self.scans_itself or self._page or self.config.scanner):
             self._pipe = LineReader(sys.stdin, self.station.submit)
             self._pipe.start()
 

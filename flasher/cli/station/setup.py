@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import getpass
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from flasher.cli.output import Output
@@ -17,6 +18,8 @@ from flasher.station.people import Crew, load_badges
 from flasher.station.pins import FORM_WORDS, Pin, hash_of, is_form
 from flasher.station.recipe import SerialNumber
 from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.scanners import Scanner
+from flasher.station.station import Station
 
 
 def crew_of(options: RunOptions, config: StationConfig, serial_number: SerialNumber) -> Crew | None:
@@ -45,6 +48,19 @@ def labels_of(config: StationConfig, recipe: LoadedRecipe) -> LabelPrinter | Non
         limit_s=label.time_limit_s,
         prints_each=label.on == "pass",
     )
+
+
+def scanners_of(config: StationConfig, station: Station) -> list[Scanner]:
+    """The scanners that the station reads itself. Raises UsageError."""
+    needs = {"serial": any(each.port for each in config.scanner)}
+    needs["evdev"] = not all(each.port for each in config.scanner)
+    missing = [name for name, is_needed in needs.items() if is_needed and not find_spec(name)]
+    if missing:
+        raise UsageError(
+            f"Scanners need packages that are not installed: {', '.join(missing)}.",
+            remedy="In the checkout: pip install -c .ci/constraints.txt '.[scanner]'",
+        )
+    return [Scanner(each, station.submit, station.publish) for each in config.scanner]
 
 
 def pin(output: Output) -> int:

@@ -22,7 +22,7 @@ from flasher.cli.documents import to_json
 from flasher.cli.output import Output, counted, duration
 from flasher.protocol.text import printable
 from flasher.station import events
-from flasher.station.board import NO_BADGES, Board, Row, label_words
+from flasher.station.board import NO_BADGES, Board, Row, beside_words
 from flasher.station.events import LineStopped, SocketState, StationEvent
 from flasher.station.records.model import Figures
 
@@ -280,8 +280,8 @@ def _words(event: StationEvent) -> Iterator[str]:
             yield f">>> {text}: type the PIN of {person} within {limit_s:.0f} s, or scan CANCEL"
         case events.OperatorPrompted(socket, text):
             yield f">>> {f'socket {socket}: ' if socket else ''}{text}"
-        case events.LabelFailed():
-            yield label_words(event)
+        case events.LabelFailed() | events.ScannerChanged():
+            yield beside_words(event)
         case events.LineStopped(code, reason, remedy):
             yield f"LINE STOPPED {code}: {reason} {remedy} Then scan RESUME."
         case events.LineResumed():

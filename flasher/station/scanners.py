@@ -1,0 +1,222 @@
+"""Scanners that the station reads itself, wherever the focus of a screen is: Linux input devices,
+which it takes for itself alone, and serial ports. Each is read by a thread, and opened again when
+it comes back.
+"""
+
+from __future__ import annotations
+
+import importlib
+import select
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Final, Protocol
+
+from flasher.protocol.text import printable
+from flasher.said import say
+from flasher.station.config import ScannerConfig
+from flasher.station.events import ScannerChanged, ScanRefused, StationEvent
+from flasher.station.keys import KeyDecoder, ScanBuilder
+
+REOPEN_S: Final = 1.0
+READ_S: Final = 0.2
+_SYS_INPUT: Final = Path("/sys/class/input")
+_DEV_INPUT: Final = Path("/dev/input")
+_TYPES_TEXT: Final = 1 << 28 | 1 << 2
+"""Keys of a device that types: Enter, and the digit 1."""
+_ENDS: Final = b"\r\n\t"
+
+
+class NoScanner(Exception):  # noqa: N818  it may be plugged in later
+    """Why a scanner cannot be read, as a sentence."""
+
+
+class Reads(Protocol):
+    """A scanner that is open. Both raise OSError when it is gone."""
+
+    def read(self, limit_s: float) -> None:
+        """Take what it has scanned; waits for it up to `limit_s`."""
+        ...
+
+    def close(self) -> None: ...
+
+
+Open = Callable[[ScanBuilder], Reads]
+"""Opens a scanner. Raises NoScanner, OSError."""
+
+
+class Scanner:
+    """One scanner, whether it is plugged in or not."""
+
+    def __init__(
+        self,
+        config: ScannerConfig,
+        submit: Callable[[str, str], None],
+        publish: Callable[[StationEvent], None],
+        open_scanner: Open | None = None,
+    ) -> None:
+        """`submit` gets each scan, and the socket that the scanner belongs to."""
+        self.config = config
+        self._publish = publish
+        self._builder = ScanBuilder(lambda text: submit(text, config.socket), self._damaged)
+        self._open = open_scanner or _opener(config)
+        self._device: Reads | None = None
+        self._why: str | None = None
+        """Why it could not be read last; None before the first look."""
+
+    def step(self, limit_s: float) -> bool:
+        """Open it, or read what it has; False while it cannot be read."""
+        try:
+            if self._device is None:
+                self._device = self._open(self._builder)
+                self._why = ""
+                self._publish(ScannerChanged(self.config.name, is_ready=True))
+            else:
+                self._device.read(limit_s)
+        except NoScanner as error:
+            self._gone(error.args[0])
+        except OSError as error:
+            self._gone(printable(error.strerror or str(error)))
+        except Exception as error:  # noqa: BLE001  of a library, as termios.error: it is opened anew
+            self._gone(printable(str(error) or type(error).__name__))
+        return self._device is not None
+
+    def close(self) -> None:
+        if self._device is not None:
+            self._device.close()
+            self._device = None
+
+    def _gone(self, why: str) -> None:
+        """Said when it goes, and when there is another reason; not each time it is looked for."""
+        self._builder.drop()
+        was_open = self._device is not None
+        try:
+            self.close()
+        except OSError:
+            self._device = None
+        if was_open or why != self._why:
+            self._why = why
+            self._publish(ScannerChanged(self.config.name, is_ready=False, reason=why))
+
+    def _damaged(self) -> None:
+        self._publish(
+            ScanRefused(
+                "",
+                "DAMAGED",
+                say("A part of a scan of {scanner} is lost.", scanner=printable(self.config.name)),
+                say("Scan it again."),
+                self.config.socket,
+            )
+        )
+
+
+class ScannerThread:
+    """Reads a scanner until it is closed."""
+
+    def __init__(self, scanner: Scanner) -> None:
+        self._scanner = scanner
+        self._ended = threading.Event()
+        self._thread = threading.Thread(
+            target=self._work, name=f"scanner {scanner.config.name}", daemon=True
+        )
+
+    def __enter__(self) -> ScannerThread:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join(2 * READ_S)
+
+    def _work(self) -> None:
+        while not self._ended.is_set():
+            if not self._scanner.step(READ_S):
+                self._ended.wait(REOPEN_S)
+        self._scanner.close()
+
+
+# -- input devices --------------------------------------------------------------------------------
+
+
+class InputScanner:
+    """A scanner that is a keyboard; `device` is one of evdev."""
+
+    def __init__(self, device: Any, builder: ScanBuilder) -> None:
+        self._device = device
+        self._decoder = KeyDecoder(builder, device.active_keys)
+        device.grab()  # nobody else gets its keys: no console, no window
+
+    def read(self, limit_s: float) -> None:
+        if not select.select([self._device.fd], [], [], limit_s)[0]:
+            return
+        for event in self._device.read():
+            self._decoder.feed(event.type, event.code, event.value, event.timestamp())
+
+    def close(self) -> None:
+        self._device.close()
+
+
+def input_device(config: ScannerConfig, sys_input: Path = _SYS_INPUT) -> Path:
+    """The device of a scanner, by its path or by its place on the USB. Raises NoScanner."""
+    if config.input:
+        return Path(config.input)
+    for entry in sorted(sys_input.glob("event*"), key=lambda each: int(each.name[5:])):
+        if config.usb_path in entry.resolve().parts and _types_text(entry):
+            return _DEV_INPUT / entry.name
+    raise NoScanner(say("No scanner is plugged in at {place}.", place=config.usb_path))
+
+
+def _types_text(entry: Path) -> bool:
+    try:
+        words = (entry / "device" / "capabilities" / "key").read_text("ascii").split()
+    except (OSError, ValueError):
+        return False
+    return bool(words) and int(words[-1], 16) & _TYPES_TEXT == _TYPES_TEXT
+
+
+# -- serial ports ---------------------------------------------------------------------------------
+
+
+class SerialScanner:
+    """A scanner on a serial port; `port` is one of pyserial."""
+
+    def __init__(self, port: Any, builder: ScanBuilder) -> None:
+        self._port = port
+        self._builder = builder
+
+    def read(self, limit_s: float) -> None:
+        self._port.timeout = limit_s
+        data = self._port.read(1)
+        data += self._port.read(self._port.in_waiting) if data else b""
+        now = time.monotonic()
+        for byte in data:
+            if byte in _ENDS:
+                self._builder.end(now)
+            else:
+                self._builder.put(chr(byte), now)
+
+    def close(self) -> None:
+        self._port.close()
+
+
+def _opener(config: ScannerConfig) -> Open:
+    if config.port:
+        serial = importlib.import_module("serial")
+
+        def open_port(builder: ScanBuilder) -> Reads:
+            port = serial.Serial(config.port, config.baudrate, timeout=READ_S, exclusive=True)
+            return SerialScanner(port, builder)
+
+        return open_port
+    evdev = importlib.import_module("evdev")
+
+    def open_input(builder: ScanBuilder) -> Reads:
+        device = evdev.InputDevice(str(input_device(config)))
+        try:
+            return InputScanner(device, builder)
+        except OSError:
+            device.close()
+            raise
+
+    return open_input
