@@ -30,7 +30,16 @@ from flasher.image.load import load
 from flasher.image.plan import Plan, make_plan
 from flasher.image.release import Release
 from flasher.log import log_event
-from flasher.procedures import DeviceInfo, Procedure, Procedures, Run, Step, Tell, WaitUntil
+from flasher.procedures import (
+    DeviceInfo,
+    Procedure,
+    Procedures,
+    Run,
+    Step,
+    Tell,
+    WaitUntil,
+    plan_for,
+)
 from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Dialect, Target, as_dialect, as_target
@@ -50,6 +59,7 @@ __all__ = [
     "connect_mock",
     "load",
     "make_plan",
+    "prepare",
     "find_release",
     "as_dialect",
     "as_level",
@@ -66,6 +76,7 @@ __all__ = [
     "EventHandler",
     "Identity",
     "Image",
+    "Job",
     "Level",
     "Outcome",
     "Plan",
@@ -74,6 +85,7 @@ __all__ = [
     "Result",
     "UpgradeOptions",
     "Verification",
+    "Watch",
     "Written",
 ]
 
@@ -289,6 +301,26 @@ class _OnBus:
         """What an upgrade with this image would send. Raises ImageError and UsageError."""
         return self._steps.plan(image)
 
+    def _job(
+        self,
+        image: str | os.PathLike[str] | Image,
+        options: UpgradeOptions | None,
+        verify: Level | str | None,
+        identity: Identity | None,
+        *,
+        at_power_up: bool = False,
+    ) -> Job:
+        rate = self.connection.bit_rate
+        return prepare(
+            image,
+            self.profile,
+            bitrate_bps=None if rate is None else rate.bps,
+            options=options,
+            verify=verify,
+            identity=identity,
+            at_power_up=at_power_up,
+        )
+
     def _cancelled(self, step: Run | WaitUntil, watch: Watch) -> Callable[[], bool] | None:
         """What ends a step before its end."""
         asked = watch.get("cancelled") or _never
@@ -410,8 +442,8 @@ class Device(_OnBus):
         of a good session, or of one that found nothing to do; every other one is raised as the
         FlasherError that stands for it (see flasher.errors).
         """
-        job = _Job(self, image, options, verify, identity)
-        return job.checked(self._run(job.procedure(), watch))
+        job = self._job(image, options, verify, identity)
+        return _checked(self._run(job.procedure(self._steps), watch))
 
     def rescue(
         self,
@@ -425,8 +457,8 @@ class Device(_OnBus):
         """`flash` for a device whose application does not run: waits until it announces its
         bootloader at power-up, for `power_up_timeout_s` of the options, and upgrades it then.
         """
-        job = _Job(self, image, options, verify, identity, at_power_up=True)
-        return job.checked(self._run(job.procedure(), watch))
+        job = self._job(image, options, verify, identity, at_power_up=True)
+        return _checked(self._run(job.procedure(self._steps), watch))
 
     def upgrade(
         self,
@@ -555,8 +587,8 @@ class AsyncDevice(_OnBus):
     ) -> Result:
         import asyncio  # noqa: PLC0415  for programs that have it already
 
-        job = await asyncio.to_thread(_Job, self, image, options, verify, identity)
-        return job.checked(await self._run(job.procedure(), watch))
+        job = await asyncio.to_thread(self._job, image, options, verify, identity)
+        return _checked(await self._run(job.procedure(self._steps), watch))
 
     async def rescue(
         self,
@@ -570,9 +602,9 @@ class AsyncDevice(_OnBus):
         import asyncio  # noqa: PLC0415  for programs that have it already
 
         job = await asyncio.to_thread(
-            partial(_Job, self, image, options, verify, identity, at_power_up=True)
+            partial(self._job, image, options, verify, identity, at_power_up=True)
         )
-        return job.checked(await self._run(job.procedure(), watch))
+        return _checked(await self._run(job.procedure(self._steps), watch))
 
     async def upgrade(
         self,
@@ -650,41 +682,55 @@ def _alone(engine: Engine) -> Procedure[None]:
 # -- an image for a device ------------------------------------------------------------------------
 
 
-class _Job:
-    """What `flash` and `rescue` do before and behind the upgrade: load, check, judge."""
+@dataclass(frozen=True)
+class Job:
+    """An upgrade whose image was checked as far as it can be without the device."""
 
-    def __init__(
-        self,
-        device: _OnBus,
-        image: str | os.PathLike[str] | Image,
-        options: UpgradeOptions | None,
-        verify: Level | str | None,
-        identity: Identity | None,
-        *,
-        at_power_up: bool = False,
-    ) -> None:
-        profile = device.profile
-        loaded = image if isinstance(image, Image) else load(image)
-        if identity is None:
-            release = None if isinstance(image, Image) else find_release(image)
-            identity = profile.identity(release=release, goes_on_unchecked=at_power_up)
-        self._identity = identity
-        self._plan = device.plan(release_checked(loaded, identity.release))
-        check_image(self._plan, identity)
-        chosen = release_options(options or profile.upgrade_options(), identity.release)
-        self._options = replace(chosen, at_power_up=True) if at_power_up else chosen
-        self._level = None if verify is None else as_level(verify)
-        self._steps = device._steps  # noqa: SLF001  of this module
+    plan: Plan
+    options: UpgradeOptions
+    level: Level
+    identity: Identity
+    checks: tuple[CheckResult, ...]
+    """What was found; nothing that speaks against it."""
 
-    def procedure(self) -> Procedure[Result]:
-        return self._steps.upgrade(self._plan, self._options, self._level, self._identity)
+    def procedure(self, steps: Procedures) -> Procedure[Result]:
+        """What carries it out, to its end, good or bad."""
+        return steps.upgrade(self.plan, self.options, self.level, self.identity)
 
-    def checked(self, result: Result) -> Result:
-        """The result of a good session. Raises the error of every other one."""
-        error = result.error()
-        if error is not None:
-            raise error
-        return result
+
+def prepare(
+    image: str | os.PathLike[str] | Image,
+    profile: Profile,
+    *,
+    bitrate_bps: int | None = None,
+    options: UpgradeOptions | None = None,
+    verify: Level | str | None = None,
+    identity: Identity | None = None,
+    at_power_up: bool = False,
+) -> Job:
+    """What an upgrade does before a bus is needed: load, plan, check, and settle what is left
+    open as `Device.flash` does. Raises ImageError, UsageError and WrongDeviceError.
+    """
+    loaded = image if isinstance(image, Image) else load(image)
+    if identity is None:
+        release = None if isinstance(image, Image) else find_release(image)
+        identity = profile.identity(release=release, goes_on_unchecked=at_power_up)
+    plan = plan_for(release_checked(loaded, identity.release), profile, bitrate_bps)
+    checks = check_image(plan, identity)
+    chosen = release_options(options or profile.upgrade_options(), identity.release)
+    if at_power_up:
+        chosen = replace(chosen, at_power_up=True)
+    level = default_level(plan.target, chosen) if verify is None else as_level(verify)
+    check_level(plan, level, chosen)
+    return Job(plan, chosen, level, identity, tuple(checks))
+
+
+def _checked(result: Result) -> Result:
+    """The result of a good session. Raises the error of every other one."""
+    error = result.error()
+    if error is not None:
+        raise error
+    return result
 
 
 def flash(

@@ -343,16 +343,8 @@ class Procedures:
                 planned, own = image.target.node.name, self.target.node.name
                 raise UsageError(f"The plan is for a {planned}, and this device is a {own}.")
             return image
-        profile = self.profile
-        profile.check_fits(image)
         rate = None if self.bit_rate is None else self.bit_rate.bps
-        return make_plan(
-            image,
-            profile.target,
-            profile.dialect,
-            bitrate_bps=rate,
-            has_upgrade=profile.has_upgrade,
-        )
+        return plan_for(image, self.profile, rate)
 
     def verify(self, image: Image | Plan, level: Level) -> Procedure[Verification]:
         """Whether the device runs this image: by its version, then by its memory."""
@@ -488,6 +480,20 @@ class Procedures:
                 is_cancelled = yield WaitUntil(until, _may_end(session))
             else:
                 return True
+
+
+def plan_for(image: Image, profile: Profile, bitrate_bps: int | None) -> Plan:
+    """What an upgrade of a profile's device with this image would send. Raises ImageError and
+    UsageError.
+    """
+    profile.check_fits(image)
+    return make_plan(
+        image,
+        profile.target,
+        profile.dialect,
+        bitrate_bps=bitrate_bps,
+        has_upgrade=profile.has_upgrade,
+    )
 
 
 def _may_end(session: Session) -> Callable[[], bool]:

@@ -114,6 +114,12 @@ class Recording:
         """The command reports this error itself, and does not raise it."""
         self.failure = error
 
+    def leave_terminal(self, output: Output) -> None:
+        """The terminal is gone."""
+        if not self.is_alone:
+            self.is_alone = True
+            output.leave_terminal("the terminal is gone")
+
     def link_report(self) -> LinkReport | None:
         """How the transfer used the bus so far; None before the first packet."""
         return None if self._meter is None else self._meter.report()

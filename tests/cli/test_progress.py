@@ -16,9 +16,10 @@ import pytest
 from flasher import events
 from flasher.api import make_plan
 from flasher.cli.output import Output
-from flasher.cli.upgrade.progress import Progress, because
+from flasher.cli.upgrade.progress import Progress
 from flasher.errors import BusError, ExitCode
 from flasher.events import Phase
+from flasher.host.told import because
 from flasher.host.table import Reason
 from flasher.image.image import Image
 from tests.cli.conftest import SAMPLES, Flasher

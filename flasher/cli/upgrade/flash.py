@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import shlex
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -25,9 +26,9 @@ from flasher.cli.options import (
     target_option,
 )
 from flasher.cli.output import Output
-from flasher.cli.recording import Recording, RecordingOptions, recording, recording_options
+from flasher.cli.recording import Recording, RecordingOptions, recording_options
 from flasher.cli.stop import stop_on_signal
-from flasher.cli.upgrade.kept import Keeper, kept
+from flasher.cli.upgrade.carried import Carried
 from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.text import (
     DryRunDocument,
@@ -37,19 +38,15 @@ from flasher.cli.upgrade.text import (
     failed,
     image_lines,
     link_lines,
-    plan_document,
     plan_lines,
     summary_lines,
-    upgrade_document,
     vector_lines,
     verdict_of,
 )
 from flasher.errors import ExitCode, FlasherError
-from flasher.events import CheckMade
 from flasher.host.identity import WAIVABLE, Check
 from flasher.host.options import DEFAULT_ATTEMPTS, DEFAULT_POWER_UP_TIMEOUT_S, UpgradeOptions
 from flasher.host.outcome import AGAIN
-from flasher.host.session import Result
 from flasher.host.verify import Level
 from flasher.image.cortexm import vector_table
 from flasher.image.plan import Plan
@@ -338,51 +335,34 @@ class _Upgrade:
             skip_same_version=skip_same_version,
             goes_on_unchecked=at_power_up,
         )
-        checks = [found.event for found in api.check_image(plan, identity)]
+        found = api.check_image(plan, identity)
         if choices.dry_run:
+            checks = [each.event for each in found]
             for check in checks:
                 output.result(check_line(check))
             output.result("dry run: nothing was sent")
             output.document(dry_run_document(plan, chosen, checks))
             return ExitCode.OK
-        return self._carry_out(plan, chosen, choices.level(plan, chosen), identity)
+        level = choices.level(plan, chosen)
+        return self._carry_out(api.Job(plan, chosen, level, identity, tuple(found)))
 
-    def _carry_out(
-        self, plan: Plan, chosen: UpgradeOptions, level: Level, identity: api.Identity
-    ) -> int:
-        checks: list[CheckMade] = []
-        with (
-            kept(self.output) as keeper,
-            recording(self.recorded, self.bus, self.output, target=plan.target) as record,
-        ):
-            keeper.record = record
-            record.facts["plan"] = plan_document(plan, chosen)
-            record.facts["image_sha256"] = plan.image.sha256
-            try:
-                result, took_s = self._upgrade(
-                    keeper, record, checks, plan, chosen, level, identity
-                )
-            except FlasherError as failure:
-                self._add_repair(failure)
-                raise
-            keeper.result = result
-            link, error = record.link_report(), result.error()
-            document = upgrade_document(plan, chosen, result, checks, link)
-            record.facts["outcome"] = document.outcome
-            record.facts["verification"] = document.verification
-            if error is not None:
-                self._add_repair(error)
-                record.failed(error)
-        # The bundle is told of before the error, so that the verdict stands at the end.
+    def _carry_out(self, job: api.Job) -> int:
         output = self.output
+        carried = Carried(job, self.bus, self.recorded, output, self._add_repair)
+        result = carried.carry_out(
+            lambda: self._connect(at_power_up=job.options.at_power_up),
+            lambda connection, record: self._watching(job, connection, record),
+        )
+        # The bundle is told of before the error, so that the verdict stands at the end.
+        error, document = carried.error, carried.document
         show = output.result if error is None else output.progress
         if result.outcome.ok:
-            for line in summary_lines(result, plan):
+            for line in summary_lines(result, job.plan):
                 show(line)
-        if link is not None:
-            for line in link_lines(link):
+        if document is not None and document.link is not None:
+            for line in link_lines(document.link):
                 output.progress(line, level=1)
-        verdict = verdict_of(result, checks, took_s)
+        verdict = verdict_of(result, carried.checks, carried.took_s)
         if error is None:
             output.verdict(verdict)
             output.document(document, exit_code=result.exit_code)
@@ -391,58 +371,33 @@ class _Upgrade:
             output.failure(error, document)
         return result.exit_code
 
-    def _upgrade(
-        self,
-        keeper: Keeper,
-        record: Recording,
-        checks: list[CheckMade],
-        plan: Plan,
-        chosen: UpgradeOptions,
-        level: Level,
-        identity: api.Identity,
-    ) -> tuple[Result, float]:
-        """The result, and how many seconds it took; `checks` are those that were made."""
+    @contextmanager
+    def _watching(
+        self, job: api.Job, connection: api.Connection, record: Recording
+    ) -> Iterator[api.Watch]:
+        """Shows the upgrade on the terminal, and ends it when the user wants to."""
         output = self.output
-        with ExitStack() as stack:
-            connection = stack.enter_context(self._connect(at_power_up=chosen.at_power_up))
-            record.opened(connection)
-            output.progress(f"on {connection.name} at {connection.bit_rate}")
-            progress = stack.enter_context(Progress(plan, output))
-            stop = stack.enter_context(
-                stop_on_signal(lambda: output.error_line("stopping at the end of the message ..."))
-            )
+        output.progress(f"on {connection.name} at {connection.bit_rate}")
+        with (
+            Progress(job.plan, output) as progress,
+            stop_on_signal(
+                lambda: output.error_line("stopping at the end of the message ...")
+            ) as stop,
+        ):
 
             def hung_up() -> bool:
-                if stop.has_hung_up and not record.is_alone:
-                    record.is_alone = True
-                    output.leave_terminal("the terminal is gone")
+                if stop.has_hung_up:
+                    record.leave_terminal(output)
                 return stop.has_hung_up
 
             def on_event(event: object) -> None:
-                if isinstance(event, CheckMade):
-                    checks.append(event)
-                    record.facts["checks"] = checks
-                keeper.heard(event)
                 output.event(event)
                 progress(event)
 
-            began_at = connection.clock.now()
-            device = connection.device(self.target, dialect=self.bus.dialect)
-            if not chosen.at_power_up:  # there its announcement is waited for, and nothing sent
+            if not job.options.at_power_up:  # there its announcement is waited for, nothing sent
+                device = connection.device(self.target, dialect=self.bus.dialect)
                 check_heard(device, self.bus, output, taps=record.taps, cancelled=stop.asked)
-            name = "rescue" if chosen.at_power_up else "flash"
-            keeper.began(name, plan, connection.name, is_mock=self.bus.mock)
-            result = device.upgrade(
-                plan,
-                options=chosen,
-                verify=level,
-                identity=identity,
-                taps=record.taps,
-                on_event=on_event,
-                cancelled=stop.asked,
-                hung_up=hung_up,
-            )
-            return result, connection.clock.now() - began_at
+            yield {"on_event": on_event, "cancelled": stop.asked, "hung_up": hung_up}
 
     def _connect(self, *, at_power_up: bool) -> AbstractContextManager[api.Connection]:
         bus = self.bus

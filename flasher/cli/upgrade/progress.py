@@ -8,8 +8,8 @@ from flasher import events
 from flasher.cli.bar import Bar
 from flasher.cli.output import Output
 from flasher.cli.terminal import painted
+from flasher.host.told import line_of, warning_of
 from flasher.image.plan import Plan
-from flasher.prose import prose, prose_of
 from flasher.protocol.spec import PACKET_DATA_SIZE
 
 SHOWN: Final = frozenset(
@@ -30,11 +30,6 @@ SHOWN: Final = frozenset(
     }
 )
 """The events that have lines or a bar of their own here: the log on stderr leaves them out."""
-
-
-def because(reason: str, what: str = "") -> str:
-    """The sentence for a reason of `MessageRepeated` and `AttemptStarted`."""
-    return prose_of("Reason", reason).replace("{what}", what)
 
 
 class Progress:
@@ -74,48 +69,9 @@ class Progress:
                 text = f"power-cycle the device now (waiting {limit_s:g} s)"
                 bold = painted(text, "yellow") if self._output.colour else text
                 self._output.error_line(f">>> {bold}")
-        if warning := _warning(event):
+        if warning := warning_of(event):
             self._bar.close()
             self._output.error_line(f"warning: {warning}")
-        elif line := _line(event):
+        elif line := line_of(event):
             text, level = line
             self._output.progress(text, level=level)
-
-
-def _warning(event: object) -> str:
-    """What nobody should miss, in words; empty for any other event."""
-    match event:
-        case events.ShutdownHeard(sender):
-            return f"the {sender} sent the command SHUTDOWN: it switches off"
-        case events.ForeignQuery(title):
-            return f"another tool asks the device ({title}); the upgrade goes on. End that tool."
-        case events.AdapterLost(reason, wait_s):
-            return f"{reason} Waiting {wait_s:g} s for the adapter ..."
-        case events.CheckMade(_, "warned" | "waived", text):
-            return text
-        case _:
-            return ""
-
-
-def _line(event: object) -> tuple[str, int] | None:
-    """A line and the level of verbosity that shows it; None for an event without a line."""
-    match event:
-        case events.PhaseEntered(phase, _):
-            return f"{prose(phase)} ...", 0
-        case events.AttemptStarted(attempt, reason):
-            return f"{because(reason)}: beginning again, attempt {attempt}", 0
-        case events.MessageRepeated(what, reason, tries):
-            return f"{because(reason, what)}: sending {what} again, try {tries}", 1
-        case events.BootVersionSeen(name, version):
-            return f"boot version: {name} {version}", 0
-        case events.CheckMade(_, verdict, text):
-            return f"check: {verdict}: {text}", 1 if verdict == "passed" else 0
-        case events.AdapterBack():
-            return "the adapter is back", 0
-        case events.Reported(what):
-            return f"note: {what}", 1
-        case events.BytesDamaged(can_id, reason, data):
-            why = prose_of("DamageReason", reason)
-            return f"bytes on 0x{can_id:03X} ignored: {why}: {data[:24].hex(' ')}", 2
-        case _:
-            return None

@@ -1,0 +1,50 @@
+"""What happens in an upgrade, in sentences for people."""
+
+from __future__ import annotations
+
+from flasher import events
+from flasher.prose import prose, prose_of
+
+
+def because(reason: str, what: str = "") -> str:
+    """The sentence for a reason of `MessageRepeated` and `AttemptStarted`."""
+    return prose_of("Reason", reason).replace("{what}", what)
+
+
+def warning_of(event: object) -> str:
+    """What nobody should miss, in words; empty for any other event."""
+    match event:
+        case events.ShutdownHeard(sender):
+            return f"the {sender} sent the command SHUTDOWN: it switches off"
+        case events.ForeignQuery(title):
+            return f"another tool asks the device ({title}); the upgrade goes on. End that tool."
+        case events.AdapterLost(reason, wait_s):
+            return f"{reason} Waiting {wait_s:g} s for the adapter ..."
+        case events.CheckMade(_, "warned" | "waived", text):
+            return text
+        case _:
+            return ""
+
+
+def line_of(event: object) -> tuple[str, int] | None:
+    """A line and the level of verbosity that shows it; None for an event without a line."""
+    match event:
+        case events.PhaseEntered(phase, _):
+            return f"{prose(phase)} ...", 0
+        case events.AttemptStarted(attempt, reason):
+            return f"{because(reason)}: beginning again, attempt {attempt}", 0
+        case events.MessageRepeated(what, reason, tries):
+            return f"{because(reason, what)}: sending {what} again, try {tries}", 1
+        case events.BootVersionSeen(name, version):
+            return f"boot version: {name} {version}", 0
+        case events.CheckMade(_, verdict, text):
+            return f"check: {verdict}: {text}", 1 if verdict == "passed" else 0
+        case events.AdapterBack():
+            return "the adapter is back", 0
+        case events.Reported(what):
+            return f"note: {what}", 1
+        case events.BytesDamaged(can_id, reason, data):
+            why = prose_of("DamageReason", reason)
+            return f"bytes on 0x{can_id:03X} ignored: {why}: {data[:24].hex(' ')}", 2
+        case _:
+            return None
