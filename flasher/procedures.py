@@ -539,6 +539,18 @@ def _no_answer(asked: Query) -> NoAnswerError:
     )
 
 
+def nobody_heard(survey: Survey, bitrate_bps: int) -> NoAnswerError:
+    """The error for a bus on which no node of the documents was heard."""
+    count = survey.foreign_frames
+    foreign = f"{count:,} frame{'' if count == 1 else 's'} under ids of other protocols came"
+    return NoAnswerError(
+        f"Nobody of the drive system was heard at {bitrate_bps / 1000:g} kbit/s"
+        f"{f'; {foreign}' if count else ''}.",
+        cause="everything is off or asleep, the wiring is open, or the bit rate is another",
+        remedy="Switch the system on; try --dialect motinova (125 kbit/s) or welling (250).",
+    )
+
+
 def _reading(entry: Readable, asked: Query | None) -> Reading:
     if asked is None:
         return Reading(entry.name, entry.item, None, was_asked=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Final, Unpack
 
@@ -28,8 +29,14 @@ def detected_adapters(*, on_network: bool = False) -> Detected:
     """What is plugged in; servers on the network only when they are asked for. Takes 5 s at the
     most. Raises InterruptedByUserError.
     """
+    with stop_on_signal() as stopped:
+        return detected_until(stopped, on_network=on_network)
+
+
+def detected_until(stopped: Callable[[], bool], *, on_network: bool = False) -> Detected:
+    """The same; `stopped` says when the user has enough."""
     asked = set(interface_names()) - (frozenset() if on_network else SLOW)
-    with stop_on_signal() as stopped, Detection(sorted(asked)) as detection:
+    with Detection(sorted(asked)) as detection:
         found = detection.collect(stopped)
         if stopped():
             raise InterruptedByUserError("Interrupted by the user.")
@@ -92,13 +99,17 @@ def settled(bus: Bus, output: Output) -> Bus:
 def only(found: Found, bus: Bus, output: Output) -> Bus:
     """The bus with the only adapter found."""
     output.progress(f"no adapter is named: using the only one found, {printable(found.arguments)}")
+    return replace(using(found, bus), found=found)
+
+
+def using(found: Found, bus: Bus) -> Bus:
+    """The bus with this adapter."""
     kwargs = tuple((key, str(value)) for key, value in found.bus_kwargs.items())
     return replace(
         bus,
         interface=found.interface,
         channel=found.channel,
         bus_kwargs=(*kwargs, *bus.bus_kwargs),
-        found=found,
     )
 
 

@@ -32,6 +32,7 @@ _PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
             "upgrade.flash:rescue",
             "wait for a device to announce itself at power-up, then upgrade it",
         ),
+        "ui": Entry("upgrade.ui:ui", "upgrade a bike in a browser, step by step"),
         "image-info": Entry(
             "upgrade.image_info:image_info",
             "what is in a file, what would be sent, how long it takes",
@@ -103,7 +104,7 @@ examples:
 _COMPLETE: Final = "_FLASHER_COMPLETE"
 """Set by a shell that completes a command line."""
 _LOG: Final = logging.getLogger("flasher.cli")
-_CHANGING: Final = frozenset({"flash", "rescue", "write", "conformance", "station"})
+_CHANGING: Final = frozenset({"flash", "rescue", "write", "conformance", "station", "ui"})
 """Commands that change a device."""
 
 

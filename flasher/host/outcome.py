@@ -91,6 +91,16 @@ class Outcome:
         return self.ending in {Ending.COMPLETED, Ending.CONFIRMED_BY_VERSION}
 
     @property
+    def is_transferred(self) -> bool:
+        """True when every packet was acknowledged."""
+        return self.statistics.transfer_s is not None
+
+    @property
+    def is_completed(self) -> bool:
+        """True when the device said that it has the complete image."""
+        return self.ending is Ending.COMPLETED
+
+    @property
     def where(self) -> str:
         """Phase, packet and attempt in words."""
         return standing(self.phase, self.packet, self.total_packets, self.statistics.attempts)

@@ -48,7 +48,9 @@ _HEADERS: Final = {
 }
 _TRIES_MAX: Final = 5
 _TRIES_WITHIN_S: Final = 60.0
-_OPEN: Final = ("/static/", "/login")
+_ENTER: Final = "/enter"
+_CLOSED: Final = "/closed"
+_OPEN: Final = ("/static/", "/login", _ENTER, _CLOSED)
 """Paths that need no password."""
 
 
@@ -70,7 +72,31 @@ class Tries:
         self._wrong.append(self._now())
 
 
-def application(
+class Entry:
+    """Lets the browser in that first opens `path`, and nobody else after it."""
+
+    def __init__(self, pages: Pages) -> None:
+        self._pages = pages
+        self._key = secrets.token_urlsafe(32)
+        self.path = f"{_ENTER}?key={self._key}"
+        self.cookie = f"flasher-{secrets.token_hex(4)}"
+        """Cookies hold for all ports of a computer, and several servers may run on it."""
+
+    async def take(self, request: Request) -> Response:
+        said = request.query_params.get("key", "")
+        if not self._key or not hmac.compare_digest(said.encode(), self._key.encode()):
+            return RedirectResponse("/" if request.session.get("is_in") else _CLOSED, 303)
+        self._key = ""
+        request.session["is_in"] = True
+        # From a page of this server on, so that the cookie goes with it wherever the address was
+        # clicked.
+        return self._pages.show(request, "enter.html")
+
+    async def refuse(self, request: Request) -> Response:
+        return self._pages.show(request, "closed.html", status=403)
+
+
+def application(  # noqa: PLR0913  the name and the rights of a server
     routes: Collection[BaseRoute],
     *,
     pages: Pages,
@@ -78,6 +104,7 @@ def application(
     secret: str,
     now: Callable[[], float],
     password: str = "",
+    entry: Entry | None = None,
     is_tls: bool = False,
     uploads: Callable[[str], int] = lambda _path: BODY_MAX,
 ) -> ASGIApp:
@@ -85,7 +112,10 @@ def application(
     `secret` signs the cookies; `uploads` gives the limit of a path's body in bytes.
     """
     login = _Login(pages, password, now)
+    entries = [] if entry is None else [Route(_ENTER, entry.take), Route(_CLOSED, entry.refuse)]
+    refused_to = "/login" if password else "" if entry is None else _CLOSED
     own: list[BaseRoute] = [
+        *entries,
         Route("/static/page.css", FileResponse(PAGE_STYLE)),
         Mount("/static", StaticFiles(packages=[("flasher.web", "static")])),
         Route("/login", login.show, methods=["GET"]),
@@ -94,13 +124,16 @@ def application(
     session = Middleware(
         SessionMiddleware,
         secret_key=secret,
-        session_cookie="flasher",
+        session_cookie="flasher" if entry is None else entry.cookie,
         same_site="strict",
         https_only=is_tls,
     )
     inner = Starlette(
         routes=[*own, *routes],
-        middleware=[session, Middleware(_Sessions, has_password=bool(password))],
+        middleware=[
+            session,
+            Middleware(_Sessions, refused_to=refused_to if password or entry else ""),
+        ],
     )
     return _Guard(inner, hosts, uploads)
 
@@ -171,21 +204,22 @@ def _limited(receive: Receive, limit: int) -> Receive:
 
 
 class _Sessions:
-    """Every session has a token, which a POST has to say; and has said the password, if there is
-    one.
+    """Every session has a token, which a POST has to say; and has said the password or used the
+    entry, where there is one: others are sent to `refused_to`.
     """
 
-    def __init__(self, app: ASGIApp, *, has_password: bool) -> None:
+    def __init__(self, app: ASGIApp, *, refused_to: str) -> None:
         self._app = app
-        self._has_password = has_password
+        self._refused_to = refused_to
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         session: dict[str, Any] = scope["session"]
         session.setdefault("token", secrets.token_urlsafe(24))
         is_open = scope["path"].startswith(_OPEN)
-        if self._has_password and not is_open and not session.get("is_in"):
+        if self._refused_to and not is_open and not session.get("is_in"):
             is_stream = scope["path"].endswith("/events")
-            refusal = Response(status_code=401) if is_stream else RedirectResponse("/login", 303)
+            to = self._refused_to
+            refusal = Response(status_code=401) if is_stream else RedirectResponse(to, 303)
             await refusal(scope, receive, send)
             return
         if scope["method"] == "POST" and scope["path"] != "/login":

@@ -4,7 +4,7 @@ the language and the session's token.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader
 from starlette.requests import Request
@@ -14,6 +14,8 @@ from flasher import __version__
 from flasher.report.base import environment
 from flasher.web.words import NAMES, Words, chosen
 
+_PART: Final = "part_"
+
 
 class Pages:
     """Renders pages. `language`: of who did not choose one; None: what the browser asks for."""
@@ -21,13 +23,30 @@ class Pages:
     def __init__(self, language: str | None = None) -> None:
         self._language = language
         self._environment: Environment = environment(
-            ChoiceLoader([PackageLoader("flasher.web"), PackageLoader("flasher.report")])
+            ChoiceLoader(
+                [
+                    PackageLoader("flasher.web"),
+                    PackageLoader("flasher.web", "static"),
+                    PackageLoader("flasher.report"),
+                ]
+            )
         )
 
     def words_of(self, request: Request) -> Words:
         """The language of a request."""
         accepted = request.headers.get("accept-language", "").replace(" ", "").split(",")
         return chosen(request.query_params.get("lang") or self._language, accepted)
+
+    def parts(self, words: Words, template: str, **context: Any) -> dict[str, str]:
+        """The pieces of a page: what each macro `part_...` of a template gives, by its name."""
+        found = self._environment.get_template(template).make_module(
+            {"_": words, "lang": words.code, **context}
+        )
+        return {
+            name.removeprefix(_PART): str(macro())
+            for name, macro in vars(found).items()
+            if name.startswith(_PART)
+        }
 
     def show(
         self, request: Request, template: str, *, status: int = 200, **context: Any

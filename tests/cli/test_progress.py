@@ -19,8 +19,8 @@ from flasher.cli.output import Output
 from flasher.cli.upgrade.progress import Progress
 from flasher.errors import BusError, ExitCode
 from flasher.events import Phase
-from flasher.host.told import because
 from flasher.host.table import Reason
+from flasher.host.told import because
 from flasher.image.image import Image
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.processes import FLASHER, clean_environment

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from collections.abc import Callable, Mapping
 from enum import Enum
 from pathlib import Path
@@ -98,6 +99,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("profile", "check", Path("right.toml")),
         ("rescue", OBC, "-t", "obc", "--mock", "--mock-speed", "0", "--events"),
         ("adapters",),
+        ("ui", "--mock", "--mock-speed", "0"),
         ("doctor", "--mock", "--listen", "0.1", "--mock-speed", "0"),
         ("manifest", "create", Path("image.bin"), "-t", "obc"),
         ("manifest", "check", Path("stated.bin"), "-t", "obc"),
@@ -111,12 +113,18 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
 )  # fmt: skip
 
 
+def _press_ctrl_c(_address: str) -> bool:
+    signal.raise_signal(signal.SIGINT)
+    return True
+
+
 @pytest.fixture
 def files(flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, request: Any) -> None:
     """The files that some of the command lines name, in the working directory; a mock that sees
-    one event of each kind and ends.
+    one event of each kind and ends; a browser that nobody looks at, and who ends its page.
     """
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("webbrowser.open", _press_ctrl_c)
     named = {str(word) for word in request.getfixturevalue("words")}
     Path("right.toml").write_text("attempts = 5\n", "utf-8")
     Path("nothing.log").write_text("(1.0) can0 123#616263\n", "utf-8")
@@ -147,7 +155,7 @@ def test_what_commands_print_is_as_described(
     run = flasher(*words, "--json")
     assert run.code == 0
     lines = hold_output(schema, run.out, 0)
-    assert bool(lines) == ("--events" in words or words[0] in ("monitor", "mock"))
+    assert bool(lines) == ("--events" in words or words[0] in ("monitor", "mock", "ui"))
 
 
 def test_every_command_is_among_them() -> None:

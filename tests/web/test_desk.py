@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 from contextlib import closing
 from functools import partial
 
 from flasher.errors import UsageError
 from flasher.web.desk import Answer, Answering, Desk, Question
+from tests.web.own_loop import in_own_loop
 
 
 class Echo:
@@ -30,6 +30,6 @@ def test_a_question_is_answered_and_what_is_wrong_is_said() -> None:
         async def ask() -> list[Answer]:
             return [await each.ask(Question("/runs")) for each in (desk, broken, broken)]
 
-        good, *bad = asyncio.run(ask())
+        good, *bad = in_own_loop(ask())
     assert good.body == b"/runs"
     assert [(each.status, b"no such place" in each.body) for each in bad] == [(503, True)] * 2

@@ -10,6 +10,7 @@ import pytest
 
 from flasher.web import feed as module
 from flasher.web.feed import Batch, Feed
+from tests.web.own_loop import in_own_loop
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +37,7 @@ def _followed(feed: Feed, *steps: Any) -> list[Batch]:
             batches.append(await anext(stream))
         return batches
 
-    return asyncio.run(follow())
+    return in_own_loop(follow())
 
 
 def _feed() -> Feed:
@@ -112,7 +113,7 @@ def test_a_program_that_hangs_is_not_vouched_for() -> None:
         feed.beat()
         return bool(heard), await waiting
 
-    was_heard, then = asyncio.run(follow())
+    was_heard, then = in_own_loop(follow())
     assert not was_heard
     assert then.changes == (("A", 1),)
 
@@ -127,4 +128,4 @@ def test_a_closed_feed_ends_its_streams() -> None:
             feed.close()
         return count
 
-    assert asyncio.run(follow()) == 1
+    assert in_own_loop(follow()) == 1

@@ -11,7 +11,7 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
-from flasher.web.guard import BODY_MAX, TOKEN_HEADER, application
+from flasher.web.guard import BODY_MAX, TOKEN_HEADER, Entry, application
 from flasher.web.pages import Pages
 
 _URL = "http://127.0.0.1:8740"
@@ -33,7 +33,9 @@ async def _write(request: Request) -> Response:
     return PlainTextResponse(str(len(await request.body())))
 
 
-def _client(password: str = "", clock: Clock | None = None) -> TestClient:
+def _client(
+    password: str = "", clock: Clock | None = None, entry: Entry | None = None
+) -> TestClient:
     app = application(
         [Route("/", _page), Route("/do", _write, methods=["POST"]), Route("/x/events", _page)],
         pages=Pages(),
@@ -41,6 +43,7 @@ def _client(password: str = "", clock: Clock | None = None) -> TestClient:
         secret=_KEY,
         now=clock or Clock(),
         password=password,
+        entry=entry,
     )
     return TestClient(app, base_url=_URL, follow_redirects=False)
 
@@ -165,3 +168,34 @@ def test_guessing_is_limited() -> None:
     assert _log_in(client, "long enough").status_code == 429
     clock.now = 61.0
     assert _log_in(client, "long enough").status_code == 303
+
+
+# -- the address that works once -------------------------------------------------------------------
+
+
+def test_the_address_lets_one_browser_in_and_is_void_then() -> None:
+    entry = Entry(Pages())
+    first = _client(entry=entry)
+    assert first.get("/").headers["location"] == "/closed"
+    assert first.get("/x/events").status_code == 401
+    assert _post_status(first) == 303
+    assert first.get(entry.path).status_code == 200
+    assert first.get("/").status_code == 200
+    assert first.get(entry.path).headers["location"] == "/"  # the same browser again
+    second = TestClient(first.app, base_url=_URL, follow_redirects=False)
+    assert second.get(entry.path).headers["location"] == "/closed"
+    assert second.get("/").headers["location"] == "/closed"
+    assert second.get("/closed").status_code == 403
+
+
+@pytest.mark.parametrize("key", ["", "?key=", "?key=guessed", "?key=%00"])
+def test_a_guessed_key_lets_nobody_in_and_does_not_void_the_address(key: str) -> None:
+    entry = Entry(Pages())
+    client = _client(entry=entry)
+    assert client.get(f"/enter{key}").headers["location"] == "/closed"
+    assert client.get("/").headers["location"] == "/closed"
+    assert client.get(entry.path).status_code == 200
+
+
+def _post_status(client: TestClient) -> int:
+    return client.post("/do", content=b"", headers={"origin": _URL, TOKEN_HEADER: ""}).status_code

@@ -11,12 +11,12 @@ from flasher.cli.documents import HeardDocument
 from flasher.cli.framework import command
 from flasher.cli.look.content import heard_document, heard_lines
 from flasher.cli.options import Bus, bus_options, target_option
-from flasher.cli.output import Output, counted
+from flasher.cli.output import Output
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
 from flasher.cli.stop import stop_on_signal
-from flasher.errors import ExitCode, NoAnswerError
+from flasher.errors import ExitCode
 from flasher.host.survey import Survey
-from flasher.procedures import SCAN_LISTEN_S
+from flasher.procedures import SCAN_LISTEN_S, nobody_heard
 from flasher.protocol.spec import BMS, DIALECTS, Dialect, Target
 
 _EXAMPLES: Final = """\
@@ -67,11 +67,11 @@ def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOpt
         output.progress(f"listening for {SCAN_LISTEN_S:g} s on {connection.name} ...")
         survey = connection.scan(dialect, taps=record.taps, cancelled=stopped)
         if not survey.heard:
-            record.failed(_silent(survey, bitrate_bps))
+            record.failed(nobody_heard(survey, bitrate_bps))
     guessed, why = judge_dialect(survey, bitrate_bps)
     document = _bus_document(survey, rate, guessed, why)
     if not survey.heard:
-        error = _silent(survey, bitrate_bps)
+        error = nobody_heard(survey, bitrate_bps)
         output.failure(error, document)
         return error.exit_code
     for line in _lines(survey, rate, dialect, guessed, why):
@@ -90,17 +90,6 @@ def judge_dialect(survey: Survey, bitrate_bps: int) -> tuple[Dialect | None, str
             if dialect.bitrate_bps == bitrate_bps:
                 return dialect, f"by the bit rate alone, which is an assumption; {why}"
     return None, why
-
-
-def _silent(survey: Survey, bitrate_bps: int) -> NoAnswerError:
-    foreign = ""
-    if survey.foreign_frames:
-        foreign = f"; {counted(survey.foreign_frames, 'frame')} under ids of other protocols came"
-    return NoAnswerError(
-        f"Nobody of the drive system was heard at {bitrate_bps / 1000:g} kbit/s{foreign}.",
-        cause="everything is off or asleep, the wiring is open, or the bit rate is another",
-        remedy="Switch the system on; try --dialect motinova (125 kbit/s) or welling (250).",
-    )
 
 
 def _lines(

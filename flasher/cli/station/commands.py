@@ -13,14 +13,12 @@ from typing import Any, Final
 import click
 
 from flasher.cli import values
+from flasher.cli.extras import need
 from flasher.cli.framework import Decorator, argument, group, option, option_set
 from flasher.cli.output import Output
 from flasher.errors import ExitCode, UsageError
 
 DEFAULT_RECORDS: Final = "records.sqlite"
-_EXTRA: Final = ("argon2", "cryptography", "segno", "sqlalchemy", "stdnum")
-"""Packages of the extra."""
-_WEB_EXTRA: Final = ("babel", "itsdangerous", "pygal", "starlette", "uvicorn")
 _EXAMPLES: Final = """\
 examples:
   flasher station check recipe.toml
@@ -77,21 +75,11 @@ def _call(action: str, *args: object, **named: object) -> int:
     """Run an action ("module.function"); returns the exit code. Raises UsageError without the
     extra.
     """
-    _need("The station", "station", _EXTRA)
+    need("The station", "station")
     module, _, name = action.partition(".")
     run = getattr(importlib.import_module(f"flasher.cli.station.{module}"), name)
     code: int = run(*args, **named)
     return code
-
-
-def _need(what: str, extra: str, packages: tuple[str, ...]) -> None:
-    """Raises UsageError without the packages of an extra."""
-    missing = [name for name in packages if importlib.util.find_spec(name) is None]
-    if missing:
-        raise UsageError(
-            f"{what} needs packages that are not installed: {', '.join(missing)}.",
-            remedy=f"In the checkout: pip install -c .ci/constraints.txt '.[{extra}]'",
-        )
 
 
 # -- options that actions share --------------------------------------------------------------------
@@ -302,7 +290,7 @@ class RunOptions:
 def run(output: Output, options: RunOptions, pages: PagesOptions, records: RecordsOptions) -> int:
     """Flash unit after unit."""
     if options.web is not None:
-        _need("The operator page", "web", _WEB_EXTRA)
+        need("The operator page", "web")
     return _call("run.run", output, options, pages, records)
 
 
@@ -317,7 +305,7 @@ def pages(output: Output, web: Address, pages: PagesOptions, records: RecordsOpt
     """Serve the supervisor pages of records, until Ctrl-C: runs, units, yield, causes, times,
     images, audit trail. Nothing of the records is changed, and no station has to run here.
     """
-    _need("The supervisor pages", "web", _WEB_EXTRA)
+    need("The supervisor pages", "web")
     return _call("desk.serve", output, web, pages, records)
 
 

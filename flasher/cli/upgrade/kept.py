@@ -17,7 +17,6 @@ from flasher.errors import ExitCode, FlasherError, InterruptedByUserError
 from flasher.events import QueryAnswered
 from flasher.history import Began, Ended, History
 from flasher.host.session import Result
-from flasher.host.table import Ending
 from flasher.image.plan import Plan
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.text import printable
@@ -76,8 +75,8 @@ class Keeper:
             what=_words(error),
             serial_number=self._serial_number,
             previous_version=result.previous_version if result else None,
-            transferred=None if outcome is None else outcome.statistics.transfer_s is not None,
-            completed=None if outcome is None else outcome.ending is Ending.COMPLETED,
+            transferred=None if outcome is None else outcome.is_transferred,
+            completed=None if outcome is None else outcome.is_completed,
             running_version=result.running_version if result else None,
             needs_rescue=left,
             bundle=None if bundle is None else printable(str(bundle)),

@@ -47,8 +47,8 @@ function follow(path, apply) {
 async function post(path, body) {
   const answer = await fetch(path, {
     method: "POST",
-    headers: { "content-type": "application/json", "x-flasher-token": token },
-    body: JSON.stringify(body),
+    headers: { "x-flasher-token": token },
+    body: body instanceof Blob ? body : JSON.stringify(body),
   });
   if (answer.status === 403) {
     location.reload(); // the server was started anew, with other tokens

@@ -1,0 +1,244 @@
+"""The bench page of `flasher ui`: adapters, recordings and the history for the bench, and its
+server.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+import click
+from platformdirs import user_state_path
+
+from flasher.api import Connection, Job, Watch, connect
+from flasher.bus.opening import bus_config
+from flasher.cli.adapters import described, detected_until, ports, using
+from flasher.cli.options import Bus, holder
+from flasher.cli.output import Output
+from flasher.cli.recording import Recording, RecordingOptions
+from flasher.cli.stop import Stop, stop_on_signal
+from flasher.cli.upgrade.carried import Carried
+from flasher.cli.values import IMAGE_SUFFIXES
+from flasher.errors import FlasherError
+from flasher.files import parse_json, read
+from flasher.protocol.spec import Target
+from flasher.protocol.text import printable
+from flasher.said import say
+from flasher.settings.profile import Profile, load_profile
+from flasher.web import bench
+from flasher.web.bench import Adapter, Bench, Doing, FindAdapters
+from flasher.web.bench_page import BenchPage, Shelf, upload_limit
+from flasher.web.guard import BODY_MAX, Entry, application
+from flasher.web.pages import Pages
+from flasher.web.server import LOOPBACK, Server
+from flasher.web.virtual_bike import NOTES, Fault, VirtualBike
+
+_TURN_S: Final = 0.2
+_MEMORY_MAX: Final = 4096
+"""In bytes, of the file with the adapter that was used last."""
+
+
+class _Place:
+    """What both kinds of workplace have: what is kept of an upgrade, and product profiles."""
+
+    def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop) -> None:
+        self.dialect = bus.dialect
+        self.images = shelf.files
+        self._bus = bus
+        self._output = output
+        self._stop = stop
+
+    def profile(self, target: Target) -> Profile:
+        return load_profile(None, target, self.dialect)
+
+    def bitrate_bps(self, adapter: Adapter) -> int:
+        return self.bus(adapter).bit_rate.bps
+
+    def bus(self, _adapter: Adapter) -> Bus:
+        """The bus of an adapter."""
+        return self._bus
+
+    def connect(self, adapter: Adapter) -> AbstractContextManager[Connection]:
+        raise NotImplementedError
+
+    def upgrade(
+        self,
+        adapter: Adapter,
+        job: Job,
+        *,
+        on_event: Callable[[object], None],
+        cancelled: Callable[[], bool],
+    ) -> bench.Carried:
+        output = self._output
+
+        @contextmanager
+        def watching(connection: Connection, record: Recording) -> Iterator[Watch]:
+            output.progress(f"{job.plan.target.node.name} on {connection.name} ...")
+
+            def hung_up() -> bool:
+                if self._stop.has_hung_up:
+                    record.leave_terminal(output)
+                return self._stop.has_hung_up
+
+            yield {"on_event": on_event, "cancelled": cancelled, "hung_up": hung_up}
+
+        carried = Carried(job, self.bus(adapter), RecordingOptions(), output)
+        result = None
+        try:
+            result = carried.carry_out(lambda: self.connect(adapter), watching)
+        except FlasherError as error:
+            carried.error = error
+        bundle = None if carried.record is None else carried.record.bundle
+        return bench.Carried(result, carried.error, bundle)
+
+
+class Adapters(_Place):
+    """The adapters of this computer."""
+
+    def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop) -> None:
+        super().__init__(bus, output, shelf, stop)
+        self._buses: dict[str, Bus] = {}
+        self._memory = user_state_path("flasher", appauthor=False) / "ui.json"
+
+    def adapters(self, cancelled: Callable[[], bool]) -> Sequence[Adapter]:
+        self._buses = {}
+        notes: dict[str, str] = {}
+        if self._bus.is_named:
+            merged = bus_config(self._bus.config, self._bus.fallback)
+            name = printable(f"{merged['interface']} {merged.get('channel') or ''}".strip())
+            self._buses[name] = self._bus
+            notes[name] = say("named on the command line or in the settings")
+        found = [each for each in detected_until(cancelled).found if each.channel]
+        maybe = {each.channel for each in ports() or ()}
+        for each in (*found, *(ports() or ())):
+            name = printable(f"{each.interface} {each.channel}")
+            if name not in self._buses:
+                self._buses[name] = using(each, self._bus)
+                is_port = each.channel in maybe and each not in found
+                note = described(each, self.dialect)
+                notes[name] = (
+                    say("a serial port: perhaps an slcan adapter. {note}", note=note)
+                    if is_port
+                    else note
+                )
+        last = self._last()
+        listed = [Adapter(name, notes[name], was_last=name == last) for name in self._buses]
+        return sorted(listed, key=lambda adapter: not adapter.was_last)
+
+    def use(self, adapter: Adapter) -> None:
+        with contextlib.suppress(OSError):
+            self._memory.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._memory.write_text(json.dumps({"adapter": adapter.name}), "utf-8")
+
+    def _last(self) -> str:
+        try:
+            kept = parse_json(read(self._memory, _MEMORY_MAX, what="adapter used last"))
+            return str(kept["adapter"])
+        except (FlasherError, ValueError, LookupError, TypeError):
+            return ""
+
+    def bus(self, adapter: Adapter) -> Bus:
+        return self._buses[adapter.name]
+
+    def connect(self, adapter: Adapter) -> AbstractContextManager[Connection]:
+        bus = self.bus(adapter)
+        return connect(self.dialect, holder=holder(), fallback=bus.fallback, **bus.config)
+
+
+class VirtualBikes(_Place):
+    """Bikes without hardware."""
+
+    def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop) -> None:
+        super().__init__(bus, output, shelf, stop)
+        self._bikes: dict[str, VirtualBike] = {}
+
+    def adapters(self, _cancelled: Callable[[], bool]) -> Sequence[Adapter]:
+        return [Adapter(fault.value, NOTES[fault]) for fault in Fault]
+
+    def use(self, adapter: Adapter) -> None:
+        """A bike stays as it was left, so that it can be rescued."""
+        if adapter.name not in self._bikes:
+            speed = self._bus.mock_speed
+            self._bikes[adapter.name] = VirtualBike(Fault(adapter.name), self.dialect, speed=speed)
+
+    def connect(self, adapter: Adapter) -> AbstractContextManager[Connection]:
+        return self._bikes[adapter.name].connect()
+
+    def upgrade(
+        self,
+        adapter: Adapter,
+        job: Job,
+        *,
+        on_event: Callable[[object], None],
+        cancelled: Callable[[], bool],
+    ) -> bench.Carried:
+        bike = self._bikes[adapter.name]
+        bike.begin(job)
+
+        def happened(event: object) -> None:
+            on_event(event)
+            bike.happened(event)
+
+        return super().upgrade(adapter, job, on_event=happened, cancelled=cancelled)
+
+
+def serve(
+    output: Output, bus: Bus, images: Path, *, port: int, opened: Callable[[str], None]
+) -> FlasherError | None:
+    """Serve the page until Ctrl-C; `opened` is told its address. Returns how an upgrade ended in
+    which that came, where it did not end well.
+    """
+    ctx = click.get_current_context()
+    pages = Pages()
+    entry = Entry(pages)
+    with (
+        TemporaryDirectory(prefix="flasher-images-") as dropped,
+        stop_on_signal(lambda: output.error_line("stopping ...")) as stop,
+    ):
+        shelf = Shelf(images.expanduser().resolve(), Path(dropped), IMAGE_SUFFIXES)
+        kind = VirtualBikes if bus.mock else Adapters
+        machine = Bench(kind(bus, output, shelf, stop), time.monotonic)
+        app = application(
+            BenchPage(pages, machine, shelf, is_mock=bus.mock).routes,
+            pages=pages,
+            hosts=LOOPBACK,
+            secret=secrets.token_urlsafe(32),
+            now=time.monotonic,
+            entry=entry,
+            uploads=upload_limit(BODY_MAX),
+        )
+
+        def work() -> None:
+            with ctx.scope(cleanup=False):
+                machine.run()
+
+        worker = threading.Thread(target=work, name="bench", daemon=True)
+        with Server(app, "127.0.0.1", port) as server:
+            machine.order(FindAdapters())
+            worker.start()
+            opened(server.url.rstrip("/") + entry.path)
+            was_upgrading = _wait(machine, worker, stop)
+            machine.feed.close()
+    done = machine.state.done
+    return done.error if was_upgrading and done is not None else None
+
+
+def _wait(machine: Bench, worker: threading.Thread, stop: Stop) -> bool:
+    """Until the user ends it; True when that was in the middle of an upgrade. A terminal that is
+    gone ends it too, but an upgrade ends by itself then.
+    """
+    was_upgrading = False
+    while worker.is_alive():
+        if stop():
+            was_upgrading |= machine.state.doing is Doing.UPGRADING
+            machine.close(ends_upgrade=stop.asked())
+        worker.join(_TURN_S)
+    return was_upgrading

@@ -1,0 +1,86 @@
+"""`flasher ui`: one bike upgraded in a browser; what is said on the page is said by
+`flasher.web.bench`. Its packages are loaded only here: they need the extra `web`.
+"""
+
+from __future__ import annotations
+
+import webbrowser
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+from flasher.cli import values
+from flasher.cli.extras import need
+from flasher.cli.framework import command, option
+from flasher.cli.options import Bus, bus_options
+from flasher.cli.output import Output
+from flasher.errors import ExitCode
+
+_EXAMPLES: Final = """\
+examples:
+  flasher ui --mock                                try it without hardware, with faults to choose
+  flasher ui                                       the adapters that are found are offered
+  flasher ui --images ~/firmware -i slcan -c /dev/ttyACM0
+
+The page is for this computer alone. Its address works once, in the browser that opens it first;
+more tabs of that show the same. Closing the page ends nothing; Ctrl-C here ends an upgrade at the
+end of its message, and says in which state the device is left. The guide is docs/bench_page.md.
+"""
+
+
+@dataclass(frozen=True)
+class ServingLine:
+    """The page is there."""
+
+    event: Literal["serving"]
+    address: str
+    """Works once, in the browser that opens it first."""
+
+
+@dataclass(frozen=True)
+class UiDocument:
+    """The page was ended; what was upgraded is in the history."""
+
+    address: str
+
+
+LINES: Final = (ServingLine,)
+DOCUMENTS: Final = (UiDocument,)
+
+
+@command(
+    epilog=_EXAMPLES,
+    exit_codes=(ExitCode.BUS, ExitCode.TRANSFER, ExitCode.INTERRUPTED),
+)
+@option(
+    "--images", metavar="DIR", type=values.FolderPath(), default=".", panel="page", brief=True,
+    help="the folder whose images are offered",
+)  # fmt: skip
+@option("--no-browser", is_flag=True, panel="page", brief=True, help="print the address only")
+@option(
+    "--port", type=values.number, default="0", metavar="N", panel="page",
+    help="of this computer; 0 is any that is free",
+)  # fmt: skip
+@bus_options(mock="offer virtual bikes, each with a fault or none", speed=values.speed)
+def ui(output: Output, bus: Bus, *, images: Path, no_browser: bool, port: int) -> int:
+    """Upgrade a bike in a browser: adapter, bike, image, checks, upgrade, and what came of it."""
+    need("The page", "web")
+    from flasher.cli.upgrade.bench_page import serve  # noqa: PLC0415  an extra
+
+    address = ""
+
+    def opened(url: str) -> None:
+        nonlocal address
+        address = url
+        output.result(url)
+        output.line(ServingLine("serving", url))
+        if not no_browser and not webbrowser.open(url):
+            output.progress("no browser could be opened: open the address in one")
+
+    error = serve(output, bus, images, port=port, opened=opened)
+    document = UiDocument(address)
+    if error is not None:
+        output.failure(error, document)
+        return error.exit_code
+    output.document(document)
+    return ExitCode.OK

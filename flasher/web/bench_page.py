@@ -1,0 +1,223 @@
+"""The bench page: the bench's state as pieces of a page, and orders from its forms."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from starlette.requests import Request
+from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.routing import BaseRoute, Route
+
+from flasher.protocol.contents import RunningInformation, VersionInformation
+from flasher.protocol.fields import Content
+from flasher.protocol.spec import TARGETS
+from flasher.trace.decoder import content_fields
+from flasher.web import bench
+from flasher.web.bench import Bench, Done, Order, State
+from flasher.web.pages import Pages
+from flasher.web.words import Words
+
+UPLOAD_MAX: Final = 32 * 1024 * 1024
+"""In bytes: the largest image as Intel HEX has less."""
+UPLOAD: Final = "/bench/upload"
+_FILES_MAX: Final = 200
+"""Files of a folder that are looked at."""
+_MANIFEST: Final = ".toml"
+_ORDERS: Final[Mapping[str, Callable[[Mapping[str, str]], Order]]] = {
+    "adapters": lambda _: bench.FindAdapters(),
+    "adapter": lambda said: bench.UseAdapter(said["name"]),
+    "look": lambda _: bench.Look(),
+    "target": lambda said: bench.ChooseTarget(said["name"]),
+    "images": lambda _: bench.Judge(),
+    "image": lambda said: bench.ChooseImage(said["name"]),
+    "upgrade": lambda said: bench.Upgrade(said["target"], said["sha256"]),
+    "next": lambda _: bench.StartOver(),
+    "rescue": lambda _: bench.StartOver(is_rescue=True),
+    "rescue-it": lambda _: bench.RescueIt(),
+}
+"""What a form may order, by the word that it sends."""
+
+
+class Shelf:
+    """Where images come from: a folder, and one for what is dropped on the page."""
+
+    def __init__(self, folder: Path, dropped: Path, suffixes: Sequence[str]) -> None:
+        self.folder = folder
+        self._dropped = dropped
+        self._suffixes = tuple(f".{suffix}" for suffix in suffixes)
+
+    def files(self) -> list[Path]:
+        """Files that may be images; dropped ones first."""
+        found: list[Path] = []
+        for folder in (self._dropped, self.folder):
+            if folder.is_dir():
+                found += sorted(each for each in folder.iterdir() if self._may_be_image(each))
+        return found[:_FILES_MAX]
+
+    def _may_be_image(self, path: Path) -> bool:
+        return path.suffix.lower() in self._suffixes and path.is_file()
+
+    def take(self, name: str, data: bytes) -> bool:
+        """Keep a dropped file; False for one that is neither image nor manifest."""
+        plain = name.replace("\\", "/").rpartition("/")[2]
+        is_known = Path(plain).suffix.lower() in (*self._suffixes, _MANIFEST)
+        if not is_known or not plain.isprintable() or plain.startswith(".") or len(plain) > 200:
+            return False
+        (self._dropped / plain).write_bytes(data)
+        return True
+
+
+def upload_limit(usual: int) -> Callable[[str], int]:
+    """The limit of a path's body, for the guard."""
+    return lambda path: UPLOAD_MAX if path == UPLOAD else usual
+
+
+class BenchPage:
+    """The routes of the page."""
+
+    def __init__(self, pages: Pages, machine: Bench, shelf: Shelf, *, is_mock: bool) -> None:
+        self._pages = pages
+        self._bench = machine
+        self._shelf = shelf
+        self._is_mock = is_mock
+
+    @property
+    def routes(self) -> list[BaseRoute]:
+        return [
+            Route("/", self._page),
+            Route("/bench/events", self._events),
+            Route("/bench/sheet", self._sheet),
+            Route("/bench/order", self._order, methods=["POST"]),
+            Route(UPLOAD, self._upload, methods=["POST"]),
+        ]
+
+    async def _page(self, request: Request) -> Response:
+        return self._pages.show(request, "bench.html", is_mock=self._is_mock)
+
+    async def _sheet(self, request: Request) -> Response:
+        done = self._bench.state.done
+        is_saved = "save" in request.query_params
+        if done is None:
+            return Response("No upgrade has ended.", 404)
+        page = self._pages.show(
+            request,
+            "bench_sheet.html",
+            done=done,
+            rows=compared(done),
+            is_saved=is_saved,
+        )
+        if is_saved:
+            name = f"{done.target.name}-{done.at:%Y%m%d-%H%M%S}.html"
+            page.headers["content-disposition"] = f'attachment; filename="{name}"'
+        return page
+
+    async def _events(self, request: Request) -> Response:
+        return StreamingResponse(
+            self._stream(self._pages.words_of(request)),
+            media_type="text/event-stream",
+            headers={"x-accel-buffering": "no"},
+        )
+
+    async def _stream(self, words: Words) -> AsyncIterator[str]:
+        yield "retry: 500\n\n"
+        sent: dict[str, str] = {}
+        async for batch in self._bench.feed.follow():
+            message: dict[str, Any] = {}
+            for _, state in batch.changes[-1:]:
+                parts = self._parts(words, state)
+                message["parts"] = {
+                    name: text for name, text in parts.items() if sent.get(name) != text
+                }
+                sent = parts
+            yield f"data: {json.dumps(message, ensure_ascii=False)}\n\n"
+
+    def _parts(self, words: Words, state: State) -> dict[str, str]:
+        return self._pages.parts(
+            words, "bench_parts.html", state=state, targets=TARGETS.values(),
+            folder=str(self._shelf.folder), is_mock=self._is_mock, facts=facts(state),
+            left_s=left_s(state),
+        )  # fmt: skip
+
+    async def _order(self, request: Request) -> Response:
+        try:
+            said = json.loads(await request.body())
+            word = said["order"]
+            order = None if word == "stop" else _ORDERS[word](said)
+        except (ValueError, TypeError, KeyError):
+            return JSONResponse({"error": "no order"}, 400)
+        if order is None:
+            self._bench.stop()
+        elif not self._bench.order(order):
+            return JSONResponse({"error": "busy"}, 409)
+        return JSONResponse({})
+
+    async def _upload(self, request: Request) -> Response:
+        data = await request.body()
+        name = request.query_params.get("name", "")
+        if not await asyncio.to_thread(self._shelf.take, name, data):
+            return JSONResponse({"error": "no image"}, 415)
+        self._bench.order(bench.Judge())
+        return JSONResponse({})
+
+
+# -- what is shown ---------------------------------------------------------------------------------
+
+_SHORT: Final = (
+    (VersionInformation, ("model", "serial_number", "hardware_version", "firmware_version")),
+    (RunningInformation, ("state_of_charge_percent", "voltage_mv", "mean_current_ma")),
+)
+"""What tells a battery from another, and whether it can be upgraded now."""
+
+
+def _rows(content: Content) -> dict[str, tuple[str, str]]:
+    """Label and value of each field, by its name."""
+    return {
+        shown.name: (shown.label, f"{shown.text} {shown.unit}".rstrip())
+        for shown in content_fields(content)
+    }
+
+
+def facts(state: State) -> list[tuple[str, str]]:
+    """What the battery says of itself, in short; its faults last."""
+    if state.bike is None:
+        return []
+    answers = {type(each.answer): each.answer for each in state.bike.readings if each.answer}
+    found = []
+    for kind, names in _SHORT:
+        answer = answers.get(kind)
+        rows = {} if answer is None else _rows(answer)
+        found += [rows[name] for name in names if name in rows]
+    if state.bike.survey.faults is not None:
+        found += _rows(state.bike.survey.faults).values()
+    return found
+
+
+def compared(done: Done) -> list[tuple[str, str, str]]:
+    """Every answer before and after: label, the one, the other; "" for none."""
+    sides: list[dict[tuple[str, str], tuple[str, str]]] = []
+    for seen in (done.before, done.after):
+        side = {}
+        for reading in () if seen is None or seen.target is not done.target else seen.readings:
+            if reading.answer is not None:
+                for name, row in _rows(reading.answer).items():
+                    side[reading.name, name] = row
+        sides.append(side)
+    before, after = sides
+    found = []
+    for key in dict.fromkeys((*before, *after)):
+        was, now = before.get(key, ("", "")), after.get(key, ("", ""))
+        if was[1] or now[1]:
+            found.append((was[0] or now[0], was[1], now[1]))
+    return found
+
+
+def left_s(state: State) -> float | None:
+    """Seconds that the transfer still takes, at the pace so far; None before there is one."""
+    if state.transfer_began_s is None or state.offer is None or state.packet < 2:
+        return None
+    took_s = state.now_s - state.transfer_began_s
+    return took_s / (state.packet - 1) * (state.offer.packets - state.packet)

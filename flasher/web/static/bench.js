@@ -1,0 +1,47 @@
+"use strict";
+// The bench page: puts the pieces that the server made into the page, and sends what was chosen.
+
+let isFocusLost = false;
+
+function apply(message) {
+  const name = document.activeElement.id;
+  isFocusLost ||= name !== "";
+  for (const [id, html] of Object.entries(message.parts ?? {})) {
+    byId(id).innerHTML = html;
+  }
+  // Who uses the keyboard is where he was, or at what is wanted now, as soon as something is.
+  for (const id of isFocusLost ? [name, "now"] : []) {
+    if (document.activeElement === document.body) {
+      byId(id)?.focus();
+    }
+  }
+  isFocusLost &&= document.activeElement === document.body;
+}
+
+async function send(path, body) {
+  const said = byId("said");
+  said.textContent = "";
+  try {
+    await post(path, body);
+  } catch (error) {
+    said.textContent = document.body.dataset[`said${error.message}`] ?? document.body.dataset.said;
+  }
+}
+
+async function upload(files) {
+  for (const file of files) {
+    await send(`/bench/upload?name=${encodeURIComponent(file.name)}`, file);
+  }
+}
+
+addEventListener("submit", (event) => {
+  event.preventDefault();
+  send("/bench/order", Object.fromEntries(new FormData(event.target, event.submitter)));
+});
+addEventListener("change", (event) => event.target.type === "file" && upload(event.target.files));
+addEventListener("dragover", (event) => event.preventDefault());
+addEventListener("drop", (event) => {
+  event.preventDefault();
+  upload(event.dataTransfer.files);
+});
+follow(`/bench/events${location.search}`, apply);

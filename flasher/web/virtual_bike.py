@@ -1,0 +1,148 @@
+"""Bikes without hardware, to try the bench with: each has a fault, or none."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from enum import Enum
+from typing import Final
+
+from flasher import events
+from flasher.api import Connection, Job
+from flasher.bus.bit_rate import BitRate
+from flasher.bus.link import Clock, PacedClock, VirtualClock
+from flasher.bus.simulated import SimulatedBus
+from flasher.mock.clients import ClientApplication
+from flasher.mock.faults import AtTime, FaultInjector, InOperation, PowerCut
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
+from flasher.said import say
+
+_ONE_FAULT: Final = 1 << 3
+_HAND_S: Final = 2.0
+"""Until somebody has taken the power away, and for how long."""
+_OTHER_HARDWARE: Final = "V0r0r1_20200101"
+_FOREIGN: Final = bytes.fromhex("55AA168700000000")
+"""The beginning of a message that only a tool sends."""
+
+
+class Fault(Enum):
+    """What is wrong with a virtual bike; the value is its name."""
+
+    NONE = "virtual bike"
+    POWER = "virtual bike 2"
+    PULLED = "virtual bike 3"
+    SECOND_TOOL = "virtual bike 4"
+    REFUSES = "virtual bike 5"
+    HARDWARE = "virtual bike 6"
+    NO_APPLICATION = "virtual bike 7"
+    OFF = "virtual bike 8"
+
+
+NOTES: Final = {
+    Fault.NONE: say("nothing is wrong with it"),
+    Fault.POWER: say("loses its power in the middle of the upgrade"),
+    Fault.PULLED: say("the adapter is pulled out in the middle of the upgrade"),
+    Fault.SECOND_TOOL: say("a second tool speaks in the middle of the upgrade"),
+    Fault.REFUSES: say("its devices refuse the image at the end"),
+    Fault.HARDWARE: say("has other hardware, and reports a fault"),
+    Fault.NO_APPLICATION: say("its upgrade was interrupted: its devices do not start"),
+    Fault.OFF: say("is switched off"),
+}
+
+
+class _BikeClock:
+    """Passes only while somebody is on the bus: a bike that nobody looks at does nothing."""
+
+    def __init__(self, speed: float) -> None:
+        self.speed = speed
+        self._passed = 0.0
+        self._running: PacedClock | None = None
+
+    def now(self) -> float:
+        return self._passed + (0.0 if self._running is None else self._running.now())
+
+    def wait_until(self, moment: float) -> None:
+        if self._running is not None:
+            self._running.wait_until(moment - self._passed)
+
+    def resume(self) -> None:
+        self._running = PacedClock(self.speed)
+
+    def rest(self) -> None:
+        self._passed, self._running = self.now(), None
+
+
+class VirtualBike:
+    """Three devices that can be upgraded, on a bus of their own. `speed` 0 takes no time."""
+
+    def __init__(self, fault: Fault, dialect: Dialect, *, speed: float = 1.0) -> None:
+        self._fault = fault
+        self._dialect = dialect
+        self._clock: Clock = _BikeClock(speed) if speed else VirtualClock()
+        self._bus = SimulatedBus(dialect.bitrate_bps, self._clock)
+        self._link = self._bus.link()
+        self._devices: dict[Target, FaultInjector] = {}
+        for target in TARGETS.values() if fault is not Fault.OFF else ():
+            self._devices[target] = FaultInjector(self._device(target))
+            self._bus.attach(self._devices[target])
+        self._job: Job | None = None
+
+    def _device(self, target: Target) -> MockDevice:
+        fault = self._fault
+        profile = DeviceProfile().speaking(self._dialect)
+        if fault is Fault.REFUSES:
+            profile = replace(profile, image_checksum="crc32")
+        if fault is Fault.HARDWARE:
+            profile = replace(profile, hardware_version=_OTHER_HARDWARE, faults=_ONE_FAULT)
+        if fault is Fault.NO_APPLICATION:
+            profile = replace(profile, without_application="listens")
+        is_battery = target is BMS
+        return MockDevice(
+            target,
+            bitrate_bps=self._dialect.bitrate_bps,
+            profile=profile,
+            has_application=fault is not Fault.NO_APPLICATION,
+            application=None if is_battery else ClientApplication(target.node, self._dialect),
+        )
+
+    @contextmanager
+    def connect(self) -> Iterator[Connection]:
+        """Its bus, with the adapter plugged in."""
+        self._bus.plug()
+        if isinstance(self._clock, _BikeClock):
+            self._clock.resume()
+        try:
+            self._link.reopen()
+            rate = BitRate(self._dialect.bitrate_bps, "the dialect's")
+            yield Connection(self._link, self._clock, self._fault.value, rate)
+        finally:
+            if isinstance(self._clock, _BikeClock):
+                self._clock.rest()
+
+    def begin(self, job: Job) -> None:
+        """An upgrade begins; its fault is going to happen."""
+        self._job = job
+        device = self._devices.get(job.plan.target)
+        if device is not None and self._fault is Fault.POWER and not job.options.at_power_up:
+            device.set(PowerCut(None), InOperation(job.plan.total_packets // 2))
+
+    def happened(self, event: object) -> None:
+        """Something happened in the upgrade."""
+        job = self._job
+        match event:
+            case events.PowerCycleAwaited() if job is not None:
+                device = self._devices.get(job.plan.target)
+                if device is not None:
+                    device.set(PowerCut(_HAND_S), AtTime(self._clock.now() + _HAND_S))
+            case events.PacketAcknowledged(number, total, _) if number == total // 2:
+                self._in_the_middle(job)
+
+    def _in_the_middle(self, job: Job | None) -> None:
+        if self._fault is Fault.PULLED:
+            self._bus.unplug()
+        elif self._fault is Fault.SECOND_TOOL and job is not None:
+            self._bus.link().send(Frame(job.plan.target.request_id, _FOREIGN))

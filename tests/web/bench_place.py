@@ -1,0 +1,90 @@
+"""A bench with virtual bikes that take no time, and its page."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from flasher.api import Job
+from flasher.cli.options import Bus
+from flasher.cli.output import Output
+from flasher.cli.stop import Stop
+from flasher.cli.upgrade.bench_page import VirtualBikes
+from flasher.cli.values import IMAGE_SUFFIXES
+from flasher.web import bench
+from flasher.web.bench import Adapter, Bench, FindAdapters
+from flasher.web.bench_page import BenchPage, Shelf, upload_limit
+from flasher.web.guard import BODY_MAX, Entry, application
+from flasher.web.pages import Pages
+from flasher.web.server import Server
+from tests.end_to_end.stage import NEW, image_of
+
+PACKETS = 20
+IMAGE = "new.bin"
+_KEY = "of the test"
+
+
+def folder_of_images(folder: Path) -> Path:
+    """With one image for every device, and one for none."""
+    (folder / IMAGE).write_bytes(image_of(PACKETS, NEW).data)
+    (folder / "broken.hex").write_text(":00")
+    return folder
+
+
+class HeldBikes(VirtualBikes):
+    """`hold` is called with each event of an upgrade, in the bench's thread."""
+
+    hold: Callable[[object], None] = staticmethod(lambda _event: None)
+
+    def upgrade(
+        self,
+        adapter: Adapter,
+        job: Job,
+        *,
+        on_event: Callable[[object], None],
+        cancelled: Callable[[], bool],
+    ) -> bench.Carried:
+        def held(event: object) -> None:
+            on_event(event)
+            self.hold(event)
+
+        return super().upgrade(adapter, job, on_event=held, cancelled=cancelled)
+
+
+class BenchPlace:
+    """A bench, without its thread."""
+
+    def __init__(self, folder: Path) -> None:
+        dropped = folder / "dropped"
+        dropped.mkdir()
+        self.shelf = Shelf(folder_of_images(folder), dropped, IMAGE_SUFFIXES)
+        bus = Bus(mock=True, mock_speed=0.0)
+        self.bikes = HeldBikes(bus, Output(verbosity=-1), self.shelf, Stop(None))
+        self.bench = Bench(self.bikes, lambda: 0.0)
+        self.do(FindAdapters())
+
+    def do(self, *orders: bench.Order) -> bench.State:
+        """Carry out orders; the state then."""
+        for order in orders:
+            self.bench.carry_out(order)
+        return self.bench.state
+
+    @contextmanager
+    def served(self) -> Iterator[str]:
+        """Its page, with its thread; gives the address that lets a browser in."""
+        pages = Pages()
+        entry = Entry(pages)
+        page = BenchPage(pages, self.bench, self.shelf, is_mock=True)
+        app = application(
+            page.routes, pages=pages, hosts={"127.0.0.1"}, secret=_KEY, now=lambda: 0.0,
+            entry=entry, uploads=upload_limit(BODY_MAX),
+        )  # fmt: skip
+        worker = threading.Thread(target=self.bench.run, daemon=True)
+        with Server(app, "127.0.0.1", 0) as server:
+            worker.start()
+            yield server.url.rstrip("/") + entry.path
+            self.bench.close()
+            worker.join()
+            self.bench.feed.close()

@@ -1,0 +1,271 @@
+"""The bench without a page: what each order makes of it, and how upgrades end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from flasher import events
+from flasher.errors import (
+    BusError,
+    ImageError,
+    InterruptedByUserError,
+    NoAnswerError,
+    RefusedError,
+    TransferError,
+    UsageError,
+    WrongDeviceError,
+)
+from flasher.history import History
+from flasher.image.release import Release
+from flasher.protocol.contents import VersionInformation
+from flasher.protocol.spec import BMS
+from flasher.settings.manifest import manifest_path, to_toml
+from flasher.web.bench import (
+    Bench,
+    ChooseImage,
+    ChooseTarget,
+    Doing,
+    Done,
+    FindAdapters,
+    Judge,
+    Look,
+    Order,
+    RescueIt,
+    StartOver,
+    State,
+    Upgrade,
+    UseAdapter,
+)
+from flasher.web.virtual_bike import Fault
+from tests.end_to_end.stage import NEW, OLD, image_of
+from tests.web.bench_place import IMAGE, PACKETS, BenchPlace
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> BenchPlace:
+    return BenchPlace(tmp_path)
+
+
+def _upgrade(state: State) -> Upgrade:
+    assert state.target is not None
+    assert state.offer is not None
+    return Upgrade(state.target.name, state.offer.sha256)
+
+
+def _chosen(place: BenchPlace, fault: Fault = Fault.NONE, target: str = "bms") -> State:
+    return place.do(UseAdapter(fault.value), ChooseTarget(target), ChooseImage(IMAGE))
+
+
+def _done(place: BenchPlace, fault: Fault = Fault.NONE, target: str = "bms") -> Done:
+    state = place.do(_upgrade(_chosen(place, fault, target)))
+    assert state.trouble is None
+    assert state.done is not None
+    return state.done
+
+
+def _version(done: Done, which: str) -> str:
+    seen = getattr(done, which)
+    answers = [each.answer for each in seen.readings]
+    (version,) = (each for each in answers if isinstance(each, VersionInformation))
+    return str(version.firmware_version)
+
+
+# -- a good upgrade --------------------------------------------------------------------------------
+
+
+def test_an_upgrade_makes_three_claims_and_shows_before_and_after(place: BenchPlace) -> None:
+    done = _done(place)
+    assert (done.is_transferred, done.is_completed, done.is_running) == (True, True, True)
+    assert done.error is None
+    assert done.packet == PACKETS
+    assert (_version(done, "before"), _version(done, "after")) == (OLD, NEW)
+
+
+def test_a_device_that_cannot_be_asked_is_not_said_to_run_anything(place: BenchPlace) -> None:
+    done = _done(place, target="wmc")
+    assert (done.is_transferred, done.is_completed, done.is_running) == (True, True, None)
+
+
+def test_it_is_kept_in_the_history_as_by_the_command(place: BenchPlace) -> None:
+    before = len(History().flashes()[0])
+    _done(place)
+    flashes, _ = History().flashes()
+    assert len(flashes) == before + 1
+    assert flashes[-1].began.command == "flash"
+    assert flashes[-1].began.is_virtual
+    assert flashes[-1].ended is not None
+    assert flashes[-1].ended.running_version == NEW
+
+
+def test_the_next_bike_begins_with_nothing_of_the_last(place: BenchPlace) -> None:
+    _done(place)
+    state = place.do(StartOver())
+    assert (state.done, state.bike, state.offer, state.adapter) == (None,) * 4
+    assert len(state.adapters) == len(Fault)
+
+
+# -- images ----------------------------------------------------------------------------------------
+
+
+def test_only_images_that_fit_are_offered_and_the_others_say_why(place: BenchPlace) -> None:
+    state = place.do(UseAdapter(Fault.NONE.value), ChooseTarget("bms"))
+    assert [(each.name, type(each.refusal)) for each in state.offers] == [
+        (IMAGE, type(None)),
+        ("broken.hex", ImageError),
+    ]
+    state = place.do(ChooseImage("broken.hex"))
+    assert isinstance(state.trouble, UsageError)
+    assert state.offer is None
+
+
+def test_an_image_for_other_hardware_is_not_offered_to_the_bike_that_answered(
+    place: BenchPlace, tmp_path: Path
+) -> None:
+    image = image_of(PACKETS, NEW)
+    release = Release(
+        target=BMS, size_bytes=image.size_bytes, sha256=image.sha256,
+        hardware_versions=("V1r2r0_*",), source="",
+    )  # fmt: skip
+    manifest_path(tmp_path / IMAGE).write_text(to_toml(release))
+    assert _chosen(place).offer is not None
+    state = place.do(UseAdapter(Fault.HARDWARE.value), ChooseTarget("bms"))
+    refusals = {each.name: each.refusal for each in state.offers}
+    assert isinstance(refusals[IMAGE], WrongDeviceError)
+
+
+def test_a_dropped_image_is_offered_and_what_is_none_is_not_taken(place: BenchPlace) -> None:
+    assert place.shelf.take("../../dropped.bin", image_of(3, NEW).data)
+    for name in ("run.sh", ".bin", "", "a\nb.bin", "x" * 300 + ".bin"):
+        assert not place.shelf.take(name, b"x"), name
+    state = place.do(UseAdapter(Fault.NONE.value), ChooseTarget("bms"))
+    assert [each.name for each in state.offers if not each.refusal] == ["dropped.bin", IMAGE]
+
+
+def test_an_image_that_changed_since_it_was_chosen_is_not_sent(
+    place: BenchPlace, tmp_path: Path
+) -> None:
+    state = _chosen(place)
+    (tmp_path / IMAGE).write_bytes(image_of(PACKETS, OLD).data)
+    state = place.do(_upgrade(state))
+    assert isinstance(state.trouble, ImageError)
+    assert state.done is None
+
+
+def test_an_order_from_a_page_that_was_not_up_to_date_sends_nothing(place: BenchPlace) -> None:
+    state = _chosen(place)
+    assert state.offer is not None
+    for order in (Upgrade("wmc", state.offer.sha256), Upgrade("bms", "0" * 64)):
+        state = place.do(order)
+        assert isinstance(state.trouble, UsageError)
+        assert state.done is None
+
+
+# -- bad ends --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("fault", "error", "claims"),
+    [
+        (Fault.POWER, TransferError, (False, False, None)),
+        (Fault.PULLED, BusError, (None, None, None)),
+        (Fault.SECOND_TOOL, BusError, (False, False, None)),
+        (Fault.REFUSES, RefusedError, (True, False, None)),
+    ],
+)
+def test_a_bad_end_says_what_happened_and_claims_no_more_than_is_known(
+    place: BenchPlace, fault: Fault, error: type[Exception], claims: tuple[bool | None, ...]
+) -> None:
+    done = _done(place, fault)
+    assert type(done.error) is error
+    assert (done.is_transferred, done.is_completed, done.is_running) == claims
+    assert done.error is not None
+    assert done.error.needs_rescue
+    assert "State of the device:" in done.error.remedy
+    assert done.bundle is not None
+    assert done.bundle.is_dir()
+
+
+def test_a_device_whose_upgrade_failed_is_rescued_with_the_same_image(place: BenchPlace) -> None:
+    _done(place, Fault.POWER)
+    state = place.do(RescueIt())
+    assert state.is_rescue
+    assert state.offer is not None
+    asked: list[float] = []
+    place.bikes.hold = lambda _: asked.extend(
+        [place.bench.state.power_cycle_s] if place.bench.state.power_cycle_s else []
+    )
+    done = place.do(_upgrade(state)).done
+    assert done is not None
+    assert asked[0] == 60.0
+    assert (done.is_completed, done.is_running) == (True, True)
+    assert place.bench.state.power_cycle_s is None
+
+
+def test_an_image_that_the_device_has_refused_is_not_chosen_for_its_rescue(
+    place: BenchPlace,
+) -> None:
+    _done(place, Fault.REFUSES)
+    state = place.do(RescueIt())
+    assert state.offers
+    assert state.offer is None
+
+
+def test_a_bike_that_was_interrupted_before_is_rescued_from_the_start(place: BenchPlace) -> None:
+    state = place.do(
+        StartOver(is_rescue=True), UseAdapter(Fault.NO_APPLICATION.value), ChooseTarget("obc"),
+        ChooseImage(IMAGE),
+    )  # fmt: skip
+    done = place.do(_upgrade(state)).done
+    assert done is not None
+    assert done.is_completed
+
+
+def test_a_bike_that_is_off_says_so(place: BenchPlace) -> None:
+    assert isinstance(place.do(UseAdapter(Fault.OFF.value)).trouble, NoAnswerError)
+
+
+# -- one thing at a time ---------------------------------------------------------------------------
+
+
+def _at_packet(number: int, do: Callable[[], None]) -> Callable[[object], None]:
+    def hold(event: object) -> None:
+        if isinstance(event, events.PacketAcknowledged) and event.number == number:
+            do()
+
+    return hold
+
+
+@pytest.mark.parametrize("end", [Bench.stop, Bench.close])
+def test_who_stops_it_is_told_in_which_state_the_device_is_left(
+    place: BenchPlace, end: Callable[[Bench], None]
+) -> None:
+    place.bikes.hold = _at_packet(7, lambda: end(place.bench))
+    done = _done(place)
+    assert isinstance(done.error, InterruptedByUserError)
+    assert done.error.needs_rescue
+    assert "its application is erased or half written" in done.error.remedy
+    assert done.packet in (7, 8)
+
+
+def test_a_terminal_that_is_gone_does_not_end_an_upgrade(place: BenchPlace) -> None:
+    place.bikes.hold = _at_packet(7, lambda: place.bench.close(ends_upgrade=False))
+    assert _done(place).error is None
+
+
+def test_while_it_does_something_it_takes_no_other_order(place: BenchPlace) -> None:
+    assert place.bench.order(FindAdapters())
+    assert not place.bench.order(StartOver())
+
+
+@pytest.mark.parametrize(
+    "order",
+    [Look(), Judge(), ChooseTarget("bms"), UseAdapter("none"), RescueIt(), Upgrade("bms", "")],
+)
+def test_an_order_out_of_turn_is_refused_in_words(place: BenchPlace, order: Order) -> None:
+    state = place.do(order)
+    assert isinstance(state.trouble, UsageError)
+    assert state.trouble.remedy
+    assert state.doing is Doing.NOTHING

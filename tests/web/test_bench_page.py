@@ -1,0 +1,164 @@
+"""The bench page in a real browser, over a bench with virtual bikes."""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Page, expect
+
+from flasher import events
+from flasher.web.virtual_bike import Fault
+from tests.end_to_end.stage import NEW, OLD, image_of
+from tests.web.bench_place import IMAGE, PACKETS, BenchPlace
+
+expect.set_options(timeout=20_000)  # the computer may have much else to do
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> BenchPlace:
+    return BenchPlace(tmp_path)
+
+
+@pytest.fixture
+def page(browser: Browser, place: BenchPlace) -> Iterator[Page]:
+    """The page; it asks for nothing from elsewhere, and its script makes no error."""
+    with place.served() as url:
+        context = browser.new_context(viewport={"width": 1280, "height": 800}, locale="en")
+        opened = context.new_page()
+        asked: list[str] = []
+        wrong: list[str] = []
+        context.on("request", lambda request: asked.append(request.url))
+        opened.on("pageerror", lambda error: wrong.append(str(error)))
+        opened.on("console", lambda said: wrong.extend([said.text] * (said.type == "error")))
+        opened.goto(url)
+        expect(opened.locator("#adapter-1")).to_be_enabled()
+        yield opened
+        root = url.partition("/enter")[0]
+        assert all(each.startswith(root) for each in asked)
+        assert [each for each in wrong if "415" not in each] == []
+        context.close()
+
+
+def _choose(page: Page, fault: Fault = Fault.NONE, target: str = "bms") -> None:
+    page.click(f"#adapter button:text-is('{fault.value}')")
+    page.click(f"#target-{target}:enabled")
+    page.click("#image-1")
+
+
+def _claims(page: Page) -> list[str]:
+    expect(page.locator("#next-bike")).to_be_enabled()
+    return page.locator("#result .claim strong").all_inner_texts()
+
+
+def _check(page: Page) -> None:
+    """Nothing bars anybody, and nothing is wider than the screen."""
+    schemes: tuple[Literal["light", "dark"], ...] = ("light", "dark")
+    for scheme in schemes:
+        page.emulate_media(color_scheme=scheme)
+        found = Axe().run(page)
+        assert found.violations_count == 0, found.generate_report()
+    page.set_viewport_size({"width": 390, "height": 844})
+    assert page.evaluate("document.scrollingElement.scrollWidth <= innerWidth")
+    page.set_viewport_size({"width": 1280, "height": 800})
+
+
+def test_keyboard_alone_upgrades_a_bike_and_leads_to_its_sheet(page: Page) -> None:
+    _check(page)
+
+    def press(name: str) -> None:
+        for _ in range(40):
+            page.keyboard.press("Tab")
+            if page.evaluate("document.activeElement.id") == name:
+                break
+        page.keyboard.press("Enter")
+
+    press("adapter-1")
+    expect(page.locator("#target-bms")).to_be_enabled()
+    expect(page.locator("#bike")).to_contain_text(OLD)
+    assert page.evaluate("document.activeElement.id") == "now"
+    press("target-bms")
+    expect(page.locator("#image-1")).to_have_text(IMAGE)
+    press("image-1")
+    expect(page.locator("#go")).to_be_enabled()
+    _check(page)
+    press("go")
+    assert _claims(page) == ["YES", "YES", "YES"]
+    expect(page.locator("#result")).to_contain_text(f"Runs {NEW}")
+    _check(page)
+    press("sheet")
+    row = page.locator("tr.changed")
+    expect(row.first).to_contain_text(OLD)
+    expect(row.first).to_contain_text(NEW)
+    _check(page)
+    saved = page.request.get(page.url + "?save")
+    assert "attachment" in saved.headers["content-disposition"]
+    assert "<style>" in saved.text()
+    assert "href=" not in saved.text().partition("<main>")[2]
+
+
+def test_an_interrupted_upgrade_is_rescued(page: Page) -> None:
+    _choose(page, Fault.POWER)
+    page.click("#go")
+    assert _claims(page) == ["NO", "NO", "NOT KNOWN"]
+    expect(page.locator("#result")).to_contain_text("erased or half written")
+    _check(page)
+    page.click("#do-rescue-it")
+    expect(page.locator("#rescue")).to_contain_text("Do not switch anything off yet")
+    page.click("#go")
+    assert _claims(page) == ["YES", "YES", "YES"]
+
+
+def test_files_that_do_not_fit_say_why_and_dropped_ones_are_looked_at(page: Page) -> None:
+    page.click("#adapter-1")
+    page.click("#target-bms:enabled")
+    expect(page.locator("#image-1")).to_be_visible()
+    page.click("#refused-all")
+    expect(page.locator("#refused")).to_contain_text("broken.hex")
+    _check(page)
+    image = image_of(3, NEW).data
+    page.set_input_files("#file", {"name": "own <b>.bin", "mimeType": "", "buffer": image})
+    expect(page.locator("#image-2")).to_have_text("own <b>.bin")
+    page.set_input_files("#file", {"name": "run.sh", "mimeType": "", "buffer": image})
+    expect(page.locator("#said")).to_contain_text("no image")
+
+
+def test_an_image_that_the_device_refuses_is_not_said_to_be_completed(page: Page) -> None:
+    _choose(page, Fault.REFUSES)
+    page.click("#go")
+    assert _claims(page) == ["YES", "NO", "NOT KNOWN"]
+    expect(page.locator("#result")).to_contain_text("the device refused the image at the end")
+
+
+def test_reloading_disturbs_nothing_and_a_second_tab_shows_the_same(
+    page: Page, place: BenchPlace
+) -> None:
+    reached, go_on = threading.Event(), threading.Event()
+
+    def hold(event: object) -> None:
+        if isinstance(event, events.PacketAcknowledged) and event.number == PACKETS // 2:
+            reached.set()
+            go_on.wait(10)
+
+    place.bikes.hold = hold
+    _choose(page)
+    page.click("#go")
+    assert reached.wait(10)
+    half = re.compile(f"{PACKETS // 2} of {PACKETS} packets")
+    expect(page.locator("#pace")).to_contain_text(half)
+    page.reload()
+    expect(page.locator("#pace")).to_contain_text(half)
+    second = page.context.new_page()
+    second.goto(page.url)
+    expect(second.locator("#pace")).to_contain_text(half)
+    _check(second)
+    page.goto("about:blank")
+    go_on.set()
+    assert _claims(second) == ["YES", "YES", "YES"]
+    page.go_back()
+    assert _claims(page) == ["YES", "YES", "YES"]
