@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib.util
+import shlex
+import sys
 from typing import Final
 
 from flasher.errors import UsageError
@@ -20,5 +22,11 @@ def need(what: str, extra: str) -> None:
     if missing:
         raise UsageError(
             f"{what} needs packages that are not installed: {', '.join(missing)}.",
-            remedy=f"In the checkout: pip install -c .ci/constraints.txt '.[{extra}]'",
+            remedy=how_to_install(extra),
         )
+
+
+def how_to_install(extra: str) -> str:
+    """What brings the packages of an extra to the Python that runs this program."""
+    words = [sys.executable, "-m", "pip", "install", "-c", ".ci/constraints.txt", f".[{extra}]"]
+    return f"In the checkout: {shlex.join(words)}"

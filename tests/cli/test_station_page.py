@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import socket
@@ -17,7 +18,7 @@ import httpx2
 import pytest
 
 from flasher.cli.station import serving
-from flasher.errors import ExitCode
+from flasher.errors import ExitCode, UsageError
 from flasher.station.records.keys import Keeping
 from flasher.web.server import Server
 from tests.cli.conftest import SAMPLES, Flasher
@@ -141,3 +142,16 @@ def test_the_secret_of_the_sessions_is_kept_for_this_user_alone(tmp_path: Path) 
     assert serving.kept_secret(keeping) == first
     (path,) = (tmp_path / "keys").iterdir()
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def test_a_full_disk_leaves_no_half_secret(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_words: object) -> str:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    keeping = Keeping(tmp_path / "keys")
+    with monkeypatch.context() as patched:
+        patched.setattr("secrets.token_urlsafe", full)
+        with pytest.raises(UsageError, match="No space left"):
+            serving.kept_secret(keeping)
+    assert list((tmp_path / "keys").iterdir()) == []
+    assert len(serving.kept_secret(keeping)) > 30

@@ -111,6 +111,12 @@ def kept_secret(keeping: Keeping) -> str:
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            with os.fdopen(handle, "w", encoding="ascii") as file:
+                file.write(secrets.token_urlsafe(32))
+        except OSError:
+            path.unlink()  # an empty one would be found at every start from now on
+            raise
     except FileExistsError:
         pass
     except OSError as error:
@@ -118,8 +124,5 @@ def kept_secret(keeping: Keeping) -> str:
             f"{path} cannot be written: {error.strerror or error}.",
             remedy="Give another place with --keys.",
         ) from error
-    else:
-        with os.fdopen(handle, "w", encoding="ascii") as file:
-            file.write(secrets.token_urlsafe(32))
     found = read(path, _SECRET_MAX_SIZE, what="secret of the pages").decode("ascii", "replace")
     return found or secrets.token_urlsafe(32)

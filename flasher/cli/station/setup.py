@@ -7,6 +7,7 @@ import sys
 from importlib.util import find_spec
 from pathlib import Path
 
+from flasher.cli.extras import how_to_install
 from flasher.cli.output import Output
 from flasher.cli.station.commands import RunOptions
 from flasher.cli.station.documents import PinDocument
@@ -58,7 +59,7 @@ def scanners_of(config: StationConfig, station: Station) -> list[Scanner]:
     if missing:
         raise UsageError(
             f"Scanners need packages that are not installed: {', '.join(missing)}.",
-            remedy="In the checkout: pip install -c .ci/constraints.txt '.[scanner]'",
+            remedy=how_to_install("scanner"),
         )
     return [Scanner(each, station.submit, station.publish) for each in config.scanner]
 
