@@ -22,7 +22,7 @@ _PASSWORD_KEY: Final = re.compile(r"(?i)([?&][^\s=&]*password=)[^\s&]*")
 
 
 class ExitCode(IntEnum):
-    """Exit codes of the command line (README, "Exit codes")."""
+    """Exit codes of the command line (docs/reference/exit_codes.md)."""
 
     OK = 0
     INTERNAL = 1

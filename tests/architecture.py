@@ -1,4 +1,4 @@
-"""The drawing of the packages in docs/architecture.md, made from the imports in the code.
+"""The drawing of the packages in docs/explanation/architecture.md, made from the imports.
 
     python -m tests.architecture
 
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Final
 
 _ROOT: Final = Path(__file__).parents[1]
-PAGE: Final = _ROOT / "docs" / "architecture.md"
+PAGE: Final = _ROOT / "docs" / "explanation" / "architecture.md"
 _MARKED: Final = re.compile(r"(<!-- packages -->\n).*?(<!-- end of packages -->)", re.DOTALL)
 _EVERYWHERE: Final = frozenset({"errors", "events", "prose", "log", "files", "form", "history"})
 """Small modules that many import: they would hide the drawing behind arrows."""
@@ -72,7 +72,7 @@ def _reached(edges: dict[str, set[str]], start: str) -> set[str]:
 
 
 def page(text: str) -> str:
-    """docs/architecture.md with its drawing made anew."""
+    """docs/explanation/architecture.md with its drawing made anew."""
     return _MARKED.sub(lambda match: f"{match[1]}{drawing()}{match[2]}", text)
 
 

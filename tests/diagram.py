@@ -2,7 +2,8 @@
 
     python -m tests.diagram
 
-writes them anew, into docs/upgrade.md and docs/states.md; a test holds both against the tables.
+writes them anew, into docs/explanation/upgrade.md and docs/reference/states.md; a test holds both
+against the tables.
 """
 
 from __future__ import annotations
@@ -19,8 +20,8 @@ from flasher.mock import table as device
 from flasher.prose import prose
 
 _ROOT: Final = Path(__file__).parents[1]
-UPGRADE: Final = _ROOT / "docs" / "upgrade.md"
-STATES: Final = _ROOT / "docs" / "states.md"
+UPGRADE: Final = _ROOT / "docs" / "explanation" / "upgrade.md"
+STATES: Final = _ROOT / "docs" / "reference" / "states.md"
 _MARKED: Final = re.compile(
     r"(<!-- state diagram -->\n).*?(<!-- end of state diagram -->)", re.DOTALL
 )
@@ -84,7 +85,7 @@ def diagram(arrows: Iterable[_Arrow], states: type[Enum], *, overview: bool = Fa
 
 
 def states_document() -> str:
-    """docs/states.md."""
+    """docs/reference/states.md."""
     return "\n".join(
         [
             _INTRODUCTION,
@@ -97,7 +98,7 @@ def states_document() -> str:
 
 
 def upgrade_document(text: str) -> str:
-    """docs/upgrade.md with its diagram drawn anew."""
+    """docs/explanation/upgrade.md with its diagram drawn anew."""
     overview = diagram(host_arrows(overview=True), host.State, overview=True)
     return _MARKED.sub(lambda match: f"{match[1]}{overview}{match[2]}", text)
 

@@ -2,7 +2,7 @@
 
     python -m tests.messages_document
 
-writes docs/messages.md anew; a test holds it against the catalogue.
+writes docs/reference/messages.md anew; a test holds it against the catalogue.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from flasher.protocol.fields import (
 )
 from flasher.protocol.spec import DIALECTS, Node
 
-MESSAGES: Final = Path(__file__).parents[1] / "docs" / "messages.md"
+MESSAGES: Final = Path(__file__).parents[1] / "docs" / "reference" / "messages.md"
 
 _INTRODUCTION: Final = """\
 # Messages of the applications
@@ -53,7 +53,7 @@ _SENDERS: Final = {
 
 
 def messages_document() -> str:
-    """docs/messages.md."""
+    """docs/reference/messages.md."""
     lines = [_INTRODUCTION, *_dialects()]
     for node, name in _SENDERS.items():
         lines += [f"## Sent by {name}", "", *_rows(item for item in ITEMS if item.sender is node)]

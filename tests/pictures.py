@@ -106,7 +106,7 @@ def take(
 
 
 def guide(browser: Browser) -> None:
-    """The six pictures of docs/station.md."""
+    """The six pictures of docs/how-to/station.md."""
     GUIDE.mkdir(exist_ok=True)
     take(browser, GUIDE / "line-4.png", _at_work)
     take(browser, GUIDE / "line-16-dark.png", _every_state, count=16, scheme="dark")

@@ -2,7 +2,8 @@
 
     python -m tests.readings_document
 
-writes docs/readings.md anew from `flasher/conformance/clauses.py`; a test holds it against that.
+writes docs/explanation/readings.md anew from `flasher/conformance/clauses.py`; a test holds it
+against that.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from flasher.conformance.catalogue import CASES, in_order
 from flasher.conformance.clauses import CLAUSES, READINGS, ROBUSTNESS, Reading, contents
 
 ROOT: Final = Path(__file__).parents[1]
-DOCUMENT: Final = ROOT / "docs" / "readings.md"
+DOCUMENT: Final = ROOT / "docs" / "explanation" / "readings.md"
 HOLDERS: Final = {
     "R1": (
         (
@@ -125,13 +126,14 @@ reading is a default. Drawn from `flasher/conformance/clauses.py` by
 `python -m tests.readings_document`; a test keeps it so, and that the tests named here exist.
 
 Options that change a reading stand in three places: the suite's profile
-([conformance.md](conformance.md#write-the-profile)), the host's profile ([profile.md](profile.md)),
+([conformance.md](../how-to/conformance.md#write-the-profile)), the host's profile
+([profile.md](../reference/profile.md)),
 and the choices of the device model (`flasher mock --set`).
 """
 
 
 def readings_document() -> str:
-    """docs/readings.md."""
+    """docs/explanation/readings.md."""
     lines = [_INTRODUCTION]
     for number, reading in READINGS.items():
         lines += _reading(number, reading)

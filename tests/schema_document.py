@@ -2,7 +2,7 @@
 
     python -m tests.schema_document
 
-writes docs/schema.json anew; a test holds it against the code.
+writes docs/reference/schema.json anew; a test holds it against the code.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from typing import Final
 
 from flasher.cli.schema import build
 
-SCHEMA: Final = Path(__file__).parents[1] / "docs" / "schema.json"
+SCHEMA: Final = Path(__file__).parents[1] / "docs" / "reference" / "schema.json"
 
 
 def schema_document() -> str:
-    """docs/schema.json."""
+    """docs/reference/schema.json."""
     return json.dumps(build(), indent=1) + "\n"
 
 

@@ -1,4 +1,4 @@
-"""docs/architecture.md is true of the code: its drawing, its packages, the way of one packet."""
+"""docs/explanation/architecture.md is true of the code: its drawing, its packages, one packet."""
 
 from __future__ import annotations
 

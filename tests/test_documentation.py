@@ -9,7 +9,8 @@ from flasher.cli.main import COMMANDS
 from flasher.errors import ExitCode
 from tests import diagram
 
-README = (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def test_the_state_diagrams_are_those_of_the_tables() -> None:
@@ -20,8 +21,9 @@ def test_the_state_diagrams_are_those_of_the_tables() -> None:
     assert diagram.upgrade_document(upgrade) == upgrade, drawn
 
 
-def test_the_readme_lists_every_exit_code() -> None:
-    listed = {int(code) for code in re.findall(r"^\| (\d+) \|", README, re.MULTILINE)}
+def test_the_reference_lists_every_exit_code() -> None:
+    page = (ROOT / "docs" / "reference" / "exit_codes.md").read_text(encoding="utf-8")
+    listed = {int(code) for code in re.findall(r"^\| (\d+) \|", page, re.MULTILINE)}
     assert listed == {int(code) for code in ExitCode}
 
 
@@ -38,18 +40,17 @@ def test_the_readme_opens_with_two_commands() -> None:
 
 
 def test_every_link_of_the_documentation_leads_somewhere() -> None:
-    root = Path(__file__).parents[1]
-    for page in (root / "README.md", *(root / "docs").glob("*.md")):
+    for page in (*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")):
         text = page.read_text(encoding="utf-8")
         for link in re.findall(r"\]\(([^)\s]+)\)", text):
             name, _, anchor = link.partition("#")
             if "://" in name:
                 continue
             target = (page.parent / name) if name else page
-            assert target.exists(), f"{page.name}: {link}"
+            assert target.exists(), f"{page}: {link}"
             if anchor and target.suffix == ".md":
                 titles = re.findall(r"^#+ (.*)$", target.read_text(encoding="utf-8"), re.MULTILINE)
-                assert anchor in {_anchor(title) for title in titles}, f"{page.name}: {link}"
+                assert anchor in {_anchor(title) for title in titles}, f"{page}: {link}"
 
 
 def _anchor(title: str) -> str:

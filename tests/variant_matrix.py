@@ -3,8 +3,8 @@
     python -m tests.variant_matrix            runs the suite on every variant, writes the table
     python -m tests.variant_matrix --check    the same, and compares: exit code 1 if it differs
 
-The table is docs/variants.md. The gate runs the check; a test runs each variant on the cases of its
-own clause only.
+The table is docs/reference/variants.md. The gate runs the check; a test runs each variant on the
+cases of its own clause only.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
 from flasher.mock.variants import VARIANTS, Variant
 
-PATH: Final = Path(__file__).parents[1] / "docs" / "variants.md"
+PATH: Final = Path(__file__).parents[1] / "docs" / "reference" / "variants.md"
 TARGET: Final = "bms"
 AREA_BYTES: Final = 80 * 1024
 """Smaller than the mock's own, since the largest image is sent often; larger than 16 bits tell."""
@@ -85,7 +85,7 @@ def groups_passed(row: Row) -> str:
 
 
 def document(rows: Iterable[Row]) -> str:
-    """docs/variants.md."""
+    """docs/reference/variants.md."""
     rows = list(rows)
     lines = [_INTRODUCTION, "## By variant", ""]
     lines += [
@@ -118,7 +118,7 @@ def _failed_text(row: Row, variant: Variant) -> str:
 
 
 def listed_rows() -> dict[str, tuple[str, ...]]:
-    """The variants of docs/variants.md with the cases that catch each."""
+    """The variants of docs/reference/variants.md with the cases that catch each."""
     rows = {}
     by_variant = PATH.read_text(encoding="utf-8").partition("## By case")[0]
     for line in by_variant.splitlines():
@@ -132,7 +132,9 @@ def listed_rows() -> dict[str, tuple[str, ...]]:
 def main(words: Sequence[str] | None = None) -> int:
     """Write the table, or compare it."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--check", action="store_true", help="compare with docs/variants.md")
+    parser.add_argument(
+        "--check", action="store_true", help="compare with docs/reference/variants.md"
+    )
     parser.add_argument("--jobs", type=int, help="processes (default: as many as cores)")
     options = parser.parse_args(words)
     text = document(all_rows(options.jobs))

@@ -1,4 +1,4 @@
-"""What --json prints is what docs/schema.json says, for every command, failures included."""
+"""What --json prints is what docs/reference/schema.json says, for every command, also a failure."""
 
 from __future__ import annotations
 

@@ -513,7 +513,7 @@ def test_an_action_has_to_be_named() -> None:
 
 # -- the guide -------------------------------------------------------------------------------------
 
-GUIDE = Path(__file__).parents[2] / "docs" / "station.md"
+GUIDE = Path(__file__).parents[2] / "docs" / "how-to" / "station.md"
 
 
 def test_the_guide_lists_every_code_with_what_to_do() -> None:

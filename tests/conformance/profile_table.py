@@ -1,4 +1,4 @@
-"""The table of all keys of a conformance profile in docs/conformance.md.
+"""The table of all keys of a conformance profile in docs/how-to/conformance.md.
 
     python -m tests.conformance.profile_table
 
@@ -12,7 +12,7 @@ from typing import Final
 
 from flasher.conformance.profile import profile_keys
 
-GUIDE: Final = Path(__file__).parents[2] / "docs" / "conformance.md"
+GUIDE: Final = Path(__file__).parents[2] / "docs" / "how-to" / "conformance.md"
 BEGIN: Final = "<!-- keys: python -m tests.conformance.profile_table -->\n"
 END: Final = "<!-- end of keys -->"
 

@@ -82,7 +82,8 @@ def test_a_unit_longer_than_a_packet_does_not_compile(tmp_path: Path) -> None:
 
 def test_the_code_on_the_page_compiles(flasher: Flasher, tmp_path: Path) -> None:
     _need("gcc")
-    page = (Path(__file__).parents[2] / "docs" / "bootloader.md").read_text(encoding="utf-8")
+    docs = Path(__file__).parents[2] / "docs"
+    page = (docs / "how-to" / "bootloader.md").read_text(encoding="utf-8")
     code = re.search(r"```c\n(.*?)```", page, re.DOTALL)
     assert code is not None
     assert flasher("conformance", "header", tmp_path).code == 0

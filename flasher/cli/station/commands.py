@@ -67,7 +67,7 @@ def __getattr__(name: str) -> tuple[type, ...]:
 def station() -> None:
     """Flash unit after unit at the end of a line, several sockets at a time, by a recipe. A PASS is
     shown only when it is on disk; the records tell years later what was written to which unit, by
-    whom, with which file. The guide is docs/station.md.
+    whom, with which file. The guide is docs/how-to/station.md.
     """
 
 

@@ -24,7 +24,8 @@ examples:
 
 The page is for this computer alone. Its address works once, in the browser that opens it first;
 more tabs of that show the same. Closing the page ends nothing; Ctrl-C here ends an upgrade at the
-end of its message, and says in which state the device is left. The guide is docs/bench_page.md.
+end of its message, and says in which state the device is left. The guide is
+docs/how-to/bench_page.md.
 """
 
 

@@ -1,0 +1,34 @@
+"""How Sphinx makes the site; `python -m tests.site` builds and checks it."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import flasher
+
+project = "flasher"
+author = "the flasher maintainers"
+copyright = "Apache-2.0"
+version = release = flasher.__version__
+
+extensions = ["myst_parser", "tests.site.diagrams"]
+exclude_patterns = ["_static", "pictures"]
+nitpicky = True
+
+myst_heading_anchors = 4
+myst_enable_extensions = ["deflist"]
+
+html_theme = "furo"
+html_title = f"flasher {release}"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_sourcelink = False
+html_show_sphinx = False
+html_use_index = False
+html_theme_options = {"navigation_with_keys": True}
+pygments_style = "friendly"
+pygments_dark_style = "native"

@@ -1,0 +1,1 @@
+"""The site: what is drawn while Sphinx builds it, and what is held of the result."""

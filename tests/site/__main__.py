@@ -1,0 +1,75 @@
+"""Builds the site of the documents, and checks it.
+
+    python -m tests.site                     into build/site
+    python -m tests.site --zip flasher.zip   and into one file, for computers without a network
+
+A warning of Sphinx, a link that leads nowhere or anything that would be loaded from another
+computer ends it with exit code 1.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+import time
+import zipfile
+from pathlib import Path
+from typing import Final
+
+from sphinx.cmd.build import build_main
+
+from tests.site.pages import Site
+
+_ROOT: Final = Path(__file__).parents[2]
+_DATE: Final = (1980, 1, 1, 0, 0, 0)
+"""Of every file in the zip archive: the same pages make the same archive."""
+
+
+def build(folder: Path, *, jobs: str = "auto") -> bool:
+    """Build it anew; whether Sphinx had nothing to say against it."""
+    shutil.rmtree(folder, ignore_errors=True)
+    arguments = ["-b", "html", "-W", "--keep-going", "-q", "-j", jobs]
+    trees = folder.with_name(f"{folder.name}.trees")
+    shutil.rmtree(trees, ignore_errors=True)
+    return build_main([*arguments, "-d", str(trees), str(_ROOT / "docs"), str(folder)]) == 0
+
+
+def pack(folder: Path, archive: Path) -> None:
+    """All files of the site in one archive, in a folder of its own."""
+    with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as packed:
+        for path in sorted(path for path in folder.rglob("*") if path.is_file()):
+            name = Path("flasher-site") / path.relative_to(folder)
+            info = zipfile.ZipInfo(name.as_posix(), _DATE)
+            info.compress_type = zipfile.ZIP_DEFLATED
+            packed.writestr(info, path.read_bytes())
+
+
+def main() -> int:
+    """Build, check, pack; returns the exit code."""
+    parser = argparse.ArgumentParser(description="Build the site of the documents, and check it.")
+    parser.add_argument("folder", nargs="?", type=Path, default=_ROOT / "build" / "site")
+    parser.add_argument("--zip", type=Path, metavar="FILE", help="pack it into one file too")
+    options = parser.parse_args()
+    began = time.perf_counter()
+    if not build(options.folder):
+        return 1
+    site = Site(options.folder)
+    problems = list(site.problems())
+    sys.stderr.writelines(f"{problem}\n" for problem in problems)
+    if problems:
+        return 1
+    size = sum(path.stat().st_size for path in options.folder.rglob("*") if path.is_file())
+    took_s = time.perf_counter() - began
+    sys.stdout.write(
+        f"{options.folder / 'index.html'}: {len(site.pages)} pages, {size / 1e6:.1f} MB, "
+        f"{took_s:.1f} s\n"
+    )
+    if options.zip:
+        pack(options.folder, options.zip)
+        sys.stdout.write(f"{options.zip}: {options.zip.stat().st_size / 1e6:.1f} MB\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
