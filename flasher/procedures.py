@@ -59,7 +59,7 @@ from flasher.protocol.contents import Memory, Reset
 from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import BMS, Command, Dialect, Target
+from flasher.protocol.spec import BMS, WELLING, Command, Dialect, Target
 from flasher.settings.profile import Profile
 
 if TYPE_CHECKING:
@@ -123,6 +123,20 @@ class Reading:
     misfit: str = ""
     was_asked: bool = True
 
+    @property
+    def title(self) -> str:
+        """Its name as people read it."""
+        return self.name.replace("-", " ")
+
+    @property
+    def why(self) -> str:
+        """Why there is no answer."""
+        if not self.was_asked:
+            return "not asked: the device is silent"
+        if self.misfit:
+            return f"came in another form: {self.misfit}"
+        return "no answer"
+
 
 @dataclass(frozen=True)
 class DeviceInfo:
@@ -138,6 +152,15 @@ class DeviceInfo:
     def is_there(self) -> bool:
         """True when the device answered or sent anything."""
         return self.target.node in self.survey.heard
+
+    @property
+    def no_faults(self) -> str:
+        """What silence about faults tells: they are heard, not asked for, and how long to wait for
+        one only one document says.
+        """
+        is_periodic = self.dialect is WELLING
+        proviso = "" if is_periodic else "; how often they are sent is not documented: see monitor"
+        return f"none heard{proviso}"
 
 
 @dataclass(frozen=True)

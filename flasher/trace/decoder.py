@@ -82,6 +82,11 @@ class BusEvent:
     """False for a message that the dialect which was asked for does not have."""
 
     @property
+    def route(self) -> str:
+        """Who to whom; empty for an id of no node."""
+        return f"{self.sender} > {self.receiver}" if self.sender else ""
+
+    @property
     def marked_title(self) -> str:
         """The title, marked where the dialect does not have the message."""
         return self.title if self.in_dialect else f"{self.title} {NOT_IN_DIALECT}"

@@ -9,25 +9,53 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
-from enum import Enum
 from pathlib import Path
 from queue import Empty, Queue
 from typing import Final, Protocol, TypeVar
 
 from flasher import events
 from flasher.api import Connection, DeviceInfo, Job, Result, prepare, refusal
+from flasher.driver import drive
 from flasher.errors import FlasherError, ImageError, UsageError
 from flasher.host.identity import Check, DeviceAnswers, judge_device, new_version
 from flasher.host.outcome import AGAIN
+from flasher.host.query import piece_of
 from flasher.host.told import line_of, warning_of
 from flasher.procedures import nobody_heard
-from flasher.protocol.contents import RunningInformation, VersionInformation
+from flasher.protocol.contents import Memory, RunningInformation, VersionInformation
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
 from flasher.protocol.text import printable
+from flasher.settings.area import Area, area_of_image, area_of_profile
 from flasher.settings.profile import Profile
+from flasher.trace.decoder import BusEvent
+from flasher.trace.watcher import Board, Pulse, Watcher
+from flasher.web.bench_state import (
+    Adapter,
+    BackUp,
+    ChooseImage,
+    ChooseTarget,
+    Doing,
+    Done,
+    FindAdapters,
+    FindAreas,
+    Judge,
+    LeaveBackup,
+    Look,
+    Offer,
+    Order,
+    RescueIt,
+    Saved,
+    SeenMessage,
+    StartOver,
+    State,
+    Upgrade,
+    UseAdapter,
+    Watch,
+    Watched,
+)
 from flasher.web.feed import Feed
 
 TURN_S: Final = 0.2
@@ -35,209 +63,13 @@ TURN_S: Final = 0.2
 SILENCE_LIMIT_S: Final = 5.0
 """Opening an adapter may take seconds, in which nothing can be told."""
 NOTES_KEPT: Final = 12
+WATCH_TURN_S: Final = 0.5
+"""Time between two looks at what is said on the bus: slow enough to read."""
 SUBJECT: Final = "bench"
 _AGAIN: Final = "Begin again with the adapter."
 _RESCUE: Final = "Then rescue this device."
 T = TypeVar("T")
 _LOG: Final = logging.getLogger("flasher.web")
-
-
-class Doing(Enum):
-    """What the bench does now."""
-
-    NOTHING = "nothing"
-    ADAPTERS = "adapters"
-    LOOKING = "looking"
-    JUDGING = "judging"
-    UPGRADING = "upgrading"
-    LOOKING_AGAIN = "looking_again"
-
-
-# -- what it shows ---------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Adapter:
-    """A way to a bike; `name` tells it from the others."""
-
-    name: str
-    note: str = ""
-    was_last: bool = False
-    """The one that was used last."""
-
-
-@dataclass(frozen=True)
-class Offer:
-    """An image file, held against the target: it fits, or `refusal` says why not."""
-
-    path: Path
-    version: str = ""
-    size_bytes: int = 0
-    packets: int = 0
-    wire_s: float = 0.0
-    sha256: str = ""
-    checks: tuple[events.CheckMade, ...] = ()
-    refusal: FlasherError | None = None
-
-    @property
-    def name(self) -> str:
-        return printable(self.path.name)
-
-
-@dataclass(frozen=True)
-class Done:
-    """An upgrade that has ended. Transferred, completed and running are three claims, of which
-    None is: not known.
-    """
-
-    at: datetime
-    adapter: Adapter
-    target: Target
-    offer: Offer
-    checks: tuple[events.CheckMade, ...]
-    before: DeviceInfo | None
-    packet: int
-    """Packets that the device has acknowledged, in the best attempt."""
-    result: Result | None
-    """None where the adapter failed, or somebody ended it at once."""
-    error: FlasherError | None
-    bundle: Path | None
-    after: DeviceInfo | None = None
-
-    @property
-    def is_transferred(self) -> bool | None:
-        return None if self.result is None else self.result.outcome.is_transferred
-
-    @property
-    def is_completed(self) -> bool | None:
-        return None if self.result is None else self.result.outcome.is_completed
-
-    @property
-    def is_running(self) -> bool | None:
-        """The application answered, and nothing speaks against its being the new one."""
-        result = self.result
-        if result is None or result.running_version is None:
-            return None
-        return result.ok
-
-    @property
-    def may_rescue_with_it(self) -> bool:
-        """The device needs an image, and has not refused this one."""
-        error = self.error
-        return error is not None and error.needs_rescue and not self.is_refused
-
-    @property
-    def is_refused(self) -> bool:
-        return self.error is not None and self.error.exit_code is self.error.exit_code.REFUSED
-
-
-@dataclass(frozen=True)
-class State:
-    """Everything that a page shows."""
-
-    doing: Doing = Doing.NOTHING
-    is_rescue: bool = False
-    adapters: tuple[Adapter, ...] = ()
-    was_looked_for: bool = False
-    adapter: Adapter | None = None
-    bike: DeviceInfo | None = None
-    """What was heard and what the battery answered, before the upgrade."""
-    target: Target | None = None
-    offers: tuple[Offer, ...] = ()
-    offer: Offer | None = None
-    phase: events.Phase | None = None
-    packet: int = 0
-    """Packets that the device has acknowledged in this attempt."""
-    furthest: int = 0
-    """The same, in the best attempt."""
-    repetitions: int = 0
-    transfer_began_s: float | None = None
-    now_s: float = 0.0
-    """On the clock of the bench, as `transfer_began_s`."""
-    power_cycle_s: float | None = None
-    """The device has to be switched off and on; it is waited for so long."""
-    checks: tuple[events.CheckMade, ...] = ()
-    notes: tuple[str, ...] = ()
-    is_stopping: bool = False
-    done: Done | None = None
-    trouble: FlasherError | None = None
-    """What ended the last step, but for an upgrade."""
-
-    @property
-    def is_idle(self) -> bool:
-        return self.doing is Doing.NOTHING
-
-
-# -- orders ----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class FindAdapters:
-    """Look what is plugged in."""
-
-
-@dataclass(frozen=True)
-class UseAdapter:
-    """Use this adapter, and look who answers on it."""
-
-    name: str
-
-
-@dataclass(frozen=True)
-class Look:
-    """Look again who answers."""
-
-
-@dataclass(frozen=True)
-class ChooseTarget:
-    """Upgrade this device, and look which images fit; "" is none."""
-
-    name: str
-
-
-@dataclass(frozen=True)
-class Judge:
-    """Look again which images fit."""
-
-
-@dataclass(frozen=True)
-class ChooseImage:
-    """Take this image; "" is none."""
-
-    name: str
-
-
-@dataclass(frozen=True)
-class Upgrade:
-    """Upgrade, with the image of this digest: what was chosen where the button was pressed."""
-
-    target: str
-    sha256: str
-
-
-@dataclass(frozen=True)
-class StartOver:
-    """Begin with the next bike, or with the rescue of one."""
-
-    is_rescue: bool = False
-
-
-@dataclass(frozen=True)
-class RescueIt:
-    """Rescue the device whose upgrade has just failed."""
-
-
-Order = (
-    FindAdapters
-    | UseAdapter
-    | Look
-    | ChooseTarget
-    | Judge
-    | ChooseImage
-    | Upgrade
-    | StartOver
-    | RescueIt
-)
 
 
 # -- the machine -----------------------------------------------------------------------------------
@@ -265,8 +97,23 @@ class Workplace(Protocol):
         """This one was chosen."""
         ...
 
-    def connect(self, adapter: Adapter) -> AbstractContextManager[Connection]:
-        """Open it."""
+    def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
+        """Open it. With `asks` False nothing will be sent."""
+        ...
+
+    def model_area(self) -> Area | None:
+        """The memory of a device model; None of devices."""
+        ...
+
+    def back_up(
+        self,
+        adapter: Adapter,
+        area: Area | None,
+        *,
+        on_event: Callable[[object], None],
+        cancelled: Callable[[], bool],
+    ) -> Saved:
+        """Save what the battery tells, and the memory of an area, to a file of its own."""
         ...
 
     def profile(self, target: Target) -> Profile:
@@ -313,6 +160,16 @@ class Bench:
         self._orders: Queue[Order] = Queue()
         self._stop = threading.Event()
         self._is_closing = self._ends_at_once = False
+        self._steps: dict[type[Order], Callable[[], None]] = {
+            FindAdapters: self._find_adapters,
+            Look: self._look,
+            Watch: self._watch,
+            FindAreas: self._find_areas,
+            LeaveBackup: lambda: self._set(areas=None),
+            Judge: self._judge,
+            RescueIt: self._rescue_it,
+        }
+        """Of the orders that say no more than their name."""
         self._set()
 
     # -- any thread --------------------------------------------------------------------------------
@@ -385,21 +242,21 @@ class Bench:
         return is_asked
 
     def _carry_out(self, order: Order) -> None:
+        step = self._steps.get(type(order))
+        if step is not None:
+            step()
+            return
         match order:
-            case FindAdapters():
-                self._find_adapters()
             case UseAdapter(name):
                 self._use(name)
-            case Look():
-                self._look()
+            case BackUp(source):
+                self._back_up(source)
             case ChooseTarget(""):
                 self._set(target=None, offers=(), offer=None, done=None)
             case ChooseImage(""):
                 self._set(offer=None, done=None)
             case ChooseTarget(name):
                 self._set(target=_known(TARGETS, name), offer=None, done=None)
-                self._judge()
-            case Judge():
                 self._judge()
             case ChooseImage(name):
                 fitting = {offer.name: offer for offer in self.state.offers if not offer.refusal}
@@ -412,8 +269,6 @@ class Bench:
                     adapters=self.state.adapters, was_looked_for=True, is_rescue=is_rescue
                 )
                 self._find_adapters()
-            case RescueIt():
-                self._rescue_it()
 
     # -- the steps ---------------------------------------------------------------------------------
 
@@ -427,7 +282,7 @@ class Bench:
         marked = tuple(replace(each, was_last=each == adapter) for each in self.state.adapters)
         self._set(
             adapter=adapter, adapters=marked, bike=None, target=None, offers=(), offer=None,
-            done=None, checks=(), notes=(),
+            done=None, checks=(), notes=(), areas=None, saved=None, watched=None,
         )  # fmt: skip
         if not self.state.is_rescue:
             self._look()
@@ -456,9 +311,63 @@ class Bench:
         offers.sort(key=lambda offer: (offer.refusal is not None, offer.name))
         self._set(offers=tuple(offers))
 
+    def _watch(self) -> None:
+        board = Board()
+        since_s = self._now()
+        messages = troubles = 0
+
+        def happened(event: object) -> None:
+            nonlocal messages, troubles
+            if isinstance(event, BusEvent):
+                messages += 1
+                troubles += event.is_trouble
+                board.add(event)
+            elif isinstance(event, Pulse):
+                rows = _rows(board, event.at)
+                self._set(watched=Watched(self._now() - since_s, messages, troubles, rows))
+
+        self._set(doing=Doing.WATCHING, watched=Watched(0.0, 0, 0, ()))
+        watcher = Watcher(pulse_s=WATCH_TURN_S, dialect=self._place.dialect)
+        with self._place.connect(self._adapter(), asks=False) as connection:
+            drive(
+                watcher, connection.link, connection.clock,
+                on_event=happened, cancelled=self._cancelled,
+            )  # fmt: skip
+
+    def _find_areas(self) -> None:
+        """Where the application may lie: nothing is guessed, since an address that does not exist
+        may crash a device. Images that cannot be for it do not count.
+        """
+        self._adapter()
+        self._set(doing=Doing.JUDGING, areas=None)
+        found = [area_of_profile(self._place.profile(BMS)) or self._place.model_area()]
+        for path in self._place.images():
+            if self._cancelled():
+                return
+            with suppress(FlasherError):
+                found.append(area_of_image(self._job(path, BMS).plan.image))
+        self._set(areas=tuple(each for each in found if each is not None))
+
+    def _back_up(self, source: str) -> None:
+        areas = {area.source: area for area in self.state.areas or ()}
+        area = _known(areas, source) if source else None
+
+        def happened(event: object) -> None:
+            match event:
+                case events.QueryAnswered(content=Memory() as piece):
+                    self._set(saved_bytes=self.state.saved_bytes + len(piece_of(piece)))
+
+        self._set(doing=Doing.SAVING, saved=None, saved_bytes=0)
+        self._set(
+            saved=self._place.back_up(
+                self._adapter(), area, on_event=happened, cancelled=self._cancelled
+            ),
+            areas=None,
+        )
+
     def _judged(self, path: Path) -> Offer:
         try:
-            job = self._job(path)
+            job = self._job(path, self.state.target)
             self._check_device(job)
         except FlasherError as error:
             return Offer(path, refusal=error)
@@ -473,8 +382,7 @@ class Bench:
             tuple(found.event for found in job.checks),
         )
 
-    def _job(self, path: Path) -> Job:
-        target = self.state.target
+    def _job(self, path: Path, target: Target | None) -> Job:
         if target is None:
             raise UsageError("No device is chosen.", remedy="Choose the one to upgrade.")
         profile = self._place.profile(target)
@@ -512,9 +420,9 @@ class Bench:
         assert offer is not None  # noqa: S101  _check_meant
         self._set(
             doing=Doing.UPGRADING, done=None, checks=(), notes=(), packet=0, furthest=0,
-            repetitions=0, phase=None, transfer_began_s=None, power_cycle_s=None,
+            repetitions=0, phase=None, transfer_began_s=None, power_cycle_s=None, watched=None,
         )  # fmt: skip
-        job = self._job(offer.path)
+        job = self._job(offer.path, self.state.target)
         if job.plan.image.sha256 != offer.sha256:
             raise ImageError(
                 f"{offer.name} is another file than when it was chosen; nothing was sent.",
@@ -579,6 +487,21 @@ class Bench:
         if self.state.adapter is None:
             raise UsageError("No adapter is chosen.", remedy="Choose one.")
         return self.state.adapter
+
+
+def _rows(board: Board, now: float) -> tuple[SeenMessage, ...]:
+    return tuple(
+        SeenMessage(
+            line.seen.marked_title,
+            line.seen.route,
+            line.seen.is_trouble,
+            line.seen.fields,
+            frozenset(line.changed(now)),
+            line.count,
+            line.rate_hz(now),
+        )
+        for line in board.lines()
+    )
 
 
 def _known(things: Mapping[str, T], name: str) -> T:

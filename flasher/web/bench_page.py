@@ -9,15 +9,16 @@ from pathlib import Path
 from typing import Any, Final
 
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Route
 
 from flasher.protocol.contents import RunningInformation, VersionInformation
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import TARGETS
 from flasher.trace.decoder import content_fields
-from flasher.web import bench
-from flasher.web.bench import Bench, Done, Order, State
+from flasher.web import bench_state as bench
+from flasher.web.bench import Bench
+from flasher.web.bench_state import Done, Order, State
 from flasher.web.pages import Pages
 from flasher.web.words import Words
 
@@ -31,6 +32,10 @@ _ORDERS: Final[Mapping[str, Callable[[Mapping[str, str]], Order]]] = {
     "adapters": lambda _: bench.FindAdapters(),
     "adapter": lambda said: bench.UseAdapter(said["name"]),
     "look": lambda _: bench.Look(),
+    "watch": lambda _: bench.Watch(),
+    "areas": lambda _: bench.FindAreas(),
+    "backup": lambda said: bench.BackUp(said["source"]),
+    "no-backup": lambda _: bench.LeaveBackup(),
     "target": lambda said: bench.ChooseTarget(said["name"]),
     "images": lambda _: bench.Judge(),
     "image": lambda said: bench.ChooseImage(said["name"]),
@@ -91,6 +96,7 @@ class BenchPage:
             Route("/", self._page),
             Route("/bench/events", self._events),
             Route("/bench/sheet", self._sheet),
+            Route("/bench/backup", self._backup),
             Route("/bench/order", self._order, methods=["POST"]),
             Route(UPLOAD, self._upload, methods=["POST"]),
         ]
@@ -114,6 +120,12 @@ class BenchPage:
             name = f"{done.target.name}-{done.at:%Y%m%d-%H%M%S}.html"
             page.headers["content-disposition"] = f'attachment; filename="{name}"'
         return page
+
+    async def _backup(self, _request: Request) -> Response:
+        saved = self._bench.state.saved
+        if saved is None or not saved.path.is_file():
+            return Response("No backup was made.", 404)
+        return FileResponse(saved.path, filename=saved.path.name)
 
     async def _events(self, request: Request) -> Response:
         return StreamingResponse(
@@ -139,7 +151,7 @@ class BenchPage:
         return self._pages.parts(
             words, "bench_parts.html", state=state, targets=TARGETS.values(),
             folder=str(self._shelf.folder), is_mock=self._is_mock, facts=facts(state),
-            left_s=left_s(state),
+            left_s=left_s(state), told=told(state),
         )  # fmt: skip
 
     async def _order(self, request: Request) -> Response:
@@ -194,6 +206,19 @@ def facts(state: State) -> list[tuple[str, str]]:
     if state.bike.survey.faults is not None:
         found += _rows(state.bike.survey.faults).values()
     return found
+
+
+def told(state: State) -> list[tuple[str, list[tuple[str, str]]]]:
+    """Everything that the battery told, in the words of `flasher info`: a title with its rows."""
+    bike = state.bike
+    if bike is None:
+        return []
+    faults = bike.survey.faults
+    found = [("faults", list(_rows(faults).values()) if faults else [("faults", bike.no_faults)])]
+    answered = {each.title: each.answer for each in bike.readings if each.answer is not None}
+    found += [(title, list(_rows(answer).values())) for title, answer in answered.items()]
+    missing = [(each.title, each.why) for each in bike.readings if each.answer is None]
+    return [*found, ("not answered", missing)] if missing else found
 
 
 def compared(done: Done) -> list[tuple[str, str, str]]:

@@ -14,8 +14,9 @@ from flasher.cli.stop import Stop
 from flasher.cli.upgrade.bench_page import VirtualBikes
 from flasher.cli.values import IMAGE_SUFFIXES
 from flasher.web import bench
-from flasher.web.bench import Adapter, Bench, FindAdapters
+from flasher.web.bench import Bench
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
+from flasher.web.bench_state import Adapter, FindAdapters, Order, State
 from flasher.web.guard import BODY_MAX, Entry, application
 from flasher.web.pages import Pages
 from flasher.web.server import Server
@@ -65,7 +66,7 @@ class BenchPlace:
         self.bench = Bench(self.bikes, lambda: 0.0)
         self.do(FindAdapters())
 
-    def do(self, *orders: bench.Order) -> bench.State:
+    def do(self, *orders: Order) -> State:
         """Carry out orders; the state then."""
         for order in orders:
             self.bench.carry_out(order)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from intelhex import IntelHex
 
 from flasher import events
 from flasher.errors import (
@@ -20,16 +22,20 @@ from flasher.errors import (
 )
 from flasher.history import History
 from flasher.image.release import Release
+from flasher.mock.store import AREA_START
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.spec import BMS
 from flasher.settings.manifest import manifest_path, to_toml
-from flasher.web.bench import (
-    Bench,
+from flasher.web.bench import Bench
+from flasher.web.bench_page import told
+from flasher.web.bench_state import (
+    BackUp,
     ChooseImage,
     ChooseTarget,
     Doing,
     Done,
     FindAdapters,
+    FindAreas,
     Judge,
     Look,
     Order,
@@ -38,6 +44,7 @@ from flasher.web.bench import (
     State,
     Upgrade,
     UseAdapter,
+    Watch,
 )
 from flasher.web.virtual_bike import Fault
 from tests.end_to_end.stage import NEW, OLD, image_of
@@ -262,10 +269,119 @@ def test_while_it_does_something_it_takes_no_other_order(place: BenchPlace) -> N
 
 @pytest.mark.parametrize(
     "order",
-    [Look(), Judge(), ChooseTarget("bms"), UseAdapter("none"), RescueIt(), Upgrade("bms", "")],
+    [
+        Look(),
+        Judge(),
+        Watch(),
+        FindAreas(),
+        BackUp(""),
+        ChooseTarget("bms"),
+        UseAdapter("none"),
+        RescueIt(),
+        Upgrade("bms", ""),
+    ],
 )
 def test_an_order_out_of_turn_is_refused_in_words(place: BenchPlace, order: Order) -> None:
     state = place.do(order)
     assert isinstance(state.trouble, UsageError)
     assert state.trouble.remedy
     assert state.doing is Doing.NOTHING
+
+
+# -- looking closer --------------------------------------------------------------------------------
+
+
+def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
+    place: BenchPlace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place.do(UseAdapter(Fault.HARDWARE.value))
+    looks: list[State] = []
+
+    def put(_subject: str, state: State, **_: object) -> None:
+        looks.append(state)
+        if state.watched is not None and state.watched.messages > 10:
+            place.bench.stop()
+
+    monkeypatch.setattr(place.bench.feed, "put", put)
+    state = place.do(Watch())
+    assert state.trouble is None
+    assert state.watched is not None
+    assert {each.doing for each in looks} == {Doing.WATCHING, Doing.NOTHING}
+    rows = {each.title: each for each in state.watched.board}
+    running = rows["running information"]
+    assert running.route == "BMS > all"
+    assert {"voltage", "state of charge"} <= {each.label for each in running.fields}
+    assert any(each.is_trouble for each in state.watched.board)  # the fault of this bike
+    assert place.do(UseAdapter(Fault.NONE.value)).watched is None
+
+
+def test_a_bus_that_fails_while_it_is_watched_says_so(
+    place: BenchPlace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place.do(UseAdapter(Fault.NONE.value))
+    monkeypatch.setattr("flasher.web.bench.drive", _lost)
+    state = place.do(Watch())
+    assert isinstance(state.trouble, BusError)
+    assert state.doing is Doing.NOTHING
+
+
+def _lost(*_: object, **__: object) -> None:
+    raise BusError("The adapter is gone.")
+
+
+def test_memory_and_answers_are_saved_to_a_file_as_by_the_command(place: BenchPlace) -> None:
+    state = place.do(UseAdapter(Fault.NONE.value), FindAreas())
+    assert state.areas is not None
+    (area,) = state.areas  # new.bin has no addresses, and broken.hex is no image
+    saved = place.do(BackUp(area.source)).saved
+    assert saved is not None
+    assert saved.path.parent.name == "backups"
+    assert saved.path.name.startswith("bms-W2605001-")
+    assert saved.names_running_version
+    with zipfile.ZipFile(saved.path) as archive:
+        assert set(archive.namelist()) == {"backup.json", "memory.hex"}
+    assert place.bench.state.saved_bytes == area.size_bytes
+    assert place.bench.state.areas is None
+
+
+def test_the_addresses_of_a_backup_may_be_those_of_an_image(
+    place: BenchPlace, tmp_path: Path
+) -> None:
+    image = IntelHex()
+    image.frombytes(image_of(3, NEW).data, offset=0x0800_4000)
+    image.write_hex_file(str(tmp_path / "running.hex"))
+    state = place.do(UseAdapter(Fault.NONE.value), FindAreas())
+    assert [each.start for each in state.areas or ()] == [AREA_START, 0x0800_4000]
+    state = place.do(BackUp((state.areas or ())[1].source))
+    assert state.saved is not None
+    assert state.saved.area is not None
+    assert state.saved.area.source.endswith("running.hex")
+
+
+def test_a_backup_without_memory_says_what_is_not_in_it(place: BenchPlace) -> None:
+    saved = place.do(UseAdapter(Fault.NONE.value), BackUp("")).saved
+    assert saved is not None
+    assert (saved.area, saved.names_running_version) == (None, None)
+    assert "memory" in saved.missing
+
+
+def test_nothing_is_saved_of_a_battery_that_is_silent_or_where_nothing_can_be_written(
+    place: BenchPlace, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    state = place.do(UseAdapter(Fault.OFF.value), BackUp(""))
+    assert isinstance(state.trouble, NoAnswerError)
+    assert state.saved is None
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "file"))
+    state = place.do(UseAdapter(Fault.NONE.value), BackUp(""))
+    assert isinstance(state.trouble, UsageError)
+    assert state.saved is None
+
+
+def test_what_the_battery_told_is_said_in_the_words_of_the_command(place: BenchPlace) -> None:
+    state = place.do(UseAdapter(Fault.NONE.value))
+    found = dict(told(state))
+    assert found["faults"] == [("faults", "none heard")]
+    assert ("cycles", "12") in found["history"]
+    assert "not answered" not in found
+    assert dict(told(place.do(UseAdapter(Fault.HARDWARE.value))))["faults"] != found["faults"]

@@ -24,13 +24,15 @@ from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode, UsageError
-from flasher.host.query import READ_MEMORY, check_range
+from flasher.host.query import READ_MEMORY
 from flasher.image.load import load
 from flasher.mock.store import AREA_START
 from flasher.procedures import DeviceInfo
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
+from flasher.said import say
+from flasher.settings.area import Area, area_of_image, area_of_profile
 from flasher.settings.profile import load_profile
 
 FORMAT: Final = 1
@@ -104,12 +106,16 @@ DOCUMENTS: Final = (BackupDocument,)
 
 
 @dataclass(frozen=True)
-class _Area:
-    """Where the application lies."""
+class Backup:
+    """What was read of a device, ready to be written."""
 
-    start: int
-    end: int
-    source: str
+    document: BackupDocument
+    archive: bytes
+    running_version: str
+    """What it answers; empty where it answers none."""
+
+
+DEVICE_MODEL: Final = Area(AREA_START, AREA_START + _MOCK_AREA_BYTES, say("the device model"))
 
 
 @command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.INTERRUPTED))
@@ -164,60 +170,40 @@ def backup(
         output.progress(f"asking the {target.node.name} on {connection.name} ...")
         device = connection.device(target, dialect=bus.dialect)
         found = device.identify(taps=record.taps, cancelled=stopped)
-        if not found.is_there:
-            raise silence(found)
         data = b""
-        if area is not None:
+        if area is not None and found.is_there:
             data = read_shown(device, area.start, area.end, output, record, stopped)
-    memory = None if area is None else _memory(area, data, found)
-    taken_at = datetime.datetime.now().astimezone()
-    info = info_document(found)
-    inside = DataInBackup(
-        FORMAT, __version__, taken_at.isoformat(timespec="seconds"), connection.name, memory, info
-    )
-    archive = _archive(inside, data, taken_at)
-    write_whole(file, archive, _OUTPUT)
-    document = BackupDocument(
-        target=target.name,
-        file=str(file),
-        size_bytes=len(archive),
-        sha256=hashlib.sha256(archive).hexdigest(),
-        taken_at=inside.taken_at,
-        memory=memory,
-        items=[*(name for name, answer in info.items.items() if answer is not None), "faults"],
-        not_in_it=dict(_missing(info, memory)),
-    )
+        made = backup_of(found, area, data, connection.name, file)
+    document, memory = made.document, made.document.memory
+    write_whole(file, made.archive, _OUTPUT)
     for line in _lines(document):
         output.result(line)
     output.table(document.not_in_it.items(), indent=2)
     if memory is not None and memory.names_running_version is False:
         output.error_line(
-            f"warning: the version that runs, {_running_version(found)}, does not stand in this "
+            f"warning: the version that runs, {made.running_version}, does not stand in this "
             "memory: these may not be the addresses of the application"
         )
     output.document(document)
     return ExitCode.OK
 
 
-def _area(image: str | None, profile: str | None, target: Target, bus: Bus) -> _Area:
+def _area(image: str | None, profile: str | None, target: Target, bus: Bus) -> Area:
     """Where the application lies. Raises UsageError where nobody says so."""
     if image is not None:
-        loaded = load(image)
-        if loaded.base is None:
+        found = area_of_image(load(image))
+        if found is None:
             raise UsageError(
                 f"{printable(image)} has no addresses: it is a raw binary.",
                 where="--image",
                 remedy="Name an Intel HEX, S-record or ELF file of it, or a profile with its area.",
             )
-        end = loaded.base + loaded.size_bytes
-        check_range(loaded.base, end)
-        return _Area(loaded.base, end, f"the image {printable(image)}")
-    area = load_profile(profile, target, bus.dialect).application_area
-    if area is not None:
-        check_range(area.start, area.end)
-        return _Area(area.start, area.end, "application_area of the profile")
+        return found
+    found = area_of_profile(load_profile(profile, target, bus.dialect))
+    if found is not None:
+        return found
     if bus.mock:
-        return _Area(AREA_START, AREA_START + _MOCK_AREA_BYTES, "the device model")
+        return DEVICE_MODEL
     raise UsageError(
         f"Nobody says where the application of the {target.node.name} lies.",
         cause="the documents give no addresses, and a wrong one may crash a device",
@@ -227,7 +213,32 @@ def _area(image: str | None, profile: str | None, target: Target, bus: Bus) -> _
     )
 
 
-def _memory(area: _Area, data: bytes, found: DeviceInfo) -> MemoryInBackup:
+def backup_of(
+    found: DeviceInfo, area: Area | None, data: bytes, connection: str, file: Path
+) -> Backup:
+    """What is written into `file`. Raises NoAnswerError for a device that is not there."""
+    if not found.is_there:
+        raise silence(found)
+    memory = None if area is None else _memory(area, data, found)
+    taken_at = datetime.datetime.now().astimezone()
+    info = info_document(found)
+    at = taken_at.isoformat(timespec="seconds")
+    inside = DataInBackup(FORMAT, __version__, at, connection, memory, info)
+    archive = _archive(inside, data, taken_at)
+    document = BackupDocument(
+        target=found.target.name,
+        file=str(file),
+        size_bytes=len(archive),
+        sha256=hashlib.sha256(archive).hexdigest(),
+        taken_at=at,
+        memory=memory,
+        items=[*(name for name, answer in info.items.items() if answer is not None), "faults"],
+        not_in_it=dict(_missing(info, memory)),
+    )
+    return Backup(document, archive, _running_version(found))
+
+
+def _memory(area: Area, data: bytes, found: DeviceInfo) -> MemoryInBackup:
     running = _running_version(found)
     return MemoryInBackup(
         start=area.start,

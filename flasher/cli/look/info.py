@@ -13,8 +13,8 @@ from flasher.cli.output import Output
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode, NoAnswerError
-from flasher.procedures import INFO_LISTEN_ONLY_S, DeviceInfo, Reading
-from flasher.protocol.spec import WELLING, Dialect, Target
+from flasher.procedures import INFO_LISTEN_ONLY_S, DeviceInfo
+from flasher.protocol.spec import Target
 
 _EXAMPLES: Final = """\
 examples:
@@ -102,38 +102,20 @@ def _lines(found: DeviceInfo) -> list[str]:
         return lines
     for reading in found.readings:
         if reading.answer is not None:
-            lines += ["", _title(reading), *content_lines(reading.answer)]
+            lines += ["", reading.title, *content_lines(reading.answer)]
     faults = found.survey.faults
-    lines += ["", "faults", *(content_lines(faults) if faults else _no_faults(found.dialect))]
+    none_heard = rows_lines([("faults", found.no_faults)])
+    lines += ["", "faults", *(content_lines(faults) if faults else none_heard)]
     missing = [reading for reading in found.readings if reading.answer is None]
     if missing:
         lines += ["", "not answered"]
-        lines += rows_lines([(_title(reading), _why(reading)) for reading in missing])
+        lines += rows_lines([(reading.title, reading.why) for reading in missing])
     heard = found.survey.heard[found.target.node]
     if heard.boot_version:
         lines += ["", f"its bootloader announced itself meanwhile: {heard.boot_version}"]
     if heard.damaged:
         lines += ["", f"bytes from it that made no message: {heard.damaged} times"]
     return lines
-
-
-def _title(reading: Reading) -> str:
-    return reading.name.replace("-", " ")
-
-
-def _no_faults(dialect: Dialect) -> list[str]:
-    """A fault is heard, not asked for: how long to wait for one only one document says."""
-    is_periodic = dialect is WELLING
-    proviso = "" if is_periodic else "; how often they are sent is not documented: see monitor"
-    return rows_lines([("faults", f"none heard{proviso}")])
-
-
-def _why(reading: Reading) -> str:
-    if not reading.was_asked:
-        return "not asked: the device is silent"
-    if reading.misfit:
-        return f"came in another form: {reading.misfit}"
-    return "no answer"
 
 
 def info_document(found: DeviceInfo) -> InfoDocument:
@@ -149,7 +131,7 @@ def info_document(found: DeviceInfo) -> InfoDocument:
             for reading in found.readings
         },
         unanswered={
-            reading.name: _why(reading) for reading in found.readings if reading.answer is None
+            reading.name: reading.why for reading in found.readings if reading.answer is None
         },
         faults=content_document(faults)["faults"] if faults else [],
         heard=heard_document(heard) if heard else None,

@@ -15,7 +15,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from flasher.cli.look.monitor_views import View, route
+from flasher.cli.look.monitor_views import View
 from flasher.cli.output import Output, counted
 from flasher.trace.decoder import NOT_IN_DIALECT, BusEvent, Field
 from flasher.trace.watcher import Board, MessageHistory
@@ -201,7 +201,7 @@ def _head(line: MessageHistory, *, wide: bool) -> list[Text]:
     style = _TROUBLE if seen.is_trouble else ""
     cells = [Text(f"{seen.can_id:03X}"), Text(seen.title, style=style)]
     if wide:
-        cells.insert(1, Text(route(seen)))
+        cells.insert(1, Text(seen.route))
     return cells
 
 

@@ -54,11 +54,6 @@ class FrameLine:
     event: Literal["Frame"] = "Frame"
 
 
-def route(seen: BusEvent) -> str:
-    """Who to whom; empty for an id of no node."""
-    return f"{seen.sender} > {seen.receiver}" if seen.sender else ""
-
-
 class View:
     """Takes the watcher's events; times are counted from the first of them."""
 
@@ -134,7 +129,7 @@ def _line(seen: BusEvent, at_s: float, changed: frozenset[str], *, cut: bool) ->
     cut = cut and not seen.is_alarm  # no fault is left out
     said = ", ".join(_field_text(shown, shown.name in changed, cut=cut) for shown in seen.fields)
     mark = "! " if seen.is_trouble else ""
-    text = f"{at_s:10.3f}  {seen.can_id:03X}  {route(seen):<9}  {mark}{seen.marked_title}"
+    text = f"{at_s:10.3f}  {seen.can_id:03X}  {seen.route:<9}  {mark}{seen.marked_title}"
     return f"{text}: {said}" if said else text
 
 

@@ -6,36 +6,44 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
 import click
-from platformdirs import user_state_path
+from platformdirs import user_data_path, user_state_path
 
 from flasher.api import Connection, Job, Watch, connect
 from flasher.bus.opening import bus_config
 from flasher.cli.adapters import described, detected_until, ports, using
+from flasher.cli.files import write_whole
+from flasher.cli.look.backup import DEVICE_MODEL, backup_of
 from flasher.cli.options import Bus, holder
 from flasher.cli.output import Output
-from flasher.cli.recording import Recording, RecordingOptions
+from flasher.cli.recording import Recording, RecordingOptions, recording
 from flasher.cli.stop import Stop, stop_on_signal
 from flasher.cli.upgrade.carried import Carried
 from flasher.cli.values import IMAGE_SUFFIXES
-from flasher.errors import FlasherError
+from flasher.errors import FlasherError, UsageError
 from flasher.files import parse_json, read
-from flasher.protocol.spec import Target
+from flasher.procedures import DeviceInfo
+from flasher.protocol.contents import VersionInformation
+from flasher.protocol.spec import BMS, Target
 from flasher.protocol.text import printable
 from flasher.said import say
+from flasher.settings.area import Area
 from flasher.settings.profile import Profile, load_profile
 from flasher.web import bench
-from flasher.web.bench import Adapter, Bench, Doing, FindAdapters
+from flasher.web.bench import Bench
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
+from flasher.web.bench_state import Adapter, Doing, FindAdapters, Saved
 from flasher.web.guard import BODY_MAX, Entry, application
 from flasher.web.pages import Pages
 from flasher.web.server import LOOPBACK, Server
@@ -66,8 +74,46 @@ class _Place:
         """The bus of an adapter."""
         return self._bus
 
-    def connect(self, adapter: Adapter) -> AbstractContextManager[Connection]:
+    def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
         raise NotImplementedError
+
+    def model_area(self) -> Area | None:
+        return DEVICE_MODEL if self._bus.mock else None
+
+    def back_up(
+        self,
+        adapter: Adapter,
+        area: Area | None,
+        *,
+        on_event: Callable[[object], None],
+        cancelled: Callable[[], bool],
+    ) -> Saved:
+        folder = _backup_folder()
+        watch: Watch = {"on_event": on_event, "cancelled": cancelled}
+        with (
+            recording(RecordingOptions(), self.bus(adapter), self._output, target=BMS) as record,
+            self.connect(adapter) as connection,
+        ):
+            record.opened(connection)
+            watch["taps"] = record.taps
+            device = connection.device(BMS, dialect=self.dialect)
+            found = device.identify(**watch)
+            data = b""
+            if area is not None and found.is_there:
+                data = device.read_memory(area.start, area.end, **watch)
+            path = folder / _backup_name(found)
+            made = backup_of(found, area, data, connection.name, path)
+        write_whole(path, made.archive, "")
+        document = made.document
+        return Saved(
+            path,
+            document.size_bytes,
+            area,
+            made.running_version,
+            None if document.memory is None else document.memory.names_running_version,
+            tuple(document.items),
+            document.not_in_it,
+        )
 
     def upgrade(
         self,
@@ -98,6 +144,29 @@ class _Place:
             carried.error = error
         bundle = None if carried.record is None else carried.record.bundle
         return bench.Carried(result, carried.error, bundle)
+
+
+def _backup_folder() -> Path:
+    """Where backups lie, which is there then. Raises UsageError where it cannot be made."""
+    folder = user_data_path("flasher", appauthor=False) / "backups"
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(
+            f"The folder for backups cannot be made: {error.strerror or error}.",
+            where=printable(str(folder)),
+            remedy="Make room, or make the folder by hand.",
+        ) from error
+    return folder
+
+
+def _backup_name(found: DeviceInfo) -> str:
+    """Of a new file: device, serial number and time."""
+    answers = (reading.answer for reading in found.readings)
+    version = next((each for each in answers if isinstance(each, VersionInformation)), None)
+    serial = "" if version is None else re.sub(r"[^A-Za-z0-9]+", "-", str(version.serial_number))
+    at = f"{datetime.now().astimezone():%Y%m%d-%H%M%S}"
+    return "-".join(each for each in (found.target.name, serial.strip("-"), at) if each) + ".zip"
 
 
 class Adapters(_Place):
@@ -148,9 +217,10 @@ class Adapters(_Place):
     def bus(self, adapter: Adapter) -> Bus:
         return self._buses[adapter.name]
 
-    def connect(self, adapter: Adapter) -> AbstractContextManager[Connection]:
+    def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
         bus = self.bus(adapter)
-        return connect(self.dialect, holder=holder(), fallback=bus.fallback, **bus.config)
+        asking = holder() if asks else None
+        return connect(self.dialect, holder=asking, fallback=bus.fallback, **bus.config)
 
 
 class VirtualBikes(_Place):
@@ -169,7 +239,7 @@ class VirtualBikes(_Place):
             speed = self._bus.mock_speed
             self._bikes[adapter.name] = VirtualBike(Fault(adapter.name), self.dialect, speed=speed)
 
-    def connect(self, adapter: Adapter) -> AbstractContextManager[Connection]:
+    def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
         return self._bikes[adapter.name].connect()
 
     def upgrade(

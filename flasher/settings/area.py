@@ -1,0 +1,43 @@
+"""Where the application lies in the memory of a device. The documents give no addresses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from flasher.host.query import check_range
+from flasher.image.image import Image
+from flasher.protocol.text import printable
+from flasher.said import say
+from flasher.settings.profile import Profile
+
+
+@dataclass(frozen=True)
+class Area:
+    """A range of addresses, `end` exclusive."""
+
+    start: int
+    end: int
+    source: str
+    """Who says so."""
+
+    @property
+    def size_bytes(self) -> int:
+        return self.end - self.start
+
+
+def area_of_image(image: Image) -> Area | None:
+    """Where this image lies; None for a raw binary. Raises UsageError for what is no range."""
+    if image.base is None:
+        return None
+    end = image.base + image.size_bytes
+    check_range(image.base, end)
+    return Area(image.base, end, say("the image {name}", name=printable(image.source)))
+
+
+def area_of_profile(profile: Profile) -> Area | None:
+    """Where the profile says that the application lies. Raises UsageError for what is no range."""
+    area = profile.application_area
+    if area is None:
+        return None
+    check_range(area.start, area.end)
+    return Area(area.start, area.end, say("application_area of the profile"))

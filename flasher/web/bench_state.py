@@ -1,0 +1,293 @@
+"""What the bench shows, and the orders that it takes. Pages know the bench by this alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from enum import Enum
+from pathlib import Path
+
+from flasher import events
+from flasher.api import DeviceInfo, Result
+from flasher.errors import FlasherError
+from flasher.protocol.spec import Target
+from flasher.protocol.text import printable
+from flasher.settings.area import Area
+from flasher.trace.decoder import Field
+
+
+class Doing(Enum):
+    """What the bench does now."""
+
+    NOTHING = "nothing"
+    ADAPTERS = "adapters"
+    LOOKING = "looking"
+    JUDGING = "judging"
+    UPGRADING = "upgrading"
+    LOOKING_AGAIN = "looking_again"
+    WATCHING = "watching"
+    SAVING = "saving"
+
+
+# -- what it shows ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """A way to a bike; `name` tells it from the others."""
+
+    name: str
+    note: str = ""
+    was_last: bool = False
+    """The one that was used last."""
+
+
+@dataclass(frozen=True)
+class Offer:
+    """An image file, held against the target: it fits, or `refusal` says why not."""
+
+    path: Path
+    version: str = ""
+    size_bytes: int = 0
+    packets: int = 0
+    wire_s: float = 0.0
+    sha256: str = ""
+    checks: tuple[events.CheckMade, ...] = ()
+    refusal: FlasherError | None = None
+
+    @property
+    def name(self) -> str:
+        return printable(self.path.name)
+
+
+@dataclass(frozen=True)
+class Done:
+    """An upgrade that has ended. Transferred, completed and running are three claims, of which
+    None is: not known.
+    """
+
+    at: datetime
+    adapter: Adapter
+    target: Target
+    offer: Offer
+    checks: tuple[events.CheckMade, ...]
+    before: DeviceInfo | None
+    packet: int
+    """Packets that the device has acknowledged, in the best attempt."""
+    result: Result | None
+    """None where the adapter failed, or somebody ended it at once."""
+    error: FlasherError | None
+    bundle: Path | None
+    after: DeviceInfo | None = None
+
+    @property
+    def is_transferred(self) -> bool | None:
+        return None if self.result is None else self.result.outcome.is_transferred
+
+    @property
+    def is_completed(self) -> bool | None:
+        return None if self.result is None else self.result.outcome.is_completed
+
+    @property
+    def is_running(self) -> bool | None:
+        """The application answered, and nothing speaks against its being the new one."""
+        result = self.result
+        if result is None or result.running_version is None:
+            return None
+        return result.ok
+
+    @property
+    def may_rescue_with_it(self) -> bool:
+        """The device needs an image, and has not refused this one."""
+        error = self.error
+        return error is not None and error.needs_rescue and not self.is_refused
+
+    @property
+    def is_refused(self) -> bool:
+        return self.error is not None and self.error.exit_code is self.error.exit_code.REFUSED
+
+
+@dataclass(frozen=True)
+class SeenMessage:
+    """The latest message of one kind on the bus."""
+
+    title: str
+    route: str
+    """Who to whom; empty for an id of no node."""
+    is_trouble: bool
+    fields: tuple[Field, ...]
+    changed: frozenset[str]
+    """Names of the fields that changed a moment ago."""
+    count: int
+    rate_hz: float | None
+
+
+@dataclass(frozen=True)
+class Watched:
+    """What is said on the bus, since somebody watches."""
+
+    since_s: float
+    messages: int
+    troubles: int
+    board: tuple[SeenMessage, ...]
+
+
+@dataclass(frozen=True)
+class Saved:
+    """A backup that was written."""
+
+    path: Path
+    size_bytes: int
+    area: Area | None
+    """The memory in it."""
+    running_version: str
+    """What the device answers; empty where it answers none."""
+    names_running_version: bool | None
+    """True when that stands in the memory; None where there is no memory, or no version."""
+    items: tuple[str, ...]
+    """What the device has answered."""
+    missing: Mapping[str, str]
+    """What is not in it, each with the reason."""
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything that a page shows."""
+
+    doing: Doing = Doing.NOTHING
+    is_rescue: bool = False
+    adapters: tuple[Adapter, ...] = ()
+    was_looked_for: bool = False
+    adapter: Adapter | None = None
+    bike: DeviceInfo | None = None
+    """What was heard and what the battery answered, before the upgrade."""
+    areas: tuple[Area, ...] | None = None
+    """Memory that a backup may hold, while that is to be chosen."""
+    saved_bytes: int = 0
+    """Memory that was read for a backup so far."""
+    saved: Saved | None = None
+    """The last backup."""
+    watched: Watched | None = None
+    target: Target | None = None
+    offers: tuple[Offer, ...] = ()
+    offer: Offer | None = None
+    phase: events.Phase | None = None
+    packet: int = 0
+    """Packets that the device has acknowledged in this attempt."""
+    furthest: int = 0
+    """The same, in the best attempt."""
+    repetitions: int = 0
+    transfer_began_s: float | None = None
+    now_s: float = 0.0
+    """On the clock of the bench, as `transfer_began_s`."""
+    power_cycle_s: float | None = None
+    """The device has to be switched off and on; it is waited for so long."""
+    checks: tuple[events.CheckMade, ...] = ()
+    notes: tuple[str, ...] = ()
+    is_stopping: bool = False
+    done: Done | None = None
+    trouble: FlasherError | None = None
+    """What ended the last step, but for an upgrade."""
+
+    @property
+    def is_idle(self) -> bool:
+        return self.doing is Doing.NOTHING
+
+
+# -- orders ----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class FindAdapters:
+    """Look what is plugged in."""
+
+
+@dataclass(frozen=True)
+class UseAdapter:
+    """Use this adapter, and look who answers on it."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Look:
+    """Look again who answers."""
+
+
+@dataclass(frozen=True)
+class Watch:
+    """Show what is said on the bus until it is stopped. Nothing is sent."""
+
+
+@dataclass(frozen=True)
+class FindAreas:
+    """Look which memory a backup may hold."""
+
+
+@dataclass(frozen=True)
+class BackUp:
+    """Save what the battery tells, and the memory of the area with this source; "" is none."""
+
+    source: str
+
+
+@dataclass(frozen=True)
+class LeaveBackup:
+    """Save nothing."""
+
+
+@dataclass(frozen=True)
+class ChooseTarget:
+    """Upgrade this device, and look which images fit; "" is none."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Look again which images fit."""
+
+
+@dataclass(frozen=True)
+class ChooseImage:
+    """Take this image; "" is none."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class Upgrade:
+    """Upgrade, with the image of this digest: what was chosen where the button was pressed."""
+
+    target: str
+    sha256: str
+
+
+@dataclass(frozen=True)
+class StartOver:
+    """Begin with the next bike, or with the rescue of one."""
+
+    is_rescue: bool = False
+
+
+@dataclass(frozen=True)
+class RescueIt:
+    """Rescue the device whose upgrade has just failed."""
+
+
+Order = (
+    FindAdapters
+    | UseAdapter
+    | Look
+    | Watch
+    | FindAreas
+    | BackUp
+    | LeaveBackup
+    | ChooseTarget
+    | Judge
+    | ChooseImage
+    | Upgrade
+    | StartOver
+    | RescueIt
+)
