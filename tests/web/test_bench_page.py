@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import threading
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -126,6 +127,26 @@ def test_files_that_do_not_fit_say_why_and_dropped_ones_are_looked_at(page: Page
     expect(page.locator("#image-2")).to_have_text("own <b>.bin")
     page.set_input_files("#file", {"name": "run.sh", "mimeType": "", "buffer": image})
     expect(page.locator("#said")).to_contain_text("no image")
+
+
+def test_the_bus_is_watched_and_the_battery_saved(page: Page) -> None:
+    page.click(f"#adapter button:text-is('{Fault.HARDWARE.value}')")
+    page.click("#told-all")
+    expect(page.locator("#told")).to_contain_text("over discharge protection")
+    expect(page.locator("#told")).to_contain_text("most recent charge interval")
+    page.click("#do-watch")
+    expect(page.locator("#watched tbody")).to_contain_text("voltage 40153 mV")
+    page.click("#stop")
+    expect(page.locator("#watched")).to_contain_text("stopped")
+    page.click("#do-areas")
+    page.focus("#area-1")
+    _check(page)
+    page.click("#area-1")
+    expect(page.locator("#saved")).to_contain_text("It names the version that runs.")
+    with page.expect_download() as download:
+        page.click("#download")
+    with zipfile.ZipFile(download.value.path()) as archive:
+        assert "memory.hex" in archive.namelist()
 
 
 def test_an_image_that_the_device_refuses_is_not_said_to_be_completed(page: Page) -> None:
