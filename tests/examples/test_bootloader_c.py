@@ -22,7 +22,8 @@ def _need(*programs: str) -> None:
         pytest.skip(why)
 
 
-def test_the_whole_suite_under_sanitizers(flasher: Flasher, tmp_path: Path) -> None:
+def test_some_of_every_group_under_sanitizers(flasher: Flasher, tmp_path: Path) -> None:
+    """The whole suite on it is a command: `python -m tests.campaigns.planted_bugs none`."""
     _need("make", "gcc")
     make("host", tmp_path, "DEFINES=-DIMAGE_CHECKSUM=1")
     profile = tmp_path / "profile.toml"
@@ -36,12 +37,12 @@ def test_the_whole_suite_under_sanitizers(flasher: Flasher, tmp_path: Path) -> N
             tmp_path / "boot",
             "--profile",
             profile,
+            "--quick",
             "--json",
         )
     )
     results = ran.document["report"]["results"]
-    others = {result["id"]: result["findings"] for result in results if result["status"] != "pass"}
-    assert list(others) == ["BU-07"], others  # takes an injector on the line
+    assert [result for result in results if result["status"] != "pass"] == []
     assert ran.code == 0
 
 
@@ -51,7 +52,8 @@ def test_another_target_in_a_shared_library(flasher: Flasher, tmp_path: Path) ->
     make("host", tmp_path, "DEFINES=-DTARGET=TARGET_OBC")
     subject = tmp_path / "libboot.so"
     ran = flasher(
-        *("conformance", "-t", "obc", "--subject", subject, "--profile", PROFILE, "--quick")
+        *("conformance", "-t", "obc", "--subject", subject, "--profile", PROFILE),
+        *("--case", "RS-01", "--case", "TX-01", "--case", "EN-01"),
     )
     assert ran.code == 0, ran.out
 
