@@ -14,7 +14,7 @@ author = "the flasher maintainers"
 copyright = "Apache-2.0"
 version = release = flasher.__version__
 
-extensions = ["myst_parser", "tests.site.diagrams"]
+extensions = ["myst_parser", "tests.site.diagrams", "tests.site.made"]
 exclude_patterns = ["_static", "pictures"]
 nitpicky = True
 

@@ -126,8 +126,8 @@ reading is a default. Drawn from `flasher/conformance/clauses.py` by
 `python -m tests.readings_document`; a test keeps it so, and that the tests named here exist.
 
 Options that change a reading stand in three places: the suite's profile
-([conformance.md](../how-to/conformance.md#write-the-profile)), the host's profile
-([profile.md](../reference/profile.md)),
+([profile of the suite](../reference/conformance_profile.md)), the host's profile
+([profile](../reference/profile.md)),
 and the choices of the device model (`flasher mock --set`).
 """
 

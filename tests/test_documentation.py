@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from flasher.cli.main import COMMANDS
 from flasher.errors import ExitCode
 from tests import diagram
 
@@ -27,9 +26,8 @@ def test_the_reference_lists_every_exit_code() -> None:
     assert listed == {int(code) for code in ExitCode}
 
 
-def test_the_readme_names_every_command() -> None:
-    for command in COMMANDS:
-        assert f"flasher {command}" in README
+def test_the_readme_is_read_in_three_minutes() -> None:
+    assert len(README.encode()) <= 5 * 1024
 
 
 def test_the_readme_opens_with_two_commands() -> None:

@@ -25,7 +25,7 @@ from flasher.errors import (
 )
 from flasher.protocol.text import printable
 
-_PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
+PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
     "upgrade a device": {
         "flash": Entry("upgrade.flash:flash", "upgrade a device"),
         "rescue": Entry(
@@ -90,7 +90,7 @@ _PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
     },
 }
 """The commands, by what they are for."""
-COMMANDS: Final = {name: each for group in _PURPOSES.values() for name, each in group.items()}
+COMMANDS: Final = {name: each for group in PURPOSES.values() for name, each in group.items()}
 _EPILOG: Final = """\
 examples:
   flasher image-info firmware.hex
@@ -170,7 +170,7 @@ def _unfinished(output: Output) -> str:
     )
 
 
-@click.group(cls=Program, entries=_PURPOSES, epilog=_EPILOG)
+@click.group(cls=Program, entries=PURPOSES, epilog=_EPILOG)
 @click.pass_context
 def flasher(ctx: click.Context) -> int:
     """Upgrade the firmware of Welling mid-drive e-bike systems over CAN, and look at what they say.

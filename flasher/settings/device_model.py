@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @cache
-def _reader() -> Reader[DeviceProfile]:
+def reader() -> Reader[DeviceProfile]:
     from flasher.settings.reading import Reader  # noqa: PLC0415
 
     return Reader(DeviceProfile, "device model")
@@ -28,7 +28,7 @@ def set_option(profile: DeviceProfile, key: str, text: str) -> DeviceProfile:
     Whole numbers take 0x and the suffixes K and M. Raises UsageError, naming what is known, for
     an unknown key and for a value that is not allowed.
     """
-    return _reader().read({**asdict(profile), key: text}, "--set")
+    return reader().read({**asdict(profile), key: text}, "--set")
 
 
 def set_options(profile: DeviceProfile, choices: Sequence[str]) -> DeviceProfile:
@@ -44,7 +44,7 @@ def set_options(profile: DeviceProfile, choices: Sequence[str]) -> DeviceProfile
 def describe_options() -> list[tuple[str, str, str]]:
     """All options as (key, allowed values with the default first, one line of help)."""
     described = []
-    for key in _reader().keys.values():
+    for key in reader().keys.values():
         default = "none" if key.default is None else str(key.default)
         words = [default, *(word for word in key.choices if word != default)]
         described.append((key.path, " | ".join(words), key.text))

@@ -63,7 +63,7 @@ def find_release(
 
 
 @cache
-def _reader() -> Reader[Release]:
+def reader() -> Reader[Release]:
     from flasher.settings.reading import Reader  # noqa: PLC0415
 
     return Reader(
@@ -90,12 +90,12 @@ def read_release(path: str | os.PathLike[str]) -> Release:
     )
     _check_format(document, printable(os.fspath(path)))
     stated = {key: value for key, value in document.items() if key != FORMAT_KEY}
-    return _reader().read(stated, path, source=os.fspath(path))
+    return reader().read(stated, path, source=os.fspath(path))
 
 
 def check_statement(key: str, value: object) -> None:
     """Raise ValueError saying why a manifest cannot hold this value."""
-    _, faults = _reader().check({key: value}, source="")
+    _, faults = reader().check({key: value}, source="")
     for fault in faults:
         if fault.place.startswith(key):
             raise ValueError(str(fault))
@@ -149,7 +149,7 @@ def release_of(  # noqa: PLR0913  one argument for each statement
         "previous_except": list(previous_except),
         "notes": notes,
     }
-    release, faults = _reader().check(stated, source=source)
+    release, faults = reader().check(stated, source=source)
     if release is None or faults:
         raise ValueError("\n".join(map(str, faults)))
     return release

@@ -65,9 +65,11 @@ class SocketConfig(Table):
     """One socket: an adapter of its own, or virtual units."""
 
     name: ShortText
+    """As screens and cards call it."""
     interface: str = ""
     """As python-can names it."""
     channel: str = ""
+    """As python-can names it; not needed with one of the next two."""
     serial_number: str = ""
     """Of the adapter; it finds the channel."""
     usb_path: str = ""
@@ -75,7 +77,7 @@ class SocketConfig(Table):
     bus: dict[str, BusValue] = Field(default_factory=dict)
     """Further keywords of python-can's bus."""
     power: str = ""
-    """A command that switches the unit's power, with `{on|off}` for the two words."""
+    """A command, run without a shell, that switches the unit's power; `{on|off}` for the words."""
     mock: MockUnits | None = None
 
     @field_validator("channel", mode="before")
@@ -114,6 +116,7 @@ class ScannerConfig(Table):
     """A scanner that the station reads itself."""
 
     name: ShortText
+    """As screens call it."""
     input: str = ""
     """A Linux input device, as "/dev/input/by-id/usb-..."."""
     usb_path: str = ""
@@ -159,20 +162,23 @@ class StationConfig(Table):
     """The whole file."""
 
     name: ShortText = "station"
+    """Of the station; another one for each."""
     records: str = "records.sqlite"
     """A file beside this one, or the URL of a PostgreSQL server."""
     files: str = ""
-    """The folder of the attachments; empty: beside the file of the records."""
+    """The folder of the traces; needed for a server, else beside the file of the records."""
     keys: str = ""
     """The folder of the signing key; empty: a place of this user."""
     heads: str = ""
-    """The folder in which the signed heads of the audit trail are kept; empty: beside the key."""
+    """The folder in which the signed heads of the audit trail are kept, best on another computer;
+    empty: beside the key.
+    """
     lock_timeout_s: float = Field(default=DEFAULT_LOCK_TIMEOUT_S, gt=0, le=60)
     """How long a record waits for another program that holds the database."""
     badges: str = ""
     """The table of the badges (TOML): who may work here; empty: there are none."""
     shifts: tuple[time, ...] = Field(default=DEFAULT_SHIFTS, min_length=1, max_length=8)
-    """When each shift begins, as "06:00"."""
+    """When each shift begins, as "06:00"; figures of the operator page count from there."""
     sound_volume: float = Field(default=0.3, ge=0, le=1)
     """Of the operator page; 0 is silent."""
     label: LabelConfig | None = None

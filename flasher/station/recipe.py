@@ -75,7 +75,9 @@ class SerialNumber(Table):
     example: str = Field(min_length=1, max_length=TEXT_MAX)
     """A good serial number; `station check` tries the whole recipe with it."""
     check_digit: str = ""
-    """Its method; without it there is none."""
+    """Its method, as luhn, gtin, mod11-2, mod11-10, mod37-2, mod37-36 or mod97-10; without it there
+    is none.
+    """
     check_group: str = ""
     """The group that the check digit is of; without it the whole serial number."""
     lot_group: str = ""
@@ -83,7 +85,9 @@ class SerialNumber(Table):
     number_group: str = ""
     """The group with the running number."""
     number_min: int = Field(default=0, ge=0)
+    """The smallest running number."""
     number_max: int | None = Field(default=None, ge=0)
+    """The largest running number."""
 
     @field_validator("pattern")
     @classmethod
@@ -154,11 +158,13 @@ class Firmware(TargetTable):
     """A target, and what it is flashed with. Targets are done in the order of the recipe."""
 
     image: str = Field(min_length=1)
+    """A file in the recipe's folder."""
     manifest: str = ""
     """What its maker states of it; without it the one beside the image, `IMAGE.toml`."""
     sha256: Sha256
     """Of the bytes to be sent, as in the manifest."""
     base: int | None = Field(default=None, ge=0, le=0xFFFF_FFFF)
+    """Address of the first byte of a raw binary."""
     hardware_versions: tuple[ShortText, ...] = ()
     """Narrower than the manifest's, which hold as well; * stands for any text."""
     previous_versions: tuple[ShortText, ...] = ()
@@ -171,7 +177,9 @@ class Write(TargetTable):
     """Something to write to a unit, with values that are templates."""
 
     item: ShortText
+    """As `flasher write --list` names it."""
     values: tuple[str, ...] = Field(min_length=1)
+    """May hold {serial}, {lot}, {date:%Y%m%d} and {match.GROUP}; each is read back."""
     manufacturer: bool = False
     """Needed for what the document reserves for the manufacturer."""
 
@@ -180,16 +188,22 @@ class Unchanged(TargetTable):
     """Something that must read the same after the run as before it."""
 
     item: ShortText
+    """As `flasher read --list` names it."""
 
 
 class Limit(TargetTable):
     """Something that is measured in a step, with its limits."""
 
     step: Literal[StepName.IDENTIFY, StepName.CHECK, StepName.VERIFY] = StepName.CHECK
+    """When it is measured: check is before the first write."""
     item: ShortText
+    """As `flasher read --list` names it."""
     field: ShortText
+    """A field of that item, with its unit in its name."""
     low: float | None = None
+    """The least good value."""
     high: float | None = None
+    """The greatest good value."""
     expected: str | None = None
     """For a text; a template."""
 
@@ -207,7 +221,9 @@ class StepRule(Table):
     """How long a step may take, and when it is tried again."""
 
     time_limit_s: Seconds | None = None
+    """A unit whose step takes longer has failed."""
     tries: int = Field(default=1, ge=1, le=_TRIES_MAX)
+    """How often it is begun, in all."""
     pause_s: float = Field(default=0.0, ge=0, le=_TIME_MAX_S)
     """Between two tries."""
     power_cycle: bool = False
@@ -226,9 +242,11 @@ class Golden(Table):
     """Known good units that test a socket before it may go on. Their runs count in no figure."""
 
     serial_numbers: tuple[ShortText, ...] = Field(min_length=1)
+    """Of the known good units."""
     shift_starts: tuple[time, ...] = ()
     """Local times at which a shift starts; one must pass on each socket after each."""
     every_h: float | None = Field(default=None, gt=0, le=24 * 31)
+    """One must pass on each socket after so many hours."""
 
     @model_validator(mode="after")
     def _check_rule(self) -> Golden:
@@ -243,10 +261,13 @@ class Recipe(Table):
     """A recipe. `target` and `write` are in the order in which they are done."""
 
     name: ShortText
+    """As people know it."""
     part: ShortText
     """The product. A serial number is unique for its part."""
     revision: Annotated[str, Field(min_length=1, max_length=64)]
+    """Raise it with every change: the records name it."""
     notes: str = ""
+    """For people."""
     profile: str = ""
     """A target profile of `flasher profile`, in the recipe's folder."""
     serial_number: SerialNumber
@@ -257,6 +278,7 @@ class Recipe(Table):
     limit: tuple[Limit, ...] = ()
     step: dict[StepName, StepRule] = Field(default_factory=dict)
     duplicate: Duplicate = Duplicate.BLOCK
+    """What is done with a unit that has passed already."""
     golden: Golden | None = None
     allow_completed_not_read_back: bool = True
     """A target that cannot be asked for its version may pass; the record says so."""

@@ -22,7 +22,6 @@ from flasher.conformance.simulated import SimulatedPort
 from flasher.errors import BusError, ExitCode
 from tests.cli.conftest import SAMPLES, Flasher
 
-from . import profile_table
 from .bench import PROFILE, fails_once, passes_once, run_case
 
 MOCK = ("conformance", "-t", "bms", "--mock")
@@ -366,10 +365,3 @@ def test_the_profile_of_the_mock_is_what_the_mock_is_judged_by(
     assert load_profile(path).choice("tx_02") == "nak_next"
     run = flasher(*MOCK, *choice, "--profile", path, "--case", "UP-04")
     assert run.code == 0
-
-
-def test_the_guide_has_the_table_of_all_keys() -> None:
-    guide = profile_table.GUIDE.read_text(encoding="utf-8")
-    drawn = "draw it anew: python -m tests.conformance.profile_table"
-    assert guide == profile_table.with_table(guide), drawn
-    assert all(f"`{key}`" in guide for key in profile_keys())
