@@ -21,6 +21,7 @@ from filelock import FileLock
 from platformdirs import user_data_path
 
 from flasher.files import opened
+from flasher.said import say
 
 SIZE_MAX: Final = 2 * 1024 * 1024
 """In bytes: beyond it the older half is dropped, some thousand flashes."""
@@ -28,6 +29,18 @@ _READ_MAX: Final = 2 * SIZE_MAX
 _LOCK_LIMIT_S: Final = 3.0
 _BEGAN: Final = "began"
 _ENDED: Final = "ended"
+
+
+_TRANSFERRED: Final = {
+    True: say("transferred"),
+    False: say("not transferred"),
+    None: say("transferred not known"),
+}
+_COMPLETED: Final = {
+    True: say("completed"),
+    False: say("not completed"),
+    None: say("completed not known"),
+}
 
 
 @dataclass(frozen=True)
@@ -70,6 +83,16 @@ class Ended:
     """The device was left without an application, or perhaps without one."""
     bundle: str | None
     """The folder with trace and report."""
+
+    @property
+    def claims(self) -> tuple[str, str, str]:
+        """The three claims in words, of which none stands for another."""
+        version = self.running_version
+        return (
+            _TRANSFERRED[self.transferred],
+            _COMPLETED[self.completed],
+            say("running {version}", version=version) if version else say("running not known"),
+        )
 
 
 @dataclass(frozen=True)

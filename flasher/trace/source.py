@@ -135,6 +135,11 @@ def _no_report(path: Path, cause: str) -> UsageError:
     )
 
 
+def recorded_of(path: Path) -> Recorded:
+    """What the command said that has left a bundle. Raises UsageError where its report is none."""
+    return _recorded(_report(path / REPORT))
+
+
 def _number(value: object) -> int | None:
     return value if isinstance(value, int) and 0 < value <= 10_000_000 else None
 

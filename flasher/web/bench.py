@@ -51,6 +51,7 @@ from flasher.web.bench_state import (
     SeenMessage,
     StartOver,
     State,
+    TakeFiles,
     Upgrade,
     UseAdapter,
     Watch,
@@ -128,6 +129,10 @@ class Workplace(Protocol):
         """Files that may be images."""
         ...
 
+    def dropped(self) -> Sequence[str]:
+        """Names of images and manifests that were dropped on the page."""
+        ...
+
     def upgrade(
         self,
         adapter: Adapter,
@@ -159,6 +164,7 @@ class Bench:
         """An order was given and is not carried out yet."""
         self._orders: Queue[Order] = Queue()
         self._stop = threading.Event()
+        self._has_new_files = threading.Event()
         self._is_closing = self._ends_at_once = False
         self._steps: dict[type[Order], Callable[[], None]] = {
             FindAdapters: self._find_adapters,
@@ -167,6 +173,7 @@ class Bench:
             FindAreas: self._find_areas,
             LeaveBackup: lambda: self._set(areas=None),
             Judge: self._judge,
+            TakeFiles: self._take_files,
             RescueIt: self._rescue_it,
         }
         """Of the orders that say no more than their name."""
@@ -183,6 +190,10 @@ class Bench:
             self._stop.clear()
         self._orders.put(order)
         return True
+
+    def files_came(self) -> None:
+        """Something was dropped: look at it when there is time."""
+        self._has_new_files.set()
 
     def stop(self) -> None:
         """End what it does, at the next message boundary."""
@@ -205,7 +216,9 @@ class Bench:
             try:
                 order = self._orders.get(timeout=TURN_S)
             except Empty:
-                continue
+                if not self._has_new_files.is_set() or not self.order(TakeFiles()):
+                    continue
+                order = self._orders.get()
             self.carry_out(order)
 
     def carry_out(self, order: Order) -> None:
@@ -254,7 +267,8 @@ class Bench:
             case ChooseTarget(""):
                 self._set(target=None, offers=(), offer=None, done=None)
             case ChooseImage(""):
-                self._set(offer=None, done=None)
+                self._set(done=None)
+                self._judge()
             case ChooseTarget(name):
                 self._set(target=_known(TARGETS, name), offer=None, done=None)
                 self._judge()
@@ -266,7 +280,10 @@ class Bench:
                 self._upgrade()
             case StartOver(is_rescue):
                 self.state = State(
-                    adapters=self.state.adapters, was_looked_for=True, is_rescue=is_rescue
+                    adapters=self.state.adapters,
+                    was_looked_for=True,
+                    is_rescue=is_rescue,
+                    dropped=self.state.dropped,
                 )
                 self._find_adapters()
 
@@ -310,6 +327,12 @@ class Bench:
             offers.append(self._judged(path))
         offers.sort(key=lambda offer: (offer.refusal is not None, offer.name))
         self._set(offers=tuple(offers))
+
+    def _take_files(self) -> None:
+        self._has_new_files.clear()
+        self._set(dropped=tuple(self._place.dropped()))
+        if self.state.target is not None and self.state.offer is None:
+            self._judge()
 
     def _watch(self) -> None:
         board = Board()

@@ -7,14 +7,16 @@ import json
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
+from urllib.parse import urlencode
 
 from starlette.requests import Request
-from starlette.responses import FileResponse, JSONResponse, Response, StreamingResponse
+from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Route
 
 from flasher.protocol.contents import RunningInformation, VersionInformation
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import TARGETS
+from flasher.protocol.text import printable
 from flasher.trace.decoder import content_fields
 from flasher.web import bench_state as bench
 from flasher.web.bench import Bench
@@ -50,10 +52,15 @@ _ORDERS: Final[Mapping[str, Callable[[Mapping[str, str]], Order]]] = {
 class Shelf:
     """Where images come from: a folder, and one for what is dropped on the page."""
 
-    def __init__(self, folder: Path, dropped: Path, suffixes: Sequence[str]) -> None:
+    def __init__(
+        self, folder: Path, dropped: Path, suffixes: Sequence[str], traces: Sequence[str]
+    ) -> None:
         self.folder = folder
         self._dropped = dropped
+        self.traces = dropped / "traces"
+        self.traces.mkdir(exist_ok=True)
         self._suffixes = tuple(f".{suffix}" for suffix in suffixes)
+        self._trace_suffixes = tuple(f".{suffix}" for suffix in traces)
 
     def files(self) -> list[Path]:
         """Files that may be images; dropped ones first."""
@@ -66,14 +73,23 @@ class Shelf:
     def _may_be_image(self, path: Path) -> bool:
         return path.suffix.lower() in self._suffixes and path.is_file()
 
-    def take(self, name: str, data: bytes) -> bool:
-        """Keep a dropped file; False for one that is neither image nor manifest."""
+    def dropped(self) -> list[str]:
+        """Names of dropped images and manifests."""
+        return sorted(printable(each.name) for each in self._dropped.iterdir() if each.is_file())
+
+    def take(self, name: str, data: bytes) -> Path | None:
+        """Keep a dropped file; None for one that is neither image, manifest nor trace. Raises
+        OSError.
+        """
         plain = name.replace("\\", "/").rpartition("/")[2]
-        is_known = Path(plain).suffix.lower() in (*self._suffixes, _MANIFEST)
+        suffix = Path(plain).suffix.lower()
+        is_trace = suffix in self._trace_suffixes
+        is_known = is_trace or suffix in (*self._suffixes, _MANIFEST)
         if not is_known or not plain.isprintable() or plain.startswith(".") or len(plain) > 200:
-            return False
-        (self._dropped / plain).write_bytes(data)
-        return True
+            return None
+        path = (self.traces if is_trace else self._dropped) / plain
+        path.write_bytes(data)
+        return path
 
 
 def upload_limit(usual: int) -> Callable[[str], int]:
@@ -96,7 +112,6 @@ class BenchPage:
             Route("/", self._page),
             Route("/bench/events", self._events),
             Route("/bench/sheet", self._sheet),
-            Route("/bench/backup", self._backup),
             Route("/bench/order", self._order, methods=["POST"]),
             Route(UPLOAD, self._upload, methods=["POST"]),
         ]
@@ -120,12 +135,6 @@ class BenchPage:
             name = f"{done.target.name}-{done.at:%Y%m%d-%H%M%S}.html"
             page.headers["content-disposition"] = f'attachment; filename="{name}"'
         return page
-
-    async def _backup(self, _request: Request) -> Response:
-        saved = self._bench.state.saved
-        if saved is None or not saved.path.is_file():
-            return Response("No backup was made.", 404)
-        return FileResponse(saved.path, filename=saved.path.name)
 
     async def _events(self, request: Request) -> Response:
         return StreamingResponse(
@@ -170,9 +179,15 @@ class BenchPage:
     async def _upload(self, request: Request) -> Response:
         data = await request.body()
         name = request.query_params.get("name", "")
-        if not await asyncio.to_thread(self._shelf.take, name, data):
-            return JSONResponse({"error": "no image"}, 415)
-        self._bench.order(bench.Judge())
+        try:
+            path = await asyncio.to_thread(self._shelf.take, name, data)
+        except OSError as error:
+            return JSONResponse({"error": error.strerror}, 507)
+        if path is None:
+            return JSONResponse({"error": "no file of flasher"}, 415)
+        if path.parent == self._shelf.traces:
+            return JSONResponse({"page": f"/kept/story?{urlencode({'trace': path.name})}"})
+        self._bench.files_came()
         return JSONResponse({})
 
 

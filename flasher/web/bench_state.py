@@ -169,6 +169,8 @@ class State:
     saved: Saved | None = None
     """The last backup."""
     watched: Watched | None = None
+    dropped: tuple[str, ...] = ()
+    """Names of files that were dropped on the page."""
     target: Target | None = None
     offers: tuple[Offer, ...] = ()
     offer: Offer | None = None
@@ -250,6 +252,11 @@ class Judge:
 
 
 @dataclass(frozen=True)
+class TakeFiles:
+    """Look at files that were dropped on the page."""
+
+
+@dataclass(frozen=True)
 class ChooseImage:
     """Take this image; "" is none."""
 
@@ -286,6 +293,7 @@ Order = (
     | LeaveBackup
     | ChooseTarget
     | Judge
+    | TakeFiles
     | ChooseImage
     | Upgrade
     | StartOver

@@ -18,10 +18,13 @@ _PART: Final = "part_"
 
 
 class Pages:
-    """Renders pages. `language`: of who did not choose one; None: what the browser asks for."""
+    """Renders pages. `language`: of who did not choose one; None: what the browser asks for. With
+    `remembers_language` a language that was chosen holds for the other pages of the session.
+    """
 
-    def __init__(self, language: str | None = None) -> None:
+    def __init__(self, language: str | None = None, *, remembers_language: bool = False) -> None:
         self._language = language
+        self._remembers_language = remembers_language
         self._environment: Environment = environment(
             ChoiceLoader(
                 [
@@ -35,7 +38,10 @@ class Pages:
     def words_of(self, request: Request) -> Words:
         """The language of a request."""
         accepted = request.headers.get("accept-language", "").replace(" ", "").split(",")
-        return chosen(request.query_params.get("lang") or self._language, accepted)
+        wanted = request.query_params.get("lang")
+        if self._remembers_language:
+            wanted = request.session["lang"] = wanted or request.session.get("lang", "")
+        return chosen(wanted or self._language, accepted)
 
     def parts(self, words: Words, template: str, **context: Any) -> dict[str, str]:
         """The pieces of a page: what each macro `part_...` of a template gives, by its name."""

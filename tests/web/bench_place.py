@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -10,14 +11,18 @@ from pathlib import Path
 from flasher.api import Job
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
+from flasher.cli.recording import bundle_folder
 from flasher.cli.stop import Stop
-from flasher.cli.upgrade.bench_page import VirtualBikes
-from flasher.cli.values import IMAGE_SUFFIXES
+from flasher.cli.upgrade.bench_page import VirtualBikes, backup_folder
+from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.web import bench
 from flasher.web.bench import Bench
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Adapter, FindAdapters, Order, State
+from flasher.web.desk import Answer, DeskPages, Question
 from flasher.web.guard import BODY_MAX, Entry, application
+from flasher.web.kept import PAGES as KEPT
+from flasher.web.kept import Kept
 from flasher.web.pages import Pages
 from flasher.web.server import Server
 from tests.end_to_end.stage import NEW, image_of
@@ -60,7 +65,7 @@ class BenchPlace:
     def __init__(self, folder: Path) -> None:
         dropped = folder / "dropped"
         dropped.mkdir()
-        self.shelf = Shelf(folder_of_images(folder), dropped, IMAGE_SUFFIXES)
+        self.shelf = Shelf(folder_of_images(folder), dropped, IMAGE_SUFFIXES, TRACE_SUFFIXES)
         bus = Bus(mock=True, mock_speed=0.0)
         self.bikes = HeldBikes(bus, Output(verbosity=-1), self.shelf, Stop(None))
         self.bench = Bench(self.bikes, lambda: 0.0)
@@ -75,12 +80,17 @@ class BenchPlace:
     @contextmanager
     def served(self) -> Iterator[str]:
         """Its page, with its thread; gives the address that lets a browser in."""
-        pages = Pages()
+        pages = Pages(remembers_language=True)
+        kept = Kept(bundle_folder(), backup_folder(), self.shelf.traces)
+
+        async def ask(question: Question) -> Answer:
+            return await asyncio.to_thread(kept.answer, question)
+
         entry = Entry(pages)
         page = BenchPage(pages, self.bench, self.shelf, is_mock=True)
         app = application(
-            page.routes, pages=pages, hosts={"127.0.0.1"}, secret=_KEY, now=lambda: 0.0,
-            entry=entry, uploads=upload_limit(BODY_MAX),
+            [*page.routes, *DeskPages(pages, ask, KEPT).routes], pages=pages, hosts={"127.0.0.1"},
+            secret=_KEY, now=lambda: 0.0, entry=entry, uploads=upload_limit(BODY_MAX),
         )  # fmt: skip
         worker = threading.Thread(target=self.bench.run, daemon=True)
         with Server(app, "127.0.0.1", 0) as server:

@@ -11,8 +11,9 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -27,10 +28,10 @@ from flasher.cli.files import write_whole
 from flasher.cli.look.backup import DEVICE_MODEL, backup_of
 from flasher.cli.options import Bus, holder
 from flasher.cli.output import Output
-from flasher.cli.recording import Recording, RecordingOptions, recording
+from flasher.cli.recording import Recording, RecordingOptions, bundle_folder, recording
 from flasher.cli.stop import Stop, stop_on_signal
 from flasher.cli.upgrade.carried import Carried
-from flasher.cli.values import IMAGE_SUFFIXES
+from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.errors import FlasherError, UsageError
 from flasher.files import parse_json, read
 from flasher.procedures import DeviceInfo
@@ -44,7 +45,10 @@ from flasher.web import bench
 from flasher.web.bench import Bench
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Adapter, Doing, FindAdapters, Saved
+from flasher.web.desk import Desk, DeskPages
 from flasher.web.guard import BODY_MAX, Entry, application
+from flasher.web.kept import PAGES as KEPT
+from flasher.web.kept import Kept
 from flasher.web.pages import Pages
 from flasher.web.server import LOOPBACK, Server
 from flasher.web.virtual_bike import NOTES, Fault, VirtualBike
@@ -60,6 +64,7 @@ class _Place:
     def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop) -> None:
         self.dialect = bus.dialect
         self.images = shelf.files
+        self.dropped = shelf.dropped
         self._bus = bus
         self._output = output
         self._stop = stop
@@ -88,7 +93,15 @@ class _Place:
         on_event: Callable[[object], None],
         cancelled: Callable[[], bool],
     ) -> Saved:
-        folder = _backup_folder()
+        folder = backup_folder()
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(
+                f"The folder for backups cannot be made: {error.strerror or error}.",
+                where=printable(str(folder)),
+                remedy="Make room, or make the folder by hand.",
+            ) from error
         watch: Watch = {"on_event": on_event, "cancelled": cancelled}
         with (
             recording(RecordingOptions(), self.bus(adapter), self._output, target=BMS) as record,
@@ -146,18 +159,9 @@ class _Place:
         return bench.Carried(result, carried.error, bundle)
 
 
-def _backup_folder() -> Path:
-    """Where backups lie, which is there then. Raises UsageError where it cannot be made."""
-    folder = user_data_path("flasher", appauthor=False) / "backups"
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-    except OSError as error:
-        raise UsageError(
-            f"The folder for backups cannot be made: {error.strerror or error}.",
-            where=printable(str(folder)),
-            remedy="Make room, or make the folder by hand.",
-        ) from error
-    return folder
+def backup_folder() -> Path:
+    """Where backups of the page lie."""
+    return user_data_path("flasher", appauthor=False) / "backups"
 
 
 def _backup_name(found: DeviceInfo) -> str:
@@ -267,17 +271,22 @@ def serve(
     which that came, where it did not end well.
     """
     ctx = click.get_current_context()
-    pages = Pages()
+    pages = Pages(remembers_language=True)
     entry = Entry(pages)
     with (
+        ExitStack() as stack,
         TemporaryDirectory(prefix="flasher-images-") as dropped,
         stop_on_signal(lambda: output.error_line("stopping ...")) as stop,
     ):
-        shelf = Shelf(images.expanduser().resolve(), Path(dropped), IMAGE_SUFFIXES)
+        folder = images.expanduser().resolve()
+        shelf = Shelf(folder, Path(dropped), IMAGE_SUFFIXES, TRACE_SUFFIXES)
+        desk = Desk(partial(Kept, bundle_folder(), backup_folder(), shelf.traces))
+        stack.callback(desk.close)
         kind = VirtualBikes if bus.mock else Adapters
         machine = Bench(kind(bus, output, shelf, stop), time.monotonic)
+        page = BenchPage(pages, machine, shelf, is_mock=bus.mock)
         app = application(
-            BenchPage(pages, machine, shelf, is_mock=bus.mock).routes,
+            [*page.routes, *DeskPages(pages, desk.ask, KEPT).routes],
             pages=pages,
             hosts=LOOPBACK,
             secret=secrets.token_urlsafe(32),

@@ -12,7 +12,7 @@ from flasher.cli.framework import command, option
 from flasher.cli.options import target_option
 from flasher.cli.output import Output, byte_count, counted
 from flasher.errors import ExitCode
-from flasher.history import Ended, Flash, History, matching
+from flasher.history import Flash, History, matching
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 
@@ -93,17 +93,10 @@ def _lines(flash: Flash) -> Iterator[str]:
         return
     if ended.previous_version:
         yield printable(f"  before   {ended.previous_version}")
-    yield printable(f"  claims   {', '.join(_claims(ended))}")
+    yield printable(f"  claims   {', '.join(ended.claims)}")
     code = f"exit code {ended.exit_code}"
     yield printable(f"  end      {f'{code}: {ended.what}' if ended.what else code}")
     if ended.needs_rescue:
         yield "           the device had no application then, or perhaps none: flasher rescue"
     if ended.bundle:
         yield printable(f"  bundle   {ended.bundle}")
-
-
-def _claims(ended: Ended) -> Iterator[str]:
-    """The three claims, of which none stands for another."""
-    for name, claim in (("transferred", ended.transferred), ("completed", ended.completed)):
-        yield name if claim else f"{name} not known" if claim is None else f"not {name}"
-    yield f"running {ended.running_version}" if ended.running_version else "running not known"

@@ -22,15 +22,19 @@ async function send(path, body) {
   const said = byId("said");
   said.textContent = "";
   try {
-    await post(path, body);
+    return await post(path, body);
   } catch (error) {
     said.textContent = document.body.dataset[`said${error.message}`] ?? document.body.dataset.said;
   }
 }
 
 async function upload(files) {
+  let page;
   for (const file of files) {
-    await send(`/bench/upload?name=${encodeURIComponent(file.name)}`, file);
+    page = (await send(`/bench/upload?name=${encodeURIComponent(file.name)}`, file))?.page ?? page;
+  }
+  if (page) {
+    location.assign(page);
   }
 }
 

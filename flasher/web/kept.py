@@ -1,0 +1,175 @@
+"""What this computer keeps: its history, bundles, backups, and the stories of traces.
+
+It is answered in processes of their own (`flasher.web.desk`), so that no upgrade waits for it.
+"""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime
+from functools import cached_property
+from itertools import islice
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from flasher.errors import FlasherError, UsageError
+from flasher.history import History, matching
+from flasher.protocol.text import printable
+from flasher.report.explain_page import told
+from flasher.trace.bundle import bundles
+from flasher.trace.source import explain_path, recorded_of
+from flasher.web.desk import HTML, Answer, Question
+from flasher.web.pages import Pages
+from flasher.web.words import words
+
+SHOWN_MAX: Final = 50
+"""Of flashes, and of files of one kind."""
+_ZIP: Final = "application/zip"
+
+
+class KeptFile(NamedTuple):
+    """A bundle or a backup."""
+
+    name: str
+    at: datetime
+    size_bytes: int
+    what: str = ""
+    """Why a bundle was left."""
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Answers the questions of the pages. `bundles`, `backups` and `traces` are folders; the last
+    one has what was dropped on the page.
+    """
+
+    bundles: Path
+    backups: Path
+    traces: Path
+
+    @cached_property
+    def _pages(self) -> Pages:
+        return Pages()
+
+    def answer(self, question: Question) -> Answer:
+        """The page or the file of a question; a page with what is wrong where there is none."""
+        try:
+            return PAGES[question.path](self, question)
+        except FlasherError as error:
+            return self._page(question, "trouble.html", http=400, error=error)
+        except OSError as error:
+            trouble = UsageError(f"That cannot be read: {error.strerror or error}.")
+            return self._page(question, "trouble.html", http=400, error=trouble)
+
+    def _page(
+        self, question: Question, template: str, *, http: int = 200, **context: Any
+    ) -> Answer:
+        text = self._pages.text(
+            template,
+            words(question.language),
+            question.token,
+            layout="bench_layout.html",
+            **context,
+        )
+        return Answer(text.encode("utf-8", "backslashreplace"), HTML, http)
+
+    def overview(self, question: Question) -> Answer:
+        """The history, bundles and backups, the latest first."""
+        history = History()
+        flashes, damaged = history.flashes()
+        serial = question.fields.get("serial", "")
+        found = list(matching(flashes, target=None, serial_number=serial))
+        left = {str(path): path.name for path in bundles(self.bundles)}
+        return self._page(
+            question,
+            "kept.html",
+            history=printable(str(history.path)),
+            serial=serial,
+            flashes=list(islice(reversed(found), SHOWN_MAX)),
+            total=len(found),
+            damaged=damaged,
+            bundle_of=left,
+            bundles=[_bundle(path) for path in reversed(bundles(self.bundles)[-SHOWN_MAX:])],
+            bundles_in=printable(str(self.bundles)),
+            backups=[_file(path) for path in reversed(self._backups()[-SHOWN_MAX:])],
+            backups_in=printable(str(self.backups)),
+        )
+
+    def story(self, question: Question) -> Answer:
+        """The story of a bundle, or of a trace that was dropped."""
+        if "bundle" in question.fields:
+            path = self._bundle(question.fields["bundle"])
+        else:
+            name = question.fields.get("trace", "")
+            path = _known({each.name: each for each in _files(self.traces)}, name)
+        try:
+            story = explain_path(path)
+        except FlasherError as error:
+            error.what = error.what.replace(printable(str(path)), printable(path.name))
+            raise
+        named = replace(story, source=printable(path.name))
+        return self._page(question, "explain.html", **told(named))
+
+    def bundle(self, question: Question) -> Answer:
+        """A bundle as one file."""
+        path = self._bundle(question.fields.get("name", ""))
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+            for each in _files(path):
+                archive.write(each, f"{path.name}/{each.name}")
+        return Answer(packed.getvalue(), _ZIP, file_name=f"{path.name}.zip")
+
+    def backup(self, question: Question) -> Answer:
+        """A backup."""
+        found = {each.name: each for each in self._backups()}
+        path = _known(found, question.fields.get("name", ""))
+        return Answer(path.read_bytes(), _ZIP, file_name=path.name)
+
+    def _bundle(self, name: str) -> Path:
+        return _known({each.name: each for each in bundles(self.bundles)}, name)
+
+    def _backups(self) -> list[Path]:
+        """The latest last."""
+        found = [each for each in _files(self.backups) if each.suffix == ".zip"]
+        return sorted(found, key=lambda each: each.stat().st_mtime_ns)
+
+
+PAGES: Final[Mapping[str, Callable[[Kept, Question], Answer]]] = {
+    "/kept": Kept.overview,
+    "/kept/story": Kept.story,
+    "/kept/bundle": Kept.bundle,
+    "/kept/backup": Kept.backup,
+}
+"""The paths of the pages, and who answers."""
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(each for each in folder.iterdir() if each.is_file()) if folder.is_dir() else []
+
+
+def _file(path: Path) -> KeptFile:
+    found = path.stat()
+    at = datetime.fromtimestamp(found.st_mtime).astimezone()
+    return KeptFile(path.name, at, found.st_size)
+
+
+def _bundle(path: Path) -> KeptFile:
+    size_bytes = sum(each.stat().st_size for each in _files(path))
+    try:
+        recorded = recorded_of(path)
+    except FlasherError as error:
+        return _file(path)._replace(size_bytes=size_bytes, what=error.what)
+    return _file(path)._replace(size_bytes=size_bytes, what=recorded.error.partition(" | ")[0])
+
+
+def _known(found: Mapping[str, Path], name: str) -> Path:
+    """Raises UsageError for a name that is not there: nothing else is read."""
+    path = found.get(name)
+    if path is None:
+        raise UsageError(
+            f"{printable(name)} is not there any more.", remedy="Load the page before it again."
+        )
+    return path
