@@ -133,8 +133,8 @@ def test_files_that_do_not_fit_say_why_and_dropped_ones_are_looked_at(page: Page
 def test_files_are_taken_before_anything_is_chosen_and_a_trace_tells_its_story(
     page: Page, place: BenchPlace
 ) -> None:
-    image = {"name": "own.bin", "mimeType": "", "buffer": image_of(3, NEW).data}
-    page.set_input_files("#file", image)
+    image = image_of(3, NEW).data
+    page.set_input_files("#file", {"name": "own.bin", "mimeType": "", "buffer": image})
     expect(page.locator("#image")).to_contain_text("Dropped: own.bin.")
     assert place.bench.state.trouble is None
     page.set_input_files("#file", {"name": "no.blf", "mimeType": "", "buffer": b"no trace"})
