@@ -11,8 +11,8 @@ import difflib
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from enum import IntEnum
-from typing import ClassVar, Final
+from enum import IntEnum, StrEnum
+from typing import ClassVar, Final, Self
 
 _PASSWORD: Final = re.compile(r"(:/+[^\s:@]*):[^@\n]*@(?:[^\s@]*@)*")
 """Between the user and the last @ of a URL: a password may hold an @ of its own."""
@@ -38,6 +38,82 @@ class ExitCode(IntEnum):
     NOTHING_TO_DO = 11
     PARTIAL = 12
     INTERRUPTED = 130
+
+
+class ErrorCode(StrEnum):
+    """What went wrong, in short: printed behind it, told by `flasher help CODE` and by
+    flasher/error_codes.md. The digits before the last two are the exit code.
+    """
+
+    BUG = "E100"
+    INTERRUPTED = "E130"
+    """The exit code itself."""
+    USAGE = "E200"
+    FILE_NOT_READ = "E201"
+    FILE_NOT_WRITTEN = "E202"
+    FILE_FAULTS = "E203"
+    PACKAGE_MISSING = "E204"
+    WHICH_ADAPTER = "E205"
+    NOT_CONFIRMED = "E206"
+    PAGES_NOT_SERVED = "E207"
+    RECORDS = "E210"
+    RECORDS_NO_ROOM = "E211"
+    RECORDS_LOCKED = "E212"
+    RECORDS_READ_ONLY = "E213"
+    RECORDS_DAMAGED = "E214"
+    RECORDS_VERSION = "E215"
+    RECORDS_RULE = "E216"
+    RECORDS_MOVED = "E217"
+    RECORDS_NOT_FOUND = "E218"
+    STATION_RUNNING = "E219"
+    STATION_KEY = "E220"
+    RECORDS_CUT = "E221"
+    CLAIM_REFUSED = "E230"
+    IMAGE = "E300"
+    IMAGE_DAMAGED = "E301"
+    IMAGE_EMPTY = "E302"
+    IMAGE_TOO_LARGE = "E303"
+    IMAGE_GAP = "E304"
+    IMAGE_CONFLICT = "E305"
+    IMAGE_IMPLAUSIBLE = "E306"
+    IMAGE_OUTSIDE = "E307"
+    MANIFEST = "E308"
+    BUS = "E400"
+    ADAPTER_NOT_OPENED = "E401"
+    ADAPTER_IN_USE = "E402"
+    ADAPTER_LOST = "E403"
+    SEND_BLOCKED = "E404"
+    NOBODY_ACKNOWLEDGES = "E405"
+    BUS_OFF = "E406"
+    SECOND_TOOL = "E407"
+    OTHER_BIT_RATE = "E408"
+    NO_ADAPTER = "E409"
+    COMMAND_FAILED = "E410"
+    NO_SOCKET = "E411"
+    DOCTOR = "E412"
+    NO_ANSWER = "E500"
+    NOBODY_HEARD = "E501"
+    NOT_IN_DOCUMENTS = "E502"
+    NO_BOOT_VERSION = "E503"
+    NO_ANNOUNCEMENT = "E504"
+    NO_REQUEST = "E505"
+    UNHEARING = "E506"
+    WRONG_DEVICE = "E600"
+    NOT_FOR_DEVICE = "E601"
+    BOOT_TOO_OLD = "E602"
+    UNCHECKED = "E603"
+    VEHICLE_IN_USE = "E604"
+    TWO_DEVICES = "E605"
+    TRANSFER = "E700"
+    PACKET_FAILED = "E701"
+    RESTARTED = "E702"
+    BROKEN_PROTOCOL = "E703"
+    REFUSED = "E800"
+    UNCONFIRMED = "E900"
+    VERIFICATION = "E1000"
+    OTHER_VERSION = "E1001"
+    WRITE_DIFFERS = "E1002"
+    RECORDS_UNPROVEN = "E1003"
 
 
 def did_you_mean(
@@ -92,18 +168,35 @@ class FlasherError(Exception):
     """
 
     exit_code: ClassVar[ExitCode] = ExitCode.INTERNAL
+    default_code: ClassVar[ErrorCode] = ErrorCode.BUG
 
-    def __init__(self, what: str, *, where: str = "", cause: str = "", remedy: str = "") -> None:
+    def __init__(
+        self,
+        what: str,
+        *,
+        where: str = "",
+        cause: str = "",
+        remedy: str = "",
+        code: ErrorCode | None = None,
+    ) -> None:
         self.what, self.where, self.cause, self.remedy = map(
             hide_passwords, (what, where, cause, remedy)
         )
         super().__init__(self.what)
+        self.code = code or self.default_code
         self.command = ""
         """The command that repairs what was left, to be copied as it stands; "" where none does."""
         self.needs_rescue = False
         """True when a device was left that has no application, or perhaps none."""
         self.faults: tuple[Fault, ...] = ()
         """Everything that is wrong with a file, where the error is about one."""
+
+    def with_faults(self, faults: Iterable[Fault]) -> Self:
+        """The same, about a file with these faults."""
+        self.faults = tuple(faults)
+        if self.code is ErrorCode.USAGE:
+            self.code = ErrorCode.FILE_FAULTS
+        return self
 
     def __str__(self) -> str:
         """The whole message, one part a line, as a person reads it."""
@@ -123,28 +216,34 @@ class UsageError(FlasherError):
     """An argument or option makes no sense."""
 
     exit_code = ExitCode.USAGE
+    default_code = ErrorCode.USAGE
 
 
 class ImageError(FlasherError):
     """The image cannot be used: unreadable, damaged, empty, too large, wrong range."""
 
     exit_code = ExitCode.IMAGE
+    default_code = ErrorCode.IMAGE
 
 
 class BusError(FlasherError):
     """The adapter or the bus failed."""
 
     exit_code = ExitCode.BUS
+    default_code = ErrorCode.BUS
 
 
 class TransmitBlockedError(BusError):
     """The adapter took no further frame within the time allowed for it."""
+
+    default_code = ErrorCode.SEND_BLOCKED
 
 
 class NoAnswerError(FlasherError):
     """The device did not answer."""
 
     exit_code = ExitCode.NO_ANSWER
+    default_code = ErrorCode.NO_ANSWER
 
 
 class WrongDeviceError(FlasherError):
@@ -153,33 +252,39 @@ class WrongDeviceError(FlasherError):
     """
 
     exit_code = ExitCode.WRONG_DEVICE
+    default_code = ErrorCode.WRONG_DEVICE
 
 
 class TransferError(FlasherError):
     """The transfer failed: tries or attempts exhausted, or the device broke the protocol."""
 
     exit_code = ExitCode.TRANSFER
+    default_code = ErrorCode.TRANSFER
 
 
 class RefusedError(FlasherError):
     """The device received everything and refused the image at the end."""
 
     exit_code = ExitCode.REFUSED
+    default_code = ErrorCode.REFUSED
 
 
 class UnconfirmedError(FlasherError):
     """Everything was sent and acknowledged, but the final answer never came."""
 
     exit_code = ExitCode.UNCONFIRMED
+    default_code = ErrorCode.UNCONFIRMED
 
 
 class VerificationError(FlasherError):
     """The application that runs after the upgrade is not the one that was sent."""
 
     exit_code = ExitCode.VERIFICATION
+    default_code = ErrorCode.VERIFICATION
 
 
 class InterruptedByUserError(FlasherError):
     """The user stopped the command."""
 
     exit_code = ExitCode.INTERRUPTED
+    default_code = ErrorCode.INTERRUPTED

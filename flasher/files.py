@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from io import BufferedReader
 from typing import Any, Final
 
-from flasher.errors import Fault, FlasherError, UsageError, printable
+from flasher.errors import ErrorCode, Fault, FlasherError, UsageError, printable
 
 TOML_MAX_SIZE: Final = 256 * 1024
 """In bytes, of any file of settings."""
@@ -56,7 +56,9 @@ def opened(
         descriptor = os.open(path, _OPEN_FLAGS)
     except (FileNotFoundError, NotADirectoryError, ValueError) as missing:
         raise UsageError(
-            f"{subject} cannot be read: there is no file of this name.", remedy=if_missing
+            f"{subject} cannot be read: there is no file of this name.",
+            remedy=if_missing,
+            code=ErrorCode.FILE_NOT_READ,
         ) from missing
     except OSError as problem:
         raise _unreadable(subject, problem, error) from problem
@@ -124,8 +126,8 @@ def parse_file(
             remedy="Texts stand in quotes, lists in brackets, tables as [name], numbers as 0x4205 "
             "or 0.5.",
         )
-        refusal.faults = (Fault("", f"It is no TOML file: {why}.", refusal.remedy),)
-        raise refusal from problem
+        fault = Fault("", f"It is no TOML file: {why}.", refusal.remedy)
+        raise refusal.with_faults((fault,)) from problem
 
 
 def parse_toml(raw: bytes) -> dict[str, Any]:
@@ -177,7 +179,9 @@ def _check_values(document: object, *, all_finite: bool) -> None:
 def _check_regular(status: os.stat_result, subject: str) -> None:
     if stat.S_ISDIR(status.st_mode):
         raise UsageError(
-            f"{subject} cannot be read: it is a directory.", remedy="Name a file in it."
+            f"{subject} cannot be read: it is a directory.",
+            remedy="Name a file in it.",
+            code=ErrorCode.FILE_NOT_READ,
         )
     if not stat.S_ISREG(status.st_mode):
         raise _no_regular(subject)
@@ -188,6 +192,7 @@ def _no_regular(subject: str) -> UsageError:
         f"{subject} cannot be read: it is no regular file.",
         cause="a pipe, a device or another special file",
         remedy="Name a file on a disk; what comes through a pipe has to be saved first.",
+        code=ErrorCode.FILE_NOT_READ,
     )
 
 

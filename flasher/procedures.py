@@ -17,6 +17,7 @@ from flasher.bus.link import Clock, Link
 from flasher.driver import Tap
 from flasher.errors import (
     BusError,
+    ErrorCode,
     FlasherError,
     InterruptedByUserError,
     NoAnswerError,
@@ -219,7 +220,10 @@ class Procedures:
         """The answer to the version request of the document or the product."""
         request = self.profile.upgrade_options().version_request_for(self.target)
         if request is None:
-            raise NoAnswerError(f"The {self.target.name} cannot be asked for its version.")
+            raise NoAnswerError(
+                f"The {self.target.name} cannot be asked for its version.",
+                code=ErrorCode.NOT_IN_DOCUMENTS,
+            )
         return self.ask(request)
 
     def read_memory(self, start: int, end: int) -> Procedure[bytes]:
@@ -247,7 +251,10 @@ class Procedures:
         reset = BY_KEY.get((self.target.request_id, Command.RESET))
         documented = (UpgradeOptions.reset_command, UpgradeOptions.reset_data)
         if reset is None or (profile.reset_command, profile.reset_data) != documented:
-            raise NoAnswerError(f"The documents give no reset for the {self.target.name}.")
+            raise NoAnswerError(
+                f"The documents give no reset for the {self.target.name}.",
+                code=ErrorCode.NOT_IN_DOCUMENTS,
+            )
         yield from self.ask(Request(reset, Reset()))
 
     # -- writing ---------------------------------------------------------------------------------
@@ -541,6 +548,7 @@ def _check_no_other_tool(survey: Survey) -> None:
             where="while listening first",
             cause="an upgrade or a test is under way",
             remedy="Wait until it has ended. flasher monitor listens without asking.",
+            code=ErrorCode.SECOND_TOOL,
         )
 
 
@@ -571,6 +579,7 @@ def nobody_heard(survey: Survey, bitrate_bps: int) -> NoAnswerError:
         f"{f'; {foreign}' if count else ''}.",
         cause="everything is off or asleep, the wiring is open, or the bit rate is another",
         remedy="Switch the system on; try --dialect motinova (125 kbit/s) or welling (250).",
+        code=ErrorCode.NOBODY_HEARD,
     )
 
 

@@ -33,7 +33,7 @@ from flasher.bus.inspect_interface import Interface, read_interface
 from flasher.bus.link import SEND_LIMIT_S
 from flasher.bus.lock import hold
 from flasher.bus.opening import bus_config, open_bus, words_of
-from flasher.errors import BusError, TransmitBlockedError
+from flasher.errors import BusError, ErrorCode, TransmitBlockedError
 from flasher.protocol.frame import Frame
 
 _FULL_QUEUE_PAUSE_S: Final = 0.0005
@@ -219,7 +219,9 @@ class CanLink:
         Frames that were waiting are gone, and the health begins anew.
         """
         if self._open_again is None:
-            raise BusError("This adapter cannot be opened again.", where=str(self))
+            raise BusError(
+                "This adapter cannot be opened again.", where=str(self), code=ErrorCode.ADAPTER_LOST
+            )
         self._shut_down()
         self._use(None)
         self._waiting.clear()
@@ -293,6 +295,7 @@ class CanLink:
             where=str(self),
             cause="it was unplugged, its interface went down, or the bus is off",
             remedy="Check the adapter and the wiring, then run the same command again.",
+            code=ErrorCode.ADAPTER_LOST,
         )
 
     def _blocked(self, error: Exception) -> TransmitBlockedError:

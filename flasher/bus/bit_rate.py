@@ -16,7 +16,7 @@ from typing import Any, Final
 
 from flasher.bus.fallback import Fallback
 from flasher.bus.inspect_interface import Interface, read_interface
-from flasher.errors import BusError, UsageError
+from flasher.errors import BusError, ErrorCode, UsageError
 from flasher.protocol.text import printable
 
 LOWEST_BPS: Final = 5_000
@@ -141,4 +141,5 @@ def _refuse_other(found: BitRate, wanted: BitRate, merged: Mapping[str, Any]) ->
         cause="another bit rate than that of the bus disturbs everybody on it",
         remedy=f"If the bus runs at {wanted.bps} bit/s: {change}. If it runs at {found.bps}: "
         f"-b {found.bps}.",
+        code=ErrorCode.OTHER_BIT_RATE,
     )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Final
 
-from flasher.errors import BusError
+from flasher.errors import BusError, ErrorCode
 from flasher.protocol.frame import Frame
 
 
@@ -213,6 +213,7 @@ class LinkHealth:
                 cause="the device is off or not connected, the bit rate is another, CAN-H and "
                 f"CAN-L are swapped or open, or termination is missing{self._evidence}",
                 remedy="Check power, wiring and bit rate; flasher doctor looks at the adapter.",
+                code=ErrorCode.NOBODY_ACKNOWLEDGES,
             )
         return None
 
@@ -232,6 +233,7 @@ def bus_off_error(where: str, what: str = "The adapter has left the bus.") -> Bu
         "short circuit, CAN-H and CAN-L swapped)",
         remedy="Check bit rate and wiring, then start the adapter again; flasher doctor names "
         "the command.",
+        code=ErrorCode.BUS_OFF,
     )
 
 

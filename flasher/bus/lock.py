@@ -22,7 +22,7 @@ from typing import Any, Final
 from filelock import FileLock, Timeout
 from platformdirs import user_state_path
 
-from flasher.errors import BusError
+from flasher.errors import BusError, ErrorCode
 from flasher.protocol.text import printable
 
 _LOG: Final = logging.getLogger("flasher.bus")
@@ -62,6 +62,7 @@ def hold(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]:
             where="before the adapter was opened",
             cause="two tools on one bus spoil each other's dialogue, and an upgrade with it",
             remedy="Wait until it has ended, or end it; flasher monitor watches the bus meanwhile.",
+            code=ErrorCode.ADAPTER_IN_USE,
         ) from None
     except OSError as error:
         _LOG.warning("no lock for %s: %s", name, error)

@@ -14,7 +14,7 @@ import can.util
 from flasher.bus.fallback import Fallback
 from flasher.bus.health import bus_off_error
 from flasher.bus.inspect_interface import Unseen, look_up
-from flasher.errors import BusError, UsageError
+from flasher.errors import BusError, ErrorCode, UsageError
 from flasher.protocol.text import printable
 
 _CHANNELS: Final = {"socketcan": "can0", "pcan": "PCAN_USBBUS1", "slcan": "COM3"}
@@ -123,6 +123,7 @@ def open_bus(config: Mapping[str, Any]) -> can.BusABC:
             where=f"interface {interface}, channel {channel}",
             cause=_opening_cause(interface, error),
             remedy=_opening_remedy(interface, channel, config.get("bitrate"), error),
+            code=ErrorCode.ADAPTER_NOT_OPENED,
         ) from error
     if interface == "socketcan":
         failure = _unusable(str(channel), config.get("bitrate"))
@@ -157,6 +158,7 @@ def _unusable(channel: str, bitrate_bps: object) -> BusError | None:
             where=where,
             cause="nobody has started it since it was plugged in",
             remedy=f"`{start_command(channel, bitrate_bps)}` (as root) starts it.",
+            code=ErrorCode.ADAPTER_NOT_OPENED,
         )
     if seen.has_carrier is False:
         error = bus_off_error(where, f"The adapter cannot be used: {channel} has no carrier.")
@@ -178,6 +180,7 @@ def _no_interface(error: Exception) -> UsageError | BusError:
             "configuration file, nor [bus] of flasher.toml names one",
             remedy="Name it, for example `-i socketcan -c can0` or `-i pcan -c PCAN_USBBUS1`; "
             f"--mock needs none. flasher adapters lists what is plugged in. Interfaces: {known}.",
+            code=ErrorCode.NO_ADAPTER,
         )
     return UsageError(f"{words_of(error)}.", remedy=f"python-can knows: {known}.")
 

@@ -20,7 +20,7 @@ from flasher.bus.health import (
 )
 from flasher.bus.link import SEND_LIMIT_S, Clock
 from flasher.bus.simulated_faults import AdapterFaults
-from flasher.errors import BusError, TransmitBlockedError
+from flasher.errors import BusError, ErrorCode, TransmitBlockedError
 from flasher.protocol.bittime import frame_bits
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
@@ -289,6 +289,7 @@ class SimulatedLink:
                 where=str(self),
                 cause="it is not plugged in",
                 remedy="Plug it in.",
+                code=ErrorCode.ADAPTER_NOT_OPENED,
             )
         if faults.is_off:
             raise bus_off_error(str(self))
@@ -325,4 +326,5 @@ class SimulatedLink:
                 where=str(self),
                 cause="it was unplugged",
                 remedy="Plug it in, then run the same command again.",
+                code=ErrorCode.ADAPTER_LOST,
             )

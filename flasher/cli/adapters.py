@@ -17,7 +17,7 @@ from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.values import interface_names
-from flasher.errors import BusError, InterruptedByUserError, NoAnswerError, UsageError
+from flasher.errors import BusError, ErrorCode, InterruptedByUserError, NoAnswerError, UsageError
 from flasher.protocol.spec import Dialect
 from flasher.protocol.text import printable
 
@@ -129,6 +129,7 @@ def check_heard(device: Device, bus: Bus, output: Output, **watch: Unpack[Watch]
             cause="it is off or asleep, it speaks only when it is switched on, or it is on another "
             "bus than that of this adapter",
             remedy="Wake it with its key. Where you know that it is on this bus, name the adapter.",
+            code=ErrorCode.NOBODY_HEARD,
         )
         ctx = click.get_current_context()
         name = ctx.info_name or ""
@@ -148,6 +149,7 @@ def _several_found(found: list[Found], dialect: Dialect) -> UsageError:
     return UsageError(
         f"{len(found)} adapters are there, and none of them is named.",
         remedy=f"Add one of these to the command:{listed}",
+        code=ErrorCode.WHICH_ADAPTER,
     )
 
 
@@ -162,4 +164,5 @@ def _none_found() -> BusError:
         "(slcan, gs_usb and others)",
         remedy="See with `flasher adapters` what is looked for and what is missing, or name an "
         f"adapter, as in `-i pcan -c PCAN_USBBUS1`; --mock needs none.{listed}",
+        code=ErrorCode.NO_ADAPTER,
     )

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final, cast
 
-from flasher.errors import ExitCode, Fault
+from flasher.errors import ErrorCode, ExitCode, Fault
 from flasher.events import Phase, QueryAnswered
 from flasher.host.outcome import DeviceLeft, Statistics
 from flasher.host.table import Ending
@@ -97,6 +97,8 @@ class ErrorDocument:
 
     kind: str
     """Name of the class in flasher.errors; FlasherError for a bug in flasher."""
+    code: ErrorCode
+    """In short; `flasher help CODE` tells more."""
     what: str
     where: str
     cause: str

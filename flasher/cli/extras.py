@@ -7,7 +7,7 @@ import shlex
 import sys
 from typing import Final
 
-from flasher.errors import UsageError
+from flasher.errors import ErrorCode, UsageError
 
 _PACKAGES: Final = {
     "station": ("argon2", "cryptography", "segno", "sqlalchemy", "stdnum"),
@@ -23,6 +23,7 @@ def need(what: str, extra: str) -> None:
         raise UsageError(
             f"{what} needs packages that are not installed: {', '.join(missing)}.",
             remedy=how_to_install(extra),
+            code=ErrorCode.PACKAGE_MISSING,
         )
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Final
 
-from flasher.errors import UsageError
+from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.text import printable
 
 _LINKS_MAX: Final = 40
@@ -48,6 +48,7 @@ def check_not_read(path: str | Path, option: str, others: Iterable[object]) -> N
                 f"{printable(str(path))} is a file of the command itself.",
                 where=option,
                 remedy="Name another file: this one would be written over.",
+                code=ErrorCode.FILE_NOT_WRITTEN,
             )
 
 
@@ -106,4 +107,5 @@ def _not_written(path: Path, option: str, reason: str) -> UsageError:
         f"{printable(str(path))} cannot be written: {reason}.",
         where=option,
         remedy="Name a file in a folder that exists and has room.",
+        code=ErrorCode.FILE_NOT_WRITTEN,
     )

@@ -15,7 +15,7 @@ from typing import Final, Self
 
 from flasher.cli.files import check_not_read, check_writable
 from flasher.cli.output import Output
-from flasher.errors import UsageError, hide_passwords
+from flasher.errors import ErrorCode, UsageError, hide_passwords
 from flasher.log import ROOT
 from flasher.protocol.text import printable
 
@@ -124,6 +124,7 @@ class _File(logging.FileHandler):
                 f"{printable(str(path))} cannot be written: {error.strerror}.",
                 where=LOG_FILE,
                 remedy="Name a file in a folder that exists and has room.",
+                code=ErrorCode.FILE_NOT_WRITTEN,
             ) from error
         self._shown = printable(str(path))
         self.failure = ""

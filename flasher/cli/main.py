@@ -67,6 +67,7 @@ PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
             "look.doctor:doctor",
             "look at adapters, bus and traffic, and say what fixes what is wrong",
         ),
+        "help": Entry("look.help:help_", "what stands behind an error code, as E402"),
         "explain": Entry(
             "look.explain:explain", "the story of a recorded trace or a bundle, with a verdict"
         ),
@@ -99,7 +100,8 @@ examples:
   flasher flash firmware.hex -t mc -i pcan -c PCAN_USBBUS1 --trace-file upgrade.asc
   flasher mock -t bms -i socketcan -c vcan0 --save-image received.bin
 
-`flasher COMMAND -h` tells what a command needs most, `flasher COMMAND --help` everything.
+`flasher COMMAND -h` tells what a command needs most, `flasher COMMAND --help` everything;
+`flasher help CODE` what stands behind the code of an error, as E402.
 """
 _COMPLETE: Final = "_FLASHER_COMPLETE"
 """Set by a shell that completes a command line."""

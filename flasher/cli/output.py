@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TextIO
 
 from flasher.cli.documents import SCHEMA_VERSION, Envelope, ErrorDocument, as_json, to_json
 from flasher.cli.terminal import columns, painted, takes_colour, unpainted, wrapped
-from flasher.errors import ExitCode, FlasherError, UsageError
+from flasher.errors import ErrorCode, ExitCode, FlasherError, UsageError
 
 if TYPE_CHECKING:
     from flasher.trace.figures import Distribution
@@ -145,13 +145,16 @@ class Output:
         """An error as a person reads it, and as the JSON document of the command, with the document
         of what was `known` by then.
         """
-        _LOG.error("error: %s", error, extra=SAID)
+        what, *others = str(error).splitlines()
+        text = "\n".join((f"{what} [{error.code}]", *others))
+        _LOG.error("error: %s", text, extra=SAID)
         head = painted("error:", "red") if self.colour else "error:"
-        self.say(f"{head} {error}")
+        self.say(f"{head} {text}")
         if self.ending is not None:
             self.verdict(self.ending(error))
         said = ErrorDocument(
             kind=type(error).__name__,
+            code=error.code,
             what=error.what,
             where=error.where,
             cause=error.cause,
@@ -182,6 +185,7 @@ def _print_stdout(text: str) -> None:
             f"Standard output cannot be written: {error.strerror}.",
             cause="the disk that it is redirected to is full",
             remedy="Redirect it elsewhere. What was done before this message stays done.",
+            code=ErrorCode.FILE_NOT_WRITTEN,
         ) from error
 
 

@@ -17,7 +17,7 @@ from flasher.bus.link import Clock, Link, StampingLink
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Arrival
 from flasher.conformance.wire import RawFrame
-from flasher.errors import BusError, UsageError
+from flasher.errors import BusError, ErrorCode, UsageError
 from flasher.files import read
 from flasher.protocol.frame import Frame
 
@@ -200,6 +200,7 @@ class ReadbackCommand:
                     "The readback command wrote no file that can be read.",
                     where=shlex.join(words),
                     cause=error.what,
+                    code=ErrorCode.COMMAND_FAILED,
                 ) from error
 
 
@@ -218,13 +219,22 @@ def _run(words: Sequence[str], limit_s: float, what: str) -> None:
             words, check=False, capture_output=True, timeout=limit_s, stdin=subprocess.DEVNULL
         )
     except subprocess.TimeoutExpired as error:
-        raise BusError(f"The {what} command took longer than {limit_s:g} s.", **shown) from error
+        raise BusError(
+            f"The {what} command took longer than {limit_s:g} s.",
+            **shown,
+            code=ErrorCode.COMMAND_FAILED,
+        ) from error
     except OSError as error:
-        raise BusError(f"The {what} command cannot be run: {error.strerror}.", **shown) from error
+        raise BusError(
+            f"The {what} command cannot be run: {error.strerror}.",
+            **shown,
+            code=ErrorCode.COMMAND_FAILED,
+        ) from error
     if done.returncode:
         said = done.stderr.decode(errors="replace").strip()[-300:]
         raise BusError(
             f"The {what} command failed with exit code {done.returncode}.",
             cause=ascii(said)[1:-1],
             **shown,
+            code=ErrorCode.COMMAND_FAILED,
         )

@@ -12,6 +12,7 @@ from typing import Final, NamedTuple, assert_never
 
 from flasher.errors import (
     BusError,
+    ErrorCode,
     FlasherError,
     ImageError,
     InterruptedByUserError,
@@ -116,7 +117,7 @@ class Outcome:
         """
         if self.ok or self.nothing_to_do:
             return None
-        kind, cause, remedy = (
+        kind, cause, remedy, code = (
             _late(self.phase, self.device_left)
             if self.ending is Ending.OUT_OF_TIME
             else _EXPLANATIONS[self.ending]
@@ -130,6 +131,7 @@ class Outcome:
             where=self.where,
             cause=cause.format(**names),
             remedy=f"{remedy.format(**names)} State of the device: {prose(self.device_left)}.",
+            code=code,
         )
         error.needs_rescue = self.device_left.needs_rescue
         return error
@@ -159,6 +161,8 @@ class _Explanation(NamedTuple):
     kind: type[FlasherError]
     cause: str
     remedy: str
+    code: ErrorCode | None = None
+    """None: that of the class."""
 
 
 AGAIN: Final = "Run the same command again."
@@ -170,6 +174,7 @@ _EXPLANATIONS: Final = {
         "bootloader announces itself only at power-up",
         "Check supply, wiring, termination and bit rate (flasher doctor). A device that announces "
         "itself at power-up only is reached by flasher rescue and a power cycle.",
+        code=ErrorCode.NO_BOOT_VERSION,
     ),
     Ending.NO_ANNOUNCEMENT: _Explanation(
         NoAnswerError,
@@ -177,16 +182,19 @@ _EXPLANATIONS: Final = {
         "differs",
         f"{AGAIN} Take the device's supply away for some seconds when you are asked to (a battery "
         "wakes by its key or charger); --wait allows more time.",
+        code=ErrorCode.NO_ANNOUNCEMENT,
     ),
     Ending.NO_REQUEST: _Explanation(
         NoAnswerError,
         "erasing takes longer than allowed, or the device refuses this size or target",
         f"Power-cycle the device. {AGAIN}",
+        code=ErrorCode.NO_REQUEST,
     ),
     Ending.UNHEARING: _Explanation(
         NoAnswerError,
         "it is another kind of device than the target, it refuses this size, or it does not hear",
         "Check that the device is a {node} and that the image fits it.",
+        code=ErrorCode.UNHEARING,
     ),
     Ending.WRONG_DEVICE: _Explanation(
         WrongDeviceError,
@@ -197,36 +205,43 @@ _EXPLANATIONS: Final = {
         WrongDeviceError,
         "the image's manifest asks for a newer bootloader",
         "Look for an image for this bootloader; --allow-boot-version takes the device as it is.",
+        code=ErrorCode.BOOT_TOO_OLD,
     ),
     Ending.NOT_FOR_DEVICE: _Explanation(
         WrongDeviceError,
         "another file was meant, another device is connected, or the manifest is not up to date",
         "Compare the image (flasher image-info) with the device (flasher info).",
+        code=ErrorCode.NOT_FOR_DEVICE,
     ),
     Ending.IMPLAUSIBLE: _Explanation(
         ImageError,
         UNLIKELY,
         "Name the firmware file itself; flasher image-info shows what is in a file.",
+        code=ErrorCode.IMAGE_IMPLAUSIBLE,
     ),
     Ending.UNCHECKED: _Explanation(
         WrongDeviceError,
         "no application runs on the device, or it has no query for what the manifest rules",
         "Look at the device's label, then waive the check; flasher rescue goes on without it.",
+        code=ErrorCode.UNCHECKED,
     ),
     Ending.IN_USE: _Explanation(
         WrongDeviceError,
         "somebody rides it, or a load draws current",
         "Let it stand still and switch its loads off; --allow-in-use upgrades it all the same.",
+        code=ErrorCode.VEHICLE_IN_USE,
     ),
     Ending.SECOND_TOOL: _Explanation(
         BusError,
         "another program or dongle speaks as the CAN dongle (CDL) on this bus",
         f"End the other tool and disconnect it. {AGAIN}",
+        code=ErrorCode.SECOND_TOOL,
     ),
     Ending.TWO_DEVICES: _Explanation(
         WrongDeviceError,
         "two devices of the same kind are on the bus",
         f"Disconnect one of them. {AGAIN}",
+        code=ErrorCode.TWO_DEVICES,
     ),
     Ending.PACKET_FAILED: _Explanation(
         TransferError,
@@ -234,17 +249,20 @@ _EXPLANATIONS: Final = {
         "packet",
         f"Check supply and wiring. {AGAIN} A device that stays silent needs flasher rescue and a "
         "power cycle.",
+        code=ErrorCode.PACKET_FAILED,
     ),
     Ending.RESTARTED: _Explanation(
         TransferError,
         "its supply drops, its watchdog bites, it does not accept what it is sent, or two devices "
         "of the same kind answer",
         f"Check the supply, and that there is one {{node}} only. {AGAIN}",
+        code=ErrorCode.RESTARTED,
     ),
     Ending.BROKEN_PROTOCOL: _Explanation(
         TransferError,
         "its bootloader does not follow the protocol",
         f"Report the boot version to its maker. {AGAIN}",
+        code=ErrorCode.BROKEN_PROTOCOL,
     ),
     Ending.REFUSED: _Explanation(
         RefusedError,
@@ -260,6 +278,7 @@ _EXPLANATIONS: Final = {
         VerificationError,
         "the device runs another image than the one sent, or the image names its version wrongly",
         "Compare with flasher image-info, then flash the right image.",
+        code=ErrorCode.OTHER_VERSION,
     ),
     Ending.CANCELLED: _Explanation(
         InterruptedByUserError,

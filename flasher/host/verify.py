@@ -13,6 +13,7 @@ from typing import Any, Final
 from flasher import events
 from flasher.errors import (
     BusError,
+    ErrorCode,
     FlasherError,
     InterruptedByUserError,
     UsageError,
@@ -88,6 +89,7 @@ class Verification:
                 where=f"verification by {self.level.value}",
                 cause="another program or dongle speaks as the CAN dongle (CDL) on this bus",
                 remedy=f"End the other tool, then look at the device with flasher info. {_IT_HAS}",
+                code=ErrorCode.SECOND_TOOL,
             )
         return VerificationError(
             what,

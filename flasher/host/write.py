@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from flasher.errors import FlasherError, UsageError, VerificationError
+from flasher.errors import ErrorCode, FlasherError, UsageError, VerificationError
 from flasher.host.items import Writable, find, make_content, meaningful_fields, writable
 from flasher.protocol.fields import Content, label
 from flasher.protocol.spec import BMS, WELLING, Dialect, Target
@@ -75,6 +75,7 @@ class Written:
                 f" {first.read_back!r} instead of {first.new!r}.",
                 cause="the device refuses the value, or it is not writable in this state",
                 remedy="Read it again after a power cycle; the old value may be in force.",
+                code=ErrorCode.WRITE_DIFFERS,
             )
         if self.is_confirmed and (self.read_back is not None or not could_read):
             return None
@@ -84,6 +85,7 @@ class Written:
             f"The {node} was sent the new {name} but did not {missing}{known}.",
             cause="the device went away, or it does not take this write",
             remedy=f"Look with: flasher read {name} -t {self.plan.target.name}",
+            code=ErrorCode.WRITE_DIFFERS,
         )
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from struct import Struct
 from typing import Final
 
-from flasher.errors import ImageError
+from flasher.errors import ErrorCode, ImageError
 from flasher.image.image import Image
 
 _VECTORS: Final = Struct("<4I")
@@ -131,6 +131,7 @@ def check_starts_inside(image: Image) -> None:
         "wrong part would be sent",
         remedy="choose the application with --range START:END, or waive this check with "
         "--allow-outside-vector",
+        code=ErrorCode.IMAGE_OUTSIDE,
     )
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from struct import Struct
 from typing import BinaryIO, Final
 
-from flasher.errors import ImageError
+from flasher.errors import ErrorCode, ImageError
 from flasher.image.image import ADDRESS_SPACE
 from flasher.image.segments import SparseBytes
 
@@ -124,6 +124,7 @@ def _header(data: bytes, source: str) -> tuple[str, tuple[int, ...]]:
             f"{source} is an ELF file for a 64-bit processor",
             cause="a program for the computer, not for the device",
             remedy="name the firmware's file",
+            code=ErrorCode.IMAGE_IMPLAUSIBLE,
         )
     fields = header.unpack_from(data)
     if fields[10] > _PROGRAM_HEADERS_MAX or fields[12] > _SECTIONS_MAX:
@@ -159,6 +160,7 @@ def _loads(data: bytes, source: str, order: str, fields: tuple[int, ...]) -> lis
             f"{source} holds no loadable segment",
             cause="an object file or a file of debug information alone",
             remedy="name the linked program",
+            code=ErrorCode.IMAGE_EMPTY,
         )
     return loads
 
@@ -168,4 +170,5 @@ def _refuse(source: str, what: str) -> ImageError:
         f"{source} is a damaged ELF file: {what}",
         cause="cut off or damaged while it was written or copied",
         remedy="make the file again, or convert it: objcopy -O ihex",
+        code=ErrorCode.IMAGE_DAMAGED,
     )

@@ -15,7 +15,7 @@ from enum import Enum
 from pathlib import PurePath
 from typing import BinaryIO, Final
 
-from flasher.errors import ImageError, UsageError
+from flasher.errors import ErrorCode, ImageError, UsageError
 from flasher.files import opened
 from flasher.image import elf
 from flasher.image.cortexm import check_starts_inside
@@ -112,6 +112,7 @@ def load(
                     f"{source} is too large for an {form.title} file: {size_bytes} bytes",
                     cause="an ELF file full of debug information, or no firmware",
                     remedy="strip it, or convert it to a raw binary: objcopy -O binary",
+                    code=ErrorCode.IMAGE_TOO_LARGE,
                 )
             _READERS[form](file, source, sparse)
             image = _joined(sparse, form, fill_gaps_up_to)

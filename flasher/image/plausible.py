@@ -12,7 +12,7 @@ import re
 from enum import Enum
 from typing import Final, NamedTuple
 
-from flasher.errors import ImageError
+from flasher.errors import ErrorCode, ImageError
 from flasher.image.cortexm import vector_table
 from flasher.image.elf import EM_ARM, machine_name
 from flasher.image.image import Image
@@ -105,6 +105,7 @@ def check_plausible(image: Image) -> None:
             cause="the wrong file" if found.is_certain else UNLIKELY,
             remedy="Name the firmware file itself; if these really are the bytes to send, say so "
             "with --allow-implausible.",
+            code=ErrorCode.IMAGE_IMPLAUSIBLE,
         )
 
 

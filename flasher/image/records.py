@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO, Final
 
-from flasher.errors import ImageError
+from flasher.errors import ErrorCode, ImageError
 from flasher.image.image import ADDRESS_SPACE
 from flasher.image.segments import SparseBytes
 
@@ -105,6 +105,7 @@ class _Scanner:
             where=self.place(0),
             cause=cause or "damaged while it was copied, or edited by hand",
             remedy="copy or make the file again",
+            code=ErrorCode.IMAGE_DAMAGED,
         )
 
     def place(self, _address: int) -> str:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from typing import Annotated
 
-from flasher.errors import ImageError, WrongDeviceError
+from flasher.errors import ErrorCode, ImageError, WrongDeviceError
 from flasher.form import Bounds, Form
 from flasher.image.image import Image
 from flasher.protocol.spec import IMAGE_MAX_SIZE, TARGETS, Target, find_target
@@ -157,6 +157,7 @@ class Release:
                     "--base or --fill-gaps-up-to than the release was made with",
                     remedy="Take image and manifest from the same release. For a build of your "
                     "own: `flasher manifest create --force`.",
+                    code=ErrorCode.MANIFEST,
                 )
 
 
@@ -189,6 +190,7 @@ def check_target(image: Image, release: Release | None, target: Target) -> None:
             where=printable(image.source),
             cause="the image was built for another device",
             remedy="Choose the image for this target, or the target that it was built for.",
+            code=ErrorCode.NOT_FOR_DEVICE,
         )
 
 

@@ -10,7 +10,7 @@ from bisect import bisect_right
 from collections.abc import Callable
 from typing import Final
 
-from flasher.errors import ImageError
+from flasher.errors import ErrorCode, ImageError
 from flasher.image.image import Span
 from flasher.protocol.spec import IMAGE_MAX_SIZE, PACKET_COUNT_MAX, PACKET_FILLER
 
@@ -120,6 +120,7 @@ class SparseBytes:
                 f"{self.source} holds more than {PIECES_MAX} separate pieces of data",
                 cause="a damaged file, or none that a linker made",
                 remedy="make the file again, or choose a part of it with --range START:END",
+                code=ErrorCode.IMAGE_GAP,
             )
         # A piece that ends where the next one starts is left apart: joining it would copy the next
         # one, again and again for a file in descending order.
@@ -140,6 +141,7 @@ class SparseBytes:
             where=place(address),
             cause="two builds or two parts merged into one file that overlap",
             remedy="make the file again from one build",
+            code=ErrorCode.IMAGE_CONFLICT,
         )
 
     def _empty(self) -> ImageError:
@@ -151,6 +153,7 @@ class SparseBytes:
             f"{self.source} holds no bytes in the range 0x{start:08X}:0x{end:08X}",
             where=f"its bytes lie between 0x{low:08X} and 0x{high:08X}",
             remedy="correct --range START:END",
+            code=ErrorCode.IMAGE_EMPTY,
         )
 
     def _gap(self, start: int, end: int, spans: tuple[Span, ...]) -> ImageError:
@@ -165,6 +168,7 @@ class SparseBytes:
             where=f"segments {named}",
             cause="option bytes, external flash or a bootloader beside the application",
             remedy=remedy,
+            code=ErrorCode.IMAGE_GAP,
         )
 
 
@@ -174,6 +178,7 @@ def empty(source: str) -> ImageError:
         f"{source} is empty: it holds no bytes to send",
         cause="the build or the conversion that made it failed",
         remedy="make the file again",
+        code=ErrorCode.IMAGE_EMPTY,
     )
 
 
@@ -184,4 +189,5 @@ def too_large(source: str, size_bytes: int, *, more: bool = False) -> ImageError
         f"and {PACKET_COUNT_MAX} packets hold {IMAGE_MAX_SIZE}",
         cause="not a firmware image, or more than the application in one file",
         remedy="choose the application with --range START:END (a raw binary needs --base too)",
+        code=ErrorCode.IMAGE_TOO_LARGE,
     )

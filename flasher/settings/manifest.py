@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import tomli_w
 
-from flasher.errors import ImageError
+from flasher.errors import ErrorCode, ImageError
 from flasher.files import read_toml
 from flasher.image.image import Image
 from flasher.image.release import Release
@@ -112,6 +112,7 @@ def _check_format(document: Mapping[str, Any], shown: str) -> None:
         where=shown,
         cause="it was written by a newer flasher" if newer else "it is no manifest of flasher",
         remedy="Use a newer flasher." if newer else "Write it with `flasher manifest create`.",
+        code=ErrorCode.MANIFEST,
     )
 
 
@@ -137,6 +138,7 @@ def release_of(  # noqa: PLR0913  one argument for each statement
             f"The image is version {image.version}, not {printable(firmware_version)}.",
             where=f"the text inside {printable(image.source)}",
             remedy="Leave the version out: the one inside holds.",
+            code=ErrorCode.MANIFEST,
         )
     stated = {
         "target": target.name,

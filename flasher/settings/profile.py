@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final
 
 from platformdirs import user_config_path
 
-from flasher.errors import Fault, ImageError, UsageError
+from flasher.errors import ErrorCode, Fault, ImageError, UsageError
 from flasher.files import read_toml
 from flasher.form import Bounds, Form
 from flasher.host.identity import Identity
@@ -239,6 +239,7 @@ class Profile:
                 where="the profile's limit",
                 cause="a merged file, or an image for another device",
                 remedy="choose the application with --range START:END",
+                code=ErrorCode.IMAGE_TOO_LARGE,
             )
         if area is None or image.base is None:
             return
@@ -249,6 +250,7 @@ class Profile:
                 f"0x{area.start:08X}..0x{area.end - 1:08X}",
                 cause="a merged file, or an image for another device",
                 remedy="choose the application with --range START:END",
+                code=ErrorCode.IMAGE_OUTSIDE,
             )
 
     def upgrade_options(self, **overrides: Any) -> UpgradeOptions:

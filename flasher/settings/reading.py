@@ -162,8 +162,7 @@ class Reader(Generic[Kind]):
                 where="\n         ".join(listed),
                 remedy=self._remedy or f"Correct the {self._what}.",
             )
-        error.faults = tuple(faults)
-        return error
+        return error.with_faults(faults)
 
     # -- faults -----------------------------------------------------------------------------------
 

@@ -20,7 +20,7 @@ from flasher.bus.detect import (
     serial_ports,
 )
 from flasher.bus.inspect_interface import SYSFS
-from flasher.errors import BusError, UsageError
+from flasher.errors import BusError, ErrorCode, UsageError
 from flasher.protocol.text import printable
 from flasher.station.config import SocketConfig
 from flasher.station.messages import VirtualUnits, WorkerSetup
@@ -80,6 +80,7 @@ def _resolve(socket: SocketConfig, detected: Sequence[Found]) -> Resolved:
             f"Socket {socket.name}: no {socket.interface} adapter with the {what} "
             f"{printable(wanted)} is plugged in.",
             remedy="Plug it in. `flasher doctor` shows the adapters that there are.",
+            code=ErrorCode.NO_ADAPTER,
         )
     if len(channels) > 1:
         raise UsageError(
@@ -140,6 +141,7 @@ def detect(sockets: Sequence[SocketConfig], *, network: Path = SYSFS) -> tuple[F
                 f"To find a {interface} adapter by its serial number, pyserial is needed.",
                 remedy="Install python-can with its serial extra: pip install "
                 "'python-can[serial]'.",
+                code=ErrorCode.PACKAGE_MISSING,
             ) from error
     if SOCKETCAN in wanted:
         found += network_adapters(network)

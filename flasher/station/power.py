@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
-from flasher.errors import BusError, FlasherError
+from flasher.errors import BusError, ErrorCode, FlasherError
 from flasher.protocol.text import printable
 from flasher.station.config import power_command
 
@@ -95,10 +95,10 @@ def run_command(words: Sequence[str]) -> None:
         )
     except subprocess.TimeoutExpired as error:
         what = f"The power command took longer than {COMMAND_LIMIT_S:g} s."
-        raise BusError(what, where=where, remedy=remedy) from error
+        raise BusError(what, where=where, remedy=remedy, code=ErrorCode.COMMAND_FAILED) from error
     except OSError as error:
         what = f"The power command cannot be run: {error.strerror}."
-        raise BusError(what, where=where, remedy=remedy) from error
+        raise BusError(what, where=where, remedy=remedy, code=ErrorCode.COMMAND_FAILED) from error
     if done.returncode:
         said = printable(done.stderr.decode(errors="replace").strip()[-300:])
         raise BusError(
@@ -106,4 +106,5 @@ def run_command(words: Sequence[str]) -> None:
             where=where,
             cause=said,
             remedy=remedy,
+            code=ErrorCode.COMMAND_FAILED,
         )

@@ -11,7 +11,7 @@ from typing import Final
 
 from flasher.api import Connection, release_checked, release_options
 from flasher.driver import Tap
-from flasher.errors import InterruptedByUserError, NoAnswerError
+from flasher.errors import ErrorCode, InterruptedByUserError, NoAnswerError
 from flasher.host.identify import identify
 from flasher.host.identity import DeviceAnswers
 from flasher.host.items import Readable, meaningful_fields
@@ -150,7 +150,10 @@ class UnitTarget:
         else:
             item = BY_KEY.get((self.loaded.target.request_id, Command.RESET))
             if item is None:
-                raise NoAnswerError(f"The documents give no reset for the {self.name}.")
+                raise NoAnswerError(
+                    f"The documents give no reset for the {self.name}.",
+                    code=ErrorCode.NOT_IN_DOCUMENTS,
+                )
             self.device.ask(Request(item, Reset()))
 
         def is_over(now: float) -> bool:

@@ -25,7 +25,7 @@ from typing import BinaryIO, Final, TextIO, cast
 
 import can
 
-from flasher.errors import UsageError
+from flasher.errors import ErrorCode, UsageError
 from flasher.files import opened
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
@@ -94,6 +94,7 @@ def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
                 f"{shown}: this trace format needs a package that is not installed.",
                 cause=printable(str(error)),
                 remedy="Install it, or convert the trace to .asc, .blf or .log.",
+                code=ErrorCode.PACKAGE_MISSING,
             ) from error
         except Exception as error:
             if isinstance(error, OSError) and not isinstance(error, gzip.BadGzipFile):

@@ -10,7 +10,7 @@ from typing import Final, Self
 
 import can
 
-from flasher.errors import UsageError
+from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
 
@@ -48,7 +48,10 @@ class Recorder:
         """Why the recording ended early; None while it is complete."""
         shown = printable(self._path) or "''"
         if not Path(self._path).absolute().parent.is_dir():
-            raise UsageError(f"{shown} cannot be written: its folder does not exist.")
+            raise UsageError(
+                f"{shown} cannot be written: its folder does not exist.",
+                code=ErrorCode.FILE_NOT_WRITTEN,
+            )
         try:
             self._writer = can.Logger(self._path)
         except ValueError as error:
@@ -61,9 +64,12 @@ class Recorder:
                 f"{shown}: this trace format needs a package that is not installed.",
                 cause=str(error),
                 remedy="Install it, or use .asc, .blf or .log.",
+                code=ErrorCode.PACKAGE_MISSING,
             ) from error
         except OSError as error:
-            raise UsageError(f"{shown} cannot be written: {error.strerror}.") from error
+            raise UsageError(
+                f"{shown} cannot be written: {error.strerror}.", code=ErrorCode.FILE_NOT_WRITTEN
+            ) from error
         self._wall_offset_s: float | None = None
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 import uvicorn
 
-from flasher.errors import UsageError
+from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.text import printable
 
 LOOPBACK: Final = frozenset({"127.0.0.1", "::1", "localhost"})
@@ -57,6 +57,7 @@ class Server:
             raise UsageError(
                 f"The certificate or its key cannot be used: {printable(str(error))}",
                 remedy="Give the certificate and its key as PEM files.",
+                code=ErrorCode.PAGES_NOT_SERVED,
             ) from error
         self._server = uvicorn.Server(config)
         self._thread = threading.Thread(
@@ -89,4 +90,5 @@ def _listen(host: str, port: int) -> socket.socket:
             f"Port {port} of {printable(host)} cannot be used: {error.strerror or error}.",
             cause="another program uses it, or the address is none of this computer",
             remedy="Give another port, or 0 for any.",
+            code=ErrorCode.PAGES_NOT_SERVED,
         ) from error

@@ -174,7 +174,7 @@ def test_an_error_without_a_place_or_remedy_is_one_line(
     run = flasher("flash", OBC_BIN, "-t", "obc", "--mock", "--trace-file", "no-folder/a.asc")
     assert run.code == ExitCode.USAGE
     what = "no-folder/a.asc cannot be written: its folder does not exist"
-    assert stream.getvalue().splitlines()[-2:] == [f"error: {what}.", f"FAILED  {what}"]
+    assert stream.getvalue().splitlines()[-2:] == [f"error: {what}. [E202]", f"FAILED  {what}"]
 
 
 def test_a_process_without_streams_works_and_exits_with_its_code(

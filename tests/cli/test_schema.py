@@ -80,6 +80,7 @@ def test_every_command_has_its_definition(schema: dict[str, Any]) -> None:
 
 COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("image-info", SAMPLES / "wmc.hex"),
+        ("help", "E402"),
         ("image-info", OBC),
         ("flash", OBC, "-t", "obc", "--dry-run"),
         ("flash", OBC, "-t", "obc", "--mock", "--mock-speed", "0", "--events"),

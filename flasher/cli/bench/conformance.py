@@ -56,7 +56,7 @@ from flasher.conformance.diff import THRESHOLD_PERCENT, Difference, compare, rea
 from flasher.conformance.json_report import ReportDocument
 from flasher.conformance.results import CaseVerdict, CheckOutcome, Gap, RunReport
 from flasher.conformance.side_by_side import SideBySide, side_by_side
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.protocol.text import printable
 
 _EXAMPLES: Final = """\
@@ -302,6 +302,7 @@ def _check_files(chosen: Choices) -> None:
                 f"{printable(str(chosen.trace_dir))} cannot be made: {error.strerror}.",
                 where=_TRACE_DIR,
                 remedy="Name a folder that exists, or a new one in a folder that does.",
+                code=ErrorCode.FILE_NOT_WRITTEN,
             ) from error
 
 

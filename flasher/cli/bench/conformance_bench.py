@@ -11,7 +11,7 @@ from flasher.cli.framework import option, option_set
 from flasher.cli.options import Bus, allow_implausible_option, target_option
 from flasher.cli.question import agrees, can_ask
 from flasher.conformance.real import HOST_UNCERTAINTY_S
-from flasher.errors import UsageError
+from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.spec import Target
 
 if TYPE_CHECKING:
@@ -79,10 +79,16 @@ def confirm_wear(said: str, *, is_agreed: bool) -> None:
     if is_agreed:
         return
     if not can_ask():
-        raise UsageError(f"{said}, and there is no terminal to ask.", remedy="Add --yes.")
+        raise UsageError(
+            f"{said}, and there is no terminal to ask.",
+            remedy="Add --yes.",
+            code=ErrorCode.NOT_CONFIRMED,
+        )
     if not agrees(f"{said}. Begin?", interrupted="nothing was sent to the device."):
         raise UsageError(
-            "Nothing was sent to the device.", remedy="Answer y to begin, or add --yes."
+            "Nothing was sent to the device.",
+            remedy="Answer y to begin, or add --yes.",
+            code=ErrorCode.NOT_CONFIRMED,
         )
 
 

@@ -15,7 +15,7 @@ from flasher.cli.framework import command, option, option_set
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.protocol.text import printable
 
 if TYPE_CHECKING:
@@ -135,6 +135,7 @@ def _check(path: Path, *, force: bool) -> None:
             f"{printable(str(path))} exists already.",
             where=_OUTPUT,
             remedy="Name another file, or add --force.",
+            code=ErrorCode.FILE_NOT_WRITTEN,
         )
 
 

@@ -23,7 +23,7 @@ from flasher.cli.options import Bus, bus_options, profile_option, target_option
 from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
 from flasher.cli.stop import stop_on_signal
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.host.query import READ_MEMORY
 from flasher.image.load import load
 from flasher.mock.store import AREA_START
@@ -160,6 +160,7 @@ def backup(
             f"{printable(str(file))} is there already.",
             where=_OUTPUT,
             remedy="Name another file, or add --force.",
+            code=ErrorCode.FILE_NOT_WRITTEN,
         )
     area = None if no_memory else _area(image, profile, target, bus)
     bus = bus.with_profile(profile)

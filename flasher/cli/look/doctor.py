@@ -41,7 +41,7 @@ from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.terminal import painted, takes_colour
 from flasher.driver import drive
-from flasher.errors import BusError, ExitCode, InterruptedByUserError
+from flasher.errors import BusError, ErrorCode, ExitCode, InterruptedByUserError
 from flasher.host.survey import Survey
 from flasher.protocol.spec import BMS
 from flasher.protocol.text import printable
@@ -145,6 +145,7 @@ def doctor(output: Output, bus: Bus, *, listen: float) -> int:
     error = BusError(
         f"A problem was found. {worst.about}: {worst.what}.",
         remedy="; ".join(worst.fix),
+        code=ErrorCode.DOCTOR,
     )
     output.failure(error, document)
     return error.exit_code

@@ -12,7 +12,7 @@ from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
 from flasher.cli.stop import stop_on_signal
-from flasher.errors import ExitCode, NoAnswerError
+from flasher.errors import ErrorCode, ExitCode, NoAnswerError
 from flasher.procedures import INFO_LISTEN_ONLY_S, DeviceInfo
 from flasher.protocol.spec import Target
 
@@ -82,12 +82,14 @@ def silence(found: DeviceInfo) -> NoAnswerError:
             f"The {node} answered nothing and sent nothing.",
             cause="it is off, asleep or not connected, or the bit rate or dialect is another",
             remedy="Wake it with its key; see who is on the bus with flasher scan.",
+            code=ErrorCode.NOBODY_HEARD,
         )
     return NoAnswerError(
         f"The {node} sent nothing in {INFO_LISTEN_ONLY_S:g} s, and the documents give no"
         " question to ask it.",
         cause="it is off, or it has nothing to say: it speaks by itself only now and then",
         remedy="Try again while it is switched on; flasher scan shows who else is there.",
+        code=ErrorCode.NOBODY_HEARD,
     )
 
 

@@ -16,7 +16,7 @@ from flasher.cli.output import Output
 from flasher.cli.question import agrees, can_ask
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
 from flasher.cli.stop import stop_on_signal
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.host.items import writable
 from flasher.host.write import Written, field_changes, plan_write
 from flasher.protocol.fields import label
@@ -133,6 +133,7 @@ def write(
         raise UsageError(
             f"Writing {plan.writable.name} needs a confirmation, and there is no terminal to ask.",
             remedy="Add --yes.",
+            code=ErrorCode.NOT_CONFIRMED,
         )
     bus = settled(bus, output)
     with recorded_connection(recorded, bus, output, target) as (connection, record):

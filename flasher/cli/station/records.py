@@ -22,7 +22,7 @@ from flasher.cli.station.documents import (
 )
 from flasher.cli.station.place import open_to_read
 from flasher.cli.station.views import figures_line
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.prose import prose
 from flasher.protocol.text import printable
 from flasher.station.records.errors import UnprovenError
@@ -116,6 +116,7 @@ def _certificates(folder: Path, report: Report, store: Store, output: Output) ->
             f"{printable(str(folder))} cannot be made: {error.strerror}.",
             where=option,
             remedy="Name a folder in a folder that exists.",
+            code=ErrorCode.FILE_NOT_WRITTEN,
         ) from error
     units = sorted({(str(row["serial"]), str(row["part"])) for row in report.runs})
     serials = [serial for serial, _ in units]

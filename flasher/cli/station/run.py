@@ -23,7 +23,14 @@ from flasher.cli.station.scans import LineReader, ScanFile, Typing, keyboard, re
 from flasher.cli.station.setup import crew_of, labels_of, scanners_of
 from flasher.cli.station.views import JsonLines, Lines, Table, View, figures_line
 from flasher.cli.stop import stop_on_signal
-from flasher.errors import BusError, ExitCode, FlasherError, InterruptedByUserError, UsageError
+from flasher.errors import (
+    BusError,
+    ErrorCode,
+    ExitCode,
+    FlasherError,
+    InterruptedByUserError,
+    UsageError,
+)
 from flasher.protocol.text import printable
 from flasher.station import codes
 from flasher.station.adapters import Resolved, detect, resolve, worker_setups
@@ -311,6 +318,7 @@ class _Session:
             raise BusError(
                 f"No socket can work; socket {printable(name)}: {printable(reason)}",
                 remedy="Mend it, then start the station again.",
+                code=ErrorCode.NO_SOCKET,
             )
 
     def _scans_used_up(self) -> bool:

@@ -14,7 +14,7 @@ from typing import Final
 from starlette.routing import BaseRoute
 
 from flasher.cli.station.commands import Address, PagesOptions
-from flasher.errors import UsageError
+from flasher.errors import ErrorCode, UsageError
 from flasher.files import read
 from flasher.station.records.keys import Keeping
 from flasher.web.guard import application
@@ -75,18 +75,24 @@ def _check_open(
         raise UsageError(
             f"Other computers could reach the pages on {address.host}, and read along.",
             remedy="Give --web-certificate and --web-key; --web-insecure does without.",
+            code=ErrorCode.PAGES_NOT_SERVED,
         )
     if not has_password:
         raise UsageError(
             f"Other computers could reach the pages on {address.host}, without a password.",
             remedy="Give --web-password FILE.",
+            code=ErrorCode.PAGES_NOT_SERVED,
         )
 
 
 def _tls(options: PagesOptions) -> Tls | None:
     certificate, key = options.web_certificate, options.web_key
     if (certificate is None) != (key is None):
-        raise UsageError("--web-certificate and --web-key belong together.", remedy="Give both.")
+        raise UsageError(
+            "--web-certificate and --web-key belong together.",
+            remedy="Give both.",
+            code=ErrorCode.PAGES_NOT_SERVED,
+        )
     return None if certificate is None or key is None else Tls(certificate, key)
 
 
@@ -101,6 +107,7 @@ def _password(options: PagesOptions) -> str:
             f"The password of the pages has less than {PASSWORD_MIN} characters.",
             where="--web-password",
             remedy="Write a longer one into the first line of the file.",
+            code=ErrorCode.PAGES_NOT_SERVED,
         )
     return text
 
@@ -123,6 +130,7 @@ def kept_secret(keeping: Keeping) -> str:
         raise UsageError(
             f"{path} cannot be written: {error.strerror or error}.",
             remedy="Give another place with --keys.",
+            code=ErrorCode.FILE_NOT_WRITTEN,
         ) from error
     found = read(path, _SECRET_MAX_SIZE, what="secret of the pages").decode("ascii", "replace")
     return found or secrets.token_urlsafe(32)

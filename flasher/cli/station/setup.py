@@ -11,7 +11,7 @@ from flasher.cli.extras import how_to_install
 from flasher.cli.output import Output
 from flasher.cli.station.commands import RunOptions
 from flasher.cli.station.documents import PinDocument
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.station.config import StationConfig
 from flasher.station.label_printer import LabelPrinter, printer_of
 from flasher.station.label_template import LabelTemplate, sample_of
@@ -60,6 +60,7 @@ def scanners_of(config: StationConfig, station: Station) -> list[Scanner]:
         raise UsageError(
             f"Scanners need packages that are not installed: {', '.join(missing)}.",
             remedy=how_to_install("scanner"),
+            code=ErrorCode.PACKAGE_MISSING,
         )
     return [Scanner(each, station.submit, station.publish) for each in config.scanner]
 

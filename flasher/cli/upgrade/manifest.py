@@ -19,7 +19,7 @@ from flasher.cli.options import (
     target_option,
 )
 from flasher.cli.output import Output
-from flasher.errors import ExitCode, FlasherError, ImageError, UsageError
+from flasher.errors import ErrorCode, ExitCode, FlasherError, ImageError, UsageError
 from flasher.image.image import Image
 from flasher.image.plausible import check_plausible
 from flasher.image.release import Comparison, Release, check_target, names_of
@@ -204,6 +204,7 @@ def _check_destination(path: Path, image: str, *, overwrite: bool) -> None:
         raise UsageError(
             f"{printable(str(path))} exists.",
             remedy="Look whether it is still wanted; --force writes over it, -o names another.",
+            code=ErrorCode.FILE_NOT_WRITTEN,
         )
 
 
@@ -237,6 +238,7 @@ def check(output: Output, image: ImageOptions, target: Target | None, *, file: s
             f"There is no manifest for {printable(image.image)}.",
             where=printable(str(manifest_path(image.image))),
             remedy="Name it with --manifest, or write it with `flasher manifest create`.",
+            code=ErrorCode.MANIFEST,
         )
     checks = checks_of(release, loaded, target)
     output.result(f"{printable(release.source)}, held against {printable(image.image)}")

@@ -14,7 +14,7 @@ from typing import ClassVar, Final
 
 from sqlalchemy import exc
 
-from flasher.errors import ExitCode, FlasherError
+from flasher.errors import ErrorCode, ExitCode, FlasherError
 
 NOT_SAVED: Final = "RECORD NOT SAVED"
 
@@ -24,56 +24,80 @@ class RecordError(FlasherError):
 
     exit_code: ClassVar[ExitCode] = ExitCode.USAGE
     """Like a file that cannot be written: the user has to make room, or correct the setting."""
+    default_code: ClassVar[ErrorCode] = ErrorCode.RECORDS
 
 
 class DiskFullError(RecordError):
     """No room for the record."""
 
+    default_code = ErrorCode.RECORDS_NO_ROOM
+
 
 class RecordsLockedError(RecordError):
     """Another program holds the records, longer than the time allowed for it."""
+
+    default_code = ErrorCode.RECORDS_LOCKED
 
 
 class RecordsReadOnlyError(RecordError):
     """The records, or their folder, cannot be written."""
 
+    default_code = ErrorCode.RECORDS_READ_ONLY
+
 
 class RecordsDamagedError(RecordError):
     """The database is damaged, or is no database."""
+
+    default_code = ErrorCode.RECORDS_DAMAGED
 
 
 class SchemaVersionError(RecordError):
     """The records were made by an older or a newer flasher."""
 
+    default_code = ErrorCode.RECORDS_VERSION
+
 
 class RuleBrokenError(RecordError):
     """The database refused what would have made the records untrue."""
+
+    default_code = ErrorCode.RECORDS_RULE
 
 
 class RecordsMovedError(RecordError):
     """The file of the database is not where it was opened: what is written is kept nowhere."""
 
+    default_code = ErrorCode.RECORDS_MOVED
+
 
 class NotFoundError(RecordError):
     """There is no such unit or run."""
+
+    default_code = ErrorCode.RECORDS_NOT_FOUND
 
 
 class StationBusyError(RecordError):
     """Another process is this station already."""
 
+    default_code = ErrorCode.STATION_RUNNING
+
 
 class KeyMissingError(RecordError):
     """The station cannot sign: its key is not there, or is not the one of its audit chain."""
 
+    default_code = ErrorCode.STATION_KEY
+
 
 class RecordsCutError(RecordError):
     """The records lack what this station has written: they are an older copy, or were cut."""
+
+    default_code = ErrorCode.RECORDS_CUT
 
 
 class UnprovenError(RecordError):
     """The records were changed: what they say is not certified."""
 
     exit_code: ClassVar[ExitCode] = ExitCode.VERIFICATION
+    default_code = ErrorCode.RECORDS_UNPROVEN
 
 
 class Refusal(StrEnum):
@@ -99,6 +123,7 @@ class ClaimRefusedError(FlasherError):
     """The unit must not be run now; nothing was recorded and nothing was done to it."""
 
     exit_code: ClassVar[ExitCode] = ExitCode.USAGE
+    default_code = ErrorCode.CLAIM_REFUSED
 
     def __init__(self, refusal: Refusal, what: str, *, remedy: str) -> None:
         super().__init__(what, remedy=remedy)

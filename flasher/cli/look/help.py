@@ -1,0 +1,106 @@
+"""`flasher help`: what stands behind an error code, a code of the station, or a command."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from typing import Final
+
+import click
+
+from flasher.cli.framework import Program, argument, command
+from flasher.cli.output import Output
+from flasher.errors import ErrorCode, ExitCode, UsageError, did_you_mean
+
+_EXAMPLES: Final = """\
+examples:
+  flasher help E402         an error code, as it stands behind a message
+  flasher help DUPLICATE    a code of the station
+  flasher help codes        all codes
+  flasher help flash        the same as flasher flash --help
+"""
+_SECTION: Final = re.compile(r"^## (E\d+): (.+)\n([^#]*)", re.MULTILINE)
+_ALL: Final = "codes"
+
+
+@dataclass(frozen=True)
+class CodeDocument:
+    """What stands behind a code."""
+
+    code: str
+    title: str
+    text: str
+    """Paragraphs, an empty line between two; empty in the list of all."""
+
+
+@dataclass(frozen=True)
+class CodesDocument:
+    """The codes that were asked for."""
+
+    codes: list[CodeDocument]
+
+
+DOCUMENTS: Final = (CodesDocument,)
+
+
+def error_codes() -> dict[str, CodeDocument]:
+    """What flasher/error_codes.md tells of each code."""
+    page = files("flasher").joinpath("error_codes.md").read_text(encoding="utf-8")
+    return {
+        code: CodeDocument(code, title, text.strip().replace("**", ""))
+        for code, title, text in _SECTION.findall(page)
+    }
+
+
+@command(name="help", epilog=_EXAMPLES)
+@argument("what", metavar="WHAT", required=False, help="a code, `codes`, or a command")
+@click.pass_context
+def help_(ctx: click.Context, output: Output, *, what: str | None) -> int:
+    """Tell what stands behind a code, or show the help of a command."""
+    from flasher.station.codes import CODES  # noqa: PLC0415  needed for its codes alone
+
+    program = ctx.find_root()
+    assert isinstance(program.command, Program)  # noqa: S101  it is the one that found us
+    if what is None:
+        output.print_help(program.get_help())
+        return ExitCode.OK
+    errors = error_codes()
+    if what.lower() == _ALL:
+        output.table((code, each.title) for code, each in errors.items())
+        output.result("")
+        output.result("of the station:")
+        output.table(((name, code.meaning) for name, code in CODES.items()), indent=2)
+        told = [CodeDocument(each.code, each.title, "") for each in errors.values()]
+        told += [CodeDocument(name, str(code.meaning), "") for name, code in CODES.items()]
+        output.document(CodesDocument(told))
+        return ExitCode.OK
+    if what in program.command.entries:
+        found = program.command.entries[what].load()
+        with found.make_context(what, [], parent=program, resilient_parsing=True) as shown:
+            output.print_help(found.get_help(shown))
+        return ExitCode.OK
+    word = what.upper()
+    if word in CODES:
+        code = CODES[word]
+        one = CodeDocument(word, str(code.meaning), str(code.action))
+    elif word in errors:
+        one = errors[word]
+    else:
+        refused = errors[ErrorCode.CLAIM_REFUSED]
+        why = re.search(rf"^- (`{re.escape(word)}`: .*)", refused.text, re.MULTILINE)
+        if why is None:
+            known = [*errors, *CODES, *program.command.entries]
+            raise UsageError(
+                f"There is no code and no command {what!a:.40}.",
+                remedy=f"{did_you_mean(word, known)}See all codes with `flasher help codes`.",
+            )
+        one = replace(refused, text=why[1])
+    output.result(f"{one.code}: {one.title}")
+    for paragraph in one.text.split("\n\n"):
+        output.result("")
+        is_list = paragraph.startswith("- ")
+        for line in re.split(r"\n(?=- )", paragraph) if is_list else [paragraph]:
+            output.result(" ".join(line.split()))
+    output.document(CodesDocument([one]))
+    return ExitCode.OK

@@ -1,0 +1,99 @@
+"""`flasher help`: each code that is printed is told, and has the digits of its exit code."""
+
+from __future__ import annotations
+
+import ast
+import itertools
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+import flasher.cli.look.help as told
+import flasher.station.records.errors
+from flasher import errors
+from flasher.errors import ErrorCode, ExitCode, FlasherError
+from flasher.host import outcome
+from flasher.station.codes import CODES
+from flasher.station.records.errors import Refusal
+from tests.cli.conftest import Flasher
+
+PACKAGE: Final = Path(errors.__file__).parent
+KINDS: Final = {
+    name: kind
+    for name, kind in itertools.chain(
+        vars(errors).items(), vars(flasher.station.records.errors).items()
+    )
+    if isinstance(kind, type) and issubclass(kind, FlasherError)
+}
+
+
+def exit_code_in(code: ErrorCode) -> int:
+    return int(code[1:] if code is ErrorCode.INTERRUPTED else code[1:-2])
+
+
+def test_the_page_tells_each_code_in_order() -> None:
+    assert list(told.error_codes()) == [code.value for code in ErrorCode]
+
+
+def test_the_code_of_a_class_has_its_exit_code() -> None:
+    for kind in KINDS.values():
+        assert exit_code_in(kind.default_code) == kind.exit_code, kind
+    for each in outcome._EXPLANATIONS.values():
+        if each.code is not None:
+            assert exit_code_in(each.code) == each.kind.exit_code, each
+
+
+def test_the_code_of_an_error_has_the_exit_code_of_its_class() -> None:
+    used = set()
+    for path in PACKAGE.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in KINDS:
+                kind = KINDS[node.func.id]  # type: ignore[attr-defined]
+                for given in node.keywords:
+                    if given.arg == "code" and isinstance(given.value, ast.Attribute):
+                        code = ErrorCode[given.value.attr]
+                        assert exit_code_in(code) == kind.exit_code, (path, node.lineno)
+                        used.add(code)
+    used |= {kind.default_code for kind in KINDS.values()}
+    used |= {each.code for each in outcome._EXPLANATIONS.values() if each.code is not None}
+    assert used | {ErrorCode.FILE_FAULTS} == set(ErrorCode)
+
+
+def test_a_code_is_printed_and_told(flasher: Flasher) -> None:
+    failed = flasher("flash", "nix.bin", "-t", "bms")
+    assert failed.err.splitlines()[0].endswith("no file of this name. [E201]")
+    said = flasher("help", "e201")
+    assert said.out.startswith("E201: a file cannot be read\n\nThere is no file of this name")
+    assert "What to do: correct the name." in said.out
+    assert flasher("flash", "nix.bin", "-t", "bms", "--json").document["error"]["code"] == "E201"
+
+
+def test_a_file_with_faults_has_their_code(flasher: Flasher, tmp_path: Path) -> None:
+    (tmp_path / "p.toml").write_text("nix = 1\n")
+    ran = flasher("profile", "check", tmp_path / "p.toml")
+    assert ran.code == ExitCode.USAGE
+    assert "[E203]" in ran.err
+
+
+@pytest.mark.parametrize("code", [*CODES, *Refusal])
+def test_a_code_of_the_station_is_told(flasher: Flasher, code: str) -> None:
+    ran = flasher("help", code)
+    assert ran.code == 0
+    assert "`" + code in ran.out if code in list(Refusal) else ran.out.startswith(f"{code}: ")
+
+
+def test_all_codes_are_listed(flasher: Flasher) -> None:
+    listed = flasher("help", "codes").out
+    assert all(f"{code}  " in listed for code in (*ErrorCode, *CODES))
+
+
+def test_help_of_a_command_is_that_of_its_option(flasher: Flasher) -> None:
+    assert flasher("help", "flash").out == flasher("flash", "--help").out
+    assert flasher("help").out == flasher("--help").out
+
+
+def test_an_unknown_code_is_refused(flasher: Flasher) -> None:
+    ran = flasher("help", "E40")
+    assert ran.code == ExitCode.USAGE
+    assert "Did you mean E4" in ran.err
