@@ -132,7 +132,8 @@ ITEMS: Final = (
     Item(_CDL, _BMS, _R, 0x4308, contents.ReadMemory, "read memory", 0x5688),
 )  # fmt: skip
 
-_UPGRADE: Final = frozenset(Command) - {item.command for item in ITEMS}
+UPGRADE_COMMANDS: Final = frozenset(Command) - {item.command for item in ITEMS}
+"""Those that only the upgrade has."""
 BY_KEY: Final = {item.key: item for item in ITEMS}
 
 
@@ -176,7 +177,7 @@ def has_message(dialect: Dialect, message: Message) -> bool:
     item = BY_KEY.get((message.can_id, message.command))
     if item is not None:
         return dialect in item.dialects
-    return dialect.has_upgrade or message.command not in _UPGRADE
+    return dialect.has_upgrade or message.command not in UPGRADE_COMMANDS
 
 
 def encode(item: Item, content: Content) -> Message:

@@ -201,6 +201,23 @@ class DateField:
 
 
 @dataclass(frozen=True)
+class Latin:
+    """Text that fills its field, one character a byte, whatever the bytes are."""
+
+    size_bytes: int
+    unit: str = ""
+
+    def encode(self, value: str) -> bytes:
+        return _sized(value.encode("latin-1"), self.size_bytes)
+
+    def decode(self, raw: bytes) -> str:
+        return raw.decode("latin-1")
+
+    def show(self, value: str) -> str:
+        return printable(value)
+
+
+@dataclass(frozen=True)
 class Bytes:
     """Bytes without a meaning of their own, shown in hexadecimal."""
 
@@ -328,7 +345,7 @@ def _is_field(value: object) -> bool:
 
 
 _UNIT_SUFFIXES: Final = {"mV": "_mv", "V": "_v", "mA": "_ma", "mAh": "_mah", "°C": "_c",
-                         "%": "_percent", "h": "_h", "min": "_min"}  # fmt: skip
+                         "%": "_percent", "h": "_h", "min": "_min", "B": "_bytes"}  # fmt: skip
 
 
 _OWN_LABELS: Final = {

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from struct import Struct
 from typing import ClassVar, Final, Self
 
+from flasher.protocol.fields import Bytes, Codec, Constant, Latin, Number
 from flasher.protocol.spec import (
     END_OF_TRANSFER_MARK,
     PACKET_DATA_SIZE,
@@ -23,13 +24,19 @@ from flasher.protocol.spec import (
 from flasher.protocol.text import boot_version_number
 from flasher.protocol.wire import Message
 
-_UINT16: Final = Struct("<H")
-_UPDATE: Final = Struct("<7sI")
-_BOOT_VERSION: Final = Struct("3s6s")
-_PACKET: Final = Struct(f"<BHH{PACKET_DATA_SIZE}s")
-assert _UPDATE.size == data_size(Command.UPDATE)
-assert _BOOT_VERSION.size == data_size(Command.BOOT_VERSION)
-assert _PACKET.size == data_size(Command.PACKET)
+
+@dataclass(frozen=True)
+class PacketNumber(Number):
+    """The number of a packet, or of all of them: 1 or more."""
+
+    size_bytes: int = 2
+
+
+@dataclass(frozen=True)
+class UpdateText(Latin):
+    """A text that names a target."""
+
+    KNOWN: ClassVar[frozenset[str]] = frozenset(each.update_text for each in TARGETS.values())
 
 
 @dataclass(frozen=True)
@@ -53,6 +60,17 @@ class _Row:
 
     MODE: ClassVar[Mode]
     COMMAND: ClassVar[Command]
+    LAYOUT: ClassVar[tuple[tuple[str, Codec], ...]]
+    """Name and codec of every field, in wire order."""
+
+    _STRUCT: ClassVar[Struct]
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if hasattr(cls, "LAYOUT"):
+            cls._STRUCT = Struct("<" + "".join(_struct_format(codec) for _, codec in cls.LAYOUT))
+        if hasattr(cls, "COMMAND"):
+            assert cls._STRUCT.size == data_size(cls.COMMAND)
 
     def data(self) -> bytes:
         """The data field."""
@@ -68,11 +86,21 @@ class _Row:
         return Message(can_id, self.MODE, self.COMMAND, self.data())
 
 
+def _struct_format(codec: Codec) -> str:
+    if isinstance(codec, Number):
+        return {1: "B", 2: "H", 4: "I"}[codec.size_bytes]
+    return f"{codec.size_bytes}s"
+
+
 @dataclass(frozen=True)
 class _Constant(_Row):
     """A row whose data never change."""
 
     DATA: ClassVar[bytes]
+
+    def __init_subclass__(cls) -> None:
+        cls.LAYOUT = (("data", Constant(cls.DATA)),)
+        super().__init_subclass__()
 
     def data(self) -> bytes:
         return self.DATA
@@ -88,14 +116,16 @@ class _Constant(_Row):
 class _Numbered(_Row):
     """A row that holds one packet number (little-endian, R4)."""
 
+    LAYOUT = (("number", Number(2)),)
+
     number: int
 
     def data(self) -> bytes:
-        return _UINT16.pack(self.number)
+        return self._STRUCT.pack(self.number)
 
     @classmethod
     def from_data(cls, data: bytes) -> Self:
-        return cls(*_UINT16.unpack(data))
+        return cls(*cls._STRUCT.unpack(data))
 
 
 @dataclass(frozen=True)
@@ -122,6 +152,7 @@ class BootVersion(_Row):
 
     MODE = Mode.REPORT
     COMMAND = Command.BOOT_VERSION
+    LAYOUT = (("name", Latin(3)), ("version", Latin(6)))
 
     name: str
     version: str
@@ -132,11 +163,12 @@ class BootVersion(_Row):
         return boot_version_number(self.version) is not None
 
     def data(self) -> bytes:
-        return _BOOT_VERSION.pack(self.name.encode("latin-1"), self.version.encode("latin-1"))
+        return b"".join(codec.encode(getattr(self, name)) for name, codec in self.LAYOUT)
 
     @classmethod
     def from_data(cls, data: bytes) -> Self:
-        return cls(*(text.decode("latin-1") for text in _BOOT_VERSION.unpack(data)))
+        parts = zip(cls.LAYOUT, cls._STRUCT.unpack(data), strict=True)
+        return cls(*(codec.decode(raw) for (_, codec), raw in parts))
 
 
 @dataclass(frozen=True)
@@ -145,18 +177,19 @@ class UpdateCommand(_Row):
 
     MODE = Mode.WRITE
     COMMAND = Command.UPDATE
+    LAYOUT = (("text", UpdateText(7)), ("size_bytes", Number(4, "B")))
 
     text: str
     size_bytes: int
 
     def data(self) -> bytes:
-        return _UPDATE.pack(self.text.encode("ascii"), self.size_bytes)
+        return self._STRUCT.pack(self.text.encode("ascii"), self.size_bytes)
 
     @classmethod
     def from_data(cls, data: bytes) -> Self:
-        raw, size_bytes = _UPDATE.unpack(data)
+        raw, size_bytes = cls._STRUCT.unpack(data)
         text = raw.decode("latin-1")
-        if text not in {target.update_text for target in TARGETS.values()}:
+        if text not in UpdateText.KNOWN:
             raise ValueError(f"no target is updated by the text {text!a}")
         return cls(text, size_bytes)
 
@@ -176,19 +209,25 @@ class Packet(_Row):
 
     MODE = Mode.WRITE
     COMMAND = Command.PACKET
+    LAYOUT = (
+        ("start", Constant(bytes((PACKET_START,)))),
+        ("number", PacketNumber()),
+        ("total", PacketNumber()),
+        ("payload", Bytes(PACKET_DATA_SIZE)),
+    )
 
     number: int
     total: int
     payload: bytes
 
     def data(self) -> bytes:
-        return _PACKET.pack(PACKET_START, self.number, self.total, self.payload)
+        return self._STRUCT.pack(bytes((PACKET_START,)), self.number, self.total, self.payload)
 
     @classmethod
     def from_data(cls, data: bytes) -> Self:
-        start, number, total, payload = _PACKET.unpack(data)
-        if start != PACKET_START:
-            raise ValueError(f"a packet starts with {PACKET_START:02X}, not {start:02X}")
+        start, number, total, payload = cls._STRUCT.unpack(data)
+        if start[0] != PACKET_START:
+            raise ValueError(f"a packet starts with {PACKET_START:02X}, not {start[0]:02X}")
         if not number or not total:
             raise ValueError(f"packet {number} of {total}: numbers start at 1")
         return cls(number, total, payload)
@@ -241,7 +280,7 @@ Row = (
     | Complete
 )
 
-_ROWS: Final[dict[int, type[Row]]] = {
+ROWS: Final[dict[int, type[Row]]] = {
     row.COMMAND: row
     for row in (
         Reset,
@@ -256,11 +295,12 @@ _ROWS: Final[dict[int, type[Row]]] = {
         Complete,
     )
 }
+"""Every row, by its command."""
 
 
 def decode(message: Message) -> Row | Malformed | Unknown:
     """The typed form of an intact message. Never raises."""
-    row = _ROWS.get(message.command)
+    row = ROWS.get(message.command)
     if row is None:
         return Unknown(message)
     if message.mode != row.MODE:

@@ -101,7 +101,7 @@ BROADCAST: Final = "all"
 NOT_IN_DIALECT: Final = "(not in this dialect)"
 _HEALTH: Final = "state_of_health_percent"
 _OLDER: Final = "or an older device, which does not know it"
-_ROUTES: Final = {
+ROUTES: Final = {
     can_id(sender, receiver): (sender.name, BROADCAST if receiver is None else receiver.name)
     for sender in Node
     for receiver in (None, *Node)
@@ -111,7 +111,7 @@ _ROUTES: Final = {
 _TO_DEVICE: Final = frozenset(target.request_id for target in TARGETS.values())
 _TO_TOOL: Final = frozenset(target.answer_id for target in TARGETS.values())
 
-_TITLES: Final[dict[type[messages.Row], str]] = {
+TITLES: Final[dict[type[messages.Row], str]] = {
     messages.Reset: "reset",
     messages.GeneralFeedback: "general feedback",
     messages.BootVersion: "boot version",
@@ -123,16 +123,17 @@ _TITLES: Final[dict[type[messages.Row], str]] = {
     messages.EndOfTransfer: "end of transfer",
     messages.Complete: "complete",
 }
+"""Titles of the messages of the upgrade."""
 
 
 def route(of_id: int) -> tuple[str, str] | None:
     """Names of sender and receiver of an 11-bit id; None for an id of no node."""
-    return _ROUTES.get(of_id)
+    return ROUTES.get(of_id)
 
 
 def message_titles() -> tuple[str, ...]:
     """The titles of all messages that can be told apart, each once."""
-    titles = [item.title for item in catalogue.ITEMS] + list(_TITLES.values())
+    titles = [item.title for item in catalogue.ITEMS] + list(TITLES.values())
     return tuple(dict.fromkeys(titles))
 
 
@@ -147,7 +148,7 @@ class Decoder:
         dialect: Dialect | None = None,
     ) -> None:
         self._dialect = dialect
-        self._streams = {key: Reassembler(key, inter_frame_timeout_s) for key in _ROUTES}
+        self._streams = {key: Reassembler(key, inter_frame_timeout_s) for key in ROUTES}
         self._holding: dict[int, Reassembler] = {}
         """The streams that hold the beginning of something: seldom more than two or three."""
 
@@ -181,7 +182,7 @@ class Decoder:
                 del self._holding[key]
 
     def _describe(self, found: Message | Damage, now: float) -> BusEvent:
-        sender, receiver = _ROUTES[found.can_id]
+        sender, receiver = ROUTES[found.can_id]
         if isinstance(found, Damage):
             reason = Field("reason", found.reason.value, "reason", prose(found.reason))
             fields = (reason, _raw("bytes", found.data))
@@ -211,7 +212,7 @@ def _judge(message: Message) -> tuple[Kind, str, tuple[Field, ...], bool]:
             return Kind.MALFORMED, prose(Kind.MALFORMED), _undecoded(message, row.problem), False
         if not isinstance(row, messages.Unknown) and _goes_this_way(row, message.can_id):
             alarm = isinstance(row, messages.Nak)
-            return Kind.MESSAGE, _TITLES[type(row)], _row_fields(row), alarm
+            return Kind.MESSAGE, TITLES[type(row)], _row_fields(row), alarm
     return Kind.UNKNOWN, prose(Kind.UNKNOWN), _undecoded(message), False
 
 
@@ -230,15 +231,15 @@ def content_fields(content: Content) -> tuple[Field, ...]:
         value = getattr(content, name)
         if not isinstance(codec, Reserved) or any(value):
             shown = Field(name, _plain_value(value), label(name, codec), codec.show(value))
-            remark = _remark(name, codec.unit, value)
-            if remark:
-                fields.append(shown._replace(text=f"{shown.text} {codec.unit} ({remark})"))
+            said = remark(name, codec.unit, value)
+            if said:
+                fields.append(shown._replace(text=f"{shown.text} {codec.unit} ({said})"))
             else:
                 fields.append(shown._replace(unit=codec.unit))
     return tuple(fields)
 
 
-def _remark(name: str, unit: str, value: object) -> str:
+def remark(name: str, unit: str, value: object) -> str:
     """What has to be said beside a percentage that is shown as it came (R22)."""
     if unit != "%" or not isinstance(value, int):
         return ""
@@ -249,15 +250,15 @@ def _remark(name: str, unit: str, value: object) -> str:
 
 def _row_fields(row: messages.Row) -> tuple[Field, ...]:
     """The fields of a message of the upgrade."""
-    fields = []
-    for name, value in vars(row).items():
-        if isinstance(value, bytes):
-            fields.append(_raw(name, value))
-        elif name == "size_bytes":
-            fields.append(Field(name, value, "size", str(value), "B"))
-        else:
-            fields.append(_plain(name, value))
-    return tuple(fields)
+    values = vars(row)
+    return tuple(
+        Field(
+            name, _plain_value(values[name]), label(name, codec), codec.show(values[name]),
+            codec.unit,
+        )
+        for name, codec in row.LAYOUT
+        if name in values
+    )  # fmt: skip
 
 
 def _undecoded(message: Message, problem: str = "") -> tuple[Field, ...]:
@@ -276,7 +277,7 @@ def _foreign(frame: Frame, now: float) -> BusEvent:
         fields.insert(0, _plain("identifier", "29 bits"))
     if frame.is_remote:
         fields.insert(0, _plain("frame", "remote request"))
-    sender, receiver = ("", "") if frame.is_extended else _ROUTES.get(frame.can_id, ("", ""))
+    sender, receiver = ("", "") if frame.is_extended else ROUTES.get(frame.can_id, ("", ""))
     title = prose(Kind.FOREIGN)
     return BusEvent(now, Kind.FOREIGN, frame.can_id, title, sender, receiver, fields=tuple(fields))
 
@@ -297,6 +298,8 @@ def _plain_value(value: object) -> Any:
             return flag_names(type(value), value)
         case Text():
             return str(value)
+        case str():
+            return printable(value)
         case bytes():
             return value.hex()
         case tuple():

@@ -34,9 +34,9 @@ NEXT_UPGRADE_S: Final = 15.0
 """A reset after so much silence begins another upgrade, not another attempt."""
 _GAP_S: Final = 1.0
 """Silence that is worth a line."""
-_AT_ONCE_S: Final = 0.3
+AT_ONCE_S: Final = 0.3
 """A tool that gives up waits longer than this for an answer, before it starts over."""
-_IN_VAIN_S: Final = 2 * DEFAULT_TIMINGS.command_timeout_s
+IN_VAIN_S: Final = 2 * DEFAULT_TIMINGS.command_timeout_s
 """A tool that is silent for so long before the transfer has waited for an answer."""
 _LATE_BOOT_S: Final = 0.25
 """Boot versions up to here after an update command may have been on their way."""
@@ -319,7 +319,7 @@ class ObservedUpgrade:
         """True when a tool that has told the device to update before waited for it in vain: what it
         sends now is its next attempt.
         """
-        return self.updates > 0 and now - self.tool_at_s >= _IN_VAIN_S
+        return self.updates > 0 and now - self.tool_at_s >= IN_VAIN_S
 
     def _is_undisturbed(self, now: float) -> bool:
         """True while all goes well, so that no tool has a reason to start over."""
@@ -327,7 +327,7 @@ class ObservedUpgrade:
             return False
         packet = self.current
         running = self.phase is Phase.TRANSFER and packet is not None and packet.is_clean
-        return running and now - self.last_at_s < _AT_ONCE_S and not self.is_restarted
+        return running and now - self.last_at_s < AT_ONCE_S and not self.is_restarted
 
     def _intrude(self, what: str) -> None:
         if len(self.intrusions) < _MAX_NOTED:
