@@ -17,7 +17,9 @@ from flasher.protocol.spec import TARGET_ALIASES, TARGETS, Node, Target
 IMAGE_SUFFIXES: Final = (
     "hex", "ihex", "ihx", "s19", "s28", "s37", "srec", "mot", "elf", "axf", "out", "bin",
 )  # fmt: skip
-TRACE_SUFFIXES: Final = ("asc", "blf", "csv", "db", "log", "mf4", "trc", "gz")
+TRACE_SUFFIXES: Final = (
+    "asc", "blf", "csv", "db", "log", "mf4", "pcap", "pcapng", "trc", "gz",
+)  # fmt: skip
 SLOWEST: Final = 0.1
 """Smallest speed of the mock, but for 0."""
 _NUMBER: Final = re.compile(r"(0[xX][0-9a-fA-F_]+|[0-9][0-9_]*)([kKmM]?)")

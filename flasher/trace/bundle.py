@@ -5,8 +5,7 @@ A folder of three files: `trace.blf`, the last frames; `transcript.txt`, what th
 owner may look into it: a command line may hold what is nobody else's business.
 
 The trace is a .blf: Wireshark, CANalyzer and python-can read it alike, with directions, remote and
-error frames. What python-can writes as .log Wireshark reads wrongly, because of the letters for the
-direction behind each frame.
+error frames.
 """
 
 from __future__ import annotations

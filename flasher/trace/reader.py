@@ -1,4 +1,5 @@
-"""Reads recorded traces of the formats that python-can knows, as frames with their times.
+"""Reads recorded traces of the formats that python-can knows, and captures of Wireshark, as frames
+with their times.
 
 python-can parses what a file holds; what it is given of a file is bounded here, since its readers
 take a line, a container or a database of any size and read on for ever.
@@ -31,6 +32,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
 from flasher.trace.blf import UnpackedBlf
 from flasher.trace.bounds import FILE_MAX_SIZE, Bounds, Lines, UnfitError, check_unpacked
+from flasher.trace.pcapng import frames_of_capture
 
 _FRAMES: Final = "SELECT ts, arbitration_id, extended, remote, error, data FROM messages"
 _IS_TABLE: Final = (
@@ -45,7 +47,7 @@ _VALUE_MAX: Final = 65_536
 _ROW_MIN_SIZE: Final = 8
 """In bytes, of the smallest row of seven columns: a damaged file may lead in circles."""
 
-SUFFIXES = ".asc .blf .csv .db .log .mf4 .trc, also with .gz behind it"
+SUFFIXES = ".asc .blf .csv .db .log .mf4 .pcap .pcapng .trc, also with .gz behind it"
 _WHOLE_MAX_SIZE: Final = 64 * 1024 * 1024
 """In bytes, of a format that is not read piece by piece."""
 _PIECE_SIZE: Final = 65_536
@@ -59,7 +61,8 @@ _LINE_READERS: Final = {
     ".log": can.CanutilsLogReader,
     ".trc": can.TRCReader,
 }
-_OTHERS: Final = (".blf", ".db", ".mf4")
+_CAPTURES: Final = (".pcap", ".pcapng")
+_OTHERS: Final = (".blf", ".db", ".mf4", *_CAPTURES)
 
 
 def read_trace(path: str | os.PathLike[str]) -> Iterator[tuple[float, Frame]]:
@@ -114,6 +117,9 @@ def _frames(
     """What the reader of the format makes of a file. Raises whatever it raises."""
     if suffix == ".db":
         yield from _frames_of_database(source, path)
+        return
+    if suffix in _CAPTURES:
+        yield from frames_of_capture(source, bounds)
         return
     reader: Iterable[can.Message]
     if suffix == ".blf":

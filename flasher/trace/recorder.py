@@ -1,4 +1,4 @@
-"""Writes every frame in both directions to a file; python-can chooses the format by its suffix."""
+"""Writes every frame in both directions to a file; its suffix chooses the format."""
 
 from __future__ import annotations
 
@@ -6,14 +6,17 @@ import os
 import time
 from pathlib import Path
 from types import TracebackType
-from typing import Final, Self
+from typing import Final, Protocol, Self
 
 import can
 
 from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
+from flasher.trace.pcapng import PcapngWriter
 
+_CANDUMP_ERROR: Final = 0x2000_0080
+"""Error frame, bus error."""
 ONE_TOOL_CHANNEL: Final = "conformance"
 """Channel of a log in which one tool breaks the protocol on purpose."""
 
@@ -30,6 +33,70 @@ def message_of(frame: Frame, *, sent: bool, at_s: float, channel: int | str = 0)
         is_rx=not sent,
         channel=channel,
     )
+
+
+class Writer(Protocol):
+    """What all writers of traces have."""
+
+    def __call__(self, msg: can.Message, /) -> None: ...
+
+    def stop(self) -> None: ...
+
+
+class CandumpWriter:
+    """Writes messages of python-can as `candump -L` does, so that canplayer, log2asc and Wireshark
+    read them. python-can's own writer adds a letter for the direction, with which Wireshark takes
+    the file for no capture.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """Raises OSError."""
+        self._file = Path(path).open("w", encoding="ascii")  # noqa: SIM115  stop() closes it
+
+    def __call__(self, message: can.Message) -> None:
+        """Write one frame. Raises OSError."""
+        can_id, data = f"{message.arbitration_id:03X}", bytes(message.data).hex().upper()
+        if message.is_error_frame:
+            can_id, data = f"{_CANDUMP_ERROR | message.arbitration_id:08X}", data or "00" * 8
+        elif message.is_extended_id:
+            can_id = f"{message.arbitration_id:08X}"
+        if message.is_remote_frame:
+            data = "R"
+        self._file.write(f"({message.timestamp:f}) can0 {can_id}#{data}\n")
+
+    def stop(self) -> None:
+        """Close the file. Raises OSError."""
+        self._file.close()
+
+
+def writer_of(path: str | os.PathLike[str], *, called: str = "") -> Writer:
+    """What writes the format that the suffix names; in messages it is `called` so. Raises
+    UsageError for a suffix that is not known, or whose format needs a package that is not
+    installed, and for a file that cannot be written.
+    """
+    suffix, shown = Path(path).suffix.lower(), printable(called or os.fspath(path)) or "''"
+    try:
+        if suffix == ".pcapng":
+            return PcapngWriter(path)
+        if suffix == ".log":
+            return CandumpWriter(path)
+        return can.Logger(path)
+    except ValueError as error:
+        raise UsageError(
+            f"{shown}: no trace format has this suffix.",
+            remedy="Use one of .asc .blf .csv .db .log .mf4 .pcapng .trc .txt.",
+        ) from error
+    except (ImportError, NotImplementedError) as error:
+        raise UsageError(
+            f"{shown}: this trace format needs a package that is not installed.",
+            cause=str(error),
+            remedy="Install it, or use .asc, .blf or .log.",
+            code=ErrorCode.PACKAGE_MISSING,
+        ) from error
+    except OSError as error:
+        raise UsageError(
+            f"{shown} cannot be written: {error.strerror}.", code=ErrorCode.FILE_NOT_WRITTEN
+        ) from error
 
 
 class Recorder:
@@ -52,24 +119,7 @@ class Recorder:
                 f"{shown} cannot be written: its folder does not exist.",
                 code=ErrorCode.FILE_NOT_WRITTEN,
             )
-        try:
-            self._writer = can.Logger(self._path)
-        except ValueError as error:
-            raise UsageError(
-                f"{shown}: no trace format has this suffix.",
-                remedy="Use one of .asc .blf .csv .db .log .mf4 .trc .txt.",
-            ) from error
-        except (ImportError, NotImplementedError) as error:
-            raise UsageError(
-                f"{shown}: this trace format needs a package that is not installed.",
-                cause=str(error),
-                remedy="Install it, or use .asc, .blf or .log.",
-                code=ErrorCode.PACKAGE_MISSING,
-            ) from error
-        except OSError as error:
-            raise UsageError(
-                f"{shown} cannot be written: {error.strerror}.", code=ErrorCode.FILE_NOT_WRITTEN
-            ) from error
+        self._writer = writer_of(self._path)
         self._wall_offset_s: float | None = None
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:

@@ -30,7 +30,7 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
     damage: list[str] = []
     if not path.is_dir():
         story = explain(
-            _until_damage(path, damage),
+            frames_until_damage(path, damage),
             source=str(path),
             suffix=_suffix(path),
             bitrate_bps=bitrate_bps,
@@ -48,7 +48,7 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
         )
     report = _report(path / REPORT)
     story = explain(
-        _until_damage(trace, damage),
+        frames_until_damage(trace, damage),
         source=str(path),
         suffix=_suffix(trace),
         bitrate_bps=bitrate_bps or _number(report.get("bitrate_bps")),
@@ -85,7 +85,7 @@ def _as_the_tool_ended(story: Story) -> Story:
     return replace(story, upgrades=tuple(upgrades), verdict=judged(story.verdict))
 
 
-def _until_damage(path: Path, damage: list[str]) -> Iterator[tuple[float, Frame]]:
+def frames_until_damage(path: Path, damage: list[str]) -> Iterator[tuple[float, Frame]]:
     """The frames of a trace up to where it cannot be read on, which is noted in `damage`: a
     recorder that was killed leaves half a line behind. Raises UsageError when not one can be read.
     """

@@ -195,13 +195,13 @@ def test_a_folder_that_cannot_be_written_is_one_warning_and_the_error_stays(
 
 
 def test_a_trace_file_holds_both_directions(tmp_path: Path) -> None:
-    path = tmp_path / "trace.log"
+    path = tmp_path / "trace.asc"
     with recording(RecordingOptions(trace_file=str(path)), Bus(), Output()) as record:
         for tap in record.taps:
             tap(Frame(0x752, b"\x01"), sent=True, now=1.0)
             tap(Frame(0x725, b"\x02"), sent=False, now=2.0)
-    lines = path.read_text().splitlines()
-    assert [line.split(maxsplit=2)[2] for line in lines] == ["752#01 T", "725#02 R"]
+    lines = [line.split() for line in path.read_text().splitlines() if " d " in line]
+    assert [(words[2], words[3]) for words in lines] == [("752", "Tx"), ("725", "Rx")]
 
 
 def test_the_echoes_of_an_adapter_are_in_neither_trace_nor_bundle_nor_figures(

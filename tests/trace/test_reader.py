@@ -19,7 +19,9 @@ from flasher.trace.recorder import Recorder
 from tests.trace import traffic
 
 
-@pytest.mark.parametrize("suffix", [".asc", ".blf", ".csv", ".db", ".log", ".trc", ".asc.gz"])
+@pytest.mark.parametrize(
+    "suffix", [".asc", ".blf", ".csv", ".db", ".log", ".pcapng", ".trc", ".asc.gz"]
+)
 def test_what_was_recorded_is_read_again(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"trace{suffix}"
     frames = traffic.running() + traffic.reset()

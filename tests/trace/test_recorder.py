@@ -41,11 +41,30 @@ def test_frames_of_both_directions_are_recorded_in_order(tmp_path: Path, suffix:
     assert second.timestamp - first.timestamp == pytest.approx(0.25, abs=0.001)
 
 
-@pytest.mark.parametrize("suffix", [".asc", ".blf", ".log", ".trc"])
+@pytest.mark.parametrize("suffix", [".asc", ".blf", ".trc"])
 def test_the_direction_is_in_the_file_where_the_format_has_it(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"trace{suffix}"
     record(path, (5.0, True, SENT), (5.25, False, RECEIVED))
     assert [message.is_rx for message in read(path)] == [False, True]
+
+
+def test_a_log_is_what_candump_writes(tmp_path: Path) -> None:
+    """Without letters for the direction, with which Wireshark does not know it for one."""
+    path = tmp_path / "trace.log"
+    record(
+        path,
+        (1.0, True, SENT),
+        (2.0, False, Frame(0x18DA00F1, b"\x01", is_extended=True)),
+        (3.0, False, Frame(0x725, b"", is_remote=True)),
+        (4.0, False, Frame(0, b"", is_error=True)),
+    )
+    said = [line.partition(") ")[2] for line in path.read_text(encoding="ascii").splitlines()]
+    assert said == [
+        f"can0 752#{SENT.data.hex().upper()}",
+        "can0 18DA00F1#01",
+        "can0 725#R",
+        "can0 20000080#0000000000000000",
+    ]
 
 
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".csv", ".db", ".log"])
@@ -162,7 +181,7 @@ def test_a_disk_that_fills_up_ends_the_recording_and_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flasher.trace.recorder.can.Logger", lambda _path: FullDisk(1))
-    with Recorder(tmp_path / "trace.log") as recorder:
+    with Recorder(tmp_path / "trace.asc") as recorder:
         for number in range(3):
             recorder(SENT, sent=True, now=float(number))
     assert recorder.failure == "No space left on device"
@@ -172,13 +191,13 @@ def test_a_recording_that_cannot_be_closed_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("flasher.trace.recorder.can.Logger", lambda _path: FullDisk(100))
-    with Recorder(tmp_path / "trace.log") as recorder:
+    with Recorder(tmp_path / "trace.asc") as recorder:
         recorder(SENT, sent=True, now=1.0)
     assert recorder.failure == "No space left on device"
 
 
 def test_a_whole_recording_has_no_failure(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "trace.log") as recorder:
+    with Recorder(tmp_path / "trace.asc") as recorder:
         recorder(SENT, sent=True, now=1.0)
     assert recorder.failure is None
 
