@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from secrets import token_hex
 from typing import Final
@@ -75,6 +75,27 @@ def write_whole(path: Path, data: bytes, option: str) -> None:
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or type(error).__name__
         raise _not_written(path, option, reason) from error
+
+
+@contextlib.contextmanager
+def writing(path: Path, option: str) -> Iterator[Path]:
+    """A name beside `path`, with its suffixes, for what is written piece by piece: it takes the
+    place of `path` when the block ends well, else it is removed. Raises UsageError with the
+    `option` that named the file.
+    """
+    check_writable(path, option)
+    if path.exists() and not path.is_file():
+        raise _not_written(path, option, "it is no regular file")
+    part = path.with_name(f".flasher-{token_hex(8)}-part{''.join(path.suffixes[-2:])}")
+    try:
+        _check_links(path, option)
+        yield part
+        part.replace(path.resolve(strict=False))
+    except OSError as error:
+        raise _not_written(path, option, error.strerror or type(error).__name__) from error
+    finally:
+        with contextlib.suppress(OSError):
+            part.unlink(missing_ok=True)
 
 
 def _check_links(path: Path, option: str) -> None:

@@ -57,6 +57,9 @@ PURPOSES: Final[Mapping[str, Mapping[str, Entry]]] = {
         "monitor": Entry(
             "look.monitor:monitor", "show decoded traffic, live or of a recorded trace"
         ),
+        "export": Entry(
+            "look.export:export", "the protocol and traces for Wireshark and other tools"
+        ),
     },
     "when something goes wrong": {
         "adapters": Entry(

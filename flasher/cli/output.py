@@ -87,6 +87,11 @@ class Output:
             for line in columns(rows, indent=indent):
                 self.result(line)
 
+    def text(self, text: str) -> None:
+        """A file's worth of the result, as it is; silent when JSON is wanted."""
+        if not self.json_wanted:
+            _print_stdout(text.removesuffix("\n"))
+
     def print_help(self, text: str) -> None:
         """Help, laid out for the window; it is printed when JSON is wanted too."""
         _print_stdout("\n".join(line.rstrip() for line in text.rstrip().splitlines()))

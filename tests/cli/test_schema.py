@@ -106,6 +106,8 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("manifest", "check", Path("stated.bin"), "-t", "obc"),
         ("explain", Path("upgrade.log")),
         ("explain", Path("nothing.log")),
+        ("export", "wireshark", "-o", Path("welling.lua")),
+        ("export", "trace", Path("upgrade.log"), "-o", Path("upgrade.pcapng")),
         ("mock", "-t", "bms", "-i", "virtual", "-c", "schema"),
         ("conformance", "-t", "bms", "--mock", "--case", "RS-01", "--case", "EN-04"),
         ("conformance", "--list"),

@@ -1,0 +1,1 @@
+"""The protocol in engineers' own tools: a dissector for Wireshark, a DBC, decoded signals."""

@@ -1,0 +1,83 @@
+"""A trace in another format; with remarks on its frames, where the format has them."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from flasher.trace.pcapng import PcapngWriter
+from flasher.trace.recorder import Writer, message_of, writer_of
+from flasher.trace.source import explain_path, frames_until_damage
+from flasher.trace.story import Step, Story
+
+_Place = tuple[int | None, float]
+"""CAN id (None: any) and seconds since the first frame, exactly as the story has them."""
+_ANY: Final = None
+
+
+@dataclass(frozen=True)
+class Converted:
+    """What was written."""
+
+    frames: int
+    remarks: int
+    """Frames with a remark."""
+    damage: str
+    """Where and why the trace could not be read on; empty where it was read to its end."""
+
+
+def convert(trace: Path, to: Path, *, called: Path) -> Converted:
+    """Write a trace in the format of the suffix of `to`; in messages it is `called` so. Raises
+    UsageError, and OSError when the disk is full.
+    """
+    remarks: dict[_Place, list[str]] = {}
+    writer: Writer
+    if to.suffix.lower() == ".pcapng":
+        story = explain_path(trace, everything=True)
+        remarks = _remarks(story)
+        writer = PcapngWriter(to, _summary(story))
+    else:
+        writer = writer_of(to, called=str(called))
+    damage: list[str] = []
+    frames = remarked = 0
+    start: float | None = None
+    now = -math.inf
+    try:
+        for at, frame in frames_until_damage(trace, damage):
+            now = max(now, at)
+            start = now if start is None else start
+            # Each is said once: frames that were accepted together have the same time.
+            places = ((frame.can_id, now - start), (_ANY, now - start))
+            said = "\n".join(text for place in places for text in remarks.pop(place, ()))
+            message = message_of(frame, sent=False, at_s=at)
+            if said and isinstance(writer, PcapngWriter):
+                writer(message, said)
+                remarked += 1
+            else:
+                writer(message)
+            frames += 1
+    finally:
+        writer.stop()
+    return Converted(frames, remarked, " ".join(damage))
+
+
+def _remarks(story: Story) -> dict[_Place, list[str]]:
+    """What went wrong, at the frame that showed it; and how each upgrade ended, at its last one."""
+    found: dict[_Place, list[str]] = defaultdict(list)
+    upgrades = story.upgrades
+    for line in (*story.steps, *(line for upgrade in upgrades for line in upgrade.steps)):
+        if isinstance(line, Step) and line.is_trouble:
+            text = f"{line.title}: {line.text}".removesuffix(": ")
+            found[line.can_id, line.at_s].append(text)
+    for upgrade in upgrades:
+        ended = f"{upgrade.target}, end of the upgrade: {upgrade.verdict.text}"
+        found[_ANY, upgrade.end_s] += [ended, *upgrade.remarks]
+    return found
+
+
+def _summary(story: Story) -> str:
+    verdict = story.verdict
+    return "\n".join(filter(None, (verdict.text, verdict.likely, verdict.remedy)))

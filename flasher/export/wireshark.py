@@ -1,0 +1,229 @@
+"""The dissector for Wireshark: `welling.lua`, with the tables of this program put into it.
+
+Ids, messages, fields, limits of time and sentences come from where the program itself has them. The
+script holds the ways of working that cannot be tables: reassembly as in `flasher.protocol.wire`,
+the course of an upgrade as in `flasher.trace.observed_upgrade`. The tests compare what tshark makes
+of it with what this program decodes.
+"""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from typing import Any, Final
+
+from flasher.export.names import key
+from flasher.prose import prose
+from flasher.protocol import messages, spec
+from flasher.protocol.catalogue import ITEMS, UPGRADE_COMMANDS, Item, answer_of
+from flasher.protocol.contents import Faults
+from flasher.protocol.fields import (
+    Address,
+    Bytes,
+    Codec,
+    Constant,
+    DateField,
+    Flags,
+    Latin,
+    Number,
+    Numbers,
+    Reserved,
+    TextField,
+    flag_names,
+    label,
+)
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.protocol.wire import DamageReason
+from flasher.trace.decoder import ROUTES, TITLES, Kind, remark
+from flasher.trace.observed_upgrade import AT_ONCE_S, IN_VAIN_S, NEXT_UPGRADE_S
+
+_SCRIPT: Final = "welling.lua"
+_MARK: Final = "{} --[[ tables ]]"
+_LINE_MAX: Final = 96
+_LUA_WORDS: Final = frozenset({"and", "end", "false", "function", "in", "nil", "not", "or", "true"})
+_ANSWERS: Final[dict[type[messages.Row], tuple[type[messages.Row], ...]]] = {
+    messages.Reset: (messages.GeneralFeedback,),
+    messages.UpdateCommand: (messages.RequestTransfer,),
+    messages.Packet: (messages.Ack, messages.Nak),
+    messages.EndOfTransfer: (messages.Complete, messages.Nak),
+}
+"""What a bootloader answers (4.1)."""
+_OWN_FILTERS: Final = {"number": "packet", "total": "packets"}
+"""Of the upgrade: what a packet, its ACK and its NAK have in common is one filter."""
+
+
+def dissector(version: str) -> str:
+    """The script, for any Wireshark from 4.0 on; `version` is that of this program."""
+    script = (files("flasher.export") / _SCRIPT).read_text(encoding="utf-8")
+    assert script.count(_MARK) == 1  # noqa: S101  the two files belong together
+    return script.replace(_MARK, _lua({"version": version, **_tables()}))
+
+
+def _tables() -> dict[str, Any]:
+    return {
+        "header": spec.HEADER,
+        "tail": spec.TAIL,
+        "prefix_size": spec.PREFIX_SIZE,
+        "overhead_size": spec.OVERHEAD_SIZE,
+        "message_max_size": spec.MESSAGE_MAX_SIZE,
+        "frame_data_size": spec.FRAME_DATA_SIZE,
+        "modes": {mode.value: mode.name.lower() for mode in spec.Mode},
+        "inter_frame_timeout_s": DEFAULT_TIMINGS.inter_frame_timeout_s,
+        "command_timeout_s": DEFAULT_TIMINGS.command_timeout_s,
+        "leftover_boot_version_s": DEFAULT_TIMINGS.leftover_boot_version_s,
+        "next_upgrade_s": NEXT_UPGRADE_S,
+        "at_once_s": AT_ONCE_S,
+        "in_vain_s": IN_VAIN_S,
+        "dialects": [
+            {
+                "name": dialect.name,
+                "text": f"{dialect.name} {dialect.version}, {dialect.bitrate_bps // 1000} kbit/s",
+                "has_upgrade": dialect.has_upgrade,
+            }
+            for dialect in spec.DIALECTS.values()
+        ],
+        "ids": {
+            can_id: {"sender": sender, "receiver": receiver}
+            for can_id, (sender, receiver) in ROUTES.items()
+        },
+        "targets": [
+            {"request_id": target.request_id, "answer_id": target.answer_id}
+            for target in spec.TARGETS.values()
+        ],
+        "commands": {command.name: command.value for command in spec.Command},
+        "items": [_item(item) for item in ITEMS],
+        "rows": [_row(row) for row in messages.ROWS.values()],
+        "titles": {kind.value: prose(kind) for kind in Kind},
+        "reasons": {reason.name: reason.value for reason in DamageReason},
+        "reason_texts": {reason.value: prose(reason) for reason in DamageReason},
+    }
+
+
+def _item(item: Item) -> dict[str, Any]:
+    """A message of chapter 3."""
+    answer = answer_of(item)
+    return {
+        "id": item.can_id,
+        "command": item.command,
+        "mode": item.mode.value,
+        "title": item.title,
+        "answers": [] if answer is None else [{"id": answer.can_id, "command": answer.command}],
+        "dialects": {dialect.name: True for dialect in item.dialects},
+        "is_alarm": item.content is Faults,
+        "fields": [
+            _field(f"{key(item.title)}.{name}", name, codec) for name, codec in item.content.LAYOUT
+        ],
+    }
+
+
+def _row(row: type[messages.Row]) -> dict[str, Any]:
+    """A message of the upgrade: what its fields may be is a part of its form."""
+    title = TITLES[row]
+    return {
+        "command": row.COMMAND.value,
+        "mode": row.MODE.value,
+        "title": title,
+        "is_upgrade": row.COMMAND in UPGRADE_COMMANDS,
+        "answers": [{"command": answer.COMMAND.value} for answer in _ANSWERS.get(row, ())],
+        "fields": [
+            _field(_OWN_FILTERS.get(name, f"{key(title)}.{name}"), name, codec) | _limits(codec)
+            for name, codec in row.LAYOUT
+        ],
+    }
+
+
+def _limits(codec: Codec) -> dict[str, Any]:
+    match codec:
+        case Constant():
+            return {"must_be": codec.expected}
+        case messages.PacketNumber():
+            return {"least": 1}
+        case messages.UpdateText():
+            return {"known": dict.fromkeys(sorted(codec.KNOWN), True)}
+    return {}
+
+
+def _field(filter_name: str, name: str, codec: Codec) -> dict[str, Any]:
+    unit = codec.unit
+    return {
+        "filter": filter_name,
+        "label": label(name, codec),
+        "size": codec.size_bytes,
+        "unit": unit,
+        "if_zero": remark(name, unit, 0),
+        "if_above_100": remark(name, unit, 101),
+        **_kind(filter_name, codec),
+    }
+
+
+def _kind(filter_name: str, codec: Codec) -> dict[str, Any]:
+    """How the bytes of a field become its value."""
+    match codec:
+        case Address():
+            return {"kind": "address"}
+        case Number():
+            return {"kind": "number", "offset": codec.offset, "signed": codec.signed}
+        case Numbers():
+            return {"kind": "numbers", "each": codec.each.size_bytes}
+        case Flags():
+            bits = [1 << bit for bit in range(8 * codec.size_bytes)]
+            return {"kind": "flags", "none": codec.none, "bits": [_bit(codec, bit) for bit in bits]}
+        case TextField() | DateField():
+            return {"kind": "text"}
+        case Latin():
+            return {"kind": "latin"}
+        case Constant():
+            return {"kind": "constant", "expected": codec.expected}
+        case Reserved():
+            return {"kind": "reserved"}
+        case Bytes():
+            return {"kind": "bytes"}
+    raise TypeError(f"{filter_name} has a codec that Wireshark is not told of: {codec}")
+
+
+def _bit(codec: Flags, mask: int) -> dict[str, Any]:
+    (text,) = flag_names(codec.names, mask)
+    return {"mask": mask, "name": key(text), "text": text}
+
+
+# -- Lua ------------------------------------------------------------------------------------------
+
+
+def _lua(value: object, indent: str = "") -> str:
+    """A value as Lua writes it."""
+    deeper = f"{indent}  "
+    match value:
+        case bool():
+            return str(value).lower()
+        case int():
+            return str(int(value))
+        case float():
+            return repr(value)
+        case str():
+            return _lua_text(value.encode())
+        case bytes():
+            return _lua_text(value)
+        case dict():
+            lines = [f"{_lua_key(name)} = {_lua(each, deeper)}" for name, each in value.items()]
+        case list():
+            lines = [_lua(each, deeper) for each in value]
+        case _:
+            raise TypeError(f"{value!r} has no form in Lua")
+    short = f"{{{', '.join(lines)}}}"
+    if len(short) <= _LINE_MAX - len(indent):
+        return short
+    joined = f",\n{deeper}".join(lines)
+    return f"{{\n{deeper}{joined}\n{indent}}}"
+
+
+def _lua_key(name: object) -> str:
+    is_word = isinstance(name, str) and name.isidentifier() and name not in _LUA_WORDS
+    return str(name) if is_word else f"[{_lua(name)}]"
+
+
+def _lua_text(raw: bytes) -> str:
+    return '"{}"'.format(
+        "".join(
+            chr(byte) if 0x20 <= byte < 0x7F and byte not in b'"\\' else f"\\{byte:03d}"
+            for byte in raw
+        )
+    )
