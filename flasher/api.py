@@ -7,7 +7,7 @@ of `flasher.procedures`.
 from __future__ import annotations
 
 import os
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -16,7 +16,8 @@ from typing import TYPE_CHECKING, Any, Final, TypedDict, TypeVar, Unpack, overlo
 
 from flasher.driver import Tap, adrive, drive
 from flasher.errors import FlasherError, UsageError
-from flasher.host.identity import Check, CheckResult, Identity, judge_image
+from flasher.host import waivers
+from flasher.host.identity import WAIVABLE, Check, CheckResult, Identity, judge_image
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft, Outcome, before_the_start
 from flasher.host.query import Request
@@ -692,6 +693,8 @@ class Job:
     identity: Identity
     checks: tuple[CheckResult, ...]
     """What was found; nothing that speaks against it."""
+    waived: tuple[str, ...] = ()
+    """Names of the checks that somebody has waived (flasher.host.waivers)."""
 
     def procedure(self, steps: Procedures) -> Procedure[Result]:
         """What carries it out, to its end, good or bad."""
@@ -707,22 +710,34 @@ def prepare(
     verify: Level | str | None = None,
     identity: Identity | None = None,
     at_power_up: bool = False,
+    waived: Iterable[str] = (),
 ) -> Job:
     """What an upgrade does before a bus is needed: load, plan, check, and settle what is left
-    open as `Device.flash` does. Raises ImageError, UsageError and WrongDeviceError.
+    open as `Device.flash` does. `waived` names checks of flasher.host.waivers; what `identity` and
+    `options` say goes before it. Raises ImageError, UsageError and WrongDeviceError.
     """
-    loaded = image if isinstance(image, Image) else load(image)
+    names = frozenset(waived)
+    if isinstance(image, Image):
+        loaded, release = image, None
+    else:
+        loaded = load(image, allow_outside_vector=waivers.OUTSIDE_VECTOR in names)
+        release = find_release(image) if identity is None else None
     if identity is None:
-        release = None if isinstance(image, Image) else find_release(image)
-        identity = profile.identity(release=release, goes_on_unchecked=at_power_up)
+        identity = profile.identity(
+            release=release,
+            waived=frozenset(check for check in WAIVABLE if check.value in names),
+            goes_on_unchecked=at_power_up,
+        )
     plan = plan_for(release_checked(loaded, identity.release), profile, bitrate_bps)
     checks = check_image(plan, identity)
-    chosen = release_options(options or profile.upgrade_options(), identity.release)
+    chosen = options or profile.upgrade_options(allow_boot_name=waivers.BOOT_NAME in names or None)
+    if waivers.BOOT_VERSION not in names:
+        chosen = release_options(chosen, identity.release)
     if at_power_up:
         chosen = replace(chosen, at_power_up=True)
     level = default_level(plan.target, chosen) if verify is None else as_level(verify)
     check_level(plan, level, chosen)
-    return Job(plan, chosen, level, identity, tuple(checks))
+    return Job(plan, chosen, level, identity, tuple(checks), tuple(sorted(names)))
 
 
 def _checked(result: Result) -> Result:
@@ -801,7 +816,9 @@ def refusal(plan: Plan, found: CheckResult) -> FlasherError | None:
     """The error for a finding that speaks against an upgrade; None for any other."""
     if found.ending is None:
         return None
-    refused = before_the_start(plan, found.ending, found.detail, duration_s=0.0).error()
+    refused = before_the_start(
+        plan, found.ending, found.detail, duration_s=0.0, waiver=found.waiver
+    ).error()
     if refused is not None:
         refused.where = "before anything was sent"
     return refused

@@ -188,6 +188,8 @@ class FlasherError(Exception):
         """The command that repairs what was left, to be copied as it stands; "" where none does."""
         self.needs_rescue = False
         """True when a device was left that has no application, or perhaps none."""
+        self.waiver = ""
+        """The check of flasher.host.waivers that refused, where a person may waive it."""
         self.faults: tuple[Fault, ...] = ()
         """Everything that is wrong with a file, where the error is about one."""
 

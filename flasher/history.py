@@ -61,6 +61,8 @@ class Began:
     """Of the bytes to be sent."""
     image_size_bytes: int
     image_version: str | None
+    waived: str = ""
+    """Checks that somebody has waived, by their names, a comma between two."""
 
 
 @dataclass(frozen=True)
@@ -184,7 +186,11 @@ def _ends_whole(descriptor: int) -> bool:
 
 def _made(kind: type[T], found: dict[str, Any]) -> T:
     """Keys that a newer flasher has added are left out. Raises LookupError and TypeError."""
-    values = {each.name: found[each.name] for each in dataclasses.fields(kind)}
+    values = {
+        each.name: found[each.name]
+        for each in dataclasses.fields(kind)
+        if each.default is dataclasses.MISSING or each.name in found
+    }
     for name, value in values.items():
         if not isinstance(value, str | int | None):
             raise TypeError(name)

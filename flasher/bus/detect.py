@@ -238,12 +238,15 @@ def network_adapters(sysfs: Path = SYSFS) -> Iterator[Found]:
 
 
 def serial_ports(interface: str) -> Iterator[Found]:
-    """Serial ports, each as an adapter of one of `SERIAL_PORTS`, which it may or may not be.
+    """Serial ports on the USB, each as an adapter of one of `SERIAL_PORTS`, which it may or may
+    not be. Others hardly have one behind them: computers have ports of their own (ttyS0, COM1).
 
     Raises ImportError where pyserial is missing.
     """
     ports: Any = importlib.import_module("serial.tools.list_ports")
     for port in ports.comports():
+        if port.vid is None:
+            continue
         description = "" if port.description in (None, "n/a", port.device) else port.description
         details = _told(
             description=description, serial_number=port.serial_number, usb_path=port.location

@@ -19,16 +19,13 @@ from flasher.bus.fallback import Fallback
 from flasher.cli import values
 from flasher.cli.framework import Decorator, argument, option, option_set
 from flasher.host.options import FRAME_GAP_SHARE, PACKET_GAP_MAX_S
+from flasher.host.waivers import IMPLAUSIBLE, OUTSIDE_VECTOR, WAIVERS
 from flasher.image.image import Image
 from flasher.image.load import DEFAULT_FILL_GAPS_UP_TO, FORMATS, load
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import DIALECTS, TARGET_ALIASES, TARGETS, WELLING, Dialect, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.settings.profile import FILE_NAME, find_bus
-
-IMPLAUSIBLE: Final = "bytes that do not look like a program for the device"
-"""What --allow-implausible lets through."""
-
 
 # -- the device ------------------------------------------------------------------------------------
 
@@ -105,7 +102,7 @@ image_options: Final = option_set(
     ),
     option(
         "--allow-outside-vector", is_flag=True, panel="image",
-        help="send an image whose reset vector points outside of it",
+        help=f"send {WAIVERS[OUTSIDE_VECTOR].lets_through}",
     ),
 )  # fmt: skip
 
@@ -113,7 +110,10 @@ image_options: Final = option_set(
 def allow_implausible_option(panel: str | None = None) -> Decorator:
     """For a command that has no other --allow-... for a device."""
     return option(
-        "--allow-implausible", is_flag=True, panel=panel, help=f"let through {IMPLAUSIBLE}"
+        "--allow-implausible",
+        is_flag=True,
+        panel=panel,
+        help=f"let through {WAIVERS[IMPLAUSIBLE].lets_through}",
     )
 
 

@@ -103,9 +103,14 @@ class CheckResult(NamedTuple):
         return _ENDINGS.get(self.check, Ending.NOT_FOR_DEVICE)
 
     @property
+    def waiver(self) -> str:
+        """The check's name where a person may waive it."""
+        return self.check.value if self.check in WAIVABLE else ""
+
+    @property
     def detail(self) -> str:
         """What is wrong, and the option that waives it."""
-        if self.check not in WAIVABLE:
+        if not self.waiver:
             return self.text
         return f"{self.text}; {self.check.option} waives this{self.other_ways}"
 

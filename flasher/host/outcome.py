@@ -24,6 +24,7 @@ from flasher.errors import (
     WrongDeviceError,
 )
 from flasher.events import Phase
+from flasher.host import waivers
 from flasher.host.table import Ending
 from flasher.image.plan import Plan
 from flasher.image.plausible import UNLIKELY
@@ -85,6 +86,8 @@ class Outcome:
     statistics: Statistics
     detail: str = ""
     """What was seen, where the ending alone does not say it."""
+    waiver: str = ""
+    """The check that refused, where a person may waive it and the ending alone does not say it."""
 
     @property
     def ok(self) -> bool:
@@ -134,11 +137,24 @@ class Outcome:
             code=code,
         )
         error.needs_rescue = self.device_left.needs_rescue
+        error.waiver = self.waiver or _WAIVERS.get(self.ending, "")
         return error
 
 
+_WAIVERS: Final = {
+    Ending.WRONG_DEVICE: waivers.BOOT_NAME,
+    Ending.BOOT_TOO_OLD: waivers.BOOT_VERSION,
+}
+
+
 def before_the_start(
-    plan: Plan, ending: Ending, detail: str, phase: Phase = Phase.IDENTIFY, *, duration_s: float
+    plan: Plan,
+    ending: Ending,
+    detail: str,
+    phase: Phase = Phase.IDENTIFY,
+    *,
+    duration_s: float,
+    waiver: str = "",
 ) -> Outcome:
     """The outcome of a session that ends before its upgrade has begun."""
     return Outcome(
@@ -152,6 +168,7 @@ def before_the_start(
         running_version=None,
         statistics=Statistics(duration_s=duration_s),
         detail=detail,
+        waiver=waiver,
     )
 
 

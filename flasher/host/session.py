@@ -229,13 +229,15 @@ class Session(Runner[Result]):
         for finding in findings:
             self.tell(finding.event)
             if finding.ending is not None and refused is None:
-                refused = self._end_early(finding.ending, finding.detail)
+                refused = self._end_early(finding.ending, finding.detail, finding.waiver)
         return refused
 
-    def _end_early(self, ending: Ending, detail: str) -> Result:
+    def _end_early(self, ending: Ending, detail: str, waiver: str = "") -> Result:
         phase = Phase.IDENTIFY if self._identify is None else self._identify.phase
         duration_s = self.now - self._began_at
-        outcome = before_the_start(self._plan, ending, detail, phase, duration_s=duration_s)
+        outcome = before_the_start(
+            self._plan, ending, detail, phase, duration_s=duration_s, waiver=waiver
+        )
         return Result(outcome, shutdown_heard=self._guard.shutdown_heard)
 
     # -- verification ----------------------------------------------------------------------------

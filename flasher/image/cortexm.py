@@ -123,7 +123,7 @@ def check_starts_inside(image: Image) -> None:
     end = image.base + image.size_bytes
     if image.base <= table.entry < end:
         return
-    raise ImageError(
+    error = ImageError(
         f"{image.source} does not start inside itself: its reset vector is "
         f"0x{table.reset_vector:08X}",
         where=f"what would be sent lies at 0x{image.base:08X}..0x{end - 1:08X}",
@@ -133,6 +133,8 @@ def check_starts_inside(image: Image) -> None:
         "--allow-outside-vector",
         code=ErrorCode.IMAGE_OUTSIDE,
     )
+    error.waiver = "outside-vector"
+    raise error
 
 
 def _inner_tables(image: Image) -> list[int]:

@@ -54,6 +54,8 @@ from flasher.web.bench_state import (
     TakeFiles,
     Upgrade,
     UseAdapter,
+    UseFolder,
+    Waive,
     Watch,
     Watched,
 )
@@ -131,6 +133,10 @@ class Workplace(Protocol):
 
     def dropped(self) -> Sequence[str]:
         """Names of images and manifests that were dropped on the page."""
+        ...
+
+    def use_folder(self, path: str) -> None:
+        """Offer the images of this folder."""
         ...
 
     def upgrade(
@@ -249,6 +255,9 @@ class Bench:
     def _cancelled(self) -> bool:
         """Asked all the time by what takes long."""
         self.feed.beat()
+        left_s = self.state.power_cycle_left_s
+        if left_s(self._now()) != left_s(self.state.now_s):
+            self._set()
         is_asked = self._stop.is_set() or self._ends_at_once
         if is_asked and not self.state.is_stopping:
             self._set(is_stopping=True)
@@ -264,13 +273,18 @@ class Bench:
                 self._use(name)
             case BackUp(source):
                 self._back_up(source)
+            case Waive(name, waiver):
+                self._waive(name, waiver)
+            case UseFolder(path):
+                self._place.use_folder(path)
+                self._judge()
             case ChooseTarget(""):
-                self._set(target=None, offers=(), offer=None, done=None)
+                self._set(target=None, offers=(), offer=None, done=None, waived=frozenset())
             case ChooseImage(""):
                 self._set(done=None)
                 self._judge()
             case ChooseTarget(name):
-                self._set(target=_known(TARGETS, name), offer=None, done=None)
+                self._set(target=_known(TARGETS, name), offer=None, done=None, waived=frozenset())
                 self._judge()
             case ChooseImage(name):
                 fitting = {offer.name: offer for offer in self.state.offers if not offer.refusal}
@@ -300,6 +314,7 @@ class Bench:
         self._set(
             adapter=adapter, adapters=marked, bike=None, target=None, offers=(), offer=None,
             done=None, checks=(), notes=(), areas=None, saved=None, watched=None,
+            waived=frozenset(),
         )  # fmt: skip
         if not self.state.is_rescue:
             self._look()
@@ -333,6 +348,22 @@ class Bench:
         self._set(dropped=tuple(self._place.dropped()))
         if self.state.target is not None and self.state.offer is None:
             self._judge()
+
+    def _waive(self, name: str, waiver: str) -> None:
+        """Only a check that has refused this very image can be waived."""
+        done = self.state.done
+        refused = {each.name: each.refusal for each in self.state.offers if each.refusal}
+        if done is not None and done.error is not None:
+            refused = {done.offer.name: done.error}
+        error = _known(refused, name)
+        if not waiver or error.waiver != waiver:
+            raise UsageError(
+                "That check has not refused this image; nothing was waived.", remedy="Look again."
+            )
+        self._set(done=None, waived=self.state.waived | {(name, waiver)})
+        self._judge()
+        fitting = (each for each in self.state.offers if each.name == name and not each.refusal)
+        self._set(offer=next(fitting, None))
 
     def _watch(self) -> None:
         board = Board()
@@ -403,6 +434,7 @@ class Bench:
             job.plan.wire_s,
             image.sha256,
             tuple(found.event for found in job.checks),
+            waived=job.waived,
         )
 
     def _job(self, path: Path, target: Target | None) -> Job:
@@ -410,7 +442,14 @@ class Bench:
             raise UsageError("No device is chosen.", remedy="Choose the one to upgrade.")
         profile = self._place.profile(target)
         rate = self._place.bitrate_bps(self._adapter())
-        return prepare(path, profile, bitrate_bps=rate, at_power_up=self.state.is_rescue)
+        name = printable(path.name)
+        return prepare(
+            path,
+            profile,
+            bitrate_bps=rate,
+            at_power_up=self.state.is_rescue,
+            waived=[waiver for waived, waiver in self.state.waived if waived == name],
+        )
 
     def _check_device(self, job: Job) -> None:
         """Raises WrongDeviceError for an image that does not belong into the device that answered;
@@ -485,7 +524,7 @@ class Bench:
             case events.MessageRepeated():
                 changes["repetitions"] = self.state.repetitions + 1
             case events.PowerCycleAwaited(limit_s):
-                changes["power_cycle_s"] = limit_s
+                changes |= {"power_cycle_s": limit_s, "power_cycle_since_s": self._now()}
             case events.CheckMade():
                 changes["checks"] = (*self.state.checks, event)
         line = line_of(event)

@@ -13,6 +13,8 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Route
 
+from flasher.errors import UsageError
+from flasher.host.waivers import WAIVERS
 from flasher.protocol.contents import RunningInformation, VersionInformation
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import TARGETS
@@ -30,6 +32,15 @@ UPLOAD: Final = "/bench/upload"
 _FILES_MAX: Final = 200
 """Files of a folder that are looked at."""
 _MANIFEST: Final = ".toml"
+
+
+def _waive(said: Mapping[str, str]) -> Order:
+    """Raises ValueError unless it was said that the risk is known."""
+    if said["risk"] != "known":
+        raise ValueError(said["risk"])
+    return bench.Waive(said["name"], said["waiver"])
+
+
 _ORDERS: Final[Mapping[str, Callable[[Mapping[str, str]], Order]]] = {
     "adapters": lambda _: bench.FindAdapters(),
     "adapter": lambda said: bench.UseAdapter(said["name"]),
@@ -40,6 +51,8 @@ _ORDERS: Final[Mapping[str, Callable[[Mapping[str, str]], Order]]] = {
     "no-backup": lambda _: bench.LeaveBackup(),
     "target": lambda said: bench.ChooseTarget(said["name"]),
     "images": lambda _: bench.Judge(),
+    "waive": _waive,
+    "folder": lambda said: bench.UseFolder(said["path"]),
     "image": lambda said: bench.ChooseImage(said["name"]),
     "upgrade": lambda said: bench.Upgrade(said["target"], said["sha256"]),
     "next": lambda _: bench.StartOver(),
@@ -61,6 +74,16 @@ class Shelf:
         self.traces.mkdir(exist_ok=True)
         self._suffixes = tuple(f".{suffix}" for suffix in suffixes)
         self._trace_suffixes = tuple(f".{suffix}" for suffix in traces)
+
+    def use(self, folder: str) -> None:
+        """Take images from this folder. Raises UsageError where it is none."""
+        path = Path(folder).expanduser()
+        if not folder or not path.is_dir():
+            raise UsageError(
+                f"{printable(folder)} is no folder of this computer.",
+                remedy="Name one with its whole path, as in /home/me/firmware.",
+            )
+        self.folder = path.resolve()
 
     def files(self) -> list[Path]:
         """Files that may be images; dropped ones first."""
@@ -129,6 +152,7 @@ class BenchPage:
             "bench_sheet.html",
             done=done,
             rows=compared(done),
+            waivers=WAIVERS,
             is_saved=is_saved,
         )
         if is_saved:
@@ -155,12 +179,13 @@ class BenchPage:
                 }
                 sent = parts
             yield f"data: {json.dumps(message, ensure_ascii=False)}\n\n"
+        yield f"data: {json.dumps({'ended': True})}\n\n"
 
     def _parts(self, words: Words, state: State) -> dict[str, str]:
         return self._pages.parts(
             words, "bench_parts.html", state=state, targets=TARGETS.values(),
             folder=str(self._shelf.folder), is_mock=self._is_mock, facts=facts(state),
-            left_s=left_s(state), told=told(state),
+            left_s=left_s(state), told=told(state), waivers=WAIVERS,
         )  # fmt: skip
 
     async def _order(self, request: Request) -> Response:

@@ -55,6 +55,8 @@ class Offer:
     sha256: str = ""
     checks: tuple[events.CheckMade, ...] = ()
     refusal: FlasherError | None = None
+    waived: tuple[str, ...] = ()
+    """Names of the checks that somebody has waived for it (flasher.host.waivers)."""
 
     @property
     def name(self) -> str:
@@ -174,6 +176,8 @@ class State:
     target: Target | None = None
     offers: tuple[Offer, ...] = ()
     offer: Offer | None = None
+    waived: frozenset[tuple[str, str]] = frozenset()
+    """Images by their names, each with a check that was waived for this device."""
     phase: events.Phase | None = None
     packet: int = 0
     """Packets that the device has acknowledged in this attempt."""
@@ -185,6 +189,8 @@ class State:
     """On the clock of the bench, as `transfer_began_s`."""
     power_cycle_s: float | None = None
     """The device has to be switched off and on; it is waited for so long."""
+    power_cycle_since_s: float = 0.0
+    """On the clock of the bench."""
     checks: tuple[events.CheckMade, ...] = ()
     notes: tuple[str, ...] = ()
     is_stopping: bool = False
@@ -195,6 +201,12 @@ class State:
     @property
     def is_idle(self) -> bool:
         return self.doing is Doing.NOTHING
+
+    def power_cycle_left_s(self, now_s: float) -> int:
+        """Whole seconds that the device is still waited for."""
+        if self.power_cycle_s is None:
+            return 0
+        return max(0, round(self.power_cycle_s - (now_s - self.power_cycle_since_s)))
 
 
 # -- orders ----------------------------------------------------------------------------------------
@@ -252,6 +264,21 @@ class Judge:
 
 
 @dataclass(frozen=True)
+class Waive:
+    """Take this image all the same, although this check has refused it."""
+
+    name: str
+    waiver: str
+
+
+@dataclass(frozen=True)
+class UseFolder:
+    """Offer the images of this folder."""
+
+    path: str
+
+
+@dataclass(frozen=True)
 class TakeFiles:
     """Look at files that were dropped on the page."""
 
@@ -294,6 +321,8 @@ Order = (
     | ChooseTarget
     | Judge
     | TakeFiles
+    | Waive
+    | UseFolder
     | ChooseImage
     | Upgrade
     | StartOver

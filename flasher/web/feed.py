@@ -121,9 +121,13 @@ class Feed:
         with self._lock:
             self._followers.add(follower)
         try:
-            while not self._is_closed:
+            is_last = False
+            while not is_last:
+                is_last = self._is_closed  # before it is taken what there is then
                 if self._now() - self._beat_at < self._silence_limit_s:
                     yield self._take(follower)
+                if is_last:
+                    return
                 await asyncio.sleep(GATHER_S)
                 try:
                     await asyncio.wait_for(follower.woken.wait(), BEAT_S)

@@ -132,9 +132,13 @@ def test_a_serial_port_is_one_with_what_its_usb_device_says(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     port = SimpleNamespace(
-        device="/dev/ttyACM0", description="CANable2", serial_number="0042", location="1-1.4"
+        device="/dev/ttyACM0", description="CANable2", serial_number="0042", location="1-1.4",
+        vid=0x16D0,
+    )  # fmt: skip
+    own = SimpleNamespace(
+        device="/dev/ttyS0", description="n/a", serial_number=None, location=None, vid=None
     )
-    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [port])
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [own, port])
     (found,) = serial_ports("slcan")
     assert (found.serial_number, found.usb_path) == ("0042", "1-1.4")
     assert found.arguments == "-i slcan -c /dev/ttyACM0"

@@ -13,7 +13,7 @@ from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import bundle_folder
 from flasher.cli.stop import Stop
-from flasher.cli.upgrade.bench_page import VirtualBikes, backup_folder
+from flasher.cli.upgrade.bench_page import Memory, VirtualBikes, backup_folder
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.web import bench
 from flasher.web.bench import Bench
@@ -67,7 +67,8 @@ class BenchPlace:
         dropped.mkdir()
         self.shelf = Shelf(folder_of_images(folder), dropped, IMAGE_SUFFIXES, TRACE_SUFFIXES)
         bus = Bus(mock=True, mock_speed=0.0)
-        self.bikes = HeldBikes(bus, Output(verbosity=-1), self.shelf, Stop(None))
+        output = Output(verbosity=-1)
+        self.bikes = HeldBikes(bus, output, self.shelf, Stop(None), Memory())
         self.bench = Bench(self.bikes, lambda: 0.0)
         self.do(FindAdapters())
 

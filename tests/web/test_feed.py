@@ -118,14 +118,16 @@ def test_a_program_that_hangs_is_not_vouched_for() -> None:
     assert then.changes == (("A", 1),)
 
 
-def test_a_closed_feed_ends_its_streams() -> None:
+def test_a_closed_feed_ends_its_streams_after_the_last_state() -> None:
     feed = _feed()
+    feed.put("a", 1, word=None)
 
-    async def follow() -> int:
-        count = 0
-        async for _ in feed.follow():
-            count += 1
+    async def follow() -> list[object]:
+        seen: list[object] = []
+        async for batch in feed.follow():
+            seen += [state for _, state in batch.changes]
+            feed.put("a", 2, word=None)
             feed.close()
-        return count
+        return seen
 
-    assert in_own_loop(follow()) == 1
+    assert in_own_loop(follow()) == [1, 2]

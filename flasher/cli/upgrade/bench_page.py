@@ -58,16 +58,46 @@ _MEMORY_MAX: Final = 4096
 """In bytes, of the file with the adapter that was used last."""
 
 
+class Memory:
+    """What the page was told last: its adapter, its folder of images."""
+
+    def __init__(self) -> None:
+        self._path = user_state_path("flasher", appauthor=False) / "ui.json"
+
+    def _all(self) -> dict[str, str]:
+        try:
+            kept = parse_json(read(self._path, _MEMORY_MAX, what="memory of the page"))
+            return {str(name): str(value) for name, value in kept.items()}
+        except (FlasherError, ValueError, AttributeError):
+            return {}
+
+    def kept(self, name: str) -> str:
+        """What was told last; empty where nothing was."""
+        return self._all().get(name, "")
+
+    def keep(self, **told: str) -> None:
+        """It is only for convenience: what cannot be written is left out."""
+        with contextlib.suppress(OSError):
+            self._path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            self._path.write_text(json.dumps({**self._all(), **told}), "utf-8")
+
+
 class _Place:
     """What both kinds of workplace have: what is kept of an upgrade, and product profiles."""
 
-    def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop) -> None:
+    def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop, memory: Memory) -> None:
         self.dialect = bus.dialect
         self.images = shelf.files
         self.dropped = shelf.dropped
+        self._shelf = shelf
+        self._memory = memory
         self._bus = bus
         self._output = output
         self._stop = stop
+
+    def use_folder(self, path: str) -> None:
+        self._shelf.use(path)
+        self._memory.keep(images=str(self._shelf.folder))
 
     def profile(self, target: Target) -> Profile:
         return load_profile(None, target, self.dialect)
@@ -176,10 +206,9 @@ def _backup_name(found: DeviceInfo) -> str:
 class Adapters(_Place):
     """The adapters of this computer."""
 
-    def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop) -> None:
-        super().__init__(bus, output, shelf, stop)
+    def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop, memory: Memory) -> None:
+        super().__init__(bus, output, shelf, stop, memory)
         self._buses: dict[str, Bus] = {}
-        self._memory = user_state_path("flasher", appauthor=False) / "ui.json"
 
     def adapters(self, cancelled: Callable[[], bool]) -> Sequence[Adapter]:
         self._buses = {}
@@ -202,21 +231,12 @@ class Adapters(_Place):
                     if is_port
                     else note
                 )
-        last = self._last()
+        last = self._memory.kept("adapter")
         listed = [Adapter(name, notes[name], was_last=name == last) for name in self._buses]
         return sorted(listed, key=lambda adapter: not adapter.was_last)
 
     def use(self, adapter: Adapter) -> None:
-        with contextlib.suppress(OSError):
-            self._memory.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            self._memory.write_text(json.dumps({"adapter": adapter.name}), "utf-8")
-
-    def _last(self) -> str:
-        try:
-            kept = parse_json(read(self._memory, _MEMORY_MAX, what="adapter used last"))
-            return str(kept["adapter"])
-        except (FlasherError, ValueError, LookupError, TypeError):
-            return ""
+        self._memory.keep(adapter=adapter.name)
 
     def bus(self, adapter: Adapter) -> Bus:
         return self._buses[adapter.name]
@@ -230,8 +250,8 @@ class Adapters(_Place):
 class VirtualBikes(_Place):
     """Bikes without hardware."""
 
-    def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop) -> None:
-        super().__init__(bus, output, shelf, stop)
+    def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop, memory: Memory) -> None:
+        super().__init__(bus, output, shelf, stop, memory)
         self._bikes: dict[str, VirtualBike] = {}
 
     def adapters(self, _cancelled: Callable[[], bool]) -> Sequence[Adapter]:
@@ -265,7 +285,7 @@ class VirtualBikes(_Place):
 
 
 def serve(
-    output: Output, bus: Bus, images: Path, *, port: int, opened: Callable[[str], None]
+    output: Output, bus: Bus, images: Path | None, *, port: int, opened: Callable[[str], None]
 ) -> FlasherError | None:
     """Serve the page until Ctrl-C; `opened` is told its address. Returns how an upgrade ended in
     which that came, where it did not end well.
@@ -278,12 +298,12 @@ def serve(
         TemporaryDirectory(prefix="flasher-images-") as dropped,
         stop_on_signal(lambda: output.error_line("stopping ...")) as stop,
     ):
-        folder = images.expanduser().resolve()
-        shelf = Shelf(folder, Path(dropped), IMAGE_SUFFIXES, TRACE_SUFFIXES)
+        memory = Memory()
+        shelf = Shelf(_folder(images, memory), Path(dropped), IMAGE_SUFFIXES, TRACE_SUFFIXES)
         desk = Desk(partial(Kept, bundle_folder(), backup_folder(), shelf.traces))
         stack.callback(desk.close)
         kind = VirtualBikes if bus.mock else Adapters
-        machine = Bench(kind(bus, output, shelf, stop), time.monotonic)
+        machine = Bench(kind(bus, output, shelf, stop, memory), time.monotonic)
         page = BenchPage(pages, machine, shelf, is_mock=bus.mock)
         app = application(
             [*page.routes, *DeskPages(pages, desk.ask, KEPT).routes],
@@ -308,6 +328,12 @@ def serve(
             machine.feed.close()
     done = machine.state.done
     return done.error if was_upgrading and done is not None else None
+
+
+def _folder(images: Path | None, memory: Memory) -> Path:
+    """Of images: the one that was named, else the one used last, else this one."""
+    last = Path(memory.kept("images") or ".")
+    return (images or (last if last.is_dir() else Path())).expanduser().resolve()
 
 
 def _wait(machine: Bench, worker: threading.Thread, stop: Stop) -> bool:

@@ -48,6 +48,7 @@ class Carried:
         ):
             self.record = keeper.record = record
             record.facts["plan"] = plan_document(plan, job.options)
+            record.facts["waived"] = job.waived
             record.facts["image_sha256"] = plan.image.sha256
             try:
                 with connect() as connection:
@@ -55,7 +56,7 @@ class Carried:
                     began_at = connection.clock.now()
                     with watching(connection, record) as watch:
                         name = "rescue" if job.options.at_power_up else "flash"
-                        keeper.began(name, plan, connection.name, is_mock=self.bus.mock)
+                        keeper.began(name, job, connection.name, is_mock=self.bus.mock)
 
                         def on_event(event: object) -> None:
                             if isinstance(event, CheckMade):

@@ -15,7 +15,6 @@ from flasher.cli import values
 from flasher.cli.adapters import check_heard, settled
 from flasher.cli.framework import command, option, option_set, retyped
 from flasher.cli.options import (
-    IMPLAUSIBLE,
     Bus,
     ImageOptions,
     bus_options,
@@ -48,6 +47,7 @@ from flasher.host.identity import WAIVABLE, Check
 from flasher.host.options import DEFAULT_ATTEMPTS, DEFAULT_POWER_UP_TIMEOUT_S, UpgradeOptions
 from flasher.host.outcome import AGAIN
 from flasher.host.verify import Level
+from flasher.host.waivers import OF_DEVICE, OUTSIDE_VECTOR
 from flasher.image.cortexm import vector_table
 from flasher.image.plan import Plan
 from flasher.image.release import Release
@@ -89,18 +89,6 @@ _EXIT_CODES: Final = (
     ExitCode.VERIFICATION,
     ExitCode.INTERRUPTED,
 )
-_WAIVERS: Final = {
-    "implausible": IMPLAUSIBLE,
-    "other-target": "an image that its manifest, or a name inside, gives to another target",
-    "hardware": "a hardware version that the manifest does not list",
-    "downgrade": "an image that is older than what runs",
-    "previous-version": "a running version that the manifest does not replace",
-    "in-use": "a vehicle whose battery gives much current",
-    "boot-name": "a bootloader that gives another name than the target's",
-    "boot-version": "a bootloader that is older than the manifest asks for",
-}
-"""What each --allow-... lets through."""
-
 
 # -- what the user chooses -------------------------------------------------------------------------
 
@@ -209,9 +197,9 @@ _upgrade_options: Final = option_set(
     *(
         option(
             f"--allow-{name}", is_flag=True, panel="checks before the first write",
-            help=f"let through {what}",
+            help=f"let through {waiver.lets_through}",
         )
-        for name, what in _WAIVERS.items()
+        for name, waiver in OF_DEVICE.items()
     ),
     option(
         "-f", "--force", is_flag=True, panel="checks before the first write",
@@ -344,7 +332,10 @@ class _Upgrade:
             output.document(dry_run_document(plan, chosen, checks))
             return ExitCode.OK
         level = choices.level(plan, chosen)
-        return self._carry_out(api.Job(plan, chosen, level, identity, tuple(found)))
+        waived = [name for name in OF_DEVICE if choices.allows(name)]
+        waived += [OUTSIDE_VECTOR] * (self.image.allow_outside_vector or choices.force)
+        job = api.Job(plan, chosen, level, identity, tuple(found), tuple(sorted(waived)))
+        return self._carry_out(job)
 
     def _carry_out(self, job: api.Job) -> int:
         output = self.output

@@ -88,6 +88,8 @@ def _lines(flash: Flash) -> Iterator[str]:
     yield printable(f"  image    {began.image}, {byte_count(began.image_size_bytes)}{version}")
     yield printable(f"  sha256   {began.image_sha256}")
     yield printable(f"  adapter  {began.adapter}")
+    if began.waived:
+        yield printable(f"  waived   {began.waived}")
     if ended is None:
         yield "  end      began, no end recorded"
         return

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Final
 
+from flasher.api import Job
 from flasher.bus.detect import BUILT_IN, SOCKETCAN
 from flasher.bus.inspect_interface import VIRTUAL_KINDS
 from flasher.cli.output import Output
@@ -17,7 +18,6 @@ from flasher.errors import ExitCode, FlasherError, InterruptedByUserError
 from flasher.events import QueryAnswered
 from flasher.history import Began, Ended, History
 from flasher.host.session import Result
-from flasher.image.plan import Plan
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.text import printable
 
@@ -36,8 +36,9 @@ class Keeper:
         self.record: Recording | None = None
         """Knows the bundle."""
 
-    def began(self, command: str, plan: Plan, adapter: str, *, is_mock: bool) -> None:
+    def began(self, command: str, job: Job, adapter: str, *, is_mock: bool) -> None:
         """The upgrade begins on this adapter."""
+        plan = job.plan
         began = Began(
             at=_now(),
             command=command,
@@ -48,6 +49,7 @@ class Keeper:
             image_sha256=plan.image.sha256,
             image_size_bytes=plan.image.size_bytes,
             image_version=plan.image.version,
+            waived=", ".join(job.waived),
         )
 
         def write() -> None:

@@ -54,8 +54,9 @@ DOCUMENTS: Final = (UiDocument,)
     exit_codes=(ExitCode.BUS, ExitCode.TRANSFER, ExitCode.INTERRUPTED),
 )
 @option(
-    "--images", metavar="DIR", type=values.FolderPath(), default=".", panel="page", brief=True,
-    help="the folder whose images are offered",
+    "--images", metavar="DIR", type=values.FolderPath(), panel="page", brief=True,
+    help="the folder whose images are offered (default: the one that was chosen on the page last, "
+    "else this one)",
 )  # fmt: skip
 @option("--no-browser", is_flag=True, panel="page", brief=True, help="print the address only")
 @option(
@@ -63,7 +64,7 @@ DOCUMENTS: Final = (UiDocument,)
     help="of this computer; 0 is any that is free",
 )  # fmt: skip
 @bus_options(mock="offer virtual bikes, each with a fault or none", speed=values.speed)
-def ui(output: Output, bus: Bus, *, images: Path, no_browser: bool, port: int) -> int:
+def ui(output: Output, bus: Bus, *, images: Path | None, no_browser: bool, port: int) -> int:
     """Upgrade a bike in a browser: adapter, bike, image, checks, upgrade, and what came of it."""
     need("The page", "web")
     from flasher.cli.upgrade.bench_page import serve  # noqa: PLC0415  an extra

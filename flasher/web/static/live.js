@@ -20,8 +20,13 @@ function follow(path, apply) {
     opened = Date.now();
     source = new EventSource(path);
     source.onmessage = (event) => {
-      apply(JSON.parse(event.data));
+      const message = JSON.parse(event.data);
+      apply(message);
       isHeard();
+      if (message.ended) {
+        source.close();
+        document.body.classList.add("ended");
+      }
     };
     source.onerror = () => {
       isLost();
