@@ -152,6 +152,7 @@ class BenchPage:
             "bench_sheet.html",
             done=done,
             rows=compared(done),
+            device=identity(done),
             waivers=WAIVERS,
             is_saved=is_saved,
         )
@@ -246,6 +247,16 @@ def facts(state: State) -> list[tuple[str, str]]:
     if state.bike.survey.faults is not None:
         found += _rows(state.bike.survey.faults).values()
     return found
+
+
+def identity(done: Done) -> list[tuple[str, str]]:
+    """What tells the upgraded device from others; empty where it cannot be asked."""
+    if done.before is None or done.before.target is not done.target:
+        return []
+    answers = (each.answer for each in done.before.readings)
+    version = next((each for each in answers if isinstance(each, VersionInformation)), None)
+    rows = {} if version is None else _rows(version)
+    return [rows[name] for name in ("model", "serial_number", "hardware_version") if name in rows]
 
 
 def told(state: State) -> list[tuple[str, list[tuple[str, str]]]]:

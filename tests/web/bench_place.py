@@ -62,14 +62,14 @@ class HeldBikes(VirtualBikes):
 class BenchPlace:
     """A bench, without its thread."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, now: Callable[[], float] = lambda: 0.0) -> None:
         dropped = folder / "dropped"
         dropped.mkdir()
         self.shelf = Shelf(folder_of_images(folder), dropped, IMAGE_SUFFIXES, TRACE_SUFFIXES)
         bus = Bus(mock=True, mock_speed=0.0)
         output = Output(verbosity=-1)
         self.bikes = HeldBikes(bus, output, self.shelf, Stop(None), Memory())
-        self.bench = Bench(self.bikes, lambda: 0.0)
+        self.bench = Bench(self.bikes, now)
         self.do(FindAdapters())
 
     def do(self, *orders: Order) -> State:

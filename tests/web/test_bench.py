@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 import zipfile
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import pytest
 from intelhex import IntelHex
 
 from flasher import events
+from flasher.cli.upgrade.bench_page import Memory
 from flasher.errors import (
     BusError,
     ImageError,
@@ -22,6 +25,7 @@ from flasher.errors import (
 )
 from flasher.history import History
 from flasher.image.release import Release
+from flasher.mock.profile import DeviceProfile
 from flasher.mock.store import AREA_START
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.spec import BMS
@@ -44,6 +48,8 @@ from flasher.web.bench_state import (
     State,
     Upgrade,
     UseAdapter,
+    UseFolder,
+    Waive,
     Watch,
 )
 from flasher.web.virtual_bike import Fault
@@ -128,15 +134,19 @@ def test_only_images_that_fit_are_offered_and_the_others_say_why(place: BenchPla
     assert state.offer is None
 
 
-def test_an_image_for_other_hardware_is_not_offered_to_the_bike_that_answered(
-    place: BenchPlace, tmp_path: Path
-) -> None:
+def _for_other_hardware(folder: Path) -> None:
     image = image_of(PACKETS, NEW)
     release = Release(
         target=BMS, size_bytes=image.size_bytes, sha256=image.sha256,
         hardware_versions=("V1r2r0_*",), source="",
     )  # fmt: skip
-    manifest_path(tmp_path / IMAGE).write_text(to_toml(release))
+    manifest_path(folder / IMAGE).write_text(to_toml(release))
+
+
+def test_an_image_for_other_hardware_is_not_offered_to_the_bike_that_answered(
+    place: BenchPlace, tmp_path: Path
+) -> None:
+    _for_other_hardware(tmp_path)
     assert _chosen(place).offer is not None
     state = place.do(UseAdapter(Fault.HARDWARE.value), ChooseTarget("bms"))
     refusals = {each.name: each.refusal for each in state.offers}
@@ -168,6 +178,61 @@ def test_an_order_from_a_page_that_was_not_up_to_date_sends_nothing(place: Bench
         state = place.do(order)
         assert isinstance(state.trouble, UsageError)
         assert state.done is None
+
+
+def test_the_folder_of_images_is_chosen_and_remembered(place: BenchPlace, tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "other.bin").write_bytes(image_of(3, NEW).data)
+    state = place.do(UseAdapter(Fault.NONE.value), ChooseTarget("bms"), UseFolder(str(other)))
+    assert [each.name for each in state.offers] == ["other.bin"]
+    assert Memory().kept("images") == str(other)
+    for wrong in ("", str(other / "other.bin"), "/no/such/folder"):
+        state = place.do(UseFolder(wrong))
+        assert isinstance(state.trouble, UsageError)
+        assert place.shelf.folder == other
+
+
+# -- checks that are waived ------------------------------------------------------------------------
+
+
+def test_a_check_that_refused_is_waived_for_this_image_and_stands_in_the_record(
+    place: BenchPlace, tmp_path: Path
+) -> None:
+    _for_other_hardware(tmp_path)
+    place.do(UseAdapter(Fault.HARDWARE.value), ChooseTarget("bms"))
+    state = place.do(Waive(IMAGE, "hardware"))
+    assert state.offer is not None
+    assert state.offer.waived == ("hardware",)
+    done = place.do(_upgrade(state)).done
+    assert done is not None
+    assert done.is_completed
+    assert ("hardware", "waived") in {(each.check, each.verdict) for each in done.checks}
+    assert History().flashes()[0][-1].began.waived == "hardware"
+    state = place.do(StartOver(), UseAdapter(Fault.HARDWARE.value), ChooseTarget("bms"))
+    assert IMAGE not in {each.name for each in state.offers if not each.refusal}
+
+
+def test_only_the_check_that_refused_can_be_waived(place: BenchPlace, tmp_path: Path) -> None:
+    _for_other_hardware(tmp_path)
+    place.do(UseAdapter(Fault.HARDWARE.value), ChooseTarget("bms"))
+    for order in (Waive(IMAGE, "downgrade"), Waive("broken.hex", ""), Waive("no", "hardware")):
+        state = place.do(order)
+        assert isinstance(state.trouble, UsageError)
+        assert (state.offer, state.waived) == (None, frozenset())
+
+
+def test_a_check_that_refused_in_the_upgrade_is_waived_after_it(
+    place: BenchPlace, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    riding = partial(DeviceProfile, battery_use="riding")
+    monkeypatch.setattr("flasher.web.virtual_bike.DeviceProfile", riding)
+    done = _done(place)
+    assert isinstance(done.error, WrongDeviceError)
+    assert done.error.waiver == "in-use"
+    state = place.do(Waive(IMAGE, "in-use"))
+    done = place.do(_upgrade(state)).done or done
+    assert done.is_completed
 
 
 # -- bad ends --------------------------------------------------------------------------------------
@@ -209,6 +274,24 @@ def test_a_device_whose_upgrade_failed_is_rescued_with_the_same_image(place: Ben
     assert asked[0] == 60.0
     assert (done.is_completed, done.is_running) == (True, True)
     assert place.bench.state.power_cycle_s is None
+
+
+def test_the_wait_for_the_power_is_counted_down(tmp_path: Path) -> None:
+    ticks = itertools.count(0.0, 0.25)
+    place = BenchPlace(tmp_path, lambda: next(ticks))
+    seen: list[int] = []
+    put = place.bench.feed.put
+
+    def watched(subject: str, state: State, *, word: object) -> None:
+        put(subject, state, word=word)
+        seen.extend([state.power_cycle_left_s(state.now_s)] * (state.power_cycle_s is not None))
+
+    place.bench.feed.put = watched  # type: ignore[method-assign]
+    _done(place, Fault.POWER)
+    place.do(_upgrade(place.do(RescueIt())))
+    assert seen[0] in (59, 60)
+    assert len(set(seen)) > 5
+    assert seen == sorted(seen, reverse=True)
 
 
 def test_an_image_that_the_device_has_refused_is_not_chosen_for_its_rescue(
@@ -279,6 +362,7 @@ def test_while_it_does_something_it_takes_no_other_order(place: BenchPlace) -> N
         UseAdapter("none"),
         RescueIt(),
         Upgrade("bms", ""),
+        Waive(IMAGE, "hardware"),
     ],
 )
 def test_an_order_out_of_turn_is_refused_in_words(place: BenchPlace, order: Order) -> None:

@@ -17,6 +17,7 @@ from playwright.sync_api import Browser, Page, expect
 from flasher import events
 from flasher.web.virtual_bike import Fault
 from tests.end_to_end.stage import NEW, OLD, image_of
+from tests.firmware import VECTORS
 from tests.web.bench_place import IMAGE, PACKETS, BenchPlace
 
 expect.set_options(timeout=20_000)  # the computer may have much else to do
@@ -186,6 +187,34 @@ def test_the_bus_is_watched_and_the_battery_saved(page: Page) -> None:
         page.click("#download")
     with zipfile.ZipFile(download.value.path()) as archive:
         assert "memory.hex" in archive.namelist()
+
+
+def test_a_check_is_waived_in_a_second_step_that_names_the_risk(page: Page) -> None:
+    page.click(f"#adapter button:text-is('{Fault.NONE.value}')")
+    page.click("#target-bms:enabled")
+    wrong = image_of(3, NEW).data[len(VECTORS) :]
+    page.set_input_files("#file", {"name": "odd.bin", "mimeType": "", "buffer": wrong})
+    expect(page.locator("#refused-all")).to_contain_text("2 files")
+    page.click("#refused-all")
+    page.click("#refused summary:text('Take it all the same')")
+    expect(page.locator("#refused")).to_contain_text("do not look like a program for the device")
+    page.click("#waive-2-go")  # not without the tick
+    expect(page.locator("#waive-2-risk:invalid")).to_be_visible()
+    _check(page)
+    page.check("#waive-2-risk")
+    page.click("#waive-2-go")
+    expect(page.locator("#start")).to_contain_text("Waived for this upgrade")
+
+
+def test_the_page_says_when_its_program_has_ended(page: Page, place: BenchPlace) -> None:
+    page.click(f"#adapter button:text-is('{Fault.NONE.value}')")
+    expect(page.locator("#target-bms")).to_be_visible()
+    place.bench.feed.close()
+    expect(page.locator("#ended")).to_be_visible()
+    expect(page.locator("#target-bms")).to_be_hidden()
+    expect(page.locator("#bike")).to_contain_text(OLD)
+    name = page.locator("#cover").evaluate("each => getComputedStyle(each).animationName")
+    assert name == "none"
 
 
 def test_an_image_that_the_device_refuses_is_not_said_to_be_completed(page: Page) -> None:

@@ -88,7 +88,7 @@ def adapters(output: Output, *, network: bool) -> int:
         output.result("no adapter found")
     if serial:
         output.result("")
-        output.result("serial ports; with an slcan adapter behind it, one is used by")
+        output.result("serial ports on the USB; with an slcan adapter behind it, one is used by")
         output.table(_rows(serial))
     output.result("")
     output.result("not seen, even when plugged in:")
