@@ -123,6 +123,17 @@ def load_badges(path: Path, serial_number: SerialNumber) -> tuple[Person, ...]:
     return table.person
 
 
+def role_of(people: Iterable[Person], code: str, pin: str, *, needs_pin: bool) -> Role | None:
+    """The role of who shows this badge and knows its PIN; None for everybody else. A badge without
+    PIN is enough, unless `needs_pin`. It takes some 50 ms.
+    """
+    person = next((each for each in people if each.code == code), None)
+    if person is None:
+        return None
+    is_known = pins.is_right(pins.Pin(pin), person.pin) if person.pin else not needs_pin
+    return person.role if is_known else None
+
+
 @dataclass(frozen=True)
 class Asked:
     """An override that waits for the PIN of its person."""
@@ -155,6 +166,11 @@ class Crew:
     def codes(self) -> frozenset[str]:
         """What the badges say."""
         return frozenset(self._people)
+
+    @property
+    def people(self) -> tuple[Person, ...]:
+        """Everybody with a badge."""
+        return tuple(self._people.values())
 
     def find(self, text: str) -> Person | None:
         """Whose badge it is."""

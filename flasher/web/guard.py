@@ -2,8 +2,9 @@
 
 Every request names this server as its host, so that no foreign name leads here (DNS rebinding).
 What changes something is a POST from a page of this server that knows the token of its session.
-Answers forbid scripts, styles and connections from anywhere else. Where a password is set, nothing
-but the page that asks for it is shown without it.
+Answers forbid scripts, styles and connections from anywhere else. Where a password is set, or a
+badge asked for, nothing but the page that asks is shown before. Where there are badges, the pages
+of supervisors are for theirs.
 """
 
 from __future__ import annotations
@@ -12,9 +13,12 @@ import hmac
 import secrets
 from collections import deque
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import partial
 from typing import Any, Final
 from urllib.parse import parse_qs
 
+from anyio.to_thread import run_sync
 from starlette.applications import Starlette
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware import Middleware
@@ -27,6 +31,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from flasher.report.base import PAGE_STYLE
 from flasher.said import say
+from flasher.station.people import Role
 from flasher.web.pages import Pages
 
 TOKEN_HEADER: Final = "x-flasher-token"  # noqa: S105  its name
@@ -50,8 +55,25 @@ _TRIES_MAX: Final = 5
 _TRIES_WITHIN_S: Final = 60.0
 _ENTER: Final = "/enter"
 _CLOSED: Final = "/closed"
-_OPEN: Final = ("/static/", "/login", _ENTER, _CLOSED)
+_LOGIN: Final = "/login"
+_OPEN: Final = ("/static/", _LOGIN, _ENTER, _CLOSED)
 """Paths that need no password."""
+_SUPERVISES_S: Final = 900.0
+"""A supervisor who looked at no page for so long has left the screen."""
+_BADGE_MAX: Final = 300
+"""Characters of a badge or a PIN."""
+
+
+@dataclass(frozen=True)
+class Badges:
+    """The people who may open pages."""
+
+    role_of: Callable[[str, str], Role | None]
+    """The role of a badge with a PIN; None when one of them is wrong. It is slow on purpose."""
+    is_supervised: Callable[[str], bool]
+    """True for the path of a page that is for supervisors."""
+    are_for_all: bool
+    """True where the other pages need a badge too: any."""
 
 
 class Tries:
@@ -104,6 +126,7 @@ def application(  # noqa: PLR0913  the name and the rights of a server
     secret: str,
     now: Callable[[], float],
     password: str = "",
+    badges: Badges | None = None,
     entry: Entry | None = None,
     is_tls: bool = False,
     uploads: Callable[[str], int] = lambda _path: BODY_MAX,
@@ -111,15 +134,16 @@ def application(  # noqa: PLR0913  the name and the rights of a server
     """The pages behind the guard. `hosts`: names by which this server is addressed, without port;
     `secret` signs the cookies; `uploads` gives the limit of a path's body in bytes.
     """
-    login = _Login(pages, password, now)
+    login = _Login(pages, password, badges, now)
     entries = [] if entry is None else [Route(_ENTER, entry.take), Route(_CLOSED, entry.refuse)]
-    refused_to = "/login" if password else "" if entry is None else _CLOSED
+    asks = bool(password) or (badges is not None and badges.are_for_all)
+    refused_to = _LOGIN if asks else "" if entry is None else _CLOSED
     own: list[BaseRoute] = [
         *entries,
         Route("/static/page.css", FileResponse(PAGE_STYLE)),
         Mount("/static", StaticFiles(packages=[("flasher.web", "static")])),
-        Route("/login", login.show, methods=["GET"]),
-        Route("/login", login.take, methods=["POST"]),
+        Route(_LOGIN, login.show, methods=["GET"]),
+        Route(_LOGIN, login.take, methods=["POST"]),
     ]
     session = Middleware(
         SessionMiddleware,
@@ -132,7 +156,7 @@ def application(  # noqa: PLR0913  the name and the rights of a server
         routes=[*own, *routes],
         middleware=[
             session,
-            Middleware(_Sessions, refused_to=refused_to if password or entry else ""),
+            Middleware(_Sessions, refused_to=refused_to, badges=badges, now=now),
         ],
     )
     return _Guard(inner, hosts, uploads)
@@ -204,55 +228,107 @@ def _limited(receive: Receive, limit: int) -> Receive:
 
 
 class _Sessions:
-    """Every session has a token, which a POST has to say; and has said the password or used the
-    entry, where there is one: others are sent to `refused_to`.
+    """Every session has a token, which a POST has to say; and has said the password, shown a badge
+    or used the entry, where there is one: others are sent to `refused_to`.
     """
 
-    def __init__(self, app: ASGIApp, *, refused_to: str) -> None:
+    def __init__(
+        self, app: ASGIApp, *, refused_to: str, badges: Badges | None, now: Callable[[], float]
+    ) -> None:
         self._app = app
         self._refused_to = refused_to
+        self._badges = badges
+        self._now = now
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         session: dict[str, Any] = scope["session"]
         session.setdefault("token", secrets.token_urlsafe(24))
-        is_open = scope["path"].startswith(_OPEN)
-        if self._refused_to and not is_open and not session.get("is_in"):
-            is_stream = scope["path"].endswith("/events")
-            to = self._refused_to
+        path: str = scope["path"]
+        if to := "" if path.startswith(_OPEN) else self._refused(path, session):
+            if to == _LOGIN and scope["method"] == "GET":
+                session["wanted"] = path
+            is_stream = path.endswith("/events")
             refusal = Response(status_code=401) if is_stream else RedirectResponse(to, 303)
             await refusal(scope, receive, send)
             return
-        if scope["method"] == "POST" and scope["path"] != "/login":
+        if scope["method"] == "POST" and path != _LOGIN:
             said = Headers(scope=scope).get(TOKEN_HEADER, "")
             if not hmac.compare_digest(said.encode(), session["token"].encode()):
                 await PlainTextResponse("Load the page again.", 403)(scope, receive, send)
                 return
         await self._app(scope, receive, send)
 
+    def _refused(self, path: str, session: dict[str, Any]) -> str:
+        """Where who may not see this page is sent to; "" for who may."""
+        if self._refused_to and not session.get("is_in"):
+            return self._refused_to
+        if self._badges is None or not self._badges.is_supervised(path):
+            return ""
+        now = self._now()
+        # A clock that began anew, after a restart of the computer, says nothing of before.
+        if not 0.0 <= now - session.get("supervised_at", -_SUPERVISES_S) < _SUPERVISES_S:
+            return _LOGIN
+        session["supervised_at"] = now
+        return ""
+
 
 class _Login:
-    """The page that asks for the password."""
+    """The page that asks for the password, or for a badge."""
 
-    def __init__(self, pages: Pages, password: str, now: Callable[[], float]) -> None:
+    def __init__(
+        self, pages: Pages, password: str, badges: Badges | None, now: Callable[[], float]
+    ) -> None:
         self._pages = pages
         self._password = password
+        self._badges = badges
+        self._now = now
         self._tries = Tries(now)
 
     async def show(self, request: Request) -> Response:
-        return self._pages.show(request, "login.html", trouble="")
+        return self._show(request)
+
+    def _show(
+        self, request: Request, trouble: str = "", status: int = 200, *, badge: str = ""
+    ) -> Response:
+        """The page; with a `badge` that was scanned it asks for its PIN alone."""
+        return self._pages.show(
+            request,
+            "login.html",
+            status=status,
+            trouble=trouble,
+            badge=badge,
+            asks_password=bool(self._password) and not request.session.get("is_in"),
+            asks_badge=self._badges is not None,
+            is_for_supervisors=self._is_supervised(request),
+        )
 
     async def take(self, request: Request) -> Response:
         fields = parse_qs((await request.body()).decode("utf-8", "replace"))
-        token, said = fields.get("token", [""])[0], fields.get("password", [""])[0]
+        token, password, badge, pin = (
+            fields.get(name, [""])[0] for name in ("token", "password", "badge", "pin")
+        )
         if not hmac.compare_digest(token.encode(), request.session["token"].encode()):
-            return RedirectResponse("/login", 303)
+            return RedirectResponse(_LOGIN, 303)
         if self._tries.are_used_up:
-            trouble = say("Too many wrong passwords: wait a minute.")
-            return self._pages.show(request, "login.html", status=429, trouble=trouble)
-        if not self._password or not hmac.compare_digest(said.encode(), self._password.encode()):
+            return self._show(request, say("Too many wrong tries: wait a minute."), 429)
+        role = None
+        if badge and self._badges is not None:
+            # Beside the loop that serves all pages: it takes its time.
+            find = partial(self._badges.role_of, badge.strip()[:_BADGE_MAX], pin[:_BADGE_MAX])
+            role = await run_sync(find)
+        is_password = hmac.compare_digest(password.encode(), self._password.encode())
+        if role is None and not (self._password and is_password):
             self._tries.was_wrong()
-            return self._pages.show(
-                request, "login.html", status=403, trouble=say("That is not it.")
-            )
+            if badge and not pin:  # a scanner ends what it types by Enter
+                return self._show(request, say("Type the PIN of the badge."), 403, badge=badge)
+            return self._show(request, say("That is not it."), 403)
+        if role is not None and role is not Role.SUPERVISOR and self._is_supervised(request):
+            return self._show(request, say("That badge is no supervisor's."), 403)
         request.session["is_in"] = True
-        return RedirectResponse("/", 303)
+        if role is Role.SUPERVISOR:
+            request.session["supervised_at"] = self._now()
+        return RedirectResponse(request.session.get("wanted", "/"), 303)
+
+    def _is_supervised(self, request: Request) -> bool:
+        wanted = request.session.get("wanted", "/")
+        return self._badges is not None and self._badges.is_supervised(wanted)

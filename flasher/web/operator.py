@@ -35,6 +35,8 @@ HEAD_EVERY_S: Final = 0.1
 SILENCE_LIMIT_S: Final = 1.5
 """A station whose loop turns more slowly is not at work for the page."""
 _HEAD: Final = "head"
+LINE: Final = "/line"
+"""Where the page is, and below it what it asks for."""
 
 WORDS: Final = {
     SocketState.STARTING: say("STARTING"),
@@ -226,14 +228,14 @@ class OperatorPage:
     def routes(self) -> list[BaseRoute]:
         return [
             Route("/", self._start),
-            Route("/line", self._page),
-            Route("/line/events", self._events),
-            Route("/line/scan", self._scan, methods=["POST"]),
+            Route(LINE, self._page),
+            Route(f"{LINE}/events", self._events),
+            Route(f"{LINE}/scan", self._scan, methods=["POST"]),
         ]
 
     async def _start(self, request: Request) -> Response:
         query = f"?{request.url.query}" if request.url.query else ""
-        return RedirectResponse(f"/line{query}", 303)
+        return RedirectResponse(f"{LINE}{query}", 303)
 
     async def _page(self, request: Request) -> Response:
         return self._pages.show(request, "line.html", sound_volume=self._sound_volume)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import partial
 from typing import Any
 
 import pytest
@@ -11,7 +12,9 @@ from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
-from flasher.web.guard import BODY_MAX, TOKEN_HEADER, Entry, application
+from flasher.station.people import Person, Role, role_of
+from flasher.station.pins import Pin, hash_of
+from flasher.web.guard import BODY_MAX, TOKEN_HEADER, Badges, Entry, application
 from flasher.web.pages import Pages
 
 _URL = "http://127.0.0.1:8740"
@@ -199,3 +202,111 @@ def test_a_guessed_key_lets_nobody_in_and_does_not_void_the_address(key: str) ->
 
 def _post_status(client: TestClient) -> int:
     return client.post("/do", content=b"", headers={"origin": _URL, TOKEN_HEADER: ""}).status_code
+
+
+# -- badges ----------------------------------------------------------------------------------------
+
+ALL = "of all of us"
+PEOPLE = (
+    Person(name="Jo", code="BADGE-1", role=Role.OPERATOR),
+    Person(name="Sue", code="BADGE-2", role=Role.SUPERVISOR, pin=hash_of(Pin("4711"))),
+    Person(name="Al", code="BADGE-3", role=Role.SUPERVISOR),
+)
+
+
+def _with_badges(clock: Clock, *, is_far: bool = False, password: str = "") -> TestClient:
+    badges = Badges(
+        partial(role_of, PEOPLE, needs_pin=is_far),
+        is_supervised=lambda path: path == "/runs",
+        are_for_all=is_far and not password,
+    )
+    app = application(
+        [Route("/", _page), Route("/runs", _page)],
+        pages=Pages(),
+        hosts={"127.0.0.1"},
+        secret=_KEY,
+        now=clock,
+        password=password,
+        badges=badges,
+    )
+    return TestClient(app, base_url=_URL, follow_redirects=False)
+
+
+def _sign_in(client: TestClient, **said: str) -> tuple[int, str]:
+    found = re.search(r'name="token" value="(.*?)"', client.get("/login").text)
+    assert found is not None
+    fields = {"token": found[1], **said}
+    answer = client.post("/login", data=fields, headers={"origin": _URL})
+    return answer.status_code, answer.headers.get("location", "")
+
+
+def test_the_pages_of_supervisors_are_for_their_badges() -> None:
+    client = _with_badges(Clock())
+    assert client.get("/").status_code == 200  # the line is for everybody
+    refused = client.get("/runs")
+    assert (refused.status_code, refused.headers["location"]) == (303, "/login")
+    assert "for supervisors" in client.get("/login").text
+    assert _sign_in(client, badge="BADGE-1")[0] == 403  # an operator's
+    assert _sign_in(client, badge="BADGE-9")[0] == 403
+    assert _sign_in(client, badge="BADGE-2", pin="1111")[0] == 403
+    assert _sign_in(client, badge="BADGE-2")[0] == 403
+    assert client.get("/runs").status_code == 303
+    assert _sign_in(client, badge="BADGE-2", pin="4711") == (303, "/runs")
+    assert client.get("/runs").status_code == 200
+
+
+def test_a_scanner_that_ends_by_enter_leaves_the_pin_to_be_typed() -> None:
+    client = _with_badges(Clock())
+    client.get("/runs")
+    token = re.search(r'name="token" value="(.*?)"', client.get("/login").text)
+    assert token is not None
+    scanned = {"token": token[1], "badge": "BADGE-2", "pin": ""}
+    page = client.post("/login", data=scanned, headers={"origin": _URL}).text
+    assert "Type the PIN of the badge." in page
+    assert '<input type="hidden" name="badge" value="BADGE-2">' in page
+    assert _sign_in(client, badge="BADGE-2", pin="4711") == (303, "/runs")
+
+
+def test_a_supervisor_who_left_is_asked_again() -> None:
+    clock = Clock()
+    client = _with_badges(clock)
+    clock.now = 5000.0
+    client.get("/runs")
+    assert _sign_in(client, badge="BADGE-3") == (303, "/runs")
+    for clock.now in (5800.0, 6600.0):  # whoever reads is not
+        assert client.get("/runs").status_code == 200
+    clock.now = 7600.0
+    assert client.get("/runs").status_code == 303
+    _sign_in(client, badge="BADGE-3")
+    clock.now = 10.0  # the computer was restarted
+    assert client.get("/runs").status_code == 303
+
+
+def test_from_other_computers_a_badge_with_a_pin_lets_in() -> None:
+    client = _with_badges(Clock(), is_far=True)
+    assert client.get("/").headers["location"] == "/login"
+    assert _sign_in(client, badge="BADGE-1")[0] == 403
+    assert _sign_in(client, badge="BADGE-3")[0] == 403
+    assert _sign_in(client, badge="BADGE-2", pin="4711") == (303, "/")
+    assert client.get("/").status_code == 200
+
+
+def test_the_password_of_all_is_not_the_badge_of_a_supervisor() -> None:
+    client = _with_badges(Clock(), is_far=True, password=ALL)
+    client.get("/runs")
+    assert _sign_in(client, password=ALL) == (303, "/runs")
+    assert client.get("/").status_code == 200
+    assert client.get("/runs").headers["location"] == "/login"
+    assert 'name="password"' not in client.get("/login").text  # it was said
+    assert _sign_in(client, badge="BADGE-2", pin="4711") == (303, "/runs")
+
+
+def test_pins_are_not_guessed() -> None:
+    clock = Clock()
+    client = _with_badges(clock)
+    client.get("/runs")
+    for pin in range(5):
+        assert _sign_in(client, badge="BADGE-2", pin=f"000{pin}")[0] == 403
+    assert _sign_in(client, badge="BADGE-2", pin="4711")[0] == 429
+    clock.now += 61.0
+    assert _sign_in(client, badge="BADGE-2", pin="4711")[0] == 303

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from contextlib import closing
 from functools import partial
+from pathlib import Path
 from typing import Final
 
 from starlette.requests import Request
@@ -18,6 +19,7 @@ from flasher.cli.station.serving import served
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode
 from flasher.station.config import load_config
+from flasher.station.people import BADGES
 from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.web.desk import Desk, DeskPages
 from flasher.web.pages import Pages
@@ -27,7 +29,10 @@ _TURN_S: Final = 0.1
 
 
 def serve(output: Output, address: Address, options: PagesOptions, records: RecordsOptions) -> int:
-    shifts = DEFAULT_SHIFTS if records.sockets is None else load_config(records.sockets).shifts
+    config = None if records.sockets is None else load_config(records.sockets)
+    shifts = DEFAULT_SHIFTS if config is None else config.shifts
+    badges = "" if config is None else config.badges
+    people = BADGES.load(Path(badges)).person if badges else ()
     with closing(open_to_read(records)) as store:  # what is wrong with them is said before
         place = place_of(store)
     pages = Pages(options.language)
@@ -36,7 +41,15 @@ def serve(output: Output, address: Address, options: PagesOptions, records: Reco
     with (
         closing(desk),
         stop_on_signal() as stopped,
-        served(options, address, routes, pages=pages, keeping=None) as url,
+        served(
+            options,
+            address,
+            routes,
+            pages=pages,
+            keeping=None,
+            people=people,
+            is_supervised=lambda _path: True,
+        ) as url,
     ):
         desk.begin()
         output.progress(f"The supervisor pages: {url}; Ctrl-C ends them")

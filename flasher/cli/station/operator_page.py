@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from datetime import datetime
 from functools import partial
@@ -14,12 +14,13 @@ from flasher.station.board import Board
 from flasher.station.config import StationConfig
 from flasher.station.events import RunEnded, StationEvent
 from flasher.station.health import Watch
+from flasher.station.people import Person
 from flasher.station.records.keys import Keeping
 from flasher.station.records.model import RunFilter, RunState, utc_moment
 from flasher.station.station import Station
 from flasher.station.tally import EndedRun, Tally
 from flasher.web.desk import Desk, DeskPages
-from flasher.web.operator import Lot, OperatorPage, Screen
+from flasher.web.operator import LINE, Lot, OperatorPage, Screen
 from flasher.web.pages import Pages
 from flasher.web.supervisor import PAGES, open_supervisor, place_of
 
@@ -66,10 +67,11 @@ def operator_page(
     config: StationConfig,
     *,
     keeping: Keeping | None,
+    people: Sequence[Person],
 ) -> Iterator[tuple[OperatorView, str]]:
     """Serve the page, and those of the supervisor beside it, while the block runs; gives its view
     and its address. `keeping`: where the secret of the sessions is kept, so that pages go on after
-    a restart; None for no place.
+    a restart; None for no place. `people`: those with a badge.
 
     Raises UsageError.
     """
@@ -89,7 +91,16 @@ def operator_page(
     # In processes of their own: a page takes no time from the station.
     desk = Desk(partial(open_supervisor, *place_of(store), config.shifts))
     routes = [*operator.routes, *DeskPages(pages, desk.ask, PAGES).routes]
-    with closing(desk), served(options, address, routes, pages=pages, keeping=keeping) as url:
+    server = served(
+        options,
+        address,
+        routes,
+        pages=pages,
+        keeping=keeping,
+        people=people,
+        is_supervised=lambda path: path != "/" and not path.startswith(LINE),
+    )
+    with closing(desk), server as url:
         try:
             yield view, url
         finally:

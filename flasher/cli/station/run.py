@@ -195,6 +195,7 @@ class _Session:
         self.file: ScanFile | None = None
         by_hand = options.scan_by_hand or crew is not None or bool(config.scanner)
         self.scans_itself = is_virtual and options.scans is None and not by_hand
+        self._people = () if crew is None else crew.people
         self._has_pins = crew is not None and crew.has_pins
         self._options = options
         self._pages = pages
@@ -240,6 +241,7 @@ class _Session:
             self.view.board,
             self.config,
             keeping=None if self.is_temporary else self._store.signer.keeping,
+            people=self._people,
         )
         self._page, url = stack.enter_context(page)
         self.view.board.page = url

@@ -6,8 +6,9 @@ import os
 import secrets
 import socket
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -16,8 +17,9 @@ from starlette.routing import BaseRoute
 from flasher.cli.station.commands import Address, PagesOptions
 from flasher.errors import ErrorCode, UsageError
 from flasher.files import read
+from flasher.station.people import Person, role_of
 from flasher.station.records.keys import Keeping
-from flasher.web.guard import application
+from flasher.web.guard import Badges, application
 from flasher.web.pages import Pages
 from flasher.web.server import LOOPBACK, Server, Tls
 
@@ -36,12 +38,24 @@ def served(
     *,
     pages: Pages,
     keeping: Keeping | None,
+    people: Sequence[Person] = (),
+    is_supervised: Callable[[str], bool],
 ) -> Iterator[str]:
     """Serve pages while the block runs; gives their address. `keeping`: where the secret of the
-    sessions is kept; None: they end with the server. Raises UsageError.
+    sessions is kept; None: they end with the server. `people`: those with a badge, of whom
+    supervisors alone see the pages that `is_supervised` tells by their path; without people
+    everybody sees them. Raises UsageError.
     """
     password, tls = _password(options), _tls(options)
-    _check_open(options, address, has_password=bool(password), has_tls=tls is not None)
+    _check_open(options, address, has_password=bool(password or people), has_tls=tls is not None)
+    badges = None
+    if people:
+        is_far = address.host not in LOOPBACK
+        badges = Badges(
+            partial(role_of, people, needs_pin=is_far),
+            is_supervised,
+            are_for_all=is_far and not password,
+        )
     app = application(
         routes,
         pages=pages,
@@ -49,6 +63,7 @@ def served(
         secret=secrets.token_urlsafe(32) if keeping is None else kept_secret(keeping),
         now=time.monotonic,
         password=password,
+        badges=badges,
         is_tls=tls is not None,
     )
     with Server(app, address.host, address.port, tls) as server:
@@ -80,7 +95,7 @@ def _check_open(
     if not has_password:
         raise UsageError(
             f"Other computers could reach the pages on {address.host}, without a password.",
-            remedy="Give --web-password FILE.",
+            remedy="Give --web-password FILE, or a badge table (--badges).",
             code=ErrorCode.PAGES_NOT_SERVED,
         )
 
