@@ -32,10 +32,30 @@ from flasher.station.events import (
     UnitRemoved,
     WorkerFailed,
 )
-from flasher.station.records.model import Figures, RunState
+from flasher.station.records.model import Figures, RunState, StepName
 from flasher.station.scans import Word
 
+STEPS: Final = {
+    StepName.CONNECT: say("connect"),
+    StepName.IDENTIFY: say("identify"),
+    StepName.CHECK: say("check"),
+    StepName.FLASH: say("flash"),
+    StepName.WRITE: say("write"),
+    StepName.RESTART: say("restart"),
+    StepName.VERIFY: say("verify"),
+    StepName.SAVE: say("save"),
+}
+"""What a socket does."""
 NO_BADGES: Final = say("No badge table: people are taken at their word.")
+
+
+def _doing(step: StepName, target: str, try_number: int) -> str:
+    words = STEPS[step]
+    if target:
+        words = say("{step} {target}", step=words, target=target)
+    if try_number > 1:
+        words = say("{step} try {number}", step=words, number=try_number)
+    return words
 
 
 @dataclass
@@ -223,8 +243,7 @@ class Board:
                 self.waiting.discard(serial)
                 row.code = ""
             case StepStarted(_, _, step, try_number, target):
-                tries = f" try {try_number}" if try_number > 1 else ""
-                row.step = f"{step.value} {target}".strip() + tries
+                row.step = _doing(step, target, try_number)
                 row.share, row.left_s, row.note = None, None, ""
             case Progressed(_, _, _, share, left_s):
                 row.share, row.left_s = share, left_s

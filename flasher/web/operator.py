@@ -75,7 +75,7 @@ class Tile:
             "is_label": bool(row.serial),
             "share": row.share,
             "left": "" if row.left_s is None else _left(row.left_s, words),
-            "step": row.step,
+            "step": words(row.step),
             "code": row.code,
             "line": words(row.note),
             "virtual": words(say("virtual unit: no product")) if row.is_virtual else "",
