@@ -11,7 +11,6 @@ import flasher
 
 project = "flasher"
 author = "the flasher maintainers"
-copyright = "Apache-2.0"
 version = release = flasher.__version__
 
 extensions = ["myst_parser", "tests.site.diagrams", "tests.site.made"]
@@ -28,6 +27,7 @@ html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
 html_show_sphinx = False
+html_show_copyright = False
 html_use_index = False
 html_theme_options = {"navigation_with_keys": True}
 pygments_style = "friendly"

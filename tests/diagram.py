@@ -1,4 +1,4 @@
-"""The state diagrams of the documentation, drawn from the tables themselves.
+"""The states of the documentation, drawn from the tables themselves.
 
     python -m tests.diagram
 
@@ -8,6 +8,7 @@ against the tables.
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Iterable, Iterator
 from enum import Enum
@@ -31,32 +32,31 @@ _EVERYWHERE: Final = {"CANCEL", "OUT_OF_TIME", "POWER_CUT", "SECOND_TOOL", "UNEX
 _GOOD: Final = {Ending.COMPLETED, Ending.CONFIRMED_BY_VERSION}
 
 _INTRODUCTION: Final = """\
-# State diagrams
+# States
 
-Drawn from the tables in the code by `python -m tests.diagram`; a test keeps them so. Each arrow is
-*event / action*. Left out are events that are ignored or only reported, and those that are possible
-in every state: for the host the overall deadline, the user's cancellation and a second tool (all
-end the upgrade; a mere query of it is reported, and no event of the table), for the device a power
-cut.
+Drawn from the tables in the code by `python -m tests.diagram`; a test keeps them so. Left out are
+events that are ignored or only reported, and those that are possible in every state: for the host
+the overall deadline, the user's cancellation and a second tool (all end the upgrade; a mere query
+of it is reported, and no event of the table), for the device a power cut.
 """
 
 _Arrow = tuple[Enum, Enum, str, Enum | None]
 """From a state, by an event, with the words of an action, to a state; None is the end."""
 
 
-def host_arrows(*, overview: bool = False) -> Iterator[_Arrow]:
+def host_arrows(*, is_overview: bool = False) -> Iterator[_Arrow]:
     """The arrows of the host's table; an overview has neither bad endings nor a lost adapter."""
     for state, row in host.TABLE.items():
         for event, move in row.items():
             if event.name in _EVERYWHERE or move.action in _QUIET:
                 continue
-            if overview and event is host.Event.LINK_BACK:
+            if is_overview and event is host.Event.LINK_BACK:
                 continue
             words = move.action.replace("_", " ")
             for target in move.leads_to or (state,):
                 if isinstance(target, host.State):
                     yield state, event, words, target
-                elif not overview or target in _GOOD:
+                elif not is_overview or target in _GOOD:
                     yield state, event, f"ends, {prose(target)}", None
 
 
@@ -68,20 +68,28 @@ def device_arrows() -> Iterator[_Arrow]:
                 yield state, event, move.action.replace("_", " "), move.state or state
 
 
-def diagram(arrows: Iterable[_Arrow], states: type[Enum], *, overview: bool = False) -> str:
-    """A Mermaid state diagram. An overview leaves the actions out."""
+def overview() -> str:
+    """A Mermaid state diagram of the host, with one arrow from a state to another."""
     lines = ["```mermaid", "stateDiagram-v2"]
-    lines += [f'    state "{state.value}" as {state.name.lower()}' for state in states]
-    lines.append(f"    [*] --> {next(iter(states)).name.lower()}")
-    drawn: dict[str, None] = {}
-    for state, event, words, target in arrows:
-        label = event.value if overview else f"{event.value} / {words}"
+    lines += [f'    state "{state.value}" as {state.name.lower()}' for state in host.State]
+    lines.append(f"    [*] --> {next(iter(host.State)).name.lower()}")
+    drawn: dict[tuple[str, str], dict[str, None]] = {}
+    for state, event, _words, target in host_arrows(is_overview=True):
         to = "stopping" if target is None else target.name.lower()
-        drawn[f"    {state.name.lower()} --> {to} : {label.replace(':', ',')}"] = None
-    lines += drawn
-    if states is host.State:
-        lines += ["    stopping --> done : the last message has left", "    done --> [*]"]
+        drawn.setdefault((state.name.lower(), to), {})[event.value.replace(":", ",")] = None
+    lines += [f"    {state} --> {to} : {'<br/>'.join(told)}" for (state, to), told in drawn.items()]
+    lines += ["    stopping --> done : the last message has left", "    done --> [*]"]
     return "\n".join([*lines, "```", ""])
+
+
+def _table(arrows: Iterable[_Arrow]) -> Iterator[str]:
+    """What each state does at each event, state by state."""
+    for state, rows in itertools.groupby(arrows, lambda arrow: arrow[0]):
+        yield from (f"### {state.value}", "", "| event | does | leads to |", "|---|---|---|")
+        for (event, words), same in itertools.groupby(rows, lambda arrow: arrow[1:3]):
+            targets = dict.fromkeys(each[3].value if each[3] else "the end" for each in same)
+            yield f"| {event.value} | {words} | {', '.join(targets)} |"
+        yield ""
 
 
 def states_document() -> str:
@@ -90,17 +98,16 @@ def states_document() -> str:
         [
             _INTRODUCTION,
             "## The host: `flasher/host/table.py`\n",
-            diagram(host_arrows(), host.State),
+            *_table(host_arrows()),
             "## The device model: `flasher/mock/table.py`\n",
-            diagram(device_arrows(), device.State),
+            *_table(device_arrows()),
         ]
     )
 
 
 def upgrade_document(text: str) -> str:
     """docs/explanation/upgrade.md with its diagram drawn anew."""
-    overview = diagram(host_arrows(overview=True), host.State, overview=True)
-    return _MARKED.sub(lambda match: f"{match[1]}{overview}{match[2]}", text)
+    return _MARKED.sub(lambda match: f"{match[1]}{overview()}{match[2]}", text)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +12,7 @@ from flasher.bus.detect import Detected
 from flasher.bus.link import VirtualClock
 from tests.documents.blocks import LANGUAGES, ROOT, Block, blocks, pages
 from tests.documents.reader import PageReader, hold_options, is_told
+from tests.terminal_picture import COMMAND, PICTURE
 
 FOLLOWED = {
     path.relative_to(ROOT).as_posix(): found
@@ -40,6 +43,13 @@ def follow(found: list[Block], folder: Path, *, patient: bool) -> None:
 @pytest.mark.parametrize("page", FOLLOWED)
 def test_what_a_page_says_works(page: str, tmp_path: Path) -> None:
     follow(FOLLOWED[page], tmp_path, patient=False)
+
+
+def test_the_picture_in_the_readme_is_of_this_program(tmp_path: Path) -> None:
+    drawn = re.findall(r"<text[^>]*>(.*?)</text>", PICTURE.read_text(encoding="utf-8"))
+    shown = " ".join(" ".join(map(html.unescape, drawn)).split())
+    text = f"```console\n{shown[shown.index('$') :]}\n```\n".replace(COMMAND, f"{COMMAND}\n")
+    follow(list(blocks(text)), tmp_path, patient=False)
 
 
 def test_a_wrong_option_a_wrong_output_and_a_wrong_code_are_found(tmp_path: Path) -> None:

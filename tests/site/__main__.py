@@ -20,6 +20,7 @@ from typing import Final
 from sphinx.cmd.build import build_main
 
 from tests.site.pages import Site
+from tests.site.questions import told, unanswered
 
 _ROOT: Final = Path(__file__).parents[2]
 _DATE: Final = (1980, 1, 1, 0, 0, 0)
@@ -50,12 +51,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Build the site of the documents, and check it.")
     parser.add_argument("folder", nargs="?", type=Path, default=_ROOT / "build" / "site")
     parser.add_argument("--zip", type=Path, metavar="FILE", help="pack it into one file too")
+    parser.add_argument("--questions", action="store_true", help="show the way to ten answers")
     options = parser.parse_args()
     began = time.perf_counter()
     if not build(options.folder):
         return 1
     site = Site(options.folder)
-    problems = list(site.problems())
+    problems = [*site.problems(), *unanswered(site)]
     sys.stderr.writelines(f"{problem}\n" for problem in problems)
     if problems:
         return 1
@@ -65,6 +67,8 @@ def main() -> int:
         f"{options.folder / 'index.html'}: {len(site.pages)} pages, {size / 1e6:.1f} MB, "
         f"{took_s:.1f} s\n"
     )
+    if options.questions:
+        sys.stdout.writelines(f"{line}\n" for line in told(site))
     if options.zip:
         pack(options.folder, options.zip)
         sys.stdout.write(f"{options.zip}: {options.zip.stat().st_size / 1e6:.1f} MB\n")

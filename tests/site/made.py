@@ -149,12 +149,13 @@ def _examples(epilog: str) -> _Lines:
 
 def _keys(keys: Mapping[str, Key] | Iterator[Key]) -> _Lines:
     each = keys.values() if isinstance(keys, Mapping) else keys
-    rows = ((f"`{key.path}`", key.allowed, _default(key.default), key.text) for key in each)
-    yield from _table("key", "allowed", "default", "meaning", rows=rows)
+    rows = ((f"`{key.path}`", f"{_prose(key.text)}<br>{_value(key)}") for key in each)
+    yield from _table("key", "meaning", rows=rows)
 
 
-def _default(value: object) -> str:
-    return "" if value in (None, "", [], {}) else f"`{value}`"
+def _value(key: Key) -> str:
+    default = "" if key.default in (None, "", [], {}) else f"; default `{key.default}`"
+    return f"*{_prose(key.allowed)}*{default}"
 
 
 def _file(kind: type[BaseModel]) -> _Lines:

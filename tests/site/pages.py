@@ -25,18 +25,30 @@ class Page(HTMLParser):
         self.path = path
         text = path.read_text(encoding="utf-8")
         self.links: list[str] = []
+        self.told: list[str] = []
+        """Those of the text, without the menus."""
+        self.text = ""
+        self._depth = 0
         self.anchors = {""}
         self.loads: list[str] = _CSS_LOAD.findall(text)
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self._depth += tag == "article"
         for name, value in attrs:
             if name == "id":
                 self.anchors.add(value or "")
             elif tag == "a" and name == "href":
                 self.links.append(value or "")
+                self.told += [value or ""] * bool(self._depth)
             elif (tag, name) in _LOADS:
                 self.loads.append(value or "")
+
+    def handle_endtag(self, tag: str) -> None:
+        self._depth -= tag == "article"
+
+    def handle_data(self, data: str) -> None:
+        self.text += data * bool(self._depth)
 
 
 class Site:
