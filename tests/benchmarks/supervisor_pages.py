@@ -33,7 +33,7 @@ from flasher.web.desk import Desk, Question
 from flasher.web.supervisor import open_supervisor, place_of
 from tests.benchmarks.station_records import SERIAL_NUMBER, fill
 from tests.station.factory import HEAD, SERIAL, Bench, make_recipe, target_table
-from tests.web.desk import client_of
+from tests.web.desk import app_of, client_of
 
 REPEATS: Final = 5
 SOCKETS: Final = tuple("ABCDEFGH")
@@ -173,7 +173,7 @@ def pages_of(image: str, serial: str) -> tuple[str, ...]:
 
 
 def measure_pages(bench: Bench) -> None:
-    client = client_of(bench.path, bench.keys)
+    client = client_of(app_of(bench.path, bench.keys))
     image = bench.recipe.targets[0].image.sha256
     for path in pages_of(image, SERIAL):
         taken_s = []
@@ -197,7 +197,7 @@ def measure_certificate(folder: Path, runs: int) -> None:
     bench.recipe = make_recipe(folder, HEAD + SERIAL_NUMBER + target_table(BMS))
     fill(bench, runs)
     bench.store.close()
-    client = client_of(bench.path, bench.keys)
+    client = client_of(app_of(bench.path, bench.keys))
     began = time.perf_counter()
     answer = client.get("/units/certificate?serial=W0000017")
     if answer.status_code != 200:

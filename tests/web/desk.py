@@ -13,7 +13,7 @@ from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.web.desk import Answer, DeskPages, Question
 from flasher.web.guard import application
 from flasher.web.pages import Pages
-from flasher.web.supervisor import PAGES, open_supervisor
+from flasher.web.supervisor import PAGES, Supervisor, open_supervisor
 
 _KEY = "of the test"
 
@@ -21,7 +21,11 @@ _KEY = "of the test"
 def app_of(database: Path, keys: Path) -> ASGIApp:
     """The pages of the records in a file."""
     folder = database.with_name(f"{database.name}.files")
-    supervisor = open_supervisor(str(database), folder, Keeping(keys), DEFAULT_SHIFTS)
+    return app_with(open_supervisor(str(database), folder, Keeping(keys), DEFAULT_SHIFTS))
+
+
+def app_with(supervisor: Supervisor) -> ASGIApp:
+    """The pages that it answers."""
 
     async def ask(question: Question) -> Answer:
         return await asyncio.to_thread(supervisor.answer, question)
@@ -36,7 +40,5 @@ def app_of(database: Path, keys: Path) -> ASGIApp:
     )
 
 
-def client_of(database: Path, keys: Path) -> TestClient:
-    return TestClient(
-        app_of(database, keys), base_url="http://127.0.0.1:8741", follow_redirects=False
-    )
+def client_of(app: ASGIApp) -> TestClient:
+    return TestClient(app, base_url="http://127.0.0.1:8741", follow_redirects=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 import sqlite3
 import tempfile
 from collections.abc import Iterator
@@ -20,6 +21,7 @@ from starlette.testclient import TestClient
 
 from flasher.protocol.spec import BMS as TARGET
 from flasher.station.records import chain
+from flasher.station.records.keys import Keeping
 from flasher.station.records.model import (
     Measurement,
     RunFilter,
@@ -28,9 +30,11 @@ from flasher.station.records.model import (
     StepState,
 )
 from flasher.station.records.overview import By, Cut, Overview, Span
-from flasher.web.supervisor import shifts_of, spans_of
+from flasher.station.tally import DEFAULT_SHIFTS
+from flasher.web.supervisor import open_supervisor, shifts_of, spans_of
 from tests.station.factory import BMS_VERSION, IMAGES, Bench
-from tests.web.desk import client_of
+from tests.station.postgres import Server
+from tests.web.desk import app_of, app_with, client_of
 
 IMAGE = IMAGES[TARGET].sha256
 HOSTILE = "<script>alert(1)</script>\u202e\x07" + "W" * 150
@@ -63,7 +67,7 @@ def overview(plant: Bench) -> Overview:
 
 @pytest.fixture(scope="module")
 def client(plant: Bench) -> TestClient:
-    return client_of(plant.path, plant.keys)
+    return client_of(app_of(plant.path, plant.keys))
 
 
 @pytest.fixture
@@ -93,6 +97,56 @@ def _links(html: str) -> dict[str, str]:
     parser = _Links()
     parser.feed(html)
     return parser.found
+
+
+# -- records on a server ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        "/runs?search=w260500&state=fail",
+        "/runs.csv?lot=L2",
+        "/runs/3",
+        "/units?serial=W2605003",
+        *(f"/yield?by={by.value}" for by in By),
+        "/times",
+        f"/images?image={IMAGE[:12]}",
+        f"/images.csv?image={IMAGE[:12]}",
+    ],
+)
+def test_a_server_is_shown_as_a_file_is(
+    client: TestClient, server_client: TestClient, page: str
+) -> None:
+    in_file, on_server = client.get(page), server_client.get(page)
+    assert in_file.status_code == on_server.status_code == 200
+    assert _without_times(on_server.text) == _without_times(in_file.text)
+
+
+def test_the_trail_and_the_certificate_of_a_server_are_shown(server_client: TestClient) -> None:
+    for page in ("/audit", "/units/certificate?serial=W2605003"):
+        assert server_client.get(page, follow_redirects=True).status_code == 200
+
+
+@pytest.fixture(scope="module")
+def server_client(postgres: Server) -> Iterator[TestClient]:
+    url = postgres.records()
+    with tempfile.TemporaryDirectory() as folder:
+        bench = Bench(Path(folder), url=url)
+        _units(bench)
+        supervisor = open_supervisor(
+            url, bench.store.files.folder, Keeping(bench.keys), DEFAULT_SHIFTS
+        )
+        with closing(bench.store), closing(supervisor.store):
+            yield client_of(app_with(supervisor))
+
+
+def _without_times(text: str) -> str:
+    """Two benches are made one after the other: what differs is when, how long it took, and the
+    token of the session.
+    """
+    text = re.sub(r'content="[\w-]{32}"', "", text)
+    return re.sub(r"\d+(?:[:.\-T]\d+)+|\d+ (?=m?s\b)", "#", text)
 
 
 # -- runs ------------------------------------------------------------------------------------------
@@ -187,7 +241,7 @@ def test_steps_and_measurements_of_a_unit_are_shown(bench: Bench) -> None:
         run_id, "check", StepState.FAIL, duration_s=0.5, measurements=[out], code="LIMIT"
     )
     bench.store.finish(run_id, bench.ending(RunState.FAIL, "LIMIT"))
-    html = client_of(bench.path, bench.keys).get("/units?serial=W2605002").text
+    html = client_of(app_of(bench.path, bench.keys)).get("/units?serial=W2605002").text
     assert "29 V" in html
     assert "from 30 to 42 V" in html
     assert "LIMIT" in html
@@ -204,7 +258,7 @@ def test_what_is_not_there_is_said(client: TestClient, path: str) -> None:
 
 def test_the_certificate_is_refused_for_changed_records(bench: Bench) -> None:
     bench.make()
-    client = client_of(bench.path, bench.keys)
+    client = client_of(app_of(bench.path, bench.keys))
     assert "Flash certificate" in client.get("/units/certificate?serial=W2605002").text
     with closing(sqlite3.connect(bench.path)) as connection:
         for (name,) in connection.execute(
@@ -255,7 +309,7 @@ def test_the_units_that_hold_an_image_are_those_it_was_last_sent_to(bench: Bench
     assert {each.serial for each in overview.all_holders(newer)} == {"W2605002"}
     assert {each.serial for each in overview.all_holders(IMAGE)} == {"W2605001", "W2605003"}
 
-    client = client_of(bench.path, bench.keys)
+    client = client_of(app_of(bench.path, bench.keys))
     html = client.get(f"/images?image={newer[:12].upper()}").text
     assert "W2605002" in html
     assert "W2605001" not in html
@@ -397,7 +451,7 @@ def test_hostile_texts_stay_texts(bench: Bench) -> None:
     bench.work(claim.run_id)
     bench.store.step(claim.run_id, "<b>step</b>", StepState.FAIL, duration_s=0.1, text=HOSTILE)
     bench.store.finish(claim.run_id, bench.ending(RunState.FAIL, "<i>CODE</i>"))
-    client = client_of(bench.path, bench.keys)
+    client = client_of(app_of(bench.path, bench.keys))
     for path in ("/runs", "/units?serial=W2605002", "/yield?by=lot", "/times", "/audit", "/images",
                  "/runs?search=<script>", "/units?serial=<script>&part=<b>"):  # fmt: skip
         text = client.get(path).text
@@ -420,12 +474,12 @@ def test_every_page_in_every_language_also_of_empty_records(
 
 @pytest.mark.parametrize("path", ["/runs", "/units", "/images", "/yield", "/times", "/audit"])
 def test_empty_records_have_pages_too(bench: Bench, path: str) -> None:
-    assert client_of(bench.path, bench.keys).get(path).status_code == 200
+    assert client_of(app_of(bench.path, bench.keys)).get(path).status_code == 200
 
 
 def test_pages_change_nothing_and_wait_for_nobody(bench: Bench) -> None:
     bench.make()
-    client = client_of(bench.path, bench.keys)
+    client = client_of(app_of(bench.path, bench.keys))
     with bench.outsider() as writer:
         writer.execute("BEGIN IMMEDIATE")
         before = bench.path.read_bytes()
@@ -437,7 +491,7 @@ def test_pages_change_nothing_and_wait_for_nobody(bench: Bench) -> None:
 
 def test_damaged_records_are_said(bench: Bench) -> None:
     bench.make()
-    client = client_of(bench.path, bench.keys)
+    client = client_of(app_of(bench.path, bench.keys))
     bench.store.close()
     for file in bench.folder.glob("records.sqlite*"):
         if file.is_file():
