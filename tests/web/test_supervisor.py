@@ -112,7 +112,7 @@ def _links(html: str) -> dict[str, str]:
         *(f"/yield?by={by.value}" for by in By),
         "/times",
         f"/images?image={IMAGE[:12]}",
-        f"/images.csv?image={IMAGE[:12]}",
+        f"/images.csv?sha256={IMAGE}",
     ],
 )
 def test_a_server_is_shown_as_a_file_is(
