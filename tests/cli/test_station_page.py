@@ -10,7 +10,7 @@ import stat
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from flasher.web.server import Server
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.cli.station_threads import ThreadPort
 from tests.loops import each
+from tests.station.factory import Bench
 
 RECIPE = SAMPLES / "station" / "recipe.toml"
 RUN = ("station", "run", "--recipe", RECIPE, "--mock-sockets", "2", "--mock-speed", "0")
@@ -125,6 +126,18 @@ def test_a_port_that_is_taken_is_said(flasher: Flasher) -> None:
         run = flasher(*RUN, "--units", "1", "--web", other.getsockname()[1])
     assert run.code == ExitCode.USAGE
     assert "another program uses it" in run.err
+
+
+def test_a_station_that_cannot_begin_names_no_page(flasher: Flasher, tmp_path: Path) -> None:
+    records = ("--database", tmp_path / "records.sqlite")
+    bench = Bench(tmp_path)
+    bench.store.close()
+    with closing(bench.opened("mock")) as held:
+        held.become_station()
+        run = flasher(*RUN, "--units", "1", "--web", "127.0.0.1:0", *records)
+    assert run.code == ExitCode.USAGE
+    assert "[E219]" in run.err
+    assert "page" not in run.err
 
 
 def test_a_password_is_asked_for(flasher: Flasher, asked: list[Any], password: Path) -> None:

@@ -208,6 +208,7 @@ class _Session:
         self._is_stopped = False
         self._failure: FlasherError | None = None
         self._page: OperatorView | None = None
+        self._is_begun = False
         self.is_temporary = False
         """The records are gone afterwards."""
 
@@ -245,7 +246,6 @@ class _Session:
         )
         self._page, url = stack.enter_context(page)
         self.view.board.page = url
-        self._output.progress(f"The operator page: {url}")
 
     def show(self, event: StationEvent) -> None:
         """Show one event; called in the station's thread."""
@@ -255,6 +255,10 @@ class _Session:
 
     def turn(self) -> None:
         """Once in each turn of the station's loop."""
+        if not self._is_begun:
+            self._is_begun = True
+            if (page := self.view.board.page) and not isinstance(self.view, Table):
+                self._output.progress(f"The operator page: {page}")
         if self._typing is not None:
             typed = self._typing.text
             self.view.typed = "*" * len(typed) if self.view.board.pin_of else typed
