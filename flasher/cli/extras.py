@@ -10,6 +10,7 @@ from typing import Final
 from flasher.errors import ErrorCode, UsageError
 
 _PACKAGES: Final = {
+    "mf4": ("asammdf",),
     "station": ("argon2", "cryptography", "segno", "sqlalchemy", "stdnum"),
     "web": ("babel", "itsdangerous", "pygal", "starlette", "uvicorn"),
 }

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from flasher.export.dbc import joined_frames
 from flasher.trace.pcapng import PcapngWriter
 from flasher.trace.recorder import Writer, message_of, writer_of
 from flasher.trace.source import explain_path, frames_until_damage
@@ -62,6 +63,22 @@ def convert(trace: Path, to: Path, *, called: Path) -> Converted:
     finally:
         writer.stop()
     return Converted(frames, remarked, " ".join(damage))
+
+
+def convert_joined(trace: Path, to: Path, *, called: Path) -> Converted:
+    """Write each intact message of a trace as one CAN FD frame, as the DBC describes them. Raises
+    as `convert`.
+    """
+    damage: list[str] = []
+    frames = 0
+    writer = writer_of(to, called=str(called))
+    try:
+        for message in joined_frames(frames_until_damage(trace, damage)):
+            writer(message)
+            frames += 1
+    finally:
+        writer.stop()
+    return Converted(frames, 0, " ".join(damage))
 
 
 def _remarks(story: Story) -> dict[_Place, list[str]]:

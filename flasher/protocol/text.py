@@ -23,6 +23,8 @@ _FIRMWARE_VERSION: Final = re.compile(
     rb"_([0-9]{4}(?:0[1-9]|1[0-2])(?:0[1-9]|[12][0-9]|3[01]))"
 )
 """`FIRMWARE_VERSION_FORM`; a number of two digits is found too."""
+_FORMULA_STARTS: Final = ("=", "+", "-", "@", "\t", "\r")
+"""A spreadsheet takes a cell that begins so for a formula."""
 _BOOT_VERSION: Final = re.compile(r"V([0-9])\.([0-9])\.([0-9])")
 
 
@@ -91,3 +93,8 @@ def find_firmware_version(data: bytes) -> str | None:
 def firmware_version_spans(data: bytes) -> Iterator[tuple[int, int]]:
     """Where `data` holds firmware versions: the offset of the first byte, and one past the last."""
     return (match.span() for match in _FIRMWARE_VERSION.finditer(data))
+
+
+def no_formula(text: str) -> str:
+    """`text` as a cell that a spreadsheet takes for text, whatever it begins with."""
+    return f"'{text}" if text.startswith(_FORMULA_STARTS) else text

@@ -9,13 +9,12 @@ from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Final
 
+from flasher.protocol.text import no_formula
 from flasher.report.junit import JUnitCase, JUnitResult, JUnitSuite, junit_xml
 from flasher.station.records.model import Figures, RunFilter, RunKind, RunState, utc_text
 from flasher.station.records.queries import Records
 
 SCHEMA_VERSION: Final = 1
-_FORMULA_STARTS: Final = ("=", "+", "-", "@", "\t", "\r")
-"""A spreadsheet takes a cell that begins so for a formula."""
 Row = dict[str, str | int | float | bool | None]
 
 
@@ -77,7 +76,7 @@ def make_report(records: Records, chosen: RunFilter) -> Report:
 def csv_cell(value: object) -> str:
     """A cell that a spreadsheet takes for what it is."""
     if isinstance(value, str):
-        return f"'{value}" if value.startswith(_FORMULA_STARTS) else value
+        return no_formula(value)
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, float):

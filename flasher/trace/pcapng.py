@@ -238,7 +238,8 @@ class PcapngWriter:
             | _ERROR * message.is_error_frame
         )
         data = b"" if message.is_remote_frame else bytes(message.data)
-        packet = _CAN_HEADER.pack(message.arbitration_id | flags, message.dlc, 0) + data
+        kind = _IS_FD if message.is_fd else 0
+        packet = _CAN_HEADER.pack(message.arbitration_id | flags, message.dlc, kind) + data
         at_ns = round(message.timestamp * 10**9)
         head = Struct("<5L").pack(0, at_ns >> 32, at_ns & 0xFFFFFFFF, len(packet), len(packet))
         direction = (_INBOUND if message.is_rx else _OUTBOUND).to_bytes(4, "little")

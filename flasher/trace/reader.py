@@ -11,15 +11,16 @@ written into the file itself is read too.
 
 from __future__ import annotations
 
+import gc
 import gzip
 import math
 import os
 import shutil
 import sqlite3
 from collections.abc import Iterable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, redirect_stderr
 from functools import partial
-from io import BufferedIOBase, BytesIO
+from io import BufferedIOBase, BytesIO, StringIO
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import BinaryIO, Final, TextIO, cast
@@ -128,7 +129,7 @@ def _frames(
         whole = source.read(_WHOLE_MAX_SIZE + 1)
         if len(whole) > _WHOLE_MAX_SIZE:
             raise UnfitError(f"it has more than {_WHOLE_MAX_SIZE:,} bytes")
-        reader = can.MF4Reader(BytesIO(whole))
+        reader = _mf4_reader(whole)
     else:
         reader = _LINE_READERS[suffix](
             cast(
@@ -139,6 +140,21 @@ def _frames(
         # Not every format marks CAN FD; no other frame has as many bytes.
         if not message.is_fd and len(message.data) <= _DATA_MAX:
             yield message.timestamp, _frame(message)
+
+
+def _mf4_reader(whole: bytes) -> can.MF4Reader:
+    """Raises UnfitError, and NotImplementedError without the package."""
+    # What asammdf leaves of a file that it cannot open complains on stderr when it goes away: that
+    # is now, and not when the error has been told.
+    with redirect_stderr(StringIO()):
+        try:
+            return can.MF4Reader(BytesIO(whole))
+        except NotImplementedError:
+            raise
+        except Exception:  # noqa: BLE001  whatever it meets in a foreign file
+            reason = "it is no measurement file of version 4, or it is cut off"
+        gc.collect()
+    raise UnfitError(reason)
 
 
 def _check(at_s: float, frame: Frame) -> None:

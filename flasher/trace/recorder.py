@@ -62,7 +62,8 @@ class CandumpWriter:
             can_id = f"{message.arbitration_id:08X}"
         if message.is_remote_frame:
             data = "R"
-        self._file.write(f"({message.timestamp:f}) can0 {can_id}#{data}\n")
+        kind = "##0" if message.is_fd else "#"
+        self._file.write(f"({message.timestamp:f}) can0 {can_id}{kind}{data}\n")
 
     def stop(self) -> None:
         """Close the file. Raises OSError."""

@@ -4,15 +4,15 @@
 
 The capture is that of upgrades, packet after packet with their ACKs, as a .pcapng. The first time
 is that of tshark alone, which decodes CAN; then with the dissector, as a list of packets, and with
-every field of every message.
+every field of every message. CPU time is counted, not the time of day.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import resource
 import subprocess
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -57,14 +57,20 @@ def main() -> None:
             ("with it", loaded),
             ("with it, every field (-V)", (*loaded, "-V")),
         ):
-            began = time.monotonic()
+            before_s = _cpu_s()
             with (folder / "said").open("wb") as said:
                 subprocess.run(
                     ("tshark", "-r", str(capture), *options), stdout=said, check=True,
                     stderr=subprocess.DEVNULL, env={**os.environ, "HOME": named},
                 )  # fmt: skip
-            took_s = time.monotonic() - began
+            took_s = _cpu_s() - before_s
             print(f"{title}: {took_s:.1f} s, {count / took_s:,.0f} frames a second")
+
+
+def _cpu_s() -> float:
+    """CPU time of the programs that were run, in seconds."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 if __name__ == "__main__":

@@ -107,6 +107,7 @@ COMMAND_LINES: Final[tuple[tuple[str | Path, ...], ...]] = (
         ("explain", Path("upgrade.log")),
         ("explain", Path("nothing.log")),
         ("export", "wireshark", "-o", Path("welling.lua")),
+        ("export", "csv", Path("upgrade.log"), "-o", Path("upgrade.csv")),
         ("export", "trace", Path("upgrade.log"), "-o", Path("upgrade.pcapng")),
         ("mock", "-t", "bms", "-i", "virtual", "-c", "schema"),
         ("conformance", "-t", "bms", "--mock", "--case", "RS-01", "--case", "EN-04"),

@@ -16,6 +16,7 @@ from flasher.protocol.text import (
     encode_text,
     find_firmware_version,
     firmware_version_spans,
+    no_formula,
     printable,
 )
 from tests.loops import each
@@ -202,3 +203,10 @@ def test_the_same_version_twice_is_one_and_two_are_none() -> None:
 def test_a_boot_version_as_numbers(text: str, number: tuple[int, int, int] | None) -> None:
     assert boot_version_number(text) == number
     assert BootVersion("BMS", text).is_version is (number is not None)
+
+
+@each(
+    "text, cell", [("=1+1", "'=1+1"), ("-A", "'-A"), ("@x", "'@x"), ("RACK 7", "RACK 7"), ("", "")]
+)
+def test_a_spreadsheet_takes_no_text_for_a_formula(text: str, cell: str) -> None:
+    assert no_formula(text) == cell

@@ -157,7 +157,10 @@ def test_a_database_that_is_still_written_is_read_whole_and_left_alone(
         assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == before
 
 
-def test_a_format_whose_package_is_missing_is_told(tmp_path: Path) -> None:
+def test_a_format_whose_package_is_missing_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("can.io.mf4.asammdf", None)
     path = tmp_path / "trace.mf4"
     path.write_bytes(b"MDF     4.10")
     with pytest.raises(UsageError, match="needs a package that is not installed"):
@@ -179,3 +182,14 @@ def test_a_recording_that_grows_faster_than_it_is_read_has_an_end(tmp_path: Path
         with path.open("ab") as file:
             file.write(b"(2.0) can0 752#00\n" * 2)
     assert count == 2000
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("data", [b"", b"MDF     4.10", b"MDF     4.10    " + bytes(200)])
+def test_a_measurement_file_that_is_none_is_told_in_words(tmp_path: Path, data: bytes) -> None:
+    pytest.importorskip("asammdf", reason="needs the extra mf4")
+    path = tmp_path / "trace.mf4"
+    path.write_bytes(data)
+    with pytest.raises(UsageError) as caught:
+        list(read_trace(path))
+    assert "no measurement file of version 4" in caught.value.cause

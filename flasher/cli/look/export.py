@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from flasher.cli import values
+from flasher.cli.extras import need
 from flasher.cli.files import check_not_read, check_writable, write_whole, writing
 from flasher.cli.framework import Decorator, argument, group, option
 from flasher.cli.output import Output, counted
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 
+if TYPE_CHECKING:
+    from flasher.export.signals import Row
+
 
 @dataclass(frozen=True)
 class ExportedFileDocument:
-    """Of `export wireshark`."""
+    """Of `export wireshark` and `export dbc`."""
 
     file: str
     size_bytes: int
@@ -34,13 +38,24 @@ class ExportedTraceDocument:
     """Where and why the trace could not be read on; empty where it was read to its end."""
 
 
-DOCUMENTS: Final = (ExportedFileDocument, ExportedTraceDocument)
+@dataclass(frozen=True)
+class ExportedSignalsDocument:
+    """Of `export csv` and `export mf4`."""
+
+    file: str
+    messages: int
+    damage: str
+    """Where and why the trace could not be read on; empty where it was read to its end."""
+
+
+DOCUMENTS: Final = (ExportedFileDocument, ExportedTraceDocument, ExportedSignalsDocument)
 _OUT: Final = "-o/--output"
 _EXAMPLES: Final = """\
 examples:
   flasher export wireshark -o welling.lua
   flasher export trace upgrade.asc -o upgrade.pcapng
-  flasher export trace upgrade.pcapng -o upgrade.log
+  flasher export csv upgrade.asc -o upgrade.csv
+  flasher export dbc -o welling.dbc
 """
 _WIRESHARK_EXAMPLES: Final = """\
 examples:
@@ -61,10 +76,43 @@ examples:
   flasher export trace upgrade.asc -o upgrade.pcapng     for Wireshark, with remarks
   flasher export trace upgrade.pcapng -o upgrade.log     for canplayer, log2asc and tshark
   flasher export trace capture.pcapng -o upgrade.blf     for CANalyzer
+  flasher export trace upgrade.asc --joined -o joined.asc
+                                                         for a program with the DBC
 
 In a .pcapng the frames at which something went wrong bear a remark (Wireshark: filter
 frame.comment), the last frame of each upgrade its verdict, and the file the verdict of all.
-The direction of frames is not kept.
+The direction of frames is not kept. With --joined there are no remarks, and nothing but messages.
+"""
+_DBC_EXAMPLES: Final = """\
+examples:
+  flasher export dbc -o welling.dbc
+  flasher export trace upgrade.blf --joined -o joined.blf
+  flasher export trace upgrade.blf --joined -o joined.log
+
+A DBC describes single frames; the messages of the drive system take several. So it describes each
+message as one CAN FD frame: `flasher export trace --joined` makes such a trace. It can say numbers
+and flags, with their units, within the first 64 bytes of a message; it cannot say texts (versions,
+serial numbers), plain bytes (image, memory, ids), what lies behind byte 64, or whether a CRC is
+right. Signals are named after message and field (running_information_voltage_mv), the message by
+the signal `command`. The encoding is Windows-1252.
+"""
+_CSV_EXAMPLES: Final = """\
+examples:
+  flasher export csv upgrade.asc -o upgrade.csv
+  flasher export csv bike.blf --message "running information" -o running.csv
+  flasher export csv bike.pcapng --message "cell voltages" --message faults
+
+One row a message, one column a field, with its unit in the name. time_s counts from the first frame
+of the trace, stamp_s is the time in the trace, frame the number of the message's last frame.
+"""
+_MF4_EXAMPLES: Final = """\
+examples:
+  flasher export mf4 bike.blf -o bike.mf4
+  flasher export mf4 bike.blf --message "running information" -o running.mf4
+
+One channel for each number and each flag (running_information.voltage_mv), with its unit; the
+messages of one kind are a group. Needs the extra `mf4`. MF4 files of others are read as traces when
+they hold CAN frames.
 """
 
 
@@ -78,6 +126,12 @@ def _output_file(what: str, *suffixes: str, required: bool = False) -> Decorator
 _trace = argument(
     "trace", type=values.FilePath(*values.TRACE_SUFFIXES, gives=Path),
     help="a recorded trace (.asc .blf .log .pcapng ...)",
+)  # fmt: skip
+
+
+_message_option = option(
+    "--message", "messages", multiple=True, metavar="WORDS", brief=True,
+    help="only messages with these words in their title (default: all); may be repeated",
 )  # fmt: skip
 
 
@@ -99,38 +153,128 @@ def wireshark(output: Output, *, file: Path | None) -> int:
     return _protocol_file(output, file, dissector(__version__))
 
 
-def _protocol_file(output: Output, file: Path | None, text: str) -> int:
+def _needs_file() -> UsageError:
+    return UsageError("--json needs a file to write.", remedy="Name one with -o FILE.")
+
+
+def _protocol_file(output: Output, file: Path | None, text: str, *, encoding: str = "utf-8") -> int:
     """What is made of the protocol alone."""
     if file is None:
         if output.json_wanted:
-            raise UsageError("--json needs a file to write.", remedy="Name one with -o FILE.")
+            raise _needs_file()
         output.text(text)
         return 0
     check_writable(file, _OUT)
-    data = text.encode("utf-8")
+    data = text.encode(encoding)
     write_whole(file, data, _OUT)
     output.result(f"{printable(str(file))}: {len(data):,} bytes")
     output.document(ExportedFileDocument(file=str(file), size_bytes=len(data)))
     return 0
 
 
+@export.action("dbc", epilog=_DBC_EXAMPLES)
+@_output_file("the DBC (default: standard output)", "dbc")
+def dbc(output: Output, *, file: Path | None) -> int:
+    """Write a DBC, for SavvyCAN, CANalyzer, cantools and the like: the messages as far as a DBC can
+    say them.
+    """
+    from flasher.export.dbc import dbc as make  # noqa: PLC0415  loads python-can
+
+    return _protocol_file(output, file, make(), encoding="cp1252")
+
+
 @export.action("trace", epilog=_TRACE_EXAMPLES)
 @_trace
 @_output_file("what to write; format by suffix", *values.TRACE_SUFFIXES, required=True)
-def trace(output: Output, *, trace: Path, file: Path) -> int:
+@option(
+    "--joined", is_flag=True, brief=True,
+    help="each intact message as one CAN FD frame, as the DBC has them; nothing else",
+)  # fmt: skip
+def trace(output: Output, *, trace: Path, file: Path, joined: bool) -> int:
     """Write a recorded trace in another format."""
-    from flasher.export.convert import convert  # noqa: PLC0415  loads python-can
+    from flasher.export.convert import convert, convert_joined  # noqa: PLC0415  loads python-can
 
     check_not_read(file, _OUT, [trace])
     with writing(file, _OUT) as part:
-        made = convert(trace, part, called=file)
+        made = (convert_joined if joined else convert)(trace, part, called=file)
     shown = f"{printable(str(file))}: {counted(made.frames, 'frame')}"
     output.result(f"{shown}, {counted(made.remarks, 'remark')}" if made.remarks else shown)
-    if made.damage:
-        output.error_line(f"warning: {printable(str(trace))} ends there: {made.damage}")
+    _warn(output, trace, made.damage)
     output.document(
         ExportedTraceDocument(
             file=str(file), frames=made.frames, remarks=made.remarks, damage=made.damage
         )
     )
     return 0
+
+
+@export.action("csv", epilog=_CSV_EXAMPLES)
+@_trace
+@_output_file("the table (default: standard output)", "csv")
+@_message_option
+def csv(output: Output, *, trace: Path, file: Path | None, messages: tuple[str, ...]) -> int:
+    """Write the decoded messages of a recorded trace as a table."""
+    from flasher.export.signals import csv_text  # noqa: PLC0415  loads python-can
+
+    if file is None and output.json_wanted:
+        raise _needs_file()
+    if file is not None:
+        check_writable(file, _OUT)
+        check_not_read(file, _OUT, [trace])
+    found, damage = _rows(trace, messages)
+    text = csv_text(found)
+    if file is None:
+        output.text(text)
+    else:
+        write_whole(file, text.encode("utf-8"), _OUT)
+        output.result(f"{printable(str(file))}: {counted(len(found), 'message')}")
+    _warn(output, trace, damage)
+    output.document(ExportedSignalsDocument(file=str(file), messages=len(found), damage=damage))
+    return 0
+
+
+@export.action("mf4", epilog=_MF4_EXAMPLES)
+@_trace
+@_output_file("the measurement file", "mf4", required=True)
+@_message_option
+def mf4(output: Output, *, trace: Path, file: Path, messages: tuple[str, ...]) -> int:
+    """Write the decoded numbers and flags of a recorded trace as a measurement (ASAM MDF 4)."""
+    need("flasher export mf4", "mf4")
+    from flasher.export.mf4 import write_mf4  # noqa: PLC0415  an extra
+
+    if file.suffix.lower() != ".mf4":
+        raise UsageError(
+            f"{printable(str(file))} does not end with .mf4.",
+            where=_OUT,
+            remedy="Other programs go by the suffix: name it so.",
+        )
+    check_not_read(file, _OUT, [trace])
+    found, damage = _rows(trace, messages)
+    with writing(file, _OUT) as part:
+        channels = write_mf4(found, part)
+    count = f"{counted(len(found), 'message')}, {counted(channels, 'channel')}"
+    output.result(f"{printable(str(file))}: {count}")
+    _warn(output, trace, damage)
+    output.document(ExportedSignalsDocument(file=str(file), messages=len(found), damage=damage))
+    return 0
+
+
+def _rows(trace: Path, messages: tuple[str, ...]) -> tuple[list[Row], str]:
+    """The messages with one of the words in their titles, and where the trace cannot be read on."""
+    from flasher.cli.look.monitor import check_messages  # noqa: PLC0415  loads python-can
+    from flasher.export.signals import rows  # noqa: PLC0415  loads python-can
+
+    check_messages(messages)
+    words = [each.lower() for each in messages]
+    damage: list[str] = []
+    found = rows(
+        trace,
+        wanted=lambda title: not words or any(each in title.lower() for each in words),
+        damage=damage,
+    )
+    return list(found), " ".join(damage)
+
+
+def _warn(output: Output, trace: Path, damage: str) -> None:
+    if damage:
+        output.error_line(f"warning: {printable(str(trace))} ends there: {damage}")

@@ -114,7 +114,7 @@ def monitor(
         raise UsageError(
             "A trace is read without a bus.", remedy="Leave out either TRACE or --mock and -i."
         )
-    _check_messages(messages)
+    check_messages(messages)
     terminal = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     is_live = terminal and trace is None
     wants_table = (table or is_live) and not (lines or raw or output.json_wanted)
@@ -157,7 +157,7 @@ def monitor(
     return ExitCode.OK
 
 
-def _check_messages(wanted: Iterable[str]) -> None:
+def check_messages(wanted: Iterable[str]) -> None:
     """Raises UsageError for words that are in no title."""
     titles = message_titles() + tuple(map(prose, Kind))
     for words in wanted:

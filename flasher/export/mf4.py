@@ -1,0 +1,88 @@
+"""Decoded signals as a measurement file (ASAM MDF 4), for plotting. Needs the extra `mf4`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+import numpy
+from asammdf import MDF, Signal
+
+from flasher.export.names import key
+from flasher.export.signals import Row
+from flasher.protocol import messages
+from flasher.protocol.catalogue import BY_KEY
+from flasher.protocol.fields import Codec, Flags, flag_names
+from flasher.trace.decoder import BusEvent, Kind
+
+_WALL_TIME_FROM: Final = 1e8
+"""Stamps from here on (1973) are wall time, smaller ones count from some start."""
+
+
+@dataclass
+class _Channel:
+    unit: str
+    samples: list[int] = field(default_factory=list)
+
+
+@dataclass
+class _Group:
+    """The messages of one title, which have one time axis."""
+
+    times_s: list[float] = field(default_factory=list)
+    channels: dict[str, _Channel] = field(default_factory=dict)
+
+
+def write_mf4(rows: Iterable[Row], to: Path) -> int:
+    """Write the numbers and flags of all messages, a channel each; returns how many channels there
+    are. Raises OSError.
+    """
+    groups: dict[str, _Group] = {}
+    start_s = 0.0
+    for row in rows:
+        start_s = row.stamp_s - row.time_s
+        values = list(_numbers(row.event)) if row.event.kind is Kind.MESSAGE else []
+        if not values:
+            continue
+        group = groups.setdefault(row.event.title, _Group())
+        group.times_s.append(row.time_s)
+        for name, unit, value in values:
+            group.channels.setdefault(name, _Channel(unit)).samples.append(value)
+    with MDF(version="4.10") as mdf:
+        if start_s >= _WALL_TIME_FROM:
+            mdf.header.start_time = datetime.fromtimestamp(start_s, tz=UTC)
+        for title, group in groups.items():
+            times = numpy.array(group.times_s)
+            signals = [
+                Signal(numpy.array(channel.samples), times, name=name, unit=channel.unit)
+                for name, channel in group.channels.items()
+            ]
+            mdf.append(signals, acq_name=title, comment=title, common_timebase=True)
+        mdf.save(to, overwrite=True)
+    return sum(len(group.channels) for group in groups.values())
+
+
+def _numbers(event: BusEvent) -> Iterator[tuple[str, str, int]]:
+    """Name, unit and value of what can be plotted."""
+    codecs, prefix = _codecs(event), key(event.title)
+    for shown in event.fields:
+        name, codec = f"{prefix}.{shown.name}", codecs[shown.name]
+        if isinstance(codec, Flags):
+            for bit in codec.names:
+                (text,) = flag_names(codec.names, bit)
+                yield f"{name}.{key(text)}", "", int(text in shown.value)
+        elif isinstance(shown.value, int):
+            yield name, codec.unit, shown.value
+        elif isinstance(shown.value, list):
+            for at, value in enumerate(shown.value, 1):
+                yield f"{name}.{at}", codec.unit, value
+
+
+def _codecs(event: BusEvent) -> dict[str, Codec]:
+    """The codecs of the fields of a message."""
+    command = event.command or 0
+    item = BY_KEY.get((event.can_id, command))
+    return dict(messages.ROWS[command].LAYOUT if item is None else item.content.LAYOUT)
