@@ -27,16 +27,17 @@ from flasher.protocol.fields import (
     flag_names,
     label,
 )
+from flasher.protocol.messages import ROWS
 from flasher.protocol.spec import DIALECTS, Node
 
 MESSAGES: Final = Path(__file__).parents[1] / "docs" / "reference" / "messages.md"
 
 _INTRODUCTION: Final = """\
-# Messages of the applications
+# Messages
 
-Every message of chapter 3 of both dialects, drawn from `flasher/protocol/catalogue.py` by
-`python -m tests.messages_document`; a test keeps it so. The messages of the upgrade (appendix 3)
-are in `flasher/protocol/messages.py`, how a message is framed in `flasher/protocol/wire.py`.
+Every message of both dialects, drawn from `flasher/protocol/catalogue.py` (chapter 3 of the
+documents) and `flasher/protocol/messages.py` (the upgrade, appendix 3) by
+`python -m tests.messages_document`; a test keeps it so. [How a message is framed](framing.md).
 
 A message is named by its CAN id and its command, as the protocol documents print them; the second
 byte of the command is the size of the data. Numbers have their low byte first. A text ends with `.`
@@ -54,7 +55,7 @@ _SENDERS: Final = {
 
 def messages_document() -> str:
     """docs/reference/messages.md."""
-    lines = [_INTRODUCTION, *_dialects()]
+    lines = [_INTRODUCTION, *_upgrade(), *_dialects()]
     for node, name in _SENDERS.items():
         lines += [f"## Sent by {name}", "", *_rows(item for item in ITEMS if item.sender is node)]
     lines += ["## What they carry", ""]
@@ -63,7 +64,32 @@ def messages_document() -> str:
     return "\n".join(lines)
 
 
+def _upgrade() -> Iterator[str]:
+    yield from ("## The upgrade", "")
+    yield "Between the tool (75x) and a device (7x5), in the order of"
+    yield from ("[the upgrade](../explanation/upgrade.md).", "")
+    yield from _table("message", "command", "mode", "what", "data")
+    for row in ROWS.values():
+        title = _words(row.__name__)
+        data = ", ".join(_part(name, codec) for name, codec in row.LAYOUT)
+        command = f"{row.COMMAND:04X}"
+        yield _cells(title, command, row.MODE.name.lower(), inspect.getdoc(row), data)
+    yield ""
+
+
+def _part(name: str, codec: Codec) -> str:
+    if isinstance(codec, Constant):
+        text = codec.expected.decode()
+        return f"`{text}`" if text.isprintable() else codec.expected.hex(" ").upper()
+    return f"{name.removesuffix('_bytes')} ({codec.size_bytes} B{_little(codec)})"
+
+
+def _little(codec: Codec) -> str:
+    return ", low byte first" if isinstance(codec, Number) else ""
+
+
 def _dialects() -> Iterator[str]:
+    yield from ("## The applications", "")
     yield from _table("dialect", "document", "bit rate", "nodes", "messages below")
     for dialect in DIALECTS.values():
         nodes = ", ".join(node.name for node in dialect.nodes)
@@ -105,10 +131,13 @@ def _link(content: type[Content]) -> str:
 
 
 def _title(content: type[Content]) -> str:
-    """The class name in words."""
+    return _words(content.__name__)
+
+
+def _words(name: str) -> str:
+    """The name of a class in words."""
     return "".join(
-        f" {char.lower()}" if char.isupper() and at else char
-        for at, char in enumerate(content.__name__)
+        f" {char.lower()}" if char.isupper() and at else char for at, char in enumerate(name)
     )
 
 
