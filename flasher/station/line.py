@@ -681,6 +681,9 @@ class Line:
             self.stopped = None
             self._tell(ScanAccepted(word, _RESUME))
             self._tell(LineResumed())
+            for socket in self.sockets.values() if self._scans_labels else ():
+                if socket.awaits_label and socket.borne:  # it was refused meanwhile
+                    self._scan_borne(socket, socket.borne, now)
         else:
             self._refuse(
                 word,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import io
 import json
+import re
 import socket
 import stat
 import sys
@@ -19,7 +20,10 @@ import pytest
 
 from flasher.cli.station import serving
 from flasher.errors import ExitCode, UsageError
+from flasher.station.records.errors import DiskFullError
 from flasher.station.records.keys import Keeping
+from flasher.station.records.store import Store
+from flasher.web.guard import TOKEN_HEADER
 from flasher.web.server import Server
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.cli.station_threads import ThreadPort
@@ -42,6 +46,40 @@ def password(tmp_path: Path) -> Path:
     path = tmp_path / "password"
     path.write_text("long enough\n")
     return path
+
+
+@pytest.fixture
+def resumed(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Somebody at the page scans RESUME once the line is stopped; what the page said by then."""
+    reasons: list[str] = []
+    threads: list[threading.Thread] = []
+
+    class Watched(Server):
+        def __enter__(self) -> Any:
+            entered = super().__enter__()
+            threads.append(threading.Thread(target=watch, args=(self.url,)))
+            threads[0].start()
+            return entered
+
+    def watch(url: str) -> None:
+        with httpx2.Client(timeout=10) as client:
+            token = re.search(
+                r'name="flasher-token" content="(.*?)"', client.get(f"{url}line").text
+            )
+            assert token is not None
+            headers = {"origin": url.rstrip("/"), TOKEN_HEADER: token[1]}
+            with suppress(httpx2.HTTPError), client.stream("GET", f"{url}line/events") as stream:
+                for line in stream.iter_lines():
+                    if line.startswith("data: ") and not reasons:
+                        head = json.loads(line.removeprefix("data: ")).get("head") or {}
+                        if head.get("stopped"):
+                            reasons.append(head["stopped"]["reason"])
+                            client.post(f"{url}line/scan", json={"text": "RESUME"}, headers=headers)
+
+    monkeypatch.setattr(serving, "Server", Watched)
+    yield reasons
+    for thread in threads:
+        thread.join(10)
 
 
 @pytest.fixture
@@ -92,6 +130,23 @@ def test_the_page_shows_what_the_station_does(flasher: Flasher, asked: list[Any]
     ended = {each["serial"] for each in lines if each.get("event") == "RunEnded"}
     assert passed
     assert passed <= ended
+
+
+def test_a_stopped_line_waits_for_the_people_at_its_page(
+    flasher: Flasher, resumed: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Though nobody is at a keyboard."""
+    finish, failures = Store.finish, [DiskFullError("The disk is full.", remedy="Make room.")]
+
+    def finish_or_fail(*given: Any, **named: Any) -> Any:
+        if failures:
+            raise failures.pop()
+        return finish(*given, **named)
+
+    monkeypatch.setattr(Store, "finish", finish_or_fail)
+    run = flasher(*RUN, "--units", "3", "--web", "0", "--mock-bad", "0", "--mock-dead", "0")
+    assert resumed == ["The disk is full."]
+    assert run.code == ExitCode.OK, run.err
 
 
 @each(

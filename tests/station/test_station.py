@@ -746,6 +746,22 @@ def test_labels_of_virtual_units_may_scan_themselves(bench: Bench) -> None:
     assert line.last(ScanRefused).code == "UNIT_RUNNING"
 
 
+def test_labels_that_came_while_the_line_was_stopped_scan_themselves_after_it(
+    bench: Bench,
+) -> None:
+    line = LineBench(bench, scans_labels=True)
+    line.say("A", PresenceChanged(is_there=True, how="a virtual unit came", label=SERIAL))
+    line.work("A")
+    other = hold(bench)
+    line.end("A")
+    line.say("B", PresenceChanged(is_there=True, how="a virtual unit came", label=OTHER))
+    assert line.last(ScanRefused).code == "LINE_STOPPED"
+    other.close()
+    line.scan("RESUME")
+    assert line.state("A") is SocketState.PASS
+    assert line.state("B") is SocketState.RUNNING
+
+
 def test_figures_follow_the_runs(line: LineBench) -> None:
     line.make("A", SERIAL)
     figures = line.station.figures

@@ -309,7 +309,8 @@ class _Session:
         except FlasherError as error:
             self._failure = error
             return True
-        if self.station.is_line_stopped and (self.file or self.scans_itself) and not self._typing:
+        is_alone = (self.file or self.scans_itself) and not (self._typing or self._page)
+        if self.station.is_line_stopped and is_alone:
             return not self.station.is_running  # nobody is there who could scan RESUME
         # What was submitted last is understood only in the station's next turn.
         was_submitted, self._was_submitted = self._was_submitted, self._scans_used_up()
