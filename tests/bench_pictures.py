@@ -1,0 +1,193 @@
+"""Every state of the bench page as a picture, light and dark, in each language and size:
+`python -m tests.bench_pictures FOLDER`. It tells what axe-core finds, and what is wider than the
+screen.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final, Literal
+
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Page, expect
+
+from flasher import events
+from flasher.web.virtual_bike import Fault
+from flasher.web.words import NAMES
+from tests.end_to_end.stage import NEW, image_of
+from tests.firmware import VECTORS
+from tests.web.bench_place import IMAGE, BenchPlace
+from tests.web.browser import chromium
+
+SIZES: Final = {"laptop": (1280, 800), "tablet": (820, 1180), "phone": (390, 844)}
+SCHEMES: Final[tuple[Literal["light", "dark"], ...]] = ("light", "dark")
+_QUIET_MS: Final = 150
+
+
+@dataclass
+class Album:
+    """The pictures of one language."""
+
+    page: Page
+    folder: Path
+    language: str
+    wrong: list[str] = field(default_factory=list)
+    count: int = 0
+
+    def take(self, state: str) -> None:
+        """The state as it is now, in each size and scheme."""
+        self.page.wait_for_timeout(_QUIET_MS)
+        for size, (width, height) in SIZES.items():
+            self.page.set_viewport_size({"width": width, "height": height})
+            for scheme in SCHEMES:
+                self.page.emulate_media(color_scheme=scheme)
+                name = f"{state}-{size}-{scheme}-{self.language}"
+                self.page.screenshot(path=self.folder / f"{name}.png", full_page=True)
+                self.count += 1
+                if self.page.evaluate("document.scrollingElement.scrollWidth > innerWidth"):
+                    self.wrong.append(f"{name}: wider than the screen")
+                found = Axe().run(self.page)
+                if found.violations_count:
+                    self.wrong.append(f"{name}: {found.generate_report()}")
+        self.page.set_viewport_size({"width": 1280, "height": 800})
+
+
+class Held:
+    """Stops an upgrade where `at` says, until it may go on."""
+
+    def __init__(self, place: BenchPlace, at: Callable[[object], bool]) -> None:
+        self._at = at
+        self.go_on = threading.Event()
+        place.bikes.hold = self._hold
+
+    def _hold(self, event: object) -> None:
+        if self._at(event):
+            self.go_on.wait(60)
+
+
+def _use(page: Page, fault: Fault) -> None:
+    page.click(f"#adapter button:text-is('{fault.value}')")
+    expect(page.locator("#target-bms")).to_be_enabled()
+
+
+def _again(page: Page) -> None:
+    page.click("#next-bike, #do-other, #do-next")
+    expect(page.locator("#adapter-1")).to_be_enabled()
+
+
+def before_an_upgrade(page: Page, album: Album) -> None:
+    """Lead the page through what comes before an upgrade."""
+    odd = image_of(3, NEW).data[len(VECTORS) :]
+    album.take("first")
+    page.set_input_files("#file", {"name": "odd.bin", "mimeType": "", "buffer": odd})
+    expect(page.locator("#image")).to_contain_text("odd.bin")
+    album.take("dropped")
+    page.click(f"#adapter button:text-is('{Fault.OFF.value}')")
+    expect(page.locator("#trouble .what")).to_be_visible()
+    album.take("nobody")
+    _again(page)
+    _use(page, Fault.HARDWARE)
+    page.click("#told-all")
+    album.take("bike")
+    page.click("#do-watch")
+    expect(page.locator("#watched tbody tr").first).to_be_visible()
+    album.take("watching")
+    page.click("#stop")
+    page.click("#do-areas")
+    expect(page.locator("#area-1")).to_be_visible()
+    album.take("areas")
+    page.click("#area-1")
+    expect(page.locator("#download")).to_be_visible()
+    album.take("saved")
+    page.click("#target-bms")
+    page.click("#refused-all")
+    page.click("#waive-2")
+    album.take("images")
+    page.check("#waive-2-risk")
+    page.click("#waive-2-go")
+    expect(page.locator("#go")).to_be_visible()
+    album.take("checks")
+    _again(page)
+
+
+def from_an_upgrade_on(page: Page, place: BenchPlace, album: Album) -> None:
+    """Lead the page through an upgrade that fails, its rescue, and what is left."""
+    _use(page, Fault.POWER)
+    page.click("#target-bms")
+    page.click(f"#image button:text-is('{IMAGE}')")
+    held = Held(
+        place, lambda event: isinstance(event, events.PacketAcknowledged) and event.number == 5
+    )
+    page.click("#go")
+    expect(page.locator("#pace progress")).to_be_visible()
+    album.take("running")
+    held.go_on.set()
+    expect(page.locator("#do-rescue-it")).to_be_enabled()
+    album.take("failed")
+    page.click("#story")
+    album.take("story")
+    page.goto(page.url.partition("/kept")[0])
+    page.click("#do-rescue-it")
+    expect(page.locator("#go")).to_be_visible()
+    album.take("rescue")
+    held = Held(place, lambda event: isinstance(event, events.PowerCycleAwaited))
+    page.click("#go")
+    expect(page.locator("#pace progress")).to_be_visible()
+    album.take("power")
+    held.go_on.set()
+    expect(page.locator("#next-bike")).to_be_enabled()
+    album.take("good")
+    page.click("#sheet")
+    album.take("sheet")
+    page.click("a[href='/']")
+    page.click("#kept")
+    album.take("kept")
+    page.click("nav a[href='/']")
+    expect(page.locator("#next-bike")).to_be_enabled()
+    place.bench.feed.close()
+    expect(page.locator("#ended")).to_be_visible()
+    album.take("ended")
+
+
+def album_of(browser: Browser, folder: Path, language: str) -> Album:
+    """All pictures of a language."""
+    with tempfile.TemporaryDirectory() as name:
+        place = BenchPlace(Path(name))
+        with place.served() as url:
+            context = browser.new_context(locale=language)
+            page = context.new_page()
+            page.goto(url)
+            expect(page.locator("#adapter-1")).to_be_enabled()
+            album = Album(page, folder, language)
+            before_an_upgrade(page, album)
+            from_an_upgrade_on(page, place, album)
+            context.close()
+    return album
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--language", choices=sorted(NAMES), action="append")
+    options = parser.parse_args()
+    options.folder.mkdir(parents=True, exist_ok=True)
+    wrong: list[str] = []
+    count = 0
+    with chromium() as browser:
+        for language in options.language or NAMES:
+            album = album_of(browser, options.folder, language)
+            wrong += album.wrong
+            count += album.count
+    sys.stdout.writelines(f"{each}\n" for each in wrong)
+    sys.stdout.write(f"{count} pictures, {len(wrong)} findings\n")
+    return 1 if wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
