@@ -116,3 +116,13 @@ def test_ctrl_c_in_an_upgrade_says_what_is_left(
     assert run.code == ExitCode.INTERRUPTED
     assert "its application is erased or half written" in run.err
     assert "bundle:" in run.err
+
+
+@pytest.mark.parametrize("name", ["missing", "file"])
+def test_a_folder_of_images_that_is_none_is_refused_at_once(
+    flasher: Flasher, tmp_path: Path, name: str
+) -> None:
+    (tmp_path / "file").write_text("")
+    run = flasher("ui", "--mock", "--no-browser", "--images", tmp_path / name)
+    assert run.code == ExitCode.USAGE
+    assert "is no folder of this computer" in run.err

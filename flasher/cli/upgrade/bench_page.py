@@ -331,7 +331,15 @@ def serve(
 
 
 def _folder(images: Path | None, memory: Memory) -> Path:
-    """Of images: the one that was named, else the one used last, else this one."""
+    """Of images: the one that was named, else the one used last, else this one. Raises UsageError
+    for a name that is none.
+    """
+    if images is not None and not images.expanduser().is_dir():
+        raise UsageError(
+            f"{printable(str(images))} is no folder of this computer.",
+            where="--images",
+            remedy="Name the folder that has the images, or leave it out and choose it on the page.",
+        )
     last = Path(memory.kept("images") or ".")
     return (images or (last if last.is_dir() else Path())).expanduser().resolve()
 
