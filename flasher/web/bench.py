@@ -28,6 +28,7 @@ from flasher.procedures import nobody_heard
 from flasher.protocol.contents import Memory, RunningInformation, VersionInformation
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
 from flasher.protocol.text import printable
+from flasher.report.base import visible
 from flasher.settings.area import Area, area_of_image, area_of_profile
 from flasher.settings.profile import Profile
 from flasher.trace.decoder import BusEvent
@@ -442,7 +443,7 @@ class Bench:
             raise UsageError("No device is chosen.", remedy="Choose the one to upgrade.")
         profile = self._place.profile(target)
         rate = self._place.bitrate_bps(self._adapter())
-        name = printable(path.name)
+        name = visible(path.name)
         return prepare(
             path,
             profile,
@@ -487,7 +488,7 @@ class Bench:
         job = self._job(offer.path, self.state.target)
         if job.plan.image.sha256 != offer.sha256:
             raise ImageError(
-                f"{offer.name} is another file than when it was chosen; nothing was sent.",
+                f"{printable(offer.name)} has changed since it was chosen; nothing was sent.",
                 remedy="Choose the image again.",
             )
         carried = self._place.upgrade(

@@ -19,6 +19,7 @@ from flasher.protocol.contents import RunningInformation, VersionInformation
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import TARGETS
 from flasher.protocol.text import printable
+from flasher.report.base import visible
 from flasher.trace.decoder import content_fields
 from flasher.web import bench_state as bench
 from flasher.web.bench import Bench
@@ -98,7 +99,7 @@ class Shelf:
 
     def dropped(self) -> list[str]:
         """Names of dropped images and manifests."""
-        return sorted(printable(each.name) for each in self._dropped.iterdir() if each.is_file())
+        return sorted(visible(each.name) for each in self._dropped.iterdir() if each.is_file())
 
     def take(self, name: str, data: bytes) -> Path | None:
         """Keep a dropped file; None for one that is neither image, manifest nor trace. Raises

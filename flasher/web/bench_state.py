@@ -12,7 +12,7 @@ from flasher import events
 from flasher.api import DeviceInfo, Result
 from flasher.errors import FlasherError
 from flasher.protocol.spec import Target
-from flasher.protocol.text import printable
+from flasher.report.base import visible
 from flasher.settings.area import Area
 from flasher.trace.decoder import Field
 
@@ -60,7 +60,8 @@ class Offer:
 
     @property
     def name(self) -> str:
-        return printable(self.path.name)
+        """As a page shows it."""
+        return visible(self.path.name)
 
 
 @dataclass(frozen=True)

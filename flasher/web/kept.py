@@ -18,6 +18,7 @@ from typing import Any, Final, NamedTuple
 from flasher.errors import FlasherError, UsageError
 from flasher.history import History, matching
 from flasher.protocol.text import printable
+from flasher.report.base import visible
 from flasher.report.explain_page import told
 from flasher.trace.bundle import bundles
 from flasher.trace.source import explain_path, recorded_of
@@ -110,7 +111,7 @@ class Kept:
         except FlasherError as error:
             error.what = error.what.replace(printable(str(path)), printable(path.name))
             raise
-        named = replace(story, source=printable(path.name))
+        named = replace(story, source=visible(path.name))
         return self._page(question, "explain.html", **told(named))
 
     def bundle(self, question: Question) -> Answer:

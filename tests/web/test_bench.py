@@ -161,6 +161,18 @@ def test_a_dropped_image_is_offered_and_what_is_none_is_not_taken(place: BenchPl
     assert [each.name for each in state.offers if not each.refusal] == ["dropped.bin", IMAGE]
 
 
+def test_a_name_is_shown_as_people_write_it_and_what_hides_is_not(
+    place: BenchPlace, tmp_path: Path
+) -> None:
+    for name in ("固件 ü.bin", "a\u202eb.bin"):
+        (tmp_path / name).write_bytes(image_of(3, NEW).data)
+    state = place.do(UseAdapter(Fault.NONE.value), ChooseTarget("bms"))
+    fitting = {each.name for each in state.offers if not each.refusal}
+    assert fitting == {IMAGE, "固件 ü.bin", "a\\u202eb.bin"}
+    for name in fitting:
+        assert place.do(ChooseImage(name)).offer is not None
+
+
 def test_an_image_that_changed_since_it_was_chosen_is_not_sent(
     place: BenchPlace, tmp_path: Path
 ) -> None:

@@ -338,7 +338,7 @@ def _folder(images: Path | None, memory: Memory) -> Path:
         raise UsageError(
             f"{printable(str(images))} is no folder of this computer.",
             where="--images",
-            remedy="Name the folder that has the images, or leave it out and choose it on the page.",
+            remedy="Name the folder that has the images, or choose it on the page.",
         )
     last = Path(memory.kept("images") or ".")
     return (images or (last if last.is_dir() else Path())).expanduser().resolve()
