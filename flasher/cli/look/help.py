@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Final
 
 import click
 
+from flasher.cli import values
 from flasher.cli.framework import Program, argument, command
 from flasher.cli.output import Output
 from flasher.errors import ErrorCode, ExitCode, UsageError, did_you_mean
@@ -53,8 +55,19 @@ def error_codes() -> dict[str, CodeDocument]:
     }
 
 
+def _codes(ctx: click.Context) -> Iterable[str]:
+    from flasher.station.codes import CODES  # noqa: PLC0415  needed for its codes alone
+
+    program = ctx.find_root().command
+    commands = program.entries if isinstance(program, Program) else ()
+    return (*ErrorCode, *CODES, _ALL, *commands)
+
+
 @command(name="help", epilog=_EXAMPLES)
-@argument("what", metavar="WHAT", required=False, help="a code, `codes`, or a command")
+@argument(
+    "what", metavar="WHAT", required=False, shell_complete=values.offers(_codes),
+    help="a code, `codes`, or a command",
+)  # fmt: skip
 @click.pass_context
 def help_(ctx: click.Context, output: Output, *, what: str | None) -> int:
     """Tell what stands behind a code, or show the help of a command."""
