@@ -30,5 +30,3 @@ html_show_sphinx = False
 html_show_copyright = False
 html_use_index = False
 html_theme_options = {"navigation_with_keys": True}
-pygments_style = "friendly"
-pygments_dark_style = "native"

@@ -17,18 +17,23 @@ import zipfile
 from pathlib import Path
 from typing import Final
 
-from sphinx.cmd.build import build_main
-
 from tests.site.pages import Site
 from tests.site.questions import told, unanswered
 
 _ROOT: Final = Path(__file__).parents[2]
+_MADE_BY_SPHINX: Final = ".buildinfo"
 _DATE: Final = (1980, 1, 1, 0, 0, 0)
 """Of every file in the zip archive: the same pages make the same archive."""
 
 
 def build(folder: Path, *, jobs: str = "auto") -> bool:
-    """Build it anew; whether Sphinx had nothing to say against it."""
+    """Build it anew in place of a site that is there; whether Sphinx had nothing against it."""
+    try:
+        from sphinx.cmd.build import build_main  # noqa: PLC0415  an extra that may be absent
+    except ImportError as error:
+        sys.exit(f"{error.name} is missing: pip install -c .ci/constraints.txt -e '.[docs]'")
+    if folder.exists() and any(folder.iterdir()) and not (folder / _MADE_BY_SPHINX).exists():
+        sys.exit(f"{folder} holds something else than a site: name another folder, or empty it")
     shutil.rmtree(folder, ignore_errors=True)
     arguments = ["-b", "html", "-W", "--keep-going", "-q", "-j", jobs]
     trees = folder.with_name(f"{folder.name}.trees")
@@ -38,6 +43,7 @@ def build(folder: Path, *, jobs: str = "auto") -> bool:
 
 def pack(folder: Path, archive: Path) -> None:
     """All files of the site in one archive, in a folder of its own."""
+    archive.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as packed:
         for path in sorted(path for path in folder.rglob("*") if path.is_file()):
             name = Path("flasher-site") / path.relative_to(folder)

@@ -107,7 +107,7 @@ def _options(command: click.Command, path: str) -> _Lines:
             panels.setdefault(getattr(param, "panel", None) or "options", []).append(param)
     for panel, params in panels.items():
         rows = ((_names(param), _prose(_told(param))) for param in params)
-        yield from _table(f"{panel[0].upper()}{panel[1:]}", "", rows=rows)
+        yield from _table(f"{panel[0].upper()}{panel[1:]}", "meaning", rows=rows)
     if isinstance(command, HelpedCommand) and not isinstance(command, Program):
         yield from _examples(command.epilog or "")
         numbers = sorted({0, 1, 2, *(int(code) for code in command.exit_codes)})
