@@ -471,6 +471,46 @@ local function bus_of(interface)
   return bus
 end
 
+-- Bits of a frame on the wire, as flasher.protocol.bittime counts them.
+
+local BITS = T.bits
+
+local function frame_bits(id, payload)
+  local head = BITS.heads[id][#payload + 1]
+  local state, inserted, crc = head[1], head[2], head[3]
+  for at = 1, #payload do
+    local byte = payload:byte(at)
+    local index = state * 16 + shift(byte, 4) + 1
+    inserted = inserted + BITS.inserted:byte(index)
+    index = BITS.next_state:byte(index) * 16 + byte % 16 + 1
+    inserted = inserted + BITS.inserted:byte(index)
+    state = BITS.next_state:byte(index)
+    crc = xor(crc * 256 % 32768, BITS.crc[xor(shift(crc, 7), byte) + 1])
+  end
+  local index = state * 8 + shift(crc, 12) + 1
+  inserted, state = inserted + BITS.top_inserted:byte(index), BITS.top_next_state:byte(index)
+  for _, part in ipairs({shift(crc, 8) % 16, shift(crc, 4) % 16, crc % 16}) do
+    index = state * 16 + part + 1
+    inserted, state = inserted + BITS.inserted:byte(index), BITS.next_state:byte(index)
+  end
+  return BITS.fixed[#payload + 1] + inserted + BITS.full_run:byte(state + 1)
+end
+
+-- When the last frame of a message had left the wire. Frames whose stamps lie closer together than
+-- they can be on the wire bear the time at which an adapter accepted them.
+local function left_at(item)
+  local bitrate = T.dialects[welling.prefs.dialect].bitrate_bps
+  if item.count == 0 then return item.end_at end  -- not the first that this frame has completed
+  local frames = math.ceil(#item.wire / T.frame_data_size)
+  local between = (frames - 1) * BITS.fixed[T.frame_data_size + 1] / bitrate
+  if item.end_at - item.begin_at >= T.accepted_share * between then return item.end_at end
+  local bits = 0
+  for at = 1, #item.wire, T.frame_data_size do
+    bits = bits + frame_bits(item.id, item.wire:sub(at, at + T.frame_data_size - 1))
+  end
+  return math.max(item.end_at, item.begin_at + bits / bitrate)
+end
+
 -- Requests and answers: one that is open is kept under what answers it.
 local function answer_keys(item)
   local keys = {}
@@ -495,7 +535,8 @@ local function connect(bus, item)
   local numbered = item.of == ROWS[COMMAND.ACK] or item.of == ROWS[COMMAND.NAK]
   local request = numbered and asked[key .. "." .. little_endian(item.data)] or asked[key]
   if request and is_open(request, item) then
-    item.answer_to, item.answer_ms = request.frame, 1000 * (item.at - request.at)
+    item.answer_to = request.frame
+    item.answer_ms = 1000 * math.max(0, item.at - left_at(request))
     request.answer_in = item.frame
     for _, each in ipairs(answer_keys(request)) do asked[each] = nil end
   end

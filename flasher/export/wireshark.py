@@ -14,6 +14,7 @@ from typing import Any, Final
 from flasher.export.names import key
 from flasher.prose import prose
 from flasher.protocol import messages, spec
+from flasher.protocol.bittime import frame_tables
 from flasher.protocol.catalogue import ITEMS, UPGRADE_COMMANDS, Item, answer_of
 from flasher.protocol.contents import Faults
 from flasher.protocol.fields import (
@@ -33,7 +34,7 @@ from flasher.protocol.fields import (
 )
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import DamageReason
-from flasher.trace.decoder import ROUTES, TITLES, Kind, remark
+from flasher.trace.decoder import ACCEPTED_SHARE, ROUTES, TITLES, Kind, remark
 from flasher.trace.observed_upgrade import AT_ONCE_S, IN_VAIN_S, NEXT_UPGRADE_S
 
 _SCRIPT: Final = "welling.lua"
@@ -78,6 +79,7 @@ def _tables() -> dict[str, Any]:
                 "name": dialect.name,
                 "text": f"{dialect.name} {dialect.version}, {dialect.bitrate_bps // 1000} kbit/s",
                 "has_upgrade": dialect.has_upgrade,
+                "bitrate_bps": dialect.bitrate_bps,
             }
             for dialect in spec.DIALECTS.values()
         ],
@@ -85,6 +87,8 @@ def _tables() -> dict[str, Any]:
             can_id: {"sender": sender, "receiver": receiver}
             for can_id, (sender, receiver) in ROUTES.items()
         },
+        "bits": frame_tables(ROUTES),
+        "accepted_share": ACCEPTED_SHARE,
         "targets": [
             {"request_id": target.request_id, "answer_id": target.answer_id}
             for target in spec.TARGETS.values()

@@ -107,6 +107,23 @@ def frame_bits(frame: Frame) -> int:
     return fixed_bits(len(data)) + inserted + _FULL_RUN[state]
 
 
+def frame_tables(can_ids: Iterable[int]) -> dict[str, object]:
+    """What `frame_bits` works with, for these ids, so that another language can do the same."""
+    return {
+        "fixed": [fixed_bits(size) for size in range(FRAME_DATA_SIZE + 1)],
+        "heads": {
+            can_id: [list(_head(can_id, size)) for size in range(FRAME_DATA_SIZE + 1)]
+            for can_id in can_ids
+        },
+        "next_state": _NEXT_STATE,
+        "inserted": _INSERTED,
+        "crc": _CRC_BYTE,
+        "top_next_state": _TOP_NEXT_STATE,
+        "top_inserted": _TOP_INSERTED,
+        "full_run": _FULL_RUN,
+    }
+
+
 def message_bits(frames: Iterable[Frame]) -> int:
     """Bit times of a message's frames one right after the other."""
     return sum(map(frame_bits, frames))

@@ -34,7 +34,7 @@ _LONG_ID_BITS: Final = 20
 """What a 29-bit id adds to a frame: 18 id bits, SRR and r1."""
 _ERROR_FRAME_BITS: Final = 20
 """About what an error frame takes: flags, delimiter, interframe space."""
-_ACCEPTED_SHARE: Final = 0.9
+ACCEPTED_SHARE: Final = 0.9
 """Frames that take less of their wire time than this, stamp to stamp, bear times of acceptance."""
 
 
@@ -336,7 +336,7 @@ class TimedEvent:
     def left_s(self, bitrate_bps: int) -> float:
         """When the last frame had left the wire, as well as the stamps tell."""
         between_s = (self.bits - self.first_bits) / bitrate_bps
-        if self.end_s - self.begin_s >= _ACCEPTED_SHARE * between_s:
+        if self.end_s - self.begin_s >= ACCEPTED_SHARE * between_s:
             return self.end_s
         return max(self.end_s, self.begin_s + self.bits / bitrate_bps)
 

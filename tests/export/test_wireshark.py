@@ -18,7 +18,7 @@ from flasher.export.names import key
 from flasher.protocol import catalogue, messages
 from flasher.protocol.fields import Codec, Constant, Flags, Numbers
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import DIALECTS, TARGETS, Dialect, Mode
+from flasher.protocol.spec import BMS, DIALECTS, HEADER, TARGETS, Dialect, Mode
 from flasher.protocol.text import printable
 from flasher.protocol.wire import Message, encode, split
 from flasher.trace.decoder import ROUTES, TITLES, BusEvent, Decoder, Kind, message_titles
@@ -287,12 +287,24 @@ def _stories() -> dict[str, Tape]:
         "two tools": Tape().to_packet(5).reset().packets(5, 6),
         "a query between": Tape().to_packet(5).tool(0x3300, b"", mode=0x11).packets(5, 6),
         "an old packet again": Tape().to_packet(5).packet(5).wait(0.01).ack(5).packet(6).packet(2),
+        "accepted at once": _accepted(Tape().to_end().complete()),
         "a message in a message": _interleaved(),
     }  # fmt: skip
 
 
 def _from(tape: Tape, frame: int) -> Tape:
     del tape.frames[:frame]
+    return tape
+
+
+def _accepted(tape: Tape) -> Tape:
+    """As a recorder of one's own stamps: all frames of a message when the adapter takes it."""
+    begun = 0.0
+    for at, (now, frame) in enumerate(tape.frames):
+        begun = now if frame.data.startswith(HEADER) else begun
+        is_own = frame.can_id == BMS.request_id
+        tape.frames[at] = (begun if is_own else now, frame)
+    tape.frames.sort(key=lambda timed: timed[0])
     return tape
 
 
@@ -346,7 +358,16 @@ def _packets(of: list[Item]) -> dict[tuple[int, int], tuple[int, list[float]]]:
     return found
 
 
-@pytest.mark.parametrize("name", ["clean", "nak and repetition", "restart", "from the middle"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "clean",
+        "nak and repetition",
+        "restart",
+        "from the middle",
+        "accepted at once",
+    ],
+)
 def test_packets_copies_and_answer_times_are_those_of_the_story(
     name: str, told: dict[str, list[Item]]
 ) -> None:
