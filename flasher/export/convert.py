@@ -11,7 +11,7 @@ from typing import Final
 from flasher.export.dbc import joined_frames
 from flasher.trace.pcapng import PcapngWriter
 from flasher.trace.recorder import Writer, message_of, writer_of
-from flasher.trace.source import explain_path, frames_until_damage
+from flasher.trace.source import explain_path, frames_until_damage, trace_file
 from flasher.trace.story import Step, Story
 
 _Place = tuple[int | None, float]
@@ -47,7 +47,7 @@ def convert(trace: Path, to: Path, *, called: Path) -> Converted:
     start: float | None = None
     now = -math.inf
     try:
-        for at, frame in frames_until_damage(trace, damage):
+        for at, frame in frames_until_damage(trace_file(trace), damage):
             now = max(now, at)
             start = now if start is None else start
             # Each is said once: frames that were accepted together have the same time.
@@ -73,7 +73,7 @@ def convert_joined(trace: Path, to: Path, *, called: Path) -> Converted:
     frames = 0
     writer = writer_of(to, called=str(called))
     try:
-        for message in joined_frames(frames_until_damage(trace, damage)):
+        for message in joined_frames(frames_until_damage(trace_file(trace), damage)):
             writer(message)
             frames += 1
     finally:

@@ -15,7 +15,7 @@ from flasher.export.names import key
 from flasher.protocol.text import no_formula
 from flasher.trace.decoder import BusEvent, Field, Kind, TimedDecoder, bits_of
 from flasher.trace.reader import read_trace
-from flasher.trace.source import frames_until_damage
+from flasher.trace.source import frames_until_damage, trace_file
 
 Value = str | int | None
 FIXED_COLUMNS: Final = (
@@ -81,7 +81,11 @@ def rows(
     decoder = TimedDecoder()
     first_s: float | None = None
     now, number = -math.inf, 0
-    frames = read_trace(trace) if damage is None else frames_until_damage(Path(trace), damage)
+    frames = (
+        read_trace(trace)
+        if damage is None
+        else frames_until_damage(trace_file(Path(trace)), damage)
+    )
     for at_s, frame in frames:
         number += 1
         now = max(now, at_s)

@@ -24,6 +24,11 @@ _LINE_MAX: Final = 65_536
 class UnfitError(Exception):
     """The content is none of a trace; the text says why."""
 
+    def __init__(self, text: str, *, remedy: str = "") -> None:
+        """`remedy` is for a file that is what its suffix says, and holds what is not read."""
+        super().__init__(text)
+        self.remedy = remedy
+
 
 def check_unpacked(pieces: Iterator[bytes], packed_size: int) -> None:
     """Unpack a file of `packed_size` bytes before anything is read out of it.

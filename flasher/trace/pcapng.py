@@ -79,8 +79,8 @@ class _Interfaces:
         """A frame came from this one."""
         if self._of_frames not in (None, key):
             raise UnfitError(
-                "it holds frames of more than one CAN interface: keep one, for example with "
-                "tshark -r FILE -Y frame.interface_id==0 -w ONE.pcapng"
+                "it holds frames of more than one CAN interface",
+                remedy="Keep one: tshark -r FILE -Y frame.interface_id==0 -w ONE.pcapng",
             )
         self._of_frames = key
 
@@ -92,7 +92,10 @@ class _Interfaces:
             f"{kind} ({_LINK_TYPES[kind]})" if kind in _LINK_TYPES else str(kind)
             for kind in sorted(self.link_types)
         )
-        raise UnfitError(f"it has the link type {kinds}, not {_LINK_TYPE_CAN} (SocketCAN)")
+        raise UnfitError(
+            f"it has the link type {kinds}, not {_LINK_TYPE_CAN} (SocketCAN)",
+            remedy="Capture on the CAN interface itself: tshark -i can0 -w FILE.",
+        )
 
 
 def _frame(packet: bytes) -> Frame | None:

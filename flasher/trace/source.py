@@ -38,14 +38,7 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
             is_one_tool=_is_of_conformance(path),
         )
         return replace(story, damage=" ".join(damage))
-    trace = next(
-        (at for name in (TRACE, OLDER_TRACE) if (at := path / name).is_file()), path / TRACE
-    )
-    if not trace.is_file():
-        raise UsageError(
-            f"{printable(str(path))} is a folder, but no bundle: there is no {TRACE} in it.",
-            remedy="Name a trace file, or the folder that a failed command has left.",
-        )
+    trace = trace_file(path)
     report = _report(path / REPORT)
     story = explain(
         frames_until_damage(trace, damage),
@@ -57,6 +50,21 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
         recorded=_recorded(report) if report else None,
     )
     return replace(_as_the_tool_ended(story), damage=" ".join(damage))
+
+
+def trace_file(path: Path) -> Path:
+    """The trace itself: of a bundle's folder, the file in it. Raises UsageError for a folder that
+    is no bundle.
+    """
+    if not path.is_dir():
+        return path
+    for name in (TRACE, OLDER_TRACE):
+        if (path / name).is_file():
+            return path / name
+    raise UsageError(
+        f"{printable(str(path))} is a folder, but no bundle: there is no {TRACE} in it.",
+        remedy="Name a trace file, or the folder that a failed command has left.",
+    )
 
 
 def _as_the_tool_ended(story: Story) -> Story:

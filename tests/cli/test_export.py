@@ -127,3 +127,19 @@ def test_an_export_needs_to_be_named(flasher: Flasher) -> None:
     ran = flasher("export", "wiresharc")
     assert ran.code == ExitCode.USAGE
     assert "Did you mean wireshark?" in ran.err
+
+
+def test_the_folder_of_a_bundle_stands_for_its_trace(
+    flasher: Flasher, trace: Path, tmp_path: Path
+) -> None:
+    bundle = tmp_path / "flasher-bms"
+    bundle.mkdir()
+    trace.rename(bundle / "trace.blf")
+    assert flasher("export", "trace", bundle, "-o", tmp_path / "out.pcapng").code == ExitCode.OK
+    assert flasher("export", "csv", bundle, "-o", tmp_path / "out.csv").code == ExitCode.OK
+    frames = [frame for _, frame in read_trace(tmp_path / "out.pcapng")]
+    assert frames == [frame for _, frame in read_trace(bundle / "trace.blf")]
+    (bundle / "trace.blf").unlink()
+    ran = flasher("export", "trace", bundle, "-o", tmp_path / "out.log")
+    assert ran.code == ExitCode.USAGE
+    assert "is a folder, but no bundle" in ran.err

@@ -153,6 +153,22 @@ def test_what_cannot_be_read_is_told_in_words(path: Path, data: bytes, said: str
     assert said in caught.value.cause
 
 
+@pytest.mark.parametrize(
+    ("data", "remedy"),
+    [
+        (section() + interface(1) + packet(bytes(60)), "Capture on the CAN interface itself"),
+        (section() + interface() * 2 + packet() + packet(number=1), "frame.interface_id==0"),
+    ],
+)
+def test_a_right_capture_of_something_else_is_not_blamed_for_its_suffix(
+    path: Path, data: bytes, remedy: str
+) -> None:
+    path.write_bytes(data)
+    with pytest.raises(UsageError, match="is no trace of one CAN bus") as caught:
+        list(read_trace(path))
+    assert remedy in caught.value.remedy
+
+
 def test_what_stands_before_a_cut_is_read(path: Path) -> None:
     path.write_bytes(WHOLE + packet()[:-3])
     found: list[Frame] = []

@@ -125,7 +125,7 @@ def _output_file(what: str, *suffixes: str, required: bool = False) -> Decorator
 
 _trace = argument(
     "trace", type=values.FilePath(*values.TRACE_SUFFIXES, gives=Path),
-    help="a recorded trace (.asc .blf .log .pcapng ...)",
+    help="a recorded trace (.asc .blf .log .pcapng ...), or the folder of a bundle",
 )  # fmt: skip
 
 
