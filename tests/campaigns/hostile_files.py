@@ -45,7 +45,7 @@ LIMIT_S = 2.0
 ROW_LIMIT_S = 4.0
 """Of the processor, for a command. 2 on an idle machine; room for a loaded one."""
 ROW_LIMIT_MB = 300
-TRACES = (".asc", ".blf", ".csv", ".db", ".log", ".trc")
+TRACES = (".asc", ".blf", ".csv", ".db", ".log", ".pcapng", ".trc")
 WORDS = (
     b"\0", b"\xff", b"\n", b"\r\n", b" ", b'"', b"'", b"[", b"{", b"}", b"]", b"=", b".", b",",
     b"#", b":", b"-", b"nan", b"inf", b"-inf", b"1e999", b"9" * 30, b"9" * 5000,

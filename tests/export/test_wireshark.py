@@ -23,8 +23,9 @@ from flasher.protocol.text import printable
 from flasher.protocol.wire import Message, encode, split
 from flasher.trace.decoder import ROUTES, TITLES, BusEvent, Decoder, Kind, message_titles
 from flasher.trace.explain import explain
+from flasher.trace.recorder import message_of, writer_of
 from flasher.trace.story import Cause, Story
-from tests.export.tshark import Item, items, needs_tshark, write_capture
+from tests.export.tshark import Item, items, needs_tshark, run, write_capture
 from tests.peers.wording import payloads
 from tests.trace.tape import Tape
 
@@ -269,6 +270,19 @@ def test_every_message_and_every_damage_is_what_flasher_decodes(
     assert len(found) == len(expected)
     assert {event.title for _, event in expected} >= set(message_titles())
     assert sum(event.kind is Kind.DAMAGED for _, event in expected) > 200
+
+
+def test_what_candump_writes_is_read_as_well(capture: Path, folder: Path) -> None:
+    """A `.log` that flasher records is one that Wireshark knows for a capture."""
+    log = folder / "reel.log"
+    writer = writer_of(log)
+    for at, frame in REEL.frames:
+        writer(message_of(frame, sent=True, at_s=at))
+    writer.stop()
+    words = ("-Y", "welling.message", "-T", "fields", "-e", "frame.number", "-e", "welling.message")
+    told = run("-r", log, *words, folder=folder)
+    assert told == run("-r", capture, *words, folder=folder)
+    assert len(told.splitlines()) > 1000
 
 
 # -- the course of an upgrade ---------------------------------------------------------------------

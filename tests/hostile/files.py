@@ -81,6 +81,26 @@ def bound_socket(path: Path) -> None:
         made.bind(str(path))
 
 
+# -- captures -------------------------------------------------------------------------------------
+
+
+def block(kind: int, body: bytes, at: int = 0) -> bytes:
+    """A block of a .pcapng; of a packet (kind 6) the bytes from `at` on, else everything."""
+    if kind == 6:
+        packet = bytearray(struct.pack("<5L", 0, 0, 0, 9, 9) + b"\0\0\7\x52\1\0\0\0\xaa\0\0\0")
+        packet[at : at + len(body)] = body
+        body = bytes(packet)
+    size = struct.pack("<L", len(body) + 12)
+    return struct.pack("<L", kind) + size + body + size
+
+
+def pcapng(blocks: bytes, resolution: int = 0) -> bytes:
+    """A .pcapng with a section and a CAN interface, whose times have this resolution."""
+    section = block(0x0A0D0D0A, struct.pack("<LHHq", 0x1A2B3C4D, 1, 0, -1))
+    interface = block(1, struct.pack("<HHLHHB3xL", 227, 0, 0, 9, 1, resolution, 0))
+    return section + interface + blocks
+
+
 # -- images ---------------------------------------------------------------------------------------
 
 
@@ -539,6 +559,26 @@ TRACES = tuple(
             0,
             "no frame",
         ),
+        (
+            "gigabyte.pcapng",
+            content(pcapng(struct.pack("<LL", 9, 0xFFFF_FFFC))),
+            USAGE,
+            "4,294,967",
+        ),
+        (
+            "idle.pcapng",
+            content(pcapng(block(9, b"") * 110_000)),
+            USAGE,
+            "entries hold 0 frames",
+        ),
+        ("time.pcapng", content(pcapng(block(6, b"\xff" * 8, at=4))), USAGE, "the time 1.8"),
+        (
+            "resolution.pcapng",
+            content(pcapng(block(6, b"\x01" * 8, at=4), resolution=0xFF)),
+            0,
+            "1 frame",
+        ),
+        ("bomb.pcapng.gz", packed(block(9, bytes(1000)), 400 * MEGA), USAGE, "unpacks to more"),
         (
             "ids.log",
             content(several(*(f"(1.0) can0 {n:08X}#" for n in range(40_000)))),
