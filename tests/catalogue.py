@@ -15,7 +15,16 @@ from babel.messages.catalog import Catalog, Message
 from babel.messages.extract import extract_from_dir
 from babel.messages.pofile import read_po, write_po
 
+from flasher.events import Phase
+from flasher.host.items import meaningful_fields
+from flasher.host.table import Ending
+from flasher.host.verify import Verdict
+from flasher.prose import prose
+from flasher.protocol.catalogue import ITEMS
+from flasher.protocol.contents import Fault
+from flasher.protocol.fields import flag_names, label
 from flasher.station.scans import Word
+from flasher.trace.decoder import message_titles
 from flasher.web.words import NAMES
 
 ROOT: Final = Path(__file__).parent.parent / "flasher"
@@ -33,6 +42,11 @@ def said() -> Iterator[str]:
     for _, _, message, _, _ in found:
         assert isinstance(message, str)
         yield message
+    yield from (prose(each) for kind in (Phase, Ending, Verdict) for each in kind)
+    yield from message_titles()
+    for item in ITEMS:
+        yield from (label(*each) for each in meaningful_fields(item.content))
+    yield from flag_names(Fault, sum(Fault))
     yield from ("label", *(word.value.lower() for word in Word))  # what a scan means
 
 

@@ -23,6 +23,7 @@ from flasher.protocol.contents import RunningInformation
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Target
 from flasher.protocol.text import FirmwareVersion, printable
+from flasher.said import say
 
 DEFAULT_LOW_CHARGE_PERCENT: Final = 20
 DEFAULT_IN_USE_MA: Final = 1000
@@ -188,13 +189,20 @@ def judge_image(image: Image, target: Target, identity: Identity) -> Iterator[Ch
     if problem is not None:
         yield identity.refusal(Check.TARGET, problem)
     elif identity.release is not None or image.named_targets:
-        source = "the manifest" if identity.release is not None else "a name inside the image"
+        has_release = identity.release is not None
+        source = say("the manifest") if has_release else say("a name inside the image")
         yield CheckResult(
-            Check.TARGET, CheckVerdict.PASSED, f"by {source} the image is for the {wanted}"
+            Check.TARGET,
+            CheckVerdict.PASSED,
+            say("by {source} the image is for the {wanted}", source=source, wanted=wanted),
         )
     else:
-        text = "no manifest, and the image names no device: nobody can tell whether it is for the "
-        yield CheckResult(Check.TARGET, CheckVerdict.UNKNOWN, text + wanted)
+        text = say(
+            "no manifest, and the image names no device: nobody can tell whether it is for the "
+            "{wanted}",
+            wanted=wanted,
+        )
+        yield CheckResult(Check.TARGET, CheckVerdict.UNKNOWN, text)
 
 
 def judge_bytes(image: Image, identity: Identity) -> Iterator[CheckResult]:
@@ -231,32 +239,46 @@ def judge_device(
 
 def _untold(identity: Identity, target: Target) -> CheckResult:
     """The application does not answer, or there is no question for its versions."""
-    text = f"the {target.node.name}'s application does not tell its versions: "
     release = identity.release
     hardware = release is not None and bool(release.hardware_versions)
     previous = release is not None and release.rules_previous
     if not hardware and not previous:
-        text += "neither hardware nor downgrade can be checked"
+        text = say(
+            "the {node}'s application does not tell its versions: neither hardware nor downgrade "
+            "can be checked",
+            node=target.node.name,
+        )
         return CheckResult(Check.HARDWARE, CheckVerdict.UNKNOWN, text)
     rules = " and ".join(["hardware"] * hardware + ["the version that is replaced"] * previous)
-    text += f"the manifest's rule on {rules} cannot be checked"
+    text = say(
+        "the {node}'s application does not tell its versions: the manifest's rule on {rules} "
+        "cannot be checked",
+        node=target.node.name,
+        rules=rules,
+    )
     return identity.uncheckable(Check.HARDWARE if hardware else Check.PREVIOUS, text)
 
 
 def _hardware(identity: Identity, hardware: str | None) -> CheckResult:
     release = identity.release
     if release is None or not release.hardware_versions:
-        text = "no manifest says which hardware the image fits"
+        text = say("no manifest says which hardware the image fits")
         return CheckResult(Check.HARDWARE, CheckVerdict.UNKNOWN, text)
     fits = ", ".join(printable(each) for each in release.hardware_versions)
     if hardware is None:
-        text = f"the device does not tell its hardware; the manifest lists {fits}"
+        text = say("the device does not tell its hardware; the manifest lists {fits}", fits=fits)
         return identity.uncheckable(Check.HARDWARE, text)
     if release.fits_hardware(hardware):
         return CheckResult(
-            Check.HARDWARE, CheckVerdict.PASSED, f"the manifest lists hardware {hardware}"
+            Check.HARDWARE,
+            CheckVerdict.PASSED,
+            say("the manifest lists hardware {hardware}", hardware=hardware),
         )
-    text = f"the device's hardware {hardware} is not in the manifest, which lists {fits}"
+    text = say(
+        "the device's hardware {hardware} is not in the manifest, which lists {fits}",
+        hardware=hardware,
+        fits=fits,
+    )
     return identity.refusal(Check.HARDWARE, text)
 
 
@@ -267,21 +289,29 @@ def _versions(image: Image, identity: Identity, running: str) -> Iterator[CheckR
         yield from _previous(release, identity, running)
     new = new_version(image, release)
     if new is None:
-        text = f"the image names no version to compare with the running {running}"
+        text = say(
+            "the image names no version to compare with the running {running}", running=running
+        )
         yield CheckResult(Check.DOWNGRADE, CheckVerdict.UNKNOWN, text)
         return
     if new == running:
         skipped = CheckVerdict.SKIPPED if identity.skip_same_version else CheckVerdict.WARNED
-        yield CheckResult(Check.SAME_VERSION, skipped, f"the device already runs {running}")
+        text = say("the device already runs {running}", running=running)
+        yield CheckResult(Check.SAME_VERSION, skipped, text)
         return
     before, after = FirmwareVersion.parse(running), FirmwareVersion.parse(new)
     if before is None or after is None:
-        text = f"{running} and {new} cannot be compared: not both follow the naming rule"
+        text = say(
+            "{running} and {new} cannot be compared: not both follow the naming rule",
+            running=running,
+            new=new,
+        )
         yield CheckResult(Check.DOWNGRADE, CheckVerdict.UNKNOWN, text)
     elif after < before:
-        yield identity.refusal(Check.DOWNGRADE, f"{new} is older than {running}, which runs now")
+        text = say("{new} is older than {running}, which runs now", new=new, running=running)
+        yield identity.refusal(Check.DOWNGRADE, text)
     else:
-        text = f"{new} is newer than {running}, which runs now"
+        text = say("{new} is newer than {running}, which runs now", new=new, running=running)
         yield CheckResult(Check.DOWNGRADE, CheckVerdict.PASSED, text)
 
 
@@ -290,20 +320,32 @@ def _previous(release: Release, identity: Identity, running: str) -> Iterator[Ch
     if not release.rules_previous:
         return
     if release.fits_previous(running):
-        text = f"the manifest lets {running} be replaced"
+        text = say("the manifest lets {running} be replaced", running=running)
         yield CheckResult(Check.PREVIOUS, CheckVerdict.PASSED, text)
     else:
         excluded = running in release.previous_except or release.previous_from is None
-        rule = "excludes it" if excluded else f"replaces {release.previous_from} and newer"
-        text = f"the device runs {running}: the manifest {rule}"
+        text = say("the device runs {running}: the manifest excludes it", running=running)
+        if not excluded:
+            text = say(
+                "the device runs {running}: the manifest replaces {oldest} and newer",
+                running=running,
+                oldest=release.previous_from,
+            )
         yield identity.refusal(Check.PREVIOUS, text)
 
 
 def _state(identity: Identity, running: RunningInformation) -> Iterator[CheckResult]:
     """Charge and current; a discharging current is negative (5.1)."""
     if running.mean_current_ma < -identity.in_use_ma:
-        text = f"the battery gives {-running.mean_current_ma} mA, more than {identity.in_use_ma} mA"
+        text = say(
+            "the battery gives {current_ma} mA, more than {limit_ma} mA",
+            current_ma=-running.mean_current_ma,
+            limit_ma=identity.in_use_ma,
+        )
         yield identity.refusal(Check.IN_USE, text)
     if running.state_of_charge_percent < identity.low_charge_percent:
-        text = f"the battery is at {running.state_of_charge_percent} %: charge it first, if it can "
-        yield CheckResult(Check.CHARGE, CheckVerdict.WARNED, text + "wait")
+        text = say(
+            "the battery is at {charge} %: charge it first, if it can wait",
+            charge=running.state_of_charge_percent,
+        )
+        yield CheckResult(Check.CHARGE, CheckVerdict.WARNED, text)

@@ -20,7 +20,8 @@ from flasher.protocol.fields import Content
 from flasher.protocol.spec import TARGETS
 from flasher.protocol.text import printable
 from flasher.report.base import visible
-from flasher.trace.decoder import content_fields
+from flasher.said import Said, say
+from flasher.trace.decoder import Field, content_fields
 from flasher.web import bench_state as bench
 from flasher.web.bench import Bench
 from flasher.web.bench_state import Done, Order, State
@@ -230,9 +231,18 @@ _SHORT: Final = (
 def _rows(content: Content) -> dict[str, tuple[str, str]]:
     """Label and value of each field, by its name."""
     return {
-        shown.name: (shown.label, f"{shown.text} {shown.unit}".rstrip())
+        shown.name: (shown.label, _listed(shown) or f"{shown.text} {shown.unit}".rstrip())
         for shown in content_fields(content)
     }
+
+
+def _listed(shown: Field) -> str:
+    """The names of flags, each to be said in the language of the page; empty for other fields."""
+    names = shown.value if isinstance(shown.value, list) else []
+    if not names or not all(isinstance(name, str) for name in names):
+        return ""
+    values = {f"name_{number}": say(name) for number, name in enumerate(names)}
+    return Said(", ".join(f"{{{name}}}" for name in values), values)
 
 
 def facts(state: State) -> list[tuple[str, str]]:

@@ -53,6 +53,7 @@ from flasher.web.bench_state import (
     Watch,
 )
 from flasher.web.virtual_bike import Fault
+from flasher.web.words import words
 from tests.end_to_end.stage import NEW, OLD, image_of
 from tests.web.bench_place import IMAGE, PACKETS, BenchPlace
 
@@ -480,4 +481,6 @@ def test_what_the_battery_told_is_said_in_the_words_of_the_command(place: BenchP
     assert found["faults"] == [("faults", "none heard")]
     assert ("cycles", "12") in found["history"]
     assert "not answered" not in found
-    assert dict(told(place.do(UseAdapter(Fault.HARDWARE.value))))["faults"] != found["faults"]
+    ((_, faults),) = dict(told(place.do(UseAdapter(Fault.HARDWARE.value))))["faults"]
+    assert faults == "over discharge protection"
+    assert words("de")(faults) == "Schutz: Tiefentladung"
