@@ -5,6 +5,7 @@ python -m tests.documents [PAGE ...]
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 import time
@@ -22,7 +23,7 @@ def run(names: list[str]) -> int:
         with tempfile.TemporaryDirectory() as folder:
             try:
                 follow(FOLLOWED[page], Path(folder), patient=True)
-            except BaseException:  # noqa: BLE001  of a page, whatever it is
+            except Exception:  # noqa: BLE001  of a page, whatever it is
                 wrong += 1
                 traceback.print_exc(limit=0)
         sys.stdout.write(f"{page}: {time.perf_counter() - began:.1f} s\n")
@@ -30,4 +31,6 @@ def run(names: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(1 if run(sys.argv[1:]) else 0)
+    parser = argparse.ArgumentParser(description="Do everything that the documents say.")
+    parser.add_argument("page", nargs="*", choices=[*FOLLOWED, []], metavar="PAGE")
+    sys.exit(1 if run(parser.parse_args().page) else 0)

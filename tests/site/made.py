@@ -225,8 +225,10 @@ def _documents(prefix: str) -> _Lines:
                 for key, value in each["properties"].items()
                 if key not in told
             ]
-            if rows:
+            if any(row[2] for row in rows):
                 yield from _table("key", "value", "meaning", rows=iter(rows))
+            elif rows:
+                yield from _table("key", "value", rows=(row[:2] for row in rows))
 
 
 def _type(node: Mapping[str, Any]) -> str:
