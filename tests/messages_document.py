@@ -42,6 +42,12 @@ documents) and `flasher/protocol/messages.py` (the upgrade, appendix 3) by
 A message is named by its CAN id and its command, as the protocol documents print them; the second
 byte of the command is the size of the data. Numbers have their low byte first. A text ends with `.`
 and is filled with spaces; a reader takes a full field without it too (R20).
+
+A field's name is that in programs and in JSON. Where messages stand side by side the title of the
+message is before it, in small letters: `running_information.voltage_mv` is a column of a
+[table](../how-to/notebook.md), `welling.running_information.voltage_mv` a filter of
+[Wireshark](../how-to/wireshark.md), `running_information_voltage_mv` a signal of the
+[DBC](../how-to/dbc.md).
 """
 
 _SENDERS: Final = {
@@ -145,11 +151,12 @@ def _content(content: type[Content]) -> Iterator[str]:
     carriers = ", ".join(item.name for item in ITEMS if item.content is content)
     yield from (f"### {_title(content)}", "", inspect.getdoc(content) or "", "")
     yield from (f"{content.SIZE_BYTES} bytes, in {carriers}.", "")
-    yield from _table("first byte", "bytes", "field", "type", "unit", "on the wire")
+    yield from _table("first byte", "bytes", "field", "name", "type", "unit", "on the wire")
     at = 0
     for name, codec in content.LAYOUT:
+        shown, kind = label(name, codec), _type(codec)
         yield _cells(
-            at, codec.size_bytes, label(name, codec), _type(codec), codec.unit, _on_the_wire(codec)
+            at, codec.size_bytes, shown, f"`{name}`", kind, codec.unit, _on_the_wire(codec)
         )
         at += codec.size_bytes
     yield ""

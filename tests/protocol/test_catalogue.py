@@ -493,15 +493,15 @@ def test_the_document_lists_the_row_with_its_answer(row: Row) -> None:
 @each(
     "line",
     [
-        "| 2 | 2 | mean current | int16 | mA | |",
-        "| 8 | 1 | cell temperature | uint8 | °C | value + 40 |",
-        "| 0 | 32 | cells | 16 uint16 | mV | |",
-        "| 16 | 8 | date | date | | YYYYMMDD |",
-        "| 12 | 4 | reserved | bytes | | 00 |",
-        "| 30 | 4 | running time | uint32 | min | |",
+        "| 2 | 2 | mean current | `mean_current_ma` | int16 | mA | |",
+        "| 8 | 1 | cell temperature | `cell_temperature_c` | uint8 | °C | value + 40 |",
+        "| 0 | 32 | cells | `cells_mv` | 16 uint16 | mV | |",
+        "| 16 | 8 | date | `date` | date | | YYYYMMDD |",
+        "| 12 | 4 | reserved | `reserved` | bytes | | 00 |",
+        "| 30 | 4 | running time | `running_time_min` | uint32 | min | |",
         "| 24 | 01000000 | mos over temperature warning |",
         "| 2 | 00000004 | short circuit protection |",
-        "| 8 | 128 | content | bytes | | |",
+        "| 8 | 128 | content | `content` | bytes | | |",
     ],
 )
 def test_the_document_has_the_fields_where_the_documents_have_them(line: str) -> None:
