@@ -140,6 +140,12 @@ def printable(text: str) -> str:
     )
 
 
+def _hidden(text: str) -> str:
+    """The same without passwords; a sentence that has none stays one that can be translated."""
+    hidden = hide_passwords(text)
+    return text if hidden == text else hidden
+
+
 @dataclass(frozen=True)
 class Fault:
     """One thing that is wrong with a file: "target[0].base cannot be -1."."""
@@ -179,9 +185,7 @@ class FlasherError(Exception):
         remedy: str = "",
         code: ErrorCode | None = None,
     ) -> None:
-        self.what, self.where, self.cause, self.remedy = map(
-            hide_passwords, (what, where, cause, remedy)
-        )
+        self.what, self.where, self.cause, self.remedy = map(_hidden, (what, where, cause, remedy))
         super().__init__(self.what)
         self.code = code or self.default_code
         self.command = ""

@@ -34,6 +34,17 @@ def say(template: str, **values: Any) -> Said:
     return Said(template, values)
 
 
+def with_value(text: str, old: str, new: str) -> str:
+    """A text with another one in the place of `old`, which may be a value of any sentence in it."""
+    if not isinstance(text, Said) or not text.values:
+        return new if text == old else text
+    values = {
+        name: with_value(value, old, new) if isinstance(value, str) else value
+        for name, value in text.values.items()
+    }
+    return Said(text.template, values)
+
+
 def in_language(text: str, gettext: Gettext) -> str:
     """A text as `gettext` says it: a sentence by its template, another text as it stands in the
     catalogue, and as it is where the catalogue does not know it.

@@ -5,6 +5,7 @@ it has one; a sentence that nobody says any more is dropped.
 
 from __future__ import annotations
 
+import itertools
 import string
 import sys
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from babel.messages.pofile import read_po, write_po
 
 from flasher.events import Phase
 from flasher.host.items import meaningful_fields
+from flasher.host.outcome import _EXPLANATIONS, AGAIN, DeviceLeft, _late
 from flasher.host.table import Ending
 from flasher.host.verify import Verdict
 from flasher.prose import prose
@@ -42,7 +44,14 @@ def said() -> Iterator[str]:
     for _, _, message, _, _ in found:
         assert isinstance(message, str)
         yield message
-    yield from (prose(each) for kind in (Phase, Ending, Verdict) for each in kind)
+    yield from (prose(each) for kind in (Phase, Ending, Verdict, DeviceLeft) for each in kind)
+    explained = [
+        *_EXPLANATIONS.values(),
+        *itertools.starmap(_late, itertools.product(Phase, DeviceLeft)),
+    ]
+    for each in explained:
+        yield from filter(None, (each.cause, each.remedy))
+    yield AGAIN
     yield from message_titles()
     for item in ITEMS:
         yield from (label(*each) for each in meaningful_fields(item.content))

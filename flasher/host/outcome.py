@@ -30,6 +30,7 @@ from flasher.image.plan import Plan
 from flasher.image.plausible import UNLIKELY
 from flasher.prose import prose
 from flasher.protocol.spec import Target
+from flasher.said import Said, say
 
 
 class DeviceLeft(Enum):
@@ -64,8 +65,15 @@ class Statistics:
 
 def standing(phase: Phase, packet: int | None, total_packets: int, attempt: int) -> str:
     """Where an upgrade stands, in words."""
-    of_packets = f", packet {packet} of {total_packets}" if packet else ""
-    return f"{prose(phase)}{of_packets}" + (f", attempt {attempt}" if attempt > 1 else "")
+    where = say(prose(phase))
+    if packet:
+        where = say(
+            "{where}, packet {packet} of {packets}",
+            where=where,
+            packet=packet,
+            packets=total_packets,
+        )
+    return say("{where}, attempt {attempt}", where=where, attempt=attempt) if attempt > 1 else where
 
 
 @dataclass(frozen=True)
@@ -125,15 +133,21 @@ class Outcome:
             if self.ending is Ending.OUT_OF_TIME
             else _EXPLANATIONS[self.ending]
         )
-        what = f"{self.target.node.name}: {prose(self.ending)}"
+        node, ending = self.target.node.name, say(prose(self.ending))
+        what = say("{node}: {ending}.", node=node, ending=ending)
         if self.detail:
-            what += f" ({self.detail})"
-        names = {"node": self.target.node.name, "boot_name": self.target.boot_name}
+            detail = self.detail
+            what = say("{node}: {ending} ({detail}).", node=node, ending=ending, detail=detail)
+        names = {"node": node, "boot_name": self.target.boot_name, "again": say(AGAIN)}
         error = kind(
-            f"{what}.",
+            what,
             where=self.where,
-            cause=cause.format(**names),
-            remedy=f"{remedy.format(**names)} State of the device: {prose(self.device_left)}.",
+            cause=Said(cause, names),
+            remedy=say(
+                "{remedy} State of the device: {state}.",
+                remedy=Said(remedy, names),
+                state=say(prose(self.device_left)),
+            ),
             code=code,
         )
         error.needs_rescue = self.device_left.needs_rescue
@@ -183,6 +197,7 @@ class _Explanation(NamedTuple):
 
 
 AGAIN: Final = "Run the same command again."
+"""What stands for {again} below."""
 
 _EXPLANATIONS: Final = {
     Ending.NO_BOOT_VERSION: _Explanation(
@@ -197,14 +212,14 @@ _EXPLANATIONS: Final = {
         NoAnswerError,
         "nobody switched it off and on, it has no power, it is not on this bus, or the bit rate "
         "differs",
-        f"{AGAIN} Take the device's supply away for some seconds when you are asked to (a battery "
+        "{again} Take the device's supply away for some seconds when you are asked to (a battery "
         "wakes by its key or charger); --wait allows more time.",
         code=ErrorCode.NO_ANNOUNCEMENT,
     ),
     Ending.NO_REQUEST: _Explanation(
         NoAnswerError,
         "erasing takes longer than allowed, or the device refuses this size or target",
-        f"Power-cycle the device. {AGAIN}",
+        "Power-cycle the device. {again}",
         code=ErrorCode.NO_REQUEST,
     ),
     Ending.UNHEARING: _Explanation(
@@ -251,20 +266,20 @@ _EXPLANATIONS: Final = {
     Ending.SECOND_TOOL: _Explanation(
         BusError,
         "another program or dongle speaks as the CAN dongle (CDL) on this bus",
-        f"End the other tool and disconnect it. {AGAIN}",
+        "End the other tool and disconnect it. {again}",
         code=ErrorCode.SECOND_TOOL,
     ),
     Ending.TWO_DEVICES: _Explanation(
         WrongDeviceError,
         "two devices of the same kind are on the bus",
-        f"Disconnect one of them. {AGAIN}",
+        "Disconnect one of them. {again}",
         code=ErrorCode.TWO_DEVICES,
     ),
     Ending.PACKET_FAILED: _Explanation(
         TransferError,
         "the device lost power or contact, the line is disturbed, or the device cannot store this "
         "packet",
-        f"Check supply and wiring. {AGAIN} A device that stays silent needs flasher rescue and a "
+        "Check supply and wiring. {again} A device that stays silent needs flasher rescue and a "
         "power cycle.",
         code=ErrorCode.PACKET_FAILED,
     ),
@@ -272,13 +287,13 @@ _EXPLANATIONS: Final = {
         TransferError,
         "its supply drops, its watchdog bites, it does not accept what it is sent, or two devices "
         "of the same kind answer",
-        f"Check the supply, and that there is one {{node}} only. {AGAIN}",
+        "Check the supply, and that there is one {node} only. {again}",
         code=ErrorCode.RESTARTED,
     ),
     Ending.BROKEN_PROTOCOL: _Explanation(
         TransferError,
         "its bootloader does not follow the protocol",
-        f"Report the boot version to its maker. {AGAIN}",
+        "Report the boot version to its maker. {again}",
         code=ErrorCode.BROKEN_PROTOCOL,
     ),
     Ending.REFUSED: _Explanation(
@@ -300,7 +315,7 @@ _EXPLANATIONS: Final = {
     Ending.CANCELLED: _Explanation(
         InterruptedByUserError,
         "",
-        f"{AGAIN} Give a bootloader that was receiving some seconds to time out first, or "
+        "{again} Give a bootloader that was receiving some seconds to time out first, or "
         "power-cycle the device if it does not.",
     ),
 }
@@ -308,7 +323,7 @@ _EXPLANATIONS: Final = {
 
 def _late(phase: Phase, left: DeviceLeft) -> _Explanation:
     """The explanation of a passed deadline, by what had been reached."""
-    remedy = f"Allow more time with --timeout, or find what is slow. {AGAIN}"
+    remedy = "Allow more time with --timeout, or find what is slow. {again}"
     match phase:
         case Phase.LISTEN | Phase.IDENTIFY | Phase.RESET | Phase.BOOT | Phase.UPDATE:
             cause = "the device is not there, or not ready in the time allowed"

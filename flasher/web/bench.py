@@ -29,6 +29,7 @@ from flasher.protocol.contents import Memory, RunningInformation, VersionInforma
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
 from flasher.protocol.text import printable
 from flasher.report.base import visible
+from flasher.said import say, with_value
 from flasher.settings.area import Area, area_of_image, area_of_profile
 from flasher.settings.profile import Profile
 from flasher.trace.decoder import BusEvent
@@ -70,8 +71,8 @@ NOTES_KEPT: Final = 12
 WATCH_TURN_S: Final = 0.5
 """Time between two looks at what is said on the bus: slow enough to read."""
 SUBJECT: Final = "bench"
-_AGAIN: Final = "Begin again with the adapter."
-_RESCUE: Final = "Then rescue this device."
+_AGAIN: Final = say("Begin again with the adapter.")
+_RESCUE: Final = say("Then rescue this device.")
 T = TypeVar("T")
 _LOG: Final = logging.getLogger("flasher.web")
 
@@ -496,7 +497,7 @@ class Bench:
         )
         if carried.error is not None:
             again = _RESCUE if carried.error.needs_rescue else _AGAIN
-            carried.error.remedy = carried.error.remedy.replace(AGAIN, again)
+            carried.error.remedy = with_value(carried.error.remedy, AGAIN, again)
         state = self.state
         done = Done(
             self._date(), adapter, job.plan.target, offer, state.checks, state.bike, state.furthest,

@@ -273,6 +273,17 @@ def test_a_bad_end_says_what_happened_and_claims_no_more_than_is_known(
     assert done.bundle.is_dir()
 
 
+def test_a_bad_end_is_said_in_the_language_of_the_page(place: BenchPlace) -> None:
+    error = _done(place, Fault.POWER).error
+    assert error is not None
+    assert "Then rescue this device." in error.remedy
+    german = words("de")
+    assert german(error.what).startswith("BMS: ein Paket wurde nicht bestätigt")
+    assert german(error.where) == "wird übertragen, Paket 8 von 20, Versuch 3"
+    assert "Dann dieses Gerät retten." in german(error.remedy)
+    assert "Zustand des Geräts: seine Anwendung" in german(error.remedy)
+
+
 def test_a_device_whose_upgrade_failed_is_rescued_with_the_same_image(place: BenchPlace) -> None:
     _done(place, Fault.POWER)
     state = place.do(RescueIt())

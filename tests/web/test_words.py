@@ -7,7 +7,7 @@ import re
 
 import pytest
 
-from flasher.said import Said, in_language, say
+from flasher.said import Said, in_language, say, with_value
 from flasher.station.scans import Word
 from flasher.web.words import chosen, words
 from tests import catalogue
@@ -45,6 +45,15 @@ def test_a_sentence_is_said_by_its_template() -> None:
 def test_a_value_is_never_taken_for_a_template() -> None:
     said = say("Scan {label}.", label="{socket} %s {0}")
     assert words("de")(said) == "{socket} %s {0} scannen."
+
+
+def test_a_value_is_exchanged_wherever_it_stands() -> None:
+    inner = say("Put {label} into socket {socket}.", label=say("W1"), socket="A")
+    both = say("{wanted} Or scan CANCEL.", wanted=inner)
+    assert with_value(both, "W1", "W2") == "Put W2 into socket A. Or scan CANCEL."
+    assert words("de")(with_value(both, "W1", "W2")).startswith("W2 auf Platz A setzen.")
+    assert with_value("W1", "W1", "W2") == "W2"
+    assert with_value("W1 and W3", "W1", "W2") == "W1 and W3"
 
 
 def test_a_sentence_passes_from_process_to_process() -> None:
