@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import random
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
@@ -427,3 +428,23 @@ def test_a_second_tool_is_found_where_explain_finds_one(
         for each in _explained(name).upgrades
     )
     assert ("foreign_tool" in _experts(told[name])) == is_foreign
+
+
+def test_two_buses_in_one_capture_are_two(folder: Path) -> None:
+    """The same id on two interfaces, frame by frame in turn."""
+    captures = []
+    for number in (1, 2):
+        message = messages.Packet(number, 9, bytes([number]) * 128).to_message(0x752)
+        frames = [
+            (START_S + at / 1000 + number / 4000, frame)
+            for at, frame in enumerate(split(0x752, encode(message)))
+        ]
+        captures.append(write_capture(folder / f"bus{number}.pcapng", frames))
+    both = folder / "buses.pcapng"
+    subprocess.run(["mergecap", "-I", "none", "-w", both, *captures], check=True)
+    found = list(items(both, folder))
+    assert [(item.one("message"), item.one("packet")) for item in found] == [
+        ("packet", "1"),
+        ("packet", "2"),
+    ]
+    assert [item.one("upgrade") for item in found] == ["1", "2"]
