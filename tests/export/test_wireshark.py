@@ -59,7 +59,7 @@ class Reel:
         self.now += PAUSE_S
 
 
-def _catalogue(reel: Reel, chance: random.Random) -> None:
+def catalogue_messages(reel: Reel, chance: random.Random) -> None:
     """Every message of chapter 3: zeros, ones, as written by people, anything; and a wrong mode."""
     for item in catalogue.ITEMS:
         size = item.content.SIZE_BYTES
@@ -70,7 +70,7 @@ def _catalogue(reel: Reel, chance: random.Random) -> None:
             reel.message(Message(item.can_id, mode, item.command, bytes(size)))
 
 
-def _upgrade(reel: Reel, chance: random.Random) -> None:
+def upgrade_messages(reel: Reel, chance: random.Random) -> None:
     """Every message of the upgrade, both ways, for each target, right and with each byte wrong."""
     rows: list[messages.Row] = [
         messages.Reset(), messages.GeneralFeedback(), messages.BootVersion("PBU", "V1.2.3"),
@@ -108,7 +108,7 @@ def _vectors(reel: Reel) -> None:
             reel.add(Frame(int(vector["can_id"], 16), bytes.fromhex(payload)))
 
 
-def _damaged(reel: Reel, chance: random.Random, *, count: int) -> None:
+def damaged(reel: Reel, chance: random.Random, *, count: int) -> None:
     """Messages of several senders among each other, cut, doubled, with wrong bytes and pauses."""
     ids = [0x720, 0x725, 0x752, 0x732]
     waiting: list[list[Frame]] = []
@@ -142,13 +142,13 @@ def _reel() -> Reel:
     reel = Reel()
     packet = messages.Packet(7, 9, chance.randbytes(128)).to_message(0x752)
     reel.add(*split(0x752, encode(packet))[5:])  # as of a capture that begins in the middle
-    _catalogue(reel, chance)
+    catalogue_messages(reel, chance)
     reel.pause()
-    _upgrade(reel, chance)
+    upgrade_messages(reel, chance)
     _unknown(reel)
     reel.pause()
     _vectors(reel)
-    _damaged(reel, chance, count=600)
+    damaged(reel, chance, count=600)
     reel.pause()
     reel.message(messages.Ack(1).to_message(0x725))  # so that everything before is over
     return reel
@@ -167,11 +167,11 @@ def capture(folder: Path) -> Path:
     return write_capture(folder / "reel.pcapng", REEL.frames)
 
 
-def _decoded(frames: Frames, dialect: Dialect) -> Iterator[tuple[int, BusEvent]]:
+def decoded(reel: Reel, dialect: Dialect) -> Iterator[tuple[int, BusEvent]]:
     """What flasher decodes, with the number of the frame at which it shows."""
     decoder = Decoder(dialect=dialect)
     late: list[BusEvent] = []
-    for number, (now, frame) in enumerate(frames, 1):
+    for number, (now, frame) in enumerate(reel.frames, 1):
         while (due := decoder.deadline()) is not None and due < now:
             late += decoder.tick(due)
         found = [each for each in decoder.feed(frame, now) if each.kind is not Kind.FOREIGN]
@@ -180,7 +180,7 @@ def _decoded(frames: Frames, dialect: Dialect) -> Iterator[tuple[int, BusEvent]]
             late = []
 
 
-def _expected(event: BusEvent) -> list[tuple[str, str]]:
+def expected_of(event: BusEvent) -> list[tuple[str, str]]:
     """Filter names and values."""
     if event.kind is Kind.DAMAGED:
         reason, raw = event.fields
@@ -222,7 +222,7 @@ _AROUND: Final = {
 }  # fmt: skip
 
 
-def _shown(item: Item) -> list[tuple[str, str]]:
+def shown(item: Item) -> list[tuple[str, str]]:
     """Filter names and values, without what stands around every message."""
     kind = item.one("kind")
     found = []
@@ -255,14 +255,14 @@ def test_every_message_and_every_damage_is_what_flasher_decodes(
     dialect: Dialect, capture: Path, folder: Path
 ) -> None:
     found = list(items(capture, folder, "-o", f"welling.dialect:{dialect.name}"))
-    expected = list(_decoded(REEL.frames, dialect))
+    expected = list(decoded(REEL, dialect))
     for item, (number, event) in zip(found, expected, strict=False):
         where = (number, event)
         assert item.frame == number, (where, item)
         assert item.one("kind") == event.kind.value, where
         assert item.one("message") == event.title, where
         assert (item.one("sender"), item.one("receiver")) == (event.sender, event.receiver)
-        assert _shown(item) == _expected(event), where
+        assert shown(item) == expected_of(event), where
         if event.kind is not Kind.DAMAGED:
             assert item.one("crc.ok") in ("1", "True"), where
             assert (item.one("in_dialect") in ("1", "True")) == event.in_dialect, where
