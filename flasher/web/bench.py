@@ -87,6 +87,8 @@ class Carried:
     result: Result | None
     error: FlasherError | None
     bundle: Path | None
+    warning: str = ""
+    """Why the history has nothing of it; empty where it has."""
 
 
 class Workplace(Protocol):
@@ -501,7 +503,7 @@ class Bench:
         state = self.state
         done = Done(
             self._date(), adapter, job.plan.target, offer, state.checks, state.bike, state.furthest,
-            carried.result, carried.error, carried.bundle,
+            carried.result, carried.error, carried.bundle, warning=carried.warning,
         )  # fmt: skip
         self._set(done=done, power_cycle_s=None, phase=None)
         is_new = carried.result is not None and carried.result.outcome.ok

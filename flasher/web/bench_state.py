@@ -83,6 +83,8 @@ class Done:
     error: FlasherError | None
     bundle: Path | None
     after: DeviceInfo | None = None
+    warning: str = ""
+    """Why the history has nothing of it; empty where it has."""
 
     @property
     def is_transferred(self) -> bool | None:

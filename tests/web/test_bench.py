@@ -114,6 +114,17 @@ def test_it_is_kept_in_the_history_as_by_the_command(place: BenchPlace) -> None:
     assert flashes[-1].ended.running_version == NEW
 
 
+def test_an_upgrade_that_the_history_cannot_take_says_so(
+    place: BenchPlace, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    assert _done(place).warning == ""
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "file"))
+    done = _done(place)
+    assert done.is_completed
+    assert done.warning.startswith("no history in ")
+
+
 def test_the_next_bike_begins_with_nothing_of_the_last(place: BenchPlace) -> None:
     _done(place)
     state = place.do(StartOver())

@@ -186,7 +186,8 @@ class _Place:
         except FlasherError as error:
             carried.error = error
         bundle = None if carried.record is None else carried.record.bundle
-        return bench.Carried(result, carried.error, bundle)
+        warning = "" if carried.keeper is None else carried.keeper.warning
+        return bench.Carried(result, carried.error, bundle, warning)
 
 
 def backup_folder() -> Path:

@@ -10,7 +10,7 @@ from flasher.api import Connection, Job, Watch
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording
-from flasher.cli.upgrade.kept import kept
+from flasher.cli.upgrade.kept import Keeper, kept
 from flasher.cli.upgrade.text import UpgradeDocument, plan_document, upgrade_document
 from flasher.errors import FlasherError
 from flasher.events import CheckMade
@@ -36,6 +36,8 @@ class Carried:
     error: FlasherError | None = None
     """What stands for a bad end, completed."""
     took_s: float = 0.0
+    keeper: Keeper | None = None
+    """Knows whether the history has it, at the end."""
 
     def carry_out(
         self, connect: Callable[[], AbstractContextManager[Connection]], watching: Watching
@@ -46,7 +48,8 @@ class Carried:
             kept(self.output) as keeper,
             recording(self.recorded, self.bus, self.output, target=plan.target) as record,
         ):
-            self.record = keeper.record = record
+            self.record, self.keeper = record, keeper
+            keeper.record = record
             record.facts["plan"] = plan_document(plan, job.options)
             record.facts["waived"] = job.waived
             record.facts["image_sha256"] = plan.image.sha256

@@ -35,6 +35,8 @@ class Keeper:
         self.result: Result | None = None
         self.record: Recording | None = None
         """Knows the bundle."""
+        self.warning = ""
+        """Why it is not kept; empty where it is."""
 
     def began(self, command: str, job: Job, adapter: str, *, is_mock: bool) -> None:
         """The upgrade begins on this adapter."""
@@ -91,7 +93,8 @@ class Keeper:
         except Exception as problem:  # noqa: BLE001  the flash is what matters
             reason = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
             path = self._history.path
-            self._output.error_line(printable(f"warning: no history in {path}: {reason}"))
+            self.warning = printable(f"no history in {path}: {reason}")
+            self._output.error_line(f"warning: {self.warning}")
 
 
 @contextmanager
