@@ -26,8 +26,8 @@ from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Message, Reassembler, encode
 from flasher.trace.decoder import ROUTES, TITLES
 
-FD_SIZE_MAX: Final = 64
-_FD_SIZES: Final = (8, 12, 16, 20, 24, 32, 48, FD_SIZE_MAX)
+FD_SIZE: Final = 64
+"""Bytes of each frame: programs refuse a frame that is shorter than the DBC says."""
 _DATA_AT: Final = PREFIX_SIZE + COMMAND_SIZE
 _NAME_MAX: Final = 32
 """Characters of a name; longer ones stand in an attribute, as Vector's tools write them."""
@@ -67,7 +67,7 @@ def dbc() -> str:
     for can_id, (signals, _) in described.items():
         sender, receiver = ROUTES[can_id]
         to = receiver if receiver in nodes else _NODE_OF_ALL
-        lines.append(f"BO_ {can_id} {sender}_to_{receiver}: {FD_SIZE_MAX} {sender}")
+        lines.append(f"BO_ {can_id} {sender}_to_{receiver}: {FD_SIZE} {sender}")
         lines.append(f' SG_ mode : 16|8@1+ (1,0) [0|255] "" {to}')
         lines.append(f' SG_ length : 24|8@1+ (1,0) [0|255] "" {to}')
         lines.append(f' SG_ {_COMMAND} M : 39|16@0+ (1,0) [0|65535] "" {to}')
@@ -122,7 +122,7 @@ def _signals(command: int, prefix: str, layout: Iterable[tuple[str, Codec]]) -> 
     for name, codec in layout:
         size, bit, whole = codec.size_bytes, 8 * at, f"{prefix}_{name}"
         at += size
-        if at > FD_SIZE_MAX:
+        if at > FD_SIZE:
             return
         match codec:
             case Number():
@@ -173,7 +173,7 @@ def _choices(values: Iterable[tuple[int, str]]) -> str:
 
 def joined_frames(frames: Iterable[tuple[float, Frame]]) -> Iterator[can.Message]:
     """Each intact message as one CAN FD frame, at the time of its last frame: the first 64 bytes,
-    filled up with zeros to a size that CAN FD has. Everything else is left out.
+    filled up with zeros. Everything else is left out.
     """
     streams = {
         can_id: Reassembler(can_id, DEFAULT_TIMINGS.inter_frame_timeout_s) for can_id in ROUTES
@@ -189,13 +189,12 @@ def joined_frames(frames: Iterable[tuple[float, Frame]]) -> Iterator[can.Message
 
 def joined(message: Message, at_s: float) -> can.Message:
     """One message as a CAN FD frame."""
-    data = encode(message)[:FD_SIZE_MAX]
-    size = next(size for size in _FD_SIZES if size >= len(data))
+    data = encode(message)[:FD_SIZE]
     return can.Message(
         timestamp=at_s,
         arbitration_id=message.can_id,
         is_extended_id=False,
         is_fd=True,
-        data=data.ljust(size, b"\0"),
+        data=data.ljust(FD_SIZE, b"\0"),
         channel=0,
     )

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
 
 import numpy
 from asammdf import MDF, Signal
@@ -17,9 +16,7 @@ from flasher.protocol import messages
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.fields import Codec, Flags, flag_names
 from flasher.trace.decoder import BusEvent, Kind
-
-_WALL_TIME_FROM: Final = 1e8
-"""Stamps from here on (1973) are wall time, smaller ones count from some start."""
+from flasher.trace.explain import WALL_TIME_FROM
 
 
 @dataclass
@@ -52,7 +49,7 @@ def write_mf4(rows: Iterable[Row], to: Path) -> int:
         for name, unit, value in values:
             group.channels.setdefault(name, _Channel(unit)).samples.append(value)
     with MDF(version="4.10") as mdf:
-        if start_s >= _WALL_TIME_FROM:
+        if start_s >= WALL_TIME_FROM:
             mdf.header.start_time = datetime.fromtimestamp(start_s, tz=UTC)
         for title, group in groups.items():
             times = numpy.array(group.times_s)

@@ -39,17 +39,11 @@ class Row:
     def values(self) -> dict[str, Any]:
         """Everything, by the names of the columns; a list has a column for each of its values."""
         event = self.event
-        return {
-            "time_s": self.time_s,
-            "stamp_s": self.stamp_s,
-            "frame": self.frame,
-            "id": f"{event.can_id:03X}",
-            "sender": event.sender,
-            "receiver": event.receiver,
-            "kind": event.kind.value,
-            "message": event.title,
-            **dict(self.fields()),
-        }
+        fixed = (
+            self.time_s, self.stamp_s, self.frame, f"{event.can_id:03X}", event.sender,
+            event.receiver, event.kind.value, event.title,
+        )  # fmt: skip
+        return {**dict(zip(FIXED_COLUMNS, fixed, strict=True)), **dict(self.fields())}
 
     def fields(self) -> Iterator[tuple[str, Value]]:
         """Names and values of the fields: `running_information.voltage_mv`."""

@@ -47,7 +47,7 @@ MAX_PACKETS: Final = 200_000
 """Packets that a story holds one by one, over all upgrades."""
 EVERYTHING_LIMIT: Final = 200_000
 """Lines of a list when every message is wanted."""
-_WALL_TIME_FROM: Final = 1e8
+WALL_TIME_FROM: Final = 1e8
 """Stamps from here on (1973) are wall time, smaller ones count from some start."""
 _MAY_BE_ANSWERED: Final = frozenset({Cause.RECORDING_ENDS, Cause.TOOL_STOPPED})
 """Ends of a trace behind which the latest message may have been answered."""
@@ -284,7 +284,7 @@ class _Reading:
         return Story(
             source=printable(source),
             format=printable(suffix),
-            started_at=start if start >= _WALL_TIME_FROM else None,
+            started_at=start if start >= WALL_TIME_FROM else None,
             duration_s=bus.duration_s,
             bitrate_bps=bitrate_bps,
             frames=bus.frames,

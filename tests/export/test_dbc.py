@@ -11,7 +11,7 @@ import cantools
 import pytest
 from cantools.database.can import Database
 
-from flasher.export.dbc import FD_SIZE_MAX, dbc, joined
+from flasher.export.dbc import FD_SIZE, dbc, joined
 from flasher.export.names import key
 from flasher.protocol import catalogue, messages
 from flasher.protocol.fields import Content, Flags, Number, Numbers, flag_names
@@ -33,10 +33,8 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> Database:
 def _decoded(database: Database, message: Message) -> dict[str, object]:
     frame = joined(message, 0.0)
     assert frame.is_fd
-    assert len(frame.data) <= FD_SIZE_MAX
-    decoded = database.decode_message(
-        frame.arbitration_id, bytes(frame.data), decode_choices=False, allow_truncated=True
-    )
+    assert len(frame.data) == FD_SIZE
+    decoded = database.decode_message(frame.arbitration_id, bytes(frame.data), decode_choices=False)
     assert isinstance(decoded, dict)
     found: dict[str, object] = {**decoded}
     wire = encode(message)
@@ -132,7 +130,7 @@ def test_a_joined_trace_has_a_frame_a_message(
             frames = list(reader)
         assert len(frames) == 12
         assert all(frame.is_fd for frame in frames)
-        last = database.decode_message(0x725, bytes(frames[-1].data), allow_truncated=True)
+        last = database.decode_message(0x725, bytes(frames[-1].data))
         assert isinstance(last, dict)
         assert last["nak_number"] == 4
     # flasher reads classic CAN alone: these are no frames of the bus.
