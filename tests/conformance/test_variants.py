@@ -1,7 +1,7 @@
 """Every wrong bootloader is caught by the case of its clause, and every case catches one.
 
 The table is docs/reference/variants.md; the gate makes all of it anew, with
-`tests.variant_matrix --check`.
+`tests.variant_matrix --quick`.
 """
 
 from __future__ import annotations
