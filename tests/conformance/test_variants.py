@@ -1,6 +1,6 @@
 """Every wrong bootloader is caught by the case of its clause, and every case catches one.
 
-The table is docs/reference/variants.md; the gate makes all of it anew, with
+The table is docs/reference/variants.md; the gate compares more of it, with
 `tests.variant_matrix --quick`.
 """
 
