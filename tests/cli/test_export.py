@@ -43,6 +43,27 @@ def test_json_needs_a_file(flasher: Flasher, tmp_path: Path) -> None:
     assert document["size_bytes"] == path.stat().st_size
 
 
+@pytest.mark.parametrize("content", [b"", b"this is no trace\n"])
+@pytest.mark.parametrize("to", ["trace out.blf", "trace --joined out.blf", "csv out.csv"])
+def test_a_file_without_a_frame_is_said(
+    flasher: Flasher, tmp_path: Path, content: bytes, to: str
+) -> None:
+    (tmp_path / "empty.asc").write_bytes(content)
+    *action, name = to.split()
+    ran = flasher("export", *action, tmp_path / "empty.asc", "-o", tmp_path / name)
+    assert ran.code == ExitCode.OK
+    assert "there is no frame in" in ran.err
+    assert "no trace of its suffix's format" in ran.err
+
+
+def test_a_trace_without_a_wanted_message_is_no_empty_one(
+    flasher: Flasher, trace: Path, tmp_path: Path
+) -> None:
+    ran = flasher("export", "csv", trace, "--message", "history", "-o", tmp_path / "out.csv")
+    assert ": 0 messages" in ran.out
+    assert ran.err == ""
+
+
 # -- trace ----------------------------------------------------------------------------------------
 
 

@@ -199,7 +199,7 @@ def trace(output: Output, *, trace: Path, file: Path, joined: bool) -> int:
         made = (convert_joined if joined else convert)(trace, part, called=file)
     shown = f"{printable(str(file))}: {counted(made.frames, 'frame')}"
     output.result(f"{shown}, {counted(made.remarks, 'remark')}" if made.remarks else shown)
-    _warn(output, trace, made.damage)
+    _warn(output, trace, made.damage, made=made.frames)
     output.document(
         ExportedTraceDocument(
             file=str(file), frames=made.frames, remarks=made.remarks, damage=made.damage
@@ -228,7 +228,7 @@ def csv(output: Output, *, trace: Path, file: Path | None, messages: tuple[str, 
     else:
         write_whole(file, text.encode("utf-8"), _OUT)
         output.result(f"{printable(str(file))}: {counted(len(found), 'message')}")
-    _warn(output, trace, damage)
+    _warn(output, trace, damage, made=len(found))
     output.document(ExportedSignalsDocument(file=str(file), messages=len(found), damage=damage))
     return 0
 
@@ -254,7 +254,7 @@ def mf4(output: Output, *, trace: Path, file: Path, messages: tuple[str, ...]) -
         channels = write_mf4(found, part)
     count = f"{counted(len(found), 'message')}, {counted(channels, 'channel')}"
     output.result(f"{printable(str(file))}: {count}")
-    _warn(output, trace, damage)
+    _warn(output, trace, damage, made=len(found))
     output.document(ExportedSignalsDocument(file=str(file), messages=len(found), damage=damage))
     return 0
 
@@ -275,6 +275,15 @@ def _rows(trace: Path, messages: tuple[str, ...]) -> tuple[list[Row], str]:
     return list(found), " ".join(damage)
 
 
-def _warn(output: Output, trace: Path, damage: str) -> None:
+def _warn(output: Output, trace: Path, damage: str, *, made: int) -> None:
+    """What the count of frames or messages `made` does not say."""
+    from flasher.trace.source import frames_until_damage, trace_file  # noqa: PLC0415  python-can
+
+    shown = printable(str(trace))
     if damage:
-        output.error_line(f"warning: {printable(str(trace))} ends there: {damage}")
+        output.error_line(f"warning: {shown} ends there: {damage}")
+    elif not made and not any(True for _ in frames_until_damage(trace_file(trace), [])):
+        output.error_line(
+            f"warning: there is no frame in {shown}: nothing was recorded, or the file is no trace "
+            "of its suffix's format"
+        )
