@@ -124,7 +124,6 @@ def _header(data: bytes, source: str) -> tuple[str, tuple[int, ...]]:
             f"{source} is an ELF file for a 64-bit processor",
             cause="a program for the computer, not for the device",
             remedy="name the firmware's file",
-            code=ErrorCode.IMAGE_IMPLAUSIBLE,
         )
     fields = header.unpack_from(data)
     if fields[10] > _PROGRAM_HEADERS_MAX or fields[12] > _SECTIONS_MAX:

@@ -69,6 +69,14 @@ def test_a_code_is_printed_and_told(flasher: Flasher) -> None:
     assert flasher("flash", "nix.bin", "-t", "bms", "--json").document["error"]["code"] == "E201"
 
 
+@pytest.mark.parametrize("code", ["E202", "E503", "E504"])
+def test_a_code_does_not_claim_that_nothing_was_done(flasher: Flasher, code: str) -> None:
+    """Each is the error of a first attempt, and of a later one behind an erased application."""
+    said = flasher("help", code).out.lower()
+    for claim in ("nothing was", "nothing has", "is still there"):
+        assert claim not in said
+
+
 def test_a_file_with_faults_has_their_code(flasher: Flasher, tmp_path: Path) -> None:
     (tmp_path / "p.toml").write_text("nix = 1\n")
     ran = flasher("profile", "check", tmp_path / "p.toml")

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from flasher.errors import ExitCode, ImageError, UsageError
+from flasher.errors import ErrorCode, ExitCode, ImageError, UsageError
 from flasher.image import load as load_module
 from flasher.image import records
 from flasher.image.image import Image, Span
@@ -107,6 +107,12 @@ def test_each_bad_file_is_refused_in_the_words_for_it(
     assert name in message
     for word in words:
         assert word in message
+
+
+def test_what_no_option_lets_through_has_not_the_code_of_that_option() -> None:
+    with pytest.raises(ImageError) as caught:
+        load(BAD / "64_bit.elf")
+    assert caught.value.code is ErrorCode.IMAGE
 
 
 def test_every_bad_file_is_in_the_table() -> None:
