@@ -312,12 +312,14 @@ class _Login:
         if self._tries.are_used_up:
             return self._show(request, say("Too many wrong tries: wait a minute."), 429)
         role = None
-        if badge and self._badges is not None:
+        badges = self._badges if badge else None
+        if badges is not None:
             # Beside the loop that serves all pages: it takes its time.
-            find = partial(self._badges.role_of, badge.strip()[:_BADGE_MAX], pin[:_BADGE_MAX])
+            find = partial(badges.role_of, badge.strip()[:_BADGE_MAX], pin[:_BADGE_MAX])
             role = await run_sync(find)
         is_password = hmac.compare_digest(password.encode(), self._password.encode())
-        if role is None and not (self._password and is_password):
+        # Beside the right password too, a wrong badge is a wrong try: else PINs could be guessed.
+        if role is None and (badges is not None or not (self._password and is_password)):
             self._tries.was_wrong()
             if badge and not pin:  # a scanner ends what it types by Enter
                 return self._show(request, say("Type the PIN of the badge."), 403, badge=badge)

@@ -310,3 +310,11 @@ def test_pins_are_not_guessed() -> None:
     assert _sign_in(client, badge="BADGE-2", pin="4711")[0] == 429
     clock.now += 61.0
     assert _sign_in(client, badge="BADGE-2", pin="4711")[0] == 303
+
+
+def test_who_knows_the_password_does_not_guess_pins_either() -> None:
+    client = _with_badges(Clock(), is_far=True, password=ALL)
+    client.get("/runs")
+    for pin in range(5):
+        assert _sign_in(client, password=ALL, badge="BADGE-2", pin=f"000{pin}")[0] == 403
+    assert _sign_in(client, password=ALL, badge="BADGE-2", pin="4711")[0] == 429
