@@ -35,7 +35,10 @@ def test_records_are_served_until_ctrl_c(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--database", "nothing.sqlite"), "There are no records"),
+        (
+            ("--database", "nothing.sqlite"),
+            "nothing.sqlite. [E201]",
+        ),
         (("--web", "0.0.0.0:0"), "--web-certificate"),
         (("--web", "here"), "is no address"),
     ],

@@ -324,7 +324,9 @@ def open_database(
     """
     if location.file is not None and not location.file.exists() and not create:
         raise UsageError(
-            f"There are no records at {location.shown}.", remedy="Correct the name of the file."
+            f"There are no records at {location.shown}.",
+            remedy="Correct the name of the file.",
+            code=ErrorCode.FILE_NOT_READ,
         )
     database = Database(location, lock_timeout_s, read_only=read_only)
     try:
