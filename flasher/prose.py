@@ -256,8 +256,8 @@ _EXPLANATIONS: Final[dict[str, Explanation]] = {
         "Record the drive system's bus with all ids.",
     ),
     "empty": Explanation(
-        "nothing was sent while it was recorded, the adapter did not hear it, or the file is no "
-        "trace of its suffix's format",
+        "nothing was sent while it was recorded, the adapter did not hear it, it holds CAN FD "
+        "frames alone, or the file is no trace of its suffix's format",
         "See with flasher doctor whether the adapter hears the bus.",
     ),
 }

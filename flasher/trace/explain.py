@@ -320,7 +320,7 @@ class _Reading:
             text = f"None of the {bus.frames:,} frames holds a message of the drive system."
         else:
             cause = Cause.EMPTY
-            text = "There is no frame in it."
+            text = "There is no classic CAN frame in it."
         if bus.error_frames:
             text += f" Error frames: {bus.error_frames:,}."
         likely, remedy = explanation(cause)

@@ -52,8 +52,19 @@ def test_a_file_without_a_frame_is_said(
     *action, name = to.split()
     ran = flasher("export", *action, tmp_path / "empty.asc", "-o", tmp_path / name)
     assert ran.code == ExitCode.OK
-    assert "there is no frame in" in ran.err
+    assert "there is no classic CAN frame in" in ran.err
     assert "no trace of its suffix's format" in ran.err
+
+
+def test_joined_frames_are_not_called_an_empty_trace(
+    flasher: Flasher, trace: Path, tmp_path: Path
+) -> None:
+    joined = tmp_path / "joined.log"
+    flasher("export", "trace", trace, "--joined", "-o", joined)
+    assert "CAN FD frames alone" in flasher("export", "csv", joined).err
+    story = flasher("explain", joined).out
+    assert "There is no classic CAN frame in it." in story
+    assert "CAN FD frames alone" in " ".join(story.split())
 
 
 def test_a_trace_without_a_wanted_message_is_no_empty_one(

@@ -284,6 +284,6 @@ def _warn(output: Output, trace: Path, damage: str, *, made: int) -> None:
         output.error_line(f"warning: {shown} ends there: {damage}")
     elif not made and not any(True for _ in frames_until_damage(trace_file(trace), [])):
         output.error_line(
-            f"warning: there is no frame in {shown}: nothing was recorded, or the file is no trace "
-            "of its suffix's format"
+            f"warning: there is no classic CAN frame in {shown}: nothing was recorded, it holds "
+            "CAN FD frames alone, as --joined makes them, or it is no trace of its suffix's format"
         )
