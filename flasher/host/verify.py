@@ -97,6 +97,7 @@ class Verification:
             cause="the device runs another image, fell back to an older one, or does not start",
             remedy="Power-cycle the device and look at it with flasher info; then flash the right "
             "image.",
+            code=ErrorCode.OTHER_VERSION if self.verdict is Verdict.VERSION_OTHER else None,
         )
 
 

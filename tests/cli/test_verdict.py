@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from flasher.cli.upgrade.text import verdict_of
+from flasher.errors import ErrorCode
 from flasher.events import Phase
 from flasher.host.outcome import DeviceLeft, Outcome, Statistics
 from flasher.host.session import Result
@@ -133,3 +134,17 @@ def test_an_upgrade_that_is_completed_and_runs_something_else_has_failed() -> No
     assert line.text == (
         "BMS: completed, but the application runs another version than the image names  2.0 s"
     )
+
+
+@pytest.mark.parametrize(
+    ("verdict", "code"),
+    [
+        (Verified.VERSION_OTHER, ErrorCode.OTHER_VERSION),
+        (Verified.MEMORY_OTHER, ErrorCode.VERIFICATION),
+        (Verified.NO_ANSWER, ErrorCode.VERIFICATION),
+    ],
+)
+def test_another_version_has_a_code_of_its_own(verdict: Verified, code: ErrorCode) -> None:
+    error = Verification(Level.VERSION, verdict, "V1").error(TARGETS["bms"])
+    assert error is not None
+    assert error.code is code
