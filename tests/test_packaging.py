@@ -16,6 +16,11 @@ def test_a_build_that_cannot_be_made_leaves_the_folder_as_it_was(tmp_path: Path)
     lacking = tmp_path / "python"
     lacking.write_text("#!/bin/sh\nexit 1\n")
     lacking.chmod(0o755)
+    absent = subprocess.run(
+        [SCRIPT, "out", "nix/python"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert absent.returncode == 2
+    assert absent.stderr.startswith(f"There is no {tmp_path}/nix/python.\n  what to do: ")
     # From another folder: what is given counts from there.
     ran = subprocess.run(
         [SCRIPT, "out", "./python"], cwd=tmp_path, capture_output=True, text=True, check=False
