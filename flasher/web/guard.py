@@ -60,6 +60,8 @@ _OPEN: Final = ("/static/", _LOGIN, _ENTER, _CLOSED)
 """Paths that need no password."""
 _SUPERVISES_S: Final = 900.0
 """A supervisor who looked at no page for so long has left the screen."""
+_QUERY_MAX: Final = 1000
+"""Characters of what a page was asked for that are kept while somebody signs in."""
 _BADGE_MAX: Final = 300
 """Characters of a badge or a PIN."""
 
@@ -246,7 +248,8 @@ class _Sessions:
         path: str = scope["path"]
         if to := "" if path.startswith(_OPEN) else self._refused(path, session):
             if to == _LOGIN and scope["method"] == "GET":
-                session["wanted"] = path
+                # One slash alone: two would begin the name of another computer.
+                session["wanted"] = "/" + path.lstrip("/\\") + _query(scope)
             is_stream = path.endswith("/events")
             refusal = Response(status_code=401) if is_stream else RedirectResponse(to, 303)
             await refusal(scope, receive, send)
@@ -270,6 +273,11 @@ class _Sessions:
             return _LOGIN
         session["supervised_at"] = now
         return ""
+
+
+def _query(scope: Scope) -> str:
+    query = scope["query_string"].decode("latin-1")[:_QUERY_MAX]
+    return f"?{query}" if query else ""
 
 
 class _Login:
@@ -332,5 +340,5 @@ class _Login:
         return RedirectResponse(request.session.get("wanted", "/"), 303)
 
     def _is_supervised(self, request: Request) -> bool:
-        wanted = request.session.get("wanted", "/")
+        wanted = str(request.session.get("wanted", "/")).partition("?")[0]
         return self._badges is not None and self._badges.is_supervised(wanted)

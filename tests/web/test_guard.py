@@ -267,6 +267,23 @@ def test_a_scanner_that_ends_by_enter_leaves_the_pin_to_be_typed() -> None:
     assert _sign_in(client, badge="BADGE-2", pin="4711") == (303, "/runs")
 
 
+@pytest.mark.parametrize(
+    ("asked", "led_to"),
+    [
+        ("/runs?search=W26&state=fail", "/runs?search=W26&state=fail"),
+        ("//evil.example", "/evil.example"),
+        ("/\\evil.example", "/evil.example"),
+        ("/%5Cevil.example", "/evil.example"),
+    ],
+)
+def test_who_signed_in_is_led_to_the_page_that_was_asked_for_and_nowhere_else(
+    asked: str, led_to: str
+) -> None:
+    client = _with_badges(Clock(), is_far=True)
+    client.get(f"{_URL}{asked}")
+    assert _sign_in(client, badge="BADGE-2", pin="4711") == (303, led_to)
+
+
 def test_a_supervisor_who_left_is_asked_again() -> None:
     clock = Clock()
     client = _with_badges(clock)

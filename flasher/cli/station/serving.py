@@ -52,7 +52,8 @@ def served(
     if people:
         is_far = address.host not in LOOPBACK
         badges = Badges(
-            partial(role_of, people, needs_pin=is_far),
+            # A badge alone is no more than paper: it does not stand for a password.
+            partial(role_of, people, needs_pin=is_far or bool(password)),
             is_supervised,
             are_for_all=is_far and not password,
         )
