@@ -78,6 +78,10 @@ class Badges:
     """True where the other pages need a badge too: any."""
 
 
+_IN: Final = "in"
+"""Kept in the session of who may see the pages, where nobody signs in."""
+
+
 class Tries:
     """Limits how often somebody may guess: `_TRIES_MAX` wrong ones in `_TRIES_WITHIN_S`."""
 
@@ -111,7 +115,7 @@ class Entry:
         if not self._key or not hmac.compare_digest(said.encode(), self._key.encode()):
             return RedirectResponse("/" if request.session.get("is_in") else _CLOSED, 303)
         self._key = ""
-        request.session["is_in"] = True
+        request.session["is_in"] = _IN
         # From a page of this server on, so that the cookie goes with it wherever the address was
         # clicked.
         return self._pages.show(request, "enter.html")
@@ -129,14 +133,17 @@ def application(  # noqa: PLR0913  the name and the rights of a server
     now: Callable[[], float],
     password: str = "",
     badges: Badges | None = None,
+    signed: str = _IN,
     entry: Entry | None = None,
     is_tls: bool = False,
     uploads: Callable[[str], int] = lambda _path: BODY_MAX,
 ) -> ASGIApp:
     """The pages behind the guard. `hosts`: names by which this server is addressed, without port;
-    `secret` signs the cookies; `uploads` gives the limit of a path's body in bytes.
+    `secret` signs the cookies; `signed` is kept in the session of who signed in, and is another one
+    where password or badges are others, so that people sign in again;
+    `uploads` gives the limit of a path's body in bytes.
     """
-    login = _Login(pages, password, badges, now)
+    login = _Login(pages, password, badges, signed, now)
     entries = [] if entry is None else [Route(_ENTER, entry.take), Route(_CLOSED, entry.refuse)]
     asks = bool(password) or (badges is not None and badges.are_for_all)
     refused_to = _LOGIN if asks else "" if entry is None else _CLOSED
@@ -158,7 +165,7 @@ def application(  # noqa: PLR0913  the name and the rights of a server
         routes=[*own, *routes],
         middleware=[
             session,
-            Middleware(_Sessions, refused_to=refused_to, badges=badges, now=now),
+            Middleware(_Sessions, refused_to=refused_to, badges=badges, signed=signed, now=now),
         ],
     )
     return _Guard(inner, hosts, uploads)
@@ -235,9 +242,16 @@ class _Sessions:
     """
 
     def __init__(
-        self, app: ASGIApp, *, refused_to: str, badges: Badges | None, now: Callable[[], float]
+        self,
+        app: ASGIApp,
+        *,
+        refused_to: str,
+        badges: Badges | None,
+        signed: str,
+        now: Callable[[], float],
     ) -> None:
         self._app = app
+        self._signed = signed
         self._refused_to = refused_to
         self._badges = badges
         self._now = now
@@ -263,10 +277,12 @@ class _Sessions:
 
     def _refused(self, path: str, session: dict[str, Any]) -> str:
         """Where who may not see this page is sent to; "" for who may."""
-        if self._refused_to and not session.get("is_in"):
+        if self._refused_to and session.get("is_in") != self._signed:
             return self._refused_to
         if self._badges is None or not self._badges.is_supervised(path):
             return ""
+        if session.get("is_in") != self._signed:
+            return _LOGIN
         now = self._now()
         # A clock that began anew, after a restart of the computer, says nothing of before.
         if not 0.0 <= now - session.get("supervised_at", -_SUPERVISES_S) < _SUPERVISES_S:
@@ -284,10 +300,16 @@ class _Login:
     """The page that asks for the password, or for a badge."""
 
     def __init__(
-        self, pages: Pages, password: str, badges: Badges | None, now: Callable[[], float]
+        self,
+        pages: Pages,
+        password: str,
+        badges: Badges | None,
+        signed: str,
+        now: Callable[[], float],
     ) -> None:
         self._pages = pages
         self._password = password
+        self._signed = signed
         self._badges = badges
         self._now = now
         self._tries = Tries(now)
@@ -305,7 +327,7 @@ class _Login:
             status=status,
             trouble=trouble,
             badge=badge,
-            asks_password=bool(self._password) and not request.session.get("is_in"),
+            asks_password=bool(self._password) and request.session.get("is_in") != self._signed,
             asks_badge=self._badges is not None,
             is_for_supervisors=self._is_supervised(request),
         )
@@ -334,7 +356,9 @@ class _Login:
             return self._show(request, say("That is not it."), 403)
         if role is not None and role is not Role.SUPERVISOR and self._is_supervised(request):
             return self._show(request, say("That badge is no supervisor's."), 403)
-        request.session["is_in"] = True
+        if request.session.get("is_in") != self._signed:
+            request.session.pop("supervised_at", None)  # by badges that may be others now
+        request.session["is_in"] = self._signed
         if role is Role.SUPERVISOR:
             request.session["supervised_at"] = self._now()
         return RedirectResponse(request.session.get("wanted", "/"), 303)

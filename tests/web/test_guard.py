@@ -214,7 +214,9 @@ PEOPLE = (
 )
 
 
-def _with_badges(clock: Clock, *, is_far: bool = False, password: str = "") -> TestClient:
+def _with_badges(
+    clock: Clock, *, is_far: bool = False, password: str = "", signed: str = "these"
+) -> TestClient:
     badges = Badges(
         partial(role_of, PEOPLE, needs_pin=is_far),
         is_supervised=lambda path: path == "/runs",
@@ -228,6 +230,7 @@ def _with_badges(clock: Clock, *, is_far: bool = False, password: str = "") -> T
         now=clock,
         password=password,
         badges=badges,
+        signed=signed,
     )
     return TestClient(app, base_url=_URL, follow_redirects=False)
 
@@ -282,6 +285,31 @@ def test_who_signed_in_is_led_to_the_page_that_was_asked_for_and_nowhere_else(
     client = _with_badges(Clock(), is_far=True)
     client.get(f"{_URL}{asked}")
     assert _sign_in(client, badge="BADGE-2", pin="4711") == (303, led_to)
+
+
+@pytest.mark.parametrize("is_far", [False, True])
+def test_who_signed_in_goes_on_after_a_restart_unless_the_badges_are_others(
+    *, is_far: bool
+) -> None:
+    client = _with_badges(Clock(), is_far=is_far)
+    client.get("/runs")
+    assert _sign_in(client, badge="BADGE-2", pin="4711") == (303, "/runs")
+    for signed, status in (("these", 200), ("others", 303)):
+        again = _with_badges(Clock(), is_far=is_far, signed=signed)
+        again.cookies = client.cookies
+        assert again.get("/runs").status_code == status
+    assert _sign_in(again, badge="BADGE-2", pin="4711")[0] == 303
+
+
+def test_who_was_a_supervisor_is_none_by_another_badge() -> None:
+    client = _with_badges(Clock(), is_far=True)
+    client.get("/runs")
+    _sign_in(client, badge="BADGE-2", pin="4711")
+    again = _with_badges(Clock(), is_far=True, signed="others", password=ALL)
+    again.cookies = client.cookies
+    again.get("/")
+    assert _sign_in(again, password=ALL) == (303, "/")
+    assert again.get("/runs").headers["location"] == "/login"
 
 
 def test_a_supervisor_who_left_is_asked_again() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hmac
 import os
 import secrets
 import socket
@@ -57,11 +58,15 @@ def served(
             is_supervised,
             are_for_all=is_far and not password,
         )
+    secret = secrets.token_urlsafe(32) if keeping is None else kept_secret(keeping)
+    # Who signed in goes on after a restart, unless the password or a badge is another one now.
+    known = repr((password, [(each.code, each.role.value, each.pin) for each in people]))
     app = application(
         routes,
         pages=pages,
         hosts=_hosts(address),
-        secret=secrets.token_urlsafe(32) if keeping is None else kept_secret(keeping),
+        secret=secret,
+        signed=hmac.digest(secret.encode(), known.encode(), "sha256").hex(),
         now=time.monotonic,
         password=password,
         badges=badges,
