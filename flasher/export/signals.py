@@ -113,7 +113,7 @@ def _cell(value: Value | float) -> str:
 
 
 def trace_rows(trace: str | os.PathLike[str]) -> Iterator[dict[str, Any]]:
-    """The messages of a trace as rows for a table: `pandas.DataFrame(flasher.trace_rows(path))`.
+    """The messages of a trace as rows for a table: `pandas.DataFrame(trace_rows(path))`.
 
     Columns are time_s (since the first frame), stamp_s (as the file has it), frame (its number, as
     in Wireshark), id, sender, receiver, kind, message, and one for each field, with its unit in the

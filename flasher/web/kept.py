@@ -15,7 +15,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from flasher.errors import FlasherError, UsageError
+from flasher.errors import ErrorCode, FlasherError, UsageError
 from flasher.history import History, matching
 from flasher.protocol.text import printable
 from flasher.report.base import visible
@@ -62,7 +62,9 @@ class Kept:
         except FlasherError as error:
             return self._page(question, "trouble.html", http=400, error=error)
         except OSError as error:
-            trouble = UsageError(f"That cannot be read: {error.strerror or error}.")
+            trouble = UsageError(
+                f"That cannot be read: {error.strerror or error}.", code=ErrorCode.FILE_NOT_READ
+            )
             return self._page(question, "trouble.html", http=400, error=trouble)
 
     def _page(

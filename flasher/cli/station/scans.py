@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final, TextIO
 
-from flasher.errors import UsageError
+from flasher.errors import ErrorCode, UsageError
 from flasher.files import read
 from flasher.protocol.text import printable
 from flasher.station.scans import Command, Label, Word, understand
@@ -43,7 +43,9 @@ def read_scans(path: Path) -> list[str]:
     try:
         text = raw.decode("utf-8-sig")
     except ValueError as error:
-        raise UsageError(f"{shown} cannot be read: it is no text.", where=OPTION) from error
+        raise UsageError(
+            f"{shown} cannot be read: it is no text.", where=OPTION, code=ErrorCode.FILE_NOT_READ
+        ) from error
     lines = [line.strip() for line in text.splitlines()]
     scans = [line for line in lines if line and not line.startswith("#")]
     if not scans:

@@ -32,7 +32,7 @@ from flasher.cli.recording import Recording, RecordingOptions, bundle_folder, re
 from flasher.cli.stop import Stop, stop_on_signal
 from flasher.cli.upgrade.carried import Carried
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
-from flasher.errors import FlasherError, UsageError
+from flasher.errors import ErrorCode, FlasherError, UsageError
 from flasher.files import parse_json, read
 from flasher.procedures import DeviceInfo
 from flasher.protocol.contents import VersionInformation
@@ -131,6 +131,7 @@ class _Place:
                 f"The folder for backups cannot be made: {error.strerror or error}.",
                 where=printable(str(folder)),
                 remedy="Make room, or make the folder by hand.",
+                code=ErrorCode.FILE_NOT_WRITTEN,
             ) from error
         watch: Watch = {"on_event": on_event, "cancelled": cancelled}
         with (
