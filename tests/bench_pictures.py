@@ -14,7 +14,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final, Literal
 
-from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, expect
 
 from flasher import events
@@ -22,6 +21,7 @@ from flasher.web.virtual_bike import Fault
 from flasher.web.words import NAMES
 from tests.end_to_end.stage import NEW, image_of
 from tests.firmware import VECTORS
+from tests.web.barriers import barriers
 from tests.web.bench_place import IMAGE, BenchPlace
 from tests.web.browser import chromium
 
@@ -52,9 +52,8 @@ class Album:
                 self.count += 1
                 if self.page.evaluate("document.scrollingElement.scrollWidth > innerWidth"):
                     self.wrong.append(f"{name}: wider than the screen")
-                found = Axe().run(self.page)
-                if found.violations_count:
-                    self.wrong.append(f"{name}: {found.generate_report()}")
+                if found := barriers(self.page):
+                    self.wrong.append(f"{name}: {found}")
         self.page.set_viewport_size({"width": 1280, "height": 800})
 
 

@@ -42,10 +42,22 @@ class LineScreen:
         self._lock = threading.Lock()
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._turn, daemon=True)
+        self._sockets = sockets
+        self.url = ""
+        """Where its page is served."""
+        self.begin_anew()
+        self._thread.start()
+
+    def begin_anew(self) -> None:
+        """As a station that was just started, for the next test on the same page."""
+        with self._lock:
+            self.board = Board()
+            self.screen._passed.clear()
+        self.scans.clear()
+        sockets = self._sockets
         self.say(StationStarted("line-2", "Battery 36 V", "7", "BAT-36-10", sockets, (), at=AT))
         for name in sockets:
             self.state(name, SocketState.EMPTY)
-        self._thread.start()
 
     def say(self, event: StationEvent) -> None:
         with self._lock:
@@ -88,6 +100,7 @@ def served(line: LineScreen, port: int = 0, *, closes_feed: bool = True) -> Iter
         pages=pages, hosts={"127.0.0.1"}, secret=_KEY, now=lambda: 0.0,
     )  # fmt: skip
     with Server(app, "127.0.0.1", port) as server:
+        line.url = server.url
         try:
             yield server.url
         finally:

@@ -7,13 +7,13 @@ from functools import partial
 from typing import Any
 
 import pytest
+from argon2 import PasswordHasher
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
 from starlette.routing import Route
 from starlette.testclient import TestClient
 
 from flasher.station.people import Person, Role, role_of
-from flasher.station.pins import Pin, hash_of
 from flasher.web.guard import BODY_MAX, TOKEN_HEADER, Badges, Entry, application
 from flasher.web.pages import Pages
 
@@ -207,9 +207,11 @@ def _post_status(client: TestClient) -> int:
 # -- badges ----------------------------------------------------------------------------------------
 
 ALL = "of all of us"
+QUICK = PasswordHasher(time_cost=1, memory_cost=8, parallelism=1)
+"""Who guesses in a test is not to be held up."""
 PEOPLE = (
     Person(name="Jo", code="BADGE-1", role=Role.OPERATOR),
-    Person(name="Sue", code="BADGE-2", role=Role.SUPERVISOR, pin=hash_of(Pin("4711"))),
+    Person(name="Sue", code="BADGE-2", role=Role.SUPERVISOR, pin=QUICK.hash("4711")),
     Person(name="Al", code="BADGE-3", role=Role.SUPERVISOR),
 )
 
