@@ -46,19 +46,24 @@ class SimulatedPort:
             self._link.send(made)
 
     def receive(self, deadline: float) -> Arrival | None:
-        with CRASHES:
-            while not self._arrived:
-                if self.now() >= deadline:
-                    return None
-                self.bus.advance(deadline)
-                # The link has the same frames; it reports errors, and raises when unplugged.
-                while (seen := self._link.receive(_AT_ONCE)) is not None:
-                    if seen.is_error:
-                        self._arrived.append((seen, self.now()))
+        if not self._arrived:
+            with CRASHES:
+                while not self._arrived and self.now() < deadline:
+                    self.bus.advance(deadline)
+                    if not self._arrived:
+                        self._take_reports()
+            if not self._arrived:
+                return None
         frame, at = self._arrived.popleft()
         if self._pending and frame is self._pending[0][0]:
             return Arrival(self._pending.popleft()[1], at, is_echo=True)
         return Arrival(RawFrame(*frame[:5]), at, is_echo=False)
+
+    def _take_reports(self) -> None:
+        """The link has the same frames; it reports errors, and raises when unplugged."""
+        while (seen := self._link.receive(_AT_ONCE)) is not None:
+            if seen.is_error:
+                self._arrived.append((seen, self.now()))
 
     def _record(self, frame: Frame, at: float) -> Sequence[Frame]:
         """Take note of every frame on the wire, unless the adapter is off the bus."""

@@ -257,7 +257,7 @@ class BusTester:
 
     def _pump(self, deadline: float) -> None:
         """Take one frame, or let time pass, up to `deadline` or for `_POLL_S`."""
-        now = self.now
+        now = self.port.now()
         if now >= self.ends_at:
             raise CaseLimitReached(
                 f"not at an end after {self.ends_at - self.began_at:g} s, the case's own limit"

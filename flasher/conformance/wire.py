@@ -92,7 +92,7 @@ def crc(covered: bytes, *, start: int = 0xFFFFFFFF, steps: int = 4) -> int:
     return register
 
 
-@lru_cache(maxsize=4096)  # the same images are sent again and again
+@lru_cache(maxsize=16384)  # the same images are sent again and again
 def message_crc(can_id: int, body: bytes) -> bytes:
     """The CRC field of a message; `body` is mode to last data byte."""
     return struct.pack(">I", crc(b"\x55\xaa" + struct.pack(">H", can_id) + body))

@@ -15,6 +15,7 @@ import sys
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any, Final
 
+from flasher.conformance.catalogue import Selection
 from flasher.conformance.init import ask
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile
@@ -63,8 +64,8 @@ def some_device(seed: str) -> tuple[str, DeviceProfile]:
     return chance.choice(_TARGETS), device
 
 
-def faults(seed: str) -> list[str]:
-    """What is wrong with the profile that this device's answers give."""
+def faults(seed: str, selection: Selection = Selection()) -> list[str]:  # noqa: B008  frozen
+    """What is wrong with the profile that this device's answers give, by these cases."""
     target, device = some_device(seed)
     asked = ask(MockSubject(target, profile=device), ConformanceProfile())
     if asked.stopped:
@@ -78,7 +79,8 @@ def faults(seed: str) -> list[str]:
         and one.key in own.given
         and one.value != own.value(one.key)
     ]
-    report = run(MockSubject(target, profile=device), asked.profile(ConformanceProfile()))
+    subject, profile = MockSubject(target, profile=device), asked.profile(ConformanceProfile())
+    report = run(subject, profile, selection=selection)
     found += [
         f"{result.case_id} {result.verdict.text}: {result.reason}"
         for result in report.results

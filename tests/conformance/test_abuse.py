@@ -31,7 +31,7 @@ IMPATIENT = ConformanceProfile(
     {
         **PROFILE.given,
         **{
-            f"limits.{name}": 0.15
+            f"limits.{name}": 0.06
             for name in (
                 "first_version_s",
                 "pause_s",

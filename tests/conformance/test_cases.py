@@ -5,22 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import pytest
-
 from flasher.conformance.catalogue import CASES, GROUPS, Selection, group_of
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.profile import profile_keys
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import run
-from flasher.mock.variants import VARIANTS
 from tests.loops import each
 
 MINE = ("RS", "UP")
-WRONG = {
-    name: one
-    for name, one in VARIANTS.items()
-    if one.clause.partition("-")[0] in MINE and not one.unseen
-}
 
 
 def failed(
@@ -59,13 +51,6 @@ def test_the_mock_passes_as_obc() -> None:
 )
 def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, Any]) -> None:
     assert failed(**choices) == []
-
-
-@pytest.mark.no_cover
-@each("name", WRONG)
-def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
-    clause = WRONG[name].clause
-    assert failed(name, only=(clause,)) == [clause]
 
 
 def test_a_choice_that_the_profile_does_not_state_fails() -> None:

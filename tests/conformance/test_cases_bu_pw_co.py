@@ -13,13 +13,12 @@ from flasher.conformance.runner import run
 from flasher.conformance.wire import Encoder
 from tests.loops import each
 
-from .verdicts import cases_of, not_passed, variants_of, verdicts
+from .verdicts import cases_of, not_passed, verdicts
 
 SHARES = ("0%", "50%", "100%")
 GROUPS = ("BU", "PW", "CO")
 MINE = tuple(case_id for group in GROUPS for case_id in cases_of(group))
 QUICK = tuple(case_id for case_id in MINE if case_id not in ("PW-01", "CO-01"))
-WRONG = {name: clause for group in GROUPS for name, clause in variants_of(group).items()}
 
 
 def result_of(case_id: str, variant: str | None = None, **powers: bool) -> CaseResult:
@@ -57,12 +56,6 @@ def test_a_target_without_a_version_query_passes() -> None:
 )
 def test_the_mock_passes_by_its_profile_whatever_it_chooses(choices: dict[str, Any]) -> None:
     assert not_passed(*QUICK, **choices) == []
-
-
-@pytest.mark.no_cover
-@each("name", WRONG)
-def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
-    assert verdicts([WRONG[name]], name) == {WRONG[name]: CaseVerdict.FAIL}
 
 
 def test_one_image_and_readback_tell_a_torn_image_too() -> None:

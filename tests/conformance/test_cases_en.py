@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
-
 from flasher.conformance.results import CaseVerdict
 from tests.loops import each
 
-from .verdicts import cases_of, not_passed, variants_of, verdicts
+from .verdicts import cases_of, not_passed, verdicts
 
 CASES = ("EN-01", "EN-02", "EN-04", "EN-07", "EN-08")
-WRONG = variants_of("EN")
 
 
 def test_the_mock_passes_with_images_that_carry_a_checksum() -> None:
@@ -54,12 +51,6 @@ def test_a_device_that_chooses_otherwise_than_its_profile_says_fails(
     case_id: str, states: dict[str, str]
 ) -> None:
     assert not_passed(case_id, states=states, image_checksum="crc32") == [case_id]
-
-
-@pytest.mark.no_cover
-@each("name", WRONG)
-def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
-    assert not_passed(WRONG[name], variant=name) == [WRONG[name]]
 
 
 def test_without_a_second_image_the_rest_of_a_row_of_upgrades_is_judged() -> None:

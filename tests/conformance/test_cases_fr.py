@@ -18,7 +18,6 @@ from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock,
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import CaseVerdict, CheckOutcome, RunReport
 from flasher.conformance.runner import run
-from flasher.mock.variants import VARIANTS
 from tests.loops import each
 
 MINE = ("FR", "CR", "TM")
@@ -26,7 +25,6 @@ LONGEST = ("CR-01", "CR-02")
 SHORT = tuple(
     case_id for case_id in CASES if case_id.partition("-")[0] in MINE and case_id not in LONGEST
 )
-WRONG = {name: one for name, one in VARIANTS.items() if one.clause.partition("-")[0] in MINE}
 
 
 def report(
@@ -90,13 +88,6 @@ def test_a_device_that_says_nothing_to_damaged_packets_is_judged_all_the_same() 
 
 def test_no_damaged_packet_is_taken_by_the_mock() -> None:
     assert failed(report(only=LONGEST)) == []
-
-
-@pytest.mark.no_cover
-@each("name", WRONG)
-def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
-    clause = WRONG[name].clause
-    assert failed(report(name, only=(clause,))) == [clause]
 
 
 @each(

@@ -8,10 +8,9 @@ import pytest
 
 from tests.loops import each
 
-from .verdicts import cases_of, not_passed, variants_of
+from .verdicts import cases_of, not_passed
 
 CASES = ("SE-01", "SE-03", "SE-04")
-WRONG = variants_of("SE")
 
 
 def test_the_mock_passes() -> None:
@@ -38,9 +37,3 @@ def test_the_mock_passes_by_its_profile_whatever_it_chooses(
     cases: tuple[str, ...], choices: dict[str, Any]
 ) -> None:
     assert not_passed(*cases, **choices) == []
-
-
-@pytest.mark.no_cover
-@each("name", WRONG)
-def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
-    assert not_passed(WRONG[name], variant=name) == [WRONG[name]]

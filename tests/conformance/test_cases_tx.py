@@ -9,13 +9,11 @@ import pytest
 from flasher.conformance.results import CaseVerdict
 from tests.loops import each
 
-from .verdicts import cases_of, not_passed, variants_of, verdicts
+from .verdicts import cases_of, not_passed, verdicts
 
 BAD_PACKET = ("TX-01", "TX-03", "TX-04", "TX-06")
 REPEATED = ("TX-02", "TX-05")
 LEFT = ("TX-12", "TX-13")
-WRONG = variants_of("TX")
-LARGE = {"application_area_bytes": 70 * 1024}
 
 
 def test_the_mock_passes() -> None:
@@ -88,13 +86,6 @@ def test_a_device_that_chooses_otherwise_than_its_profile_says_fails(
     case_id: str, states: dict[str, str]
 ) -> None:
     assert not_passed(case_id, states=states) == [case_id]
-
-
-@pytest.mark.no_cover
-@each("name", WRONG)
-def test_a_wrong_device_fails_the_case_of_its_clause(name: str) -> None:
-    size = LARGE if name == "sixteen-bit-offsets" else {}
-    assert not_passed(WRONG[name], variant=name, **size) == [WRONG[name]]
 
 
 def test_a_device_that_waits_for_ever_after_a_pause_fails_although_waiting_is_allowed() -> None:

@@ -69,14 +69,14 @@ def test_nothing_is_found_on_a_right_device(target: str) -> None:
 def test_the_shortest_walk_to_a_flaw_is_found_and_finds_it_again(
     variant: str, rule: str, last: str, count: int
 ) -> None:
-    found, steps = _found(_explorer(variant).explore(4000))
+    found, steps = _found(_explorer(variant, seed="2").explore(4000))
     assert (found, steps.split()[-1], len(steps.split())) == (rule, last, count)
-    assert _found(_explorer(variant, seed="2").replay(steps.split())) == (rule, steps)
+    assert _found(_explorer(variant).replay(steps.split())) == (rule, steps)
     assert _explorer().replay(steps.split()).finding is None
 
 
 def test_a_seed_decides_everything() -> None:
-    first, second = (_explorer("accepts-early-end", seed="5").explore(1000) for _ in range(2))
+    first, second = (_explorer("accepts-early-end", seed="4").explore(1000) for _ in range(2))
     assert first == second
 
 

@@ -16,7 +16,7 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import Selection
 from flasher.conformance.html_report import MESSAGES_BAD, html_page
 from flasher.conformance.json_report import BINS, CHECKS_KEPT, report_document, to_bytes, to_json
-from flasher.conformance.mock import MockSubject, variant_maker
+from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.release import summary_page
 from flasher.conformance.reports import candump, is_traced, junit_report, trace_file_name
@@ -111,9 +111,11 @@ def test_the_document_tells_what_went_wrong_and_how_to_see_it_again() -> None:
 
 @each("address, by", [(AREA_START, ["version", "memory over the bus"]), (0, ["version"])])
 def test_all_forms_tell_alike_by_what_the_flash_was_compared(address: int, by: list[str]) -> None:
-    device = MockSubject()
+    small = replace(MOCK_PROFILE, application_area_bytes=4096)
+    device = MockSubject(profile=small)
     device.has_readback = False
-    profile = ConformanceProfile({**PROFILE.given, "device.application_address": address})
+    given = profile_of_mock(small).given
+    profile = ConformanceProfile({**given, "device.application_address": address})
     report = run(device, profile, selection=Selection(cases=("UP-08", "TX-07")))
     document, how = document_of(report), report.final_image_text
     assert document["final_image_seen_by"] == by

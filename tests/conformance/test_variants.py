@@ -29,8 +29,8 @@ SAMPLE = [
     "accepts-skipped-number",
     _NAMES[-1],
 ]
-"""The gate judges every variant; the tests of the cases judge some of each clause. Those by name
-have branches that no other test takes."""
+"""Some of each clause; the gate judges every variant. Those by name have branches that no other
+test takes."""
 
 
 def test_the_table_has_every_variant() -> None:

@@ -13,7 +13,6 @@ from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock,
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import CaseVerdict
 from flasher.conformance.runner import execute
-from flasher.mock.variants import VARIANTS
 
 SMALL_AREA = {"application_area_bytes": 34 * 1024}
 """272 packets: enough for all but images beyond 64 KiB, and quickly filled."""
@@ -78,12 +77,3 @@ def not_passed(*cases: str, **kwargs: Any) -> list[str]:
 def cases_of(group: str) -> list[str]:
     """The cases of a group."""
     return [case_id for case_id, case in CASES.items() if group_of(case_id) == group]
-
-
-def variants_of(group: str) -> dict[str, str]:
-    """The variants of a group: name to the case that they fail."""
-    return {
-        name: variant.clause
-        for name, variant in VARIANTS.items()
-        if variant.clause.partition("-")[0] == group
-    }

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, NamedTuple
 
 
@@ -109,6 +110,7 @@ def _table_entry(index: int) -> int:
 _TABLE: Final = [_table_entry(index) for index in range(256)]
 
 
+@lru_cache(maxsize=16384)  # the same images are sent again and again
 def crc(data: bytes) -> int:
     """Appendix 1: a byte into the low end of the register, then four table steps."""
     register = 0xFFFFFFFF

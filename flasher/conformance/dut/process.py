@@ -71,6 +71,8 @@ class BootloaderProcess:
         UsageError for one that does not talk as it has to.
         """
         self.kill()
+        if not self._is_program:  # loaded once, not in each process
+            from flasher.conformance.dut import child  # noqa: F401, PLC0415
         self._stderr.seek(0)
         self._stderr.truncate()
         read_fd, its_write_fd = os.pipe()
