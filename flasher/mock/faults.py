@@ -1,25 +1,20 @@
-"""Faults of a device at a given moment: its power is cut, or its controller goes bus-off.
+"""Power cuts of a device at a given moment.
 
-A power cut that matters comes in the middle of a flash operation, at a moment that nobody on the
-bus can know. So a fault is set beforehand (`FaultInjector.set`), and the injector, an engine around
-the device, lets it happen at that very moment.
+One that matters comes in the middle of a flash operation, at a moment that nobody on the bus can
+know. So it is set beforehand (`FaultInjector.set`), and the injector, an engine around the device,
+lets it happen at that very moment.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 from typing import Final
 
-from flasher.mock.machine import BUS_OFF_S
 from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
 
 POWER_OFF_S: Final = 0.5
-
-
-# -- moments --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -33,24 +28,13 @@ class InOperation:
 
 
 @dataclass(frozen=True)
-class AfterFrame:
-    """`delay_s` after the device received its frame number `frames` from now on, counted from 1."""
-
-    frames: int
-    delay_s: float = 0.0
-
-
-@dataclass(frozen=True)
 class AtTime:
     """At a time, in seconds on the clock of all calls."""
 
     at_s: float
 
 
-Moment = InOperation | AfterFrame | AtTime
-
-
-# -- faults ---------------------------------------------------------------------------------------
+Moment = InOperation | AtTime
 
 
 @dataclass(frozen=True)
@@ -60,46 +44,36 @@ class PowerCut:
     off_s: float | None = POWER_OFF_S
 
 
-@dataclass(frozen=True)
-class BusOff:
-    """The controller leaves the bus for `off_s` seconds; see `Machine.bus_off`."""
-
-    off_s: float = BUS_OFF_S
-
-
-Fault = PowerCut | BusOff
-
-
 class FaultInjector:
-    """An engine (`flasher.protocol.engine`): `device`, and one fault at a time."""
+    """An engine (`flasher.protocol.engine`): `device`, and one power cut at a time."""
 
     def __init__(self, device: MockDevice) -> None:
         self.device = device
         self.happened = 0
-        """How many faults happened so far."""
-        self._fault: Fault | None = None
+        """How many cuts happened so far."""
+        self._cut: PowerCut | None = None
         self._moment: Moment | None = None
         self._operations_before = 0
-        self._frames_left = 0
         self._due_at = self._power_due_at = inf
+        self.next_frame, self.frame_sent = device.next_frame, device.frame_sent
+        self.cancel, self.take_events = device.cancel, device.take_events
 
-    def set(self, fault: Fault, moment: Moment) -> None:
-        """Let `fault` happen at `moment`, in place of one that is still to come."""
-        self._fault, self._moment = fault, moment
+    def set(self, cut: PowerCut, moment: Moment) -> None:
+        """Cut the power at `moment`, in place of a cut that is still to come."""
+        self._cut, self._moment = cut, moment
         self._operations_before = self.device.operations_done
-        self._frames_left = moment.frames if isinstance(moment, AfterFrame) else 0
         self._due_at = moment.at_s if isinstance(moment, AtTime) else inf
         self._look_at_flash()
 
     def clear(self) -> None:
-        """Let no fault happen; power that is off still comes back."""
-        self._fault = self._moment = None
+        """Let none happen; power that is off still comes back."""
+        self._cut = self._moment = None
         self._due_at = inf
 
     @property
     def is_set(self) -> bool:
-        """True while a fault is still to come."""
-        return self._fault is not None
+        """True while a cut is still to come."""
+        return self._cut is not None
 
     # -- the engine interface ---------------------------------------------------------------------
 
@@ -110,10 +84,6 @@ class FaultInjector:
     def receive(self, frame: Frame, now: float) -> None:
         self._happen(now)
         self.device.receive(frame, now)
-        if self._frames_left and frame.can_id == self.device.target.request_id:
-            self._frames_left -= 1
-            if not self._frames_left and isinstance(self._moment, AfterFrame):
-                self._due_at = now + self._moment.delay_s
         self._look_at_flash()
         self._happen(now)
 
@@ -127,18 +97,6 @@ class FaultInjector:
         wanted = self.device.deadline()
         due_at = min(self._due_at, self._power_due_at, inf if wanted is None else wanted)
         return None if due_at == inf else due_at
-
-    def next_frame(self, now: float) -> Frame | None:
-        return self.device.next_frame(now)
-
-    def frame_sent(self, now: float) -> None:
-        self.device.frame_sent(now)
-
-    def cancel(self, now: float) -> None:
-        self.device.cancel(now)
-
-    def take_events(self) -> Sequence[object]:
-        return self.device.take_events()
 
     # -- how it happens ---------------------------------------------------------------------------
 
@@ -155,14 +113,11 @@ class FaultInjector:
         if self._power_due_at <= now:
             at_s, self._power_due_at = self._power_due_at, inf
             self.device.power_on(at_s)
-        if self._fault is None or self._due_at > now:
+        if self._cut is None or self._due_at > now:
             return
         # At its own time, not when it was noticed: so much of the operation is done, and no more.
-        fault, at_s = self._fault, self._due_at
+        cut, at_s = self._cut, self._due_at
         self.clear()
         self.happened += 1
-        if isinstance(fault, BusOff):
-            self.device.bus_off(at_s, fault.off_s)
-            return
         self.device.power_cut(at_s)
-        self._power_due_at = inf if fault.off_s is None else at_s + fault.off_s
+        self._power_due_at = inf if cut.off_s is None else at_s + cut.off_s
