@@ -2,9 +2,9 @@
 
 `drive` blocks while it waits for a frame; `adrive` awaits it. All else they share.
 
-Its rules: everything that waits is received before `tick`, so that a stall of the computer does not
-become a timeout of the device; frames go out one at a time and the engine is told when each was
-accepted; waiting is a blocking receive with a deadline.
+Its rules: everything that waits is received before `tick`, which is told the time of before, so
+that a stall of the computer does not become a timeout of the device; frames go out one at a time
+and the engine is told when each was accepted; waiting is a blocking receive with a deadline.
 """
 
 from __future__ import annotations
@@ -12,15 +12,13 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from typing import Final, Protocol
 
-from flasher.bus.link import Clock, Link
+from flasher.bus.link import AT_ONCE, Clock, Link
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 
 MAX_WAIT_S: Final = 0.1
 """Longest blocking receive, in real seconds: the time after which a cancellation is seen at the
 latest."""
-_AT_ONCE: Final = float("-inf")
-"""A deadline in the past: only what is there already."""
 _CATCH_UP_FRAMES: Final = 10_000
 """Frames received before a due `tick` at the most: a babbling bus must not stop the timers."""
 
@@ -118,15 +116,15 @@ def _turns(
     """The loop without its waiting: yields until when to receive, and is sent what came."""
     link.drain()
     cancel_seen = False
+    came = None
     while True:
-        now = clock.now()
+        heard_until = _hear(came, engine, link, clock, taps)
         if cancelled is not None and not cancel_seen and cancelled():
             cancel_seen = True
-            engine.cancel(now)
+            engine.cancel(clock.now())
         wanted = engine.deadline()
-        if wanted is not None and now >= wanted:
-            _hear(link.receive(_AT_ONCE), engine, link, clock, taps)
-            engine.tick(clock.now())
+        if wanted is not None and heard_until >= wanted:
+            engine.tick(heard_until)
         now = clock.now()
         while (frame := engine.next_frame(now)) is not None:
             link.send(frame)
@@ -142,21 +140,24 @@ def _turns(
         wanted = engine.deadline()
         latest = clock.now() + MAX_WAIT_S * clock.speed
         came = yield latest if wanted is None else min(wanted, latest)
-        _hear(came, engine, link, clock, taps)
 
 
 def _hear(
     frame: Frame | None, engine: Engine, link: Link, clock: Clock, taps: Sequence[Tap]
-) -> None:
+) -> float:
     """Hand on a frame and all that wait behind it: what is sent next must not look like the cause
-    of what had come before.
+    of what had come before. Returns the time up to which everything was heard.
     """
     now_of, hear, receive = clock.now, engine.receive, link.receive
+    now = now_of()
+    if frame is None:
+        frame = receive(AT_ONCE)
     for _ in range(_CATCH_UP_FRAMES):
         if frame is None:
-            return
-        now = now_of()
+            break
         for tap in taps:
             tap(frame, sent=False, now=now)
         hear(frame, now)
-        frame = receive(_AT_ONCE)
+        now = now_of()
+        frame = receive(AT_ONCE)
+    return now

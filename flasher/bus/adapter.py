@@ -30,7 +30,7 @@ from flasher.bus.health import (
     bus_off_error,
 )
 from flasher.bus.inspect_interface import Interface, read_interface
-from flasher.bus.link import SEND_LIMIT_S
+from flasher.bus.link import AT_ONCE, SEND_LIMIT_S
 from flasher.bus.lock import hold
 from flasher.bus.opening import bus_config, open_bus, words_of
 from flasher.errors import BusError, ErrorCode, TransmitBlockedError
@@ -188,8 +188,9 @@ class CanLink:
         if self._waiting:
             waited, self.received_at = self._waiting.popleft()
             return waited
-        remaining_s = deadline - time.monotonic()
-        frame = self._receive_once(max(0.0, remaining_s))
+        if deadline == AT_ONCE:
+            return self._receive_once(0.0)
+        frame = self._receive_once(max(0.0, deadline - time.monotonic()))
         # A filtered or foreign frame ends a wait early.
         while frame is None and (remaining_s := deadline - time.monotonic()) > 0:
             frame = self._receive_once(remaining_s)
@@ -270,7 +271,9 @@ class CanLink:
         self._health.received += 1
         if filtered or self._bus is None:
             return frame
-        is_wanted = self._bus._matches_filters(message)  # noqa: SLF001  as recv() does
+        # As recv() does.
+        has_filters = self._bus._filters is not None  # noqa: SLF001
+        is_wanted = not has_filters or self._bus._matches_filters(message)  # noqa: SLF001
         return frame if is_wanted else None
 
     def _pause(self) -> None:

@@ -16,6 +16,8 @@ SEND_LIMIT_S: Final = 2.0
 """How long a link waits for room in a full transmit queue. A packet takes 10 ms on a free bus."""
 
 
+AT_ONCE: Final = float("-inf")
+"""A deadline in the past: only what is there already."""
 _AWAKE_S: Final = 0.0001
 """Real seconds that a paced clock waits awake."""
 

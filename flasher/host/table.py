@@ -17,6 +17,8 @@ from typing import Final, NamedTuple
 class State(Enum):
     """Where the host stands; the value is how the documentation names it."""
 
+    __hash__ = object.__hash__  # Enum's own runs Python code at each look-up
+
     RESETTING = "resetting"
     AWAITING_BOOT = "awaiting boot version"
     AWAITING_REQUEST = "awaiting request transfer"
@@ -30,6 +32,8 @@ class State(Enum):
 
 class Event(Enum):
     """What happened; the value is its name in diagrams."""
+
+    __hash__ = object.__hash__
 
     FEEDBACK = "general feedback"
     BOOT_VERSION = "boot version"

@@ -48,8 +48,6 @@ class Machine(ABC):
             can_id: self.reassembler_type(can_id, timings.inter_frame_timeout_s)
             for can_id in sorted(own_ids | application.hears)
         }
-        self._half_received: dict[int, Reassembler] = {}
-        """Those of them that may hold a part of a message."""
         self._transmitter = Transmitter(bitrate_bps)
         self._events: list[object] = []
         self._due_at = inf
@@ -74,23 +72,18 @@ class Machine(ABC):
             return
         if self._runs_application:
             self.application.heard(now)
-        can_id = frame[0]
+        can_id, payload, is_extended, is_remote, is_error = frame[:5]
         reassembler = self._reassemblers.get(can_id)
-        if reassembler is None or not frame.is_payload:
+        if reassembler is None or is_extended or is_remote or is_error:
             return
-        completed = reassembler.feed(frame[1], now)
-        if reassembler.due_at == inf:
-            self._half_received.pop(can_id, None)
-        else:
-            self._half_received[can_id] = reassembler
-        for found in completed:
+        for found in reassembler.feed(payload, now):
             self._take(found, now)
 
     def tick(self, now: float) -> None:
         if self._is_cancelled:
             return
         self._rejoin_bus(now)
-        for reassembler in tuple(self._half_received.values()):
+        for reassembler in self._reassemblers.values():
             for found in reassembler.tick(now):
                 self._take(found, now)
         self._run_timer(now)
@@ -101,7 +94,7 @@ class Machine(ABC):
         due_at = self._transmitter.due_at
         if not self._is_cancelled:
             due_at = min(due_at, self._due_at)
-            for reassembler in self._half_received.values():
+            for reassembler in self._reassemblers.values():
                 due_at = min(due_at, reassembler.due_at)
             if self._off_bus_until is not None:
                 due_at = min(due_at, self._off_bus_until)

@@ -53,7 +53,11 @@ AnyRow = messages.Row | messages.Malformed | messages.Unknown
 _DEFAULT_PROFILE: Final = DeviceProfile()
 _DEAF: Final = frozenset((State.OFF, State.RESTARTING))
 _WORKS_ON_FLASH: Final = frozenset((State.ERASING, State.PROGRAMMING, State.CHECKING))
-_PER_PACKET: Final = frozenset((State.TRANSFER, State.PROGRAMMING))
+_UNTOLD: Final = (
+    (State.TRANSFER, State.PROGRAMMING),
+    (State.PROGRAMMING, State.TRANSFER),
+)
+"""Changes of state that happen with every packet."""
 _DURING_END: Final = frozenset((State.CHECKING, State.STARTING))
 _AFTER_END: Final = _DURING_END | {State.REFUSED}
 _WAITS_FOR_UPDATE: Final = frozenset((State.ANNOUNCING, State.REFUSED))
@@ -331,7 +335,7 @@ class MockDevice(Machine):
         if before is State.APPLICATION and not self._runs_application:
             self.application.stop()
         detail = getattr(self, f"_{move.action}")(now)
-        if self.state is not before and not {self.state, before} <= _PER_PACKET:
+        if self.state is not before and (self.state, before) not in _UNTOLD:
             self._events.append(DeviceStateEntered(self.state.value, detail))
 
     # -- actions: application, reset, announcements -----------------------------------------------

@@ -16,6 +16,8 @@ from typing import Final, NamedTuple
 class State(Enum):
     """Where the device stands; the value is how the documentation names it."""
 
+    __hash__ = object.__hash__  # Enum's own runs Python code at each look-up
+
     OFF = "off"
     APPLICATION = "application"
     RESTARTING = "restarting"
@@ -30,6 +32,8 @@ class State(Enum):
 
 class Event(Enum):
     """A received message or an expired timer, classified; the value is its name in diagrams."""
+
+    __hash__ = object.__hash__
 
     # Messages.
     RESET = "reset"

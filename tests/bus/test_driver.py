@@ -141,6 +141,23 @@ def test_everything_that_waits_is_received_before_a_due_tick(
     ]
 
 
+def test_a_stall_behind_the_last_poll_does_not_make_a_tick_late(clock: VirtualClock) -> None:
+    """What comes while the computer stands still is heard before a timer that ran out then."""
+
+    class StallingLink(FakeLink):
+        def receive(self, deadline: float) -> Frame | None:
+            came = super().receive(deadline)
+            if deadline < 0.0 and clock.now() == 1.5:  # the first poll
+                self.arrivals.append((2.0, Frame(0x725, b"answer")))
+                clock.wait_until(4.0)
+            return came
+
+    engine = Recorder(ticks=2, every_s=1.0)
+    clock.wait_until(1.5)
+    drive(engine, StallingLink(clock), clock)
+    assert engine.calls == [("tick", 1.5), ("receive 725", 4.0), ("tick", 4.0)]
+
+
 def test_what_waits_is_received_before_anything_is_sent(
     clock: VirtualClock, link: FakeLink
 ) -> None:
