@@ -265,7 +265,7 @@ def test_an_adapter_that_cannot_be_opened_is_exit_code_4_and_names_the_fix(
 def test_a_silent_bus_is_exit_code_5_in_bounded_time(flasher: Flasher) -> None:
     began = time.monotonic()
     run = flasher(
-        "flash", BMS, "-t", "bms", "-i", "virtual", "-c", uuid.uuid4().hex, "--timeout", "1"
+        "flash", BMS, "-t", "bms", "-i", "virtual", "-c", uuid.uuid4().hex, "--timeout", "0.2"
     )
     assert run.code == ExitCode.NO_ANSWER
     assert time.monotonic() - began < 3.0

@@ -147,7 +147,7 @@ def test_what_cannot_be_written_is_a_warning_and_the_flash_goes_on(
     breaks: Callable[[Path, pytest.MonkeyPatch], None],
 ) -> None:
     breaks(file, monkeypatch)
-    run = flasher("flash", BMS, "-t", "bms", *MOCK)
+    run = flasher("flash", WMC, "-t", "wmc", *MOCK)
     assert run.code == ExitCode.OK
     assert "warning: no history in" in run.err
 
@@ -158,7 +158,7 @@ def test_a_lock_that_another_program_holds_is_waited_for_a_moment_only(
     monkeypatch.setattr(history, "_LOCK_LIMIT_S", 0.01)
     file.parent.mkdir(parents=True)
     with FileLock(f"{file}.lock"):
-        run = flasher("flash", BMS, "-t", "bms", *MOCK)
+        run = flasher("flash", WMC, "-t", "wmc", *MOCK)
     assert run.code == ExitCode.OK
     assert "warning: no history in" in run.err
     assert not file.exists()

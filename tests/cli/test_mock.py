@@ -43,6 +43,9 @@ class Host:
         self.outcomes: list[Outcome] = []
         self.mock_runs = False
         self._listens = threading.Event()
+        self.has_done = threading.Event()
+        self.ends_the_mock = True
+        """The mock need not find out by itself that the tool is quiet."""
         self._thread = threading.Thread(target=self._run)
         self._does: Callable[[], object] = lambda: None
 
@@ -67,6 +70,8 @@ class Host:
             self.failure = failure
             if self.mock_runs:
                 self.interrupt()
+        finally:
+            self.has_done.set()
 
     # -- what it can do ---------------------------------------------------------------------------
 
@@ -115,9 +120,17 @@ def host(monkeypatch: pytest.MonkeyPatch) -> Iterator[Host]:
             beside.mock_runs = False
 
     monkeypatch.setattr(mock_command, "drive", drive_and_tell)
-    # So that the mock sees sooner that it may end.
+    is_quiet = mock_command._Tool.is_quiet
+
+    def has_ended(tool: mock_command._Tool, now: float) -> bool:
+        return (beside.ends_the_mock and beside.has_done.is_set()) or is_quiet(tool, now)
+
+    # So that the mock sees sooner that it may end, and nobody listens for a second tool.
+    monkeypatch.setattr(mock_command._Tool, "is_quiet", has_ended)
+    monkeypatch.setattr(mock_command, "_QUIET_S", 0.3)
     monkeypatch.setattr("flasher.driver.MAX_WAIT_S", 0.02)
-    monkeypatch.setattr("flasher.cli.bench.mock._QUIET_S", 0.3)
+    monkeypatch.setattr("flasher.host.identify.LISTEN_FIRST_S", 0.0)
+    monkeypatch.setattr("flasher.host.identify.LISTENS_ON_S", 0.0)
     yield beside
     if beside._thread.ident is not None:
         beside.join()
@@ -183,6 +196,7 @@ def test_the_last_upgrade_can_be_verified_before_it_ends(serve: Serve, host: Hos
         with api.connect(interface="virtual", channel=host.channel) as connection:
             results.append(connection.device().upgrade(plan, verify=api.Level.VERSION))
 
+    host.ends_the_mock = False
     host.do(upgrade)
     assert serve("--upgrades", "1", "--set", "after_complete=restarts").code == ExitCode.OK
     host.join()

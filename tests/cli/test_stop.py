@@ -129,10 +129,12 @@ def test_an_interruption_anywhere_is_exit_code_130_without_a_traceback(
 
 
 @contextmanager
-def flashing(folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+def flashing(
+    folder: Path, *options: str, command: str = "flash"
+) -> Iterator[subprocess.Popen[str]]:
     """A flash to the paced mock: five and a half seconds, unless something ends it."""
     with subprocess.Popen(
-        [*FLASHER, "flash", str(SAMPLES / "bms.hex"), "-t", "bms", "--mock", *options],
+        [*FLASHER, command, str(SAMPLES / "bms.hex"), "-t", "bms", "--mock", *options],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -182,8 +184,8 @@ def test_a_signal_in_the_transfer_ends_it_cleanly_and_says_what_to_do(
     "options", [("--frame-gap", "0.08"), ("--packet-gap", "10"), ("--mock-speed", "0.1")]
 )
 def test_ctrl_c_ends_in_no_time_at_any_setting(tmp_path: Path, options: tuple[str, ...]) -> None:
-    """The end of a message is 1.4 s away at the slowest gap."""
-    with flashing(tmp_path, *options) as process:
+    """The end of a message is 1.4 s away at the slowest gap. A rescue transfers soonest."""
+    with flashing(tmp_path, *options, command="rescue") as process:
         told(process)("transferring ...")
         process.send_signal(signal.SIGINT)
         began = time.monotonic()

@@ -70,7 +70,7 @@ COMMANDS = {
     "explain": ("explain", "TRACE"),
     "flash": ("flash", str(SAMPLES / "obc.bin"), "-t", "obc", *MOCK),
     "image-info": ("image-info", str(SAMPLES / "wmc.s19")),
-    "doctor": ("doctor", "--mock"),
+    "doctor": ("doctor", *MOCK),
     "conformance": ("conformance", "-t", "bms", "--mock", "--list"),
     "profile": ("profile", "show", "-t", "bms"),
     "mock": ("mock", "--list-variants"),
