@@ -10,7 +10,6 @@ import datetime
 import logging
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Self
 
 from flasher.cli.files import check_not_read, check_writable
@@ -47,12 +46,7 @@ class Logs:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         # A bus that could not be opened complains when it is forgotten: not on a bare stderr.
         logging.getLogger(_PYTHON_CAN).addHandler(_NOWHERE)
         while self._restore:
@@ -68,27 +62,20 @@ class Logs:
         """Begin. Raises UsageError when the log file cannot be written, or is one of the `others`:
         the texts of the command line, which may name an image.
         """
-        flasher_level, can_level = _ON_STDERR[max(-1, min(verbosity, 2))]
-        screen = _Screen(self._output)
-        self._attach(ROOT, _at(flasher_level, screen))
-        self._attach(_PYTHON_CAN, _at(can_level, _Screen(self._output)))
+        self._attach(_Screen(self._output), *_ON_STDERR[max(-1, min(verbosity, 2))])
         if log_file is not None:
             check_not_read(log_file, LOG_FILE, others)
             self._file = _File(Path(log_file))
-            self._attach(ROOT, _at(logging.DEBUG, self._file))
-            self._attach(_PYTHON_CAN, _at(_FILE_CAN_LEVEL, _Forward(self._file)))
+            self._attach(self._file, logging.DEBUG, _FILE_CAN_LEVEL)
 
-    def _attach(self, name: str, handler: logging.Handler) -> None:
-        logger = logging.getLogger(name)
-        self._restore.append((logger, logger.level, handler))
-        logger.addHandler(handler)
-        levels = [each.level for each in logger.handlers if each.level]
-        logger.setLevel(min(levels))
-
-
-def _at(level: int, handler: logging.Handler) -> logging.Handler:
-    handler.setLevel(level)
-    return handler
+    def _attach(self, handler: logging.Handler, flasher_level: int, can_level: int) -> None:
+        levels = {ROOT: flasher_level, _PYTHON_CAN: can_level}
+        handler.addFilter(lambda record: record.levelno >= levels[record.name.partition(".")[0]])
+        for name, level in levels.items():
+            logger = logging.getLogger(name)
+            self._restore.append((logger, logger.level, handler))
+            logger.addHandler(handler)
+            logger.setLevel(min(level, logger.level or level))
 
 
 class _Screen(logging.Handler):
@@ -147,17 +134,6 @@ class _File(logging.FileHandler):
 
     def _fail(self) -> None:
         self.failure = f"the log {self._shown} is incomplete: it could not be written any more"
-
-
-class _Forward(logging.Handler):
-    """Records of another logger into the same file, from a level of their own."""
-
-    def __init__(self, file: _File) -> None:
-        super().__init__()
-        self._file = file
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._file.handle(record)
 
 
 def _lines(record: logging.LogRecord) -> list[str]:
