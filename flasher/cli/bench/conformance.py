@@ -17,9 +17,11 @@ import click
 from flasher.cli import values
 from flasher.cli.bench import conformance_explore, conformance_init
 from flasher.cli.bench.conformance_bench import (
+    OUTPUT_OPTIONS,
     BenchChoices,
     bench_options,
     confirm_wear,
+    opened,
     set_option,
 )
 from flasher.cli.bench.conformance_explore import explore
@@ -36,7 +38,6 @@ from flasher.cli.files import check_not_read, check_writable, write_whole
 from flasher.cli.framework import argument, group, option, option_set, retyped, typed_values
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
-from flasher.cli.stop import stop_on_signal
 from flasher.conformance.catalogue import (
     BARE,
     BRING_UP,
@@ -89,7 +90,7 @@ _RUN_OPTIONS: Final = frozenset(
         *("--list", "--case", "--group", "--exclude", "--quick", "--seed", "--repeat", "--timeout"),
         *_FILES.values(),
         _TRACE_DIR,
-        *("--json", "--events", "--verbose", "--quiet", "--log-file"),
+        *OUTPUT_OPTIONS,
     }
 )
 """Options about the selection, the reports and the output; the others are about the bench."""
@@ -250,7 +251,6 @@ def conformance(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) 
     if chosen.is_list:
         return _list(chosen.selection, output)
     from flasher.cli.bench.conformance_progress import progress  # noqa: PLC0415  much is loaded
-    from flasher.conformance.opening import open_bench  # noqa: PLC0415
     from flasher.conformance.runner import RunOptions, run  # noqa: PLC0415
 
     described = bench.described(bus)
@@ -259,13 +259,9 @@ def conformance(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) 
     if wear and not described.is_simulated:
         named = ", ".join(f"{case_id} {count} times" for case_id, count in wear.items())
         confirm_wear(f"the device is erased and written: {named}", is_agreed=chosen.yes)
-    stopping = lambda: output.progress(  # noqa: E731
-        "stopping: the device gets its good image back; press again to end at once"
-    )
     started_at = datetime.now(UTC).isoformat(timespec="seconds")
     with (
-        open_bench(described) as (subject, profile),
-        stop_on_signal(stopping) as stopped,
+        opened(described, output) as (subject, profile, stopped),
         progress(output) as observer,
     ):
         missing = gaps(lacking(subject, profile), chosen.selection.chosen())
@@ -331,8 +327,15 @@ def _tell(
     if traces:
         output.progress(f"traces: {len(traces)} in {printable(str(chosen.trace_dir))}")
     document = report_document(report, started_at=started_at, replays=replays, trace_files=traces)
-
-    failed += _write_files(report, document, chosen, output)
+    for name, option_name in _FILES.items():
+        path: Path | None = getattr(chosen, name)
+        if path is None:
+            continue
+        try:
+            write_whole(path, _content(name, report, document), option_name)
+            output.progress(f"{name.replace('_', ' ')}: {printable(str(path))}")
+        except UsageError as error:
+            failed.append(error)
     if failed:
         raise failed[0]
     if code not in (ExitCode.OK, ExitCode.PARTIAL):
@@ -340,51 +343,27 @@ def _tell(
     output.document(ConformanceDocument(document), exit_code=code)
 
 
-def _write_files(
-    report: RunReport, document: ReportDocument, chosen: Choices, output: Output
-) -> list[UsageError]:
-    """Write the files that were asked for; returns why some could not be."""
-    failed: list[UsageError] = []
+def _content(name: str, report: RunReport, document: ReportDocument) -> bytes:
+    """What is written into the file of this name."""
+    from flasher.conformance import html_report, json_report, release, reports  # noqa: PLC0415
+
     started_at = document.started_at
     replays = {(one.id, one.repeat): one.replay for one in document.results}
     traces = {(one.id, one.repeat): one.trace_file for one in document.results if one.trace_file}
-
-    def junit() -> bytes:
-        from flasher.conformance.reports import junit_report  # noqa: PLC0415
-
-        return junit_report(report, started_at=started_at, replays=replays)
-
-    def json_report() -> bytes:
-        from flasher.conformance.json_report import to_bytes  # noqa: PLC0415
-
-        return to_bytes(document)
-
-    def html() -> bytes:
-        from flasher.conformance.html_report import html_page  # noqa: PLC0415  loads jinja2
-
-        page = html_page(report, started_at=started_at, replays=replays, trace_files=traces)
-        return page.encode("utf-8")
-
-    def badge() -> bytes:
-        from flasher.conformance.release import badge  # noqa: PLC0415  loads jinja2
-
-        return badge(report).encode("utf-8")
-
-    def summary() -> bytes:
-        from flasher.conformance.release import summary_page  # noqa: PLC0415  loads jinja2
-
-        return summary_page(report, started_at=started_at).encode("utf-8")
-
-    for make in (junit, json_report, html, badge, summary):
-        path: Path | None = getattr(chosen, make.__name__)
-        if path is None:
-            continue
-        try:
-            write_whole(path, make(), _FILES[make.__name__])
-            output.progress(f"{make.__name__.replace('_', ' ')}: {printable(str(path))}")
-        except UsageError as error:
-            failed.append(error)
-    return failed
+    match name:
+        case "junit":
+            return reports.junit_report(report, started_at=started_at, replays=replays)
+        case "json_report":
+            return json_report.to_bytes(document)
+        case "html":
+            text = html_report.html_page(
+                report, started_at=started_at, replays=replays, trace_files=traces
+            )
+        case "badge":
+            text = release.badge(report)
+        case _:
+            text = release.summary_page(report, started_at=started_at)
+    return text.encode("utf-8")
 
 
 def replay_commands(report: RunReport) -> dict[tuple[str, int], str]:

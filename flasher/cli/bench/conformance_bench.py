@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Final
@@ -9,13 +11,20 @@ from typing import TYPE_CHECKING, Final
 from flasher.cli import values
 from flasher.cli.framework import option, option_set
 from flasher.cli.options import Bus, allow_implausible_option, target_option
+from flasher.cli.output import Output
 from flasher.cli.question import agrees, can_ask
+from flasher.cli.stop import Stop, stop_on_signal
 from flasher.conformance.real import HOST_UNCERTAINTY_S
 from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.spec import Target
 
 if TYPE_CHECKING:
     from flasher.conformance.opening import BenchOptions
+    from flasher.conformance.profile import ConformanceProfile
+    from flasher.conformance.subject import Subject
+
+OUTPUT_OPTIONS: Final = ("--json", "--events", "--verbose", "--quiet", "--log-file")
+"""What a command that runs something again leaves out."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +79,20 @@ class BenchChoices:
         )
         check_bench(bench)
         return bench
+
+
+@contextmanager
+def opened(
+    described: BenchOptions, output: Output
+) -> Iterator[tuple[Subject, ConformanceProfile, Stop]]:
+    """The device, its profile, and whether the user has enough of it."""
+    from flasher.conformance.opening import open_bench  # noqa: PLC0415  much is loaded
+
+    def stopping() -> None:
+        output.progress("stopping: the device gets its good image back; press again to end at once")
+
+    with open_bench(described) as (subject, profile), stop_on_signal(stopping) as stopped:
+        yield subject, profile, stopped
 
 
 def confirm_wear(said: str, *, is_agreed: bool) -> None:

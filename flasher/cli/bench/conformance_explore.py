@@ -14,12 +14,17 @@ import click
 
 from flasher.cli import values
 from flasher.cli.bar import Bar
-from flasher.cli.bench.conformance_bench import BenchChoices, bench_options, confirm_wear
+from flasher.cli.bench.conformance_bench import (
+    OUTPUT_OPTIONS,
+    BenchChoices,
+    bench_options,
+    confirm_wear,
+    opened,
+)
 from flasher.cli.files import check_not_read, check_writable, write_whole
 from flasher.cli.framework import command, option, option_set, retyped, typed_values
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
-from flasher.cli.stop import stop_on_signal
 from flasher.errors import ExitCode
 from flasher.protocol.text import printable
 
@@ -41,10 +46,7 @@ _TRACE_FILE: Final = "--trace-file"
 _WALKS_PER_STEP: Final = 1 / 12
 _ERASES_A_WALK: Final = 2
 _REPLACED: Final = frozenset(
-    {
-        *("--steps", "--seed", "--replay", _TRACE_FILE, "--yes"),
-        *("--json", "--events", "--verbose", "--quiet", "--log-file"),
-    }
+    {"--steps", "--seed", "--replay", _TRACE_FILE, "--yes", *OUTPUT_OPTIONS}
 )
 
 
@@ -129,7 +131,6 @@ def explore(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> i
     find the shortest walk that breaks it.
     """
     from flasher.conformance.explore import Explorer  # noqa: PLC0415  much is loaded
-    from flasher.conformance.opening import open_bench  # noqa: PLC0415
 
     described = bench.described(bus)
     if chosen.trace_file is not None:
@@ -139,12 +140,8 @@ def explore(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> i
         erases = max(1, round(chosen.steps * _WALKS_PER_STEP * _ERASES_A_WALK))
         said = f"{chosen.steps} steps erase and write the device about {erases} times"
         confirm_wear(said, is_agreed=chosen.yes)
-    stopping = lambda: output.progress(  # noqa: E731
-        "stopping: the device gets its good image back; press again to end at once"
-    )
     with (
-        open_bench(described) as (subject, profile),
-        stop_on_signal(stopping) as stopped,
+        opened(described, output) as (subject, profile, stopped),
         Bar(output, leave=False, unit=" steps") as bar,
     ):
         explorer = Explorer(

@@ -9,12 +9,16 @@ from typing import TYPE_CHECKING, Final
 
 from flasher.cli import values
 from flasher.cli.bar import Bar
-from flasher.cli.bench.conformance_bench import BenchChoices, bench_options, confirm_wear
+from flasher.cli.bench.conformance_bench import (
+    BenchChoices,
+    bench_options,
+    confirm_wear,
+    opened,
+)
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import command, option, option_set
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
-from flasher.cli.stop import stop_on_signal
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.protocol.text import printable
 
@@ -103,7 +107,6 @@ def init(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> int:
     what was seen. The good image runs before and after it.
     """
     from flasher.conformance.init import UPGRADES, ask  # noqa: PLC0415  much is loaded
-    from flasher.conformance.opening import open_bench  # noqa: PLC0415
     from flasher.conformance.profile import ConformanceProfile, load_profile  # noqa: PLC0415
 
     described = bench.described(bus)
@@ -114,12 +117,8 @@ def init(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> int:
     if not described.is_simulated:
         said = f"the questions erase and write the device about {UPGRADES} times"
         confirm_wear(said, is_agreed=chosen.yes)
-    stopping = lambda: output.progress(  # noqa: E731
-        "stopping: the device gets its good image back; press again to end at once"
-    )
     with (
-        open_bench(described) as (subject, _),
-        stop_on_signal(stopping) as stopped,
+        opened(described, output) as (subject, _, stopped),
         Bar(output, leave=False, unit=" questions") as bar,
     ):
         asked = ask(subject, start, stopped=stopped, progress=bar.move_to)
@@ -149,13 +148,14 @@ def _tell(
     was_stopped: bool,
 ) -> int:
     """Print what was seen, and write the file unless the questions ended early."""
-    width = max(len(one.key) for one in asked.answers)
-    broad = max(len(str(_shown(one.value))) for one in asked.answers)
+    rows = []
     for one in asked.answers:
         seen = one.seen
         if output.verbosity <= 0 and len(seen) > _SEEN_SHOWN:
             seen = seen[: _SEEN_SHOWN - 3] + "..."
-        output.result(printable(f"{one.key:<{width}}  {_shown(one.value):<{broad}}  {seen}"))
+        value = "open" if one.value is None else str(one.value)
+        rows.append(tuple(map(printable, (one.key, value, seen))))
+    output.table(rows)
     toml, code = "", ExitCode.OK
     if asked.stopped:
         code = ExitCode.PARTIAL
@@ -186,7 +186,3 @@ def _tell(
         exit_code=code,
     )
     return code
-
-
-def _shown(value: str | int | float | None) -> str:
-    return "open" if value is None else str(value)

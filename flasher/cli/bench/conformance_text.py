@@ -8,6 +8,7 @@ from math import ceil
 from typing import Final
 
 from flasher.cli.output import counted, duration
+from flasher.cli.terminal import columns
 from flasher.conformance.diff import Difference, VerdictChange
 from flasher.conformance.reports import ByResult, distribution, group_title
 from flasher.conformance.results import (
@@ -92,11 +93,11 @@ def _untried(result: CaseResult) -> str:
 
 
 def _groups(report: RunReport) -> Iterator[str]:
-    groups = report.by_group()
-    width = max((len(group_title(group)) for group in groups), default=0)
-    for group, members in groups.items():
-        said = count_text(result for _, result in members)
-        yield f"{group}  {group_title(group):<{width}}  {said}"
+    rows = (
+        (group, group_title(group), count_text(result for _, result in members))
+        for group, members in report.by_group().items()
+    )
+    yield from columns(rows)
 
 
 def _told(text: CaseText, result: CaseResult, replays: ByResult, *, verbose: bool) -> Iterator[str]:
@@ -303,11 +304,7 @@ def _median_and_p95(median_s: float | None, p95_s: float | None) -> str:
 
 
 def _table(rows: Iterable[Sequence[str]]) -> Iterator[str]:
-    cells = [[_short(printable(cell), _CELL) for cell in row] for row in rows]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    for row in cells:
-        padded = (f"{cell:<{width}}" for cell, width in zip(row, widths, strict=True))
-        yield "  ".join(padded).rstrip()
+    yield from columns([_short(printable(cell), _CELL) for cell in row] for row in rows)
 
 
 def _short(text: str, limit: int = _TEXT_LIMIT) -> str:
