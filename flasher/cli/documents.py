@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final, cast
+from typing import TYPE_CHECKING, Any, Final, TypeVar, cast
 
 from flasher.errors import ErrorCode, ExitCode, Fault
 from flasher.events import Phase, QueryAnswered
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 SCHEMA_VERSION: Final = 2
 """Counts up when a field of any document changes its meaning or goes away; not for a new one."""
 
+Kind = TypeVar("Kind")
 FieldValue = str | int | list[int] | list[str] | None
 """A value of a message: bytes are in hexadecimal, flags are a list of names."""
 
@@ -52,6 +53,12 @@ def as_json(document: object) -> Any:
     """A document, an event or a part of one as JSON holds it."""
     kind: Any = type(document)
     return adapter(kind).dump_python(document, mode="json")
+
+
+def document_of(kind: type[Kind], source: object, /, **others: Any) -> Kind:
+    """A document of a type: what `source` has by the same names, and the `others`."""
+    names = {each.name for each in dataclasses.fields(cast("Any", kind))} - others.keys()
+    return kind(**{name: getattr(source, name) for name in names}, **others)
 
 
 def content_document(content: Content) -> dict[str, FieldValue]:

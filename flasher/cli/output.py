@@ -17,7 +17,14 @@ import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Final, Literal, NamedTuple, TextIO
 
-from flasher.cli.documents import SCHEMA_VERSION, Envelope, ErrorDocument, as_json, to_json
+from flasher.cli.documents import (
+    SCHEMA_VERSION,
+    Envelope,
+    ErrorDocument,
+    as_json,
+    document_of,
+    to_json,
+)
 from flasher.cli.terminal import columns, painted, takes_colour, unpainted, wrapped
 from flasher.errors import ErrorCode, ExitCode, FlasherError, UsageError
 
@@ -157,16 +164,7 @@ class Output:
         self.say(f"{head} {text}")
         if self.ending is not None:
             self.verdict(self.ending(error))
-        said = ErrorDocument(
-            kind=type(error).__name__,
-            code=error.code,
-            what=error.what,
-            where=error.where,
-            cause=error.cause,
-            remedy=error.remedy,
-            command=error.command,
-            faults=error.faults,
-        )
+        said = document_of(ErrorDocument, error, kind=type(error).__name__)
         self._print_document(known, error.exit_code, said)
 
 

@@ -230,14 +230,11 @@ def _circumstances(bus: Bus, target: Target | None) -> dict[str, Any]:
 
 def _error(error: BaseException) -> dict[str, Any]:
     if isinstance(error, FlasherError):
+        said = ("what", "where", "cause", "remedy", "command")
         return {
             "kind": type(error).__name__,
             "exit_code": int(error.exit_code),
-            "what": error.what,
-            "where": error.where,
-            "cause": error.cause,
-            "remedy": error.remedy,
-            "command": error.command,
+            **{name: getattr(error, name) for name in said},
         }
     lines = traceback.format_exception(error)
     return {

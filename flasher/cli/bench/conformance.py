@@ -34,6 +34,7 @@ from flasher.cli.bench.conformance_text import (
     report_lines,
     side_by_side_lines,
 )
+from flasher.cli.documents import document_of
 from flasher.cli.files import check_not_read, check_writable, write_whole
 from flasher.cli.framework import argument, group, option, option_set, retyped, typed_values
 from flasher.cli.options import Bus, adapter_options
@@ -412,15 +413,11 @@ def _list(selection: Selection, output: Output) -> int:
     chosen = in_order(known_cases()) if selection == Selection() else selection.chosen()
     texts = [case_text(case_id, ConformanceProfile()) for case_id in chosen]
     found = [
-        ListedCase(
-            text.id,
-            text.group,
-            text.title,
-            text.clause,
-            text.clauses,
-            text.requires,
-            in_part_without(text.id),
-            tuple(text.choices),
+        document_of(
+            ListedCase,
+            text,
+            in_part_without=in_part_without(text.id),
+            choices=tuple(text.choices),
             can_be_run=text.id in CASES,
             only_when_named=text.id in WEAR,
         )

@@ -21,6 +21,7 @@ from flasher.cli.bench.conformance_bench import (
     confirm_wear,
     opened,
 )
+from flasher.cli.documents import document_of
 from flasher.cli.files import check_not_read, check_writable, write_whole
 from flasher.cli.framework import command, option, option_set, retyped, typed_values
 from flasher.cli.options import Bus, adapter_options
@@ -192,19 +193,10 @@ def _tell(explored: Explored, output: Output, trace_file: Path | None, code: Exi
             output.result(printable(explored.stopped))
     else:
         output.result(explored.stopped or "nothing was found")
-    output.document(
-        ExploreDocument(
-            explored.subject,
-            explored.seed,
-            explored.walks,
-            explored.steps,
-            None
-            if finding is None
-            else FindingDocument(
-                finding.rule, finding.text, list(finding.steps), list(finding.first_steps), replay
-            ),
-            explored.stopped,
-            [CoverageDocument(*each) for each in explored.coverage],
-        ),
-        exit_code=code,
-    )
+    found = None
+    if finding is not None:
+        steps, first_steps = list(finding.steps), list(finding.first_steps)
+        found = FindingDocument(finding.rule, finding.text, steps, first_steps, replay)
+    coverage = [CoverageDocument(*each) for each in explored.coverage]
+    document = document_of(ExploreDocument, explored, finding=found, coverage=coverage)
+    output.document(document, exit_code=code)

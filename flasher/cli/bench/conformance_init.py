@@ -15,6 +15,7 @@ from flasher.cli.bench.conformance_bench import (
     confirm_wear,
     opened,
 )
+from flasher.cli.documents import document_of
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import command, option, option_set
 from flasher.cli.options import Bus, adapter_options
@@ -175,13 +176,12 @@ def _tell(
             f"was seen; {len(asked.open)} stay open"
         )
     output.document(
-        InitDocument(
-            asked.subject,
-            asked.target,
-            [AnswerDocument(one.key, one.value, one.seen) for one in asked.answers],
-            toml,
-            str(path) if toml else "",
-            asked.stopped,
+        document_of(
+            InitDocument,
+            asked,
+            answers=[document_of(AnswerDocument, one) for one in asked.answers],
+            toml=toml,
+            file=str(path) if toml else "",
         ),
         exit_code=code,
     )

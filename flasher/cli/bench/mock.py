@@ -11,7 +11,7 @@ import click
 
 from flasher import api, events
 from flasher.cli import values
-from flasher.cli.documents import to_json
+from flasher.cli.documents import document_of, to_json
 from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import command, option
 from flasher.cli.options import Bus, bus_options, target_option
@@ -225,14 +225,7 @@ def _served(
 def _list_variants(output: Output) -> None:
     output.table((each.name, each.clause, each.summary) for each in VARIANTS.values())
     documents = [
-        VariantDocument(
-            name=variant.name,
-            clause=variant.clause,
-            also=list(variant.also),
-            summary=variant.summary,
-            upgrade_works=variant.upgrade_works,
-        )
-        for variant in VARIANTS.values()
+        document_of(VariantDocument, each, also=list(each.also)) for each in VARIANTS.values()
     ]
     output.document(VariantsDocument(variants=documents))
 

@@ -18,6 +18,7 @@ from flasher.bus.health import ControllerState
 from flasher.bus.link import Clock, Link, MonotonicClock
 from flasher.cli import values
 from flasher.cli.adapters import only
+from flasher.cli.documents import document_of
 from flasher.cli.framework import command, option
 from flasher.cli.look.findings import (
     Finding,
@@ -171,17 +172,10 @@ def _document(examination: Examination) -> DoctorDocument:
             for found in examination.detected.found
         ],
         bitrate_bps=examination.bitrate_bps,
-        health=None if heard is None else _health_document(heard),
+        health=None
+        if heard is None
+        else document_of(HealthDocument, heard.health, error_frames=heard.traffic.error_frames),
         traffic=None if heard is None else _traffic_document(heard),
-    )
-
-
-def _health_document(heard: Listened) -> HealthDocument:
-    return HealthDocument(
-        state=heard.health.state,
-        tx_errors=heard.health.tx_errors,
-        rx_errors=heard.health.rx_errors,
-        error_frames=heard.traffic.error_frames,
     )
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from flasher.cli import values
+from flasher.cli.documents import document_of
 from flasher.cli.extras import need
 from flasher.cli.files import check_not_read, check_writable, write_whole, writing
 from flasher.cli.framework import Decorator, argument, group, option
@@ -200,11 +201,7 @@ def trace(output: Output, *, trace: Path, file: Path, joined: bool) -> int:
     shown = f"{printable(str(file))}: {counted(made.frames, 'frame')}"
     output.result(f"{shown}, {counted(made.remarks, 'remark')}" if made.remarks else shown)
     _warn(output, trace, made.damage, made=made.frames)
-    output.document(
-        ExportedTraceDocument(
-            file=str(file), frames=made.frames, remarks=made.remarks, damage=made.damage
-        )
-    )
+    output.document(document_of(ExportedTraceDocument, made, file=str(file)))
     return 0
 
 

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+from flasher.cli.documents import document_of
 from flasher.cli.files import check_writable
 from flasher.cli.output import Output, byte_count, counted
 from flasher.cli.station.commands import RecordsOptions
@@ -67,15 +68,7 @@ def verify(output: Output, records: RecordsOptions) -> int:
     else:
         _say_what_was_checked(found, output)
     code = ExitCode.VERIFICATION if found.problems else ExitCode.OK
-    document = VerifiedRecordsDocument(
-        problems=found.problems,
-        remarks=found.remarks,
-        kept=found.kept,
-        unkept=found.unkept,
-        traces=found.traces,
-        is_checked_elsewhere=found.is_checked_elsewhere,
-    )
-    output.document(document, exit_code=code)
+    output.document(document_of(VerifiedRecordsDocument, found), exit_code=code)
     return code
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from datetime import date, datetime
 from pathlib import Path
 
+from flasher.cli.documents import document_of
 from flasher.cli.output import Output, byte_count
 from flasher.cli.station.documents import (
     CheckedTargetDocument,
@@ -88,10 +89,10 @@ def _lines(recipe: LoadedRecipe, day: date) -> Iterator[str]:
 
 
 def _document(recipe: LoadedRecipe, sockets: dict[str, str]) -> StationCheckDocument:
-    return StationCheckDocument(
+    return document_of(
+        StationCheckDocument,
+        recipe.recipe,
         recipe=recipe.recipe.name,
-        part=recipe.recipe.part,
-        revision=recipe.recipe.revision,
         sha256=recipe.sha256,
         targets=[
             CheckedTargetDocument(

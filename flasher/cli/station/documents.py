@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final, get_args
 
+from flasher.cli.documents import document_of
 from flasher.station.events import RunEnded, ScanRefused, StationEvent
 from flasher.station.records.migration import Migrated
 from flasher.station.records.model import (
@@ -245,19 +246,8 @@ LINES: Final[tuple[type, ...]] = get_args(StationEvent)
 
 
 def figures_document(figures: Figures) -> FiguresDocument:
-    return FiguresDocument(
-        runs=figures.runs,
-        units=figures.units,
-        passed=figures.passed,
-        first_passed=figures.first_passed,
-        yield_share=figures.yield_share,
-        first_pass_share=figures.first_pass_share,
-        by_state={RunState(state).name.lower(): n for state, n in figures.by_state.items()},
-        failures=dict(figures.failures),
-        duration_median_s=figures.duration_median_s,
-        duration_longest_s=figures.duration_longest_s,
-        virtual_runs=figures.virtual_runs,
-    )
+    by_state = {RunState(state).name.lower(): n for state, n in figures.by_state.items()}
+    return document_of(FiguresDocument, figures, by_state=by_state, failures=dict(figures.failures))
 
 
 def run_document(row: Mapping[str, Any]) -> ReportedRunDocument:

@@ -11,12 +11,13 @@ from flasher.cli.documents import (
     OutcomeDocument,
     PlanDocument,
     SegmentDocument,
+    document_of,
 )
 from flasher.cli.output import ClosingLine, byte_count, counted, duration, spread_ms
 from flasher.errors import FlasherError, InterruptedByUserError
 from flasher.events import CheckMade
 from flasher.host.options import UpgradeOptions, gaps_s
-from flasher.host.outcome import DeviceLeft, Outcome
+from flasher.host.outcome import DeviceLeft
 from flasher.host.session import Result
 from flasher.host.table import Ending
 from flasher.host.verify import Level, Verdict, Verification, possible_levels
@@ -231,30 +232,24 @@ def _rate(plan: Plan, transfer_s: float) -> str:
 
 def image_document(image: Image, table: VectorTable | None) -> ImageDocument:
     """The image as JSON."""
-    return ImageDocument(
-        source=image.source,
-        format=image.format,
-        size_bytes=image.size_bytes,
-        base=image.base,
-        segments=[SegmentDocument(s.start, s.size_bytes) for s in image.segments],
-        filled_bytes=image.filled_bytes,
-        version=image.version,
+    return document_of(
+        ImageDocument,
+        image,
+        segments=[document_of(SegmentDocument, s) for s in image.segments],
         named_targets=sorted(target.name for target in image.named_targets),
-        sha256=image.sha256,
         vector_table=table,
     )
 
 
 def plan_document(plan: Plan, options: UpgradeOptions) -> PlanDocument:
     """The plan as JSON."""
-    return PlanDocument(
+    return document_of(
+        PlanDocument,
+        plan,
         target=plan.target.name,
         request_id=plan.target.request_id,
         answer_id=plan.target.answer_id,
-        bitrate_bps=plan.bitrate_bps,
         packets=plan.total_packets,
-        frames=plan.frames,
-        bytes_on_wire=plan.bytes_on_wire,
         wire_s=round(plan.wire_s, 6),
         gaps_s=round(gaps_s(plan, options), 6),
     )
@@ -272,7 +267,7 @@ def upgrade_document(
         image=image_document(plan.image, vector_table(plan.image)),
         plan=plan_document(plan, options),
         checks=list(checks),
-        outcome=_outcome_document(result.outcome),
+        outcome=document_of(OutcomeDocument, result.outcome),
         verification=replace(result.verification, running_version=result.running_version),
         previous_version=result.previous_version,
         shutdown_heard=result.shutdown_heard,
@@ -289,17 +284,4 @@ def dry_run_document(
         image=image_document(plan.image, vector_table(plan.image)),
         plan=plan_document(plan, options),
         checks=list(checks),
-    )
-
-
-def _outcome_document(outcome: Outcome) -> OutcomeDocument:
-    return OutcomeDocument(
-        ending=outcome.ending,
-        phase=outcome.phase,
-        packet=outcome.packet,
-        device_left=outcome.device_left,
-        boot_version=outcome.boot_version,
-        running_version=outcome.running_version,
-        detail=outcome.detail,
-        statistics=outcome.statistics,
     )
