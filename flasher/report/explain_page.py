@@ -162,7 +162,7 @@ def _wall_text(seconds: float | None) -> str:
 
 def _view(upgrade: UpgradeStory, room: _Room) -> UpgradeView:
     status = status_of(upgrade.verdict.cause)
-    troubled = [packet for packet in upgrade.packets if _is_troubled(packet)]
+    troubled = [each for each in upgrade.packets if not each.is_clean or each.answered_at_s is None]
     more = len(upgrade.remarks) - REMARKS_SHOWN
     remarks = upgrade.remarks[:REMARKS_SHOWN]
     return UpgradeView(
@@ -178,10 +178,6 @@ def _view(upgrade: UpgradeStory, room: _Room) -> UpgradeView:
         troubled_count=len(troubled),
         remarks=(*remarks, f"{more:,} more remarks") if more > 0 else remarks,
     )
-
-
-def _is_troubled(packet: PacketStory) -> bool:
-    return packet.tries > 1 or packet.naks > 0 or packet.answered_at_s is None
 
 
 # -- the parts of an upgrade ----------------------------------------------------------------------

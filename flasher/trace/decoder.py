@@ -61,6 +61,13 @@ class Field(NamedTuple):
     text: str
     unit: str = ""
 
+    def words(self, limit: int | None = None, mark: str = "") -> str:
+        """Label, value and unit; a value is cut behind `limit` characters."""
+        text = self.text
+        if limit is not None and len(text) > limit:
+            text = f"{text[:limit].rstrip()} ..."
+        return f"{mark}{self.label} {text} {self.unit}".rstrip()
+
 
 @dataclass(frozen=True)
 class BusEvent:

@@ -248,7 +248,7 @@ class _Reading:
             running_version=upgrade.running_version,
             attempts=upgrade.attempt,
             phases=tuple(upgrade.spans),
-            packets=tuple(record.story() for record in upgrade.packets),
+            packets=tuple(upgrade.packets),
             steps=mark_unanswered(
                 upgrade.steps, target.node.name, is_over=verdict.cause not in _MAY_BE_ANSWERED
             ),

@@ -46,36 +46,6 @@ _MAX_NOTED: Final = 10
 """Different texts of one sort that are kept."""
 
 
-@dataclass(slots=True)
-class PacketRecord:
-    """One packet in one attempt."""
-
-    number: int
-    attempt: int
-    sent_at_s: float
-    left_s: float
-    tries: int = 1
-    naks: int = 0
-    answered_at_s: float | None = None
-    answer_s: float | None = None
-
-    @property
-    def is_clean(self) -> bool:
-        """True while nothing went wrong with it."""
-        return self.tries == 1 and not self.naks
-
-    def story(self) -> PacketStory:
-        return PacketStory(
-            self.number,
-            self.attempt,
-            self.tries,
-            self.naks,
-            self.sent_at_s,
-            self.answered_at_s,
-            self.answer_s,
-        )
-
-
 class Interleaving:
     """Finds messages that begin inside another one on the same id: two senders at once."""
 
@@ -153,9 +123,9 @@ class ObservedUpgrade:
 
     # The transfer.
     total: int | None = None
-    packets: list[PacketRecord] = field(default_factory=list)
+    packets: list[PacketStory] = field(default_factory=list)
     """In the order of first copies; their number is limited."""
-    current: PacketRecord | None = None
+    current: PacketStory | None = None
     restarts: int = 0
     is_restarted: bool = False
     """The device restarted and has not been told to prepare since."""
@@ -192,7 +162,9 @@ class ObservedUpgrade:
         """The latest message of either side, and of the tool."""
         self.link = Transfer(self.bitrate_bps)
         self._update_at_s = self._request_at_s = self.begin_s
-        self._by_number: dict[int, PacketRecord] = {}
+        self._by_number: dict[int, PacketStory] = {}
+        self._left_s: dict[int, float] = {}
+        """When the latest copy of each packet had left the wire."""
         self._last_boot = ""
         self._tail = b""
 
@@ -344,21 +316,19 @@ class ObservedUpgrade:
         self.total = values["total"]
         self._look_for_version(bytes.fromhex(values["payload"]))
         self.link.packet(number, timed)
-        record = self._by_number.get(number)
-        current = self.current
-        if record is None:
-            left_s = timed.left_s(self.bitrate_bps)
-            record = PacketRecord(number, self.attempt, timed.end_s, left_s)
-            self._by_number[number] = record
+        packet, current = self._by_number.get(number), self.current
+        if packet is None:
+            packet = PacketStory(number, self.attempt, 1, 0, timed.end_s, None, None)
+            self._by_number[number] = packet
             if len(self.packets) < self.max_packets:
-                self.packets.append(record)
+                self.packets.append(packet)
         else:
-            if current is not None and current.number > number and record.answered_at_s:
+            if current is not None and current.number > number and packet.answered_at_s:
                 self._intrude(f"packet {number} once more")
                 return
-            record.tries += 1
-            record.left_s = timed.left_s(self.bitrate_bps)
-        self.current = record
+            packet.tries += 1
+        self._left_s[number] = timed.left_s(self.bitrate_bps)
+        self.current = packet
 
     def _look_for_version(self, payload: bytes) -> None:
         found = find_firmware_version(self._tail + payload)
@@ -434,7 +404,7 @@ class ObservedUpgrade:
             self.extra_acks += packet.is_clean
             return
         packet.answered_at_s = timed.end_s
-        packet.answer_s = max(0.0, timed.end_s - packet.left_s)
+        packet.answer_s = max(0.0, timed.end_s - self._left_s[number])
         self._progress()
 
     def _nak(self, number: int, timed: TimedEvent) -> None:

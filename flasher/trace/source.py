@@ -28,18 +28,8 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
     Raises UsageError for what is neither.
     """
     damage: list[str] = []
-    if not path.is_dir():
-        story = explain(
-            frames_until_damage(path, damage),
-            source=str(path),
-            suffix=_suffix(path),
-            bitrate_bps=bitrate_bps,
-            everything=everything,
-            is_one_tool=_is_of_conformance(path),
-        )
-        return replace(story, damage=" ".join(damage))
     trace = trace_file(path)
-    report = _report(path / REPORT)
+    report = _report(path / REPORT) if path.is_dir() else {}
     story = explain(
         frames_until_damage(trace, damage),
         source=str(path),
@@ -48,6 +38,7 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
         until=report.get("written_at") if isinstance(report.get("written_at"), float) else None,
         everything=everything,
         recorded=_recorded(report) if report else None,
+        is_one_tool=_is_of_conformance(path),
     )
     return replace(_as_the_tool_ended(story), damage=" ".join(damage))
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Final
 
 from flasher.protocol.spec import Node
-from flasher.trace.decoder import BusEvent, Field, Kind
+from flasher.trace.decoder import BusEvent, Kind
 from flasher.trace.story import PacketRun, Step, StepKind, StoryLine
 
 MAX_STEPS: Final = 1000
@@ -133,7 +133,9 @@ def step_of(event: BusEvent, at_s: float) -> Step:
     """A bus event as a line."""
     kind = StepKind.DAMAGED if event.kind is Kind.DAMAGED else StepKind.MESSAGE
     width = None if event.is_alarm else _VALUE_WIDTH  # no fault is left out
-    said = ", ".join(_field_text(shown, width) for shown in event.fields if _says_something(shown))
+    # Image bytes, and a constant text that repeats the title, say nothing.
+    told = (shown for shown in event.fields if shown.name not in ("payload", "text"))
+    said = ", ".join(shown.words(width) for shown in told)
     return Step(
         at_s,
         kind,
@@ -144,15 +146,3 @@ def step_of(event: BusEvent, at_s: float) -> Step:
         is_trouble=event.is_trouble,
         can_id=event.can_id,
     )
-
-
-def _says_something(shown: Field) -> bool:
-    """False for image bytes, and for a constant text that repeats the title."""
-    return shown.name not in ("payload", "text")
-
-
-def _field_text(shown: Field, width: int | None) -> str:
-    text = shown.text
-    if width is not None and len(text) > width:
-        text = f"{text[:width].rstrip()} ..."
-    return f"{shown.label} {text} {shown.unit}".rstrip()

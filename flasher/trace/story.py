@@ -1,7 +1,8 @@
 """The story of a recorded trace, as data: what `flasher explain` prints, draws, and gives as JSON.
 
-Frozen dataclasses and nothing else. All times named `..._s` are seconds since the first frame of
-the trace. Every text is safe to show in a terminal; a page still has to escape it for HTML.
+Dataclasses and nothing else; those of packets grow while the trace is read. All times named
+`..._s` are seconds since the first frame of the trace. Every text is safe to show in a terminal; a
+page still has to escape it for HTML.
 JSON is made of them by `flasher.cli.documents.as_json`.
 """
 
@@ -148,7 +149,7 @@ class PhaseSpan:
     end_s: float
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class PacketStory:
     """One packet in one attempt."""
 
@@ -165,6 +166,11 @@ class PacketStory:
     """Its ACK; None when there was none."""
     answer_s: float | None
     """From the last frame of the latest copy to the ACK; None without one."""
+
+    @property
+    def is_clean(self) -> bool:
+        """True while nothing went wrong with it."""
+        return self.tries == 1 and not self.naks
 
 
 @dataclass(frozen=True)

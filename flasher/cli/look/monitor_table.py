@@ -122,11 +122,6 @@ def _fault_lines(lines: list[MessageHistory], width: int, room: int) -> list[str
     return [*shown_lines, f"{left} {more}FAULTS: make the window higher"[:width]]
 
 
-def _longest(text: str) -> str:
-    """A value for a column that folds: not over half the screen."""
-    return text if len(text) <= _VALUE_MAX else f"{text[:_VALUE_MAX].rstrip()} ..."
-
-
 def _by_field(lines: list[MessageHistory], now: float, title: str, *, wide: bool) -> Table:
     table = _table(title, wide=wide)
     _column(table, "field", ratio=5)
@@ -151,7 +146,10 @@ def _by_message(lines: list[MessageHistory], now: float, title: str, *, wide: bo
     _figures(table, wide=wide)
     for line in lines:
         changed = line.changed(now)
-        words = [_in_words(shown, changed) for shown in line.seen.fields]
+        words = []
+        for shown in line.seen.fields:
+            mark, style = ("*", _CHANGED) if shown.name in changed else ("", "")
+            words.append(Text(shown.words(mark=mark), style=style))
         if not line.seen.in_dialect:  # first: what stands behind may be cut
             words.insert(0, Text(NOT_IN_DIALECT))
         fields = Text(", ").join(words)
@@ -215,13 +213,10 @@ def _tail(line: MessageHistory, now: float, *, wide: bool) -> list[Text]:
 
 def _cells(shown: Field, changed: set[str]) -> list[Text]:
     """Label, value and unit; a change is told by a mark too, for screens without colours."""
-    text = _longest(shown.text)
+    text = shown.text
+    if len(text) > _VALUE_MAX:  # it folds: not over half the screen
+        text = f"{text[:_VALUE_MAX].rstrip()} ..."
     if shown.name not in changed:
         return [Text(shown.label), Text(text), Text(shown.unit)]
     value = Text(f"*{text}", style=_CHANGED)
     return [Text(shown.label), value, Text(shown.unit, style=_CHANGED)]
-
-
-def _in_words(shown: Field, changed: set[str]) -> Text:
-    mark, style = ("*", _CHANGED) if shown.name in changed else ("", "")
-    return Text(f"{mark}{shown.label} {shown.text} {shown.unit}".rstrip(), style=style)

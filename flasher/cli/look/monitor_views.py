@@ -8,7 +8,7 @@ from typing import Final, Literal, Self
 from flasher.cli.documents import FieldValue
 from flasher.cli.output import Output
 from flasher.protocol.frame import Frame
-from flasher.trace.decoder import BusEvent, Field, Kind
+from flasher.trace.decoder import BusEvent, Kind
 from flasher.trace.watcher import Board, Pulse, RawFrame
 
 _VALUE_WIDTH: Final = 64
@@ -106,11 +106,35 @@ class Lines(View):
     """One line, or one JSON document, for each."""
 
     def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
-        self.output.result(_line(seen, at_s, changed, cut=self.output.verbosity < 1))
-        self.output.line(_document(seen, at_s, changed))
+        # No fault is left out.
+        width = None if seen.is_alarm or self.output.verbosity >= 1 else _VALUE_WIDTH
+        said = ", ".join(
+            shown.words(width, "*" if shown.name in changed else "") for shown in seen.fields
+        )
+        mark = "! " if seen.is_trouble else ""
+        text = f"{at_s:10.3f}  {seen.can_id:03X}  {seen.route:<9}  {mark}{seen.marked_title}"
+        self.output.result(f"{text}: {said}" if said else text)
+        self.output.line(
+            SeenLine(
+                at_s=round(at_s, 6),
+                kind=seen.kind,
+                can_id=seen.can_id,
+                command=seen.command,
+                from_=seen.sender,
+                to=seen.receiver,
+                message=seen.title,
+                trouble=seen.is_trouble,
+                fields={shown.name: shown.value for shown in seen.fields},
+                changed=sorted(changed),
+                in_dialect=seen.in_dialect,
+            )
+        )
 
     def show_frame(self, frame: Frame, at_s: float) -> None:
-        self.output.result(f"{at_s:10.3f}  {frame.can_id:03X}  {_frame_text(frame)}")
+        words = [f"[{len(frame.data)}]", *filter(None, [frame.data.hex(" ")])]
+        words += ["29-bit id"] * frame.is_extended
+        words += ["remote request"] * frame.is_remote + ["error frame"] * frame.is_error
+        self.output.result(f"{at_s:10.3f}  {frame.can_id:03X}  {' '.join(words)}")
         self.output.line(
             FrameLine(
                 at_s=round(at_s, 6),
@@ -122,42 +146,3 @@ class Lines(View):
                 error=frame.is_error,
             )
         )
-
-
-def _line(seen: BusEvent, at_s: float, changed: frozenset[str], *, cut: bool) -> str:
-    """Time, id, sender to receiver, title, fields with units."""
-    cut = cut and not seen.is_alarm  # no fault is left out
-    said = ", ".join(_field_text(shown, shown.name in changed, cut=cut) for shown in seen.fields)
-    mark = "! " if seen.is_trouble else ""
-    text = f"{at_s:10.3f}  {seen.can_id:03X}  {seen.route:<9}  {mark}{seen.marked_title}"
-    return f"{text}: {said}" if said else text
-
-
-def _field_text(shown: Field, is_changed: bool, *, cut: bool) -> str:  # noqa: FBT001
-    text = shown.text
-    if cut and len(text) > _VALUE_WIDTH:
-        text = f"{text[:_VALUE_WIDTH].rstrip()} ..."
-    return f"{'*' if is_changed else ''}{shown.label} {text} {shown.unit}".rstrip()
-
-
-def _document(seen: BusEvent, at_s: float, changed: frozenset[str]) -> SeenLine:
-    return SeenLine(
-        at_s=round(at_s, 6),
-        kind=seen.kind,
-        can_id=seen.can_id,
-        command=seen.command,
-        from_=seen.sender,
-        to=seen.receiver,
-        message=seen.title,
-        trouble=seen.is_trouble,
-        fields={shown.name: shown.value for shown in seen.fields},
-        changed=sorted(changed),
-        in_dialect=seen.in_dialect,
-    )
-
-
-def _frame_text(frame: Frame) -> str:
-    words = [f"[{len(frame.data)}]", frame.data.hex(" ")]
-    words += ["29-bit id"] * frame.is_extended
-    words += ["remote request"] * frame.is_remote + ["error frame"] * frame.is_error
-    return " ".join(word for word in words if word)
