@@ -187,8 +187,7 @@ class _Place:
         except FlasherError as error:
             carried.error = error
         bundle = None if carried.record is None else carried.record.bundle
-        warning = "" if carried.keeper is None else carried.keeper.warning
-        return bench.Carried(result, carried.error, bundle, warning)
+        return bench.Carried(result, carried.error, bundle, carried.warning)
 
 
 def backup_folder() -> Path:

@@ -1,21 +1,31 @@
-"""One upgrade with everything that is kept of it: frames, a bundle when it fails, the history."""
+"""One upgrade with everything that is kept of it: frames, a bundle when it fails, and this
+computer's history. Nothing that goes wrong with these changes what it does: it is said in a
+warning.
+"""
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from typing import Final
 
 from flasher.api import Connection, Job, Watch
+from flasher.bus.detect import BUILT_IN, SOCKETCAN
+from flasher.bus.inspect_interface import VIRTUAL_KINDS
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording
-from flasher.cli.upgrade.kept import Keeper, kept
 from flasher.cli.upgrade.text import UpgradeDocument, plan_document, upgrade_document
-from flasher.errors import FlasherError
-from flasher.events import CheckMade
+from flasher.errors import ExitCode, FlasherError
+from flasher.events import CheckMade, QueryAnswered
+from flasher.history import Began, Ended, History
 from flasher.host.session import Result
+from flasher.protocol.contents import VersionInformation
+from flasher.protocol.text import printable
 
+_MOCK: Final = "the built-in mock"
 Watching = Callable[[Connection, Recording], AbstractContextManager[Watch]]
 """Begins when the bus is open, and says who watches the upgrade."""
 
@@ -36,20 +46,32 @@ class Carried:
     error: FlasherError | None = None
     """What stands for a bad end, completed."""
     took_s: float = 0.0
-    keeper: Keeper | None = None
-    """Knows whether the history has it, at the end."""
+    warning: str = ""
+    """Why the history does not have it; empty where it has."""
+    _history: History = field(default_factory=History)
+    _name: str | None = None
+    """Of the history's; None before it has begun."""
+    _serial_number: str | None = None
+    _result: Result | None = None
 
     def carry_out(
         self, connect: Callable[[], AbstractContextManager[Connection]], watching: Watching
     ) -> Result:
         """Returns the result, good or bad. Raises BusError and InterruptedByUserError."""
+        try:
+            result = self._recorded(connect, watching)
+        except BaseException as failure:
+            self._ended(failure)
+            raise
+        self._ended(None)
+        return result
+
+    def _recorded(
+        self, connect: Callable[[], AbstractContextManager[Connection]], watching: Watching
+    ) -> Result:
         job, plan = self.job, self.job.plan
-        with (
-            kept(self.output) as keeper,
-            recording(self.recorded, self.bus, self.output, target=plan.target) as record,
-        ):
-            self.record, self.keeper = record, keeper
-            keeper.record = record
+        with recording(self.recorded, self.bus, self.output, target=plan.target) as record:
+            self.record = record
             record.facts["plan"] = plan_document(plan, job.options)
             record.facts["waived"] = job.waived
             record.facts["image_sha256"] = plan.image.sha256
@@ -58,14 +80,10 @@ class Carried:
                     record.opened(connection)
                     began_at = connection.clock.now()
                     with watching(connection, record) as watch:
-                        name = "rescue" if job.options.at_power_up else "flash"
-                        keeper.began(name, job, connection.name, is_mock=self.bus.mock)
+                        self._began(connection.name)
 
                         def on_event(event: object) -> None:
-                            if isinstance(event, CheckMade):
-                                self.checks.append(event)
-                                record.facts["checks"] = self.checks
-                            keeper.heard(event)
+                            self._heard(event)
                             tell = watch.get("on_event")
                             if tell is not None:
                                 tell(event)
@@ -86,7 +104,7 @@ class Carried:
                 self.error = failure
                 self.on_failure(failure)
                 raise
-            keeper.result = result
+            self._result = result
             self.error = error = result.error()
             self.document = document = upgrade_document(
                 plan, job.options, result, self.checks, record.link_report()
@@ -97,3 +115,88 @@ class Carried:
                 self.on_failure(error)
                 record.failed(error)
         return result
+
+    def _heard(self, event: object) -> None:
+        if isinstance(event, CheckMade) and self.record is not None:
+            self.checks.append(event)
+            self.record.facts["checks"] = self.checks
+        if isinstance(event, QueryAnswered) and isinstance(event.content, VersionInformation):
+            self._serial_number = printable(str(event.content.serial_number)) or None
+
+    # -- the history -------------------------------------------------------------------------------
+
+    def _began(self, adapter: str) -> None:
+        """The upgrade begins on this adapter."""
+        image, is_mock = self.job.plan.image, self.bus.mock
+        began = Began(
+            at=_now(),
+            command="rescue" if self.job.options.at_power_up else "flash",
+            target=self.job.plan.target.name,
+            is_virtual=is_mock or _is_virtual(adapter),
+            adapter=_MOCK if is_mock else printable(adapter),
+            image=printable(image.source),
+            image_sha256=image.sha256,
+            image_size_bytes=image.size_bytes,
+            image_version=image.version,
+            waived=", ".join(self.job.waived),
+        )
+
+        def write() -> None:
+            self._name = self._history.begin(began)
+
+        self._carefully(write)
+
+    def _ended(self, failure: BaseException | None) -> None:
+        """It is over, with this exception or without one."""
+        name, result = self._name, self._result
+        if name is None:
+            return
+        error = self.error if failure is None else failure
+        bundle = None if self.record is None else self.record.bundle
+        outcome = None if result is None else result.outcome
+        ended = Ended(
+            at=_now(),
+            exit_code=int(result.exit_code if result and not failure else _exit_code(error)),
+            what=_words(error),
+            serial_number=self._serial_number,
+            previous_version=result.previous_version if result else None,
+            transferred=None if outcome is None else outcome.is_transferred,
+            completed=None if outcome is None else outcome.is_completed,
+            running_version=result.running_version if result else None,
+            needs_rescue=outcome.device_left.needs_rescue
+            if outcome
+            else getattr(error, "needs_rescue", True),
+            bundle=None if bundle is None else printable(str(bundle)),
+        )
+        self._carefully(lambda: self._history.end(name, ended))
+
+    def _carefully(self, write: Callable[[], None]) -> None:
+        try:
+            write()
+        except Exception as problem:  # noqa: BLE001  the flash is what matters
+            reason = getattr(problem, "strerror", None) or str(problem) or type(problem).__name__
+            self.warning = printable(f"no history in {self._history.path}: {reason}")
+            self.output.error_line(f"warning: {self.warning}")
+
+
+def _now() -> str:
+    return datetime.datetime.now().astimezone().isoformat(timespec="seconds")
+
+
+def _is_virtual(adapter: str) -> bool:
+    """A bus of python-can, or of the kernel, without hardware."""
+    interface, _, channel = adapter.partition(" ")
+    is_vcan = interface == SOCKETCAN and channel.startswith(tuple(VIRTUAL_KINDS))
+    return interface in BUILT_IN or is_vcan
+
+
+def _exit_code(error: BaseException | None) -> ExitCode:
+    if isinstance(error, KeyboardInterrupt):
+        return ExitCode.INTERRUPTED
+    return error.exit_code if isinstance(error, FlasherError) else ExitCode.INTERNAL
+
+
+def _words(error: BaseException | None) -> str:
+    if isinstance(error, KeyboardInterrupt):
+        return "Interrupted at once."
+    return "" if error is None else printable(getattr(error, "what", str(error)))
