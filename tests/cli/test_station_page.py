@@ -18,7 +18,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from flasher.cli.station import serving
+from flasher.cli.station import pages
 from flasher.errors import ExitCode, UsageError
 from flasher.station.records.errors import DiskFullError
 from flasher.station.records.keys import Keeping
@@ -76,7 +76,7 @@ def resumed(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
                             reasons.append(head["stopped"]["reason"])
                             client.post(f"{url}line/scan", json={"text": "RESUME"}, headers=headers)
 
-    monkeypatch.setattr(serving, "Server", Watched)
+    monkeypatch.setattr(pages, "Server", Watched)
     yield reasons
     for thread in threads:
         thread.join(10)
@@ -106,7 +106,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[Any]]:
                     data = (line for line in stream.iter_lines() if line.startswith("data: "))
                     found.extend(json.loads(line.removeprefix("data: ")) for line in data)
 
-    monkeypatch.setattr(serving, "Server", Asked)
+    monkeypatch.setattr(pages, "Server", Asked)
     yield found
     for thread in threads:
         thread.join(10)
@@ -205,9 +205,9 @@ def test_a_password_is_asked_for(flasher: Flasher, asked: list[Any], password: P
 
 def test_the_secret_of_the_sessions_is_kept_for_this_user_alone(tmp_path: Path) -> None:
     keeping = Keeping(tmp_path / "keys")
-    first = serving.kept_secret(keeping)
+    first = pages.kept_secret(keeping)
     assert len(first) > 30
-    assert serving.kept_secret(keeping) == first
+    assert pages.kept_secret(keeping) == first
     (path,) = (tmp_path / "keys").iterdir()
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
 
@@ -220,6 +220,6 @@ def test_a_full_disk_leaves_no_half_secret(tmp_path: Path, monkeypatch: pytest.M
     with monkeypatch.context() as patched:
         patched.setattr("secrets.token_urlsafe", full)
         with pytest.raises(UsageError, match="No space left"):
-            serving.kept_secret(keeping)
+            pages.kept_secret(keeping)
     assert list((tmp_path / "keys").iterdir()) == []
-    assert len(serving.kept_secret(keeping)) > 30
+    assert len(pages.kept_secret(keeping)) > 30

@@ -306,7 +306,7 @@ def pages(output: Output, web: Address, pages: PagesOptions, records: RecordsOpt
     images, audit trail. Nothing of the records is changed, and no station has to run here.
     """
     need("The supervisor pages", "web")
-    return _call("desk.serve", output, web, pages, records)
+    return _call("pages.serve", output, web, pages, records)
 
 
 @station.action("pin")

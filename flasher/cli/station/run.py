@@ -6,18 +6,15 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from flasher.cli.output import Output
 from flasher.cli.station.commands import PagesOptions, RecordsOptions, RunOptions
-from flasher.cli.station.documents import (
-    FiguresDocument,
-    StationRunDocument,
-    figures_document,
-)
+from flasher.cli.station.documents import StationRunDocument, figures_document
 from flasher.cli.station.place import operator_of, records_of
 from flasher.cli.station.scans import LineReader, ScanFile, Typing, keyboard, read_scans
 from flasher.cli.station.setup import crew_of, labels_of, scanners_of
@@ -47,7 +44,7 @@ from flasher.station.supervisor import Launch, ProcessPort
 from flasher.station.virtual_units import next_number
 
 if TYPE_CHECKING:
-    from flasher.cli.station.operator_page import OperatorView
+    from flasher.cli.station.pages import OperatorView
 
 LAUNCH: Launch = ProcessPort
 """How a socket's process is made."""
@@ -73,8 +70,10 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
     elif options.lines or os.environ.get("TERM") == "dumb":
         view = Lines(output)
     with _opened_records(options, records, config) as store:
-        session = _Session(options, pages, output, store, view, crew, config, is_virtual=is_virtual)
-        session.is_temporary = _is_temporary(options, records)
+        session = _Session(
+            options, pages, output, store, view, crew, config, is_virtual,
+            is_temporary=_is_temporary(options, records),
+        )  # fmt: skip
         first = 1
         if is_virtual:  # numbers that these records do not know yet
             rows, part = store.read.table(), recipe.recipe.part
@@ -173,44 +172,36 @@ def _opened_records(
             yield store
 
 
+@dataclass
 class _Session:
     """A station at work, from its start to its end."""
 
-    station: Station
+    options: RunOptions
+    pages: PagesOptions
+    output: Output
+    store: Store
+    view: View
+    crew: Crew | None
+    config: StationConfig
+    is_virtual: bool
+    is_temporary: bool
+    """The records are gone afterwards."""
+    station: Station = field(init=False)
+    file: ScanFile | None = None
+    _pipe: LineReader | None = None
+    _typing: Typing | None = None
+    _was_submitted: bool = False
+    _is_used_up: bool = False
+    _failure: FlasherError | None = None
+    _page: OperatorView | None = None
+    _is_begun: bool = False
 
-    def __init__(
-        self,
-        options: RunOptions,
-        pages: PagesOptions,
-        output: Output,
-        store: Store,
-        view: View,
-        crew: Crew | None,
-        config: StationConfig,
-        *,
-        is_virtual: bool,
-    ) -> None:
-        self.config = config
-        self.view = view
-        self.file: ScanFile | None = None
-        by_hand = options.scan_by_hand or crew is not None or bool(config.scanner)
-        self.scans_itself = is_virtual and options.scans is None and not by_hand
-        self._people = () if crew is None else crew.people
-        self._has_pins = crew is not None and crew.has_pins
-        self._options = options
-        self._pages = pages
-        self._output = output
-        self._store = store
-        self._pipe: LineReader | None = None
-        self._typing: Typing | None = None
-        self._was_submitted = False
-        self._is_used_up = False
-        self._is_stopped = False
-        self._failure: FlasherError | None = None
-        self._page: OperatorView | None = None
-        self._is_begun = False
-        self.is_temporary = False
-        """The records are gone afterwards."""
+    @property
+    def scans_itself(self) -> bool:
+        """Nobody has to scan the labels of its virtual units."""
+        options = self.options
+        by_hand = options.scan_by_hand or self.crew is not None or bool(self.config.scanner)
+        return self.is_virtual and options.scans is None and not by_hand
 
     # -- at work ----------------------------------------------------------------------------------
 
@@ -220,7 +211,7 @@ class _Session:
         """
         try:
             with ExitStack() as stack:
-                stopped = stack.enter_context(stop_on_signal(self._say_stop, self._stop_now))
+                stopped = stack.enter_context(stop_on_signal(self._first_stop, self._second_stop))
                 self._open_page(stack)
                 stack.enter_context(self.view.on_screen())
                 self._open_scans(stack)
@@ -230,19 +221,19 @@ class _Session:
 
     def _open_page(self, stack: ExitStack) -> None:
         """Serve the pages, where they are asked for. Raises UsageError."""
-        address = self._options.web
+        address = self.options.web
         if address is None:
             return
-        from flasher.cli.station.operator_page import operator_page  # noqa: PLC0415  an extra
+        from flasher.cli.station.pages import operator_page  # noqa: PLC0415  an extra
 
         page = operator_page(
-            self._pages,
+            self.pages,
             address,
             self.station,
             self.view.board,
             self.config,
-            keeping=None if self.is_temporary else self._store.signer.keeping,
-            people=self._people,
+            keeping=None if self.is_temporary else self.store.signer.keeping,
+            people=() if self.crew is None else self.crew.people,
         )
         self._page, url = stack.enter_context(page)
         self.view.board.page = url
@@ -258,7 +249,7 @@ class _Session:
         if not self._is_begun:
             self._is_begun = True
             if (page := self.view.board.page) and not isinstance(self.view, Table):
-                self._output.progress(f"The operator page: {page}")
+                self.output.progress(f"The operator page: {page}")
         if self._typing is not None:
             typed = self._typing.text
             self.view.typed = "*" * len(typed) if self.view.board.pin_of else typed
@@ -275,7 +266,8 @@ class _Session:
         if sys.stdin is None:
             return
         if sys.stdin.isatty():
-            if isinstance(self.view, Table) or self._has_pins:  # what is typed is not echoed
+            has_pins = self.crew is not None and self.crew.has_pins
+            if isinstance(self.view, Table) or has_pins:  # what is typed is not echoed
                 self._typing = Typing(self.station.submit)
                 stack.enter_context(keyboard(self._typing))
             else:
@@ -284,17 +276,16 @@ class _Session:
             self._pipe = LineReader(sys.stdin, self.station.submit)
             self._pipe.start()
 
-    def _stop_now(self) -> None:
+    def _second_stop(self) -> None:
         """A second Ctrl-C; called in the handler of the signal."""
         # No exception: it could tear the station's turn, and a socket would wait for its answer.
         self._failure = _stopped_now()
         self.station.abort_all()
 
-    def _say_stop(self) -> None:
-        self._is_stopped = True
+    def _first_stop(self) -> None:
         text = "No further unit is begun; those that run are finished. Ctrl-C again stops them."
         self.view.board.said, self.view.board.is_refusal = text, False
-        self._output.progress(text)
+        self.output.progress(text)
         self.view.refresh()
 
     def _is_over(self, *, is_stopped: bool) -> bool:
@@ -332,7 +323,7 @@ class _Session:
         if self.file is not None:
             return self.file.is_used_up
         if self.scans_itself:
-            wanted = self._options.units
+            wanted = self.options.units
             return wanted is not None and self.view.board.arrivals >= wanted
         return self._pipe is not None and self._pipe.is_at_end
 
@@ -348,31 +339,24 @@ class _Session:
         board = self.view.board
         code = ExitCode.PARTIAL if board.bad_units or self._not_done() else ExitCode.OK
         for line in self._summary():
-            self._output.result(line)
-        error = self._failure or self._line_error() or self._incomplete()
+            self.output.result(line)
+        error, stopped = self._failure, board.stopped
+        if error is None and stopped is not None:
+            is_record = stopped.code == codes.RECORD_NOT_SAVED.name
+            kind = RecordError if is_record else UsageError
+            error = kind(f"The line was stopped: {stopped.reason}", remedy=stopped.remedy)
+        # A list of scans has an end; a shift has none.
+        is_list = self.file is not None or bool(self.options.units)
+        if error is None and is_list and not self._is_used_up:
+            error = InterruptedByUserError(
+                "Ended before all units were done.",
+                remedy="Start it again with those that are left.",
+            )
         if error is not None:
-            self._output.failure(error, self._document())
+            self.output.failure(error, self._document())
             return error.exit_code
-        self._output.document(self._document(), exit_code=code)
+        self.output.document(self._document(), exit_code=code)
         return code
-
-    def _line_error(self) -> FlasherError | None:
-        """The error for a line that was stopped at the end."""
-        stopped = self.view.board.stopped
-        if stopped is None:
-            return None
-        is_record = stopped.code == codes.RECORD_NOT_SAVED.name
-        kind = RecordError if is_record else UsageError
-        return kind(f"The line was stopped: {stopped.reason}", remedy=stopped.remedy)
-
-    def _incomplete(self) -> FlasherError | None:
-        """The error for a list of scans that was not finished; a shift has no such end."""
-        is_list = self.file is not None or bool(self._options.units)
-        if not is_list or self._is_used_up:
-            return None
-        return InterruptedByUserError(
-            "Ended before all units were done.", remedy="Start it again with those that are left."
-        )
 
     def _not_done(self) -> list[str]:
         """Labels of the file that were refused, and have no run."""
@@ -396,24 +380,21 @@ class _Session:
             last = next(each for each in reversed(board.refused) if each.text == label)
             yield printable(f"{'refused':<8} {label}: {last.code}: {last.reason} {last.remedy}")
         if not self.is_temporary:
-            yield f"records: {self._store.database.location.shown}"
-
-    def _figures(self) -> FiguresDocument | None:
-        try:
-            return figures_document(self.station.figures)
-        except RecordError:
-            return None
+            yield f"records: {self.store.database.location.shown}"
 
     def _document(self) -> StationRunDocument:
         board, recipe = self.view.board, self.station.recipe.recipe
-        location = self._store.database.location
+        location = self.store.database.location
+        figures = None
+        with suppress(RecordError):
+            figures = figures_document(self.station.figures)
         return StationRunDocument(
-            station=self._store.station,
+            station=self.store.station,
             recipe=recipe.name,
             revision=recipe.revision,
             records="" if self.is_temporary else str(location.file or Path(location.shown)),
             is_complete=self._is_used_up,
-            figures=self._figures(),
+            figures=figures,
             units=list(board.ended.values()),
             refused=list(board.refused),
         )

@@ -1,0 +1,302 @@
+"""The pages of a station: the operator's of `flasher station run --web` with the supervisor's
+beside it, the supervisor's alone of `flasher station pages`, and who may see them.
+"""
+
+from __future__ import annotations
+
+import hmac
+import os
+import secrets
+import socket
+import time
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import closing, contextmanager
+from datetime import datetime
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+from starlette.routing import BaseRoute, Route
+
+from flasher.cli.output import Output
+from flasher.cli.station.commands import Address, PagesOptions, RecordsOptions
+from flasher.cli.station.place import open_to_read
+from flasher.cli.stop import stop_on_signal
+from flasher.errors import ErrorCode, ExitCode, UsageError
+from flasher.files import read
+from flasher.said import say
+from flasher.station.board import Board
+from flasher.station.config import StationConfig, load_config
+from flasher.station.events import RunEnded, StationEvent
+from flasher.station.health import Watch
+from flasher.station.people import BADGES, Person, role_of
+from flasher.station.records.keys import Keeping
+from flasher.station.records.model import RunFilter, RunState, utc_moment
+from flasher.station.station import Station
+from flasher.station.tally import DEFAULT_SHIFTS, EndedRun, Tally
+from flasher.web.desk import Desk, DeskPages
+from flasher.web.guard import Badges, application
+from flasher.web.operator import LINE, Lot, OperatorPage, Screen
+from flasher.web.pages import Pages
+from flasher.web.server import LOOPBACK, Server, Tls
+from flasher.web.supervisor import PAGES, open_supervisor, place_of
+
+_TURN_S: Final = 0.1
+PASSWORD_MIN: Final = 8
+_PASSWORD_FILE_MAX_SIZE: Final = 4096
+"""In bytes."""
+_ANY: Final = frozenset({"0.0.0.0", "::"})  # noqa: S104  compared, not bound
+_SECRET_MAX_SIZE: Final = 200
+
+
+# -- the operator's -------------------------------------------------------------------------------
+
+
+class OperatorView:
+    """Hands the events and turns of a station to the screen; called in the station's thread."""
+
+    def __init__(self, screen: Screen, station: Station, board: Board) -> None:
+        self._screen = screen
+        self._station = station
+        self._board = board
+        self._lot = ""
+        self._good: dict[str, bool] = {}
+        """Units of the lot, and whether each passed in the end."""
+
+    def show(self, event: StationEvent) -> None:
+        """Show an event that the board has applied."""
+        if isinstance(event, RunEnded):
+            self._good[event.serial] = event.outcome is RunState.PASS
+        self._screen.show(event, self._board)
+
+    def turn(self) -> None:
+        """Once in each turn of the station's loop."""
+        line, board = self._station.line, self._board
+        rule = self._station.recipe.recipe
+        if rule.lot.quantity_max and line.lot != self._lot:
+            runs = self._station.store.read.table(RunFilter(lot=line.lot, part=rule.part))
+            self._good = {str(run["serial"]): run["state"] == RunState.PASS for run in runs}
+        self._lot = line.lot
+        lot = Lot(line.lot, rule.lot.quantity_max or 0, sum(self._good.values()))
+        names = (board.station, board.recipe, board.part)
+        operator = line.operator or say("nobody: scan a badge")
+        if not board.has_badges:
+            operator = say("{name} (no badges)", name=line.operator)
+        self._screen.turn(board, station=names, operator=operator, lot=lot)
+
+
+@contextmanager
+def operator_page(
+    options: PagesOptions,
+    address: Address,
+    station: Station,
+    board: Board,
+    config: StationConfig,
+    *,
+    keeping: Keeping | None,
+    people: Sequence[Person],
+) -> Iterator[tuple[OperatorView, str]]:
+    """Serve the page, and those of the supervisor beside it, while the block runs; gives its view
+    and its address. `keeping`: where the secret of the sessions is kept, so that pages go on after
+    a restart; None for no place. `people`: those with a badge.
+
+    Raises UsageError.
+    """
+    tally = Tally(config.shifts)
+    began = tally.began(datetime.now().astimezone())
+    store = station.store
+    for row in store.read.table(RunFilter(since=began)):
+        state = RunState(str(row["state"]))
+        if row["station"] == store.station and state is not RunState.RUNNING:
+            at = utc_moment(str(row["begun_at"]))
+            tally.add(EndedRun(at, str(row["serial"]), state, str(row["code"])))
+    watch = Watch(store.files.folder, station.clock.utc, station.clock.monotonic_s)
+    screen = Screen(tally, watch)
+    pages = Pages(options.language)
+    operator = OperatorPage(pages, screen.feed, station.submit, sound_volume=config.sound_volume)
+    view = OperatorView(screen, station, board)
+    # In processes of their own: a page takes no time from the station.
+    desk = Desk(partial(open_supervisor, *place_of(store), config.shifts))
+    routes = [*operator.routes, *DeskPages(pages, desk.ask, PAGES).routes]
+    server = served(
+        options,
+        address,
+        routes,
+        pages=pages,
+        keeping=keeping,
+        people=people,
+        is_supervised=lambda path: path != "/" and not path.startswith(LINE),
+    )
+    with closing(desk), server as url:
+        try:
+            yield view, url
+        finally:
+            screen.feed.close()
+
+
+# -- the supervisor's alone -----------------------------------------------------------------------
+
+
+def serve(output: Output, address: Address, options: PagesOptions, records: RecordsOptions) -> int:
+    config = None if records.sockets is None else load_config(records.sockets)
+    shifts = DEFAULT_SHIFTS if config is None else config.shifts
+    badges = "" if config is None else config.badges
+    people = BADGES.load(Path(badges)).person if badges else ()
+    with closing(open_to_read(records)) as store:  # what is wrong with them is said before
+        place = place_of(store)
+    pages = Pages(options.language)
+    desk = Desk(partial(open_supervisor, *place, shifts))
+    routes = [Route("/", _start), *DeskPages(pages, desk.ask, PAGES).routes]
+    with (
+        closing(desk),
+        stop_on_signal() as stopped,
+        served(
+            options,
+            address,
+            routes,
+            pages=pages,
+            keeping=None,
+            people=people,
+            is_supervised=lambda _path: True,
+        ) as url,
+    ):
+        desk.begin()
+        output.progress(f"The supervisor pages: {url}; Ctrl-C ends them")
+        while not stopped():
+            time.sleep(_TURN_S)
+    return ExitCode.OK
+
+
+async def _start(_request: Request) -> Response:
+    return RedirectResponse("/runs", 303)
+
+
+# -- who may see them ------------------------------------------------------------------------------
+
+
+@contextmanager
+def served(
+    options: PagesOptions,
+    address: Address,
+    routes: Collection[BaseRoute],
+    *,
+    pages: Pages,
+    keeping: Keeping | None,
+    people: Sequence[Person] = (),
+    is_supervised: Callable[[str], bool],
+) -> Iterator[str]:
+    """Serve pages while the block runs; gives their address. `keeping`: where the secret of the
+    sessions is kept; None: they end with the server. `people`: those with a badge, of whom
+    supervisors alone see the pages that `is_supervised` tells by their path; without people
+    everybody sees them. Raises UsageError.
+    """
+    password, tls = _password(options), _tls(options)
+    _check_open(options, address, has_password=bool(password or people), has_tls=tls is not None)
+    badges = None
+    if people:
+        is_far = address.host not in LOOPBACK
+        badges = Badges(
+            # A badge alone is no more than paper: it does not stand for a password.
+            partial(role_of, people, needs_pin=is_far or bool(password)),
+            is_supervised,
+            are_for_all=is_far and not password,
+        )
+    secret = secrets.token_urlsafe(32) if keeping is None else kept_secret(keeping)
+    # Who signed in goes on after a restart, unless the password or a badge is another one now.
+    known = repr((password, [(each.code, each.role.value, each.pin) for each in people]))
+    app = application(
+        routes,
+        pages=pages,
+        hosts=_hosts(address),
+        secret=secret,
+        signed=hmac.digest(secret.encode(), known.encode(), "sha256").hex(),
+        now=time.monotonic,
+        password=password,
+        badges=badges,
+        is_tls=tls is not None,
+    )
+    with Server(app, address.host, address.port, tls) as server:
+        yield server.url
+
+
+def _hosts(address: Address) -> set[str]:
+    """Names by which a browser may call this server."""
+    hosts = {address.host, *LOOPBACK, "[::1]"}
+    if address.host not in LOOPBACK:
+        hosts |= {socket.gethostname(), socket.getfqdn(), f"[{address.host}]"}
+    if address.host in _ANY:
+        hosts |= {str(info[4][0]) for info in socket.getaddrinfo(socket.gethostname(), None)}
+    return hosts
+
+
+def _check_open(
+    options: PagesOptions, address: Address, *, has_password: bool, has_tls: bool
+) -> None:
+    """Raises UsageError for pages that other computers could reach without TLS or password."""
+    if address.host in LOOPBACK:
+        return
+    if not (has_tls or options.web_insecure):
+        raise UsageError(
+            f"Other computers could reach the pages on {address.host}, and read along.",
+            remedy="Give --web-certificate and --web-key; --web-insecure does without.",
+            code=ErrorCode.PAGES_NOT_SERVED,
+        )
+    if not has_password:
+        raise UsageError(
+            f"Other computers could reach the pages on {address.host}, without a password.",
+            remedy="Give --web-password FILE, or a badge table (--badges).",
+            code=ErrorCode.PAGES_NOT_SERVED,
+        )
+
+
+def _tls(options: PagesOptions) -> Tls | None:
+    certificate, key = options.web_certificate, options.web_key
+    if (certificate is None) != (key is None):
+        raise UsageError(
+            "--web-certificate and --web-key belong together.",
+            remedy="Give both.",
+            code=ErrorCode.PAGES_NOT_SERVED,
+        )
+    return None if certificate is None or key is None else Tls(certificate, key)
+
+
+def _password(options: PagesOptions) -> str:
+    path = options.web_password
+    if path is None:
+        return ""
+    data = read(path, _PASSWORD_FILE_MAX_SIZE, what="file of the password")
+    text = data.decode("utf-8", "replace").partition("\n")[0].strip()
+    if len(text) < PASSWORD_MIN:
+        raise UsageError(
+            f"The password of the pages has less than {PASSWORD_MIN} characters.",
+            where="--web-password",
+            remedy="Write a longer one into the first line of the file.",
+            code=ErrorCode.PAGES_NOT_SERVED,
+        )
+    return text
+
+
+def kept_secret(keeping: Keeping) -> str:
+    """What signs the sessions of the pages, for this user alone; made where there is none."""
+    path: Path = keeping.keys_folder / "pages.secret"
+    try:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            with os.fdopen(handle, "w", encoding="ascii") as file:
+                file.write(secrets.token_urlsafe(32))
+        except OSError:
+            path.unlink()  # an empty one would be found at every start from now on
+            raise
+    except FileExistsError:
+        pass
+    except OSError as error:
+        raise UsageError(
+            f"{path} cannot be written: {error.strerror or error}.",
+            remedy="Give another place with --keys.",
+            code=ErrorCode.FILE_NOT_WRITTEN,
+        ) from error
+    found = read(path, _SECRET_MAX_SIZE, what="secret of the pages").decode("ascii", "replace")
+    return found or secrets.token_urlsafe(32)
