@@ -103,13 +103,14 @@ class Output:
         """Help, laid out for the window; it is printed when JSON is wanted too."""
         _print_stdout("\n".join(line.rstrip() for line in text.rstrip().splitlines()))
 
-    def document(self, document: object, *, exit_code: ExitCode = ExitCode.OK) -> None:
-        """The one JSON document of a command, the last line of its output, in its envelope."""
-        self._print_document(document, exit_code)
-
-    def _print_document(
-        self, document: object, exit_code: ExitCode, error: ErrorDocument | None = None
+    def document(
+        self,
+        document: object,
+        *,
+        exit_code: ExitCode = ExitCode.OK,
+        error: ErrorDocument | None = None,
     ) -> None:
+        """The one JSON document of a command, the last line of its output, in its envelope."""
         if not self.json_wanted:
             return
         around = Envelope(SCHEMA_VERSION, self.command, exit_code == ExitCode.OK, exit_code)
@@ -165,7 +166,7 @@ class Output:
         if self.ending is not None:
             self.verdict(self.ending(error))
         said = document_of(ErrorDocument, error, kind=type(error).__name__)
-        self._print_document(known, error.exit_code, said)
+        self.document(known, exit_code=error.exit_code, error=said)
 
 
 def _plain_stderr(text: str) -> None:

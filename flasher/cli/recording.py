@@ -14,7 +14,7 @@ from __future__ import annotations
 import os
 import traceback
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -136,8 +136,7 @@ def recording(
     record = Recording(target, facts["bitrate_bps"])
     record.facts |= facts
     try:
-        with ExitStack() as stack:
-            stack.enter_context(_trace_file(options, record, output))
+        with _trace_file(options, record, output):
             yield record
     except KeyboardInterrupt:
         record.failed(InterruptedByUserError("Interrupted at once."))
@@ -187,20 +186,13 @@ def _trace_file(options: RecordingOptions, record: Recording, output: Output) ->
 def _leave_bundle(
     options: RecordingOptions, output: Output, record: Recording, error: BaseException | None
 ) -> None:
-    own = isinstance(error, FlasherError) and error.exit_code not in _WITH_BUNDLE
-    if own and not record.is_alone:
-        return
-    if not record.flight.frames:
+    is_usage = isinstance(error, FlasherError) and error.exit_code not in _WITH_BUNDLE
+    if (is_usage and not record.is_alone) or not record.flight.frames:
         return
     from flasher.trace.bundle import keep_last, write_bundle  # noqa: PLC0415  loads python-can
 
     folder = bundle_folder(options.bundle_dir)
-    link = record.link_report()
-    facts = {
-        **record.facts,
-        "error": error and _error(error),
-        "link": link,
-    }
+    facts = {**record.facts, "error": error and _error(error), "link": record.link_report()}
     is_own = options.bundle_dir is None and not os.environ.get(BUNDLE_FOLDER)
     try:
         if is_own:

@@ -54,14 +54,16 @@ def report_lines(report: RunReport, replays: ByResult, *, verbose: bool = False)
         f"seed {report.seed}"
     )
     yield ""
-    yield from _groups(report)
+    yield from columns(
+        (group, group_title(group), count_text(result for _, result in members))
+        for group, members in report.by_group().items()
+    )
     cases = report.by_case()
     if verbose:
         yield ""
-        yield from (
-            printable(f"{result.verdict.text:<12}  {text.id}  {text.title}{_untried(result)}")
-            for text, result in cases
-        )
+        for text, result in cases:
+            why = f": {result.reason}" if result.verdict is CaseVerdict.PASS_IN_PART else ""
+            yield printable(f"{result.verdict.text:<12}  {text.id}  {text.title}{why}")
     for status in _TOLD:
         lines = [
             line
@@ -86,18 +88,6 @@ def report_lines(report: RunReport, replays: ByResult, *, verbose: bool = False)
         yield report.in_full
     verdict = "passed" if report.ok else "NOT PASSED"
     yield f"{verdict}: {report.headline}; {duration(report.duration_s)} on the bus"
-
-
-def _untried(result: CaseResult) -> str:
-    return f": {result.reason}" if result.verdict is CaseVerdict.PASS_IN_PART else ""
-
-
-def _groups(report: RunReport) -> Iterator[str]:
-    rows = (
-        (group, group_title(group), count_text(result for _, result in members))
-        for group, members in report.by_group().items()
-    )
-    yield from columns(rows)
 
 
 def _told(text: CaseText, result: CaseResult, replays: ByResult, *, verbose: bool) -> Iterator[str]:

@@ -7,8 +7,6 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
-import click
-
 from flasher import api, events
 from flasher.cli import values
 from flasher.cli.documents import document_of, to_json
@@ -86,22 +84,14 @@ class VariantsDocument:
 DOCUMENTS: Final = (MockDocument, VariantsDocument)
 
 
-def _settings(_ctx: click.Context) -> list[str]:
-    """What a shell offers for --set."""
-    return [f"{key}=" for key, _, _ in describe_options()]
+_SETTINGS: Final = describe_options()
 
 
-def _variants(_ctx: click.Context) -> list[str]:
-    """What a shell offers for --variant."""
-    return list(VARIANTS)
-
-
-def _examples() -> str:
-    rows = [f"  {key:<24} {values}\n      {summary}" for key, values, summary in describe_options()]
-    return _EXAMPLES + "\n".join(rows)
-
-
-@command(epilog=_examples(), exit_codes=(ExitCode.BUS,))
+@command(
+    epilog=_EXAMPLES
+    + "\n".join(f"  {key:<24} {allowed}\n      {text}" for key, allowed, text in _SETTINGS),
+    exit_codes=(ExitCode.BUS,),
+)
 @target_option(required=False)
 @option(
     _SAVE_IMAGE, metavar="FILE", type=values.FilePath("bin", gives=Path), panel="device model",
@@ -113,7 +103,7 @@ def _examples() -> str:
 )  # fmt: skip
 @option(
     "--set", "choices", multiple=True, metavar="KEY=VALUE", panel="device model", brief=True,
-    shell_complete=values.offers(_settings),
+    shell_complete=values.offers(lambda _ctx: (f"{key}=" for key, _, _ in _SETTINGS)),
     help="set a choice of the device; may be repeated, see below",
 )  # fmt: skip
 @option(
@@ -121,7 +111,8 @@ def _examples() -> str:
     help="serve as a whole bicycle; what is printed is about the target",
 )  # fmt: skip
 @option(
-    "--variant", metavar="NAME", panel="device model", shell_complete=values.offers(_variants),
+    "--variant", metavar="NAME", panel="device model",
+    shell_complete=values.offers(lambda _ctx: VARIANTS),
     help="serve as a device that is wrong in one thing, see --list-variants",
 )  # fmt: skip
 @option(

@@ -175,19 +175,17 @@ def _document(examination: Examination) -> DoctorDocument:
         health=None
         if heard is None
         else document_of(HealthDocument, heard.health, error_frames=heard.traffic.error_frames),
-        traffic=None if heard is None else _traffic_document(heard),
-    )
-
-
-def _traffic_document(heard: Listened) -> TrafficDocument:
-    return TrafficDocument(
-        listened_s=heard.duration_s,
-        listen_only=heard.is_silent,
-        frames=heard.traffic.frames,
-        frames_per_s=round(heard.frames_per_s, 1),
-        bus_load=round(heard.load, 4),
-        nodes=sorted(node.name.lower() for node in heard.survey.heard),
-        foreign_frames=heard.foreign_frames,
+        traffic=None
+        if heard is None
+        else TrafficDocument(
+            listened_s=heard.duration_s,
+            listen_only=heard.is_silent,
+            frames=heard.traffic.frames,
+            frames_per_s=round(heard.frames_per_s, 1),
+            bus_load=round(heard.load, 4),
+            nodes=sorted(node.name.lower() for node in heard.survey.heard),
+            foreign_frames=heard.foreign_frames,
+        ),
     )
 
 

@@ -90,9 +90,10 @@ def explain(
             read += [source / name for name in (TRACE, OLDER_TRACE, REPORT)]
         check_not_read(html, _HTML, read)
     story = explain_path(source, bitrate_bps=bitrate, everything=everything)
-    paint = _painted if takes_colour(sys.stdout) else str
+    is_coloured = takes_colour(sys.stdout)
     for line in story_lines(story, packets=packets):
-        output.result(paint(line))
+        is_bad = "  ! " in line or line.endswith("  none")
+        output.result(painted(line, "red") if is_coloured and is_bad else line)
     if html is not None:
         from flasher.report.explain_page import render  # noqa: PLC0415  loads jinja2
 
@@ -100,12 +101,6 @@ def explain(
         output.progress(f"page: {printable(str(html))}")
     output.document(ExplainDocument(story=story))
     return ExitCode.OK
-
-
-def _painted(line: str) -> str:
-    """A line for a terminal: what went wrong is red."""
-    is_bad = "  ! " in line or line.endswith("  none")
-    return painted(line, "red") if is_bad else line
 
 
 def _source(trace: Path | None, *, last: bool) -> Path:

@@ -9,6 +9,7 @@ import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -61,6 +62,9 @@ class Finding:
     fix: tuple[str, ...] = ()
 
 
+_ok, _note, _warning, _problem = (partial(Finding, severity) for severity in Severity)
+
+
 # -- python-can ------------------------------------------------------------------------------------
 
 
@@ -69,22 +73,19 @@ def setup_findings(fallback: Fallback | None) -> Iterator[Finding]:
     import can  # noqa: PLC0415  slow
     import can.util  # noqa: PLC0415
 
-    yield Finding(Severity.OK, "python-can", f"python-can {can.__version__}")
+    yield _ok("python-can", f"python-can {can.__version__}")
     for name in can.util.CONFIG_FILES:
         path = Path(name).expanduser()
         if path.is_file():
-            what = f"the configuration file {printable(str(path))} is in effect"
-            yield Finding(Severity.NOTE, "python-can", what)
+            yield _note("python-can", f"the configuration file {printable(str(path))} is in effect")
     for variable in _VARIABLES:
         if os.environ.get(variable):
-            what = f"{variable}={printable(os.environ[variable])} is set"
-            yield Finding(Severity.NOTE, "python-can", what)
+            yield _note("python-can", f"{variable}={printable(os.environ[variable])} is set")
     if fallback is not None:
         named = " ".join(
             str(fallback.bus[k]) for k in ("interface", "channel") if k in fallback.bus
         )
-        what = f"{fallback.source} names {printable(named)}"
-        yield Finding(Severity.NOTE, "python-can", what)
+        yield _note("python-can", f"{fallback.source} names {printable(named)}")
 
 
 def package_findings(interface: str) -> Iterator[Finding]:
@@ -93,14 +94,13 @@ def package_findings(interface: str) -> Iterator[Finding]:
     if needed is not None and importlib.util.find_spec(needed[1]) is None:
         extra, module = needed
         what = f"the package {module!r}, which the interface {interface} needs, is not installed"
-        yield Finding(Severity.PROBLEM, "python-can", what, (f"pip install 'python-can[{extra}]'",))
+        yield _problem("python-can", what, (f"pip install 'python-can[{extra}]'",))
 
 
 def bit_rate_findings(bitrate_bps: int, dialect: Dialect) -> Iterator[Finding]:
     """A bit rate that was asked for against the one of the dialect."""
     if bitrate_bps != dialect.bitrate_bps:
-        yield Finding(
-            Severity.WARNING,
+        yield _warning(
             "adapter",
             f"{bitrate_bps / 1000:g} kbit/s is configured, {dialect.name} runs at "
             f"{dialect.bitrate_bps / 1000:g} kbit/s",
@@ -116,40 +116,38 @@ def adapter_findings(detected: Detected) -> Iterator[Finding]:
     for found in detected.found[:_SHOWN_AT_MOST]:
         details = " ".join(f"{key}={value}" for key, value in found.details.items())
         shown = printable(f"{found.interface} {found.channel} {details}".strip())
-        yield Finding(Severity.OK, "adapters", f"detected {shown}")
+        yield _ok("adapters", f"detected {shown}")
     if not detected.found:
-        yield Finding(
-            Severity.NOTE,
+        yield _note(
             "adapters",
             "no adapter is detected; not every back end can tell (slcan and gs_usb cannot)",
             ("flasher adapters",),
         )
     if detected.hung:
         names = ", ".join(detected.hung)
-        yield Finding(Severity.NOTE, "adapters", f"no answer in time from the back ends {names}")
+        yield _note("adapters", f"no answer in time from the back ends {names}")
     for name, said in detected.failed.items():
         text = printable(said)
-        yield Finding(Severity.NOTE, "adapters", f"the back end {name} fails: {text}")
+        yield _note("adapters", f"the back end {name} fails: {text}")
 
 
 def opened_finding(name: str, *, is_silent: bool) -> Finding:
     """The adapter was opened."""
     how = "listens without acknowledging" if is_silent else "acknowledges as usual"
-    return Finding(Severity.OK, "adapter", f"{printable(name)} opens and {how}")
+    return _ok("adapter", f"{printable(name)} opens and {how}")
 
 
 def opening_finding(error: BusError) -> Finding:
     """Why the adapter cannot be opened."""
     cause = f" ({printable(error.cause)})" if error.cause else ""
     what = f"{printable(error.what).rstrip('.')}{cause}"
-    return Finding(Severity.PROBLEM, "adapter", what, (printable(error.remedy),))
+    return _problem("adapter", what, (printable(error.remedy),))
 
 
 def unchosen_finding(detected: Detected) -> Finding:
     """No adapter was named, on the command line or elsewhere: how to choose one."""
     ways = [f"flasher doctor {printable(each.arguments)}" for each in detected.found]
-    return Finding(
-        Severity.PROBLEM,
+    return _problem(
         "adapter",
         "no adapter is chosen: neither -i, nor the variable CAN_INTERFACE, nor a configuration "
         "file of python-can, nor [bus] of flasher.toml names one",
@@ -160,7 +158,7 @@ def unchosen_finding(detected: Detected) -> Finding:
 def nameless_finding() -> Finding:
     """SocketCAN without a channel listens to all interfaces, and can send to none."""
     what = "no channel is named: without one, SocketCAN can send nothing"
-    return Finding(Severity.PROBLEM, "interface", what, (_LIST_INTERFACES, _EXAMPLES[0]))
+    return _problem("interface", what, (_LIST_INTERFACES, _EXAMPLES[0]))
 
 
 def interface_findings(
@@ -169,9 +167,9 @@ def interface_findings(
     """A SocketCAN interface against what flasher needs of it."""
     name = printable(channel)
     if seen is Unseen.CANNOT_TELL:
-        yield Finding(Severity.NOTE, "interface", f"{name}: this system tells nothing about it")
+        yield _note("interface", f"{name}: this system tells nothing about it")
     elif seen is Unseen.MISSING:
-        yield Finding(Severity.PROBLEM, "interface", f"there is no interface {name}", _make(name))
+        yield _problem("interface", f"there is no interface {name}", _make(name))
     elif isinstance(seen, Interface):
         yield from _kind(seen, name, bitrate_bps)
 
@@ -184,22 +182,17 @@ def _make(name: str) -> tuple[str, ...]:
 
 def _kind(seen: Interface, name: str, bitrate_bps: int) -> Iterator[Finding]:
     if not seen.is_can:
-        yield Finding(
-            Severity.PROBLEM,
-            "interface",
-            f"{name} is no CAN interface",
-            (_LIST_INTERFACES,),
-        )
+        yield _problem("interface", f"{name} is no CAN interface", (_LIST_INTERFACES,))
         return
     is_virtual = seen.kind in VIRTUAL_KINDS
     if not seen.is_up:
         start = f"ip link set {name} up" if is_virtual else start_command(name, bitrate_bps)
-        yield Finding(Severity.PROBLEM, "interface", f"{name} is down", (start,))
+        yield _problem("interface", f"{name} is down", (start,))
     else:
-        yield Finding(Severity.OK, "interface", f"{name} is up")
+        yield _ok("interface", f"{name} is up")
     if is_virtual:
         what = f"{name} is virtual ({seen.kind}): no wire, no bit rate, no acknowledgement"
-        yield Finding(Severity.NOTE, "interface", what)
+        yield _note("interface", what)
         return
     yield from _bit_rate(seen, name, bitrate_bps)
     yield from _modes(seen, name)
@@ -218,16 +211,15 @@ def _bit_rate(seen: Interface, name: str, bitrate_bps: int) -> Iterator[Finding]
         if seen.is_up:
             what = f"the bit rate of {name} is not told; {wanted} is needed"
             fix = (f"ip -details link show {name}",)
-            yield Finding(Severity.NOTE, "interface", what, fix)
+            yield _note("interface", what, fix)
     elif seen.bitrate_bps != bitrate_bps:
-        yield Finding(
-            Severity.PROBLEM,
+        yield _problem(
             "interface",
             f"{name} runs at {seen.bitrate_bps / 1000:g} kbit/s, {wanted} is needed",
             _again(name, f"bitrate {bitrate_bps}", "restart-ms 100"),
         )
     else:
-        yield Finding(Severity.OK, "interface", f"{name} runs at {wanted}")
+        yield _ok("interface", f"{name} runs at {wanted}")
 
 
 def _modes(seen: Interface, name: str) -> Iterator[Finding]:
@@ -242,13 +234,12 @@ def _modes(seen: Interface, name: str) -> Iterator[Finding]:
             yield Finding(severity, "interface", what, _again(name, f"{mode.lower()} off"))
     if "FD" in seen.modes:
         what = f"{name} takes CAN FD; the protocol is classic CAN, which works there as well"
-        yield Finding(Severity.NOTE, "interface", what)
+        yield _note("interface", what)
 
 
 def _queue_and_restart(seen: Interface, name: str) -> Iterator[Finding]:
     if seen.restart_ms == 0:
-        yield Finding(
-            Severity.WARNING,
+        yield _warning(
             "interface",
             f"{name} stays off the bus after a bus-off (restart-ms 0)",
             _again(name, "restart-ms 100"),
@@ -256,7 +247,7 @@ def _queue_and_restart(seen: Interface, name: str) -> Iterator[Finding]:
     if seen.queue_frames is not None and seen.queue_frames < FRAMES_PER_PACKET:
         what = f"the transmit queue of {name} holds {counted(seen.queue_frames, 'frame')}, a packet"
         what += f" has {FRAMES_PER_PACKET}: flasher waits for room, nothing is to be done"
-        yield Finding(Severity.NOTE, "interface", what)
+        yield _note("interface", what)
 
 
 def health_findings(health: LinkHealth, channel: str, *, is_socketcan: bool) -> Iterator[Finding]:
@@ -267,17 +258,17 @@ def health_findings(health: LinkHealth, channel: str, *, is_socketcan: bool) -> 
     restart = (f"ip link set {channel} type can restart",) if is_socketcan else ()
     what = f"the controller is {prose(health.state)}{counters}"
     if health.state is ControllerState.ACTIVE:
-        yield Finding(Severity.OK, "bus", what)
+        yield _ok("bus", what)
     elif health.state is ControllerState.BUS_OFF:
         why = "too many frames met errors (bit rate, short circuit, CAN-H and CAN-L swapped)"
-        yield Finding(Severity.PROBLEM, "bus", f"{what}: {why}", restart)
+        yield _problem("bus", f"{what}: {why}", restart)
     elif health.state is ControllerState.PASSIVE:
         silent = not health.frames_received
         severity = Severity.PROBLEM if silent else Severity.WARNING
         why = "nobody acknowledges it, or the bit rate is wrong" if silent else "the bus is bad"
         yield Finding(severity, "bus", f"{what}: {why}", ("check power, wiring, termination",))
     else:
-        yield Finding(Severity.NOTE, "bus", "this back end does not tell the controller's state")
+        yield _note("bus", "this back end does not tell the controller's state")
 
 
 # -- traffic ---------------------------------------------------------------------------------------
@@ -346,7 +337,7 @@ def traffic_findings(heard: Listened) -> Iterator[Finding]:
     if heard.load > _HIGH_LOAD:
         what = "the bus is nearly full: an upgrade will be slow, and answers come late"
         fix = (f"flasher monitor {heard.bus_arguments}",)
-        yield Finding(Severity.WARNING, "traffic", what, fix)
+        yield _warning("traffic", what, fix)
     if traffic.error_frames:
         many = traffic.error_frames > _MANY_ERRORS * traffic.frames
         what = f"{counted(traffic.error_frames, 'error frame')} among {traffic.frames:,} frames"
@@ -372,8 +363,7 @@ def _only_errors(heard: Listened) -> Finding:
     )
     other = "motinova" if heard.dialect.name == "welling" else "welling"
     errors = counted(heard.traffic.error_frames, "error frame")
-    return Finding(
-        Severity.PROBLEM,
+    return _problem(
         "traffic",
         f"{errors} and nothing else{_reported(heard.health)}: {causes}",
         (f"flasher doctor --dialect {other} {heard.bus_arguments}".rstrip(),),
@@ -381,8 +371,7 @@ def _only_errors(heard: Listened) -> Finding:
 
 
 def _silence(heard: Listened) -> Finding:
-    return Finding(
-        Severity.WARNING,
+    return _warning(
         "traffic",
         f"the bus was silent for {heard.duration_s:g} s. In this order: the system is off or "
         "asleep (press its key); a device that is alone speaks only when asked (flasher scan asks "
@@ -394,8 +383,7 @@ def _silence(heard: Listened) -> Finding:
 def _nodes(heard: Listened) -> Iterator[Finding]:
     survey = heard.survey
     if Node.CDL in survey.heard:
-        yield Finding(
-            Severity.PROBLEM,
+        yield _problem(
             "traffic",
             "another tool speaks as CDL on this bus: two at once spoil an upgrade",
             ("wait if it upgrades a device; else close the other tool, or disconnect it",),
@@ -403,16 +391,16 @@ def _nodes(heard: Listened) -> Iterator[Finding]:
     for node, said in sorted(survey.heard.items(), key=lambda pair: pair[0].value):
         if any(isinstance(content, contents.Shutdown) for content in said.last.values()):
             what = f"the {node.name} sent the command SHUTDOWN: the system switches off"
-            yield Finding(Severity.WARNING, "traffic", what, ("press the key of the system",))
+            yield _warning("traffic", what, ("press the key of the system",))
         if said.boot_version:
             what = f"the {node.name} is in its bootloader ({said.boot_version})"
             fix = f"flasher flash IMAGE -t {node.name.lower()} {heard.bus_arguments}".rstrip()
-            yield Finding(Severity.NOTE, "traffic", what, (fix,))
+            yield _note("traffic", what, (fix,))
         if said.damaged:
             what = f"the {node.name} sent {counted(said.damaged, 'run')} of bytes that made no "
-            yield Finding(Severity.NOTE, "traffic", f"{what}message")
+            yield _note("traffic", f"{what}message")
     guessed, why = survey.guess_dialect()
     if guessed is not None and guessed is not heard.dialect:
         fix = f"flasher doctor --dialect {guessed.name} {heard.bus_arguments}".rstrip()
         what = f"the bus speaks {guessed.name}, not {heard.dialect.name}: {why}"
-        yield Finding(Severity.WARNING, "traffic", what, (fix,))
+        yield _warning("traffic", what, (fix,))

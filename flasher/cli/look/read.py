@@ -142,7 +142,9 @@ def read(
         document = MemoryDocument(target.name, first, behind, file=str(file), format=name)
     else:
         for at in range(0, len(data), _DUMP_WIDTH):
-            output.result(_dump_line(first + at, data[at : at + _DUMP_WIDTH]))
+            line = data[at : at + _DUMP_WIDTH]
+            text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in line)
+            output.result(f"{first + at:08X}  {line.hex(' '):<{_DUMP_WIDTH * 3 - 1}}  {text}")
         document = MemoryDocument(target.name, first, behind, data=data.hex())
     output.document(document)
     return ExitCode.OK
@@ -179,11 +181,6 @@ def _range(start: str | None, end: str | None) -> tuple[int, int]:
         raise UsageError(f"{error.message}.") from error
     check_range(first, behind)
     return first, behind
-
-
-def _dump_line(address: int, data: bytes) -> str:
-    text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in data)
-    return f"{address:08X}  {data.hex(' '):<{_DUMP_WIDTH * 3 - 1}}  {text}"
 
 
 def _list(target: Target, dialect: Dialect, output: Output) -> int:
