@@ -56,7 +56,7 @@ from flasher.image.image import Image
 from flasher.image.plan import Plan, make_plan
 from flasher.prose import prose
 from flasher.protocol.catalogue import BY_KEY, Item
-from flasher.protocol.contents import Memory, Reset
+from flasher.protocol.contents import Memory, Reset, VersionInformation
 from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
@@ -153,6 +153,12 @@ class DeviceInfo:
     def is_there(self) -> bool:
         """True when the device answered or sent anything."""
         return self.target.node in self.survey.heard
+
+    @property
+    def version(self) -> VersionInformation | None:
+        """Its answer to the question for it."""
+        answers = (reading.answer for reading in self.readings)
+        return next((each for each in answers if isinstance(each, VersionInformation)), None)
 
     @property
     def no_faults(self) -> str:

@@ -28,7 +28,6 @@ from flasher.host.query import READ_MEMORY
 from flasher.image.load import load
 from flasher.mock.store import AREA_START
 from flasher.procedures import DeviceInfo
-from flasher.protocol.contents import VersionInformation
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.said import say
@@ -251,9 +250,7 @@ def _memory(area: Area, data: bytes, found: DeviceInfo) -> MemoryInBackup:
 
 
 def _running_version(found: DeviceInfo) -> str:
-    answers = (reading.answer for reading in found.readings)
-    version = next((each for each in answers if isinstance(each, VersionInformation)), None)
-    return "" if version is None else printable(str(version.firmware_version))
+    return "" if found.version is None else printable(str(found.version.firmware_version))
 
 
 def _archive(inside: DataInBackup, data: bytes, taken_at: datetime.datetime) -> bytes:

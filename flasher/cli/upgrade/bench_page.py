@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -35,7 +36,6 @@ from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.errors import ErrorCode, FlasherError, UsageError
 from flasher.files import parse_json, read
 from flasher.procedures import DeviceInfo
-from flasher.protocol.contents import VersionInformation
 from flasher.protocol.spec import BMS, Target
 from flasher.protocol.text import printable
 from flasher.said import say
@@ -82,18 +82,20 @@ class Memory:
             self._path.write_text(json.dumps({**self._all(), **told}), "utf-8")
 
 
+@dataclass
 class _Place:
     """What both kinds of workplace have: what is kept of an upgrade, and product profiles."""
 
-    def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop, memory: Memory) -> None:
-        self.dialect = bus.dialect
-        self.images = shelf.files
-        self.dropped = shelf.dropped
-        self._shelf = shelf
-        self._memory = memory
-        self._bus = bus
-        self._output = output
-        self._stop = stop
+    _bus: Bus
+    _output: Output
+    _shelf: Shelf
+    _stop: Stop
+    _memory: Memory
+
+    def __post_init__(self) -> None:
+        self.dialect = self._bus.dialect
+        self.images = self._shelf.files
+        self.dropped = self._shelf.dropped
 
     def use_folder(self, path: str) -> None:
         self._shelf.use(path)
@@ -178,7 +180,8 @@ class _Place:
                     record.leave_terminal(output)
                 return self._stop.has_hung_up
 
-            yield {"on_event": on_event, "cancelled": cancelled, "hung_up": hung_up}
+            told = self._told(adapter, job, on_event)
+            yield {"on_event": told, "cancelled": cancelled, "hung_up": hung_up}
 
         carried = Carried(job, self.bus(adapter), RecordingOptions(), output)
         result = None
@@ -189,6 +192,12 @@ class _Place:
         bundle = None if carried.record is None else carried.record.bundle
         return bench.Carried(result, carried.error, bundle, carried.warning)
 
+    def _told(
+        self, _adapter: Adapter, _job: Job, on_event: Callable[[object], None]
+    ) -> Callable[[object], None]:
+        """Who is told what happens in an upgrade that begins."""
+        return on_event
+
 
 def backup_folder() -> Path:
     """Where backups of the page lie."""
@@ -197,19 +206,17 @@ def backup_folder() -> Path:
 
 def _backup_name(found: DeviceInfo) -> str:
     """Of a new file: device, serial number and time."""
-    answers = (reading.answer for reading in found.readings)
-    version = next((each for each in answers if isinstance(each, VersionInformation)), None)
+    version = found.version
     serial = "" if version is None else re.sub(r"[^A-Za-z0-9]+", "-", str(version.serial_number))
     at = f"{datetime.now().astimezone():%Y%m%d-%H%M%S}"
     return "-".join(each for each in (found.target.name, serial.strip("-"), at) if each) + ".zip"
 
 
+@dataclass
 class Adapters(_Place):
     """The adapters of this computer."""
 
-    def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop, memory: Memory) -> None:
-        super().__init__(bus, output, shelf, stop, memory)
-        self._buses: dict[str, Bus] = {}
+    _buses: dict[str, Bus] = field(default_factory=dict)
 
     def adapters(self, cancelled: Callable[[], bool]) -> Sequence[Adapter]:
         self._buses = {}
@@ -248,12 +255,11 @@ class Adapters(_Place):
         return connect(self.dialect, holder=asking, fallback=bus.fallback, **bus.config)
 
 
+@dataclass
 class VirtualBikes(_Place):
     """Bikes without hardware."""
 
-    def __init__(self, bus: Bus, output: Output, shelf: Shelf, stop: Stop, memory: Memory) -> None:
-        super().__init__(bus, output, shelf, stop, memory)
-        self._bikes: dict[str, VirtualBike] = {}
+    _bikes: dict[str, VirtualBike] = field(default_factory=dict)
 
     def adapters(self, _cancelled: Callable[[], bool]) -> Sequence[Adapter]:
         return [Adapter(fault.value, NOTES[fault]) for fault in Fault]
@@ -267,22 +273,17 @@ class VirtualBikes(_Place):
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
         return self._bikes[adapter.name].connect()
 
-    def upgrade(
-        self,
-        adapter: Adapter,
-        job: Job,
-        *,
-        on_event: Callable[[object], None],
-        cancelled: Callable[[], bool],
-    ) -> bench.Carried:
+    def _told(
+        self, adapter: Adapter, job: Job, on_event: Callable[[object], None]
+    ) -> Callable[[object], None]:
         bike = self._bikes[adapter.name]
         bike.begin(job)
 
-        def happened(event: object) -> None:
+        def told(event: object) -> None:
             on_event(event)
             bike.happened(event)
 
-        return super().upgrade(adapter, job, on_event=happened, cancelled=cancelled)
+        return told
 
 
 def serve(
