@@ -94,15 +94,6 @@ _FILES: Final[dict[str, tuple[str, Callable[[Report], str]]]] = {
 }
 
 
-class PartOfYield(NamedTuple):
-    """A row of the table of yields."""
-
-    name: str
-    units: int
-    share: float | None
-    first_share: float | None
-
-
 class PartOfCauses(NamedTuple):
     """A row of the table of causes. `share`: of it and those before it, of 1."""
 
@@ -292,14 +283,7 @@ class Supervisor:
         chosen, span = self._figured(question)
         said = words(question.language)
         spans = list(spans_of(span))
-        found = self.overview.yields(chosen, spans)
-        rows = [
-            PartOfYield(_name_of(each.span), each.units, _share(each.passed, each.units),
-                        _share(each.first_passed, each.units))
-            for each in found
-        ]  # fmt: skip
-        drawn = [row for row in rows if row.units]
-        whole = self.overview.yields(chosen, [span])[0]
+        rows = [each for each in self.overview.yields(chosen, spans) if each.units]
         by = By(question.fields["by"]) if question.fields.get("by") in set(By) else By.SOCKET
         groups, causes = self._causes(chosen, span, by, said)
         return self._page(
@@ -307,22 +291,18 @@ class Supervisor:
             "yield.html",
             span=span,
             rows=rows,
-            whole=PartOfYield(
-                "",
-                whole.units,
-                _share(whole.passed, whole.units),
-                _share(whole.first_passed, whole.units),
-            ),
+            name_of=_name_of,
+            whole=self.overview.yields(chosen, [span])[0],
             chart=lines(
                 said(say("Yield over time")),
-                [row.name.removeprefix(f"{span.end.astimezone():%Y-}") for row in drawn],
+                [_name_of(row.span).removeprefix(f"{span.end.astimezone():%Y-}") for row in rows],
                 {
-                    "end": [_percent(row.share) for row in drawn],
-                    "first": [_percent(row.first_share) for row in drawn],
+                    "end": [100 * (row.share or 0) for row in rows],
+                    "first": [100 * (row.first_share or 0) for row in rows],
                 },
                 " %",
             )
-            if drawn
+            if rows
             else "",
             by=by,
             by_words=BY_WORDS,
@@ -574,14 +554,6 @@ def _zone(now: datetime) -> str:
 
 
 # -- words -----------------------------------------------------------------------------------------
-
-
-def _share(part: int, whole: int) -> float | None:
-    return part / whole if whole else None
-
-
-def _percent(share: float | None) -> float | None:
-    return None if share is None else share * 100
 
 
 def _is_trace(file: AttachmentFile) -> bool:

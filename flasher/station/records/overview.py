@@ -107,6 +107,16 @@ class SpanYield:
     """Units whose last such run is a PASS."""
     first_passed: int = 0
 
+    @property
+    def share(self) -> float | None:
+        """Units passed in the end, as a share of 1; None without units."""
+        return self.passed / self.units if self.units else None
+
+    @property
+    def first_share(self) -> float | None:
+        """Units passed at their first run."""
+        return self.first_passed / self.units if self.units else None
+
 
 class By(StrEnum):
     """What causes are told apart by."""
