@@ -34,33 +34,7 @@ from flasher.settings.area import Area, area_of_image, area_of_profile
 from flasher.settings.profile import Profile
 from flasher.trace.decoder import BusEvent
 from flasher.trace.watcher import Board, Pulse, Watcher
-from flasher.web.bench_state import (
-    Adapter,
-    BackUp,
-    ChooseImage,
-    ChooseTarget,
-    Doing,
-    Done,
-    FindAdapters,
-    FindAreas,
-    Judge,
-    LeaveBackup,
-    Look,
-    Offer,
-    Order,
-    RescueIt,
-    Saved,
-    SeenMessage,
-    StartOver,
-    State,
-    TakeFiles,
-    Upgrade,
-    UseAdapter,
-    UseFolder,
-    Waive,
-    Watch,
-    Watched,
-)
+from flasher.web.bench_state import Adapter, Doing, Done, Offer, Saved, SeenMessage, State, Watched
 from flasher.web.feed import Feed
 
 TURN_S: Final = 0.2
@@ -74,6 +48,8 @@ SUBJECT: Final = "bench"
 _AGAIN: Final = say("Begin again with the adapter.")
 _RESCUE: Final = say("Then rescue this device.")
 T = TypeVar("T")
+Order = Callable[["Bench"], object]
+"""A step for the bench to carry out in its own thread."""
 _LOG: Final = logging.getLogger("flasher.web")
 
 
@@ -176,17 +152,6 @@ class Bench:
         self._stop = threading.Event()
         self._has_new_files = threading.Event()
         self._is_closing = self._ends_at_once = False
-        self._steps: dict[type[Order], Callable[[], None]] = {
-            FindAdapters: self._find_adapters,
-            Look: self._look,
-            Watch: self._watch,
-            FindAreas: self._find_areas,
-            LeaveBackup: lambda: self._set(areas=None),
-            Judge: self._judge,
-            TakeFiles: self._take_files,
-            RescueIt: self._rescue_it,
-        }
-        """Of the orders that say no more than their name."""
         self._set()
 
     # -- any thread --------------------------------------------------------------------------------
@@ -226,7 +191,7 @@ class Bench:
             try:
                 order = self._orders.get(timeout=TURN_S)
             except Empty:
-                if not self._has_new_files.is_set() or not self.order(TakeFiles()):
+                if not self._has_new_files.is_set() or not self.order(Bench.take_files):
                     continue
                 order = self._orders.get()
             self.carry_out(order)
@@ -235,7 +200,7 @@ class Bench:
         """Do it, and show how it goes."""
         self._set(trouble=None)
         try:
-            self._carry_out(order)
+            order(self)
         except FlasherError as error:
             self._set(trouble=error)
         except Exception as error:  # noqa: BLE001  it is shown, and the bench goes on
@@ -267,51 +232,24 @@ class Bench:
             self._set(is_stopping=True)
         return is_asked
 
-    def _carry_out(self, order: Order) -> None:
-        step = self._steps.get(type(order))
-        if step is not None:
-            step()
-            return
-        match order:
-            case UseAdapter(name):
-                self._use(name)
-            case BackUp(source):
-                self._back_up(source)
-            case Waive(name, waiver):
-                self._waive(name, waiver)
-            case UseFolder(path):
-                self._place.use_folder(path)
-                self._judge()
-            case ChooseTarget(""):
-                self._set(target=None, offers=(), offer=None, done=None, waived=frozenset())
-            case ChooseImage(""):
-                self._set(done=None)
-                self._judge()
-            case ChooseTarget(name):
-                self._set(target=_known(TARGETS, name), offer=None, done=None, waived=frozenset())
-                self._judge()
-            case ChooseImage(name):
-                fitting = {offer.name: offer for offer in self.state.offers if not offer.refusal}
-                self._set(offer=_known(fitting, name), done=None)
-            case Upgrade(target, sha256):
-                self._check_meant(target, sha256)
-                self._upgrade()
-            case StartOver(is_rescue):
-                self.state = State(
-                    adapters=self.state.adapters,
-                    was_looked_for=True,
-                    is_rescue=is_rescue,
-                    dropped=self.state.dropped,
-                )
-                self._find_adapters()
+    # -- the steps: orders to be carried out -------------------------------------------------------
 
-    # -- the steps ---------------------------------------------------------------------------------
+    def start_over(self, *, is_rescue: bool = False) -> None:
+        """Begin with the next bike, or with the rescue of one."""
+        self.state = State(
+            adapters=self.state.adapters,
+            was_looked_for=True,
+            is_rescue=is_rescue,
+            dropped=self.state.dropped,
+        )
+        self.find_adapters()
 
-    def _find_adapters(self) -> None:
+    def find_adapters(self) -> None:
         self._set(doing=Doing.ADAPTERS)
         self._set(adapters=tuple(self._place.adapters(self._cancelled)), was_looked_for=True)
 
-    def _use(self, name: str) -> None:
+    def use_adapter(self, name: str) -> None:
+        """Use this one, and look who answers on it."""
         adapter = _known({each.name: each for each in self.state.adapters}, name)
         self._place.use(adapter)
         marked = tuple(replace(each, was_last=each == adapter) for each in self.state.adapters)
@@ -321,9 +259,9 @@ class Bench:
             waived=frozenset(),
         )  # fmt: skip
         if not self.state.is_rescue:
-            self._look()
+            self.look()
 
-    def _look(self) -> None:
+    def look(self) -> None:
         """Ask the battery, and listen to the others: the documents give no question for them."""
         self._set(doing=Doing.LOOKING, bike=None, done=None)
         bike = self._seen(self._adapter(), BMS)
@@ -336,7 +274,29 @@ class Bench:
             device = connection.device(target, dialect=self._place.dialect)
             return device.identify(cancelled=self._cancelled)
 
-    def _judge(self) -> None:
+    def choose_target(self, name: str) -> None:
+        """Upgrade this device, and look which images fit; "" is none."""
+        if not name:
+            self._set(target=None, offers=(), offer=None, done=None, waived=frozenset())
+            return
+        self._set(target=_known(TARGETS, name), offer=None, done=None, waived=frozenset())
+        self.judge()
+
+    def choose_image(self, name: str) -> None:
+        """Take this image; "" is none."""
+        if not name:
+            self._set(done=None)
+            self.judge()
+            return
+        fitting = {offer.name: offer for offer in self.state.offers if not offer.refusal}
+        self._set(offer=_known(fitting, name), done=None)
+
+    def use_folder(self, path: str) -> None:
+        self._place.use_folder(path)
+        self.judge()
+
+    def judge(self) -> None:
+        """Look which images fit."""
         self._set(doing=Doing.JUDGING, offers=(), offer=None)
         self._adapter()
         offers = []
@@ -347,14 +307,17 @@ class Bench:
         offers.sort(key=lambda offer: (offer.refusal is not None, offer.name))
         self._set(offers=tuple(offers))
 
-    def _take_files(self) -> None:
+    def take_files(self) -> None:
+        """Look at files that were dropped on the page."""
         self._has_new_files.clear()
         self._set(dropped=tuple(self._place.dropped()))
         if self.state.target is not None and self.state.offer is None:
-            self._judge()
+            self.judge()
 
-    def _waive(self, name: str, waiver: str) -> None:
-        """Only a check that has refused this very image can be waived."""
+    def waive(self, name: str, waiver: str) -> None:
+        """Take this image all the same, although this check has refused it: only one that has
+        refused this very image can be waived.
+        """
         done = self.state.done
         refused = {each.name: each.refusal for each in self.state.offers if each.refusal}
         if done is not None and done.error is not None:
@@ -365,11 +328,12 @@ class Bench:
                 "That check has not refused this image; nothing was waived.", remedy="Look again."
             )
         self._set(done=None, waived=self.state.waived | {(name, waiver)})
-        self._judge()
+        self.judge()
         fitting = (each for each in self.state.offers if each.name == name and not each.refusal)
         self._set(offer=next(fitting, None))
 
-    def _watch(self) -> None:
+    def watch(self) -> None:
+        """Show what is said on the bus until it is stopped. Nothing is sent."""
         board = Board()
         since_s = self._now()
         messages = troubles = 0
@@ -392,9 +356,9 @@ class Bench:
                 on_event=happened, cancelled=self._cancelled,
             )  # fmt: skip
 
-    def _find_areas(self) -> None:
-        """Where the application may lie: nothing is guessed, since an address that does not exist
-        may crash a device. Images that cannot be for it do not count.
+    def find_areas(self) -> None:
+        """Look which memory a backup may hold: nothing is guessed, since an address that does not
+        exist may crash a device. Images that cannot be for it do not count.
         """
         self._adapter()
         self._set(doing=Doing.JUDGING, areas=None)
@@ -406,7 +370,11 @@ class Bench:
                 found.append(area_of_image(self._job(path, BMS).plan.image))
         self._set(areas=tuple(each for each in found if each is not None))
 
-    def _back_up(self, source: str) -> None:
+    def leave_backup(self) -> None:
+        self._set(areas=None)
+
+    def back_up(self, source: str) -> None:
+        """Save what the battery tells, and the memory of the area with this source; "" is none."""
         areas = {area.source: area for area in self.state.areas or ()}
         area = _known(areas, source) if source else None
 
@@ -472,23 +440,22 @@ class Bench:
             if error is not None:
                 raise error
 
-    def _check_meant(self, target: str, sha256: str) -> None:
-        """Raises UsageError when a page that was not up to date has ordered it."""
+    def upgrade(self, target: str, sha256: str) -> None:
+        """Upgrade, with the image of this digest: what was chosen where the button was pressed.
+        Raises UsageError when a page that was not up to date has ordered it.
+        """
         chosen, offer = self.state.target, self.state.offer
         if chosen is None or offer is None or (chosen.name, offer.sha256) != (target, sha256):
             raise UsageError(
                 "Another device or image was chosen meanwhile; nothing was sent.",
                 remedy="Look at what is chosen, and begin again.",
             )
-
-    def _upgrade(self) -> None:
-        adapter, offer = self._adapter(), self.state.offer
-        assert offer is not None  # noqa: S101  _check_meant
+        adapter = self._adapter()
         self._set(
             doing=Doing.UPGRADING, done=None, checks=(), notes=(), packet=0, furthest=0,
             repetitions=0, phase=None, transfer_began_s=None, power_cycle_s=None, watched=None,
         )  # fmt: skip
-        job = self._job(offer.path, self.state.target)
+        job = self._job(offer.path, chosen)
         if job.plan.image.sha256 != offer.sha256:
             raise ImageError(
                 f"{printable(offer.name)} has changed since it was chosen; nothing was sent.",
@@ -538,13 +505,13 @@ class Bench:
         if changes:
             self._set(**changes)
 
-    def _rescue_it(self) -> None:
+    def rescue_it(self) -> None:
         """The same device, and the same image where the device has not refused it."""
         done = self.state.done
         if done is None:
             raise UsageError("No upgrade has failed.", remedy="Begin with the adapter.")
         self._set(is_rescue=True, done=None, offer=None, checks=(), notes=())
-        self._judge()
+        self.judge()
         if done.may_rescue_with_it:
             same = [each for each in self.state.offers if each.sha256 == done.offer.sha256]
             self._set(offer=next(iter(same), None))

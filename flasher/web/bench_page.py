@@ -5,12 +5,13 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlencode
 
 from starlette.requests import Request
-from starlette.responses import JSONResponse, Response, StreamingResponse
+from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from flasher.errors import UsageError
@@ -22,10 +23,9 @@ from flasher.protocol.text import printable
 from flasher.report.base import visible
 from flasher.said import Said, say
 from flasher.trace.decoder import Field, content_fields
-from flasher.web import bench_state as bench
 from flasher.web.bench import Bench
-from flasher.web.bench_state import Done, Order, State
-from flasher.web.pages import Pages
+from flasher.web.bench_state import Done, State
+from flasher.web.pages import Pages, streamed
 from flasher.web.words import Words
 
 UPLOAD_MAX: Final = 32 * 1024 * 1024
@@ -36,32 +36,25 @@ _FILES_MAX: Final = 200
 _MANIFEST: Final = ".toml"
 
 
-def _waive(said: Mapping[str, str]) -> Order:
-    """Raises ValueError unless it was said that the risk is known."""
-    if said["risk"] != "known":
-        raise ValueError(said["risk"])
-    return bench.Waive(said["name"], said["waiver"])
-
-
-_ORDERS: Final[Mapping[str, Callable[[Mapping[str, str]], Order]]] = {
-    "adapters": lambda _: bench.FindAdapters(),
-    "adapter": lambda said: bench.UseAdapter(said["name"]),
-    "look": lambda _: bench.Look(),
-    "watch": lambda _: bench.Watch(),
-    "areas": lambda _: bench.FindAreas(),
-    "backup": lambda said: bench.BackUp(said["source"]),
-    "no-backup": lambda _: bench.LeaveBackup(),
-    "target": lambda said: bench.ChooseTarget(said["name"]),
-    "images": lambda _: bench.Judge(),
-    "waive": _waive,
-    "folder": lambda said: bench.UseFolder(said["path"]),
-    "image": lambda said: bench.ChooseImage(said["name"]),
-    "upgrade": lambda said: bench.Upgrade(said["target"], said["sha256"]),
-    "next": lambda _: bench.StartOver(),
-    "rescue": lambda _: bench.StartOver(is_rescue=True),
-    "rescue-it": lambda _: bench.RescueIt(),
+_ORDERS: Final[Mapping[str, tuple[Callable[..., None], tuple[str, ...]]]] = {
+    "adapters": (Bench.find_adapters, ()),
+    "adapter": (Bench.use_adapter, ("name",)),
+    "look": (Bench.look, ()),
+    "watch": (Bench.watch, ()),
+    "areas": (Bench.find_areas, ()),
+    "backup": (Bench.back_up, ("source",)),
+    "no-backup": (Bench.leave_backup, ()),
+    "target": (Bench.choose_target, ("name",)),
+    "images": (Bench.judge, ()),
+    "waive": (Bench.waive, ("name", "waiver")),
+    "folder": (Bench.use_folder, ("path",)),
+    "image": (Bench.choose_image, ("name",)),
+    "upgrade": (Bench.upgrade, ("target", "sha256")),
+    "next": (Bench.start_over, ()),
+    "rescue": (partial(Bench.start_over, is_rescue=True), ()),
+    "rescue-it": (Bench.rescue_it, ()),
 }
-"""What a form may order, by the word that it sends."""
+"""What a form may order, by the word that it sends, and what it says with it."""
 
 
 class Shelf:
@@ -164,14 +157,9 @@ class BenchPage:
         return page
 
     async def _events(self, request: Request) -> Response:
-        return StreamingResponse(
-            self._stream(self._pages.words_of(request)),
-            media_type="text/event-stream",
-            headers={"x-accel-buffering": "no"},
-        )
+        return streamed(self._messages(self._pages.words_of(request)))
 
-    async def _stream(self, words: Words) -> AsyncIterator[str]:
-        yield "retry: 500\n\n"
+    async def _messages(self, words: Words) -> AsyncIterator[dict[str, Any]]:
         sent: dict[str, str] = {}
         async for batch in self._bench.feed.follow():
             message: dict[str, Any] = {}
@@ -181,8 +169,8 @@ class BenchPage:
                     name: text for name, text in parts.items() if sent.get(name) != text
                 }
                 sent = parts
-            yield f"data: {json.dumps(message, ensure_ascii=False)}\n\n"
-        yield f"data: {json.dumps({'ended': True})}\n\n"
+            yield message
+        yield {"ended": True}
 
     def _parts(self, words: Words, state: State) -> dict[str, str]:
         return self._pages.parts(
@@ -195,12 +183,17 @@ class BenchPage:
         try:
             said = json.loads(await request.body())
             word = said["order"]
-            order = None if word == "stop" else _ORDERS[word](said)
+            if word == "stop":
+                self._bench.stop()
+                return JSONResponse({})
+            step, fields = _ORDERS[word]
+            values = [said[name] for name in fields]
+            is_meant = word != "waive" or said["risk"] == "known"
         except (ValueError, TypeError, KeyError):
+            is_meant = False
+        if not is_meant:
             return JSONResponse({"error": "no order"}, 400)
-        if order is None:
-            self._bench.stop()
-        elif not self._bench.order(order):
+        if not self._bench.order(lambda bench: step(bench, *values)):
             return JSONResponse({"error": "busy"}, 409)
         return JSONResponse({})
 

@@ -1,4 +1,4 @@
-"""What the bench shows, and the orders that it takes. Pages know the bench by this alone."""
+"""What the bench shows."""
 
 from __future__ import annotations
 
@@ -28,9 +28,6 @@ class Doing(Enum):
     LOOKING_AGAIN = "looking_again"
     WATCHING = "watching"
     SAVING = "saving"
-
-
-# -- what it shows ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -210,124 +207,3 @@ class State:
         if self.power_cycle_s is None:
             return 0
         return max(0, round(self.power_cycle_s - (now_s - self.power_cycle_since_s)))
-
-
-# -- orders ----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class FindAdapters:
-    """Look what is plugged in."""
-
-
-@dataclass(frozen=True)
-class UseAdapter:
-    """Use this adapter, and look who answers on it."""
-
-    name: str
-
-
-@dataclass(frozen=True)
-class Look:
-    """Look again who answers."""
-
-
-@dataclass(frozen=True)
-class Watch:
-    """Show what is said on the bus until it is stopped. Nothing is sent."""
-
-
-@dataclass(frozen=True)
-class FindAreas:
-    """Look which memory a backup may hold."""
-
-
-@dataclass(frozen=True)
-class BackUp:
-    """Save what the battery tells, and the memory of the area with this source; "" is none."""
-
-    source: str
-
-
-@dataclass(frozen=True)
-class LeaveBackup:
-    """Save nothing."""
-
-
-@dataclass(frozen=True)
-class ChooseTarget:
-    """Upgrade this device, and look which images fit; "" is none."""
-
-    name: str
-
-
-@dataclass(frozen=True)
-class Judge:
-    """Look again which images fit."""
-
-
-@dataclass(frozen=True)
-class Waive:
-    """Take this image all the same, although this check has refused it."""
-
-    name: str
-    waiver: str
-
-
-@dataclass(frozen=True)
-class UseFolder:
-    """Offer the images of this folder."""
-
-    path: str
-
-
-@dataclass(frozen=True)
-class TakeFiles:
-    """Look at files that were dropped on the page."""
-
-
-@dataclass(frozen=True)
-class ChooseImage:
-    """Take this image; "" is none."""
-
-    name: str
-
-
-@dataclass(frozen=True)
-class Upgrade:
-    """Upgrade, with the image of this digest: what was chosen where the button was pressed."""
-
-    target: str
-    sha256: str
-
-
-@dataclass(frozen=True)
-class StartOver:
-    """Begin with the next bike, or with the rescue of one."""
-
-    is_rescue: bool = False
-
-
-@dataclass(frozen=True)
-class RescueIt:
-    """Rescue the device whose upgrade has just failed."""
-
-
-Order = (
-    FindAdapters
-    | UseAdapter
-    | Look
-    | Watch
-    | FindAreas
-    | BackUp
-    | LeaveBackup
-    | ChooseTarget
-    | Judge
-    | TakeFiles
-    | Waive
-    | UseFolder
-    | ChooseImage
-    | Upgrade
-    | StartOver
-    | RescueIt
-)

@@ -15,7 +15,7 @@ from datetime import UTC, datetime
 from typing import Any, Final
 
 from starlette.requests import Request
-from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
+from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from flasher.said import say
@@ -24,7 +24,7 @@ from flasher.station.events import LineStopped, RunEnded, SocketState, StationEv
 from flasher.station.health import Health, Watch
 from flasher.station.tally import EndedRun, Output, Tally
 from flasher.web.feed import Feed
-from flasher.web.pages import Pages
+from flasher.web.pages import Pages, streamed
 from flasher.web.words import Words
 
 TAIL_DIGITS: Final = 6
@@ -241,12 +241,7 @@ class OperatorPage:
         return self._pages.show(request, "line.html", sound_volume=self._sound_volume)
 
     async def _events(self, request: Request) -> Response:
-        words = self._pages.words_of(request)
-        return StreamingResponse(
-            _stream(self._feed, words),
-            media_type="text/event-stream",
-            headers={"x-accel-buffering": "no"},
-        )
+        return streamed(_messages(self._feed, self._pages.words_of(request)))
 
     async def _scan(self, request: Request) -> Response:
         try:
@@ -261,8 +256,7 @@ class OperatorPage:
         return JSONResponse({})
 
 
-async def _stream(feed: Feed, words: Words) -> AsyncIterator[str]:
-    yield "retry: 500\n\n"
+async def _messages(feed: Feed, words: Words) -> AsyncIterator[dict[str, Any]]:
     async for batch in feed.follow():
         message: dict[str, Any] = {}
         if batch.is_all:
@@ -273,4 +267,4 @@ async def _stream(feed: Feed, words: Words) -> AsyncIterator[str]:
             message["tiles"] = tiles
         if heads:
             message["head"] = heads[-1].said(words)
-        yield f"data: {json.dumps(message, ensure_ascii=False)}\n\n"
+        yield message

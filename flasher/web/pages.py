@@ -4,17 +4,31 @@ the language and the session's token.
 
 from __future__ import annotations
 
+import json
+from collections.abc import AsyncIterator
 from typing import Any, Final
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader
 from starlette.requests import Request
-from starlette.responses import HTMLResponse, Response
+from starlette.responses import HTMLResponse, Response, StreamingResponse
 
 from flasher import __version__
 from flasher.report.base import environment
 from flasher.web.words import NAMES, Words, chosen
 
 _PART: Final = "part_"
+
+
+def streamed(messages: AsyncIterator[dict[str, Any]]) -> Response:
+    """Messages for a page's script, as server-sent events."""
+
+    async def lines() -> AsyncIterator[str]:
+        yield "retry: 500\n\n"
+        async for message in messages:
+            yield f"data: {json.dumps(message, ensure_ascii=False)}\n\n"
+
+    headers = {"x-accel-buffering": "no"}
+    return StreamingResponse(lines(), media_type="text/event-stream", headers=headers)
 
 
 class Pages:

@@ -7,6 +7,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Concatenate, ParamSpec
 
 from flasher.api import Job
 from flasher.cli.options import Bus
@@ -16,9 +17,9 @@ from flasher.cli.stop import Stop
 from flasher.cli.upgrade.bench_page import Memory, VirtualBikes, backup_folder
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.web import bench
-from flasher.web.bench import Bench
+from flasher.web.bench import Bench, Order
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
-from flasher.web.bench_state import Adapter, FindAdapters, Order, State
+from flasher.web.bench_state import Adapter, State
 from flasher.web.desk import Answer, DeskPages, Question
 from flasher.web.guard import BODY_MAX, Entry, application
 from flasher.web.kept import PAGES as KEPT
@@ -30,6 +31,7 @@ from tests.end_to_end.stage import NEW, image_of
 PACKETS = 20
 IMAGE = "new.bin"
 _KEY = "of the test"
+P = ParamSpec("P")
 
 
 def folder_of_images(folder: Path) -> Path:
@@ -59,6 +61,11 @@ class HeldBikes(VirtualBikes):
         return super().upgrade(adapter, job, on_event=held, cancelled=cancelled)
 
 
+def order(step: Callable[Concatenate[Bench, P], None], *args: P.args, **named: P.kwargs) -> Order:
+    """A step with what is said of it."""
+    return lambda bench: step(bench, *args, **named)
+
+
 class BenchPlace:
     """A bench, without its thread."""
 
@@ -70,7 +77,7 @@ class BenchPlace:
         output = Output(verbosity=-1)
         self.bikes = HeldBikes(bus, output, self.shelf, Stop(None), Memory())
         self.bench = Bench(self.bikes, now)
-        self.do(FindAdapters())
+        self.do(Bench.find_adapters)
 
     def do(self, *orders: Order) -> State:
         """Carry out orders; the state then."""

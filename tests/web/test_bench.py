@@ -30,32 +30,13 @@ from flasher.mock.store import AREA_START
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.spec import BMS
 from flasher.settings.manifest import manifest_path, to_toml
-from flasher.web.bench import Bench
+from flasher.web.bench import Bench, Order
 from flasher.web.bench_page import told
-from flasher.web.bench_state import (
-    BackUp,
-    ChooseImage,
-    ChooseTarget,
-    Doing,
-    Done,
-    FindAdapters,
-    FindAreas,
-    Judge,
-    Look,
-    Order,
-    RescueIt,
-    StartOver,
-    State,
-    Upgrade,
-    UseAdapter,
-    UseFolder,
-    Waive,
-    Watch,
-)
+from flasher.web.bench_state import Doing, Done, State
 from flasher.web.virtual_bike import Fault
 from flasher.web.words import words
 from tests.end_to_end.stage import NEW, OLD, image_of
-from tests.web.bench_place import IMAGE, PACKETS, BenchPlace
+from tests.web.bench_place import IMAGE, PACKETS, BenchPlace, order
 
 
 @pytest.fixture
@@ -63,14 +44,18 @@ def place(tmp_path: Path) -> BenchPlace:
     return BenchPlace(tmp_path)
 
 
-def _upgrade(state: State) -> Upgrade:
+def _upgrade(state: State) -> Order:
     assert state.target is not None
     assert state.offer is not None
-    return Upgrade(state.target.name, state.offer.sha256)
+    return order(Bench.upgrade, state.target.name, state.offer.sha256)
 
 
 def _chosen(place: BenchPlace, fault: Fault = Fault.NONE, target: str = "bms") -> State:
-    return place.do(UseAdapter(fault.value), ChooseTarget(target), ChooseImage(IMAGE))
+    return place.do(
+        order(Bench.use_adapter, fault.value),
+        order(Bench.choose_target, target),
+        order(Bench.choose_image, IMAGE),
+    )
 
 
 def _done(place: BenchPlace, fault: Fault = Fault.NONE, target: str = "bms") -> Done:
@@ -127,7 +112,7 @@ def test_an_upgrade_that_the_history_cannot_take_says_so(
 
 def test_the_next_bike_begins_with_nothing_of_the_last(place: BenchPlace) -> None:
     _done(place)
-    state = place.do(StartOver())
+    state = place.do(Bench.start_over)
     assert (state.done, state.bike, state.offer, state.adapter) == (None,) * 4
     assert len(state.adapters) == len(Fault)
 
@@ -136,12 +121,12 @@ def test_the_next_bike_begins_with_nothing_of_the_last(place: BenchPlace) -> Non
 
 
 def test_only_images_that_fit_are_offered_and_the_others_say_why(place: BenchPlace) -> None:
-    state = place.do(UseAdapter(Fault.NONE.value), ChooseTarget("bms"))
+    state = place.do(order(Bench.use_adapter, Fault.NONE.value), order(Bench.choose_target, "bms"))
     assert [(each.name, type(each.refusal)) for each in state.offers] == [
         (IMAGE, type(None)),
         ("broken.hex", ImageError),
     ]
-    state = place.do(ChooseImage("broken.hex"))
+    state = place.do(order(Bench.choose_image, "broken.hex"))
     assert isinstance(state.trouble, UsageError)
     assert state.offer is None
 
@@ -160,7 +145,9 @@ def test_an_image_for_other_hardware_is_not_offered_to_the_bike_that_answered(
 ) -> None:
     _for_other_hardware(tmp_path)
     assert _chosen(place).offer is not None
-    state = place.do(UseAdapter(Fault.HARDWARE.value), ChooseTarget("bms"))
+    state = place.do(
+        order(Bench.use_adapter, Fault.HARDWARE.value), order(Bench.choose_target, "bms")
+    )
     refusals = {each.name: each.refusal for each in state.offers}
     assert isinstance(refusals[IMAGE], WrongDeviceError)
 
@@ -169,7 +156,7 @@ def test_a_dropped_image_is_offered_and_what_is_none_is_not_taken(place: BenchPl
     assert place.shelf.take("../../dropped.bin", image_of(3, NEW).data)
     for name in ("run.sh", ".bin", "", "a\nb.bin", "x" * 300 + ".bin"):
         assert place.shelf.take(name, b"x") is None, name
-    state = place.do(UseAdapter(Fault.NONE.value), ChooseTarget("bms"))
+    state = place.do(order(Bench.use_adapter, Fault.NONE.value), order(Bench.choose_target, "bms"))
     assert [each.name for each in state.offers if not each.refusal] == ["dropped.bin", IMAGE]
 
 
@@ -178,11 +165,11 @@ def test_a_name_is_shown_as_people_write_it_and_what_hides_is_not(
 ) -> None:
     for name in ("固件 ü.bin", "a\u202eb.bin"):
         (tmp_path / name).write_bytes(image_of(3, NEW).data)
-    state = place.do(UseAdapter(Fault.NONE.value), ChooseTarget("bms"))
+    state = place.do(order(Bench.use_adapter, Fault.NONE.value), order(Bench.choose_target, "bms"))
     fitting = {each.name for each in state.offers if not each.refusal}
     assert fitting == {IMAGE, "固件 ü.bin", "a\\u202eb.bin"}
     for name in fitting:
-        assert place.do(ChooseImage(name)).offer is not None
+        assert place.do(order(Bench.choose_image, name)).offer is not None
 
 
 def test_an_image_that_changed_since_it_was_chosen_is_not_sent(
@@ -198,8 +185,11 @@ def test_an_image_that_changed_since_it_was_chosen_is_not_sent(
 def test_an_order_from_a_page_that_was_not_up_to_date_sends_nothing(place: BenchPlace) -> None:
     state = _chosen(place)
     assert state.offer is not None
-    for order in (Upgrade("wmc", state.offer.sha256), Upgrade("bms", "0" * 64)):
-        state = place.do(order)
+    for ordered in (
+        order(Bench.upgrade, "wmc", state.offer.sha256),
+        order(Bench.upgrade, "bms", "0" * 64),
+    ):
+        state = place.do(ordered)
         assert isinstance(state.trouble, UsageError)
         assert state.done is None
 
@@ -208,11 +198,15 @@ def test_the_folder_of_images_is_chosen_and_remembered(place: BenchPlace, tmp_pa
     other = tmp_path / "other"
     other.mkdir()
     (other / "other.bin").write_bytes(image_of(3, NEW).data)
-    state = place.do(UseAdapter(Fault.NONE.value), ChooseTarget("bms"), UseFolder(str(other)))
+    state = place.do(
+        order(Bench.use_adapter, Fault.NONE.value),
+        order(Bench.choose_target, "bms"),
+        order(Bench.use_folder, str(other)),
+    )
     assert [each.name for each in state.offers] == ["other.bin"]
     assert Memory().kept("images") == str(other)
     for wrong in ("", str(other / "other.bin"), "/no/such/folder"):
-        state = place.do(UseFolder(wrong))
+        state = place.do(order(Bench.use_folder, wrong))
         assert isinstance(state.trouble, UsageError)
         assert place.shelf.folder == other
 
@@ -224,8 +218,8 @@ def test_a_check_that_refused_is_waived_for_this_image_and_stands_in_the_record(
     place: BenchPlace, tmp_path: Path
 ) -> None:
     _for_other_hardware(tmp_path)
-    place.do(UseAdapter(Fault.HARDWARE.value), ChooseTarget("bms"))
-    state = place.do(Waive(IMAGE, "hardware"))
+    place.do(order(Bench.use_adapter, Fault.HARDWARE.value), order(Bench.choose_target, "bms"))
+    state = place.do(order(Bench.waive, IMAGE, "hardware"))
     assert state.offer is not None
     assert state.offer.waived == ("hardware",)
     done = place.do(_upgrade(state)).done
@@ -233,15 +227,23 @@ def test_a_check_that_refused_is_waived_for_this_image_and_stands_in_the_record(
     assert done.is_completed
     assert ("hardware", "waived") in {(each.check, each.verdict) for each in done.checks}
     assert History().flashes()[0][-1].began.waived == "hardware"
-    state = place.do(StartOver(), UseAdapter(Fault.HARDWARE.value), ChooseTarget("bms"))
+    state = place.do(
+        Bench.start_over,
+        order(Bench.use_adapter, Fault.HARDWARE.value),
+        order(Bench.choose_target, "bms"),
+    )
     assert IMAGE not in {each.name for each in state.offers if not each.refusal}
 
 
 def test_only_the_check_that_refused_can_be_waived(place: BenchPlace, tmp_path: Path) -> None:
     _for_other_hardware(tmp_path)
-    place.do(UseAdapter(Fault.HARDWARE.value), ChooseTarget("bms"))
-    for order in (Waive(IMAGE, "downgrade"), Waive("broken.hex", ""), Waive("no", "hardware")):
-        state = place.do(order)
+    place.do(order(Bench.use_adapter, Fault.HARDWARE.value), order(Bench.choose_target, "bms"))
+    for ordered in (
+        order(Bench.waive, IMAGE, "downgrade"),
+        order(Bench.waive, "broken.hex", ""),
+        order(Bench.waive, "no", "hardware"),
+    ):
+        state = place.do(ordered)
         assert isinstance(state.trouble, UsageError)
         assert (state.offer, state.waived) == (None, frozenset())
 
@@ -254,7 +256,7 @@ def test_a_check_that_refused_in_the_upgrade_is_waived_after_it(
     done = _done(place)
     assert isinstance(done.error, WrongDeviceError)
     assert done.error.waiver == "in-use"
-    state = place.do(Waive(IMAGE, "in-use"))
+    state = place.do(order(Bench.waive, IMAGE, "in-use"))
     done = place.do(_upgrade(state)).done or done
     assert done.is_completed
 
@@ -297,7 +299,7 @@ def test_a_bad_end_is_said_in_the_language_of_the_page(place: BenchPlace) -> Non
 
 def test_a_device_whose_upgrade_failed_is_rescued_with_the_same_image(place: BenchPlace) -> None:
     _done(place, Fault.POWER)
-    state = place.do(RescueIt())
+    state = place.do(Bench.rescue_it)
     assert state.is_rescue
     assert state.offer is not None
     asked: list[float] = []
@@ -323,7 +325,7 @@ def test_the_wait_for_the_power_is_counted_down(tmp_path: Path) -> None:
 
     place.bench.feed.put = watched  # type: ignore[method-assign]
     _done(place, Fault.POWER)
-    place.do(_upgrade(place.do(RescueIt())))
+    place.do(_upgrade(place.do(Bench.rescue_it)))
     assert seen[0] in (59, 60)
     assert len(set(seen)) > 5
     assert seen == sorted(seen, reverse=True)
@@ -333,23 +335,25 @@ def test_an_image_that_the_device_has_refused_is_not_chosen_for_its_rescue(
     place: BenchPlace,
 ) -> None:
     _done(place, Fault.REFUSES)
-    state = place.do(RescueIt())
+    state = place.do(Bench.rescue_it)
     assert state.offers
     assert state.offer is None
 
 
 def test_a_bike_that_was_interrupted_before_is_rescued_from_the_start(place: BenchPlace) -> None:
     state = place.do(
-        StartOver(is_rescue=True), UseAdapter(Fault.NO_APPLICATION.value), ChooseTarget("obc"),
-        ChooseImage(IMAGE),
-    )  # fmt: skip
+        order(Bench.start_over, is_rescue=True),
+        order(Bench.use_adapter, Fault.NO_APPLICATION.value),
+        order(Bench.choose_target, "obc"),
+        order(Bench.choose_image, IMAGE),
+    )
     done = place.do(_upgrade(state)).done
     assert done is not None
     assert done.is_completed
 
 
 def test_a_bike_that_is_off_says_so(place: BenchPlace) -> None:
-    assert isinstance(place.do(UseAdapter(Fault.OFF.value)).trouble, NoAnswerError)
+    assert isinstance(place.do(order(Bench.use_adapter, Fault.OFF.value)).trouble, NoAnswerError)
 
 
 # -- one thing at a time ---------------------------------------------------------------------------
@@ -381,27 +385,27 @@ def test_a_terminal_that_is_gone_does_not_end_an_upgrade(place: BenchPlace) -> N
 
 
 def test_while_it_does_something_it_takes_no_other_order(place: BenchPlace) -> None:
-    assert place.bench.order(FindAdapters())
-    assert not place.bench.order(StartOver())
+    assert place.bench.order(Bench.find_adapters)
+    assert not place.bench.order(Bench.start_over)
 
 
 @pytest.mark.parametrize(
-    "order",
+    "ordered",
     [
-        Look(),
-        Judge(),
-        Watch(),
-        FindAreas(),
-        BackUp(""),
-        ChooseTarget("bms"),
-        UseAdapter("none"),
-        RescueIt(),
-        Upgrade("bms", ""),
-        Waive(IMAGE, "hardware"),
+        Bench.look,
+        Bench.judge,
+        Bench.watch,
+        Bench.find_areas,
+        order(Bench.back_up, ""),
+        order(Bench.choose_target, "bms"),
+        order(Bench.use_adapter, "none"),
+        Bench.rescue_it,
+        order(Bench.upgrade, "bms", ""),
+        order(Bench.waive, IMAGE, "hardware"),
     ],
 )
-def test_an_order_out_of_turn_is_refused_in_words(place: BenchPlace, order: Order) -> None:
-    state = place.do(order)
+def test_an_order_out_of_turn_is_refused_in_words(place: BenchPlace, ordered: Order) -> None:
+    state = place.do(ordered)
     assert isinstance(state.trouble, UsageError)
     assert state.trouble.remedy
     assert state.doing is Doing.NOTHING
@@ -413,7 +417,7 @@ def test_an_order_out_of_turn_is_refused_in_words(place: BenchPlace, order: Orde
 def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place.do(UseAdapter(Fault.HARDWARE.value))
+    place.do(order(Bench.use_adapter, Fault.HARDWARE.value))
     looks: list[State] = []
 
     def put(_subject: str, state: State, **_: object) -> None:
@@ -422,7 +426,7 @@ def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
             place.bench.stop()
 
     monkeypatch.setattr(place.bench.feed, "put", put)
-    state = place.do(Watch())
+    state = place.do(Bench.watch)
     assert state.trouble is None
     assert state.watched is not None
     assert {each.doing for each in looks} == {Doing.WATCHING, Doing.NOTHING}
@@ -431,15 +435,15 @@ def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
     assert running.route == "BMS > all"
     assert {"voltage", "state of charge"} <= {each.label for each in running.fields}
     assert any(each.is_trouble for each in state.watched.board)  # the fault of this bike
-    assert place.do(UseAdapter(Fault.NONE.value)).watched is None
+    assert place.do(order(Bench.use_adapter, Fault.NONE.value)).watched is None
 
 
 def test_a_bus_that_fails_while_it_is_watched_says_so(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    place.do(UseAdapter(Fault.NONE.value))
+    place.do(order(Bench.use_adapter, Fault.NONE.value))
     monkeypatch.setattr("flasher.web.bench.drive", _lost)
-    state = place.do(Watch())
+    state = place.do(Bench.watch)
     assert isinstance(state.trouble, BusError)
     assert state.doing is Doing.NOTHING
 
@@ -449,10 +453,10 @@ def _lost(*_: object, **__: object) -> None:
 
 
 def test_memory_and_answers_are_saved_to_a_file_as_by_the_command(place: BenchPlace) -> None:
-    state = place.do(UseAdapter(Fault.NONE.value), FindAreas())
+    state = place.do(order(Bench.use_adapter, Fault.NONE.value), Bench.find_areas)
     assert state.areas is not None
     (area,) = state.areas  # new.bin has no addresses, and broken.hex is no image
-    saved = place.do(BackUp(area.source)).saved
+    saved = place.do(order(Bench.back_up, area.source)).saved
     assert saved is not None
     assert saved.path.parent.name == "backups"
     assert saved.path.name.startswith("bms-W2605001-")
@@ -469,16 +473,16 @@ def test_the_addresses_of_a_backup_may_be_those_of_an_image(
     image = IntelHex()
     image.frombytes(image_of(3, NEW).data, offset=0x0800_4000)
     image.write_hex_file(str(tmp_path / "running.hex"))
-    state = place.do(UseAdapter(Fault.NONE.value), FindAreas())
+    state = place.do(order(Bench.use_adapter, Fault.NONE.value), Bench.find_areas)
     assert [each.start for each in state.areas or ()] == [AREA_START, 0x0800_4000]
-    state = place.do(BackUp((state.areas or ())[1].source))
+    state = place.do(order(Bench.back_up, (state.areas or ())[1].source))
     assert state.saved is not None
     assert state.saved.area is not None
     assert state.saved.area.source.endswith("running.hex")
 
 
 def test_a_backup_without_memory_says_what_is_not_in_it(place: BenchPlace) -> None:
-    saved = place.do(UseAdapter(Fault.NONE.value), BackUp("")).saved
+    saved = place.do(order(Bench.use_adapter, Fault.NONE.value), order(Bench.back_up, "")).saved
     assert saved is not None
     assert (saved.area, saved.names_running_version) == (None, None)
     assert "memory" in saved.missing
@@ -487,22 +491,22 @@ def test_a_backup_without_memory_says_what_is_not_in_it(place: BenchPlace) -> No
 def test_nothing_is_saved_of_a_battery_that_is_silent_or_where_nothing_can_be_written(
     place: BenchPlace, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    state = place.do(UseAdapter(Fault.OFF.value), BackUp(""))
+    state = place.do(order(Bench.use_adapter, Fault.OFF.value), order(Bench.back_up, ""))
     assert isinstance(state.trouble, NoAnswerError)
     assert state.saved is None
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "file"))
-    state = place.do(UseAdapter(Fault.NONE.value), BackUp(""))
+    state = place.do(order(Bench.use_adapter, Fault.NONE.value), order(Bench.back_up, ""))
     assert isinstance(state.trouble, UsageError)
     assert state.saved is None
 
 
 def test_what_the_battery_told_is_said_in_the_words_of_the_command(place: BenchPlace) -> None:
-    state = place.do(UseAdapter(Fault.NONE.value))
+    state = place.do(order(Bench.use_adapter, Fault.NONE.value))
     found = dict(told(state))
     assert found["faults"] == [("faults", "none heard")]
     assert ("cycles", "12") in found["history"]
     assert "not answered" not in found
-    ((_, faults),) = dict(told(place.do(UseAdapter(Fault.HARDWARE.value))))["faults"]
+    ((_, faults),) = dict(told(place.do(order(Bench.use_adapter, Fault.HARDWARE.value))))["faults"]
     assert faults == "over discharge protection"
     assert words("de")(faults) == "Schutz: Tiefentladung"

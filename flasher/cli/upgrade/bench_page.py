@@ -44,7 +44,7 @@ from flasher.settings.profile import Profile, load_profile
 from flasher.web import bench
 from flasher.web.bench import Bench
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
-from flasher.web.bench_state import Adapter, Doing, FindAdapters, Saved
+from flasher.web.bench_state import Adapter, Doing, Saved
 from flasher.web.desk import Desk, DeskPages
 from flasher.web.guard import BODY_MAX, Entry, application
 from flasher.web.kept import PAGES as KEPT
@@ -323,7 +323,7 @@ def serve(
 
         worker = threading.Thread(target=work, name="bench", daemon=True)
         with Server(app, "127.0.0.1", port) as server:
-            machine.order(FindAdapters())
+            machine.order(Bench.find_adapters)
             worker.start()
             opened(server.url.rstrip("/") + entry.path)
             was_upgrading = _wait(machine, worker, stop)
