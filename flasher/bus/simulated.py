@@ -120,6 +120,12 @@ class SimulatedBus:
         self._nodes.append(device)
         self._devices.append(device)
 
+    def detach(self, engine: Engine) -> None:
+        """Take a device off the bus, with what it had still to send."""
+        device = next(each for each in self._devices if each.engine is engine)
+        self._nodes.remove(device)
+        self._devices.remove(device)
+
     def link(self, queue_frames: int = DEFAULT_QUEUE_FRAMES) -> SimulatedLink:
         """A way onto the bus for somebody who drives it from outside."""
         host = _Host()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from enum import StrEnum
 from typing import Final
@@ -18,9 +18,9 @@ from flasher.bus.link import Clock, PacedClock, VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.errors import UsageError
 from flasher.image.release import Release
+from flasher.mock.faults import AtTime, FaultInjector, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.protocol.frame import Frame
 from flasher.protocol.spec import IMAGE_MAX_SIZE, VERSION_FIELD_SIZE, Dialect, Target
 from flasher.protocol.text import encode_text
 from flasher.station.config import MockUnits
@@ -106,68 +106,8 @@ def next_number(rule: SerialNumber, known: set[str]) -> int:
     return last + 1
 
 
-class Place:
-    """The connector of one target on the bus: an engine, with or without a device behind it."""
-
-    def __init__(self) -> None:
-        self.device: MockDevice | None = None
-        self._power_at: float | None = None
-        """When the power comes back."""
-
-    def put(self, device: MockDevice, now: float) -> None:
-        """Put a device in. Its power comes with the socket: it passes through its bootloader."""
-        self.device = device
-        device.power_cut(now)
-        device.power_on(now)
-
-    def take(self) -> None:
-        self.device = self._power_at = None
-
-    def cycle(self, now: float) -> None:
-        if self.device is not None and self.device.has_power:
-            self.device.power_cut(now)
-        self._power_at = now + POWER_OFF_S
-
-    # -- the engine interface: that of the device, where one is -----------------------------------
-
-    @property
-    def done(self) -> bool:
-        return False
-
-    def receive(self, frame: Frame, now: float) -> None:
-        if self.device is not None:
-            self.device.receive(frame, now)
-
-    def tick(self, now: float) -> None:
-        if self._power_at is not None and now >= self._power_at:
-            self._power_at = None
-            if self.device is not None and not self.device.has_power:
-                self.device.power_on(now)
-        if self.device is not None:
-            self.device.tick(now)
-
-    def deadline(self) -> float | None:
-        wanted = None if self.device is None else self.device.deadline()
-        if self._power_at is None:
-            return wanted
-        return self._power_at if wanted is None else min(wanted, self._power_at)
-
-    def next_frame(self, now: float) -> Frame | None:
-        return None if self.device is None else self.device.next_frame(now)
-
-    def frame_sent(self, now: float) -> None:
-        if self.device is not None:
-            self.device.frame_sent(now)
-
-    def cancel(self, now: float) -> None:
-        pass
-
-    def take_events(self) -> Sequence[object]:
-        return () if self.device is None else self.device.take_events()
-
-
 class VirtualSocket:
-    """A socket with virtual units: a bus, the places on it, and who comes and goes."""
+    """A socket with virtual units: a bus, and who comes and goes."""
 
     def __init__(
         self, recipe: LoadedRecipe, virtual: VirtualUnits, clock: Clock | None = None
@@ -177,11 +117,10 @@ class VirtualSocket:
         made = PacedClock(virtual.speed) if virtual.speed else VirtualClock()
         self.clock = clock or made
         self.dialect = recipe.targets[0].profile.dialect
-        bus = SimulatedBus(self.dialect.bitrate_bps, self.clock)
-        self.places = {target.name: Place() for target in recipe.targets}
-        for place in self.places.values():
-            bus.attach(place)
-        self.connection = Connection(bus.link(), self.clock, "virtual units")
+        self._bus = SimulatedBus(self.dialect.bitrate_bps, self.clock)
+        self.devices: dict[str, FaultInjector] = {}
+        """Those of the unit in the socket, by their targets."""
+        self.connection = Connection(self._bus.link(), self.clock, "virtual units")
         self._serials = serial_numbers(
             recipe.recipe.serial_number, virtual.first_number, virtual.number_step
         )
@@ -198,8 +137,9 @@ class VirtualSocket:
         self._next_at = None
         if self.serial:
             self.serial = ""
-            for place in self.places.values():
-                place.take()
+            for device in self.devices.values():
+                self._bus.detach(device)
+            self.devices.clear()
             self._next_at = now + self._virtual.arrive_after_s
             return PresenceChanged(is_there=False, how="the virtual unit left", is_certain=True)
         if self._left == 0:
@@ -213,12 +153,14 @@ class VirtualSocket:
         """Put the unit with this label in."""
         self.serial = serial
         health = health_of(self._virtual.units, serial)
-        if health is not Health.DEAD:
-            for target in self._recipe.targets:
-                device = make_device(
-                    target.target, self.dialect, health, target.release, self._own_number(serial)
-                )
-                self.places[target.name].put(device, self.clock.now())
+        own_number, now = self._own_number(serial), self.clock.now()
+        for target in self._recipe.targets if health is not Health.DEAD else ():
+            device = make_device(target.target, self.dialect, health, target.release, own_number)
+            # Its power comes with the socket: it passes through its bootloader.
+            device.power_cut(now)
+            device.power_on(now)
+            self.devices[target.name] = FaultInjector(device)
+            self._bus.attach(self.devices[target.name])
         return health
 
     def _own_number(self, label: str) -> str:
@@ -240,8 +182,9 @@ class VirtualSocket:
     # -- the power of the socket ------------------------------------------------------------------
 
     def begin_cycle(self) -> None:
-        for place in self.places.values():
-            place.cycle(self.clock.now())
+        for injector in self.devices.values():
+            if injector.device.has_power:
+                injector.set(PowerCut(POWER_OFF_S), AtTime(self.clock.now()))
 
     def check(self) -> None:
         """It never fails."""

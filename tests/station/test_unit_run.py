@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from flasher.mock.bms import BmsApplication
+from flasher.mock.faults import AtTime, PowerCut
+from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WMC
 from flasher.settings.manifest import release_of, to_toml
@@ -136,7 +138,7 @@ def test_a_unit_that_has_just_been_switched_on_is_asked_when_its_bootloader_is_t
 
 def test_a_dead_unit_fails_with_no_answer(tmp_path: Path) -> None:
     bench = UnitBench(tmp_path)
-    bench.places[BMS].take()
+    bench.bus.detach(bench.units[BMS])
     result = bench.run()
     assert (result.outcome, result.code) == (RunState.FAIL, "NO_ANSWER")
     assert bench.journal.rows[-1] == ("step", "identify", "FAIL", "NO_ANSWER")
@@ -219,9 +221,7 @@ def test_what_must_not_change_is_compared(tmp_path: Path) -> None:
 
 def test_what_must_not_change_but_cannot_be_read_first_is_not_risked(tmp_path: Path) -> None:
     bench = UnitBench(tmp_path, USUAL + UNCHANGED)
-    bench.places[BMS].device = type(bench.device)(
-        BMS, bitrate_bps=250_000, profile=NEW_UNIT, has_application=False
-    )
+    bench.put(MockDevice(BMS, bitrate_bps=250_000, profile=NEW_UNIT, has_application=False))
     assert bench.run().code == "UNCHANGED_UNKNOWN"
     assert bench.device.erase_count == 0
 
@@ -247,9 +247,7 @@ def test_a_unit_in_its_bootloader_says_its_number_before_anything_is_written(
 ) -> None:
     profile = replace(NEW_UNIT, serial_number="W2605009")
     bench = UnitBench(tmp_path)
-    bench.places[BMS].device = type(bench.device)(
-        BMS, bitrate_bps=250_000, profile=profile, has_application=False
-    )
+    bench.put(MockDevice(BMS, bitrate_bps=250_000, profile=profile, has_application=False))
     assert bench.run().code == "WRONG_UNIT"
     assert ("intent", "bms", "serial-number") not in bench.journal.rows
 
@@ -266,9 +264,7 @@ def test_a_unit_left_without_an_application_is_flashed_from_the_start(tmp_path: 
         for m in bench.step(StepName.CHECK).measurements
         if m.name.startswith("before ")
     }
-    bench.places[BMS].device = type(bench.device)(
-        BMS, bitrate_bps=250_000, profile=NEW_UNIT, has_application=False
-    )
+    bench.put(MockDevice(BMS, bitrate_bps=250_000, profile=NEW_UNIT, has_application=False))
     result = bench.run(RunKind.RECHECK, known_before=before, flashed_before=frozenset({"bms"}))
     assert result.outcome is RunState.PASS, result.text
     assert bench.journal.rows.count(("intent", "bms", "flash")) == 2
@@ -331,7 +327,7 @@ def test_an_answer_that_is_compared_with_nothing_proves_nothing(tmp_path: Path) 
 
 def test_a_step_is_tried_as_often_as_the_recipe_says(tmp_path: Path) -> None:
     bench = UnitBench(tmp_path, USUAL + WRITES + "\n[step.identify]\ntries = 3\npause_s = 2\n")
-    bench.places[BMS].take()
+    bench.bus.detach(bench.units[BMS])
     began = bench.clock.now()
     assert bench.run().code == "NO_ANSWER"
     tries = [r.try_number for r in bench.journal.reports if r.step is StepName.IDENTIFY]
@@ -388,7 +384,7 @@ class SwitchedPower:
 
     def begin_cycle(self) -> None:
         self.cycles += 1
-        self._bench.places[BMS].cycle(self._bench.clock.now())
+        self._bench.units[BMS].set(PowerCut(1.0), AtTime(self._bench.clock.now()))
 
     def check(self) -> None:
         pass

@@ -109,13 +109,13 @@ def test_units_come_and_go(tmp_path: Path) -> None:
     came = socket.step()
     assert came is not None
     assert came.label == socket.serial
-    assert all(place.device for place in socket.places.values())
+    assert list(socket.devices) == [target.name for target in recipe.targets]
     socket.run_ended()
     socket.clock.wait_until(2.0)
     gone = socket.step()
     assert gone is not None
     assert not gone.is_there
-    assert not any(place.device for place in socket.places.values())
+    assert not socket.devices
     socket.clock.wait_until(10.0)
     assert socket.step() is None
 

@@ -122,8 +122,7 @@ def test_it_does_nothing_before_the_reply(tmp_path: Path) -> None:
     ended = socket.work()
     assert ended is not None
     assert ended.result.code == "RECORD_NOT_SAVED"
-    device = socket.virtual.places["bms"].device
-    assert device is not None
+    device = socket.virtual.devices["bms"].device
     assert device.erase_count == 0
 
 
@@ -140,8 +139,7 @@ def test_when_the_station_dies_it_ends_without_another_act(tmp_path: Path, asks:
     socket.channel._answer = die
     assert socket.work() is None
     assert socket.line.is_gone
-    device = socket.virtual.places["bms"].device
-    assert device is not None
+    device = socket.virtual.devices["bms"].device
     # The fourth ask is the intent to flash: without its reply nothing was erased.
     assert (device.erase_count == 0) == (asks <= 4)
 

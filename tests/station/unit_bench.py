@@ -10,6 +10,7 @@ from flasher.api import Connection
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.driver import Tap
+from flasher.mock.faults import FaultInjector
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, WELLING, Target
@@ -17,7 +18,6 @@ from flasher.station.messages import JournalError, RunEvent, RunOrder, RunResult
 from flasher.station.power import PowerControl
 from flasher.station.records.model import RunId, RunKind, StepName, StepState, WriteId
 from flasher.station.unit_run import UnitRun
-from flasher.station.virtual_units import Place
 from tests.station.factory import DAY, SERIAL, USUAL, make_recipe
 
 WRITES = """
@@ -75,10 +75,9 @@ class UnitBench:
         self.recipe = make_recipe(folder, text)
         self.clock = VirtualClock()
         self.bus = SimulatedBus(WELLING.bitrate_bps, self.clock)
-        self.places = {target: Place() for target in targets}
-        for target, place in self.places.items():
-            self.bus.attach(place)
-            place.device = MockDevice(target, bitrate_bps=WELLING.bitrate_bps, profile=profile)
+        self.units: dict[Target, FaultInjector] = {}
+        for target in targets:
+            self.put(MockDevice(target, bitrate_bps=WELLING.bitrate_bps, profile=profile))
         self.connection = Connection(self.bus.link(), self.clock, "a simulated bus")
         self.journal = Notes()
         self.notes: list[RunEvent] = []
@@ -86,12 +85,17 @@ class UnitBench:
         self.power: PowerControl | None = None
         self.taps: Sequence[Tap] = ()
 
+    def put(self, device: MockDevice) -> None:
+        """Put a device on the bus, in place of one for the same target."""
+        if device.target in self.units:
+            self.bus.detach(self.units[device.target])
+        self.units[device.target] = FaultInjector(device)
+        self.bus.attach(self.units[device.target])
+
     @property
     def device(self) -> MockDevice:
         """The only unit, or the first."""
-        device = next(iter(self.places.values())).device
-        assert device is not None
-        return device
+        return next(iter(self.units.values())).device
 
     def run(
         self,
