@@ -33,7 +33,7 @@ from flasher.station.events import (
     UnitRemoved,
 )
 from flasher.station.messages import AdapterDown, PresenceChanged, Ready
-from flasher.station.people import HIDDEN, Crew, Person
+from flasher.station.people import HIDDEN, Asked, Crew, Person
 from flasher.station.pins import FORM_WORDS, Pin, is_form
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import AuditEvent, RunState
@@ -218,7 +218,7 @@ class Line:
         self._arrival_limit_s = arrival_limit_s
         self._scan_limit_s = scan_limit_s
         self._scans_labels = scans_labels
-        self._crew = crew
+        self._crew = crew or Crew(())
         self._effects: list[Effect] = []
         self._label = ""
         """The label that waits for the card of its socket."""
@@ -373,17 +373,17 @@ class Line:
         """Something was scanned; `mounted`: by the scanner of this socket."""
         scanned = text.strip()
         crew = self._crew
-        person = None if crew is None else crew.find(scanned)
+        person = crew.find(scanned)
         if mounted and self._is_serial(scanned):  # not the PIN that a person may be typing
             socket = self.sockets[mounted]
             self._answer(
                 printable(scanned)[:80], lambda: ("label", self._take_mounted(socket, scanned, now))
             )
-        elif crew is not None and crew.asked is not None:
-            self._take_pin(crew, scanned)
+        elif crew.asked is not None:
+            self._take_pin(crew.asked, scanned)
         elif person is not None:
             self._log_in(person)
-        elif crew is not None and crew.may_be_pin(scanned) and not self._is_serial(scanned):
+        elif crew.may_be_pin(scanned) and not self._is_serial(scanned):
             # Typed too late, or too often: it must not be shown in what is said of it.
             reason = say("No PIN is awaited, and it is no serial number of this recipe.")
             self._refuse(HIDDEN, "NO_PIN_AWAITED", reason, say("Scan first what needs the PIN."))
@@ -404,10 +404,11 @@ class Line:
 
     def _understand(self, text: str, now: float) -> tuple[str, Socket | None]:
         """What a scan means, and for which socket. Raises Refused."""
-        if self._crew is not None and isinstance(understand(text), Label):
+        understood = understand(text)
+        if isinstance(understood, Label):
             self._crew.check_somebody()
         was_refused, self._is_choice_refused = self._is_choice_refused, False
-        match understand(text):
+        match understood:
             case Label(serial):
                 if was_refused:
                     raise Refused(
@@ -417,8 +418,8 @@ class Line:
                     )
                 return "label", self._take_label(serial, now)
             case Command(word, argument):
-                person = None if self._crew is None else self._crew.check_role(word)
-                if self._crew is not None and person is not None and person.pin:
+                person = self._crew.check_role(word)
+                if person is not None and person.pin:
                     asked = self._crew.ask(person, word, argument, now)
                     self._tell(PinAwaited(person.name, asked.text, asked.until_s - now))
                     return _PIN, None
@@ -429,20 +430,15 @@ class Line:
     # -- badges and PINs --------------------------------------------------------------------------
 
     def _log_in(self, person: Person) -> None:
-        if self._crew is None:
-            return
         self._crew.person = person
         before, self.operator = self.operator, person.name
         self._audit(AuditEvent.OPERATOR, before=before, now=person.name, role=person.role.value)
         self._tell(ScanAccepted(printable(person.name), "badge"))
 
-    def _take_pin(self, crew: Crew, scanned: str) -> None:
+    def _take_pin(self, asked: Asked, scanned: str) -> None:
         """What was scanned while a PIN is awaited: it is never shown."""
-        asked = crew.asked
-        if asked is None:
-            return
         if scanned.upper() == Word.CANCEL.value:
-            self._end_pin(crew, "CANCELLED", say("It was cancelled."), _NOTHING)
+            self._end_pin(asked, "CANCELLED", say("It was cancelled."), _NOTHING)
         elif is_form(scanned):
             self._effects.append(CheckPin(Pin(scanned), asked.person.pin))
         else:
@@ -456,8 +452,8 @@ class Line:
     def pin_checked(self, now: float, *, is_right: bool) -> None:
         """Result of `CheckPin`."""
         crew = self._crew
-        asked = None if crew is None else crew.asked
-        if crew is None or asked is None:
+        asked = crew.asked
+        if asked is None:
             return
         has_tries = crew.take_answer(asked.person.name, is_right=is_right, now=now)
         if is_right:
@@ -473,15 +469,14 @@ class Line:
             self._refuse(HIDDEN, "WRONG_PIN", say("The PIN is wrong."), remedy)
         else:
             remedy = say("Wait a minute, then scan it again.")
-            self._end_pin(crew, "PIN_LOCKED", say("Too many wrong PINs."), remedy)
+            self._end_pin(asked, "PIN_LOCKED", say("Too many wrong PINs."), remedy)
         self._go_on(now)
 
-    def _end_pin(self, crew: Crew, code: str, reason: str, remedy: str) -> None:
+    def _end_pin(self, asked: Asked, code: str, reason: str, remedy: str) -> None:
         """The override that waited for its PIN is refused."""
-        if crew.asked is not None:
-            asked, crew.asked = crew.asked, None
-            self._tell(PinEnded(asked.person.name, is_right=False))
-            self._refuse(printable(asked.text)[:80], code, reason, remedy)
+        self._crew.asked = None
+        self._tell(PinEnded(asked.person.name, is_right=False))
+        self._refuse(printable(asked.text)[:80], code, reason, remedy)
 
     # -- labels and commands ----------------------------------------------------------------------
 
@@ -507,8 +502,7 @@ class Line:
         """A label of the scanner at a socket: as its card and the label. Raises Refused. What waits
         of another scanner goes on waiting.
         """
-        if self._crew is not None:
-            self._crew.check_somebody()
+        self._crew.check_somebody()
         self._check_label(serial)
         self._check_takes(socket)
         self._check_for(socket, serial)
@@ -645,7 +639,7 @@ class Line:
         self.lot = argument
 
     def _set_operator(self, argument: str, _now: float) -> None:
-        if self._crew is not None:
+        if self._crew.has_badges:
             raise Refused("BADGES", say("Here a badge says who works."), say("Scan your badge."))
         self._audit(AuditEvent.OPERATOR, before=self.operator, now=argument)
         self.operator = argument
@@ -655,8 +649,7 @@ class Line:
         self._reason = argument
 
     def _reprint(self, argument: str, _now: float) -> None:
-        if self._crew is not None:
-            self._crew.check_somebody()
+        self._crew.check_somebody()
         self._effects.append(Reprint(argument, self._with_author({"serial": argument})))
 
     def reprinted(self, serial: str, refused: Refused | None) -> None:
@@ -705,9 +698,9 @@ class Line:
                 reason = say("No label was scanned for it.")
                 self._refuse(text, _FORGOTTEN, reason, _AGAIN)
             self._forget_scans()
-        crew = self._crew
-        if crew is not None and crew.asked is not None and now >= crew.asked.until_s:
-            self._end_pin(crew, "NO_PIN", say("No PIN came."), _AGAIN)
+        asked = self._crew.asked
+        if asked is not None and now >= asked.until_s:
+            self._end_pin(asked, "NO_PIN", say("No PIN came."), _AGAIN)
         for socket in self.sockets.values():
             waits = socket.label and socket.begin_at_s is None and socket.phase is Phase.REST
             if waits and now >= socket.bound_at_s + self._scan_limit_s:
@@ -794,7 +787,7 @@ class Line:
 
     def _with_author(self, data: dict[str, str]) -> dict[str, str]:
         """What goes into the audit trail: with badges, who it is by."""
-        if self._crew is None:
+        if not self._crew.has_badges:
             return data
         return {**data, "by": "" if self._crew.person is None else self._crew.person.name}
 

@@ -150,10 +150,13 @@ class Asked:
 
 
 class Crew:
-    """Everybody with a badge, who works here, and the override that waits for a PIN."""
+    """Everybody with a badge, who works here, and the override that waits for a PIN. Where nobody
+    has a badge, people are taken at their word.
+    """
 
     def __init__(self, people: Iterable[Person]) -> None:
         self._people = {each.code: each for each in people}
+        self.has_badges = bool(self._people)
         self.has_pins = any(each.pin for each in self._people.values())
         self.person: Person | None = None
         """Who works here; None before the first badge."""
@@ -180,13 +183,12 @@ class Crew:
         """True for a text that may be a PIN, which somebody has typed too late."""
         return self.has_pins and pins.is_form(text)
 
-    def check_somebody(self) -> Person:
-        """Who works here. Raises Refused before the first badge."""
-        if self.person is None:
+    def check_somebody(self) -> None:
+        """Raises Refused before the first badge."""
+        if self.has_badges and self.person is None:
             raise Refused(
                 "NOBODY", say("Nobody has scanned a badge yet."), say("Scan your badge first.")
             )
-        return self.person
 
     def check_role(self, word: Word) -> Person | None:
         """Who says a command that overrides the station; None for the other commands. Raises
@@ -194,8 +196,9 @@ class Crew:
         """
         if word not in _ROLES:
             return None
-        person = self.check_somebody()
-        if person.role not in _ROLES[word]:
+        self.check_somebody()
+        person = self.person
+        if person is not None and person.role not in _ROLES[word]:
             raise Refused(
                 "NOT_ALLOWED",
                 say("{name} may not do that.", name=printable(person.name)),
