@@ -30,13 +30,6 @@ class Check:
     """What was seen."""
 
 
-@dataclass(frozen=True)
-class Health:
-    """All of them."""
-
-    checks: tuple[Check, ...]
-
-
 class Watch:
     """Looks at the disk and the clock every few seconds. `folder`: where the records' files are;
     `utc` and `monotonic_s`: the two clocks.
@@ -58,7 +51,7 @@ class Watch:
         records_fault: str,
         unprinted: Collection[str] = (),
         lost_scanners: Collection[str] = (),
-    ) -> Health:
+    ) -> tuple[Check, ...]:
         """What is so now; `records_fault`: why records are not saved, empty when they are;
         `unprinted`: units without their labels; `lost_scanners`: those that cannot be read.
         """
@@ -73,7 +66,7 @@ class Watch:
         if lost_scanners:
             text = say("cannot be read: {names}", names=_few(lost_scanners))
             checks.append(Check(say("scanners"), is_good=False, text=text))
-        return Health((*checks, *self._seen))
+        return (*checks, *self._seen)
 
     def _disk(self) -> Check:
         try:

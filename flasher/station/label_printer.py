@@ -43,14 +43,6 @@ class LabelJob:
     is_reprint: bool = False
 
 
-@dataclass(frozen=True)
-class LabelDone:
-    """What came of it; `reason` is empty when it was printed."""
-
-    job: LabelJob
-    reason: str = ""
-
-
 class LabelPrinter:
     """The printer of a station. `submit` and `take` are called in the station's thread."""
 
@@ -64,7 +56,7 @@ class LabelPrinter:
         self._limit_s = limit_s
         self._wake: Callable[[], None] = lambda: None
         self._jobs: queue.Queue[LabelJob | None] = queue.Queue(BACKLOG_MAX)
-        self._done: deque[LabelDone] = deque()
+        self._done: deque[tuple[LabelJob, str]] = deque()
         self._thread = threading.Thread(target=self._work, name="labels", daemon=True)
 
     def start(self, wake: Callable[[], None]) -> None:
@@ -77,11 +69,13 @@ class LabelPrinter:
         try:
             self._jobs.put_nowait(job)
         except queue.Full:
-            self._done.append(LabelDone(job, say("Too many labels wait for the printer.")))
+            self._done.append((job, say("Too many labels wait for the printer.")))
             self._wake()
 
-    def take(self) -> list[LabelDone]:
-        """What has come of labels since the last call."""
+    def take(self) -> list[tuple[LabelJob, str]]:
+        """The labels that are done since the last call, each with why it was not printed; "" for
+        one that was.
+        """
         return [self._done.popleft() for _ in range(len(self._done))]
 
     def close(self) -> None:
@@ -102,7 +96,7 @@ class LabelPrinter:
                 reason = error.args[0]
             except Exception as error:  # noqa: BLE001  of a template: a station has to know it
                 reason = say("The label cannot be made: {why}.", why=printable(str(error))[:200])
-            self._done.append(LabelDone(job, reason))
+            self._done.append((job, reason))
             self._wake()
 
 

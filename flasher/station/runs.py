@@ -91,11 +91,11 @@ def _attach(store: Store, run: ActiveRun) -> None:
     if trace is None:
         if run.trace.exists():
             with suppress(FileNotFoundError):
-                run.attached = [store.add_file(TORN_TRACE, run.trace)]
+                run.attached = [store.files.add(TORN_TRACE, run.trace)]
         if run.result is not None and run.result.outcome is RunState.PASS:
             run.result = _worse(run.result, codes.TRACE_NOT_SAVED, "There is no trace of the bus.")
         return
-    file = store.add_file(TRACE, trace.path)
+    file = store.files.add(TRACE, trace.path)
     if file.sha256 != trace.sha256 and run.result is not None:
         words = "The trace on disk is not the one that was written."
         run.result = _worse(run.result, codes.TRACE_NOT_SAVED, words)

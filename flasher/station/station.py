@@ -586,10 +586,9 @@ class Station:
         return LabelJob(socket, run.serial, values_of(run, groups), is_reprint)
 
     def _tell_labels(self) -> None:
-        for done in () if self._labels is None else self._labels.take():
-            job = done.job
-            if done.reason:
-                self._label_failed(job.socket, job.serial, done.reason)
+        for job, reason in () if self._labels is None else self._labels.take():
+            if reason:
+                self._label_failed(job.socket, job.serial, reason)
             else:
                 self.tell(LabelPrinted(job.socket, job.serial, job.is_reprint))
 

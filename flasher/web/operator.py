@@ -21,7 +21,7 @@ from starlette.routing import BaseRoute, Route
 from flasher.said import say
 from flasher.station.board import Board, Row
 from flasher.station.events import LineStopped, RunEnded, SocketState, StationEvent
-from flasher.station.health import Health, Watch
+from flasher.station.health import Check, Watch
 from flasher.station.tally import EndedRun, Output, Tally
 from flasher.web.feed import Feed
 from flasher.web.pages import Pages, streamed
@@ -102,7 +102,7 @@ class Head:
     lot: Lot
     virtual: str
     output: Output
-    health: Health
+    health: tuple[Check, ...]
     stopped: LineStopped | None
     spoken: str
     is_refusal: bool
@@ -139,7 +139,7 @@ class Head:
             "causes": [f"{code} {count}" for code, count in self.output.causes],
             "health": [
                 {"name": words(check.name), "is_good": check.is_good, "text": words(check.text)}
-                for check in self.health.checks
+                for check in self.health
             ],
         }
 

@@ -67,7 +67,7 @@ def one_run(bench: Bench, serial: str, *, bad: bool) -> None:
     state = StepState.FAIL if bad else StepState.PASS
     store.step(run_id, StepName.VERIFY, state, duration_s=1.0)
     trace = bench.traced(serial)
-    file = store.add_file("trace", trace)
+    file = store.files.add("trace", trace)
     trace.unlink()
     verified = {} if bad else {"bms": Verified.VERSION}
     outcome, code = (RunState.FAIL, "VERSION") if bad else (RunState.PASS, "OK")

@@ -205,7 +205,7 @@ class Bench:
     def ending(
         self, state: RunState = RunState.PASS, code: str = "OK", trace: Path | None = None
     ) -> Ending:
-        file = self.store.add_file("trace", trace or self.trace)
+        file = self.store.files.add("trace", trace or self.trace)
         verified = {"bms": Verified.VERSION} if state is RunState.PASS else {}
         return Ending(state, code, "", verified, file.sha256, [file])
 

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
-from typing import IO, Final
+from typing import Final
 
 from flasher.protocol.text import printable
 from flasher.station.records.errors import RecordError, RecordsDamagedError, mapped
@@ -35,13 +35,14 @@ class FileStore:
         self.folder = folder
 
     def add(self, kind: str, source: Path) -> AttachmentFile:
-        """Copy a file in. It is on disk when this returns. Raises RecordError."""
-        with mapped(printable(str(source)), writes=True), source.open("rb") as stream:
-            return self._add(kind, source.name, stream)
-
-    def _add(self, kind: str, name: str, stream: IO[bytes]) -> AttachmentFile:
-        shown = printable(str(self.folder))
-        with mapped(shown, writes=True):
+        """Copy a file in, for an `Ending` to name. It is on disk when this returns. Raises
+        RecordError.
+        """
+        with (
+            mapped(printable(str(source)), writes=True),
+            source.open("rb") as stream,
+            mapped(printable(str(self.folder)), writes=True),
+        ):
             self.folder.mkdir(parents=True, exist_ok=True)
             handle, part = tempfile.mkstemp(prefix=_PART, dir=self.folder)
             try:
@@ -65,7 +66,7 @@ class FileStore:
                 with contextlib.suppress(OSError):
                     Path(part).unlink(missing_ok=True)
                 raise
-        return AttachmentFile(kind, name, sha256, size_bytes)
+        return AttachmentFile(kind, source.name, sha256, size_bytes)
 
     @property
     def spool(self) -> Path:
@@ -107,16 +108,13 @@ class FileStore:
             path.write_bytes(data)
             yield path
 
-    def sweep(self, now: datetime) -> int:
-        """Take away what a crash left half written, a day later; how many files it was."""
-        swept = 0
+    def sweep(self, now: datetime) -> None:
+        """Take away what a crash left half written, a day later."""
         oldest = now.timestamp() - _PART_AGE_S
         with mapped(printable(str(self.folder)), writes=True):
             for part in self.folder.glob(_PART + "*"):
                 if part.stat().st_mtime < oldest:
                     part.unlink(missing_ok=True)
-                    swept += 1
-        return swept
 
     def path(self, sha256: str) -> Path:
         """Where the file with this hash lies."""

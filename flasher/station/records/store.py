@@ -7,7 +7,7 @@
     ... the act ...
     store.verified(write, "V1r0r4_20220512")
     store.step(claim.run_id, "flash", StepState.PASS, ...)
-    trace = store.add_file("trace", path)
+    trace = store.files.add("trace", path)
     store.finish(claim.run_id, Ending(RunState.PASS, "OK", "", ...))   # only now show PASS
 
 Whatever raises RecordError has saved nothing; a run that could not be finished stays RUNNING, and
@@ -278,10 +278,6 @@ class Store:
             )
             for each in measurements:
                 insert(connection, schema.measurement, step_id=step_id, **asdict(each))
-
-    def add_file(self, kind: str, path: Path) -> AttachmentFile:
-        """Store a file by its hash, for an `Ending` to name; on disk when it returns."""
-        return self.files.add(kind, path)
 
     # -- ending -----------------------------------------------------------------------------------
 

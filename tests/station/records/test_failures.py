@@ -207,7 +207,7 @@ def test_a_trace_that_cannot_be_stored_is_an_error_and_leaves_no_part(
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
         with pytest.raises(DiskFullError, match="RECORD NOT SAVED"):
-            bench.store.add_file("trace", bench.trace)
+            bench.store.files.add("trace", bench.trace)
     assert not [path for path in bench.store.files.folder.rglob("*") if "part" in path.name]
     bench.make()
 
@@ -225,7 +225,7 @@ def test_what_a_crash_left_half_written_is_swept_away_a_day_later(bench: Bench) 
 
 def test_a_trace_that_is_not_there_is_an_error(bench: Bench) -> None:
     with pytest.raises(RecordError, match="RECORD NOT SAVED"):
-        bench.store.add_file("trace", bench.folder / "none.asc")
+        bench.store.files.add("trace", bench.folder / "none.asc")
 
 
 def test_a_pass_whose_trace_vanished_is_not_saved(bench: Bench) -> None:
