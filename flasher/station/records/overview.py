@@ -11,9 +11,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from enum import StrEnum
-from typing import Any, Final, Generic, TypeVar
+from typing import Annotated, Any, Final, Generic, TypeVar
 
-from pydantic import TypeAdapter
+from pydantic import BeforeValidator, TypeAdapter
 from sqlalchemy import Select, and_, case, exists, func, literal, or_, select, union_all
 from sqlalchemy.sql.expression import ColumnElement
 
@@ -39,7 +39,6 @@ LIFE_SIZE: Final = 10
 IMAGES_MAX: Final = 100
 _SPANS_AT_ONCE: Final = 400
 """Spans in one query: SQLite takes 500 parts."""
-_RUNS: Final = TypeAdapter(tuple[RunRecord, ...])
 _Row = TypeVar("_Row")
 
 
@@ -137,8 +136,13 @@ class AuditRow:
     at: datetime
     event: str
     run_id: RunId | None
-    data: dict[str, Any]
+    data: Annotated[dict[str, Any], BeforeValidator(data_of)]
     hash: str
+
+
+_RUNS: Final = TypeAdapter(tuple[RunRecord, ...])
+_HOLDERS: Final = TypeAdapter(tuple[Holder, ...])
+_AUDIT: Final = TypeAdapter(tuple[AuditRow, ...])
 
 
 class Overview:
@@ -222,13 +226,15 @@ class Overview:
     def holders(self, sha256: str, cut: Cut, size: int = PAGE_SIZE) -> Page[Holder]:
         """A page of the units whose last transfer was that of the image with this hash."""
         rows, older, newer = self._cut(_holders(sha256), schema.run_target.c.id, cut, size)
-        return Page(tuple(map(_holder, rows)), older, newer)
+        return Page(_HOLDERS.validate_python(rows), older, newer)
 
-    def all_holders(self, sha256: str) -> list[Holder]:
+    def all_holders(self, sha256: str) -> tuple[Holder, ...]:
         """All of them, in the order in which they were made."""
         query = _holders(sha256).order_by(schema.run_target.c.id)
         with self._database.reading() as connection:
-            return [_holder(dict(row)) for row in connection.execute(query).mappings()]
+            return _HOLDERS.validate_python(
+                [dict(row) for row in connection.execute(query).mappings()]
+            )
 
     def holder_count(self, sha256: str) -> int:
         """How many units that are."""
@@ -341,9 +347,9 @@ class Overview:
     ) -> Page[AuditRow]:
         """A page of the audit trails of all stations."""
         audit = schema.audit.c
-        query = select(schema.audit, schema.station.c.name.label("station")).join_from(
-            schema.audit, schema.station
-        )
+        query = select(
+            schema.audit, audit.id.label("row_id"), schema.station.c.name.label("station")
+        ).join_from(schema.audit, schema.station)
         if event is not None:
             query = query.where(audit.event == event)
         if since is not None:
@@ -351,28 +357,12 @@ class Overview:
         if until is not None:
             query = query.where(audit.at < utc_text(until))
         rows, older, newer = self._cut(query, audit.id, cut, size)
-        return Page(
-            tuple(
-                AuditRow(
-                    row["id"],
-                    row["station"],
-                    row["number"],
-                    utc_moment(row["at"]),
-                    row["event"],
-                    row["run_id"],
-                    data_of(row["data"]),
-                    row["hash"],
-                )
-                for row in rows
-            ),
-            older,
-            newer,
-        )
+        return Page(_AUDIT.validate_python(rows), older, newer)
 
     def _cut(
         self, query: Select[Any], row_id: Any, cut: Cut, size: int
     ) -> tuple[list[dict[str, Any]], Cut | None, Cut | None]:
-        query = query.add_columns(row_id.label("row_id"))
+        query = query.add_columns(row_id.label("cut_id"))
         if cut.after is not None:
             query = query.where(row_id > cut.after).order_by(row_id)
         else:
@@ -383,7 +373,7 @@ class Overview:
             rows = [dict(row) for row in connection.execute(query.limit(size + 1)).mappings()]
         has_more = len(rows) > size
         rows = rows[:size]
-        ids = [row.pop("row_id") for row in rows]
+        ids = [row.pop("cut_id") for row in rows]
         has_older, has_newer = has_more, cut.before is not None
         if cut.after is not None:
             rows, ids = rows[::-1], ids[::-1]
@@ -453,24 +443,11 @@ def _holders(sha256: str) -> Select[Any]:
             run.state,
             run.begun_at,
             target.c.target,
-            confirmed_at.label("confirmed_at"),
+            confirmed_at.is_not(None).label("is_confirmed"),
         )
         .join_from(target, schema.run, target.c.run_id == run.id)
         .join(schema.unit, run.unit_id == schema.unit.c.id)
         .where(target.c.artifact_id.in_(select(artifact.id).where(artifact.sha256 == sha256)))
         .where(exists(select(write.id).where(of_run).correlate(schema.run, target)))
         .where(~exists(overwritten))
-    )
-
-
-def _holder(row: dict[str, Any]) -> Holder:
-    return Holder(
-        row["serial"],
-        row["part"],
-        bool(row["is_virtual"]),
-        row["run_id"],
-        RunState(row["state"]),
-        utc_moment(row["begun_at"]),
-        row["target"],
-        row["confirmed_at"] is not None,
     )
