@@ -47,7 +47,7 @@ Open = Callable[[ScanBuilder], Reads]
 
 
 class Scanner:
-    """One scanner, whether it is plugged in or not."""
+    """One scanner, whether it is plugged in or not. A thread reads it while the block runs."""
 
     def __init__(
         self,
@@ -64,6 +64,24 @@ class Scanner:
         self._device: Reads | None = None
         self._why: str | None = None
         """Why it could not be read last; None before the first look."""
+        self._ended = threading.Event()
+        self._thread = threading.Thread(
+            target=self._work, name=f"scanner {config.name}", daemon=True
+        )
+
+    def __enter__(self) -> Scanner:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join(2 * READ_S)
+
+    def _work(self) -> None:
+        while not self._ended.is_set():
+            if not self.step(READ_S):
+                self._ended.wait(REOPEN_S)
+        self.close()
 
     def step(self, limit_s: float) -> bool:
         """Open it, or read what it has; False while it cannot be read."""
@@ -109,31 +127,6 @@ class Scanner:
                 self.config.socket,
             )
         )
-
-
-class ScannerThread:
-    """Reads a scanner until it is closed."""
-
-    def __init__(self, scanner: Scanner) -> None:
-        self._scanner = scanner
-        self._ended = threading.Event()
-        self._thread = threading.Thread(
-            target=self._work, name=f"scanner {scanner.config.name}", daemon=True
-        )
-
-    def __enter__(self) -> ScannerThread:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._ended.set()
-        self._thread.join(2 * READ_S)
-
-    def _work(self) -> None:
-        while not self._ended.is_set():
-            if not self._scanner.step(READ_S):
-                self._ended.wait(REOPEN_S)
-        self._scanner.close()
 
 
 # -- input devices --------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import asyncio
 import json
 import time
 from collections.abc import AsyncIterator, Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from typing import Any, Final
 
@@ -52,34 +52,6 @@ WORDS: Final = {
     SocketState.STOPPED: say("STOPPED"),
 }
 """What a tile says in large letters."""
-
-
-@dataclass(frozen=True)
-class Tile:
-    """One socket as the page shows it."""
-
-    row: Row
-    state: SocketState
-    """PASS only when the run's end with PASS was told, which is after it is on disk."""
-
-    def said(self, words: Words) -> dict[str, Any]:
-        """The tile in a language, for the page's script."""
-        row = self.row
-        serial = row.serial or row.borne
-        return {
-            "socket": row.socket,
-            "state": self.state.value.lower(),
-            "word": words(WORDS[self.state]),
-            "serial": serial,
-            "tail": serial[-TAIL_DIGITS:],
-            "is_label": bool(row.serial),
-            "share": row.share,
-            "left": "" if row.left_s is None else _left(row.left_s, words),
-            "step": words(row.step),
-            "code": row.code,
-            "line": words(row.note),
-            "virtual": words(say("virtual unit: no product")) if row.is_virtual else "",
-        }
 
 
 @dataclass(frozen=True)
@@ -154,6 +126,25 @@ def _left(left_s: float, words: Words) -> str:
     return words(say("{time} left"), time=text)
 
 
+def _tile(row: Row, words: Words) -> dict[str, Any]:
+    """One socket in a language, for the page's script."""
+    serial = row.serial or row.borne
+    return {
+        "socket": row.socket,
+        "state": row.state.value.lower(),
+        "word": words(WORDS[row.state]),
+        "serial": serial,
+        "tail": serial[-TAIL_DIGITS:],
+        "is_label": bool(row.serial),
+        "share": row.share,
+        "left": "" if row.left_s is None else _left(row.left_s, words),
+        "step": words(row.step),
+        "code": row.code,
+        "line": words(row.note),
+        "virtual": words(say("virtual unit: no product")) if row.is_virtual else "",
+    }
+
+
 class Screen:
     """What the page shows, from the events of a station. Its methods are called in the station's
     thread.
@@ -180,12 +171,12 @@ class Screen:
             self._put(name, board.rows[name])
 
     def _put(self, name: str, row: Row) -> None:
+        """PASS only when the run's end with PASS was told, which is after it is on disk."""
         state, passed = row.state, self._passed.get(name)
         if state is SocketState.PASS and (passed is None or passed.serial != row.serial):
             state = SocketState.SAVING
-        tile = Tile(Row(**vars(row)), state)
         word = (state, row.serial, row.code, row.note, row.step)
-        self.feed.put(f"socket {name}", tile, word=word)
+        self.feed.put(f"socket {name}", replace(row, state=state), word=word)
 
     def turn(self, board: Board, *, station: tuple[str, str, str], operator: str, lot: Lot) -> None:
         """Once in each turn of the station's loop. `station`: its name, recipe and part."""
@@ -261,7 +252,7 @@ async def _messages(feed: Feed, words: Words) -> AsyncIterator[dict[str, Any]]:
         message: dict[str, Any] = {}
         if batch.is_all:
             message["all"] = True
-        tiles = [state.said(words) for _, state in batch.changes if isinstance(state, Tile)]
+        tiles = [_tile(state, words) for _, state in batch.changes if isinstance(state, Row)]
         heads = [state for _, state in batch.changes if isinstance(state, Head)]
         if tiles:
             message["tiles"] = tiles

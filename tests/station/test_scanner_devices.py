@@ -16,7 +16,7 @@ import pytest
 
 from flasher.station.config import ScannerConfig
 from flasher.station.events import ScannerChanged, StationEvent
-from flasher.station.scanners import Scanner, ScannerThread
+from flasher.station.scanners import Scanner
 from tests.station.scanner_keys import KEYS
 
 pytestmark = [
@@ -73,7 +73,7 @@ class Reading:
         self._came = threading.Condition()
         config = ScannerConfig(name=socket, input=path, socket=socket)
         scanner = Scanner(config, lambda *scan: self._add(self.scans, scan), self._hear)
-        stack.enter_context(ScannerThread(scanner))
+        stack.enter_context(scanner)
 
     def _add(self, to: list[Any], what: Any) -> None:
         with self._came:

@@ -38,7 +38,6 @@ from flasher.station.recipe_file import load_checked
 from flasher.station.records.errors import RecordError
 from flasher.station.records.keys import Keeping
 from flasher.station.records.store import Store
-from flasher.station.scanners import ScannerThread
 from flasher.station.station import Station, StationOptions
 from flasher.station.supervisor import Launch, ProcessPort
 from flasher.station.virtual_units import next_number
@@ -262,7 +261,7 @@ class _Session:
         come from. Raises UsageError.
         """
         for scanner in scanners_of(self.config, self.station):
-            stack.enter_context(ScannerThread(scanner))
+            stack.enter_context(scanner)
         if sys.stdin is None:
             return
         if sys.stdin.isatty():
