@@ -122,7 +122,10 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof) -> dict[str, Any]:
             for step in last.steps
             for each in step.measurements
         ],
-        "earlier": [(details.run, _run_status(details)) for details in earlier[-EARLIER_SHOWN:]],
+        "earlier": [
+            (run, _RUN_STATUS.get(run.state, Status.WARNING))
+            for run in (details.run for details in earlier[-EARLIER_SHOWN:])
+        ],
         "earlier_left_out": max(0, len(earlier) - EARLIER_SHOWN),
         "moment": _moment,
         "number": number,
@@ -146,10 +149,6 @@ def _code(last: RunDetails, record_sha256: str, head: Head) -> Markup:
     )
     drawn = segno.make("\n".join(lines), error="m", micro=False, boost_error=False)
     return Markup(drawn.svg_inline(omitsize=True, svgclass=None, lineclass=None))  # noqa: S704
-
-
-def _run_status(details: RunDetails) -> Status:
-    return _RUN_STATUS.get(details.run.state, Status.WARNING)
 
 
 def limits_of(each: Measurement) -> str:

@@ -58,6 +58,7 @@ from flasher.station.socket import Binding, LastRun, Occupancy, Phase, Socket
 
 ARRIVAL_LIMIT_S: Final = 20.0
 SCAN_LIMIT_S: Final = 120.0
+"""After this time a label without its unit, or a socket without its label, is forgotten."""
 CARD_LIMIT_S: Final = 15.0
 """The label has to follow the card of its socket within this time."""
 SHORT_OUTAGE_S: Final = 3.0
@@ -190,9 +191,8 @@ class Line:
     """All sockets and the scans. After each call, `take` returns the effects, in their order.
 
     `arrival_limit_s`: a label with a scanned socket waits this long for its unit; then the run
-    starts all the same and reports the fault. `scan_limit_s`: after this time a label without its
-    unit, or a socket without its label, is forgotten. `crew`: who has a badge; None: people are
-    taken at their word.
+    starts all the same and reports the fault. `crew`: who has a badge; None: people are taken at
+    their word.
     """
 
     def __init__(
@@ -203,7 +203,6 @@ class Line:
         operator: str,
         lot: str = "",
         arrival_limit_s: float = ARRIVAL_LIMIT_S,
-        scan_limit_s: float = SCAN_LIMIT_S,
         scans_labels: bool = False,
         crew: Crew | None = None,
     ) -> None:
@@ -216,7 +215,6 @@ class Line:
         """No further run is begun."""
         self._check_serial = check_serial
         self._arrival_limit_s = arrival_limit_s
-        self._scan_limit_s = scan_limit_s
         self._scans_labels = scans_labels
         self._crew = crew or Crew(())
         self._effects: list[Effect] = []
@@ -563,7 +561,7 @@ class Line:
                 say("No socket works."),
                 say("Mend one of them, then scan it again."),
             )
-        self._label, self._forget_at_s = serial, now + self._scan_limit_s
+        self._label, self._forget_at_s = serial, now + SCAN_LIMIT_S
         shown, before = printable(serial), was_in(self.sockets, serial)
         words = say("Scan the card of the socket that {label} is in, or goes into.", label=shown)
         if before is not None:
@@ -703,7 +701,7 @@ class Line:
             self._end_pin(asked, "NO_PIN", say("No PIN came."), _AGAIN)
         for socket in self.sockets.values():
             waits = socket.label and socket.begin_at_s is None and socket.phase is Phase.REST
-            if waits and now >= socket.bound_at_s + self._scan_limit_s:
+            if waits and now >= socket.bound_at_s + SCAN_LIMIT_S:
                 reason = say("Its unit did not come.")
                 self._drop_label(socket, reason, say("Scan it again with its unit."))
         self._go_on(now)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
 from flasher.errors import FlasherError
 from flasher.station.config import MockUnits
@@ -21,8 +21,6 @@ from flasher.station.records.model import (
     Verified,
     WriteId,
 )
-
-REPLY_LIMIT_S: Final = 60.0
 
 # -- a run --------------------------------------------------------------------------------------
 
@@ -138,12 +136,6 @@ class WorkerSetup:
     """python-can's keywords; None: virtual units."""
     virtual: VirtualUnits | None = None
     power: str = ""
-    silence_s: float = 2.0
-    """A unit of which nothing was heard for so long is out."""
-    probe_s: float = 0.5
-    """How often a unit is asked whether it is there."""
-    reply_limit_s: float = REPLY_LIMIT_S
-    """How long it waits until the station has something on disk."""
 
 
 # -- from the station -----------------------------------------------------------------------------

@@ -22,6 +22,10 @@ from flasher.settings.profile import sent_ids
 from flasher.station.messages import PresenceChanged
 from flasher.station.recipe_file import LoadedTarget
 
+SILENCE_S: Final = 2.0
+"""A unit of which nothing was heard for so long is out."""
+PROBE_S: Final = 0.5
+"""How often a unit is asked whether it is there."""
 _LOOK_EVERY_S: Final = 0.05
 
 
@@ -92,11 +96,7 @@ class Listen:
 class Presence:
     """Watches an idle bus; pure: frames and times come from outside."""
 
-    def __init__(
-        self, targets: Sequence[LoadedTarget], *, silence_s: float, probe_s: float
-    ) -> None:
-        self._silence_s = silence_s
-        self._probe_s = probe_s
+    def __init__(self, targets: Sequence[LoadedTarget]) -> None:
         self._watchers = [BootWatcher(each.target) for each in targets]
         self._answers: list[tuple[Request, Reassembler]] = []
         for each in targets:
@@ -152,7 +152,7 @@ class Presence:
 
     def probe(self, now: float) -> list[Frame]:
         """What is to be sent now: a question to each target that can be asked, in its time."""
-        if self._probed_at is not None and now - self._probed_at < self._probe_s:
+        if self._probed_at is not None and now - self._probed_at < PROBE_S:
             return []
         self._probed_at = now
         frames: list[Frame] = []
@@ -165,8 +165,8 @@ class Presence:
         """The change since the last call; None without one."""
         if self._began_at is None:
             self._began_at = now
-        heard = self._heard_at is not None and now - self._heard_at < self._silence_s
-        is_soon = self.is_there is None and now - self._began_at < self._silence_s
+        heard = self._heard_at is not None and now - self._heard_at < SILENCE_S
+        is_soon = self.is_there is None and now - self._began_at < SILENCE_S
         if is_soon and not heard:
             return None
         # What the unit says that it is; None before it has said anything.
@@ -176,7 +176,7 @@ class Presence:
         self.is_there = heard
         if not heard:
             self._serials, self._told_serial = {}, None
-            return PresenceChanged(is_there=False, how=f"nothing heard for {self._silence_s:g} s")
+            return PresenceChanged(is_there=False, how=f"nothing heard for {SILENCE_S:g} s")
         how = "boot version" if self._announced > self._announcements else "traffic"
         self._told_serial, self._announcements = serial, self._announced
         return PresenceChanged(is_there=True, how=how, serial=serial)

@@ -73,11 +73,6 @@ class LoadedTarget:
         """The version inside the image, or that the manifest states; empty when nobody says it."""
         return self.image.version or self.release.firmware_version or ""
 
-    @property
-    def can_read_version(self) -> bool:
-        """True when the application can be asked for its version."""
-        return self.profile.version_query is not None
-
 
 @dataclass(frozen=True)
 class LoadedRecipe:
@@ -268,7 +263,7 @@ def _check_level(loaded: LoadedRecipe, target: LoadedTarget, where: str) -> Iter
         elif target.image.base is None:
             yield Fault(where, "a raw binary can be read back only with its base.")
         return
-    if not target.can_read_version:
+    if target.profile.version_query is None:
         yield Fault(
             where,
             "it cannot be asked for its version.",

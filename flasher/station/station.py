@@ -43,7 +43,7 @@ from flasher.station.events import (
 )
 from flasher.station.label_printer import LabelJob, LabelPrinter
 from flasher.station.label_template import values_of
-from flasher.station.line import ARRIVAL_LIMIT_S, SCAN_LIMIT_S, Line
+from flasher.station.line import ARRIVAL_LIMIT_S, Line
 from flasher.station.messages import (
     Abort,
     AdapterDown,
@@ -64,6 +64,7 @@ from flasher.station.messages import (
 )
 from flasher.station.people import Crew
 from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.records.claims import Order
 from flasher.station.records.errors import ClaimRefusedError, RecordError, Refusal
 from flasher.station.records.model import (
     AuditEvent,
@@ -80,7 +81,7 @@ from flasher.station.records.store import Store, SystemClock
 from flasher.station.runs import ActiveRun, save, verified_words, with_history
 from flasher.station.scans import Refused
 from flasher.station.socket import Phase, Socket
-from flasher.station.supervisor import HANG_S, Launch, ProcessPort, Supervisor, WorkerLost
+from flasher.station.supervisor import Launch, ProcessPort, Supervisor, WorkerLost
 
 TURN_S: Final = 0.1
 """How long a turn of the loop waits at the most."""
@@ -92,9 +93,7 @@ class StationOptions:
     """What may be set; the defaults are for a line with people."""
 
     arrival_limit_s: float = ARRIVAL_LIMIT_S
-    scan_limit_s: float = SCAN_LIMIT_S
-    """Both as `Line` has them."""
-    hang_s: float = HANG_S
+    """As `Line` has it."""
     end_limit_s: float = 30.0
     """How long runs may take to end when the station is ended."""
     scans_labels: bool = False
@@ -138,15 +137,12 @@ class Station:
             operator=operator,
             lot=lot,
             arrival_limit_s=self.options.arrival_limit_s,
-            scan_limit_s=self.options.scan_limit_s,
             scans_labels=self.options.scans_labels,
             crew=crew,
         )
         self._has_badges = crew is not None
         self._labels = labels
-        self.supervisor = Supervisor(
-            setups, self.clock.monotonic_s, launch=launch, hang_s=self.options.hang_s
-        )
+        self.supervisor = Supervisor(setups, self.clock.monotonic_s, launch)
         self._runs: dict[str, ActiveRun] = {}
         """Runs that are claimed and not saved yet, by their sockets."""
         self._scans: deque[tuple[str, str]] = deque()
@@ -397,13 +393,15 @@ class Station:
             lives = self.store.read.units(order.serial)
             life = next((life for life in lives if life.part == part), None)
             claim = self.store.claim(
-                order.serial,
-                order.socket,
-                self.recipe,
-                order.operator,
-                lot=order.lot,
-                reason=order.reason,
-                is_virtual=socket.is_virtual,
+                Order(
+                    order.serial,
+                    order.socket,
+                    self.recipe,
+                    order.operator,
+                    order.lot,
+                    order.reason,
+                    socket.is_virtual,
+                )
             )
         except ClaimRefusedError as error:
             is_changed = error.refusal is Refusal.RECIPE_CHANGED

@@ -125,14 +125,11 @@ class Supervisor:
         self,
         setups: Iterable[WorkerSetup],
         now: Callable[[], float],
-        *,
         launch: Launch = ProcessPort,
-        hang_s: float = HANG_S,
     ) -> None:
         self._slots = {setup.socket: _Slot(setup) for setup in setups}
         self._now = now
         self._launch = launch
-        self._hang_s = hang_s
 
     @property
     def ports(self) -> Mapping[str, Port]:
@@ -163,7 +160,7 @@ class Supervisor:
             messages, is_gone = self._receive(slot)
             found += [(name, message) for message in messages]
             # Looked at after everything that waited was read: a busy station is no hung process.
-            limit_s = START_S if slot.is_new else self._hang_s
+            limit_s = START_S if slot.is_new else HANG_S
             if is_gone:
                 found.append((name, self._lose(slot, "its process ended", hung=False)))
             elif self._now() - slot.heard_at > limit_s:

@@ -27,7 +27,6 @@ class Output:
 
     hour: Count
     shift: Count
-    shift_began: datetime
     first_pass_share: float | None
     """Of the shift: units passed at their first run, as a share of 1; None without units."""
     causes: tuple[tuple[str, int], ...]
@@ -78,7 +77,6 @@ class Tally:
         return Output(
             _count(run for run in runs if run.at >= hour),
             _count(shift),
-            began,
             sum(first.values()) / len(first) if first else None,
             tuple(causes.most_common(CAUSES_MAX)),
         )

@@ -28,7 +28,6 @@ from flasher.log import log_event
 from flasher.protocol.text import printable
 from flasher.station import codes
 from flasher.station.messages import (
-    REPLY_LIMIT_S,
     Abort,
     AdapterDown,
     Ask,
@@ -63,6 +62,8 @@ _REOPEN_S: Final = 1.0
 BEAT_S: Final = 0.5
 """How often it says that it is alive."""
 IDLE_S: Final = 0.05
+REPLY_LIMIT_S: Final = 60.0
+"""How long it waits until the station has something on disk."""
 _LOOK_S: Final = 0.1
 """How often the pipe is looked at while a run goes on: between frames, it must cost nothing."""
 
@@ -90,12 +91,9 @@ class StationGoneError(Exception):
 class StationPipe:
     """The pipe to the station: sends heartbeats, and keeps messages until they are asked for."""
 
-    def __init__(
-        self, channel: Channel, now: Callable[[], float], reply_limit_s: float = REPLY_LIMIT_S
-    ) -> None:
+    def __init__(self, channel: Channel, now: Callable[[], float]) -> None:
         self._channel = channel
         self._now = now
-        self._reply_limit_s = reply_limit_s
         self._asked = 0
         self._looked_at = float("-inf")
         self._beat_at = float("-inf")
@@ -165,12 +163,12 @@ class StationPipe:
         """Wait until it is saved. Raises StationGoneError; JournalError when it is not."""
         self._asked += 1
         self.send(Ask(self._asked, what))
-        give_up_at = self._now() + self._reply_limit_s
+        give_up_at = self._now() + REPLY_LIMIT_S
         while self._asked not in self._replies:
             if self.is_gone:
                 raise StationGoneError
             if self._now() >= give_up_at:
-                raise JournalError(f"The station did not save within {self._reply_limit_s:g} s.")
+                raise JournalError(f"The station did not save within {REPLY_LIMIT_S:g} s.")
             self.look(IDLE_S)
         reply = self._replies.pop(self._asked)
         if reply.error:
@@ -205,7 +203,7 @@ class Worker:
         self._connection = connection
         self._virtual = virtual
         self._power: PowerControl | None = PowerCommand(setup.power) if setup.power else virtual
-        self._presence = Presence(recipe.targets, silence_s=setup.silence_s, probe_s=setup.probe_s)
+        self._presence = Presence(recipe.targets)
         self._is_down = False
         """The adapter failed."""
         self._is_blocked = False
@@ -357,7 +355,7 @@ def worker_main(channel: Channel, setup: WorkerSetup) -> None:
     for name in ("SIGINT", "SIGHUP"):  # Windows has no SIGHUP
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
-    pipe = StationPipe(channel, time.monotonic, setup.reply_limit_s)
+    pipe = StationPipe(channel, time.monotonic)
     with suppress(StationGoneError):
         try:
             recipe = load_same(setup)

@@ -19,6 +19,7 @@ from flasher.image.image import Image
 from flasher.protocol.spec import BMS, WMC, Target
 from flasher.settings.manifest import release_of, to_toml
 from flasher.station.recipe_file import LoadedRecipe, load_checked
+from flasher.station.records.claims import Order
 from flasher.station.records.keys import Keeping
 from flasher.station.records.model import Claim, Ending, RunId, RunState, StepState, Verified
 from flasher.station.records.store import Store
@@ -191,9 +192,8 @@ class Bench:
         reason: str = "",
         is_virtual: bool = False,
     ) -> Claim:
-        return self.store.claim(
-            serial, socket, self.recipe, "jo", lot=lot, reason=reason, is_virtual=is_virtual
-        )
+        order = Order(serial, socket, self.recipe, "jo", lot, reason, is_virtual)
+        return self.store.claim(order)
 
     def work(self, run_id: RunId) -> None:
         """What comes before the end of a good run."""

@@ -97,7 +97,6 @@ class LineBench:
             on_event=self.events.append,
             options=StationOptions(
                 arrival_limit_s=5.0,
-                hang_s=10.0,
                 end_limit_s=0.0,
                 scans_labels=scans_labels,
                 mixes_virtual=mixes_virtual,

@@ -23,7 +23,7 @@ TRAFFIC = Frame(0x720, b"\x55\xaa\x0c\x12\x10\x10\x00\x00")
 @pytest.fixture
 def presence(tmp_path: Path) -> Presence:
     bench = UnitBench(tmp_path)
-    return Presence(bench.recipe.targets, silence_s=2.0, probe_s=0.5)
+    return Presence(bench.recipe.targets)
 
 
 def test_nothing_is_said_before_it_is_known(presence: Presence) -> None:
@@ -111,4 +111,4 @@ def test_a_unit_that_cannot_be_asked_is_said_to_be_unseen(tmp_path: Path) -> Non
     profile = replace(loaded.profile, target=WMC, version_query=None)
     firmware = loaded.firmware.model_copy(update={"target": "wmc"})
     target = replace(loaded, firmware=firmware, profile=profile)
-    assert not Presence([target], silence_s=2.0, probe_s=0.5).sees_units
+    assert not Presence([target]).sees_units

@@ -187,8 +187,8 @@ def test_a_station_that_does_not_save_in_time_is_not_waited_for() -> None:
         now[0] += 1.0
         return now[0]
 
-    pipe = StationPipe(FakeChannel(lambda _channel, _message: None), clock, 30.0)
-    with pytest.raises(JournalError, match="did not save within 30 s"):
+    pipe = StationPipe(FakeChannel(lambda _channel, _message: None), clock)
+    with pytest.raises(JournalError, match="did not save within 60 s"):
         pipe.intent("bms", "flash", "V1")
 
 

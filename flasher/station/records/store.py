@@ -2,7 +2,7 @@
 
     store = Store.open("records.sqlite", station="line-2", clock=SystemClock())
     store.recover()
-    claim = store.claim(serial, "A", recipe, operator="jo")
+    claim = store.claim(Order(serial, "A", recipe, operator="jo"))
     write = store.intent(claim.run_id, "bms", "flash", "V1r0r4_20220512")
     ... the act ...
     store.verified(write, "V1r0r4_20220512")
@@ -27,7 +27,6 @@ from typing import Any, Final, Self
 
 from sqlalchemy import func, select, update
 
-from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import Trail, digests_of
 from flasher.station.records.claims import Claiming, Order
@@ -184,23 +183,13 @@ class Store:
             self.files.forget_spooled(run_id)
         return found
 
-    def claim(
-        self,
-        serial: str,
-        socket: str,
-        recipe: LoadedRecipe,
-        operator: str,
-        *,
-        lot: str = "",
-        reason: str = "",
-        is_virtual: bool = False,
-    ) -> Claim:
+    def claim(self, order: Order) -> Claim:
         """Begin a run of a unit, when every rule allows it; nothing is recorded when not.
 
         Raises ClaimRefusedError, RecordError (before `recover` too).
         """
         now = self._clock.utc()
-        order = Order(serial, socket, recipe, operator, lot, reason, is_virtual).checked(now)
+        order = order.checked(now)
         # One claim at a time, of all stations: two must not find the last place of a lot free.
         with self.signer.writing("claims") as trail:
             return Claiming(trail, order, now).begin(self._clock.monotonic_s())

@@ -273,16 +273,11 @@ FROM pg_attribute JOIN pg_class c ON c.oid = attrelid
 WHERE c.relnamespace = current_schema()::regnamespace AND c.relkind = 'r'
     AND attnum > 0 AND NOT attisdropped
 """
-_QUERIES: Final = {"sqlite": _SQLITE, "postgresql": _POSTGRESQL}
 
 
 def fingerprint_of(connection: Connection) -> dict[str, str]:
-    """A short hash for each table, index, trigger, ... by its name; empty for a back end of which
-    it cannot be read.
-    """
-    query = _QUERIES.get(connection.dialect.name)
-    if query is None:
-        return {}
+    """A short hash for each table, index, trigger, ... by its name."""
+    query = _SQLITE if connection.dialect.name == "sqlite" else _POSTGRESQL
     return {
         name: hashlib.sha256((sql or "").encode()).hexdigest()[:16]
         for name, sql in connection.execute(text(query)).all()

@@ -13,6 +13,7 @@ import psycopg
 import pytest
 
 from flasher.station.records import server
+from flasher.station.records.claims import Order
 from flasher.station.records.errors import (
     ClaimRefusedError,
     RecordError,
@@ -136,8 +137,8 @@ def test_a_station_that_lost_its_name_to_another_writes_no_more(
                 )
             second.recover()
             with pytest.raises(StationBusyError):
-                first.claim(SERIAL, "A", bench.recipe, "jo")
-            assert second.claim(SERIAL, "A", bench.recipe, "jo").serial == SERIAL
+                first.claim(Order(SERIAL, "A", bench.recipe, "jo"))
+            assert second.claim(Order(SERIAL, "A", bench.recipe, "jo")).serial == SERIAL
 
 
 def test_of_two_stations_that_claim_one_unit_one_gets_it(bench: Bench) -> None:
@@ -151,7 +152,7 @@ def test_of_two_stations_that_claim_one_unit_one_gets_it(bench: Bench) -> None:
         for number in range(10):
             try:
                 said.append(
-                    store.claim(f"W26051{number:02}", f"{number}", bench.recipe, "jo", lot="L1")
+                    store.claim(Order(f"W26051{number:02}", f"{number}", bench.recipe, "jo", "L1"))
                 )
             except ClaimRefusedError as error:
                 said.append(error.refusal)
