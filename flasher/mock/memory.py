@@ -87,6 +87,20 @@ class Flash:
         self._used_units.update(self._units(offset, len(data)))
         self.program_count += 1
 
+    def carry_out(self, operation: Operation) -> None:
+        """Erase or program, to the end. Raises as these do."""
+        if operation.data is None:
+            self.erase_page(operation.address)
+        else:
+            self.program(operation.address, operation.data)
+
+    def tear(self, operation: Operation, fraction: float) -> None:
+        """Leave it interrupted after `fraction` of its time (0 to 1). Raises as `carry_out`."""
+        if operation.data is None:
+            self.tear_erase(operation.address, fraction)
+        else:
+            self.tear_program(operation.address, operation.data, fraction)
+
     def tear_erase(self, address: int, fraction: float) -> None:
         """Leave the erasing of a page interrupted after `fraction` of its time (0 to 1).
 
@@ -205,7 +219,7 @@ class FlashController:
             ends_at = self._began_at + self._duration_s(operation)
             if ends_at > now:
                 return False
-            self._carry_out(operation)
+            self._flash.carry_out(operation)
             self._begin_next(ends_at)
         return True
 
@@ -216,21 +230,11 @@ class FlashController:
         operation, self._under_way = self._under_way, None
         if operation is None or now <= self._began_at:
             return
-        fraction = (now - self._began_at) / self._duration_s(operation)
-        if operation.data is None:
-            self._flash.tear_erase(operation.address, fraction)
-        else:
-            self._flash.tear_program(operation.address, operation.data, fraction)
+        self._flash.tear(operation, (now - self._began_at) / self._duration_s(operation))
 
     def _begin_next(self, now: float) -> None:
         self._under_way = self._waiting.popleft() if self._waiting else None
         self._began_at = now
-
-    def _carry_out(self, operation: Operation) -> None:
-        if operation.data is None:
-            self._flash.erase_page(operation.address)
-        else:
-            self._flash.program(operation.address, operation.data)
 
     def _duration_s(self, operation: Operation) -> float:
         return self._erase_time_s if operation.data is None else self._program_time_s

@@ -115,6 +115,8 @@ class MockDevice(Machine):
     transfer_type: ClassVar[type[Transfer]] = Transfer
     burst: ClassVar[int] = BOOT_VERSION_BURST
     """How often it announces itself before it starts the application."""
+    in_ram: ClassVar[tuple[str, ...]] = ()
+    """Attributes that a power cut sets back to what the class has."""
 
     def __init__(
         self,
@@ -422,7 +424,12 @@ class MockDevice(Machine):
         self._due_at = self._controller.ends_at
 
     def _request(self, now: float) -> str:
-        self._send(messages.RequestTransfer())
+        return self._reply(messages.RequestTransfer(), now)
+
+    def _reply(self, row: messages.Row | None, now: float) -> str:
+        """Answer, or say nothing, and wait for what the host sends next."""
+        if row is not None:
+            self._send(row)
         self._await_host(now)
         return ""
 
@@ -439,37 +446,29 @@ class MockDevice(Machine):
     def _acknowledge(self, now: float) -> str:
         transfer = self._transfer
         transfer.stored += 1
-        self._send(messages.Ack(transfer.stored))
         self._events.append(PacketStored(transfer.stored, transfer.total))
-        self._await_host(now)
-        return ""
+        return self._reply(messages.Ack(transfer.stored), now)
 
     def _answer_repeated(self, now: float) -> str:
         """The first copy stays, whatever the second one holds (TX-05)."""
         stored = self._transfer.stored
         if self.profile.repeated_packet == "ack":
-            self._send(messages.Ack(stored))
-        else:
-            self._send(messages.Nak(min(stored + 1, PACKET_COUNT_MAX)))
-        self._await_host(now)
-        return ""
+            return self._reply(messages.Ack(stored), now)
+        return self._reply(messages.Nak(min(stored + 1, PACKET_COUNT_MAX)), now)
 
     def _answer_older(self, now: float) -> str:
         if self.profile.older_packet == "ack" and self._number is not None:
-            self._send(messages.Ack(self._number))
-        elif self.profile.older_packet == "nak":
-            self._send(messages.Nak(self._transfer.wanted))
-        self._await_host(now)
-        return ""
+            return self._reply(messages.Ack(self._number), now)
+        refused = self.profile.older_packet == "nak"
+        return self._reply(messages.Nak(self._transfer.wanted) if refused else None, now)
 
     def _answer_bad(self, now: float) -> str:
         choice = self.profile.bad_packet
         if choice == "nak_received" and self._number is not None:
-            self._send(messages.Nak(self._number))
-        elif choice != "silence":
-            self._send(messages.Nak(self._transfer.wanted))
-        self._await_host(now)
-        return ""
+            return self._reply(messages.Nak(self._number), now)
+        return self._reply(
+            None if choice == "silence" else messages.Nak(self._transfer.wanted), now
+        )
 
     # -- actions: end -----------------------------------------------------------------------------
 
@@ -506,6 +505,8 @@ class MockDevice(Machine):
     def _switch_off(self, now: float) -> str:
         self._controller.abort(now)
         self._lose_memory()
+        for name in self.in_ram:
+            vars(self).pop(name, None)
         return ""
 
     def _send(self, row: messages.Row) -> None:

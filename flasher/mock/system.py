@@ -96,10 +96,6 @@ class System:
             if not member.has_power:
                 member.power_on(now)
 
-    def _share_power(self, now: float) -> None:
-        if not self._battery.has_power:
-            self.power_cut(now)
-
     # -- the engine interface ---------------------------------------------------------------------
 
     @property
@@ -116,7 +112,8 @@ class System:
     def tick(self, now: float) -> None:
         for member in self._turns:
             member.tick(now)
-        self._share_power(now)
+        if not self._battery.has_power:
+            self.power_cut(now)
 
     def deadline(self) -> float | None:
         wanted = [member.deadline() for member in self._turns]

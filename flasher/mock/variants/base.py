@@ -4,18 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Final, TypeVar
+from typing import Any, ClassVar, Final, TypeVar
 
 from flasher.mock.memory import Flash, FlashNotErasedError, FlashRangeError
 from flasher.mock.model import AnyRow, MockDevice
 from flasher.mock.store import ApplicationStore
-from flasher.protocol.frame import Frame
-from flasher.protocol.wire import Damage, Message
+from flasher.mock.table import Event
+from flasher.protocol.messages import Malformed
+from flasher.protocol.spec import Command, Mode
+from flasher.protocol.wire import Message
 
-__all__ = ["DECLARED", "AnyRow", "HangingDevice", "PlainFlash", "PlainStore", "Variant", "variant"]
+__all__ = ["DECLARED", "AnyRow", "HangingDevice", "PlainStore", "Variant", "bad_write", "variant"]
 
 _ANY: Final = "*"
 _WrongT = TypeVar("_WrongT", bound=type[object])
+
+
+def bad_write(row: AnyRow, command: Command) -> Message | None:
+    """A write of that command which is no row of the upgrade; None for anything else."""
+    if not isinstance(row, Malformed):
+        return None
+    message = row.message
+    return message if (message.command, message.mode) == (command, Mode.WRITE) else None
 
 
 @dataclass(frozen=True)
@@ -56,32 +66,18 @@ def variant(
     summary: str,
     *,
     also: str = "",
-    unseen: str = "",
-    upgrade_works: bool = True,
-    profile: Mapping[str, object] | None = None,
-    timings: Mapping[str, float] | None = None,
+    **more: Any,
 ) -> Callable[[_WrongT], _WrongT]:
     """Declares a class as what is wrong with a `Variant`: a device, or one of the parts that it is
-    made of. The cases in `also` are parted by blanks; "*" stands for `everywhere`.
+    made of. The cases in `also` are parted by blanks; "*" stands for `everywhere`; `more` are
+    further fields of the variant.
     """
 
     def declare(wrong: _WrongT) -> _WrongT:
         device_type = wrong if issubclass(wrong, MockDevice) else _device_with(wrong)
-        others = () if also == _ANY else tuple(also.split())
-        DECLARED.append(
-            Variant(
-                name,
-                clause,
-                summary,
-                device_type,
-                others,
-                also == _ANY,
-                unseen,
-                upgrade_works,
-                profile or {},
-                timings or {},
-            )
-        )
+        is_any = also == _ANY
+        others = () if is_any else tuple(also.split())
+        DECLARED.append(Variant(name, clause, summary, device_type, others, is_any, **more))
         return wrong
 
     return declare
@@ -98,39 +94,19 @@ def _device_with(part: type[object]) -> type[MockDevice]:
 class HangingDevice(MockDevice):
     """A device that can hang: deaf and dumb until its power is cut."""
 
-    _hangs = False
+    hangs = False
+    in_ram: ClassVar[tuple[str, ...]] = ("hangs",)
 
-    @property
-    def hangs(self) -> bool:
-        """True from when it hung up to the next power cut."""
-        return self._hangs
-
-    def receive(self, frame: Frame, now: float) -> None:
-        if not self._hangs:
-            super().receive(frame, now)
-
-    def tick(self, now: float) -> None:
-        if not self._hangs:
-            super().tick(now)
-
-    def deadline(self) -> float | None:
-        return None if self._hangs else super().deadline()
-
-    def next_frame(self, now: float) -> Frame | None:
-        return None if self._hangs else super().next_frame(now)
-
-    def power_cut(self, now: float) -> None:
-        self._hangs = False
-        super().power_cut(now)
-
-    def _take(self, found: Message | Damage, now: float) -> None:
-        if not self._hangs:
-            super()._take(found, now)
+    def _handle(self, event: Event, now: float) -> None:
+        super()._handle(event, now)
+        if self.hangs:
+            self._is_deaf, self._runs_application = True, False
 
     def _hang(self) -> str:
         """Nothing is heard, said or due from now on; what waited to be sent is lost."""
         self._lose_memory()
-        self._hangs = True
+        self.hangs = self._is_deaf = True
+        self._runs_application = False
         self._report("it hangs until its power is cut")
         return "hangs"
 

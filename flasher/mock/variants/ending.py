@@ -9,9 +9,9 @@ from flasher.mock.memory import ERASED, Operation
 from flasher.mock.model import MockDevice
 from flasher.mock.store import AREA_START, ApplicationStore
 from flasher.mock.table import Event, State
-from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, variant
+from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, bad_write, variant
 from flasher.protocol import messages
-from flasher.protocol.spec import Command, Mode
+from flasher.protocol.spec import Command
 
 _DARK_BOOTS: Final = 2
 """Power-ups in a row without an application after which one is spent in the dark."""
@@ -28,6 +28,7 @@ class AnnouncesAfterComplete(MockDevice):
     """Goes on as a device without an application after complete, until its power is cut."""
 
     _holds_back = False
+    in_ram = ("_holds_back",)
 
     def _complete(self, now: float) -> str:
         self._holds_back = True
@@ -42,10 +43,6 @@ class AnnouncesAfterComplete(MockDevice):
         detail = super()._boot(now)
         self._has_whole_application = self._has_whole_application and not self._holds_back
         return detail
-
-    def _switch_off(self, now: float) -> str:
-        self._holds_back = False
-        return super()._switch_off(now)
 
 
 @variant("accepts-early-end", "EN-02", "completes when packets are missing")
@@ -96,15 +93,12 @@ class ReportsOldVersion(MockDevice):
     """Reads the version of its application at power-up only."""
 
     _version: str | None = None
+    in_ram = ("_version",)
 
     def _firmware(self) -> str:
         if self._version is None:
             self._version = super()._firmware()
         return self._version
-
-    def _switch_off(self, now: float) -> str:
-        self._version = None
-        return super()._switch_off(now)
 
 
 @variant(
@@ -168,7 +162,7 @@ class AckBeforeWrite(MockDevice):
     def _flush(self) -> None:
         operation, self._buffered = self._buffered, None
         if operation is not None:
-            self.store.flash.program(operation.address, operation.data or b"")
+            self.store.flash.carry_out(operation)
 
     def _erase(self, now: float) -> str:
         self._buffered = None
@@ -177,10 +171,6 @@ class AckBeforeWrite(MockDevice):
     def _boot(self, now: float) -> str:
         self._buffered = None
         return super()._boot(now)
-
-    def _switch_off(self, now: float) -> str:
-        self._buffered = None
-        return super()._switch_off(now)
 
 
 @variant(
@@ -295,11 +285,8 @@ class RefusalHangs(HangingDevice):
 @variant("any-end-byte", "EN-02", "takes an end of transfer with another byte than 04")
 class AnyEndByte(MockDevice):
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if isinstance(row, messages.Malformed):
-            message = row.message
-            if (message.command, message.mode) == (Command.END_OF_TRANSFER, Mode.WRITE):
-                row = messages.EndOfTransfer()
-        super()._take_row(row, now)
+        is_end = bad_write(row, Command.END_OF_TRANSFER)
+        super()._take_row(messages.EndOfTransfer() if is_end else row, now)
 
 
 @variant(
@@ -341,6 +328,7 @@ class RecordErasedLast(MockDevice):
 )
 class CompleteBeforeRecord(MockDevice):
     _owes_record = False
+    in_ram = ("_owes_record",)
 
     def _record(self, now: float) -> str:
         self._send(messages.Complete())
@@ -363,9 +351,4 @@ class CompleteBeforeRecord(MockDevice):
     def _pay_record(self) -> None:
         if self._owes_record:
             self._owes_record = False
-            operation = self.store.recording(self._transfer.size_bytes)
-            self.store.flash.program(operation.address, operation.data or b"")
-
-    def _switch_off(self, now: float) -> str:
-        self._owes_record = False
-        return super()._switch_off(now)
+            self.store.flash.carry_out(self.store.recording(self._transfer.size_bytes))

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from math import inf
-from typing import Final, TypeGuard
+from typing import Final
 
 from flasher.mock.model import MockDevice, Transfer
 from flasher.mock.table import Event, State
-from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, variant
+from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, bad_write, variant
 from flasher.protocol import messages
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import PACKET_DATA_SIZE, Command, Mode
+from flasher.protocol.spec import PACKET_DATA_SIZE, Command
 from flasher.protocol.wire import Message, Reassembler
 
 _PATIENCE: Final = 8
@@ -119,22 +119,17 @@ class GivesUp(HangingDevice):
         return self._hang() if hopeless else detail
 
 
-def _is_bad_reset(row: AnyRow) -> TypeGuard[messages.Malformed]:
-    return isinstance(row, messages.Malformed) and row.message.command == Command.RESET
-
-
 @variant("resets-at-any-text", "RS-04", "takes a reset with a wrong text")
 class ResetByAnyText(MockDevice):
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if _is_bad_reset(row) and row.message.mode == Mode.WRITE:
-            row = messages.Reset()
-        super()._take_row(row, now)
+        super()._take_row(messages.Reset() if bad_write(row, Command.RESET) else row, now)
 
 
 @variant("resets-on-read", "RS-04", "takes a reset that is a read")
 class ResetByRead(MockDevice):
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if _is_bad_reset(row) and row.message.data == messages.Reset.DATA:
+        message = row.message if isinstance(row, messages.Malformed) else None
+        if message and (message.command, message.data) == (Command.RESET, messages.Reset.DATA):
             row = messages.Reset()
         super()._take_row(row, now)
 
@@ -200,7 +195,7 @@ class ErasesFromApplication(MockDevice):
 def _erase_at_once(device: MockDevice) -> None:
     """The record and the first page are gone; the time that it takes is not modelled."""
     for operation in device.store.erasing(1)[:2]:
-        device.store.flash.erase_page(operation.address)
+        device.store.flash.carry_out(operation)
 
 
 @variant(
@@ -275,9 +270,9 @@ class ResetTextOfFour(MockDevice):
     """Compares as many bytes as a pointer has."""
 
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if _is_bad_reset(row) and row.message.mode == Mode.WRITE:
-            is_alike = row.message.data.startswith(messages.Reset.DATA[:_POINTER_BYTES])
-            row = messages.Reset() if is_alike else row
+        message = bad_write(row, Command.RESET)
+        if message and message.data.startswith(messages.Reset.DATA[:_POINTER_BYTES]):
+            row = messages.Reset()
         super()._take_row(row, now)
 
 
@@ -286,11 +281,9 @@ class UpdateTextOfFour(MockDevice):
     """Compares as many bytes as a pointer has."""
 
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if isinstance(row, messages.Malformed) and row.message.mode == Mode.WRITE:
-            text = self.target.update_text.encode("ascii")
-            message = row.message
-            if message.command == Command.UPDATE and message.data.startswith(text[:_POINTER_BYTES]):
-                row = messages.decode(message._replace(data=text + message.data[len(text) :]))
+        message, text = bad_write(row, Command.UPDATE), self.target.update_text.encode("ascii")
+        if message and message.data.startswith(text[:_POINTER_BYTES]):
+            row = messages.decode(message._replace(data=text + message.data[len(text) :]))
         super()._take_row(row, now)
 
 
@@ -348,6 +341,7 @@ class LeftoverAnnouncement(MockDevice):
     """Does not stop the timer of its announcements at the update command."""
 
     _leftover_at = inf
+    in_ram = ("_leftover_at",)
 
     def _request(self, now: float) -> str:
         self._leftover_at = now + _LEFTOVER_S
@@ -363,10 +357,6 @@ class LeftoverAnnouncement(MockDevice):
         if now >= self._leftover_at:
             self._leftover_at = inf
             self._send(messages.BootVersion(self.target.boot_name, self.profile.boot_version))
-
-    def power_cut(self, now: float) -> None:
-        self._leftover_at = inf
-        super().power_cut(now)
 
 
 @variant(
@@ -392,14 +382,11 @@ class HangsAt20thUpdate(HangingDevice):
     """Allocates a buffer for each transfer, and frees none."""
 
     _updates = 0
+    in_ram = ("hangs", "_updates")
 
     def _erase(self, now: float) -> str:
         self._updates += 1
         return self._hang() if self._updates >= _UPDATES_MAX else super()._erase(now)
-
-    def power_cut(self, now: float) -> None:
-        self._updates = 0
-        super().power_cut(now)
 
 
 @variant(

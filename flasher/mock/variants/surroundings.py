@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections import deque
-from collections.abc import Sequence
 from functools import cached_property
 from itertools import pairwise
 from math import inf
@@ -175,9 +174,7 @@ class WritesAnywhere(MockDevice):
             return super()._answer_bad(now)
         address = AREA_START + (self._number - 1) * PACKET_DATA_SIZE
         self.store.flash.program(address, self._payload)
-        self._send(messages.Ack(self._number))
-        self._await_host(now)
-        return ""
+        return self._reply(messages.Ack(self._number), now)
 
 
 @variant(
@@ -255,14 +252,11 @@ class HearsOtherTargets(MockDevice):
         other = self._others.get(frame.can_id)
         if other is None or not frame.is_payload or self.state is not State.TRANSFER:
             return
-        self._take_others(other.feed(frame.data, now), now)
-
-    def _take_others(self, found: Sequence[Message | Damage], now: float) -> None:
-        for one in found:
-            if isinstance(one, Message):
-                row = messages.decode(one)
-                if isinstance(row, messages.Packet | messages.EndOfTransfer):
-                    self._take(one._replace(can_id=self.target.request_id), now)
+        for one in other.feed(frame.data, now):
+            if not isinstance(one, Message):
+                continue
+            if isinstance(messages.decode(one), messages.Packet | messages.EndOfTransfer):
+                self._take(one._replace(can_id=self.target.request_id), now)
 
 
 @variant(
@@ -273,14 +267,10 @@ class HearsOtherTargets(MockDevice):
 )
 class AnswersInBootloader(MockDevice):
     def _take_row(self, row: AnyRow, now: float) -> None:
-        in_bootloader = self.state is not State.APPLICATION
-        if in_bootloader and isinstance(row, messages.Unknown):
-            self._confirm(row.message.command)
-        super()._take_row(row, now)
-
-    def _confirm(self, command: int) -> None:
-        if command in _APPLICATION_COMMANDS:
+        command = row.message.command if isinstance(row, messages.Unknown) else None
+        if self.state is not State.APPLICATION and command in _APPLICATION_COMMANDS:
             self._send(messages.GeneralFeedback())
+        super()._take_row(row, now)
 
 
 @variant(

@@ -10,7 +10,7 @@ from flasher.mock.memory import Operation
 from flasher.mock.model import MockDevice, is_damaged_packet
 from flasher.mock.store import AREA_START
 from flasher.mock.table import Event, State
-from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, variant
+from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, bad_write, variant
 from flasher.protocol import messages
 from flasher.protocol.spec import (
     PACKET_COUNT_MAX,
@@ -18,7 +18,6 @@ from flasher.protocol.spec import (
     PACKET_FILLER,
     PACKET_START,
     Command,
-    Mode,
 )
 from flasher.protocol.wire import Damage, Message
 
@@ -37,9 +36,7 @@ _WRAP_S: Final = 65.536
 )
 class NakWrongNumber(MockDevice):
     def _answer_bad(self, now: float) -> str:
-        self._send(messages.Nak(min(self._transfer.wanted + 1, PACKET_COUNT_MAX)))
-        self._await_host(now)
-        return ""
+        return self._reply(messages.Nak(min(self._transfer.wanted + 1, PACKET_COUNT_MAX)), now)
 
 
 @variant(
@@ -95,7 +92,7 @@ class WritesRepeated(MockDevice):
         if self._written * PACKET_DATA_SIZE < size_bytes:
             self._written += 1
             operation = self.store.storing(self._written, self._payload, size_bytes)
-            self.store.flash.program(operation.address, operation.data or b"")
+            self.store.flash.carry_out(operation)
 
 
 @variant("accepts-skipped-number", "TX-03", "takes a packet after a gap, and leaves the gap")
@@ -132,18 +129,17 @@ class RepeatOverwrites(MockDevice):
     def _answer_repeated(self, now: float) -> str:
         transfer = self._transfer
         operation = self.store.storing(transfer.stored, self._payload, transfer.size_bytes)
-        self.store.flash.program(operation.address, operation.data or b"")
+        self.store.flash.carry_out(operation)
         return super()._answer_repeated(now)
 
 
 @variant("ignores-start-byte", "TX-06", "takes a packet with any start byte")
 class IgnoresStartByte(MockDevice):
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if isinstance(row, messages.Malformed):
-            message = row.message
-            if (message.command, message.mode) == (Command.PACKET, Mode.WRITE):
-                data = bytes((PACKET_START,)) + message.data[1:]
-                row = messages.decode(message._replace(data=data))
+        message = bad_write(row, Command.PACKET)
+        if message:
+            data = bytes((PACKET_START,)) + message.data[1:]
+            row = messages.decode(message._replace(data=data))
         super()._take_row(row, now)
 
 
@@ -153,17 +149,11 @@ class ByteNumbers(MockDevice):
 
     def _classify(self, row: AnyRow) -> Event:
         event = super()._classify(row)
-        in_transfer = self.state is State.TRANSFER and isinstance(row, messages.Packet)
-        return Event.PACKET_BAD if in_transfer and self._wraps(row) else event
-
-    @staticmethod
-    def _wraps(row: AnyRow) -> bool:
-        return isinstance(row, messages.Packet) and row.number > _BYTE
+        wraps = isinstance(row, messages.Packet) and row.number > _BYTE
+        return Event.PACKET_BAD if wraps and self.state is State.TRANSFER else event
 
     def _answer_bad(self, now: float) -> str:
-        self._send(messages.Nak(self._transfer.wanted & _BYTE))
-        self._await_host(now)
-        return ""
+        return self._reply(messages.Nak(self._transfer.wanted & _BYTE), now)
 
 
 @variant("hangs-after-256-packets", "TX-07", "hangs when packet 257 is stored, until power is cut")
@@ -198,6 +188,7 @@ class NeverTimesOut(MockDevice):
     """
 
     _waits_on = False
+    in_ram = ("_waits_on",)
 
     def _await_host(self, now: float) -> None:
         self._waits_on = False
@@ -215,10 +206,6 @@ class NeverTimesOut(MockDevice):
         is_way_out = event in {Event.UPDATE, Event.UPDATE_AGAIN, Event.RESET}
         stuck = self._waits_on and self.state is State.TRANSFER
         return Event.NO_CONCERN if stuck and is_way_out else event
-
-    def _switch_off(self, now: float) -> str:
-        self._waits_on = False
-        return super()._switch_off(now)
 
 
 @variant(
@@ -284,8 +271,7 @@ class DamageEndsTransfer(MockDevice):
 )
 class RepeatUnanswered(MockDevice):
     def _answer_repeated(self, now: float) -> str:
-        self._await_host(now)
-        return ""
+        return self._reply(None, now)
 
 
 @variant(
@@ -302,7 +288,7 @@ class OlderOverwrites(MockDevice):
         if self._number:
             size_bytes = self._transfer.size_bytes
             operation = self.store.storing(self._number, self._payload, size_bytes)
-            self.store.flash.program(operation.address, operation.data or b"")
+            self.store.flash.carry_out(operation)
         return super()._answer_older(now)
 
 
@@ -352,12 +338,10 @@ class TotalsModulo256(MockDevice):
 )
 class NumberZeroIsFirst(MockDevice):
     def _take_row(self, row: AnyRow, now: float) -> None:
-        if isinstance(row, messages.Malformed) and not self._transfer.stored:
-            message = row.message
-            if (message.command, message.mode) == (Command.PACKET, Mode.WRITE):
-                data = message.data
-                if not any(data[1:3]):
-                    row = messages.decode(message._replace(data=data[:1] + b"\x01\x00" + data[3:]))
+        message = bad_write(row, Command.PACKET)
+        if message and not self._transfer.stored and not any(message.data[1:3]):
+            data = message.data[:1] + b"\x01\x00" + message.data[3:]
+            row = messages.decode(message._replace(data=data))
         super()._take_row(row, now)
 
 
@@ -374,9 +358,7 @@ class AcksDamagedRepetition(MockDevice):
         stored = self._transfer.stored
         if not self._is_damage or not stored or self._number != stored:
             return super()._answer_bad(now)
-        self._send(messages.Ack(stored))
-        self._await_host(now)
-        return ""
+        return self._reply(messages.Ack(stored), now)
 
     _is_damage = False
 
@@ -407,8 +389,7 @@ class BlankPacketUnanswered(MockDevice):
         if set(self._payload) != {PACKET_FILLER}:
             return super()._acknowledge(now)
         self._transfer.stored += 1
-        self._await_host(now)
-        return ""
+        return self._reply(None, now)
 
 
 @variant(
