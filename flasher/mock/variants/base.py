@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Final, TypeVar
@@ -14,9 +15,8 @@ from flasher.protocol.messages import Malformed
 from flasher.protocol.spec import Command, Mode
 from flasher.protocol.wire import Message
 
-__all__ = ["DECLARED", "AnyRow", "HangingDevice", "PlainStore", "Variant", "bad_write", "variant"]
-
 _ANY: Final = "*"
+_SENTENCE_END: Final = re.compile(r"\.\s+(?=[A-Z])")
 _WrongT = TypeVar("_WrongT", bound=type[object])
 
 
@@ -60,23 +60,18 @@ DECLARED: Final[list[Variant]] = []
 """All that the modules of this package declare."""
 
 
-def variant(
-    name: str,
-    clause: str,
-    summary: str,
-    *,
-    also: str = "",
-    **more: Any,
-) -> Callable[[_WrongT], _WrongT]:
+def variant(name: str, clause: str, *, also: str = "", **more: Any) -> Callable[[_WrongT], _WrongT]:
     """Declares a class as what is wrong with a `Variant`: a device, or one of the parts that it is
-    made of. The cases in `also` are parted by blanks; "*" stands for `everywhere`; `more` are
-    further fields of the variant.
+    made of; the first sentence of its docstring is the summary. The cases in `also` are parted by
+    blanks; "*" stands for `everywhere`; `more` are further fields of the variant.
     """
 
     def declare(wrong: _WrongT) -> _WrongT:
         device_type = wrong if issubclass(wrong, MockDevice) else _device_with(wrong)
         is_any = also == _ANY
         others = () if is_any else tuple(also.split())
+        told = _SENTENCE_END.split(" ".join((wrong.__doc__ or "").split()))[0].rstrip(".")
+        summary = told[:1].lower() + told[1:]
         DECLARED.append(Variant(name, clause, summary, device_type, others, is_any, **more))
         return wrong
 

@@ -6,10 +6,10 @@ from math import inf
 from typing import Final
 
 from flasher.mock.memory import ERASED, Operation
-from flasher.mock.model import MockDevice
+from flasher.mock.model import AnyRow, MockDevice
 from flasher.mock.store import AREA_START, ApplicationStore
 from flasher.mock.table import Event, State
-from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, bad_write, variant
+from flasher.mock.variants.base import HangingDevice, PlainStore, bad_write, variant
 from flasher.protocol import messages
 from flasher.protocol.spec import Command
 
@@ -17,15 +17,9 @@ _DARK_BOOTS: Final = 2
 """Power-ups in a row without an application after which one is spent in the dark."""
 
 
-@variant(
-    "announces-after-complete",
-    "EN-01",
-    "does not start the new application until power is cut, announces itself instead",
-    also="EN-07 EN-08",
-    upgrade_works=False,
-)
+@variant("announces-after-complete", "EN-01", also="EN-07 EN-08", upgrade_works=False)
 class AnnouncesAfterComplete(MockDevice):
-    """Goes on as a device without an application after complete, until its power is cut."""
+    """Does not start the new application until power is cut, announces itself instead."""
 
     _holds_back = False
     in_ram = ("_holds_back",)
@@ -45,8 +39,10 @@ class AnnouncesAfterComplete(MockDevice):
         return detail
 
 
-@variant("accepts-early-end", "EN-02", "completes when packets are missing")
+@variant("accepts-early-end", "EN-02")
 class AcceptsEarlyEnd(MockDevice):
+    """Completes when packets are missing."""
+
     def _classify(self, row: AnyRow) -> Event:
         event = super()._classify(row)
         if event is not Event.END_EARLY:
@@ -54,24 +50,18 @@ class AcceptsEarlyEnd(MockDevice):
         return Event.END_WHOLE if self._accepts_image() else Event.END_WRONG
 
 
-@variant(
-    "ignores-image-checksum",
-    "EN-04",
-    "starts an image whose own checksum is wrong",
-    profile={"image_checksum": "crc32"},
-)
+@variant("ignores-image-checksum", "EN-04", profile={"image_checksum": "crc32"})
 class ImageChecksumIgnored(MockDevice):
+    """Starts an image whose own checksum is wrong."""
+
     def _accepts_image(self) -> bool:
         return True
 
 
-@variant(
-    "keeps-longer-rest",
-    "EN-07",
-    "does not erase the page where a smaller image ends: a mixture with the old one",
-    also="UP-01 UP-08 EN-01 EN-08",
-)
+@variant("keeps-longer-rest", "EN-07", also="UP-01 UP-08 EN-01 EN-08")
 class KeepsLongerRest(PlainStore):
+    """Does not erase the page where a smaller image ends: a mixture with the old one."""
+
     def erasing(self, size_bytes: int) -> list[Operation]:
         """All but the page where the new image ends, when the old one reaches beyond it."""
         old = self.image()
@@ -83,14 +73,11 @@ class KeepsLongerRest(PlainStore):
         return [operation for operation in operations if operation.address != kept]
 
 
-@variant(
-    "reports-old-version",
-    "EN-08",
-    "reports the version from before the upgrade until power is cut (a BMS)",
-    also="EN-01 EN-07",
-)
+@variant("reports-old-version", "EN-08", also="EN-01 EN-07")
 class ReportsOldVersion(MockDevice):
-    """Reads the version of its application at power-up only."""
+    """Reports the version from before the upgrade until power is cut (a BMS). Reads the version of
+    its application at power-up only.
+    """
 
     _version: str | None = None
     in_ram = ("_version",)
@@ -101,14 +88,9 @@ class ReportsOldVersion(MockDevice):
         return self._version
 
 
-@variant(
-    "starts-torn-image",
-    "PW-01",
-    "starts what is stored of an image that was broken off",
-    also="RS-03 TX-12 EN-04 PW-02",
-)
+@variant("starts-torn-image", "PW-01", also="RS-03 TX-12 EN-04 PW-02")
 class StartsTornImage(MockDevice):
-    """Starts whatever stands at the start of the application area."""
+    """Starts what is stored of an image that was broken off."""
 
     def _boot(self, now: float) -> str:
         super()._boot(now)
@@ -117,21 +99,20 @@ class StartsTornImage(MockDevice):
         return "something" if self._has_whole_application else "no application"
 
 
-class _RecordFirst(ApplicationStore):
-    def erasing(self, size_bytes: int) -> list[Operation]:
-        return [*super().erasing(size_bytes), self.recording(size_bytes)]
-
+class _Trusting(ApplicationStore):
     def _is_intact(self, image: bytes, crc: int) -> bool:
         return True
 
 
-@variant(
-    "record-first",
-    "PW-01",
-    "declares the new image whole before its first packet",
-    also="TX-12 EN-04 RS-03 PW-02",
-)
+class _RecordFirst(_Trusting):
+    def erasing(self, size_bytes: int) -> list[Operation]:
+        return [*super().erasing(size_bytes), self.recording(size_bytes)]
+
+
+@variant("record-first", "PW-01", also="TX-12 EN-04 RS-03 PW-02")
 class RecordFirst(MockDevice):
+    """Declares the new image whole before its first packet."""
+
     store_type = _RecordFirst
 
     def _record(self, now: float) -> str:
@@ -139,13 +120,10 @@ class RecordFirst(MockDevice):
         return f"{self._transfer.size_bytes} bytes"
 
 
-@variant(
-    "ack-before-write",
-    "PW-01",
-    "acknowledges a packet, and writes it when the next message comes",
-    also="TX-02 TX-05",
-)
+@variant("ack-before-write", "PW-01", also="TX-02 TX-05")
 class AckBeforeWrite(MockDevice):
+    """Acknowledges a packet, and writes it when the next message comes."""
+
     _buffered: Operation | None = None
 
     def _store(self, now: float) -> str:
@@ -173,13 +151,10 @@ class AckBeforeWrite(MockDevice):
         return super()._boot(now)
 
 
-@variant(
-    "dark-after-second-cut",
-    "PW-02",
-    "hangs at the second power-up in a row without an application",
-    also="PW-01",
-)
+@variant("dark-after-second-cut", "PW-02", also="PW-01")
 class DarkAfterSecondCut(HangingDevice):
+    """Hangs at the second power-up in a row without an application."""
+
     _dark_boots = 0
     _is_power_up = False
 
@@ -206,11 +181,12 @@ class DarkAfterSecondCut(HangingDevice):
 @variant(
     "runs-new-application-once",
     "EN-01",
-    "does not find the new application any more after the next restart",
     also="CR-03 RS-01 RS-02 RS-03 RS-05 UP-02 UP-03 UP-04 UP-06 TX-03 EN-02 TM-05 PW-01 "
     "SE-01 SE-03 SE-04 CO-01 BU-02",
 )
 class RunsOnce(MockDevice):
+    """Does not find the new application any more after the next restart."""
+
     _ended = False
 
     def _complete(self, now: float) -> str:
@@ -228,23 +204,21 @@ class RunsOnce(MockDevice):
         return super()._erase(now)
 
 
-@variant(
-    "second-end-refused", "EN-02", "answers the end of transfer that follows complete with a NAK"
-)
+@variant("second-end-refused", "EN-02")
 class RefusesSecondEnd(MockDevice):
-    """Takes the second end of transfer for one that came too early."""
+    """Answers the end of transfer that follows complete with a NAK. Takes the second end of
+    transfer for one that came too early.
+    """
 
     def _complete_again(self, now: float) -> str:
         self._send(messages.Nak(self._transfer.total))
         return ""
 
 
-@variant(
-    "believes-second-early-end",
-    "EN-02",
-    "refuses an early end of transfer once, and completes at the second one",
-)
+@variant("believes-second-early-end", "EN-02")
 class CompletesSecondEnd(MockDevice):
+    """Refuses an early end of transfer once, and completes at the second one."""
+
     _refused = False
 
     def _erase(self, now: float) -> str:
@@ -261,14 +235,9 @@ class CompletesSecondEnd(MockDevice):
         return event
 
 
-@variant(
-    "refusal-is-final",
-    "EN-04",
-    "takes nothing after it has refused an image, until power is cut",
-    profile={"image_checksum": "crc32"},
-)
+@variant("refusal-is-final", "EN-04", profile={"image_checksum": "crc32"})
 class RefusalHangs(HangingDevice):
-    """Waits for ever after it has refused an image."""
+    """Takes nothing after it has refused an image, until power is cut."""
 
     def _refuse_end(self, now: float) -> str:
         detail = super()._refuse_end(now)
@@ -282,8 +251,10 @@ class RefusalHangs(HangingDevice):
         return Event.NO_CONCERN if stuck else event
 
 
-@variant("any-end-byte", "EN-02", "takes an end of transfer with another byte than 04")
+@variant("any-end-byte", "EN-02")
 class AnyEndByte(MockDevice):
+    """Takes an end of transfer with another byte than 04."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         is_end = bad_write(row, Command.END_OF_TRANSFER)
         super()._take_row(messages.EndOfTransfer() if is_end else row, now)
@@ -292,41 +263,31 @@ class AnyEndByte(MockDevice):
 @variant(
     "single-packet-image-fails",
     "UP-01",
-    "refuses the end of transfer of an image of one packet",
     unseen="it takes an image of one packet that runs; a part of one is never ended",
 )
 class SinglePacketImageFails(MockDevice):
-    """Looks for the last packet where one is stored, not where one comes first."""
+    """Refuses the end of transfer of an image of one packet. Looks for the last packet where one is
+    stored, not where one comes first.
+    """
 
     def _classify_end(self) -> Event:
         event = super()._classify_end()
         return Event.END_EARLY if event is Event.END_WHOLE and self._transfer.total == 1 else event
 
 
-class _RecordErasedLast(ApplicationStore):
+@variant("record-erased-last", "PW-01")
+class RecordErasedLast(_Trusting):
+    """Erases the application first, and then the record that it is whole."""
+
     def erasing(self, size_bytes: int) -> list[Operation]:
         record, *pages = super().erasing(size_bytes)
         return [*pages, record]
 
-    def _is_intact(self, image: bytes, crc: int) -> bool:
-        return True
 
-
-@variant(
-    "record-erased-last",
-    "PW-01",
-    "erases the application first, and then the record that it is whole",
-)
-class RecordErasedLast(MockDevice):
-    store_type = _RecordErasedLast
-
-
-@variant(
-    "complete-before-record",
-    "PW-01",
-    "says complete, and records that the image is whole when it starts it",
-)
+@variant("complete-before-record", "PW-01")
 class CompleteBeforeRecord(MockDevice):
+    """Says complete, and records that the image is whole when it starts it."""
+
     _owes_record = False
     in_ram = ("_owes_record",)
 

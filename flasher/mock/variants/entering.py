@@ -6,9 +6,9 @@ import dataclasses
 from math import inf
 from typing import Final
 
-from flasher.mock.model import MockDevice, Transfer
+from flasher.mock.model import AnyRow, MockDevice, Transfer
 from flasher.mock.table import Event, State
-from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, bad_write, variant
+from flasher.mock.variants.base import HangingDevice, PlainStore, bad_write, variant
 from flasher.protocol import messages
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import PACKET_DATA_SIZE, Command
@@ -26,37 +26,32 @@ _LEFTOVER_S: Final = 0.1
 _UPDATES_MAX: Final = 20
 
 
-@variant("no-feedback", "RS-01", "restarts at a reset without general feedback")
+@variant("no-feedback", "RS-01")
 class NoFeedback(MockDevice):
+    """Restarts at a reset without general feedback."""
+
     def _confirm_reset(self, now: float) -> str:
         self._await_restart(now)
         return "reset"
 
 
-@variant("announces-three-times", "RS-01", "announces itself three times", also="RS-02 RS-05 UP-04")
+@variant("announces-three-times", "RS-01", also="RS-02 RS-05 UP-04")
 class ThreeAnnouncements(MockDevice):
+    """Announces itself three times."""
+
     burst = 3
 
 
 @variant(
-    "announces-every-60-ms",
-    "RS-01",
-    "announces itself 60 ms apart",
-    also="RS-05 TM-05",
-    timings={"boot_version_spacing_s": 0.06},
+    "announces-every-60-ms", "RS-01", also="RS-05 TM-05", timings={"boot_version_spacing_s": 0.06}
 )
 class SlowAnnouncements(MockDevice):
-    pass
+    """Announces itself 60 ms apart."""
 
 
-@variant(
-    "feedback-on-wrong-id",
-    "RS-01",
-    "answers on its broadcast id: general feedback to 7S0",
-    also="CR-04 UP-03",
-)
+@variant("feedback-on-wrong-id", "RS-01", also="CR-04 UP-03")
 class FeedbackOnWrongId(MockDevice):
-    """Confirms a reset to everybody, not to the tool."""
+    """Answers on its broadcast id: general feedback to 7S0."""
 
     def send(self, message: Message) -> None:
         if message.command == Command.GENERAL_FEEDBACK:
@@ -64,9 +59,11 @@ class FeedbackOnWrongId(MockDevice):
         super().send(message)
 
 
-@variant("two-restarts", "RS-02", "restarts once for each of two resets")
+@variant("two-restarts", "RS-02")
 class TwoRestarts(MockDevice):
-    """Keeps a reset that comes during the restart, and carries it out after the burst."""
+    """Restarts once for each of two resets. Keeps a reset that comes during the restart, and
+    carries it out after the burst.
+    """
 
     _waiting_reset = False
 
@@ -92,11 +89,12 @@ class TwoRestarts(MockDevice):
 @variant(
     "stays-in-bootloader",
     "RS-03",
-    "without an update command, waits silently for ever",
     also="RS-02 RS-05 UP-02 UP-04 UP-03 UP-06 TX-03 PW-01 EN-01 EN-02 BU-02 CO-01 SE-01 SE-03 "
     "SE-04",
 )
 class StaysInBootloader(MockDevice):
+    """Without an update command, waits silently for ever."""
+
     def _announce(self, now: float) -> str:
         detail = super()._announce(now)
         if self._has_whole_application and self._announced >= self.burst:
@@ -104,14 +102,9 @@ class StaysInBootloader(MockDevice):
         return detail
 
 
-@variant(
-    "gives-up-without-application",
-    "RS-03",
-    "without an application, announces itself eight times and hangs",
-    also="TX-07 TX-12 PW-01 PW-02 SE-01",
-)
+@variant("gives-up-without-application", "RS-03", also="TX-07 TX-12 PW-01 PW-02 SE-01")
 class GivesUp(HangingDevice):
-    """Without an application to start, announces itself twice four times and hangs."""
+    """Without an application, announces itself eight times and hangs."""
 
     def _announce(self, now: float) -> str:
         detail = super()._announce(now)
@@ -119,14 +112,18 @@ class GivesUp(HangingDevice):
         return self._hang() if hopeless else detail
 
 
-@variant("resets-at-any-text", "RS-04", "takes a reset with a wrong text")
+@variant("resets-at-any-text", "RS-04")
 class ResetByAnyText(MockDevice):
+    """Takes a reset with a wrong text."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         super()._take_row(messages.Reset() if bad_write(row, Command.RESET) else row, now)
 
 
-@variant("resets-on-read", "RS-04", "takes a reset that is a read")
+@variant("resets-on-read", "RS-04")
 class ResetByRead(MockDevice):
+    """Takes a reset that is a read."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         message = row.message if isinstance(row, messages.Malformed) else None
         if message and (message.command, message.data) == (Command.RESET, messages.Reset.DATA):
@@ -134,9 +131,9 @@ class ResetByRead(MockDevice):
         super()._take_row(row, now)
 
 
-@variant("silent-power-up", "RS-05", "starts the application at power-up without announcing itself")
+@variant("silent-power-up", "RS-05")
 class SilentPowerUp(MockDevice):
-    """Starts a whole application at power-up without passing through the announcements."""
+    """Starts the application at power-up without announcing itself."""
 
     _is_power_up = False
 
@@ -152,25 +149,19 @@ class SilentPowerUp(MockDevice):
         return detail
 
 
-@variant(
-    "full-last-packet-fails",
-    "UP-01",
-    "wants a packet more when the size is a multiple of 128",
-    also="EN-01 EN-07 EN-08 PW-01 PW-02 TX-07 TX-12",
-)
+@variant("full-last-packet-fails", "UP-01", also="EN-01 EN-07 EN-08 PW-01 PW-02 TX-07 TX-12")
 class FullPacketsFail(Transfer):
+    """Wants a packet more when the size is a multiple of 128."""
+
     @property
     def total(self) -> int:
         return self.size_bytes // PACKET_DATA_SIZE + 1
 
 
-@variant(
-    "erases-before-checking-size",
-    "UP-02",
-    "erases the application before it refuses an impossible size",
-    also="SE-04",
-)
+@variant("erases-before-checking-size", "UP-02", also="SE-04")
 class ErasesBeforeCheck(MockDevice):
+    """Erases the application before it refuses an impossible size."""
+
     def _refuse_update(self, now: float) -> str:
         size_bytes, limit_bytes = self._offered_bytes, self.profile.image_limit_bytes
         if self.state is State.ANNOUNCING and not 0 < size_bytes <= limit_bytes:
@@ -179,13 +170,10 @@ class ErasesBeforeCheck(MockDevice):
         return super()._refuse_update(now)
 
 
-@variant(
-    "erases-from-application",
-    "UP-03",
-    "erases at an update command to the running application",
-    also="SE-03",
-)
+@variant("erases-from-application", "UP-03", also="SE-03")
 class ErasesFromApplication(MockDevice):
+    """Erases at an update command to the running application."""
+
     def _send_feedback(self, now: float) -> str:
         if self._message is not None and self._message.command == Command.UPDATE:
             _erase_at_once(self)
@@ -198,14 +186,11 @@ def _erase_at_once(device: MockDevice) -> None:
         device.store.flash.carry_out(operation)
 
 
-@variant(
-    "listens-until-third-version",
-    "UP-04",
-    "takes no update command from its third announcement on",
-    also="UP-05",
-)
+@variant("listens-until-third-version", "UP-04", also="UP-05")
 class StopsListening(MockDevice):
-    """Listens between its first announcements only, when it has an application to start."""
+    """Takes no update command from its third announcement on. Listens between its first
+    announcements only, when it has an application to start.
+    """
 
     def _classify(self, row: AnyRow) -> Event:
         event = super()._classify(row)
@@ -214,9 +199,11 @@ class StopsListening(MockDevice):
         return Event.NO_CONCERN if is_deaf and event is Event.UPDATE else event
 
 
-@variant("queues-updates", "UP-05", "carries out a second update command after packet 1")
+@variant("queues-updates", "UP-05")
 class QueuesUpdates(MockDevice):
-    """Keeps an update command that comes while it erases, and erases for it in the transfer."""
+    """Carries out a second update command after packet 1. Keeps an update command that comes while
+    it erases, and erases for it in the transfer.
+    """
 
     _waiting_update = False
 
@@ -238,22 +225,19 @@ class QueuesUpdates(MockDevice):
         return super()._elapsed()
 
 
-@variant("any-target-name", "UP-06", "takes the update command of any target")
+@variant("any-target-name", "UP-06")
 class AnyTargetName(MockDevice):
+    """Takes the update command of any target."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.UpdateCommand):
             row = dataclasses.replace(row, text=self.target.update_text)
         super()._take_row(row, now)
 
 
-@variant(
-    "mixes-transfers",
-    "UP-08",
-    "goes on with what is stored when an update command comes in the midst",
-    also="FR-07 UP-01 TX-12 TM-05",
-)
+@variant("mixes-transfers", "UP-08", also="FR-07 UP-01 TX-12 TM-05")
 class MixesTransfers(MockDevice):
-    """On an update command in the midst, requests anew but keeps what is stored, and its count."""
+    """Goes on with what is stored when an update command comes in the midst."""
 
     store_type = PlainStore
 
@@ -265,9 +249,9 @@ class MixesTransfers(MockDevice):
         return event
 
 
-@variant("reset-text-of-four", "RS-04", "compares the first four letters of a reset's text")
+@variant("reset-text-of-four", "RS-04")
 class ResetTextOfFour(MockDevice):
-    """Compares as many bytes as a pointer has."""
+    """Compares the first four letters of a reset's text. As many as a pointer has bytes."""
 
     def _take_row(self, row: AnyRow, now: float) -> None:
         message = bad_write(row, Command.RESET)
@@ -276,9 +260,9 @@ class ResetTextOfFour(MockDevice):
         super()._take_row(row, now)
 
 
-@variant("update-text-of-four", "UP-06", "compares the first four letters of a target's name")
+@variant("update-text-of-four", "UP-06")
 class UpdateTextOfFour(MockDevice):
-    """Compares as many bytes as a pointer has."""
+    """Compares the first four letters of a target's name. As many as a pointer has bytes."""
 
     def _take_row(self, row: AnyRow, now: float) -> None:
         message, text = bad_write(row, Command.UPDATE), self.target.update_text.encode("ascii")
@@ -287,9 +271,11 @@ class UpdateTextOfFour(MockDevice):
         super()._take_row(row, now)
 
 
-@variant("reset-from-any-node", "RS-04", "takes a reset that another node than the tool sends")
+@variant("reset-from-any-node", "RS-04")
 class ResetFromAnyNode(MockDevice):
-    """Goes by the receiver in an id, not by the sender."""
+    """Takes a reset that another node than the tool sends. Goes by the receiver in an id, not by
+    the sender.
+    """
 
     def _take_message(self, message: Message, now: float) -> None:
         if messages.decode(message) == messages.Reset():
@@ -297,12 +283,10 @@ class ResetFromAnyNode(MockDevice):
         super()._take_message(message, now)
 
 
-@variant(
-    "dies-after-255-announcements",
-    "RS-03",
-    "without an application, hangs after 255 announcements",
-)
+@variant("dies-after-255-announcements", "RS-03")
 class DiesAfter255(HangingDevice):
+    """Without an application, hangs after 255 announcements."""
+
     def _announce(self, now: float) -> str:
         return self._hang() if self._announced >= _BYTE_MAX else super()._announce(now)
 
@@ -310,11 +294,12 @@ class DiesAfter255(HangingDevice):
 @variant(
     "feedback-after-version",
     "RS-01",
-    "sends general feedback behind the first boot version",
     also="FR-06 FR-10 CR-03 CR-04 RS-02 UP-02 UP-04 UP-06 SE-04 CO-02 CO-04",
 )
 class FeedbackAfterVersion(MockDevice):
-    """Leaves the answer to a reset to the bootloader."""
+    """Sends general feedback behind the first boot version. Leaves the answer to a reset to the
+    bootloader.
+    """
 
     _owes_feedback = False
 
@@ -331,14 +316,11 @@ class FeedbackAfterVersion(MockDevice):
         return detail
 
 
-@variant(
-    "leftover-announcement",
-    "UP-04",
-    "announces itself once more 0.1 s after request transfer",
-    also="*",
-)
+@variant("leftover-announcement", "UP-04", also="*")
 class LeftoverAnnouncement(MockDevice):
-    """Does not stop the timer of its announcements at the update command."""
+    """Announces itself once more 0.1 s after request transfer. Does not stop the timer of its
+    announcements at the update command.
+    """
 
     _leftover_at = inf
     in_ram = ("_leftover_at",)
@@ -359,27 +341,21 @@ class LeftoverAnnouncement(MockDevice):
             self._send(messages.BootVersion(self.target.boot_name, self.profile.boot_version))
 
 
-@variant(
-    "sixteen-bit-size",
-    "UP-02",
-    "keeps 16 bits of the size, and takes one beyond 64 KiB for a small one",
-    profile={"application_area_bytes": 48 * 1024},
-)
+@variant("sixteen-bit-size", "UP-02", profile={"application_area_bytes": 48 * 1024})
 class SixteenBitSize(MockDevice):
+    """Keeps 16 bits of the size, and takes one beyond 64 KiB for a small one."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.UpdateCommand):
             row = dataclasses.replace(row, size_bytes=row.size_bytes & _SIXTEEN_BITS)
         super()._take_row(row, now)
 
 
-@variant(
-    "hangs-at-20th-update",
-    "UP-08",
-    "hangs at the 20th update command since power-up until power is cut",
-    also="FR-07 UP-06 TX-12 TM-05",
-)
+@variant("hangs-at-20th-update", "UP-08", also="FR-07 UP-06 TX-12 TM-05")
 class HangsAt20thUpdate(HangingDevice):
-    """Allocates a buffer for each transfer, and frees none."""
+    """Hangs at the 20th update command since power-up until power is cut. Allocates a buffer for
+    each transfer, and frees none.
+    """
 
     _updates = 0
     in_ram = ("hangs", "_updates")
@@ -389,12 +365,10 @@ class HangsAt20thUpdate(HangingDevice):
         return self._hang() if self._updates >= _UPDATES_MAX else super()._erase(now)
 
 
-@variant(
-    "reset-while-erasing-hangs",
-    "TX-13",
-    "hangs at a reset while it erases until power is cut",
-)
+@variant("reset-while-erasing-hangs", "TX-13")
 class ResetWhileErasingHangs(HangingDevice):
+    """Hangs at a reset while it erases until power is cut."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.Reset) and self.state is State.ERASING:
             self._hang()
@@ -402,13 +376,11 @@ class ResetWhileErasingHangs(HangingDevice):
             super()._take_row(row, now)
 
 
-@variant(
-    "completes-without-transfer",
-    "EN-02",
-    "answers an end of transfer with complete while it announces itself",
-)
+@variant("completes-without-transfer", "EN-02")
 class CompletesWithoutTransfer(MockDevice):
-    """Counts no packet missing as long as none was announced."""
+    """Answers an end of transfer with complete while it announces itself. Counts no packet missing
+    as long as none was announced.
+    """
 
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.EndOfTransfer) and self.state is State.ANNOUNCING:
@@ -416,12 +388,10 @@ class CompletesWithoutTransfer(MockDevice):
         super()._take_row(row, now)
 
 
-@variant(
-    "acks-without-transfer",
-    "TX-03",
-    "acknowledges packets while it announces itself, and stores nothing",
-)
+@variant("acks-without-transfer", "TX-03")
 class AcksWithoutTransfer(MockDevice):
+    """Acknowledges packets while it announces itself, and stores nothing."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.Packet) and self.state is State.ANNOUNCING:
             self._send(messages.Ack(row.number))

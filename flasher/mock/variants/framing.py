@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from math import inf
 from typing import Final
 
-from flasher.mock.model import MockDevice, is_damaged_packet
+from flasher.mock.model import AnyRow, MockDevice, is_damaged_packet
 from flasher.mock.table import Event, State
-from flasher.mock.variants.base import AnyRow, HangingDevice, variant
+from flasher.mock.variants.base import HangingDevice, variant
 from flasher.protocol import messages
 from flasher.protocol.catalogue import ITEMS
 from flasher.protocol.crc import crc32
@@ -38,12 +38,10 @@ _KNOWN_MODES: Final = frozenset(Mode)
 _WRITTEN: Final = (Command.RESET, Command.UPDATE, Command.PACKET, Command.END_OF_TRANSFER)
 
 
-@variant(
-    "short-frame-ends-message",
-    "FR-01",
-    "drops a message when a frame other than its last has less than 8 bytes",
-)
+@variant("short-frame-ends-message", "FR-01")
 class ShortFrameEnds(Reassembler):
+    """Drops a message when a frame other than its last has less than 8 bytes."""
+
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
         found = super().feed(payload, now)
         if len(payload) < FRAME_DATA_SIZE:
@@ -51,25 +49,18 @@ class ShortFrameEnds(Reassembler):
         return found
 
 
-@variant(
-    "header-at-frame-start-only",
-    "FR-02",
-    "misses a message whose header stands behind junk in the same frame",
-)
+@variant("header-at-frame-start-only", "FR-02")
 class HeaderAtFrameStart(Reassembler):
+    """Misses a message whose header stands behind junk in the same frame."""
+
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
         starts = payload.startswith(HEADER) or HEADER.startswith(payload)
         return super().feed(payload, now) if self._buffer or starts else ()
 
 
-@variant(
-    "header-in-data-restarts",
-    "FR-03",
-    "begins a new message where 55 AA stands at the start of a frame of data",
-    also="FR-10",
-)
+@variant("header-in-data-restarts", "FR-03", also="FR-10")
 class HeaderRestarts(Reassembler):
-    """Begins anew at every frame that starts with a header's bytes."""
+    """Begins a new message where 55 AA stands at the start of a frame of data."""
 
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
         if payload.startswith(HEADER):
@@ -77,21 +68,18 @@ class HeaderRestarts(Reassembler):
         return super().feed(payload, now)
 
 
-@variant("ignores-tail", "FR-04", "takes a message with any last byte", also="CR-01")
+@variant("ignores-tail", "FR-04", also="CR-01")
 class TailIgnored(Reassembler):
+    """Takes a message with any last byte."""
+
     def _judge_message(self, size: int, found: list[Message | Damage]) -> None:
         self._buffer[size - len(TAIL) : size] = TAIL
         super()._judge_message(size, found)
 
 
-@variant(
-    "trusts-length",
-    "FR-05",
-    "after a broken-off message, swallows the next ones until its length is used up",
-    also="TX-01 CR-02",
-)
+@variant("trusts-length", "FR-05", also="TX-01 CR-02")
 class LengthTrusted(Reassembler):
-    """Waits for as many bytes as the length says, for ever, whatever comes meanwhile."""
+    """After a broken-off message, swallows the next ones until its length is used up."""
 
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
         found = super().feed(payload, now)
@@ -104,11 +92,9 @@ class LengthTrusted(Reassembler):
         del self._buffer[:size]
 
 
-@variant(
-    "short-length-hangs", "FR-06", "hangs on a length of 0 or 1 until power is cut", also="SE-03"
-)
+@variant("short-length-hangs", "FR-06", also="SE-03")
 class ShortLengthHangs(HangingDevice):
-    """Computes length minus 2 unsigned."""
+    """Hangs on a length of 0 or 1 until power is cut. Computes length minus 2 unsigned."""
 
     def _take_damage(self, damage: Damage, now: float) -> None:
         is_bad = damage.reason is DamageReason.BAD_LENGTH
@@ -118,8 +104,10 @@ class ShortLengthHangs(HangingDevice):
             super()._take_damage(damage, now)
 
 
-@variant("padding-is-fatal", "FR-07", "drops a message whose last frame is padded to 8 bytes")
+@variant("padding-is-fatal", "FR-07")
 class PaddingFatal(Reassembler):
+    """Drops a message whose last frame is padded to 8 bytes."""
+
     def feed(self, payload: bytes, now: float) -> Sequence[Message | Damage]:
         found = super().feed(payload, now)
         if self.held_size and any(isinstance(one, Message) for one in found):
@@ -128,10 +116,10 @@ class PaddingFatal(Reassembler):
         return found
 
 
-@variant(
-    "back-to-back-lost", "FR-08", "misses a message that follows the one before without a pause"
-)
+@variant("back-to-back-lost", "FR-08")
 class BackToBackLost(MockDevice):
+    """Misses a message that follows the one before without a pause."""
+
     _message_ended_at = -inf
     _skips = False
 
@@ -146,13 +134,11 @@ class BackToBackLost(MockDevice):
         super()._take_message(message, now)
 
 
-@variant(
-    "every-frame-is-payload",
-    "FR-09",
-    "takes remote, extended, error and empty frames between for payload",
-)
+@variant("every-frame-is-payload", "FR-09")
 class EveryFrameIsPayload(MockDevice):
-    """Copies its receive buffer at every frame with its id, of whatever kind."""
+    """Takes remote, extended, error and empty frames between for payload. Copies its receive buffer
+    at every frame with its id, of whatever kind.
+    """
 
     def receive(self, frame: Frame, now: float) -> None:
         if frame.can_id == self.target.request_id and not frame.is_payload:
@@ -160,14 +146,9 @@ class EveryFrameIsPayload(MockDevice):
         super().receive(frame, now)
 
 
-@variant(
-    "unknown-restarts",
-    "FR-10",
-    "its bootloader restarts on an unknown command or mode",
-    also="SE-01 SE-03 FR-06",
-)
+@variant("unknown-restarts", "FR-10", also="SE-01 SE-03 FR-06")
 class UnknownRestarts(MockDevice):
-    """Its bootloader's default branch is a restart."""
+    """Its bootloader restarts on an unknown command or mode."""
 
     def _classify(self, row: AnyRow) -> Event:
         if isinstance(row, messages.Unknown | messages.Malformed):
@@ -185,20 +166,19 @@ def _with_mirrored_crc(wire: bytes) -> bytes:
     return bytes(changed)
 
 
-@variant("no-crc-check", "CR-01", "takes a message with any CRC", also="CR-02 CR-03 TX-01 BU-01")
+@variant("no-crc-check", "CR-01", also="CR-02 CR-03 TX-01 BU-01")
 class CrcIgnored(Reassembler):
+    """Takes a message with any CRC."""
+
     def _crc_fits(self, wire: bytes) -> bool:
         return True
 
 
-@variant(
-    "short-packet-filled",
-    "CR-02",
-    "fills a packet that lost a frame with FF and stores it",
-    also="TX-01 TM-02 BU-01 BU-02",
-)
+@variant("short-packet-filled", "CR-02", also="TX-01 TM-02 BU-01 BU-02")
 class ShortPacketFilled(MockDevice):
-    """Takes a packet that ends early for a whole one: it has no CRC, so none is looked at."""
+    """Fills a packet that lost a frame with FF and stores it. Takes a packet that ends early for a
+    whole one: it has no CRC, so none is looked at.
+    """
 
     def _take_damage(self, damage: Damage, now: float) -> None:
         if damage.reason is DamageReason.INCOMPLETE and is_damaged_packet(damage):
@@ -210,26 +190,27 @@ class ShortPacketFilled(MockDevice):
             super()._take_damage(damage, now)
 
 
-@variant("either-crc-order", "CR-03", "takes a little-endian CRC as well")
+@variant("either-crc-order", "CR-03")
 class EitherCrcOrder(Reassembler):
+    """Takes a little-endian CRC as well."""
+
     def _crc_fits(self, wire: bytes) -> bool:
         return super()._crc_fits(wire) or super()._crc_fits(_with_mirrored_crc(wire))
 
 
-@variant("crc-without-id", "CR-03", "takes a CRC that leaves the id out as well")
+@variant("crc-without-id", "CR-03")
 class CrcWithoutId(Reassembler):
+    """Takes a CRC that leaves the id out as well."""
+
     def _crc_fits(self, wire: bytes) -> bool:
         crc = int.from_bytes(wire[_CRC_AT], "big")
         return super()._crc_fits(wire) or crc32(wire[: -CRC_SIZE - len(TAIL)]) == crc
 
 
-@variant(
-    "feedback-crc-mirrored",
-    "CR-04",
-    "sends general feedback with a little-endian CRC",
-    also="RS-01 RS-04 UP-03",
-)
+@variant("feedback-crc-mirrored", "CR-04", also="RS-01 RS-04 UP-03")
 class FeedbackCrcMirrored(MockDevice):
+    """Sends general feedback with a little-endian CRC."""
+
     def send(self, message: Message) -> None:
         if message.command != Command.GENERAL_FEEDBACK:
             super().send(message)
@@ -238,28 +219,29 @@ class FeedbackCrcMirrored(MockDevice):
             self._transmitter.queue(frames)
 
 
-@variant("crc-zero-accepted", "CR-03", "takes a message whose CRC is 00000000")
+@variant("crc-zero-accepted", "CR-03")
 class CrcZeroAccepted(Reassembler):
-    """Has a way past the check, for the first tests on a desk."""
+    """Takes a message whose CRC is 00000000. Has a way past the check, for the first tests on a
+    desk.
+    """
 
     def _crc_fits(self, wire: bytes) -> bool:
         return super()._crc_fits(wire) or wire[_CRC_AT] == bytes(CRC_SIZE)
 
 
-@variant("crc-ones-accepted", "CR-03", "takes a message whose CRC is FFFFFFFF")
+@variant("crc-ones-accepted", "CR-03")
 class CrcOnesAccepted(Reassembler):
+    """Takes a message whose CRC is FFFFFFFF."""
+
     def _crc_fits(self, wire: bytes) -> bool:
         return super()._crc_fits(wire) or wire[_CRC_AT] == b"\xff" * CRC_SIZE
 
 
-@variant(
-    "long-commands-accepted",
-    "FR-06",
-    "takes a reset or update command with more data than its command says",
-    also="RS-04 UP-06",
-)
+@variant("long-commands-accepted", "FR-06", also="RS-04 UP-06")
 class LongCommandsAccepted(Reassembler):
-    """Goes by the length byte, and looks at as much of the data as it needs."""
+    """Takes a reset or update command with more data than its command says. Goes by the length
+    byte, and looks at as much of the data as it needs.
+    """
 
     def _judge_head(self, found: list[Message | Damage]) -> bool:
         head = self._buffer[PREFIX_SIZE - 1 : PREFIX_SIZE + COMMAND_SIZE]
@@ -273,22 +255,19 @@ class LongCommandsAccepted(Reassembler):
             found[-1] = last._replace(data=last.data[: data_size(last.command)])
 
 
-@variant(
-    "tail-in-crc",
-    "FR-03",
-    "takes F0 in the first byte of a CRC for the tail",
-    also="FR-02 TX-07 TM-05",
-)
+@variant("tail-in-crc", "FR-03", also="FR-02 TX-07 TM-05")
 class TailInCrc(Reassembler):
-    """Looks for the tail from the end of the data on: the CRC before it may hold the same byte."""
+    """Takes F0 in the first byte of a CRC for the tail. Looks for the tail from the end of the data
+    on: the CRC before it may hold the same byte.
+    """
 
     def _crc_fits(self, wire: bytes) -> bool:
         return not wire[_CRC_AT].startswith(TAIL) and super()._crc_fits(wire)
 
 
-@variant("answers-padded", "CR-04", "fills the last frame of its messages up to 8 bytes")
+@variant("answers-padded", "CR-04")
 class AnswersPadded(MockDevice):
-    """Its CAN driver always sends 8 bytes."""
+    """Fills the last frame of its messages up to 8 bytes. Its CAN driver always sends 8 bytes."""
 
     def send(self, message: Message) -> None:
         if not self.is_off_bus:
@@ -297,13 +276,10 @@ class AnswersPadded(MockDevice):
             self._transmitter.queue(split(message.can_id, wire.ljust(whole, b"\x00")))
 
 
-@variant(
-    "ignores-mode",
-    "FR-10",
-    "takes reset, update command, packet and end with any mode",
-    also="RS-04 UP-06",
-)
+@variant("ignores-mode", "FR-10", also="RS-04 UP-06")
 class IgnoresMode(MockDevice):
+    """Takes reset, update command, packet and end with any mode."""
+
     def _take_message(self, message: Message, now: float) -> None:
         if message.can_id == self.target.request_id and message.command in _WRITTEN:
             message = message._replace(mode=Mode.WRITE)

@@ -10,10 +10,10 @@ from math import inf
 from typing import Final
 
 from flasher.mock.machine import BUS_OFF_S
-from flasher.mock.model import MockDevice
+from flasher.mock.model import AnyRow, MockDevice
 from flasher.mock.store import AREA_START
 from flasher.mock.table import Event, State
-from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, variant
+from flasher.mock.variants.base import HangingDevice, PlainStore, variant
 from flasher.protocol import messages
 from flasher.protocol.catalogue import ITEMS
 from flasher.protocol.frame import Frame
@@ -36,24 +36,15 @@ _APPLICATION_COMMANDS: Final = frozenset(item.command for item in ITEMS)
 _USELESS: Final = frozenset((Event.NO_CONCERN, Event.OUT_OF_TURN, Event.RESET_IGNORED))
 
 
-@variant(
-    "drops-after-20-ms-gap",
-    "TM-02",
-    "drops a message when 20 ms pass between two of its frames",
-    also="BU-01",
-    timings={"inter_frame_timeout_s": 0.02},
-)
+@variant("drops-after-20-ms-gap", "TM-02", also="BU-01", timings={"inter_frame_timeout_s": 0.02})
 class ImpatientWithGaps(MockDevice):
-    pass
+    """Drops a message when 20 ms pass between two of its frames."""
 
 
-@variant(
-    "slow-sixteenth-packet",
-    "TM-05",
-    "acknowledges packets 16, 32, ... after 0.6 s",
-    also="FR-03 FR-09 TX-07 TX-12",
-)
+@variant("slow-sixteenth-packet", "TM-05", also="FR-03 FR-09 TX-07 TX-12")
 class SlowSixteenth(MockDevice):
+    """Acknowledges packets 16, 32, ... after 0.6 s."""
+
     def _store(self, now: float) -> str:
         detail = super()._store(now)
         if self._transfer.wanted % _PACKETS_A_PAGE == 0:
@@ -61,13 +52,10 @@ class SlowSixteenth(MockDevice):
         return detail
 
 
-@variant(
-    "doubled-frame-hangs",
-    "BU-01",
-    "hangs at a message with a doubled frame until power is cut",
-    also="CR-02",
-)
+@variant("doubled-frame-hangs", "BU-01", also="CR-02")
 class DoubledFrameHangs(HangingDevice):
+    """Hangs at a message with a doubled frame until power is cut."""
+
     def _take_damage(self, damage: Damage, now: float) -> None:
         size = FRAME_DATA_SIZE
         frames = [damage.data[at : at + size] for at in range(0, len(damage.data), size)]
@@ -79,32 +67,29 @@ class DoubledFrameHangs(HangingDevice):
             super()._take_damage(damage, now)
 
 
-@variant("stays-off-after-bus-off", "BU-02", "does not come back from bus-off until power is cut")
+@variant("stays-off-after-bus-off", "BU-02")
 class StaysOffBus(MockDevice):
+    """Does not come back from bus-off until power is cut."""
+
     def bus_off(self, now: float, off_s: float = BUS_OFF_S) -> None:
         super().bus_off(now, inf)
 
 
-@variant(
-    "collision-hangs",
-    "BU-06",
-    "hangs when somebody else sends with its answer id, until power is cut",
-)
+@variant("collision-hangs", "BU-06")
 class CollisionHangs(HangingDevice):
+    """Hangs when somebody else sends with its answer id, until power is cut."""
+
     def receive(self, frame: Frame, now: float) -> None:
         if frame.can_id == self.target.answer_id and self.has_power and not self.hangs:
             self._hang()
         super().receive(frame, now)
 
 
-@variant(
-    "logs-useless-messages",
-    "SE-01",
-    "hangs after 4 KiB of messages of no use in a row",
-    also="SE-03 CO-04",
-)
+@variant("logs-useless-messages", "SE-01", also="SE-03 CO-04")
 class LogsUseless(HangingDevice):
-    """Keeps every message of no use until a useful one comes, in a memory that is soon full."""
+    """Hangs after 4 KiB of messages of no use in a row. Keeps every message of no use until a
+    useful one comes, in a memory that is soon full.
+    """
 
     _log_bytes = 0
 
@@ -126,13 +111,10 @@ class LogsUseless(HangingDevice):
         return event in _USELESS
 
 
-@variant(
-    "noise-hangs",
-    "SE-03",
-    "hangs at 64 bytes of junk in a row, or at a report sent to its bootloader",
-    also="SE-01 FR-10 FR-02 FR-09 TX-01 BU-01 CR-01 CR-02 FR-06",
-)
+@variant("noise-hangs", "SE-03", also="SE-01 FR-10 FR-02 FR-09 TX-01 BU-01 CR-01 CR-02 FR-06")
 class NoiseHangs(HangingDevice):
+    """Hangs at 64 bytes of junk in a row, or at a report sent to its bootloader."""
+
     def _take_message(self, message: Message, now: float) -> None:
         is_own = message.can_id == self.target.request_id
         if is_own and message.mode == Mode.REPORT and self.state is not State.APPLICATION:
@@ -147,11 +129,11 @@ class NoiseHangs(HangingDevice):
             super()._take_damage(damage, now)
 
 
-@variant(
-    "writes-anywhere", "SE-04", "writes and acknowledges a packet beyond the total", also="TX-03"
-)
+@variant("writes-anywhere", "SE-04", also="TX-03")
 class WritesAnywhere(MockDevice):
-    """Writes a packet beyond the total to where its number says, whatever lies there."""
+    """Writes and acknowledges a packet beyond the total. It goes to where its number says, whatever
+    lies there.
+    """
 
     store_type = PlainStore
     _is_beyond = False
@@ -177,14 +159,11 @@ class WritesAnywhere(MockDevice):
         return self._reply(messages.Ack(self._number), now)
 
 
-@variant(
-    "size-rounds-to-small",
-    "SE-04",
-    "rounds a size of nearly 2^32 up to a small one, and erases for it",
-    also="UP-02",
-)
+@variant("size-rounds-to-small", "SE-04", also="UP-02")
 class SizeRoundedUp(MockDevice):
-    """Rounds the size up to whole packets in 32 bits, then looks whether it fits."""
+    """Rounds a size of nearly 2^32 up to a small one, and erases for it. Rounds the size up to
+    whole packets in 32 bits, then looks whether it fits.
+    """
 
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.UpdateCommand):
@@ -195,13 +174,10 @@ class SizeRoundedUp(MockDevice):
         super()._take_row(row, now)
 
 
-@variant(
-    "any-message-is-life",
-    "SE-01",
-    "window and pause begin anew with every message of no use",
-    also="CO-04",
-)
+@variant("any-message-is-life", "SE-01", also="CO-04")
 class AnyMessageIsLife(MockDevice):
+    """Window and pause begin anew with every message of no use."""
+
     def _take_message(self, message: Message, now: float) -> None:
         before, due = self.state, self._due_at
         super()._take_message(message, now)
@@ -213,9 +189,11 @@ class AnyMessageIsLife(MockDevice):
             self._due_at = now + self.profile.window_s
 
 
-@variant("load-hangs", "CO-01", "hangs when 140 frames of others come within 100 ms", also="CO-02")
+@variant("load-hangs", "CO-01", also="CO-02")
 class LoadHangs(HangingDevice):
-    """Is interrupted by every frame on the bus: more than it can serve leave it hanging."""
+    """Hangs when 140 frames of others come within 100 ms. Is interrupted by every frame on the bus:
+    more than it can serve leave it hanging.
+    """
 
     @cached_property
     def _foreign(self) -> deque[float]:
@@ -232,13 +210,10 @@ class LoadHangs(HangingDevice):
         super().receive(frame, now)
 
 
-@variant(
-    "hears-other-targets",
-    "CO-02",
-    "takes packets for other targets during its own transfer",
-    also="CO-04",
-)
+@variant("hears-other-targets", "CO-02", also="CO-04")
 class HearsOtherTargets(MockDevice):
+    """Takes packets for other targets during its own transfer."""
+
     @cached_property
     def _others(self) -> dict[int, Reassembler]:
         return {
@@ -259,13 +234,10 @@ class HearsOtherTargets(MockDevice):
                 self._take(one._replace(can_id=self.target.request_id), now)
 
 
-@variant(
-    "answers-in-bootloader",
-    "CO-04",
-    "its bootloader confirms messages of chapter 3",
-    also="FR-10 SE-01",
-)
+@variant("answers-in-bootloader", "CO-04", also="FR-10 SE-01")
 class AnswersInBootloader(MockDevice):
+    """Its bootloader confirms messages of chapter 3."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         command = row.message.command if isinstance(row, messages.Unknown) else None
         if self.state is not State.APPLICATION and command in _APPLICATION_COMMANDS:
@@ -273,14 +245,11 @@ class AnswersInBootloader(MockDevice):
         super()._take_row(row, now)
 
 
-@variant(
-    "answer-lost-on-busy-bus",
-    "CO-01",
-    "loses an ACK that is due within 1 ms after a frame of others",
-    also="FR-09",
-)
+@variant("answer-lost-on-busy-bus", "CO-01", also="FR-09")
 class AnswerLostOnBusyBus(MockDevice):
-    """Gives up when its transmit mailbox is not free at once."""
+    """Loses an ACK that is due within 1 ms after a frame of others. Gives up when its transmit
+    mailbox is not free at once.
+    """
 
     _foreign_at = -inf
 

@@ -7,10 +7,10 @@ from math import inf
 from typing import ClassVar, Final
 
 from flasher.mock.memory import Operation
-from flasher.mock.model import MockDevice, is_damaged_packet
+from flasher.mock.model import AnyRow, MockDevice, is_damaged_packet
 from flasher.mock.store import AREA_START
 from flasher.mock.table import Event, State
-from flasher.mock.variants.base import AnyRow, HangingDevice, PlainStore, bad_write, variant
+from flasher.mock.variants.base import HangingDevice, PlainStore, bad_write, variant
 from flasher.protocol import messages
 from flasher.protocol.spec import (
     PACKET_COUNT_MAX,
@@ -28,25 +28,17 @@ _BANK_BYTES: Final = 0x10000
 _WRAP_S: Final = 65.536
 
 
-@variant(
-    "nak-wrong-number",
-    "TX-01",
-    "asks for the next packet when one was damaged",
-    also="CR-01 CR-02 CR-03 TX-03 TX-04 TX-06 SE-04 BU-01",
-)
+@variant("nak-wrong-number", "TX-01", also="CR-01 CR-02 CR-03 TX-03 TX-04 TX-06 SE-04 BU-01")
 class NakWrongNumber(MockDevice):
+    """Asks for the next packet when one was damaged."""
+
     def _answer_bad(self, now: float) -> str:
         return self._reply(messages.Nak(min(self._transfer.wanted + 1, PACKET_COUNT_MAX)), now)
 
 
-@variant(
-    "swallows-after-bad",
-    "TX-01",
-    "misses the message after a damaged packet",
-    also="CR-01 CR-02 CR-03 FR-04 BU-01 CR-04 FR-05",
-)
+@variant("swallows-after-bad", "TX-01", also="CR-01 CR-02 CR-03 FR-04 BU-01 CR-04 FR-05")
 class SwallowsAfterBad(MockDevice):
-    """Skips a message after a damaged packet, as if the damage had been a message more."""
+    """Misses the message after a damaged packet."""
 
     _swallows = False
 
@@ -62,14 +54,11 @@ class SwallowsAfterBad(MockDevice):
             super()._take_message(message, now)
 
 
-@variant(
-    "writes-repeated-twice",
-    "TX-02",
-    "writes a repeated packet behind its first copy: the rest of the image is moved",
-    also="TX-05 BU-01 BU-02",
-)
+@variant("writes-repeated-twice", "TX-02", also="TX-05 BU-01 BU-02")
 class WritesRepeated(MockDevice):
-    """Writes wherever it stopped writing: a packet that is repeated stands there twice."""
+    """Writes a repeated packet behind its first copy: the rest of the image is moved. Writes
+    wherever it stopped writing: a packet that is repeated stands there twice.
+    """
 
     store_type = PlainStore
     _written = 0
@@ -95,9 +84,9 @@ class WritesRepeated(MockDevice):
             self.store.flash.carry_out(operation)
 
 
-@variant("accepts-skipped-number", "TX-03", "takes a packet after a gap, and leaves the gap")
+@variant("accepts-skipped-number", "TX-03")
 class AcceptsSkipped(MockDevice):
-    """Takes any number beyond the last one, and goes on from there."""
+    """Takes a packet after a gap, and leaves the gap."""
 
     def _classify(self, row: AnyRow) -> Event:
         event = super()._classify(row)
@@ -110,20 +99,20 @@ class AcceptsSkipped(MockDevice):
         return Event.PACKET_NEXT
 
 
-@variant("ignores-total", "TX-04", "takes a packet with any total")
+@variant("ignores-total", "TX-04")
 class IgnoresTotal(MockDevice):
+    """Takes a packet with any total."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.Packet) and self._transfer.total:
             row = dataclasses.replace(row, total=self._transfer.total)
         super()._take_row(row, now)
 
 
-@variant(
-    "repeat-overwrites",
-    "TX-05",
-    "programs a repeated packet with other data over the first: a mixture of both",
-)
+@variant("repeat-overwrites", "TX-05")
 class RepeatOverwrites(MockDevice):
+    """Programs a repeated packet with other data over the first: a mixture of both."""
+
     store_type = PlainStore
 
     def _answer_repeated(self, now: float) -> str:
@@ -133,8 +122,10 @@ class RepeatOverwrites(MockDevice):
         return super()._answer_repeated(now)
 
 
-@variant("ignores-start-byte", "TX-06", "takes a packet with any start byte")
+@variant("ignores-start-byte", "TX-06")
 class IgnoresStartByte(MockDevice):
+    """Takes a packet with any start byte."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         message = bad_write(row, Command.PACKET)
         if message:
@@ -143,9 +134,9 @@ class IgnoresStartByte(MockDevice):
         super()._take_row(row, now)
 
 
-@variant("eight-bit-numbers", "TX-07", "expects packet 0 after packet 255")
+@variant("eight-bit-numbers", "TX-07")
 class ByteNumbers(MockDevice):
-    """Counts packets in a byte: the one after 255 is 0."""
+    """Expects packet 0 after packet 255. Counts them in a byte."""
 
     def _classify(self, row: AnyRow) -> Event:
         event = super()._classify(row)
@@ -156,16 +147,20 @@ class ByteNumbers(MockDevice):
         return self._reply(messages.Nak(self._transfer.wanted & _BYTE), now)
 
 
-@variant("hangs-after-256-packets", "TX-07", "hangs when packet 257 is stored, until power is cut")
+@variant("hangs-after-256-packets", "TX-07")
 class HangsAfter256(HangingDevice):
-    """Has room for 256 packets in its list of what was received."""
+    """Hangs when packet 257 is stored, until power is cut. Has room for 256 packets in its list of
+    what was received.
+    """
 
     def _acknowledge(self, now: float) -> str:
         return self._hang() if self._transfer.stored >= _HANGS_AFTER else super()._acknowledge(now)
 
 
-@variant("filler-checked", "TX-08", "refuses a last packet whose bytes behind the image are not FF")
+@variant("filler-checked", "TX-08")
 class FillerChecked(MockDevice):
+    """Refuses a last packet whose bytes behind the image are not FF."""
+
     def _classify(self, row: AnyRow) -> Event:
         event = super()._classify(row)
         if event is Event.PACKET_NEXT and isinstance(row, messages.Packet):
@@ -176,16 +171,9 @@ class FillerChecked(MockDevice):
         return event
 
 
-@variant(
-    "never-times-out",
-    "TX-12",
-    "after a pause in the transfer, takes only the next packet until power is cut",
-    also="SE-01 SE-03",
-)
+@variant("never-times-out", "TX-12", also="SE-01 SE-03")
 class NeverTimesOut(MockDevice):
-    """After a long pause, still takes nothing but the next packet: a transfer that was left can
-    be ended by a power cut only.
-    """
+    """After a pause in the transfer, takes only the next packet until power is cut."""
 
     _waits_on = False
     in_ram = ("_waits_on",)
@@ -208,13 +196,10 @@ class NeverTimesOut(MockDevice):
         return Event.NO_CONCERN if stuck and is_way_out else event
 
 
-@variant(
-    "reset-in-transfer-hangs",
-    "TX-13",
-    "hangs at a reset during the upgrade until power is cut",
-    also="SE-03",
-)
+@variant("reset-in-transfer-hangs", "TX-13", also="SE-03")
 class ResetHangs(HangingDevice):
+    """Hangs at a reset during the upgrade until power is cut."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.Reset) and self.state in _UPGRADING:
             self._hang()
@@ -222,14 +207,10 @@ class ResetHangs(HangingDevice):
             super()._take_row(row, now)
 
 
-@variant(
-    "big-endian-numbers",
-    "TX-01",
-    "sends the numbers of ACK and NAK high byte first (against R4)",
-    also="CR-01 CR-02 CR-03 EN-02",
-    upgrade_works=False,
-)
+@variant("big-endian-numbers", "TX-01", also="CR-01 CR-02 CR-03 EN-02", upgrade_works=False)
 class BigEndianNumbers(MockDevice):
+    """Sends the numbers of ACK and NAK high byte first (against R4)."""
+
     big_endian: ClassVar[tuple[type[messages.Row], ...]] = (messages.Ack, messages.Nak)
 
     def _send(self, row: messages.Row) -> None:
@@ -239,23 +220,21 @@ class BigEndianNumbers(MockDevice):
         super()._send(row)
 
 
-@variant(
-    "big-endian-nak",
-    "TX-01",
-    "sends the number of a NAK high byte first (against R4)",
-    also="CR-01 CR-02 CR-03 TX-03 TX-04 TX-06 SE-04 BU-01 EN-02",
-)
+@variant("big-endian-nak", "TX-01", also="CR-01 CR-02 CR-03 TX-03 TX-04 TX-06 SE-04 BU-01 EN-02")
 class BigEndianNak(BigEndianNumbers):
+    """Sends the number of a NAK high byte first (against R4)."""
+
     big_endian = (messages.Nak,)
 
 
 @variant(
     "damage-ends-transfer",
     "TX-01",
-    "announces itself again when a packet was damaged",
     also="FR-02 FR-04 FR-05 FR-06 FR-09 CR-01 CR-02 CR-03 CR-04 BU-01",
 )
 class DamageEndsTransfer(MockDevice):
+    """Announces itself again when a packet was damaged."""
+
     def _take_damage(self, damage: Damage, now: float) -> None:
         in_transfer = self.state is State.TRANSFER
         super()._take_damage(damage, now)
@@ -263,24 +242,17 @@ class DamageEndsTransfer(MockDevice):
             self._handle(Event.PAUSE_OVER, now)
 
 
-@variant(
-    "repeat-unanswered",
-    "TX-02",
-    "does not answer a repeated packet",
-    also="FR-08 TX-05 BU-01 BU-02",
-)
+@variant("repeat-unanswered", "TX-02", also="FR-08 TX-05 BU-01 BU-02")
 class RepeatUnanswered(MockDevice):
+    """Does not answer a repeated packet."""
+
     def _answer_repeated(self, now: float) -> str:
         return self._reply(None, now)
 
 
-@variant(
-    "older-overwrites",
-    "TX-03",
-    "programs a packet that is older than the last one over its first copy",
-)
+@variant("older-overwrites", "TX-03")
 class OlderOverwrites(MockDevice):
-    """Programs every packet that it had before at its place, and acknowledges it."""
+    """Programs a packet that is older than the last one over its first copy."""
 
     store_type = PlainStore
 
@@ -292,8 +264,10 @@ class OlderOverwrites(MockDevice):
         return super()._answer_older(now)
 
 
-@variant("total-looked-at-once", "TX-04", "looks at the total of packet 1 only")
+@variant("total-looked-at-once", "TX-04")
 class TotalLookedAtOnce(MockDevice):
+    """Looks at the total of packet 1 only."""
+
     def _classify(self, row: AnyRow) -> Event:
         event = super()._classify(row)
         if event is Event.PACKET_BAD and isinstance(row, messages.Packet):
@@ -302,8 +276,10 @@ class TotalLookedAtOnce(MockDevice):
         return event
 
 
-@variant("sixteen-bit-offsets", "TX-07", "writes what lies behind 64 KiB over the beginning")
+@variant("sixteen-bit-offsets", "TX-07")
 class SixteenBitOffsets(PlainStore):
+    """Writes what lies behind 64 KiB over the beginning."""
+
     def storing(self, number: int, payload: bytes, size_bytes: int) -> Operation:
         """Offsets are counted in 16 bits."""
         operation = super().storing(number, payload, size_bytes)
@@ -311,8 +287,10 @@ class SixteenBitOffsets(PlainStore):
         return operation._replace(address=AREA_START + offset)
 
 
-@variant("numbers-modulo-256", "TX-03", "looks at the low byte of a packet's number only")
+@variant("numbers-modulo-256", "TX-03")
 class NumbersModulo256(MockDevice):
+    """Looks at the low byte of a packet's number only."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.Packet) and self.state is State.TRANSFER:
             transfer = self._transfer
@@ -322,21 +300,20 @@ class NumbersModulo256(MockDevice):
         super()._take_row(row, now)
 
 
-@variant("totals-modulo-256", "TX-04", "looks at the low byte of a packet's total only")
+@variant("totals-modulo-256", "TX-04")
 class TotalsModulo256(MockDevice):
+    """Looks at the low byte of a packet's total only."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         if isinstance(row, messages.Packet) and (row.total - self._transfer.total) & _BYTE == 0:
             row = dataclasses.replace(row, total=self._transfer.total)
         super()._take_row(row, now)
 
 
-@variant(
-    "number-zero-is-first",
-    "TX-03",
-    "takes packet 0 for packet 1 at the beginning",
-    also="SE-04",
-)
+@variant("number-zero-is-first", "TX-03", also="SE-04")
 class NumberZeroIsFirst(MockDevice):
+    """Takes packet 0 for packet 1 at the beginning."""
+
     def _take_row(self, row: AnyRow, now: float) -> None:
         message = bad_write(row, Command.PACKET)
         if message and not self._transfer.stored and not any(message.data[1:3]):
@@ -345,14 +322,11 @@ class NumberZeroIsFirst(MockDevice):
         super()._take_row(row, now)
 
 
-@variant(
-    "acks-damaged-repetition",
-    "TX-01",
-    "acknowledges a damaged packet that names the number stored last",
-    also="CR-01",
-)
+@variant("acks-damaged-repetition", "TX-01", also="CR-01")
 class AcksDamagedRepetition(MockDevice):
-    """Looks at the number before the checksum."""
+    """Acknowledges a damaged packet that names the number stored last. Looks at the number before
+    the checksum.
+    """
 
     def _answer_bad(self, now: float) -> str:
         stored = self._transfer.stored
@@ -368,22 +342,21 @@ class AcksDamagedRepetition(MockDevice):
         self._is_damage = False
 
 
-@variant("acks-twice", "TX-07", "sends every ACK of a packet twice", also="*")
+@variant("acks-twice", "TX-07", also="*")
 class AcksTwice(MockDevice):
+    """Sends every ACK of a packet twice."""
+
     def _acknowledge(self, now: float) -> str:
         detail = super()._acknowledge(now)
         self._send(messages.Ack(self._transfer.stored))
         return detail
 
 
-@variant(
-    "blank-packet-unanswered",
-    "FR-03",
-    "does not acknowledge a packet of nothing but FF until it is repeated",
-    also="TX-07",
-)
+@variant("blank-packet-unanswered", "FR-03", also="TX-07")
 class BlankPacketUnanswered(MockDevice):
-    """Has nothing to program for a blank packet, and forgets to answer it."""
+    """Does not acknowledge a packet of nothing but FF until it is repeated. Has nothing to program
+    for a blank packet, and forgets to answer it.
+    """
 
     def _acknowledge(self, now: float) -> str:
         if set(self._payload) != {PACKET_FILLER}:
@@ -392,13 +365,10 @@ class BlankPacketUnanswered(MockDevice):
         return self._reply(None, now)
 
 
-@variant(
-    "pause-counts-from-start",
-    "TX-12",
-    "counts the pause from request transfer on, not from the last packet",
-    also="CR-01 CR-02 TX-07 TM-02 BU-02",
-)
+@variant("pause-counts-from-start", "TX-12", also="CR-01 CR-02 TX-07 TM-02 BU-02")
 class PauseCountsFromStart(MockDevice):
+    """Counts the pause from request transfer on, not from the last packet."""
+
     _began_at = 0.0
 
     def _request(self, now: float) -> str:
@@ -409,12 +379,10 @@ class PauseCountsFromStart(MockDevice):
         super()._await_host(self._began_at)
 
 
-@variant(
-    "timer-wraps",
-    "TX-12",
-    "gives a transfer up 65.536 s after its start, where its clock of 16 bits wraps",
-)
+@variant("timer-wraps", "TX-12")
 class TimerWraps(MockDevice):
+    """Gives a transfer up 65.536 s after its start, where its clock of 16 bits wraps."""
+
     _booted_at = 0.0
 
     def _boot(self, now: float) -> str:
