@@ -10,7 +10,7 @@ by step, check what the device answers, and end the case when it is wrong.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final
 
 from flasher.conformance.host import UPDATES_MAX, PatientHost
@@ -21,8 +21,10 @@ from flasher.conformance.subject import BY_BUS, Subject, readback_source
 from flasher.conformance.tester import BusTester
 from flasher.conformance.wire import (
     MEMORY_BYTES,
+    PACKET_FRAMES,
     Encoder,
     Kind,
+    RawFrame,
     Received,
     describe,
     packet_count,
@@ -32,6 +34,8 @@ from flasher.conformance.wire import (
 _PIECES: Final = 64
 """Of an image, so many pieces are read over the bus at the most, which takes about a second."""
 _EDGE_S: Final = 0.001
+QUIET_S: Final = 0.1
+"""A second answer to one message would come within that time of the first one."""
 _PAUSES: Final = 4
 """A pause that nobody knows may be so many times as long as limits.pause_s."""
 
@@ -185,6 +189,23 @@ class Bench:
         number = wanted if choice == "nak_expected" else named
         ok = len(numbers) == len(heard) == 1 and number in (None, numbers[0])
         return self.check(ok, "NAK" if number is None else f"NAK {number}", describe(heard))
+
+    def answers(self) -> list[Received]:
+        """The answers to what was just sent: the first one, and those that follow it at once."""
+        first = self.next_message(self.limit("ack_s") + self.limit("inter_frame_s"))
+        return [] if first is None else [first, *self.collect(QUIET_S)]
+
+    def gaps(
+        self, packet: Sequence[RawFrame], shares: Iterable[float]
+    ) -> Iterator[tuple[float, int]]:
+        """Gaps between the frames of a packet, as shares of `limits.inter_frame_s` and just below
+        it; behind how many frames, so that the packet takes less than a pause (TX-12).
+        """
+        limit_s, pause_s = self.limit("inter_frame_s"), self.limit("pause_s")
+        frame_s = self.tester.wire_s(packet[:1], is_stuffed=True)
+        edge_s = frame_s + 2 * self.port.uncertainty_s + _EDGE_S
+        for gap_s in (*(share * limit_s for share in shares), max(limit_s - edge_s, 0.0)):
+            yield gap_s, min(int(pause_s / 2 / max(gap_s, frame_s)), PACKET_FRAMES) or 1
 
     def end_transfer(self) -> None:
         """End of transfer; complete has to come."""

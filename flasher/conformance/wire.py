@@ -239,6 +239,19 @@ class Encoder:
         """End of transfer."""
         return self.message(WRITE, END, END_MARK)
 
+    def damaged_packet_of(self, image: bytes, number: int) -> list[RawFrame]:
+        """The same with another CRC."""
+        raw = joined(self.packet_of(image, number))
+        return self.frames(raw[:-5] + inverted(raw[-5:-1]) + raw[-1:])
+
+    def upgrade_messages(self, size_bytes: int) -> dict[str, list[RawFrame]]:
+        """The messages of an upgrade to an image of that size, each once, by name."""
+        return {
+            "update command": self.update(size_bytes),
+            "packet": self.packet(1, packet_count(size_bytes), bytes(PACKET_BYTES)),
+            "end of transfer": self.end(),
+        }
+
     def answer(self, command: int, data: bytes) -> list[RawFrame]:
         """What this target itself sends to the tool: a report."""
         return split(self.to_tool, build(self.to_tool, REPORT, command, data))

@@ -6,7 +6,7 @@ from itertools import cycle
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.cases.tx import answers, transfer_image
+from flasher.conformance.cases.tx import transfer_image
 from flasher.conformance.cases.up import check_update_rejected
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
 from flasher.conformance.wire import (
@@ -269,7 +269,7 @@ def outside(bench: Bench) -> None:
         for number, named in numbers:
             with bench.step(f"after packet {stored}, packet {number} of {named}"):
                 bench.send(bench.encoder.packet(number, named, marker))
-                heard = answers(bench)
+                heard = bench.answers()
                 ok = all(one.kind is Kind.NAK for one in heard)
                 bench.check(ok, "NAK or silence", describe(heard))
     expected = "none of the rejected data in the flash"

@@ -24,7 +24,6 @@ _COMPLETE: Final = "end of transfer to complete"
 """Names of the times, as all cases measure them."""
 _SHARES: Final = (0.0, 0.01, 0.1, 0.25, 0.5, 0.75, 0.9)
 """Gaps between frames, as shares of `limits.inter_frame_s`."""
-_EDGE_S: Final = 0.001
 _RESETS: Final = 5
 _PACKETS: Final = 64
 """So many packets, at the least, tell how their answers are spread."""
@@ -48,14 +47,9 @@ def gaps(bench: Bench) -> None:
     wanted = ACCEPTED if bench.choice("tm_02") == "accepted" else EITHER
     probe = Probe(bench)
     probe.begin()
-    frame_s = bench.tester.wire_s(probe.frames()[:1], is_stuffed=True)
-    pause_s = bench.limit("pause_s")
-    edge_s = frame_s + 2 * bench.port.uncertainty_s + _EDGE_S
-    for gap_s in (*(share * limit_s for share in _SHARES), max(limit_s - edge_s, 0.0)):
+    for gap_s, gaps in bench.gaps(probe.frames(), _SHARES):
         with bench.step(f"{gap_s * 1000:.1f} ms"):
             began_at = bench.tester.elapsed_s
-            # The whole packet takes less than the pause that may end a transfer (TX-12).
-            gaps = min(int(pause_s / 2 / max(gap_s, frame_s)), PACKET_FRAMES) or 1
             taken = probe.offer(probe.frames(), EITHER, gap_s=gap_s, gaps=gaps)
             widest_s = _widest_s(bench, began_at)
             bench.info(f"gap of {gap_s * 1000:.1f} ms: {'taken' if taken else 'not taken'}")

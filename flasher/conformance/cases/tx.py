@@ -25,7 +25,6 @@ from flasher.conformance.wire import (
 )
 
 _PACKETS_MIN: Final = 7
-_CRC_AT: Final = slice(-5, -1)
 _DATA_AT: Final = 40
 """An offset amid the 128 bytes of a packet."""
 _LOST_FRAMES: Final = (0, 1, 9, 17)
@@ -34,8 +33,6 @@ _NUMBER_IN: Final = 1
 _BUFFER_BYTES: Final = 4096
 """What a device that writes whole pages may hold back until the end of transfer."""
 _REPEATS: Final = 2
-_QUIET_S: Final = 0.1
-"""A second answer to one packet would come within that time of the first one."""
 _NUMBER_MAX: Final = 0xFFFF
 _STORED: Final = 3
 """Packets stored when packets with a wrong head come."""
@@ -62,12 +59,6 @@ def transfer_image(bench: Bench) -> bytes:
     if packet_count(len(image)) < _PACKETS_MIN:
         raise Unsupported(f"the good image has less than {_PACKETS_MIN} packets")
     return image
-
-
-def answers(bench: Bench) -> list[Received]:
-    """The answers to a packet: the first one, and those that follow it at once."""
-    first = bench.next_message(bench.limit("ack_s") + bench.limit("inter_frame_s"))
-    return [] if first is None else [first, *bench.collect(_QUIET_S)]
 
 
 def _stops(bench: Bench, image: bytes, numbers: Iterable[int]) -> Iterator[int]:
@@ -105,7 +96,7 @@ def _nak_counts(choice: str) -> tuple[int, ...]:
 
 def _check_naks(bench: Bench, numbers: Collection[int] | None, counts: Collection[int]) -> None:
     """One of `counts` NAKs came, with one of `numbers` (None: any), and nothing else."""
-    heard = answers(bench)
+    heard = bench.answers()
     naks = [one for one in heard if one.kind is Kind.NAK]
     right = [one for one in naks if numbers is None or one.number in numbers]
     which = "" if numbers is None else " " + " or ".join(map(str, sorted(numbers)))
@@ -146,24 +137,22 @@ def damaged(bench: Bench) -> None:
         if number in lost:
             _lose_frame(bench, image, number, lost[number])
             continue
-        for step, named, raw in _damages(bench, image, number):
+        for step, named, frames in _damages(bench, image, number):
             with bench.step(f"packet {number}, {step}"):
-                bench.send(bench.encoder.frames(raw))
+                bench.send(frames)
                 _check_rejected(bench, number, named)
 
 
-def _damages(bench: Bench, image: bytes, number: int) -> Iterator[tuple[str, int, bytes]]:
-    """Step, number in the packet, its bytes."""
+def _damages(bench: Bench, image: bytes, number: int) -> Iterator[tuple[str, int, list[RawFrame]]]:
+    """Step, number in the packet, its frames."""
     which = {number: "wrong CRC", number + 1: "the next one came, with a wrong CRC"}
     which[number - 1] = "the one before came, with a wrong CRC"
     for named, step in which.items():
         if 1 <= named <= packet_count(len(image)):
-            raw = bytearray(joined(bench.encoder.packet_of(image, named)))
-            raw[_CRC_AT] = inverted(raw[_CRC_AT])
-            yield step, named, bytes(raw)
+            yield step, named, bench.encoder.damaged_packet_of(image, named)
     raw = bytearray(joined(bench.encoder.packet_of(image, number)))
     raw[_DATA_AT] ^= 0x10
-    yield "a wrong bit", number, bytes(raw)
+    yield "a wrong bit", number, bench.encoder.frames(bytes(raw))
 
 
 def _lose_frame(bench: Bench, image: bytes, number: int, index: int) -> None:
@@ -220,7 +209,7 @@ def _repeat(bench: Bench, changed: Callable[[bytes], bytes]) -> None:
 
 def _check_repeated(bench: Bench, number: int, total: int) -> None:
     """The packet stored last was answered once more, as tx_02 says."""
-    heard, choice = describe(answers(bench)), bench.choice("tx_02")
+    heard, choice = describe(bench.answers()), bench.choice("tx_02")
     ack, nak = f"ACK {number}", f"NAK {number + 1}"
     allowed = {"ack": [ack], "nak_next": [nak]}.get(choice, [ack, nak])
     # Behind the last packet there is no next one to ask for.
@@ -279,7 +268,7 @@ def _send_wrong_numbers(bench: Bench, total: int, stored: int) -> None:
 def _check_older(bench: Bench, number: int) -> None:
     choice = bench.choice("tx_03")
     if choice in ("ack", "either"):
-        heard = describe(answers(bench))
+        heard = describe(bench.answers())
         others = ["nothing", f"NAK {number}", f"NAK {_STORED + 1}"] if choice == "either" else []
         allowed = [f"ACK {number}", *others]
         bench.check(heard in allowed, " or ".join(allowed), heard)

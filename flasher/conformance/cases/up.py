@@ -85,13 +85,8 @@ def wrong_sizes(bench: Bench) -> None:
 )
 def without_reset(bench: Bench) -> None:
     image = bench.good_image
-    stimuli = {
-        "update command": bench.encoder.update(len(image)),
-        "packet": bench.encoder.packet(1, packet_count(len(image)), bytes(PACKET_BYTES)),
-        "end of transfer": bench.encoder.end(),
-    }
     choice = bench.choice("up_03")
-    for step, frames in stimuli.items():
+    for step, frames in bench.encoder.upgrade_messages(len(image)).items():
         with bench.step(step), bench.tester.hearing_feedback():
             bench.send(frames)
             _check_answer(bench, bench.collect(bench.limit("silence_s")), Kind.FEEDBACK, choice)

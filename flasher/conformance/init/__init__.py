@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from flasher.conformance.init import entering, transferring
-from flasher.conformance.init.answers import Answer, limit
+from flasher.conformance.init.answers import Answer, Findings, Trial, decided, limit
 from flasher.conformance.init.session import (
     ANSWER,
     COMPLETE,
@@ -33,7 +33,7 @@ from flasher.conformance.subject import Subject
 
 UPGRADES: Final = 100
 """About how often the device is erased: some forty upgrades, sizes, and what goes wrong."""
-Question = Callable[[Session], Iterator[Answer]]
+Question = Callable[[Session], Findings]
 QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
     (
         entering.burst,
@@ -175,20 +175,28 @@ class _Asking:
 
     def _put(self, question: Question, keys: tuple[str, ...]) -> None:
         """Ask, and once more when the device did something else: a frame may have been late."""
-        why = self._tried(question)
+        why = self._tried(question, keys)
         if why and not self._restored("before it was asked again", flash=False):
-            why = self._tried(question) or "nothing was seen"
+            why = self._tried(question, keys) or "nothing was seen"
         for key in keys:
             self._answers.setdefault(key, Answer(key, None, why))
 
-    def _tried(self, question: Question) -> str:
+    def _tried(self, question: Question, keys: tuple[str, ...]) -> str:
         """Ask; returns what the device did else, or ""."""
         it = Session(self._subject, self._profile(), self._stopped)
-        why = ""
+        why, trials = "", list[Trial]()
         try:
             it.settle()
-            for answer in question(it):
-                self._answers[answer.key] = answer
+            for found in question(it):
+                if isinstance(found, Trial):
+                    trials.append(found)
+                elif isinstance(found, Answer):
+                    self._answers[found.key] = found
+                else:
+                    self._answers |= {key: Answer(key, None, found) for key in keys}
+            if trials:
+                choice = next(key for key in keys if "." not in key)
+                self._answers[choice] = decided(choice, trials)
         except RunStopped:
             raise
         except CaseEnded as ended:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil, floor, log10
 from typing import Final, NamedTuple
@@ -44,10 +44,12 @@ class Trial(NamedTuple):
         return f"{self.answer} {self.link} {self.stimulus}"
 
 
+Findings = Iterator[Answer | Trial | str]
+"""What a question finds: answers, trials for its choice, or why all of its keys stay open."""
+
+
 def decided(key: str, trials: Sequence[Trial]) -> Answer:
     """The value that all trials agree in; where they differ, `either` if the key has it."""
-    if not trials:
-        return Answer(key, None, "it was never tried")
     seen, values = _told(trials), {trial.value for trial in trials}
     allowed = profile_keys()[key].choices
     if not values <= set(allowed):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from itertools import pairwise
 from math import ceil
 from statistics import median
 from typing import Final
 
-from flasher.conformance.init.answers import Answer, Trial, decided
+from flasher.conformance.init.answers import Answer, Findings, Trial
 from flasher.conformance.init.session import (
     GAP,
     POWERED,
@@ -23,7 +22,6 @@ from flasher.conformance.init.session import (
 from flasher.conformance.restore import needs_power
 from flasher.conformance.wire import (
     IMAGE_BYTES_MAX,
-    PACKET_BYTES,
     WRITE,
     Kind,
     RawFrame,
@@ -47,7 +45,7 @@ _AGAIN: Final = 0.03
 """Update commands are at least this far apart (R2)."""
 
 
-def burst(it: Session) -> Iterator[Answer]:
+def burst(it: Session) -> Findings:
     """The announcements after a reset, and after power-up."""
     bench = it.bench
     counts: list[int] = []
@@ -96,9 +94,9 @@ def burst(it: Session) -> Iterator[Answer]:
     )
 
 
-def upgrade(it: Session) -> Iterator[Answer]:
+def upgrade(it: Session) -> Findings:
     """Plain upgrades, for their times and for what follows complete."""
-    bench, trials = it.bench, []
+    bench = it.bench
     for _ in range(REPEATS):
         it.begin()
         it.packets()
@@ -107,13 +105,12 @@ def upgrade(it: Session) -> Iterator[Answer]:
         heard = _first_sign(it)
         if heard is not None and heard.kind is Kind.BOOT_VERSION:
             bench.measure(RESTARTED, heard.at - complete_at)
-            trials.append(Trial("restarts", "a boot version", "complete", "after"))
+            yield Trial("restarts", "a boot version", "complete", "after")
         else:
-            trials.append(Trial("starts", "no boot version", "complete", "after"))
+            yield Trial("starts", "no boot version", "complete", "after")
         it.await_application(START, complete_at)
         last = it.enter(bench.number("versions"))
         it.await_application(START_AGAIN, last.at)
-    yield decided("en_03", trials)
 
 
 def _first_sign(it: Session) -> Received | None:
@@ -133,33 +130,28 @@ def _first_sign(it: Session) -> Received | None:
 # -- the window -----------------------------------------------------------------------------------
 
 
-def in_burst(it: Session) -> Iterator[Answer]:
+def in_burst(it: Session) -> Findings:
     """Update command between the announcements."""
     bench = it.bench
-    count, trials = bench.number("versions"), []
+    count = bench.number("versions")
+    if count < 2:
+        yield "the burst is a single boot version"
     for version in range(1, count):
         for _ in range(REPEATS):
             it.enter(version)
             taken = it.offer_update(bench.encoder.update(len(it.image)))
             answer = "request transfer" if taken else "no request transfer"
             stimulus = f"update command at boot version {version} of {count}"
-            trials.append(Trial("accepted" if taken else "rejected", answer, stimulus))
+            yield Trial("accepted" if taken else "rejected", answer, stimulus)
             it.finish() if taken else it.await_application()
-    if count < 2:
-        yield Answer("up_04_burst", None, "the burst is a single boot version")
-    else:
-        yield decided("up_04_burst", trials)
 
 
-def window(it: Session) -> Iterator[Answer]:
+def window(it: Session) -> Findings:
     """The window's end behind the last announcement, by bisection."""
     bench = it.bench
-    low_s, high_s = 0.0, 0.1
     at_s, taken = _offer_at(it, 0.0)
     if not taken:
-        why = "an update command at the last boot version is not taken"
-        for key in ("limits.window_s", "limits.window_tolerance_s", "up_04"):
-            yield Answer(key, None, why)
+        yield "an update command at the last boot version is not taken"
         return
     low_s, high_s = at_s, max(0.1, 2 * at_s)
     while True:
@@ -169,8 +161,7 @@ def window(it: Session) -> Iterator[Answer]:
             break
         low_s, high_s = at_s, 2 * at_s
         if high_s > _WINDOW_MAX_S:
-            for key in ("limits.window_s", "limits.window_tolerance_s", "up_04"):
-                yield Answer(key, None, f"an update command is taken {low_s:.1f} s behind the last")
+            yield f"an update command is taken {low_s:.1f} s behind the last"
             return
     resolution_s = max(_RESOLUTION_S, bench.port.uncertainty_s)
     while high_s - low_s > resolution_s:
@@ -194,18 +185,12 @@ def window(it: Session) -> Iterator[Answer]:
     yield Answer("limits.window_s", window_s, f"{seen}; the middle")
     half_s = _up((high_s - low_s) / 2 + off_s + bench.port.uncertainty_s + _RESOLUTION_S / 2)
     yield Answer("limits.window_tolerance_s", half_s, f"{seen}; half of that, and what is unsure")
-    yield decided(
-        "up_04",
-        [
-            Trial(
-                "accepted" if taken else "rejected",
-                "request transfer" if taken else "no request transfer",
-                f"update command {(high_s + resolution_s) * 1000:.0f} ms behind the last boot "
-                "version",
-            )
-            for at_s, taken in outside
-        ],
+    stimulus = (
+        f"update command {(high_s + resolution_s) * 1000:.0f} ms behind the last boot version"
     )
+    for _, taken in outside:
+        answer = "request transfer" if taken else "no request transfer"
+        yield Trial("accepted" if taken else "rejected", answer, stimulus)
 
 
 def _offer_at(it: Session, offset_s: float) -> tuple[float, bool]:
@@ -230,9 +215,9 @@ def _offer_at(it: Session, offset_s: float) -> tuple[float, bool]:
 # -- what is not taken ----------------------------------------------------------------------------
 
 
-def reset_in_bootloader(it: Session) -> Iterator[Answer]:
+def reset_in_bootloader(it: Session) -> Findings:
     """Reset between the announcements."""
-    bench, trials = it.bench, []
+    bench = it.bench
     count = bench.number("versions")
     place = min(2, count)
     for _ in range(REPEATS):
@@ -241,14 +226,13 @@ def reset_in_bootloader(it: Session) -> Iterator[Answer]:
         more = len(it.more_versions())
         value = {count - place: "ignored", count: "restarts"}.get(more, "")
         stimulus = f"reset after boot version {place} of {count}"
-        trials.append(Trial(value, f"{more} boot versions more", stimulus, "after"))
+        yield Trial(value, f"{more} boot versions more", stimulus, "after")
         it.await_application()
-    yield decided("rs_02", trials)
 
 
-def rejected_update(it: Session) -> Iterator[Answer]:
+def rejected_update(it: Session) -> Findings:
     """Update commands that no bootloader takes."""
-    bench, trials = it.bench, []
+    bench = it.bench
     other = next(iter(bench.encoder.others()))
     stimuli = {
         "update command for 0 bytes": bench.encoder.update(0),
@@ -263,14 +247,13 @@ def rejected_update(it: Session) -> Iterator[Answer]:
             bench.send(frames)
             heard = bench.collect(bench.host.burst_s + bench.limit("ack_s"))
             answers = [one for one in heard if one.kind is not Kind.BOOT_VERSION]
-            trials.append(Trial(_word(answers), told(answers), stimulus))
+            yield Trial(_word(answers), told(answers), stimulus)
             it.await_application()
-    yield decided("up_02", trials)
 
 
-def feedback(it: Session) -> Iterator[Answer]:
+def feedback(it: Session) -> Findings:
     """General feedback of the bootloader, to an unknown write and to those of an upgrade."""
-    bench, trials = it.bench, []
+    bench = it.bench
     unknown = bench.encoder.message(WRITE, _UNKNOWN, bytes(_UNKNOWN & 0xFF))
     for _ in range(REPEATS):
         first = it.enter()
@@ -283,14 +266,13 @@ def feedback(it: Session) -> Iterator[Answer]:
         count = it.feedback_since(first.at)
         answer = f"general feedback {count} times" if count else "no general feedback"
         stimulus = "an unknown write, update command and packets"
-        trials.append(Trial("either" if count else "silence", answer, stimulus))
+        yield Trial("either" if count else "silence", answer, stimulus)
         it.finish()
-    yield decided("fr_10", trials)
 
 
-def update_twice(it: Session) -> Iterator[Answer]:
+def update_twice(it: Session) -> Findings:
     """Two update commands in a row."""
-    bench, trials = it.bench, []
+    bench = it.bench
     update = bench.encoder.update(len(it.image))
     for _ in range(REPEATS):
         it.enter()
@@ -301,29 +283,22 @@ def update_twice(it: Session) -> Iterator[Answer]:
         count = (first is not None) + sum(one.kind is Kind.REQUEST for one in more)
         value = {1: "once", 2: "each"}.get(count, "")
         answer = f"request transfer {count} times"
-        trials.append(Trial(value, answer, "two update commands in a row"))
+        yield Trial(value, answer, "two update commands in a row")
         it.stored = 0
         it.finish() if count else it.await_application()
-    yield decided("up_05", trials)
 
 
-def application(it: Session) -> Iterator[Answer]:
+def application(it: Session) -> Findings:
     """Messages of the upgrade to the running application."""
-    bench, trials = it.bench, []
-    stimuli = {
-        "update command": bench.encoder.update(len(it.image)),
-        "packet": bench.encoder.packet(1, it.total, bytes(PACKET_BYTES)),
-        "end of transfer": bench.encoder.end(),
-    }
-    for stimulus, frames in stimuli.items():
+    bench = it.bench
+    for stimulus, frames in bench.encoder.upgrade_messages(len(it.image)).items():
         for _ in range(REPEATS):
             bench.forget()
             with bench.tester.hearing_feedback():
                 bench.send(frames)
                 heard = bench.collect(bench.limit("silence_s"))
-            trials.append(Trial(_word(heard), told(heard), f"{stimulus} to the application"))
+            yield Trial(_word(heard), told(heard), f"{stimulus} to the application")
     it.await_application()
-    yield decided("up_03", trials)
 
 
 def _word(heard: list[Received]) -> str:
@@ -347,12 +322,12 @@ def _way_out(it: Session) -> str:
     return ""
 
 
-def without_application(it: Session) -> Iterator[Answer]:
+def without_application(it: Session) -> Findings:
     """A bootloader that has nothing to start."""
-    bench, trials = it.bench, []
+    bench = it.bench
     why = _way_out(it)
     if why:
-        yield Answer("rs_03", None, why)
+        yield why
         return
     count = bench.number("versions")
     for _ in range(REPEATS):
@@ -368,19 +343,18 @@ def without_application(it: Session) -> Iterator[Answer]:
         value = "listens" if more == count - 1 else "announces" if more >= 2 * count else ""
         answer = f"{more} boot versions more" + ("" if value == "announces" else ", then silence")
         stimulus = "the first one, without an application"
-        trials.append(Trial(value, answer, stimulus, "after"))
+        yield Trial(value, answer, stimulus, "after")
         it.update()
         it.finish()
-    yield decided("rs_03", trials)
 
 
-def largest_image(it: Session) -> Iterator[Answer]:
+def largest_image(it: Session) -> Findings:
     """The largest size that an update command is taken with."""
-    key, bench = "device.largest_image_bytes", it.bench
+    bench = it.bench
     restarts_at_once = bench.choice("up_08") == "starts_over"
     why = "" if restarts_at_once else _way_out(it)
     if why:
-        yield Answer(key, None, why)
+        yield why
         return
     it.begin()
     if not restarts_at_once:
@@ -410,7 +384,7 @@ def largest_image(it: Session) -> Iterator[Answer]:
     said = f"update command for {low} bytes is taken"
     if high:
         said += f", and for {high} bytes not, by bisection"
-    yield Answer(key, low, said)
+    yield Answer("device.largest_image_bytes", low, said)
 
 
 def _is_size_taken(it: Session, frames: list[RawFrame], within_s: float) -> bool:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from flasher.conformance.bench import Bench
+from flasher.conformance.bench import QUIET_S, Bench
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Subject
@@ -37,7 +37,6 @@ START: Final = "complete to an application that answers"
 START_AGAIN: Final = "last boot version to an application that answers"
 _LIMIT_S: Final = 7200.0
 _ASK_S: Final = 0.05
-_QUIET_S: Final = 0.1
 _BURST_GAP_S: Final = 1.5
 """Two boot versions of a burst are not so far apart."""
 _VERSIONS_MAX: Final = 100
@@ -184,7 +183,7 @@ class Session:
         heard = bench.wait_for(Kind.ACK, within_s=within_s)
         while heard is not None and heard.number != number:
             heard = bench.wait_for(Kind.ACK, within_s=deadline - bench.now)
-        bench.collect(_QUIET_S)
+        bench.collect(QUIET_S)
         if heard is None:
             self.insist()
         else:
@@ -209,12 +208,6 @@ class Session:
             if not entry.sent and entry.at_s > since_s
             for heard in decoder.feed(entry.frame, entry.at_s)
         )
-
-    def answers(self) -> list[Received]:
-        """The answers to what was just sent: the first one, and those that follow it at once."""
-        bench = self.bench
-        first = bench.next_message(bench.limit("ack_s") + bench.limit("inter_frame_s"))
-        return [] if first is None else [first, *bench.collect(_QUIET_S)]
 
 
 def told(heard: Sequence[Received]) -> str:
