@@ -7,6 +7,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from functools import partial
 from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
@@ -49,76 +50,28 @@ class _Disturbance(NamedTuple):
     """True when the message itself arrives, so that the device goes on."""
 
 
-class _Disturbances:
-    """The faults that each message of the tool has still to meet, in turn."""
-
-    def __init__(
-        self, bench: Bench, image: bytes, make: Callable[[int], Iterator[_Disturbance]]
-    ) -> None:
-        encoder = bench.encoder
-        self.left: Final = {
-            "reset": deque(make(len(encoder.reset()))),
-            "update command": deque(make(len(encoder.update(len(image))))),
-            "packet": deque(make(len(encoder.packet_of(image, 1)))),
-            "end of transfer": deque(make(len(encoder.end()))),
-        }
-
-    @property
-    def rounds_max(self) -> int:
-        """Upgrades that are enough: each of them takes one fault of every message."""
-        return 1 + max(map(len, self.left.values()))
-
-    def __bool__(self) -> bool:
-        return any(self.left.values())
-
-    def take(self, message: str) -> _Disturbance:
-        """The next fault for that message; an undisturbed sending when none is left."""
-        queue = self.left[message]
-        return queue.popleft() if queue else _UNDISTURBED
+_Left = dict[str, deque[_Disturbance]]
+"""The faults that each message of the tool has still to meet, in turn."""
 
 
 @contextmanager
-def _sent_well(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
-    yield bench.send(frames)
+def _faulty(
+    bench: Bench, frames: Sequence[RawFrame], faults: Sequence[Fault] = ()
+) -> Iterator[Sent]:
+    """Send a message while these faults are set for it and its answer."""
+    with bench.disturb(*faults):
+        yield bench.send(frames)
 
 
-_UNDISTURBED: Final = _Disturbance("", _sent_well)
+_UNDISTURBED: Final = _Disturbance("", _faulty)
 
 
-def _faults_of(frames: int, delay_s: float) -> Iterator[Fault]:
-    """Every fault of the frames of a message, and of the frames of its answer."""
-    for index in range(frames):
-        yield Fault(FaultKind.DROP, index)
-        yield Fault(FaultKind.DOUBLE, index)
-        if index:
-            yield Fault(FaultKind.DELAY, index, delay_s=delay_s)
-            yield Fault(FaultKind.SWAP, index - 1)
-    for index in range(_ANSWER_FRAMES):
-        for kind in (FaultKind.DROP, FaultKind.DOUBLE):
-            yield Fault(kind, index, incoming=True)
-
-
-def _faulty(fault: Fault) -> _Sending:
-    """Send a message while this fault is set for it and its answer."""
-
-    @contextmanager
-    def send(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
-        with bench.disturb(fault):
-            yield bench.send(frames)
-
-    return send
-
-
-def _off_bus_after(after: int) -> _Sending:
+@contextmanager
+def _off_bus_after(bench: Bench, frames: Sequence[RawFrame], after: int) -> Iterator[Sent]:
     """Send a message; after `after` of its frames the device's controller goes off the bus."""
-
-    @contextmanager
-    def send(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sent]:
-        bench.send(frames[:after])
-        bench.subject.bus_off(_OFF_BUS_S)
-        yield bench.send(frames[after:])
-
-    return send
+    bench.send(frames[:after])
+    bench.subject.bus_off(_OFF_BUS_S)
+    yield bench.send(frames[after:])
 
 
 @contextmanager
@@ -149,9 +102,21 @@ def _off_bus_in_answer(bench: Bench, frames: Sequence[RawFrame]) -> Iterator[Sen
 def disturbed_frames(bench: Bench) -> None:
     delay_s = 1.5 * bench.limit("inter_frame_s")
 
+    def faults(frames: int) -> Iterator[Fault]:
+        for index in range(frames):
+            yield Fault(FaultKind.DROP, index)
+            yield Fault(FaultKind.DOUBLE, index)
+            if index:
+                yield Fault(FaultKind.DELAY, index, delay_s=delay_s)
+                yield Fault(FaultKind.SWAP, index - 1)
+        for index in range(_ANSWER_FRAMES):
+            for kind in (FaultKind.DROP, FaultKind.DOUBLE):
+                yield Fault(kind, index, incoming=True)
+
     def disturbances(frames: int) -> Iterator[_Disturbance]:
-        for fault in _faults_of(frames, delay_s):
-            yield _Disturbance(str(fault), _faulty(fault), fault.incoming)
+        for fault in faults(frames):
+            faulty = partial(_faulty, faults=(fault,))
+            yield _Disturbance(str(fault), faulty, fault.incoming)
 
     _upgrade_disturbed(bench, disturbances)
 
@@ -172,29 +137,26 @@ def bus_off(bench: Bench) -> None:
     def disturbances(frames: int) -> Iterator[_Disturbance]:
         for after in range(frames + 1):
             name = f"bus-off after {after} of {frames} frames"
-            yield _Disturbance(name, _off_bus_after(after), hits_answer=after == frames)
+            send = partial(_off_bus_after, after=after)
+            yield _Disturbance(name, send, hits_answer=after == frames)
         yield _Disturbance(
             "bus-off in the middle of the answer", _off_bus_in_answer, hits_answer=True
         )
 
     _upgrade_disturbed(bench, disturbances)
     with bench.step("off the bus from a power-up on"):
-        _start_alone(bench)
-
-
-def _start_alone(bench: Bench) -> None:
-    if not bench.subject.has_power:
-        bench.unsupported("the application starts", "needs power control")
-        return
-    off_s = bench.host.burst_s + bench.limit("start_s")
-    bench.power_cycle()
-    bench.subject.bus_off(off_s)
-    bench.wait(off_s / 2)
-    bench.forget()
-    heard = bench.collect(off_s / 2 + bench.host.burst_s)
-    versions = [one for one in heard if one.kind is Kind.BOOT_VERSION]
-    bench.check(not versions, "the application runs by then", describe(versions))
-    bench.check_application()
+        if not bench.subject.has_power:
+            bench.unsupported("the application starts", "needs power control")
+            return
+        off_s = bench.host.burst_s + bench.limit("start_s")
+        bench.power_cycle()
+        bench.subject.bus_off(off_s)
+        bench.wait(off_s / 2)
+        bench.forget()
+        heard = bench.collect(off_s / 2 + bench.host.burst_s)
+        versions = [one for one in heard if one.kind is Kind.BOOT_VERSION]
+        bench.check(not versions, "the application runs by then", describe(versions))
+        bench.check_application()
 
 
 @case(
@@ -229,20 +191,29 @@ def same_id(bench: Bench) -> None:
 
 def _upgrade_disturbed(bench: Bench, make: Callable[[int], Iterator[_Disturbance]]) -> None:
     """Repeat the upgrade until every fault has happened, one in each message at most."""
-    image = bench.good_image
-    disturbances = _Disturbances(bench, image, make)
-    for _ in range(disturbances.rounds_max):
-        if not disturbances:
+    image, encoder = bench.good_image, bench.encoder
+    left: _Left = {
+        "reset": deque(make(len(encoder.reset()))),
+        "update command": deque(make(len(encoder.update(len(image))))),
+        "packet": deque(make(len(encoder.packet_of(image, 1)))),
+        "end of transfer": deque(make(len(encoder.end()))),
+    }
+    for _ in range(1 + max(map(len, left.values()))):
+        if not any(left.values()):
             break
-        _enter(bench, image, disturbances)
-        if _send_packets(bench, image, disturbances) and _end(bench, image, disturbances):
+        _enter(bench, image, left)
+        if _send_packets(bench, image, left) and _end(bench, image, left):
             bench.check_image(image)
-    bench.check(
-        not disturbances, "the upgrades come to their end", "the device restarts in each one"
-    )
+    done = not any(left.values())
+    bench.check(done, "the upgrades come to their end", "the device restarts in each one")
 
 
-def _enter(bench: Bench, image: bytes, disturbances: _Disturbances) -> None:
+def _next(left: _Left, message: str) -> _Disturbance:
+    """The next fault for that message; an undisturbed sending when none is left."""
+    return left[message].popleft() if left[message] else _UNDISTURBED
+
+
+def _enter(bench: Bench, image: bytes, left: _Left) -> None:
     """Send reset and update command until request transfer. A device that received only a part of
     them may announce, run, erase or wait for packet 1; it has to request the transfer in the end.
     """
@@ -252,7 +223,7 @@ def _enter(bench: Bench, image: bytes, disturbances: _Disturbances) -> None:
     message = "reset"
     bench.forget()
     for _ in range(_ENTRIES_MAX):
-        disturbance = disturbances.take(message)
+        disturbance = _next(left, message)
         names += [f"{message}, {disturbance.name}"] if disturbance.name else []
         if message == "reset":
             within_s = limit("feedback_s") if disturbance.name else limit("first_version_s")
@@ -278,13 +249,13 @@ def _enter(bench: Bench, image: bytes, disturbances: _Disturbances) -> None:
         bench.require(is_there, Kind.REQUEST.value, heard or "nothing in many tries")
 
 
-def _send_packets(bench: Bench, image: bytes, disturbances: _Disturbances) -> bool:
+def _send_packets(bench: Bench, image: bytes, left: _Left) -> bool:
     """Send all packets, each one with its fault and then undisturbed until it is acknowledged.
     False when the device announced a restart: the upgrade begins again (R11).
     """
     total, began_at = packet_count(len(image)), bench.now
     for number in range(1, total + 1):
-        disturbance = disturbances.take("packet")
+        disturbance = _next(left, "packet")
         with bench.step(f"packet {number}, {disturbance.name}" if disturbance.name else "packets"):
             with disturbance.send(bench, bench.encoder.packet_of(image, number)):
                 heard = bench.wait_for(Kind.ACK, Kind.NAK)
@@ -299,7 +270,7 @@ def _send_packets(bench: Bench, image: bytes, disturbances: _Disturbances) -> bo
     return True
 
 
-def _end(bench: Bench, image: bytes, disturbances: _Disturbances) -> bool:
+def _end(bench: Bench, image: bytes, left: _Left) -> bool:
     """End of transfer, with one fault after the other until it is answered; false when the device
     refused the image explicitly, with two NAKs (R6).
     """
@@ -307,8 +278,8 @@ def _end(bench: Bench, image: bytes, disturbances: _Disturbances) -> bool:
     heard: Received | None = None
     # Before the device takes the silence for a pause in the transfer (TX-12).
     give_up_at = bench.now + bench.limit("pause_s") / 2
-    while heard is None and bench.now < give_up_at and disturbances.left["end of transfer"]:
-        disturbance = disturbances.take("end of transfer")
+    while heard is None and bench.now < give_up_at and left["end of transfer"]:
+        disturbance = _next(left, "end of transfer")
         names.append(disturbance.name)
         with disturbance.send(bench, bench.encoder.end()):
             heard = bench.wait_for(Kind.COMPLETE, Kind.NAK, within_s=bench.limit("silence_s"))

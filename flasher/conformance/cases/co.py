@@ -152,7 +152,17 @@ def two_upgrades(bench: Bench) -> None:
             bench.expect(Kind.REQUEST, ignoring=(Kind.BOOT_VERSION,))
             bench.send(other.answer(REQUEST, bytes(2)))
             for number in range(1, total + 1):
-                _check_packet_beside(bench, other, image, number)
+                # The other's packet has other data; its next one comes alone.
+                inverse = inverted(packet_payload(image, number))
+                own = bench.encoder.packet_of(image, number)
+                _between(bench, own, other.packet(number, total, inverse))
+                bench.expect(Kind.ACK, number=number)
+                bench.send(other.answer(ACK, number.to_bytes(2, "little")))
+                if number < total:
+                    bench.send(other.packet(number + 1, total, inverse))
+                if number == 1:
+                    bench.send(other.answer(BOOT_VERSION, other.boot_name.encode() + b"V1.0.0"))
+                    bench.expect_silence(bench.limit("ack_s"))
             # A device that hears it ends here, or refuses.
             bench.send(other.end())
             bench.send(other.answer(COMPLETE, bytes(2)))
@@ -236,23 +246,6 @@ def _between(bench: Bench, own: Sequence[RawFrame], others: Sequence[RawFrame]) 
         frames += others[index : index + 1]
         frames += own[index : index + 1]
     bench.send(frames)
-
-
-def _check_packet_beside(bench: Bench, other: Encoder, image: bytes, number: int) -> None:
-    """Send a packet between the frames of the other target's packet, which has other data; then the
-    other target's next packet alone.
-    """
-    total = packet_count(len(image))
-    inverse = inverted(packet_payload(image, number))
-    own = bench.encoder.packet_of(image, number)
-    _between(bench, own, other.packet(number, total, inverse))
-    bench.expect(Kind.ACK, number=number)
-    bench.send(other.answer(ACK, number.to_bytes(2, "little")))
-    if number < total:
-        bench.send(other.packet(number + 1, total, inverse))
-    if number == 1:
-        bench.send(other.answer(BOOT_VERSION, other.boot_name.encode() + b"V1.0.0"))
-        bench.expect_silence(bench.limit("ack_s"))
 
 
 # -- chapter 3 ------------------------------------------------------------------------------------

@@ -95,7 +95,12 @@ def bursts(bench: Bench) -> None:
         chosen = [_burst(bench) for _ in range(_BURSTS)]
         _check_none_taken(bench, probe, chosen, framed=True)
     with bench.step("frames"):
-        faults = list(_frame_faults())
+        # Those after which no intact packet is left: the first or the last frame doubled leaves
+        # one, and behind the last frame there is none to swap it with.
+        last = PACKET_FRAMES - 1
+        faults = [Fault(FaultKind.DROP, index) for index in range(PACKET_FRAMES)]
+        faults += [Fault(FaultKind.DOUBLE, index) for index in range(1, last)]
+        faults += [Fault(FaultKind.SWAP, index) for index in range(last)]
         for fault in faults:
             probe.keep_alive()
             frames = probe.frames()
@@ -272,20 +277,15 @@ class _Exact:
         self._judge("boot version", version, heard)
         for _ in range(UPDATES_MAX):
             sent = bench.send(update)
-            heard = self._behind_leftovers(sent.left_at)
+            for _ in range(UPDATES_MAX):
+                heard = bench.next_message(limit("erase_s"))
+                # Boot versions sent before it was heard do not count (R2).
+                is_version = heard is not None and heard.kind is Kind.BOOT_VERSION
+                if heard is None or not is_version or heard.at > sent.left_at + _LEFTOVER_S:
+                    break
             if heard is None or heard.kind is not Kind.BOOT_VERSION:
                 break
         self._judge("request", self._written["request"], heard)
-
-    def _behind_leftovers(self, asked_at: float) -> Received | None:
-        """What follows the update command; boot versions sent before it was heard do not (R2)."""
-        heard: Received | None = None
-        for _ in range(UPDATES_MAX):
-            heard = self._bench.next_message(self._bench.limit("erase_s"))
-            is_version = heard is not None and heard.kind is Kind.BOOT_VERSION
-            if heard is None or not is_version or heard.at > asked_at + _LEFTOVER_S:
-                break
-        return heard
 
     def _judge(self, name: str, wanted: bytes, heard: Received | None) -> None:
         where = self._bench.encoder.to_tool
@@ -320,18 +320,6 @@ def _burst(bench: Bench) -> Damage:
     last = 8 * _LIKE_PACKETS.stop - length
     first_bit = bench.random.randint(8 * _LIKE_PACKETS.start, last)
     return f"pattern {pattern:b} from bit {first_bit} on", _flipping(first_bit, pattern)
-
-
-def _frame_faults() -> Iterator[Fault]:
-    """Faults after which no intact packet is left: the first or the last frame doubled leaves one,
-    and behind the last frame there is none to swap it with.
-    """
-    for index in range(PACKET_FRAMES):
-        yield Fault(FaultKind.DROP, index)
-        if 0 < index < PACKET_FRAMES - 1:
-            yield Fault(FaultKind.DOUBLE, index)
-        if index < PACKET_FRAMES - 1:
-            yield Fault(FaultKind.SWAP, index)
 
 
 def _wrong_checksums(bench: Bench) -> Iterator[Damage]:

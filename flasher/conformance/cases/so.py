@@ -35,7 +35,9 @@ def many_upgrades(bench: Bench) -> None:
             if _is_upgraded(bench, images[done % 2 == 0]):
                 continue
             failed.append(done)
-            if not _is_rescued(bench):
+            image = bench.good_image
+            rescued = bench.upgrade(image).ok or bench.upgrade(image, blind=True).ok
+            if not (rescued and bench.application_runs()):
                 bench.fail("the device can be upgraded after it", "it cannot")
                 break
     named = ", ".join(map(str, failed[:_NAMED_MAX]))
@@ -44,12 +46,6 @@ def many_upgrades(bench: Bench) -> None:
         not failed and done == bench.upgrades, f"{bench.upgrades} upgrades, each one verified", got
     )
     bench.info(f"flash wear: the application was erased and written {done} times")
-
-
-def _is_rescued(bench: Bench) -> bool:
-    """Upgrade to the good image from wherever the device is."""
-    rescued = bench.upgrade(bench.good_image).ok or bench.upgrade(bench.good_image, blind=True).ok
-    return rescued and bench.application_runs()
 
 
 def _is_upgraded(bench: Bench, image: bytes) -> bool:

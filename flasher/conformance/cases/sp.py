@@ -93,7 +93,11 @@ def window(bench: Bench) -> None:
     wire_s = bench.tester.wire_s(frames)
     taken: list[float] = []
     not_taken: list[float] = []
-    for offset_s in _offsets(window_s, bench.upgrades):
+    close = round(bench.upgrades * _AT_THE_END)
+    wide = max(bench.upgrades - close, 1)
+    offsets_s = [_BEYOND * window_s * (at + 0.5) / wide for at in range(wide)]
+    offsets_s += [window_s * (0.95 + 0.1 * (at + 0.5) / close) for at in range(close)]
+    for offset_s in sorted(offsets_s):
         with bench.step(f"{offset_s * 1000:.1f} ms behind the last boot version"):
             heard = bench.reset_to_bootloader()
             for _ in range(bench.number("versions") - 1):
@@ -119,12 +123,3 @@ def window(bench: Bench) -> None:
             f"taken from {min(not_taken) * 1000:.1f} ms on"
         )
     bench.info(f"flash wear: the application was erased and written {len(taken)} times")
-
-
-def _offsets(window_s: float, count: int) -> list[float]:
-    """Half of them over the window and behind it, half around its end; in seconds."""
-    close = round(count * _AT_THE_END)
-    wide = max(count - close, 1)
-    found = [_BEYOND * window_s * (at + 0.5) / wide for at in range(wide)]
-    found += [window_s * (0.95 + 0.1 * (at + 0.5) / close) for at in range(close)]
-    return sorted(found)

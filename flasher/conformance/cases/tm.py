@@ -51,7 +51,9 @@ def gaps(bench: Bench) -> None:
         with bench.step(f"{gap_s * 1000:.1f} ms"):
             began_at = bench.tester.elapsed_s
             taken = probe.offer(probe.frames(), EITHER, gap_s=gap_s, gaps=gaps)
-            widest_s = _widest_s(bench, began_at)
+            sent = [one.at_s for one in bench.tester.trace if one.sent and one.at_s > began_at]
+            pairs = pairwise(sent[:PACKET_FRAMES])  # of the packet, as it was on the bus
+            widest_s = max(behind - before for before, behind in pairs)
             bench.info(f"gap of {gap_s * 1000:.1f} ms: {'taken' if taken else 'not taken'}")
             if wanted == EITHER:
                 continue
@@ -156,10 +158,3 @@ def end_measured(bench: Bench) -> Received:
     heard = bench.await_message(Kind.COMPLETE, within_s=within_s)
     bench.measure(_COMPLETE, heard.at - sent.left_at)
     return heard
-
-
-def _widest_s(bench: Bench, since_s: float) -> float:
-    """The widest gap between the ends of the packet's frames, as it was on the bus."""
-    sent = [entry.at_s for entry in bench.tester.trace if entry.sent and entry.at_s > since_s]
-    sent = sent[:PACKET_FRAMES]
-    return max(behind - before for before, behind in pairwise(sent))

@@ -137,22 +137,21 @@ def damaged(bench: Bench) -> None:
         if number in lost:
             _lose_frame(bench, image, number, lost[number])
             continue
-        for step, named, frames in _damages(bench, image, number):
-            with bench.step(f"packet {number}, {step}"):
-                bench.send(frames)
-                _check_rejected(bench, number, named)
-
-
-def _damages(bench: Bench, image: bytes, number: int) -> Iterator[tuple[str, int, list[RawFrame]]]:
-    """Step, number in the packet, its frames."""
-    which = {number: "wrong CRC", number + 1: "the next one came, with a wrong CRC"}
-    which[number - 1] = "the one before came, with a wrong CRC"
-    for named, step in which.items():
-        if 1 <= named <= packet_count(len(image)):
-            yield step, named, bench.encoder.damaged_packet_of(image, named)
-    raw = bytearray(joined(bench.encoder.packet_of(image, number)))
-    raw[_DATA_AT] ^= 0x10
-    yield "a wrong bit", number, bench.encoder.frames(bytes(raw))
+        neighbours = {
+            number: "wrong CRC",
+            number + 1: "the next one came, with a wrong CRC",
+            number - 1: "the one before came, with a wrong CRC",
+        }
+        for named, step in neighbours.items():
+            if 1 <= named <= total:
+                with bench.step(f"packet {number}, {step}"):
+                    bench.send(bench.encoder.damaged_packet_of(image, named))
+                    _check_rejected(bench, number, named)
+        with bench.step(f"packet {number}, a wrong bit"):
+            raw = bytearray(joined(bench.encoder.packet_of(image, number)))
+            raw[_DATA_AT] ^= 0x10
+            bench.send(bench.encoder.frames(bytes(raw)))
+            _check_rejected(bench, number, number)
 
 
 def _lose_frame(bench: Bench, image: bytes, number: int, index: int) -> None:
@@ -197,25 +196,20 @@ def other_data(bench: Bench) -> None:
 
 def _repeat(bench: Bench, changed: Callable[[bytes], bytes]) -> None:
     """A transfer with repetitions whose data are those of the first copy, `changed`."""
-    image = transfer_image(bench)
+    image, choice = transfer_image(bench), bench.choice("tx_02")
     total = packet_count(len(image))
     for number in bench.transfer_in_parts(image, (1, 2, total)):
         payload = changed(packet_payload(image, number))
+        ack, nak = f"ACK {number}", f"NAK {number + 1}"
+        allowed = {"ack": [ack], "nak_next": [nak]}.get(choice, [ack, nak])
+        # Behind the last packet there is no next one to ask for.
+        more = [ack, f"NAK {number}"] if number == total and choice != "ack" else []
         for copy in range(1, _REPEATS + 1):
             with bench.step(f"packet {number}, repetition {copy}"):
                 bench.send(bench.encoder.packet(number, total, payload))
-                _check_repeated(bench, number, total)
-
-
-def _check_repeated(bench: Bench, number: int, total: int) -> None:
-    """The packet stored last was answered once more, as tx_02 says."""
-    heard, choice = describe(bench.answers()), bench.choice("tx_02")
-    ack, nak = f"ACK {number}", f"NAK {number + 1}"
-    allowed = {"ack": [ack], "nak_next": [nak]}.get(choice, [ack, nak])
-    # Behind the last packet there is no next one to ask for.
-    more = [ack, f"NAK {number}"] if number == total and choice != "ack" else []
-    expected = f"{' or '.join(allowed)} for the repeated packet"
-    bench.check(heard in (*allowed, *more), expected, heard)
+                heard = describe(bench.answers())
+                expected = f"{' or '.join(allowed)} for the repeated packet"
+                bench.check(heard in (*allowed, *more), expected, heard)
 
 
 # -- wrong heads ----------------------------------------------------------------------------------
@@ -240,29 +234,25 @@ def out_of_order(bench: Bench) -> None:
         check_out_of_turn(bench, bench.encoder.packet_of(image, 1))
         bench.check_application()
     for stored in bench.transfer_in_parts(image, (0, _STORED, total)):
-        _send_wrong_numbers(bench, total, stored)
+        beyond = (stored + 2, total, 0, total + 1, _NUMBER_MAX, stored + 1 + 256)
+        for number in dict.fromkeys(beyond):
+            # The one stored last is a repetition (TX-02), and 65536 cannot be said.
+            if 0 < number == stored or number > _NUMBER_MAX:
+                continue
+            with bench.step(f"after packet {stored}, number {number}"):
+                bench.send(bench.encoder.packet(number, total, bytes(PACKET_BYTES)))
+                if stored < total:
+                    # The number 0 is not credible.
+                    _check_rejected(bench, stored + 1, number, is_plain=number != 0)
+                else:
+                    # All is there: which number is wanted is nobody's business.
+                    _check_naks(bench, None, _nak_counts(bench.choice("tx_01")))
         for number in range(1, _STORED) if stored == _STORED else ():
             payload = packet_payload(image, number)
             for what, data in (("the right", payload), ("other", inverted(payload))):
                 with bench.step(f"after packet {stored}, packet {number} with {what} data"):
                     bench.send(bench.encoder.packet(number, total, data))
                     _check_older(bench, number)
-
-
-def _send_wrong_numbers(bench: Bench, total: int, stored: int) -> None:
-    numbers = {stored + 2: True, total: True, 0: False, total + 1: True, _NUMBER_MAX: True}
-    numbers[stored + 1 + 256] = True
-    for number, is_plain in numbers.items():
-        # The one stored last is a repetition (TX-02), and 65536 cannot be said.
-        if 0 < number == stored or number > _NUMBER_MAX:
-            continue
-        with bench.step(f"after packet {stored}, number {number}"):
-            bench.send(bench.encoder.packet(number, total, bytes(PACKET_BYTES)))
-            if stored < total:
-                _check_rejected(bench, stored + 1, number, is_plain=is_plain)
-            else:
-                # All is there: which number is wanted is nobody's business.
-                _check_naks(bench, None, _nak_counts(bench.choice("tx_01")))
 
 
 def _check_older(bench: Bench, number: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Final
 
 from flasher.conformance.bench import Bench
@@ -172,8 +171,23 @@ def repeated(bench: Bench) -> None:
     choices=("up_02",),
 )
 def wrong_names(bench: Bench) -> None:
-    for step, frames in _wrong_updates(bench):
-        check_update_rejected(bench, step, frames)
+    encoder, size = bench.encoder, len(bench.good_image)
+    own = encoder.update_text
+    names = {f"name {other.update_text.decode()}": other.update_text for other in encoder.others()}
+    for at in range(len(own)):
+        name = own[:at] + b"X" + own[at + 1 :]
+        names[f"name {name.decode()}"] = name
+    names |= {"name in small letters": own.lower(), "name of zeros": bytes(7)}
+    for step, name in names.items():
+        check_update_rejected(bench, step, encoder.update(size, name))
+    payload = own + size.to_bytes(4, "little")
+    for step, mode, command, data in (
+        ("payload too short", WRITE, 0xA10A, payload[:-1]),
+        ("payload too long", WRITE, 0xA10C, payload + b"\0"),
+        ("length greater by four", WRITE, UPDATE, payload + bytes(4)),
+        ("as a read", READ, UPDATE, payload),
+    ):
+        check_update_rejected(bench, step, encoder.message(mode, command, data))
 
 
 @case(
@@ -301,22 +315,6 @@ def _enter_at(bench: Bench, version: int) -> float:
     for _ in range(version - 1):
         heard = bench.next_version()
     return heard.at
-
-
-def _wrong_updates(bench: Bench) -> Iterator[tuple[str, list[RawFrame]]]:
-    encoder, size = bench.encoder, len(bench.good_image)
-    payload = encoder.update_text + size.to_bytes(4, "little")
-    for other in encoder.others():
-        yield f"name {other.update_text.decode()}", encoder.update(size, other.update_text)
-    for at in range(len(encoder.update_text)):
-        name = encoder.update_text[:at] + b"X" + encoder.update_text[at + 1 :]
-        yield f"name {name.decode()}", encoder.update(size, name)
-    yield "name in small letters", encoder.update(size, encoder.update_text.lower())
-    yield "name of zeros", encoder.update(size, bytes(7))
-    yield "payload too short", encoder.message(WRITE, 0xA10A, payload[:-1])
-    yield "payload too long", encoder.message(WRITE, 0xA10C, payload + b"\0")
-    yield "length greater by four", encoder.message(WRITE, UPDATE, payload + bytes(4))
-    yield "as a read", encoder.message(READ, UPDATE, payload)
 
 
 def check_update_rejected(bench: Bench, step: str, frames: list[RawFrame]) -> None:
