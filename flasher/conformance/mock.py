@@ -17,7 +17,7 @@ from flasher.mock.faults import FaultInjector, InOperation, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.variants import find, make
-from flasher.protocol.bittime import frame_bits
+from flasher.protocol.bittime import message_bits
 from flasher.protocol.engine import Engine
 from flasher.protocol.messages import BootVersion
 from flasher.protocol.spec import TARGETS, WELLING
@@ -159,7 +159,10 @@ def profile_of_mock(device: DeviceProfile = MOCK_PROFILE) -> ConformanceProfile:
     if device.start_delay_s < _SOON_S:  # its application may run by then
         given["en_02"] = "either"
     # The model's window begins when it queues an announcement, the suite's when it has arrived.
-    given["limits.window_s"] = device.window_s - _announcement_s(device)
+    target = TARGETS["bms"]
+    announcement = BootVersion(target.boot_name, device.boot_version).to_message(target.answer_id)
+    frames = split(announcement.can_id, encode(announcement))
+    given["limits.window_s"] = device.window_s - message_bits(frames) / WELLING.bitrate_bps
     given["limits.window_tolerance_s"] = _WINDOW_TOLERANCE_S
     given["limits.version_spacing_s"] = DEFAULT_TIMINGS.boot_version_spacing_s
     given["limits.version_spacing_tolerance_s"] = _SPACING_TOLERANCE_S
@@ -168,11 +171,3 @@ def profile_of_mock(device: DeviceProfile = MOCK_PROFILE) -> ConformanceProfile:
     given["device.application_bytes"] = device.application_area_bytes
     given["device.largest_image_bytes"] = device.image_limit_bytes
     return ConformanceProfile(given, source="the mock's own choices")
-
-
-def _announcement_s(device: DeviceProfile) -> float:
-    """How long a boot version takes on the wire."""
-    target = TARGETS["bms"]
-    message = BootVersion(target.boot_name, device.boot_version).to_message(target.answer_id)
-    frames = split(message.can_id, encode(message))
-    return sum(map(frame_bits, frames)) / WELLING.bitrate_bps

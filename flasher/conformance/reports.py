@@ -97,8 +97,12 @@ def junit_report(report: RunReport, *, started_at: str, replays: ByResult) -> by
 def _junit_case(text: CaseText, result: CaseResult, report: RunReport, replay: str) -> JUnitCase:
     repeat = f" (repeat {result.repeat})" if result.repeat > 1 else ""
     ended = _JUNIT_RESULTS.get(result.verdict, JUnitResult.PASSED)
-    if result.verdict is CaseVerdict.NOT_RUN and _was_wanted(report):
-        ended = JUnitResult.SKIPPED
+    is_broken = report.adapter_failed or report.killed_by
+    has_verdicts = any(
+        one.verdict is not CaseVerdict.NOT_RUN and one.checks for one in report.results
+    )
+    if result.verdict is CaseVerdict.NOT_RUN and has_verdicts and not is_broken:
+        ended = JUnitResult.SKIPPED  # it was stopped on request, or by its time limit
     word = result.verdict.text
     message, kind, details = result.reason or word, word, ""
     if ended is JUnitResult.SKIPPED:
@@ -124,13 +128,6 @@ def _junit_case(text: CaseText, result: CaseResult, report: RunReport, replay: s
         kind,
         details,
         "\n".join([*said, *result.infos]),
-    )
-
-
-def _was_wanted(report: RunReport) -> bool:
-    """True when the run was stopped on request or by its time limit, after some verdicts."""
-    return not (report.adapter_failed or report.killed_by) and any(
-        result.verdict is not CaseVerdict.NOT_RUN and result.checks for result in report.results
     )
 
 

@@ -155,17 +155,13 @@ def _upgrade(bench: Bench) -> str:
     for attempt in range(_UPGRADE_TRIES):
         if attempt and bench.choice("tx_12") != "waits":
             bench.wait(bench.limit("pause_s"))
-        reset = not blind or attempt == _UPGRADE_TRIES - 1 or _may_run(bench)
+        is_last, tells = attempt == _UPGRADE_TRIES - 1, bench.encoder.has_version_query
+        reset = not (blind and tells) or is_last or bench.application_version(_ASK_S) is not None
         # Without an application it may listen silently (RS-03).
         reason = _upgraded(bench, reset=reset, blind=blind or attempt > 0)
         if not reason:
             break
     return reason
-
-
-def _may_run(bench: Bench) -> bool:
-    """True when an application runs, or when the target has no query to find out."""
-    return not bench.encoder.has_version_query or bench.application_version(_ASK_S) is not None
 
 
 def _upgraded(bench: Bench, *, reset: bool, blind: bool = False) -> str:

@@ -76,15 +76,22 @@ def end_early_and_twice(bench: Bench) -> None:
             # A NAK of any number (R6), and nothing else.
             bench.expect(Kind.NAK, within_s=bench.limit("complete_s"))
             bench.expect_silence(bench.limit("ack_s"), ignoring=(Kind.BOOT_VERSION,))
-            done += _goes_on(bench, image, stored)
+            bench.send_packet(image, stored + 1)
+            heard = bench.wait_for(Kind.ACK, Kind.NAK, Kind.BOOT_VERSION)
+            if str(heard) == f"ACK {stored + 1}":
+                bench.succeed(f"ACK {stored + 1}", heard)
+                done += 1
+            else:
+                bench.info(f"after packet {stored}, an early end of transfer ends the transfer")
+                _begin_anew(bench, image, stored, heard)
     bench.packets(image, done + 1)
     for mark in _WRONG_MARKS:
         with bench.step(f"end of transfer with {mark:02X}"):
             bench.send(bench.encoder.message(WRITE, END, bytes((mark,))))
-            heard = bench.collect(bench.limit("ack_s"))
-            ok = not any(one.kind in (Kind.COMPLETE, Kind.ACK) for one in heard)
-            bench.require(ok, "rejected", describe(heard))
-        if any(one.kind in (Kind.NAK, Kind.BOOT_VERSION) for one in heard):
+            answers = bench.collect(bench.limit("ack_s"))
+            ok = not any(one.kind in (Kind.COMPLETE, Kind.ACK) for one in answers)
+            bench.require(ok, "rejected", describe(answers))
+        if any(one.kind in (Kind.NAK, Kind.BOOT_VERSION) for one in answers):
             bench.send_packet(image, total)
             known = bench.wait_for(Kind.ACK, Kind.NAK, unlike=lambda one: one.number < total)
             if known is None:
@@ -94,20 +101,6 @@ def end_early_and_twice(bench: Bench) -> None:
     with bench.step("end of transfer after complete"):
         _check_second_end(bench, Kind.COMPLETE)
         bench.check_image(image)
-
-
-def _goes_on(bench: Bench, image: bytes, stored: int) -> int:
-    """Send the next packet. Returns 1 when the transfer goes on; otherwise begins a new transfer,
-    up to the same packet, and returns 0.
-    """
-    bench.send_packet(image, stored + 1)
-    heard = bench.wait_for(Kind.ACK, Kind.NAK, Kind.BOOT_VERSION)
-    if heard is not None and (heard.kind, heard.number) == (Kind.ACK, stored + 1):
-        bench.succeed(f"ACK {stored + 1}", heard)
-        return 1
-    bench.info(f"after packet {stored}, an early end of transfer ends the transfer")
-    _begin_anew(bench, image, stored, heard)
-    return 0
 
 
 def _begin_anew(bench: Bench, image: bytes, stored: int, heard: Received | None = None) -> None:

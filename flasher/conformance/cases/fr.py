@@ -188,11 +188,20 @@ def wrong_tail(bench: Bench) -> None:
     expectation="a packet is taken after the timeout; at once it may be taken or lost",
     requires={DESTRUCTIVE},
 )
-def broken_off(bench: Bench) -> None:
+def too_short(bench: Bench) -> None:
     probe = Probe(bench)
     probe.begin()
     at_once = []
-    for name, raw in _messages_broken_off(bench):
+    encoder = bench.encoder
+    packet = joined(encoder.packet(1, 1, bytes(range(PACKET_BYTES))))
+    query = build(encoder.to_device, READ, QUERY_VERSION)
+    broken_off = {
+        "length 255, two bytes follow": b"\x55\xaa\x16\xff\x77\xfd\x01\x02",
+        **{f"packet cut off behind frame {end}": packet[: 8 * end] for end in (1, 9, 17)},
+        "update command cut off behind frame 1": joined(encoder.update(PACKET_BYTES))[:8],
+        "length greater by one": _HEADER + bytes((READ, 3, QUERY_VERSION >> 8, 1)) + query[-5:],
+    }
+    for name, raw in broken_off.items():
         with bench.step(name):
             bench.send(bench.encoder.frames(raw))
             bench.wait(probe.settle_s())
@@ -309,7 +318,19 @@ def back_to_back(bench: Bench) -> None:
 def no_payload(bench: Bench) -> None:
     probe = Probe(bench)
     probe.begin()
-    for name, stranger in _strangers(bench.encoder.to_device):
+    own, junk = bench.encoder.to_device, b"\x12" * 8
+    neighbours = [own ^ 1 << bit for bit in range(11)]
+    strangers = {
+        "a frame of 0 bytes": RawFrame(own, b""),
+        "a remote frame": RawFrame(own, b"", is_remote=True),
+        "a remote frame of 8 bytes": RawFrame(own, bytes(8), is_remote=True),
+        "an extended frame": RawFrame(own, junk, is_extended=True),
+        "an extended frame with a header": RawFrame(own, _HEADER, is_extended=True),
+        "an extended frame of the same first 11 bits": RawFrame(own << 18, junk, is_extended=True),
+        "an error frame": RawFrame(own, bytes(8), is_error=True),
+        **{f"a frame of id {other:03X}": RawFrame(other, junk) for other in neighbours},
+    }
+    for name, stranger in strangers.items():
         with bench.step(f"{name} between all frames"):
             try:
                 bench.send([stranger])
@@ -420,34 +441,3 @@ def _reduced(change: int, bits: int, basis: Mapping[int, tuple[int, int]]) -> tu
         if change.bit_length() == top:
             change, bits = change ^ basis[top][0], bits ^ basis[top][1]
     return change, bits
-
-
-def _messages_broken_off(bench: Bench) -> Iterator[tuple[str, bytes]]:
-    """Messages, by name, that end before their length is used up."""
-    encoder = bench.encoder
-    packet = joined(encoder.packet(1, 1, bytes(range(PACKET_BYTES))))
-    query = build(encoder.to_device, READ, QUERY_VERSION)
-    yield "length 255, two bytes follow", b"\x55\xaa\x16\xff\x77\xfd\x01\x02"
-    yield "packet cut off behind frame 1", packet[:8]
-    yield "packet cut off behind frame 9", packet[:72]
-    yield "packet cut off behind frame 17", packet[:136]
-    yield "update command cut off behind frame 1", joined(encoder.update(PACKET_BYTES))[:8]
-    longer = bytes((READ, 3, QUERY_VERSION >> 8, 1))
-    yield "length greater by one", _HEADER + longer + query[-5:]
-
-
-def _strangers(to_device: int) -> Iterator[tuple[str, RawFrame]]:
-    """Frames with the device's id that carry no payload, by name."""
-    yield "a frame of 0 bytes", RawFrame(to_device, b"")
-    yield "a remote frame", RawFrame(to_device, b"", is_remote=True)
-    yield "a remote frame of 8 bytes", RawFrame(to_device, bytes(8), is_remote=True)
-    yield "an extended frame", RawFrame(to_device, b"\x12" * 8, is_extended=True)
-    yield "an extended frame with a header", RawFrame(to_device, _HEADER, is_extended=True)
-    yield (
-        "an extended frame of the same first 11 bits",
-        RawFrame(to_device << 18, b"\x12" * 8, is_extended=True),
-    )
-    yield "an error frame", RawFrame(to_device, bytes(8), is_error=True)
-    for bit in range(11):
-        other = to_device ^ 1 << bit
-        yield f"a frame of id {other:03X}", RawFrame(other, b"\x12" * 8)

@@ -74,17 +74,16 @@ class _Upgrade:
 )
 def cuts(bench: Bench) -> None:
     upgrade = _upgrade(bench)
-    _say_what_is_not_judged(bench, upgrade)
     for frames in range(1, len(bench.encoder.reset()) + 1):
         with bench.step(f"after frame {frames} of reset"):
             bench.send(bench.encoder.reset()[:frames])
-            _cut(bench)
+            bench.power_cycle(_OFF_S)
             _check_after_cut(bench, upgrade)
     total = packet_count(len(upgrade.new))
     for cut in _cuts_at_frames(bench, upgrade.new):
         with bench.step(_name_of(cut, total)):
             _go_to(bench, upgrade, cut)
-            _cut(bench)
+            bench.power_cycle(_OFF_S)
             _check_after_cut(bench, upgrade)
     _cut_erase(bench, upgrade)
     _cut_operations(bench, upgrade)
@@ -107,7 +106,6 @@ def cuts(bench: Bench) -> None:
 )
 def second_cut(bench: Bench) -> None:
     upgrade = _upgrade(bench)
-    _say_what_is_not_judged(bench, upgrade)
     total = packet_count(len(upgrade.new))
     update, end = len(bench.encoder.update(1)), len(bench.encoder.end())
     second = [_Cut(0, 1), _Cut(0, update), _Cut(1, 9), _Cut(1, PACKET_FRAMES)]
@@ -119,12 +117,12 @@ def second_cut(bench: Bench) -> None:
     for cut in second:
         with bench.step("first cut"):
             _go_to(bench, upgrade, _Cut(1, 9))
-            _cut(bench)
+            bench.power_cycle(_OFF_S)
             bench.await_message(Kind.BOOT_VERSION)
         with bench.step(f"second cut {_name_of(cut, total)}"):
             upgrade.runs = False
             _go_to(bench, upgrade, cut)
-            _cut(bench)
+            bench.power_cycle(_OFF_S)
             _check_after_cut(bench, upgrade)
     _check_upgrade(bench, upgrade)
 
@@ -164,18 +162,17 @@ def _name_of(cut: _Cut, total: int) -> str:
 
 
 def _upgrade(bench: Bench) -> _Upgrade:
-    """From the good image to another one where there is one, so that they can be told apart."""
-    has_other = bench.subject.second_image is not None
-    return _Upgrade(bench.good_image, bench.second_image() if has_other else bench.good_image)
-
-
-def _say_what_is_not_judged(bench: Bench, upgrade: _Upgrade) -> None:
+    """From the good image to another one where there is one, so that they can be told apart; it is
+    said where they cannot.
+    """
+    upgrade = _Upgrade(bench.good_image, bench.subject.second_image or bench.good_image)
     same = version_in(upgrade.old) == version_in(upgrade.new) or version_in(upgrade.old) is None
     if not bench.subject.has_readback and (same or not bench.encoder.has_version_query):
         bench.unsupported(
             "what runs after a cut is a whole image",
             "it takes readback, or a version query and two images of different versions",
         )
+    return upgrade
 
 
 # -- an upgrade up to the cut ---------------------------------------------------------------------
@@ -207,18 +204,13 @@ def _go_to(bench: Bench, upgrade: _Upgrade, cut: _Cut) -> None:
         bench.send(encoder.packet_of(upgrade.new, cut.packet)[: cut.frames])
 
 
-def _cut(bench: Bench) -> None:
-    """Power off and on."""
-    bench.power_cycle(_OFF_S)
-
-
 def _check_upgrade(bench: Bench, upgrade: _Upgrade) -> None:
     """From a power-up where no application runs, as a bootloader that only listens ignores the
     reset of a host (rs_03).
     """
     with bench.step("afterwards"):
         if not upgrade.runs:
-            _cut(bench)
+            bench.power_cycle(_OFF_S)
         bench.check_upgrade()
 
 
@@ -271,7 +263,7 @@ def _run_old(bench: Bench, upgrade: _Upgrade) -> None:
     """
     if upgrade.runs:
         return
-    _cut(bench)
+    bench.power_cycle(_OFF_S)
     done = bench.upgrade(upgrade.old, reset=False)
     bench.require(done.ok, "the device can be upgraded", done.reason or "it was")
     upgrade.runs = bench.application_runs()
@@ -295,7 +287,7 @@ def _cut_erase(bench: Bench, upgrade: _Upgrade) -> None:
             bench.wait_to_be_heard()
             bench.send(bench.encoder.update(len(upgrade.new)))
             bench.wait(share * erase_s)
-            _cut(bench)
+            bench.power_cycle(_OFF_S)
             _check_after_cut(bench, upgrade)
 
 
@@ -375,7 +367,7 @@ def _cut_after_complete(bench: Bench, upgrade: _Upgrade) -> None:
         _enter(bench, upgrade)
         bench.packets(upgrade.new)
         bench.end_transfer()
-        _cut(bench)
+        bench.power_cycle(_OFF_S)
         bench.wait_for(Kind.BOOT_VERSION)  # without one: RS-05
         bench.collect(bench.host.burst_s)
         bench.check_image(upgrade.new)

@@ -135,7 +135,14 @@ def damaged(bench: Bench) -> None:
     lost = {3 + place: index for place, index in enumerate(_LOST_FRAMES)}
     for number in _stops(bench, image, (1, 2, *lost, total)):
         if number in lost:
-            _lose_frame(bench, image, number, lost[number])
+            index, choice = lost[number], bench.choice("tx_01_lost_frame")
+            # Without the first frame there is nothing to know a packet by.
+            counts = {"nak": (1,), "silence": (0,)}.get(choice if index else "", (0, 1))
+            trusts_it = bench.choice("tx_01") in ("nak_received", "either")
+            with bench.step(f"packet {number} without its frame {index + 1}"):
+                frames = bench.encoder.packet_of(image, number)
+                bench.send(frames[:index] + frames[index + 1 :])
+                _check_naks(bench, None if trusts_it and index <= _NUMBER_IN else {number}, counts)
             continue
         neighbours = {
             number: "wrong CRC",
@@ -152,17 +159,6 @@ def damaged(bench: Bench) -> None:
             raw[_DATA_AT] ^= 0x10
             bench.send(bench.encoder.frames(bytes(raw)))
             _check_rejected(bench, number, number)
-
-
-def _lose_frame(bench: Bench, image: bytes, number: int, index: int) -> None:
-    choice = bench.choice("tx_01_lost_frame")
-    # Without the first frame there is nothing to know a packet by.
-    counts = {"either": (0, 1), "nak": (1,), "silence": (0,)}[choice] if index else (0, 1)
-    trusts_it = bench.choice("tx_01") in ("nak_received", "either")
-    with bench.step(f"packet {number} without its frame {index + 1}"):
-        frames = bench.encoder.packet_of(image, number)
-        bench.send(frames[:index] + frames[index + 1 :])
-        _check_naks(bench, None if trusts_it and index <= _NUMBER_IN else {number}, counts)
 
 
 # -- repetitions ----------------------------------------------------------------------------------

@@ -117,11 +117,6 @@ def _crc_mirrored(raw: bytes) -> bytes:
     return raw[:-5] + raw[-5:-1][::-1] + raw[-1:]
 
 
-def _longer(place: Place) -> bytes:
-    """A packet whose length byte and data are longer by one than its command says."""
-    return build(place.encoder.to_device, WRITE, PACKET, place.next_packet[6:-5] + b"\xff")
-
-
 PACKETS: Final[dict[str, Maker]] = {
     "packet-crc": _with_crc(lambda _: b"\x12\x34\x56\x78"),
     "packet-crc-zero": _with_crc(lambda _: bytes(4)),
@@ -149,7 +144,11 @@ PACKETS: Final[dict[str, Maker]] = {
     "packet-doubled": _with_frames(lambda all_: all_[:_SPOILT_FRAME] + all_[_SPOILT_FRAME - 1 :]),
     "packet-exchanged": _with_frames(_exchanged),
     "packet-half": _with_frames(lambda all_: all_[: len(all_) // 2]),
-    "packet-long": _bytes(_longer),
+    "packet-long": _bytes(  # length byte and data are longer by one than its command says
+        lambda place: build(
+            place.encoder.to_device, WRITE, PACKET, place.next_packet[6:-5] + b"\xff"
+        )
+    ),
 }
 
 
@@ -228,10 +227,6 @@ def _junk(place: Place) -> list[RawFrame]:
     return [RawFrame(place.encoder.to_device, each) for each in data]
 
 
-def _load(_place: Place) -> list[RawFrame]:
-    return [RawFrame(0x7A0 + number % 5, bytes(8)) for number in range(_LOAD_FRAMES)]
-
-
 NO_CONCERN: Final[dict[str, Maker]] = {
     "reset-read": _frames(_reset(READ, lambda encoder: encoder.reset_data)),
     "reset-text": _frames(
@@ -258,5 +253,7 @@ NO_CONCERN: Final[dict[str, Maker]] = {
         )
     ),
     "own-id": _frames(lambda place: place.encoder.answer(_UNKNOWN, b"\0")),
-    "load": _frames(_load),
+    "load": _frames(
+        lambda _: [RawFrame(0x7A0 + number % 5, bytes(8)) for number in range(_LOAD_FRAMES)]
+    ),
 }

@@ -127,7 +127,7 @@ class Walk:
         elif name in ENDS or name in NO_CONCERN:
             self._no_concern(name)
         else:
-            getattr(self, f"_{STEPS[name]}")(argument)
+            getattr(self, f"_{name.replace('-', '_')}")(argument)
 
     def check_application(self) -> None:
         """The application that should be there runs. Raises Violation."""
@@ -302,7 +302,7 @@ class Walk:
             if choice not in ("", "ignored") and self.phase is before:
                 self.phase = Phase.UNCLEAR
 
-    def _watch_burst(self, argument: str) -> None:
+    def _burst(self, argument: str) -> None:
         """Reset, no update command: the burst is whole, then the application starts. With `twice`,
         a second reset follows the first one.
         """
@@ -738,26 +738,10 @@ def _answers_update(heard: Received, not_before: float) -> bool:
     return is_later or heard.kind is Kind.REQUEST
 
 
-STEPS: Final = {
-    "reset": "reset",
-    "burst": "watch_burst",
-    "power": "power",
-    "bus-off": "bus_off",
-    "wait": "wait",
-    "query": "query",
-    "update": "update",
-    "update-reset": "update_reset",
-    "cut": "cut",
-    "packet": "packet",
-    "packets": "packets",
-    "packet-again": "packet_again",
-    "packet-between": "packet_between",
-    "packet-slow": "packet_slow",
-    "packet-behind": "packet_behind",
-    "packet-filler": "packet_filler",
-    "packet-open": "packet_open",
-    "read": "read",
-    "end": "end",
-}
-"""Steps with the methods of `Walk` that take them; the others send what has to be refused."""
+STEPS: Final = (
+    *("reset", "burst", "power", "bus-off", "wait", "query", "update", "update-reset", "cut"),
+    *("packet", "packets", "packet-again", "packet-between", "packet-slow", "packet-behind"),
+    *("packet-filler", "packet-open", "read", "end"),
+)
+"""Steps that methods of `Walk` take; the others send what has to be refused."""
 ALL_STEPS: Final = (*STEPS, *PACKETS, *UPDATES, *ENDS, *NO_CONCERN)

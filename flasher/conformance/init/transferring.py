@@ -219,6 +219,9 @@ def wrong_tail(it: Session) -> Findings:
 def padded(it: Session) -> Findings:
     """Update command and end of transfer, their last frames filled up."""
     bench = it.bench
+    within_s = bench.limit("complete_s")
+    if bench.choice("tx_12") == "announces":  # while the transfer still lasts
+        within_s = min(within_s, bench.limit("pause_s") / 2)
     for byte in _PADDINGS:
         it.enter()
         bench.wait_to_be_heard()
@@ -231,7 +234,7 @@ def padded(it: Session) -> Findings:
         it.packets()
         bench.forget()
         sent = bench.send(filled_up(bench.encoder.end(), byte))
-        heard = bench.wait_for(Kind.COMPLETE, within_s=_end_s(it))
+        heard = bench.wait_for(Kind.COMPLETE, within_s=within_s)
         yield _taken(heard is not None, f"end {said}", "ignored", "rejected")
         if heard is None:
             bench.forget()
@@ -239,14 +242,6 @@ def padded(it: Session) -> Findings:
         else:
             bench.measure(COMPLETE, heard.at - sent.left_at)
         it.await_application()
-
-
-def _end_s(it: Session) -> float:
-    """How long complete is waited for, while the transfer still lasts (TX-12)."""
-    within_s = it.bench.limit("complete_s")
-    if it.bench.choice("tx_12") == "announces":
-        within_s = min(within_s, it.bench.limit("pause_s") / 2)
-    return within_s
 
 
 def gaps(it: Session) -> Findings:
