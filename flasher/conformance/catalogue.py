@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass
 from enum import Enum
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from flasher.conformance.clauses import contents
 from flasher.conformance.results import CaseText, Gap
@@ -131,18 +131,10 @@ CASES: Final[dict[str, Case]] = {}
 
 
 def case(
-    case_id: str,
-    title: str,
-    *,
-    clause: str,
-    stimulus: str,
-    expectation: str,
-    requires: Collection[Requirement] = (),
-    choices: tuple[str, ...] = (),
-    limit_s: float = 300.0,
+    case_id: str, title: str, *, clause: str, requires: Collection[Requirement] = (), **more: Any
 ) -> Callable[[CaseScript], CaseScript]:
-    """Register the function below as a case. Raises ValueError for an id that is taken and a clause
-    that does not exist.
+    """Register the function below as a case, with the fields of `Case`. Raises ValueError for an id
+    that is taken and a clause that does not exist.
     """
 
     def register(run: CaseScript) -> CaseScript:
@@ -150,9 +142,7 @@ def case(
             raise ValueError(f"there are two cases {case_id}")
         contents(clause)
         needs = frozenset(requires)
-        CASES[case_id] = Case(
-            case_id, title, clause, stimulus, expectation, run, needs, choices, limit_s
-        )
+        CASES[case_id] = Case(case_id, title, clause, run=run, requires=needs, **more)
         return run
 
     return register

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from typing import TYPE_CHECKING, Any, Final
 
@@ -156,40 +156,21 @@ def report_document(
     report: RunReport, *, started_at: str, replays: ByResult, trace_files: ByResult
 ) -> ReportDocument:
     """The document of a run. `replays` and `trace_files` are by case id and repeat."""
+    same: dict[str, Any] = {one.name: getattr(report, one.name) for one in fields(report)}
+    same["results"] = [
+        _result(result, replays.get(result.key, ""), trace_files.get(result.key, ""))
+        for result in report.results
+    ]
     return ReportDocument(
+        **same,
         report_schema=SCHEMA_VERSION,
         passed=report.ok,
         started_at=started_at,
-        duration_s=report.duration_s,
-        subject=report.subject,
-        target=report.target,
-        bitrate_bps=report.bitrate_bps,
-        timestamp_source=report.timestamp_source,
-        uncertainty_s=report.uncertainty_s,
-        seed=report.seed,
-        strict=report.strict,
-        profile_source=report.profile_source,
-        profile=dict(report.profile),
-        stopped=report.stopped,
-        adapter_failed=report.adapter_failed,
-        killed_by=report.killed_by,
-        not_upgradable=report.not_upgradable,
-        final_image=report.final_image,
-        final_image_seen_by=report.final_image_seen_by,
         passes=report.count(CaseVerdict.PASS) + report.count(CaseVerdict.PASS_IN_PART),
         passes_in_full=report.count(CaseVerdict.PASS),
         not_tried=report.not_tried(),
         counts={verdict.value: report.count(verdict) for verdict in CaseVerdict},
-        cases=report.cases,
-        results=[
-            _result(result, replays.get(result.key, ""), trace_files.get(result.key, ""))
-            for result in report.results
-        ],
-        rescues=report.rescues,
         times=[_times(name, found) for name, found in report.times().items()],
-        gaps=report.gaps,
-        not_selected=report.not_selected,
-        host_cases=report.host_cases,
     )
 
 

@@ -6,7 +6,6 @@ bytes does not import them.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -16,6 +15,7 @@ from flasher.conformance.simulated import CRASHES, SimulatedPort
 from flasher.mock.faults import FaultInjector, InOperation, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
+from flasher.mock.store import with_checksum
 from flasher.mock.variants import find, make
 from flasher.protocol.bittime import message_bits
 from flasher.protocol.engine import Engine
@@ -37,9 +37,7 @@ _WINDOW_TOLERANCE_S: Final = 0.0005
 
 def model_image(version: str, size_bytes: int) -> bytes:
     """An image that the device model runs: `version` in it, its own checksum at its end."""
-    body = f"conformance {version}".encode("ascii") + b"\0"
-    body += bytes(index * 7 % 253 for index in range(size_bytes - len(body) - 4))
-    return body + zlib.crc32(body).to_bytes(4, "little")
+    return with_checksum(f"conformance {version}".encode("ascii") + b"\0", size_bytes)
 
 
 GOOD_IMAGE: Final = model_image("V2r0r1_20240131", 10 * 128 - 3)

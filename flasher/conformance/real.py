@@ -9,7 +9,7 @@ import shlex
 import subprocess
 import tempfile
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -196,11 +196,8 @@ class ReadbackCommand:
             try:
                 return read(path, _READBACK_MAX_SIZE)
             except UsageError as error:
-                raise BusError(
-                    "The readback command wrote no file that can be read.",
-                    where=shlex.join(words),
-                    cause=error.what,
-                    code=ErrorCode.COMMAND_FAILED,
+                raise _failed(
+                    "readback", "wrote no file that can be read", words, error.what
                 ) from error
 
 
@@ -213,28 +210,23 @@ def _split(template: str, what: str) -> Sequence[str]:
 
 
 def _run(words: Sequence[str], limit_s: float, what: str) -> None:
-    shown: Mapping[str, str] = {"where": shlex.join(words)}
     try:
         done = subprocess.run(  # noqa: S603  the user's own command
             words, check=False, capture_output=True, timeout=limit_s, stdin=subprocess.DEVNULL
         )
     except subprocess.TimeoutExpired as error:
-        raise BusError(
-            f"The {what} command took longer than {limit_s:g} s.",
-            **shown,
-            code=ErrorCode.COMMAND_FAILED,
-        ) from error
+        raise _failed(what, f"took longer than {limit_s:g} s", words) from error
     except OSError as error:
-        raise BusError(
-            f"The {what} command cannot be run: {error.strerror}.",
-            **shown,
-            code=ErrorCode.COMMAND_FAILED,
-        ) from error
+        raise _failed(what, f"cannot be run: {error.strerror}", words) from error
     if done.returncode:
         said = done.stderr.decode(errors="replace").strip()[-300:]
-        raise BusError(
-            f"The {what} command failed with exit code {done.returncode}.",
-            cause=ascii(said)[1:-1],
-            **shown,
-            code=ErrorCode.COMMAND_FAILED,
-        )
+        raise _failed(what, f"failed with exit code {done.returncode}", words, ascii(said)[1:-1])
+
+
+def _failed(what: str, how: str, words: Sequence[str], cause: str = "") -> BusError:
+    return BusError(
+        f"The {what} command {how}.",
+        where=shlex.join(words),
+        cause=cause,
+        code=ErrorCode.COMMAND_FAILED,
+    )

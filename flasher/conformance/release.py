@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 from flasher import __version__
 from flasher.conformance.decoded import boot_versions
@@ -11,7 +11,6 @@ from flasher.conformance.profile import profile_keys
 from flasher.conformance.reports import distribution, group_title
 from flasher.conformance.results import CaseResult, CaseText, CaseVerdict, RunReport
 from flasher.report.base import Status, render_page
-from flasher.trace.figures import Distribution
 
 _LISTED: Final = 6
 """Cases that went wrong, deviations and times: the page has room for so many of each."""
@@ -21,20 +20,6 @@ _NARROW_WIDTH: Final = 3.8
 """Of a character in the badge, at its size of 11."""
 _LABEL: Final = "bootloader conformance"
 _WRONG: Final = (CaseVerdict.FAIL, CaseVerdict.ERROR, CaseVerdict.INCONCLUSIVE)
-
-
-class GroupRow(NamedTuple):
-    """A group with how many of its results have each verdict."""
-
-    title: str
-    counts: Sequence[int]
-
-
-class TimeRow(NamedTuple):
-    """The times of one name."""
-
-    name: str
-    distribution: Distribution
 
 
 def badge(report: RunReport) -> str:
@@ -59,7 +44,7 @@ def badge(report: RunReport) -> str:
 def summary_page(report: RunReport, *, started_at: str) -> str:
     """The run on one page."""
     by_case = report.by_case()
-    times = [TimeRow(name, distribution(found)) for name, found in report.times().items()]
+    times = [(name, distribution(found)) for name, found in report.times().items()]
     columns = [verdict for verdict in CaseVerdict if report.count(verdict)]
     return render_page(
         "release.html",
@@ -70,13 +55,12 @@ def summary_page(report: RunReport, *, started_at: str) -> str:
         version=__version__,
         boot_versions=boot_versions(report),
         columns=columns,
-        groups=[
-            GroupRow(
-                f"{group} {group_title(group)}",
-                [sum(one.verdict is verdict for _, one in members) for verdict in columns],
-            )
+        groups={
+            f"{group} {group_title(group)}": [
+                sum(one.verdict is verdict for _, one in members) for verdict in columns
+            ]
             for group, members in report.by_group().items()
-        ],
+        },
         wrong=_listed(by_case, _WRONG),
         deviating=_listed(by_case, (CaseVerdict.DEVIATION,)),
         not_judged=[
@@ -90,7 +74,7 @@ def summary_page(report: RunReport, *, started_at: str) -> str:
             for path, key in profile_keys().items()
             if report.profile.get(path, key.default) != key.default
         ),
-        times=sorted(times, key=lambda row: -row.distribution.count)[:_LISTED],
+        times=sorted(times, key=lambda row: -row[1].count)[:_LISTED],
     )
 
 

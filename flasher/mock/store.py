@@ -35,6 +35,12 @@ def checksum_fits(image: bytes) -> bool:
     return len(image) > _CHECKSUM.size and _CHECKSUM.pack(zlib.crc32(body)) == image[len(body) :]
 
 
+def with_checksum(body: bytes, size_bytes: int) -> bytes:
+    """`body`, filled up with bytes that are not all alike, and the checksum of R7 behind it."""
+    body += bytes(index * 7 % 253 for index in range(size_bytes - len(body) - _CHECKSUM.size))
+    return body + _CHECKSUM.pack(zlib.crc32(body))
+
+
 def factory_image(profile: DeviceProfile) -> bytes:
     """The application that a device leaves the factory with: its version among filler, and the
     checksum of R7, so that every profile accepts it.

@@ -72,7 +72,7 @@ class _Frame(ctypes.Structure):
 
 class _Facts(ctypes.Structure):
     _fields_: ClassVar = [
-        *((name, ctypes.c_uint32) for name in ("abi", *list(Facts.__dataclass_fields__)[:-1])),
+        ("numbers", ctypes.c_uint8 * pipes.FACTS.size),
         ("name", ctypes.c_char_p),
     ]
 
@@ -111,12 +111,7 @@ class _Library:
         if not about:
             raise SubjectError("flasher_dut_about gives NULL")
         found = about.contents
-        if found.abi != pipes.ABI:
-            raise ValueError(
-                f"it was built with version {found.abi} of flasher_dut.h, and not {pipes.ABI}"
-            )
-        numbers = {name: getattr(found, name) for name in list(Facts.__dataclass_fields__)[:-1]}
-        self.facts = Facts(**numbers, name=(found.name or b"").decode(errors="replace"))
+        self.facts = pipes.unpack_facts(bytes(found.numbers) + (found.name or b""))
         self._table: _HostTable | None = None
         self._out = _Frame()
 

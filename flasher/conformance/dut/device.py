@@ -4,7 +4,6 @@ and the application that the bootloader starts.
 
 from __future__ import annotations
 
-import zlib
 from collections import deque
 from math import inf
 from struct import Struct
@@ -17,9 +16,9 @@ from flasher.errors import FlasherError
 from flasher.mock.application import Application
 from flasher.mock.bms import BmsApplication
 from flasher.mock.machine import Machine
-from flasher.mock.memory import Flash, FlashError
+from flasher.mock.memory import Flash, FlashError, Operation
 from flasher.mock.profile import DeviceProfile
-from flasher.mock.store import AREA_START, MemoryMap
+from flasher.mock.store import AREA_START, MemoryMap, checksum_fits, with_checksum
 from flasher.protocol import messages
 from flasher.protocol.bittime import frame_bits
 from flasher.protocol.frame import Frame
@@ -38,7 +37,6 @@ _MAGIC: Final = b"FLASHERA"
 _HEAD: Final = Struct("<II8sI")
 _STACK: Final = 0x2000_1000
 _ENTRY: Final = AREA_START + 0x101
-_CHECKSUM_SIZE: Final = 4
 _TIMES_OVER: Final = 16
 """A call that reads, erases, writes and logs more than all flash so many times does not return."""
 
@@ -48,8 +46,7 @@ def application_image(version: str, size_bytes: int) -> bytes:
     does, and can tell whether it is whole.
     """
     body = _HEAD.pack(_STACK, _ENTRY, _MAGIC, size_bytes) + version.encode("ascii") + b"\0"
-    body += bytes(index * 7 % 253 for index in range(size_bytes - len(body) - _CHECKSUM_SIZE))
-    return body + zlib.crc32(body).to_bytes(_CHECKSUM_SIZE, "little")
+    return with_checksum(body, size_bytes)
 
 
 def _is_torn(area: bytes) -> bool:
@@ -59,9 +56,7 @@ def _is_torn(area: bytes) -> bool:
     _, _, magic, size_bytes = _HEAD.unpack_from(area)
     if magic != _MAGIC:
         return bool(magic == b"\xff" * len(_MAGIC))
-    body = area[: size_bytes - _CHECKSUM_SIZE]
-    checksum = area[len(body) : size_bytes]
-    return zlib.crc32(body).to_bytes(_CHECKSUM_SIZE, "little") != checksum
+    return not checksum_fits(area[:size_bytes])
 
 
 class CompiledDevice(Machine):
@@ -307,25 +302,21 @@ class CompiledDevice(Machine):
             self._count(size_bytes)
             return self.flash.read(self.flash.start + offset, size_bytes)
         now_us, offset = pipes.PLACE.unpack_from(data)
-        address, content = self.flash.start + offset, data[pipes.PLACE.size :]
-        is_erase = asked is Kind.FLASH_ERASE
-        units = len(content) // self.facts.write_bytes
-        self._count(self.facts.sector_bytes if is_erase else len(content))
-        takes_us = self.facts.erase_us if is_erase else units * self.facts.write_us
-        if self._is_cut_here():
-            _, share, off_s = self._cut or (0, 0.0, 0.0)
-            self._cut = None
-            if is_erase:
-                self.flash.tear_erase(address, share)
-            else:
-                self.flash.tear_program(address, content, share)
+        content = None if asked is Kind.FLASH_ERASE else data[pipes.PLACE.size :]
+        operation = Operation(self.flash.start + offset, content)
+        takes_us, size_bytes = self.facts.erase_us, self.facts.sector_bytes
+        if content is not None:
+            takes_us = len(content) // self.facts.write_bytes * self.facts.write_us
+            size_bytes = len(content)
+        self._count(size_bytes)
+        self._operations += 1
+        if self._cut is not None and self._operations == self._cut[0] + 1:
+            (_, share, off_s), self._cut = self._cut, None
+            self.flash.tear(operation, share)
             self.power_cut(now_us / _US)
             self._due_at = (now_us + share * takes_us) / _US + off_s
             return None
-        if is_erase:
-            self.flash.erase_page(address)
-        else:
-            self.flash.program(address, content)
+        self.flash.carry_out(operation)
         return pipes.TIME.pack(now_us + takes_us)
 
     def _count(self, size_bytes: int) -> None:
@@ -335,8 +326,3 @@ class CompiledDevice(Machine):
                 "the bootloader read, erased, wrote and logged as much as all its flash "
                 f"{_TIMES_OVER} times over in one call, and was ended: it does not seem to return"
             )
-
-    def _is_cut_here(self) -> bool:
-        """Counts flash operations; True for the one at which the power is to be cut."""
-        self._operations += 1
-        return self._cut is not None and self._operations == self._cut[0] + 1

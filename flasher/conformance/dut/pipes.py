@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import astuple
 from enum import Enum
 from struct import Struct
 from typing import Final
@@ -16,7 +17,6 @@ TRANSMIT_FRAMES: Final = 3
 """As FLASHER_TRANSMIT_FRAMES of the header."""
 HEADER: Final = Struct("<B3xI")
 FACTS: Final = Struct("<9I")
-START: Final = Struct("<QI")
 TURN: Final = Struct("<QI")
 FRAME: Final = Struct("<IBBBx8s")
 RANGE: Final = Struct("<II")
@@ -107,12 +107,8 @@ def unpack_frame(data: bytes) -> CanFrame:
 
 def pack_facts(facts: Facts) -> bytes:
     """The content of a message with facts."""
-    numbers = (
-        *(ABI, facts.flash_bytes, facts.sector_bytes, facts.write_bytes),
-        *(facts.application_offset, facts.application_bytes),
-        *(facts.erase_us, facts.write_us, facts.receive_frames),
-    )
-    return FACTS.pack(*numbers) + facts.name.encode()
+    *numbers, _ = astuple(facts)
+    return FACTS.pack(ABI, *numbers) + facts.name.encode()
 
 
 def unpack_facts(data: bytes) -> Facts:
