@@ -1,4 +1,4 @@
-"""Listening to a bus: announcements of a bootloader, and whether a unit is in the socket.
+"""What is heard on a bus: announcements of a bootloader, and whether a unit is in the socket.
 
 Units talk by themselves, announce themselves when their power comes, or are asked for their version
 while the socket is idle; the answer may name the unit's serial number. A target that can do none of
@@ -7,7 +7,7 @@ it is not seen; then only a person knows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Final
 
 from flasher.host.query import Request
@@ -26,7 +26,6 @@ SILENCE_S: Final = 2.0
 """A unit of which nothing was heard for so long is out."""
 PROBE_S: Final = 0.5
 """How often a unit is asked whether it is there."""
-_LOOK_EVERY_S: Final = 0.05
 
 
 class BootWatcher:
@@ -54,43 +53,6 @@ class BootWatcher:
                 self.announcements += 1
                 self.announced_at = now
                 self.version = printable(row.version)
-
-
-class Listen:
-    """An engine that sends nothing, and listens until `enough(now)` or for `limit_s`."""
-
-    def __init__(
-        self, limit_s: float, enough: Callable[[float], bool] = lambda _now: False
-    ) -> None:
-        self._limit_s = limit_s
-        self._enough = enough
-        self._ends_at: float | None = None
-        self._look_at = float("-inf")
-        self.done = False
-
-    def receive(self, frame: Frame, now: float) -> None:
-        self.done = self.done or self._enough(now)  # taps have looked at the frame
-
-    def tick(self, now: float) -> None:
-        if self._ends_at is None:
-            self._ends_at = now + self._limit_s
-        self._look_at = min(now + _LOOK_EVERY_S, self._ends_at)
-        self.done = self.done or now >= self._ends_at or self._enough(now)
-
-    def deadline(self) -> float | None:
-        return None if self.done else self._look_at  # soon: what is enough may be a silence
-
-    def next_frame(self, now: float) -> Frame | None:
-        return None
-
-    def frame_sent(self, now: float) -> None:
-        pass
-
-    def cancel(self, now: float) -> None:
-        self.done = True
-
-    def take_events(self) -> Sequence[object]:
-        return ()
 
 
 class Presence:

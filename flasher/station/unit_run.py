@@ -32,7 +32,6 @@ from flasher.station.messages import (
     StepReport,
 )
 from flasher.station.power import PowerControl
-from flasher.station.presence import Listen
 from flasher.station.recipe import StepRule
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import Measurement, RunState, StepName, StepState
@@ -192,7 +191,7 @@ class UnitRun:
             if rule.power_cycle and self._power is not None:
                 self._power.begin_cycle()
             if rule.pause_s:
-                steps.targets[0].run(Listen(rule.pause_s))
+                steps.targets[0].listen(rule.pause_s)
         except InterruptedByUserError:
             return
         except BusError as error:

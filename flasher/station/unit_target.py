@@ -17,6 +17,7 @@ from flasher.host.identity import DeviceAnswers
 from flasher.host.items import Readable, meaningful_fields
 from flasher.host.options import UpgradeOptions
 from flasher.host.query import Request
+from flasher.host.runner import Runner, Stage
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.contents import Reset
 from flasher.protocol.engine import Engine
@@ -24,9 +25,10 @@ from flasher.protocol.fields import Content
 from flasher.protocol.spec import Command
 from flasher.station.codes import Code
 from flasher.station.power import PowerControl
-from flasher.station.presence import BootWatcher, Listen
+from flasher.station.presence import BootWatcher
 from flasher.station.recipe_file import LoadedTarget
 
+_LOOK_EVERY_S: Final = 0.05
 BURST_QUIET_S: Final = 0.3
 """No further announcement for so long: the burst (4 of them, 50 ms apart) is over."""
 
@@ -101,7 +103,7 @@ class UnitTarget:
         found = self._identify_once()
         if not found.is_in_bootloader or self.version_request is None:
             return found
-        self.run(Listen(self.loaded.profile.timings.announcing_on_s, self._is_quiet))
+        self.listen(self.loaded.profile.timings.announcing_on_s, self._is_quiet)
         if not self._is_quiet(self.clock.now()) or self.await_application() is None:
             return found
         return self._identify_once()
@@ -159,7 +161,7 @@ class UnitTarget:
         def is_over(now: float) -> bool:
             return watcher.announcements > before and self._is_quiet(now)
 
-        self.run(Listen(self.loaded.profile.timings.boot_version_timeout_s, is_over))
+        self.listen(self.loaded.profile.timings.boot_version_timeout_s, is_over)
         if power is not None:
             power.check()
         return watcher.announcements > before
@@ -174,6 +176,16 @@ class UnitTarget:
         """Raises InterruptedByUserError when the run is to end."""
         if self._cancelled():
             raise InterruptedByUserError("The run is to end.")
+
+    def listen(self, limit_s: float, enough: Callable[[float], bool] = lambda _now: False) -> None:
+        """Send nothing, and let time pass until `enough(now)`, or for `limit_s`."""
+
+        def stage(run: Runner[None]) -> Stage[None]:
+            ends_at = run.now + limit_s
+            while run.now < ends_at and not run.is_cancelled and not enough(run.now):
+                yield min(run.now + _LOOK_EVERY_S, ends_at)  # what is enough may be a silence
+
+        self.run(Runner(stage, bitrate_bps=self.loaded.profile.dialect.bitrate_bps))
 
     def run(self, engine: Engine, on_event: Callable[[object], None] | None = None) -> None:
         self.device.run(engine, on_event=on_event)

@@ -50,8 +50,6 @@ if TYPE_CHECKING:
 _SYNCHRONOUS_FULL: Final = 2
 _IMMEDIATE: Final = "flasher_immediate"
 _POSTGRESQL: Final = "postgresql+psycopg"
-_WRITER_LOCK: Final = 7052
-"""Of the server's advisory locks; a table's lock would need rights that a station has not."""
 _OPENED: Final = "flasher_file"
 """Which file a connection has open."""
 
@@ -145,6 +143,7 @@ class Database:
                 if self.backend == "postgresql":
                     for name in locks:
                         connection.execute(
+                            # A table's lock would need rights that a station has not.
                             text("SELECT pg_advisory_xact_lock(7052, hashtext(:name))"),
                             {"name": name},
                         )
@@ -366,31 +365,27 @@ def _check_version(database: Database, now: datetime, *, create: bool) -> None:
 
 def _create(database: Database, now: datetime) -> None:
     """All tables and triggers in one transaction, unless another process was faster."""
-    shown = database.location.shown
-    with mapped(shown, writes=True), database.engine.connect() as bare:
-        connection = bare.execution_options(**{_IMMEDIATE: True})
-        with connection.begin():
-            if database.backend == "postgresql":
-                connection.execute(text(f"SELECT pg_advisory_xact_lock({_WRITER_LOCK})"))
-                # Of the functions of the triggers: temporary tables stand behind the records.
-                connection.execute(
-                    text(
-                        "SELECT set_config('search_path',"
-                        " quote_ident(current_schema()) || ', pg_temp', true)"
-                    )
-                )
-            if inspect(connection).has_table(schema_info.name):
-                return
-            metadata.create_all(connection)
-            for statement in trigger_statements(database.backend):
-                connection.exec_driver_sql(statement)
+    with database.writing("creation") as connection:
+        if database.backend == "postgresql":
+            # Of the functions of the triggers: temporary tables stand behind the records.
             connection.execute(
-                schema_info.insert().values(
-                    version=SCHEMA_VERSION, created_at=utc_text(now), records_id=uuid4().hex
+                text(
+                    "SELECT set_config('search_path',"
+                    " quote_ident(current_schema()) || ', pg_temp', true)"
                 )
             )
-        if database.location.file is not None:
-            sync_folder(database.location.file.parent)
+        if inspect(connection).has_table(schema_info.name):
+            return
+        metadata.create_all(connection)
+        for statement in trigger_statements(database.backend):
+            connection.exec_driver_sql(statement)
+        connection.execute(
+            schema_info.insert().values(
+                version=SCHEMA_VERSION, created_at=utc_text(now), records_id=uuid4().hex
+            )
+        )
+    if database.location.file is not None:
+        sync_folder(database.location.file.parent)
 
 
 def make_backup(database: Database, files: FileStore, path: Path) -> Backup:
