@@ -83,15 +83,12 @@ class Journal(Protocol):
 
     def intent(self, target: str, what: str, value: str) -> WriteId:
         """Before a write to the device."""
-        ...
 
     def verified(self, write_id: WriteId, read_back: str | None) -> None:
         """After it; `read_back` is None when nothing could be read back."""
-        ...
 
     def step(self, report: StepReport) -> None:
         """A try of a step ended."""
-        ...
 
 
 def write_key(target: str, item: str) -> str:

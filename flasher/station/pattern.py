@@ -55,7 +55,6 @@ class Pattern:
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """The names of its groups."""
         return tuple(self._compiled.groupindex)
 
     def match(self, text: str) -> dict[str, str] | None:

@@ -167,16 +167,13 @@ class Crew:
 
     @property
     def codes(self) -> frozenset[str]:
-        """What the badges say."""
         return frozenset(self._people)
 
     @property
     def people(self) -> tuple[Person, ...]:
-        """Everybody with a badge."""
         return tuple(self._people.values())
 
     def find(self, text: str) -> Person | None:
-        """Whose badge it is."""
         return self._people.get(text)
 
     def may_be_pin(self, text: str) -> bool:

@@ -28,11 +28,9 @@ class PowerControl(Protocol):
 
     def begin_cycle(self) -> None:
         """Begin; returns at once. Raises BusError when the one before failed."""
-        ...
 
     def check(self) -> None:
         """Raises BusError when a cycle failed."""
-        ...
 
 
 class PowerCommand:

@@ -63,7 +63,6 @@ class TargetTable(Table):
 
     @property
     def device(self) -> Target:
-        """The target itself."""
         return TARGETS[self.target]
 
 
@@ -150,7 +149,6 @@ class Verify(StrEnum):
 
     @property
     def level(self) -> Verified:
-        """The level of the records."""
         return Verified[self.name]
 
 

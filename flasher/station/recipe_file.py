@@ -60,12 +60,10 @@ class LoadedTarget:
 
     @property
     def target(self) -> Target:
-        """The device."""
         return self.firmware.device
 
     @property
     def name(self) -> str:
-        """The target's name."""
         return self.firmware.target
 
     @property

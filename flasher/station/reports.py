@@ -44,7 +44,6 @@ class Report:
         }
 
     def to_json(self) -> str:
-        """The report as a JSON document."""
         return json.dumps(self.to_dict(), indent=1) + "\n"
 
     def to_csv(self) -> str:

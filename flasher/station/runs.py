@@ -18,6 +18,7 @@ from flasher.station.messages import Finished, RunOrder, RunResult, flash_value,
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.errors import RuleBrokenError
 from flasher.station.records.model import (
+    FLASH,
     TORN_TRACE,
     TRACE,
     AttachmentFile,
@@ -137,7 +138,6 @@ def _forget_spooled(run: ActiveRun) -> None:
 
 
 _OPEN: Final = frozenset({RunState.INTERRUPTED, RunState.ERROR, RunState.ABORTED})
-FLASH: Final = "flash"
 
 
 def with_history(

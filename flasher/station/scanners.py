@@ -37,7 +37,6 @@ class Reads(Protocol):
 
     def read(self, limit_s: float) -> None:
         """Take what it has scanned; waits for it up to `limit_s`."""
-        ...
 
     def close(self) -> None: ...
 

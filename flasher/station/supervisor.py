@@ -30,25 +30,20 @@ class Port(Protocol):
     @property
     def waitable(self) -> Any:
         """For `multiprocessing.connection.wait`; None where there is nothing to wait for."""
-        ...
 
     def send(self, message: ToWorker) -> bool:
         """False when the process is gone."""
-        ...
 
     def receive(self) -> FromWorker | None:
         """The next message, None when there is none. Raises EOFError or OSError when the process is
         gone.
         """
-        ...
 
     def kill(self) -> None:
         """End the process at once, and wait for its end."""
-        ...
 
     def join(self, limit_s: float) -> bool:
         """Wait for its own end; False when it did not come."""
-        ...
 
 
 class ProcessPort:

@@ -20,8 +20,6 @@ from flasher.station.recipe_file import LoadedRecipe, codec_of, readable_of
 from flasher.station.records.model import Measurement, RunKind, StepName
 from flasher.station.unit_target import Identified, StepFailedError, UnitTarget
 
-SERIAL_ITEM: Final = "serial-number"
-"""The item that gives a unit its number."""
 BEFORE: Final = "before "
 """Begins the names of measurements of what must not change."""
 OF_CHECK: Final = {
@@ -74,7 +72,6 @@ def said_of(name: str, found: Identified) -> list[Measurement]:
 
 
 def state_words(target: UnitTarget, found: Identified) -> str:
-    """The state of a device in words."""
     if found.is_in_bootloader:
         return f"in its bootloader {target.watcher.version}".strip()
     if found.seen.version is None:

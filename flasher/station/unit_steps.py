@@ -26,10 +26,16 @@ from flasher.station import codes
 from flasher.station.messages import Journal, RunOrder, flash_value, write_key
 from flasher.station.power import PowerControl
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.records.model import Measurement, RunKind, StepName, Verified
+from flasher.station.records.model import (
+    FLASH,
+    SERIAL_NUMBER,
+    Measurement,
+    RunKind,
+    StepName,
+    Verified,
+)
 from flasher.station.unit_checks import (
     OF_CHECK,
-    SERIAL_ITEM,
     UnitReads,
     check_measured,
     check_texts,
@@ -145,7 +151,7 @@ class UnitSteps:
             try:
                 self._recipe.recipe.serial_number.read(own)
             except ValueError:
-                if any(plan.writable.name == SERIAL_ITEM for plan in self._plans):
+                if any(plan.writable.name == SERIAL_NUMBER for plan in self._plans):
                     continue  # it gets its number in this run
             raise StepFailedError(
                 codes.WRONG_UNIT,
@@ -200,7 +206,7 @@ class UnitSteps:
         ):
             return "flashed before the interruption, and the device names the version"
         value = flash_value(target.loaded.version, target.image.sha256)
-        write = self._journal.intent(name, "flash", value)
+        write = self._journal.intent(name, FLASH, value)
         self._progress(0.0)
         try:
             result = self._upgrade(target, at_power_up=target.is_silent(found))

@@ -27,7 +27,7 @@ from flasher.station.config import MockUnits
 from flasher.station.messages import PresenceChanged, VirtualUnits
 from flasher.station.recipe import SerialNumber
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.unit_checks import SERIAL_ITEM
+from flasher.station.records.model import SERIAL_NUMBER
 
 NO_NUMBER: Final = "NONE"
 """What a new unit has for a serial number."""
@@ -167,7 +167,7 @@ class VirtualSocket:
         """What the unit says that it is: none yet where the recipe gives it its number, else what
         its label says, as far as it has room for it.
         """
-        if any(write.item == SERIAL_ITEM for write in self._recipe.recipe.write):
+        if any(write.item == SERIAL_NUMBER for write in self._recipe.recipe.write):
             return NO_NUMBER
         try:
             encode_text(label, VERSION_FIELD_SIZE)

@@ -73,15 +73,12 @@ class Channel(Protocol):
 
     def send(self, obj: Any, /) -> None:
         """Raises OSError when the station is gone."""
-        ...
 
     def recv(self) -> Any:
         """Raises EOFError when the station is gone."""
-        ...
 
     def poll(self, timeout: float = 0.0) -> bool:
         """True when there is something to receive, or the station is gone."""
-        ...
 
 
 class StationGoneError(Exception):
@@ -350,7 +347,6 @@ def load_same(setup: WorkerSetup) -> LoadedRecipe:
 
 
 def worker_main(channel: Channel, setup: WorkerSetup) -> None:
-    """Main function of the process."""
     # Ctrl-C and a closed terminal are the station's business: it tells its processes what to do.
     for name in ("SIGINT", "SIGHUP"):  # Windows has no SIGHUP
         if hasattr(signal, name):

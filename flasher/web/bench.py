@@ -74,19 +74,15 @@ class Workplace(Protocol):
 
     def adapters(self, cancelled: Callable[[], bool]) -> Sequence[Adapter]:
         """What there is now."""
-        ...
 
     def use(self, adapter: Adapter) -> None:
         """This one was chosen."""
-        ...
 
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
         """Open it. With `asks` False nothing will be sent."""
-        ...
 
     def model_area(self) -> Area | None:
         """The memory of a device model; None of devices."""
-        ...
 
     def back_up(
         self,
@@ -97,27 +93,21 @@ class Workplace(Protocol):
         cancelled: Callable[[], bool],
     ) -> Saved:
         """Save what the battery tells, and the memory of an area, to a file of its own."""
-        ...
 
     def profile(self, target: Target) -> Profile:
         """What the product does its own way."""
-        ...
 
     def bitrate_bps(self, adapter: Adapter) -> int:
         """What its bus runs at."""
-        ...
 
     def images(self) -> Sequence[Path]:
         """Files that may be images."""
-        ...
 
     def dropped(self) -> Sequence[str]:
         """Names of images and manifests that were dropped on the page."""
-        ...
 
     def use_folder(self, path: str) -> None:
         """Offer the images of this folder."""
-        ...
 
     def upgrade(
         self,
@@ -128,7 +118,6 @@ class Workplace(Protocol):
         cancelled: Callable[[], bool],
     ) -> Carried:
         """Carry out an upgrade, to its end, and keep what is to be kept of it."""
-        ...
 
 
 class Bench:

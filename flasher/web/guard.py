@@ -12,7 +12,7 @@ from __future__ import annotations
 import hmac
 import secrets
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, Final
@@ -76,6 +76,22 @@ class Badges:
     """True for the path of a page that is for supervisors."""
     are_for_all: bool
     """True where the other pages need a badge too: any."""
+
+
+@dataclass(frozen=True)
+class _Rights:
+    """What who signs in has to say, and how a session shows that it was said."""
+
+    password: str
+    badges: Badges | None
+    signed: str
+    now: Callable[[], float]
+
+    def has_signed(self, session: Mapping[str, Any]) -> bool:
+        return bool(session.get("is_in") == self.signed)
+
+    def is_supervised(self, path: str) -> bool:
+        return self.badges is not None and self.badges.is_supervised(path)
 
 
 _IN: Final = "in"
@@ -143,7 +159,8 @@ def application(  # noqa: PLR0913  the name and the rights of a server
     where password or badges are others, so that people sign in again;
     `uploads` gives the limit of a path's body in bytes.
     """
-    login = _Login(pages, password, badges, signed, now)
+    rights = _Rights(password, badges, signed, now)
+    login = _Login(pages, rights)
     entries = [] if entry is None else [Route(_ENTER, entry.take), Route(_CLOSED, entry.refuse)]
     asks = bool(password) or (badges is not None and badges.are_for_all)
     refused_to = _LOGIN if asks else "" if entry is None else _CLOSED
@@ -165,7 +182,7 @@ def application(  # noqa: PLR0913  the name and the rights of a server
         routes=[*own, *routes],
         middleware=[
             session,
-            Middleware(_Sessions, refused_to=refused_to, badges=badges, signed=signed, now=now),
+            Middleware(_Sessions, rights=rights, refused_to=refused_to),
         ],
     )
     return _Guard(inner, hosts, uploads)
@@ -241,20 +258,10 @@ class _Sessions:
     or used the entry, where there is one: others are sent to `refused_to`.
     """
 
-    def __init__(
-        self,
-        app: ASGIApp,
-        *,
-        refused_to: str,
-        badges: Badges | None,
-        signed: str,
-        now: Callable[[], float],
-    ) -> None:
+    def __init__(self, app: ASGIApp, *, rights: _Rights, refused_to: str) -> None:
         self._app = app
-        self._signed = signed
+        self._rights = rights
         self._refused_to = refused_to
-        self._badges = badges
-        self._now = now
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         session: dict[str, Any] = scope["session"]
@@ -263,7 +270,8 @@ class _Sessions:
         if to := "" if path.startswith(_OPEN) else self._refused(path, session):
             if to == _LOGIN and scope["method"] == "GET":
                 # One slash alone: two would begin the name of another computer.
-                session["wanted"] = "/" + path.lstrip("/\\") + _query(scope)
+                query = scope["query_string"].decode("latin-1")[:_QUERY_MAX]
+                session["wanted"] = "/" + path.lstrip("/\\") + (f"?{query}" if query else "")
             is_stream = path.endswith("/events")
             refusal = Response(status_code=401) if is_stream else RedirectResponse(to, 303)
             await refusal(scope, receive, send)
@@ -277,13 +285,14 @@ class _Sessions:
 
     def _refused(self, path: str, session: dict[str, Any]) -> str:
         """Where who may not see this page is sent to; "" for who may."""
-        if self._refused_to and session.get("is_in") != self._signed:
+        rights = self._rights
+        if self._refused_to and not rights.has_signed(session):
             return self._refused_to
-        if self._badges is None or not self._badges.is_supervised(path):
+        if not rights.is_supervised(path):
             return ""
-        if session.get("is_in") != self._signed:
+        if not rights.has_signed(session):
             return _LOGIN
-        now = self._now()
+        now = rights.now()
         # A clock that began anew, after a restart of the computer, says nothing of before.
         if not 0.0 <= now - session.get("supervised_at", -_SUPERVISES_S) < _SUPERVISES_S:
             return _LOGIN
@@ -291,28 +300,13 @@ class _Sessions:
         return ""
 
 
-def _query(scope: Scope) -> str:
-    query = scope["query_string"].decode("latin-1")[:_QUERY_MAX]
-    return f"?{query}" if query else ""
-
-
 class _Login:
     """The page that asks for the password, or for a badge."""
 
-    def __init__(
-        self,
-        pages: Pages,
-        password: str,
-        badges: Badges | None,
-        signed: str,
-        now: Callable[[], float],
-    ) -> None:
+    def __init__(self, pages: Pages, rights: _Rights) -> None:
         self._pages = pages
-        self._password = password
-        self._signed = signed
-        self._badges = badges
-        self._now = now
-        self._tries = Tries(now)
+        self._rights = rights
+        self._tries = Tries(rights.now)
 
     async def show(self, request: Request) -> Response:
         return self._show(request)
@@ -327,8 +321,9 @@ class _Login:
             status=status,
             trouble=trouble,
             badge=badge,
-            asks_password=bool(self._password) and request.session.get("is_in") != self._signed,
-            asks_badge=self._badges is not None,
+            asks_password=bool(self._rights.password)
+            and not self._rights.has_signed(request.session),
+            asks_badge=self._rights.badges is not None,
             is_for_supervisors=self._is_supervised(request),
         )
 
@@ -341,28 +336,27 @@ class _Login:
             return RedirectResponse(_LOGIN, 303)
         if self._tries.are_used_up:
             return self._show(request, say("Too many wrong tries: wait a minute."), 429)
-        role = None
-        badges = self._badges if badge else None
+        role, rights = None, self._rights
+        badges = rights.badges if badge else None
         if badges is not None:
             # Beside the loop that serves all pages: it takes its time.
             find = partial(badges.role_of, badge.strip()[:_BADGE_MAX], pin[:_BADGE_MAX])
             role = await run_sync(find)
-        is_password = hmac.compare_digest(password.encode(), self._password.encode())
+        is_password = hmac.compare_digest(password.encode(), rights.password.encode())
         # Beside the right password too, a wrong badge is a wrong try: else PINs could be guessed.
-        if role is None and (badges is not None or not (self._password and is_password)):
+        if role is None and (badges is not None or not (rights.password and is_password)):
             self._tries.was_wrong()
             if badge and not pin:  # a scanner ends what it types by Enter
                 return self._show(request, say("Type the PIN of the badge."), 403, badge=badge)
             return self._show(request, say("That is not it."), 403)
         if role is not None and role is not Role.SUPERVISOR and self._is_supervised(request):
             return self._show(request, say("That badge is no supervisor's."), 403)
-        if request.session.get("is_in") != self._signed:
+        if not rights.has_signed(request.session):
             request.session.pop("supervised_at", None)  # by badges that may be others now
-        request.session["is_in"] = self._signed
+        request.session["is_in"] = rights.signed
         if role is Role.SUPERVISOR:
-            request.session["supervised_at"] = self._now()
+            request.session["supervised_at"] = rights.now()
         return RedirectResponse(request.session.get("wanted", "/"), 303)
 
     def _is_supervised(self, request: Request) -> bool:
-        wanted = str(request.session.get("wanted", "/")).partition("?")[0]
-        return self._badges is not None and self._badges.is_supervised(wanted)
+        return self._rights.is_supervised(str(request.session.get("wanted", "/")).partition("?")[0])

@@ -126,7 +126,6 @@ class Kept:
         return Answer(packed.getvalue(), _ZIP, file_name=f"{path.name}.zip")
 
     def backup(self, question: Question) -> Answer:
-        """A backup."""
         found = {each.name: each for each in self._backups()}
         path = _known(found, question.fields.get("name", ""))
         return Answer(path.read_bytes(), _ZIP, file_name=path.name)

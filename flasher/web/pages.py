@@ -50,7 +50,6 @@ class Pages:
         )
 
     def words_of(self, request: Request) -> Words:
-        """The language of a request."""
         accepted = request.headers.get("accept-language", "").replace(" ", "").split(",")
         wanted = request.query_params.get("lang")
         if self._remembers_language:

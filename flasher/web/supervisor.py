@@ -349,18 +349,14 @@ class Supervisor:
         chosen, span = self._figured(question)
         found = self.overview.step_times(chosen)
         order = {step.value: at for at, step in enumerate(StepName)}
-        rows = []
-        for name, counts in sorted(
-            found.items(), key=lambda item: order.get(item[0].split()[0], 99)
-        ):
-            ranked = Counter(dict(sorted(counts.items())))
-            rows.append(
-                (
-                    name,
-                    Distribution.of(ranked.elements()),
-                    {kind: histogram(counts, width) for kind, width in WIDTHS.items()},
-                )
+        rows = [
+            (
+                name,
+                Distribution.of(Counter(dict(sorted(found[name].items()))).elements()),
+                {kind: histogram(found[name], width) for kind, width in WIDTHS.items()},
             )
+            for name in sorted(found, key=lambda name: order.get(name.split()[0], 99))
+        ]
         return self._page(
             question,
             "times.html",

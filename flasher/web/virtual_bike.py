@@ -131,7 +131,6 @@ class VirtualBike:
             device.set(PowerCut(None), InOperation(job.plan.total_packets // 2))
 
     def happened(self, event: object) -> None:
-        """Something happened in the upgrade."""
         job = self._job
         match event:
             case events.PowerCycleAwaited() if job is not None:

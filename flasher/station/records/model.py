@@ -185,6 +185,10 @@ class Measurement:
         )
 
 
+FLASH: Final = "flash"
+"""What the transfer of an image is called among the writes to a target."""
+SERIAL_NUMBER: Final = "serial-number"
+"""What a write of the serial number is called: that of its item."""
 TRACE: Final = "trace"
 """Kind of the attachment: the whole trace of the bus."""
 TORN_TRACE: Final = "torn-trace"

@@ -21,6 +21,7 @@ from flasher.station.records import schema
 from flasher.station.records.chain import data_of
 from flasher.station.records.database import Database
 from flasher.station.records.model import (
+    FLASH,
     RunDetails,
     RunFilter,
     RunId,
@@ -31,7 +32,6 @@ from flasher.station.records.model import (
     utc_moment,
     utc_text,
 )
-from flasher.station.records.proof import FLASH
 from flasher.station.records.queries import JUDGED, details_of, filtered, joined, run_query
 
 PAGE_SIZE: Final = 50
@@ -152,7 +152,6 @@ class Overview:
         self._database = database
 
     def runs(self, chosen: RunFilter, cut: Cut, size: int = PAGE_SIZE) -> Page[RunRecord]:
-        """A page of the runs of a filter."""
         run_id = schema.run.c.id
         query = filtered(run_query(schema.run.c.verification_reached.label("verified")), chosen)
         rows, older, newer = self._cut(query, run_id, cut, size)
@@ -160,14 +159,12 @@ class Overview:
         return Page(_RUNS.validate_python(rows), older, newer)
 
     def parts(self, serial: str) -> tuple[str, ...]:
-        """The parts of the units with this serial number."""
         unit = schema.unit.c
         query = select(unit.part).where(unit.serial == serial).order_by(unit.part)
         with self._database.reading() as connection:
             return tuple(connection.execute(query).scalars())
 
     def life(self, serial: str, part: str, cut: Cut, size: int = LIFE_SIZE) -> Page[RunDetails]:
-        """A page of the runs of a unit, with their parts."""
         run_id = schema.run.c.id
         query = filtered(joined(run_id), RunFilter(serial=serial, part=part))
         rows, older, newer = self._cut(query, run_id, cut, size)
@@ -176,7 +173,6 @@ class Overview:
         return Page(found[::-1], older, newer)
 
     def recipes(self) -> tuple[tuple[str, str], ...]:
-        """Names and parts of the recipes."""
         recipe = schema.recipe.c
         query = select(recipe.name, recipe.part).distinct().order_by(recipe.name, recipe.part)
         with self._database.reading() as connection:
@@ -245,7 +241,6 @@ class Overview:
     # -- figures over time ------------------------------------------------------------------------
 
     def yields(self, chosen: RunFilter, spans: Sequence[Span]) -> list[SpanYield]:
-        """The yield in each of these spans."""
         run, first, last = schema.run.c, schema.run.alias(), schema.run.alias()
         found: dict[int, SpanYield] = {}
         for begin in range(0, len(spans), _SPANS_AT_ONCE):

@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
-from typing import Final
 
 from flasher.host.options import firmware_version
 from flasher.protocol import catalogue, messages
@@ -20,11 +19,7 @@ from flasher.protocol.spec import TARGETS, Node, Target, can_id, packet_count
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Message, Reassembler
-from flasher.station.records.model import RunDetails, TargetRecord, Verified
-
-FLASH: Final = "flash"
-SERIAL: Final = "serial-number"
-"""What a write of the serial number is called."""
+from flasher.station.records.model import FLASH, SERIAL_NUMBER, RunDetails, TargetRecord, Verified
 
 
 @dataclass
@@ -139,7 +134,7 @@ def contradictions(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Ite
             yield f"it is of the unit {printable(said.serial)}, not of {printable(run.serial)}"
     for write in details.writes:
         said = traces.get(write.target)
-        if write.what == SERIAL and said is not None:
+        if write.what == SERIAL_NUMBER and said is not None:
             if said.written_serial != run.serial:
                 yield f"the serial number {printable(run.serial)} is not written in it"
             if not said.serial:

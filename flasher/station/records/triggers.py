@@ -203,7 +203,6 @@ RULES: Final = tuple(_rules())
 
 
 def trigger_statements(dialect: str) -> list[str]:
-    """The SQL that makes the triggers."""
     statements = _statements(dialect, RULES)
     if dialect == "postgresql":
         # TRUNCATE deletes all rows, and no trigger of a row sees it; SQLite has no such command.
