@@ -25,6 +25,8 @@ from flasher.station.label_template import LabelTemplate
 
 BACKLOG_MAX: Final = 100
 """Labels that wait for a printer; more are refused."""
+_IS_WINDOWS: Final = os.name == "nt"
+"""There a file cannot be waited for."""
 Send = Callable[[bytes, float], None]
 """Sends a label to the printer within a time in seconds. Raises NotPrinted."""
 
@@ -141,19 +143,13 @@ def write_file(path: Path, data: bytes, limit_s: float) -> None:
         try:
             while data:
                 left_s = until - time.monotonic()
-                if left_s <= 0 or not _can_write(handle, left_s):
+                if left_s <= 0 or not (_IS_WINDOWS or select.select([], [handle], [], left_s)[1]):
                     raise _too_slow(limit_s)
                 data = data[os.write(handle, data) :]
         finally:
             os.close(handle)
     except OSError as error:
         raise _unreachable(error) from error
-
-
-def _can_write(handle: int, limit_s: float) -> bool:
-    if os.name == "nt":
-        return True
-    return bool(select.select([], [handle], [], limit_s)[1])
 
 
 def run_command(words: Sequence[str], data: bytes, limit_s: float) -> None:

@@ -123,14 +123,10 @@ def _check(form: str, is_right: Callable[[str], bool]) -> Callable[[str], bool]:
     return lambda text: re.fullmatch(form, text) is not None and is_right(text)
 
 
-def _gtin(text: str) -> bool:
-    """Of any length: stdnum's `is_valid` knows no SSCC."""
-    return bool(ean.calc_check_digit(text[:-1]) == text[-1])
-
-
 CHECKS: Final = {
     "luhn": _check("[0-9]{2,}", luhn.is_valid),
-    "gtin": _check("[0-9]{2,}", _gtin),
+    # Of any length: stdnum's `is_valid` knows no SSCC.
+    "gtin": _check("[0-9]{2,}", lambda text: bool(ean.calc_check_digit(text[:-1]) == text[-1])),
     "mod11-2": _check("[0-9]{2,}[0-9X]", mod_11_2.is_valid),
     "mod11-10": _check("[0-9]{2,}", mod_11_10.is_valid),
     "mod37-2": _check("[0-9A-Z]{2,}[0-9A-Z*]", mod_37_2.is_valid),

@@ -73,7 +73,12 @@ def save(store: Store, run: ActiveRun, now_s: Callable[[], float]) -> RunResult:
         # The records know better: it is no PASS. That is a bug, and the unit is not judged.
         run.result = _worse(run.result, codes.INTERNAL, error.what)
         store.finish(run.claim.run_id, _ending(run, run.result))
-    _forget_spooled(run)
+    spooled = [run.trace]
+    if run.finished is not None and run.finished.trace is not None:
+        spooled.append(run.finished.trace.path)
+    for path in spooled:  # the records have their own copy
+        with suppress(OSError):
+            path.unlink(missing_ok=True)
     return run.result
 
 
@@ -125,16 +130,6 @@ def verified_words(result: RunResult) -> str:
 
 def _worse(result: RunResult, code: Code, text: str) -> RunResult:
     return replace(result, outcome=code.outcome, code=code.name, text=text, verified={})
-
-
-def _forget_spooled(run: ActiveRun) -> None:
-    """Delete the spooled trace: the records have their own copy."""
-    paths: list[Path] = [run.trace]
-    if run.finished is not None and run.finished.trace is not None:
-        paths.append(run.finished.trace.path)
-    for path in paths:
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
 
 
 _OPEN: Final = frozenset({RunState.INTERRUPTED, RunState.ERROR, RunState.ABORTED})

@@ -123,9 +123,10 @@ def place(sockets: Sockets, serial: str) -> tuple[Socket, Binding] | None:
     if len(sockets) == 1:
         (only,) = sockets.values()
         return only, _why_only(only, serial)
-    found = _where_it_is(sockets, serial)
-    if found is not None:
-        return found, Binding.SAID
+    idle = [e for e in sockets.values() if e.can_work and e.phase is Phase.REST]
+    said = [each for each in idle if each.is_there and each.own == serial]
+    if len(said) == 1:
+        return said[0], Binding.SAID
     starting = next((each for each in sockets.values() if each.is_starting), None)
     if starting is not None:
         raise Refused(
@@ -175,13 +176,6 @@ def _why_only(only: Socket, serial: str) -> Binding:
             say("Take it out, scan FREE {socket}, then the label again.", socket=only.name),
         )
     return Binding.ONLY
-
-
-def _where_it_is(sockets: Sockets, serial: str) -> Socket | None:
-    """The idle socket whose unit reports this serial number."""
-    idle = [e for e in sockets.values() if e.can_work and e.phase is Phase.REST]
-    said = [each for each in idle if each.is_there and each.own == serial]
-    return said[0] if len(said) == 1 else None
 
 
 def check_free(socket: Socket) -> None:

@@ -56,7 +56,6 @@ from flasher.station.messages import (
     PresenceChanged,
     Ready,
     Reply,
-    RunEvent,
     RunOrder,
     RunResult,
     StepReport,
@@ -339,8 +338,10 @@ class Station:
                 self._feed(socket, message)
             case Ask(number, what):
                 self._answer(socket, number, what)
-            case StepStarted() | Progressed() | OperatorPrompted():
-                self._pass_on(socket, message)
+            case StepStarted() | Progressed() | OperatorPrompted() if socket in self._runs:
+                if isinstance(message, StepStarted):
+                    self._runs[socket].where = f"{message.step.value} {message.target}".strip()
+                self.tell(replace(message, socket=socket))
             case Finished():
                 self.supervisor.worked(socket)
                 self._end(socket, message)
@@ -480,13 +481,6 @@ class Station:
                 report.target,
             )
         )
-
-    def _pass_on(self, socket: str, event: RunEvent) -> None:
-        run = self._runs.get(socket)
-        if run is not None:
-            if isinstance(event, StepStarted):
-                run.where = f"{event.step.value} {event.target}".strip()
-            self.tell(replace(event, socket=socket))
 
     # -- its end ----------------------------------------------------------------------------------
 

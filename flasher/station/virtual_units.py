@@ -73,21 +73,16 @@ def serial_numbers(rule: SerialNumber, first: int, step: int) -> Iterator[str]:
             size = place.end() - place.start()
             digits = f"{number % 10**size:0{size}d}"
             serial = rule.example[: place.start()] + digits + rule.example[place.end() :]
-            if _fits(rule, serial):
-                yield serial
-                break
+            try:
+                rule.read(serial)
+            except ValueError:
+                continue
+            yield serial
+            break
     raise UsageError(
         "There are no serial numbers for further virtual units.",
         remedy="End the serial number of the recipe with a number, or begin anew.",
     )
-
-
-def _fits(rule: SerialNumber, serial: str) -> bool:
-    try:
-        rule.read(serial)
-    except ValueError:
-        return False
-    return True
 
 
 def next_number(rule: SerialNumber, known: set[str]) -> int:

@@ -85,11 +85,12 @@ class Shelf:
         found: list[Path] = []
         for folder in (self._dropped, self.folder):
             if folder.is_dir():
-                found += sorted(each for each in folder.iterdir() if self._may_be_image(each))
+                found += sorted(
+                    each
+                    for each in folder.iterdir()
+                    if each.suffix.lower() in self._suffixes and each.is_file()
+                )
         return found[:_FILES_MAX]
-
-    def _may_be_image(self, path: Path) -> bool:
-        return path.suffix.lower() in self._suffixes and path.is_file()
 
     def dropped(self) -> list[str]:
         """Names of dropped images and manifests."""

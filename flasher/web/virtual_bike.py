@@ -138,10 +138,7 @@ class VirtualBike:
                 if device is not None:
                     device.set(PowerCut(_HAND_S), AtTime(self._clock.now() + _HAND_S))
             case events.PacketAcknowledged(number, total, _) if number == total // 2:
-                self._in_the_middle(job)
-
-    def _in_the_middle(self, job: Job | None) -> None:
-        if self._fault is Fault.PULLED:
-            self._bus.unplug()
-        elif self._fault is Fault.SECOND_TOOL and job is not None:
-            self._bus.link().send(Frame(job.plan.target.request_id, _FOREIGN))
+                if self._fault is Fault.PULLED:
+                    self._bus.unplug()
+                elif self._fault is Fault.SECOND_TOOL and job is not None:
+                    self._bus.link().send(Frame(job.plan.target.request_id, _FOREIGN))

@@ -101,7 +101,13 @@ class Claiming:
         order, loaded, connection = self._order, self._order.loaded, self._connection
         self._check_free()
         self._check_nature()
-        before, count = self._unit_before()
+        last = connection.execute(
+            select(run.c.state)
+            .where(run.c.unit_id == self._unit_id)
+            .order_by(run.c.id.desc())
+            .limit(1)
+        ).scalar_one_or_none()
+        before = UnitState.after(None if last is None else RunState(last))
         kind = self._kind(before)
         run_id = insert(
             connection,
@@ -144,7 +150,7 @@ class Claiming:
         digests = digests_of(connection, [run_id])[run_id]
         data = {"serial": order.serial, "digests": {name: digests[name] for name in CLAIM_PARTS}}
         self._trail.append(self._now, chain.CLAIMED, data, run_id)
-        return Claim(RunId(run_id), kind, order.serial, order.part, before, count)
+        return Claim(RunId(run_id), kind, order.serial)
 
     def _recipe_id(self) -> int:
         """The recipe's row; it holds the whole text, so that it can be read years later."""
@@ -236,12 +242,6 @@ class Claiming:
                 ),
                 remedy=say("Keep records of virtual units apart, in a database of their own."),
             )
-
-    def _unit_before(self) -> tuple[UnitState, int]:
-        """The unit's state, and how many runs it had."""
-        query = select(run.c.state).where(run.c.unit_id == self._unit_id).order_by(run.c.id)
-        states = self._connection.execute(query).scalars().all()
-        return UnitState.after(RunState(states[-1]) if states else None), len(states)
 
     def _kind(self, before: UnitState) -> RunKind:
         """What kind of run it is. Raises ClaimRefusedError."""

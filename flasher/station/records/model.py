@@ -158,9 +158,6 @@ class Claim:
     run_id: RunId
     kind: RunKind
     serial: str
-    part: str
-    unit_before: UnitState
-    runs_before: int
 
 
 @dataclass(frozen=True)

@@ -93,11 +93,16 @@ def traces_of_targets(
 ) -> dict[str, TraceOfTarget]:
     """What a trace shows of these targets."""
     traces = {name: TraceOfTarget(TARGETS[name]) for name in targets if name in TARGETS}
+    # The CAN ids on which a node speaks.
+    ids_of = {
+        node: [can_id(node, receiver) for receiver in (None, *Node) if receiver is not node]
+        for node in Node
+    }
     timeout_s = DEFAULT_TIMINGS.inter_frame_timeout_s
     streams = {
         of_id: (Reassembler(of_id, timeout_s), each)
         for each in traces.values()
-        for of_id in (each.target.request_id, *_ids_of(each.target.node))
+        for of_id in (each.target.request_id, *ids_of[each.target.node])
     }
     for at_s, frame in frames:
         if not frame.is_payload or frame.can_id not in streams:
@@ -108,11 +113,6 @@ def traces_of_targets(
             if isinstance(message, Message):
                 each.take(message)
     return traces
-
-
-def _ids_of(node: Node) -> list[int]:
-    """The CAN ids on which a node speaks."""
-    return [can_id(node, receiver) for receiver in (None, *Node) if receiver is not node]
 
 
 def contradictions(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Iterator[str]:

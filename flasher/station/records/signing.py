@@ -72,7 +72,16 @@ class Signer:
         Raises KeyMissingError; RecordsCutError for records that lack rows of which the heads are
         kept; RecordError.
         """
-        self._check_cut()
+        kept = self._kept()
+        if kept and not self._is_there(kept[-1]):
+            raise RecordsCutError(
+                f"These records lack what {self._station} wrote up to {kept[-1].at}: they are an"
+                " older copy, or their end was cut off.",
+                where=self._database.location.shown,
+                cause=f"audit row {kept[-1].number} is kept in {self.heads_file.path}",
+                remedy="Put the right records back (flasher station verify names what is missing);"
+                " if they are lost: flasher station accept restored.",
+            )
         self._load()
 
     @contextmanager
@@ -89,7 +98,11 @@ class Signer:
             trail = chain.Trail(connection, self._station, self._key)
             yield trail
         self._unkept += trail.heads
-        self._keep_heads()
+        with self._heads_lock:
+            some = list(self._unkept)  # those of earlier commits too that could not be kept
+            if some:
+                self.heads_file.append(some)
+                del self._unkept[: len(some)]
 
     def rotate(self, operator: str) -> None:
         """Sign with a new key from now on. The one before is deleted."""
@@ -165,14 +178,6 @@ class Signer:
             following.replace(path)
         self._key = loaded
 
-    def _keep_heads(self) -> None:
-        """Append the heads of this commit, and of earlier ones that could not be kept."""
-        with self._heads_lock:
-            some = list(self._unkept)
-            if some:
-                self.heads_file.append(some)
-                del self._unkept[: len(some)]
-
     @property
     def heads_file(self) -> HeadsFile:
         return self.keeping.heads_file(self._station, self.records_id)
@@ -198,15 +203,3 @@ class Signer:
     def _is_there(self, head: Head) -> bool:
         with self._database.reading() as connection:
             return chain.hash_at(connection, self._station, head.number) == head.hash
-
-    def _check_cut(self) -> None:
-        kept = self._kept()
-        if kept and not self._is_there(kept[-1]):
-            raise RecordsCutError(
-                f"These records lack what {self._station} wrote up to {kept[-1].at}: they are an"
-                " older copy, or their end was cut off.",
-                where=self._database.location.shown,
-                cause=f"audit row {kept[-1].number} is kept in {self.heads_file.path}",
-                remedy="Put the right records back (flasher station verify names what is missing);"
-                " if they are lost: flasher station accept restored.",
-            )
