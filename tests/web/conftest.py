@@ -1,14 +1,49 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 
 import pytest
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, Page
 
 from tests.web.browser import chromium
+
+
+@dataclass
+class Tab:
+    """A page, what it has asked for, and what went wrong in it."""
+
+    page: Page
+    asked: list[str] = field(default_factory=list)
+    wrong: list[str] = field(default_factory=list)
 
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
     with chromium() as started:
         yield started
+
+
+@pytest.fixture(scope="session")
+def only_tab(browser: Browser) -> Iterator[Tab]:
+    context = browser.new_context(locale="en")
+    tab = Tab(context.new_page())
+    context.on("request", lambda request: tab.asked.append(request.url))
+    tab.page.on("pageerror", lambda error: tab.wrong.append(str(error)))
+    tab.page.on("console", lambda said: tab.wrong.extend([said.text] * (said.type == "error")))
+    yield tab
+    context.close()
+
+
+@pytest.fixture
+def tab(only_tab: Tab) -> Iterator[Tab]:
+    """The tab, with nothing of the test before: one of its own costs more than most tests do."""
+    page = only_tab.page
+    page.goto("about:blank")
+    page.context.clear_cookies()
+    page.set_viewport_size({"width": 1280, "height": 800})
+    page.emulate_media(media="screen", color_scheme="light")
+    only_tab.asked.clear()
+    only_tab.wrong.clear()
+    yield only_tab
+    page.unroute_all()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
-from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import Page, expect
 
 from flasher import events
 from flasher.web.virtual_bike import Fault
@@ -19,6 +19,7 @@ from tests.end_to_end.stage import NEW, OLD, image_of
 from tests.firmware import VECTORS
 from tests.web.barriers import barriers
 from tests.web.bench_place import IMAGE, PACKETS, BenchPlace
+from tests.web.conftest import Tab
 
 expect.set_options(timeout=20_000)  # the computer may have much else to do
 
@@ -29,23 +30,16 @@ def place(tmp_path: Path) -> BenchPlace:
 
 
 @pytest.fixture
-def page(browser: Browser, place: BenchPlace) -> Iterator[Page]:
+def page(tab: Tab, place: BenchPlace) -> Iterator[Page]:
     """The page; it asks for nothing from elsewhere, and its script makes no error."""
     with place.served() as url:
-        context = browser.new_context(viewport={"width": 1280, "height": 800}, locale="en")
-        opened = context.new_page()
-        asked: list[str] = []
-        wrong: list[str] = []
-        context.on("request", lambda request: asked.append(request.url))
-        opened.on("pageerror", lambda error: wrong.append(str(error)))
-        opened.on("console", lambda said: wrong.extend([said.text] * (said.type == "error")))
-        opened.goto(url)
-        expect(opened.locator("#adapter-1")).to_be_enabled()
-        yield opened
+        tab.page.goto(url)
+        expect(tab.page.locator("#adapter-1")).to_be_enabled()
+        yield tab.page
         root = url.partition("/enter")[0]
-        assert all(each.startswith(root) for each in asked)
-        assert [each for each in wrong if not re.search("status of (400|415)", each)] == []
-        context.close()
+        assert all(each.startswith(root) for each in tab.asked)
+        assert [each for each in tab.wrong if not re.search("status of (400|415)", each)] == []
+        tab.page.goto("about:blank")
 
 
 def _choose(page: Page, fault: Fault = Fault.NONE, target: str = "bms") -> None:
@@ -248,5 +242,6 @@ def test_reloading_disturbs_nothing_and_a_second_tab_shows_the_same(
     page.goto("about:blank")
     go_on.set()
     assert _claims(second) == ["YES", "YES", "YES"]
+    second.close()
     page.go_back()
     assert _claims(page) == ["YES", "YES", "YES"]

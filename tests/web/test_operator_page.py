@@ -7,7 +7,6 @@ import itertools
 import random
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from typing import Literal
 
 import pytest
@@ -25,6 +24,7 @@ from flasher.station.events import (
 )
 from flasher.station.records.model import RunState
 from tests.web.barriers import barriers
+from tests.web.conftest import Tab
 from tests.web.line_screen import AT, LineScreen, ended, served, tile
 
 STATES = tuple(SocketState)
@@ -62,28 +62,15 @@ def own_line() -> Iterator[LineScreen]:
     made.hang()
 
 
-@contextmanager
-def _opened(browser: Browser, line: LineScreen) -> Iterator[Page]:
-    """The page of a line; it asks for nothing from elsewhere, and its script makes no error."""
-    context = browser.new_context(viewport={"width": 1920, "height": 1080}, locale="en")
-    opened = context.new_page()
-    asked: list[str] = []
-    wrong: list[str] = []
-    opened.on("request", lambda request: asked.append(request.url))
-    opened.on("pageerror", lambda error: wrong.append(str(error)))
-    opened.on("console", lambda said: wrong.extend([said.text] * (said.type == "error")))
-    opened.goto(f"{line.url}line")
-    expect(opened.locator("article")).to_have_count(4)
-    yield opened
-    assert all(each.startswith(line.url) for each in asked)
-    assert [each for each in wrong if "ERR_" not in each] == []
-    context.close()
-
-
 @pytest.fixture
-def page(browser: Browser, line: LineScreen) -> Iterator[Page]:
-    with _opened(browser, line) as opened:
-        yield opened
+def page(tab: Tab, line: LineScreen) -> Iterator[Page]:
+    """The page of `line`; it asks for nothing from elsewhere, and its script makes no error."""
+    tab.page.set_viewport_size({"width": 1920, "height": 1080})
+    tab.page.goto(f"{line.url}line")
+    expect(tab.page.locator("article")).to_have_count(4)
+    yield tab.page
+    assert all(each.startswith(line.url) for each in tab.asked)
+    assert [each for each in tab.wrong if "ERR_" not in each] == []
 
 
 def _rounds(page: Page, line: LineScreen, names: Sequence[str]) -> Iterator[None]:
@@ -135,9 +122,9 @@ def test_every_page_shows_the_same_after_it_was_loaded(page: Page, line: LineScr
 
 
 def test_a_station_that_is_gone_covers_the_page_and_it_comes_back_by_itself(
-    browser: Browser, own_line: LineScreen
+    tab: Tab, own_line: LineScreen
 ) -> None:
-    page = browser.new_page()
+    page = tab.page
     with served(own_line) as url:
         page.goto(f"{url}line")
         own_line.state("A", SocketState.PASS, "BAT2620-0005")
@@ -149,32 +136,32 @@ def test_a_station_that_is_gone_covers_the_page_and_it_comes_back_by_itself(
         expect(page.locator("#cover")).to_be_hidden(timeout=10_000)
         _shows(page, 0, "EMPTY")
     again.hang()
-    page.close()
 
 
 def test_the_server_ends_within_two_seconds_though_a_stream_is_open(
-    browser: Browser, own_line: LineScreen
+    tab: Tab, own_line: LineScreen
 ) -> None:
-    page = browser.new_page()
     with served(own_line, closes_feed=False) as url:
-        page.goto(f"{url}line")
-        expect(page.locator("article")).to_have_count(4)
+        tab.page.goto(f"{url}line")
+        expect(tab.page.locator("article")).to_have_count(4)
         began = time.monotonic()
     assert time.monotonic() - began < 2.0
-    page.close()
 
 
 def test_a_station_that_hangs_and_a_script_that_died_cover_their_pages(
     browser: Browser, page: Page, own_line: LineScreen
 ) -> None:
     """The cover comes down by the style sheet alone."""
-    with served(own_line), _opened(browser, own_line) as other:
+    other = browser.new_page()
+    with served(own_line) as url:
+        other.goto(f"{url}line")
         for each in (page, other):
             expect(each.locator("#cover")).to_be_hidden()
         page.evaluate("() => void setTimeout(() => { JSON.parse = () => { throw 'ERR_TEST' } })")
         own_line.hang()
         for each in (page, other):
             expect(each.locator("#cover")).to_be_visible(timeout=6000)
+    other.close()
 
 
 def test_a_stopped_line_covers_everything(page: Page, line: LineScreen) -> None:
@@ -330,11 +317,11 @@ TOO_LARGE = """() => {
     ("count", "sizes"),
     [(1, ["screen"]), (4, ["screen", "phone"]), (8, ["laptop"]), (16, ["tablet", "phone"])],
 )
-def test_everything_fits(browser: Browser, count: int, sizes: list[str]) -> None:
+def test_everything_fits(tab: Tab, count: int, sizes: list[str]) -> None:
+    page = tab.page
     names = [f"{number + 1}" for number in range(count)]
     line = LineScreen(*names)
     with served(line) as url:
-        page = browser.new_page()
         for language in ("en", "de", "zh"):
             page.goto(f"{url}line?lang={language}")
             expect(page.locator("article")).to_have_count(count)
@@ -343,5 +330,4 @@ def test_everything_fits(browser: Browser, count: int, sizes: list[str]) -> None
                     width, height = SIZES[size]
                     page.set_viewport_size({"width": width, "height": height})
                     assert page.evaluate(TOO_LARGE) == [], (language, size)
-        page.close()
     line.hang()

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser
 
 from flasher.station.records.model import Measurement, RunState, StepState
 from flasher.web.server import Server
 from tests.station.factory import Bench
 from tests.web.barriers import barriers
+from tests.web.conftest import Tab
 from tests.web.desk import app_of
 
 LONG = "W" * 90
@@ -47,13 +47,9 @@ def url() -> Iterator[str]:
 
 
 @pytest.mark.parametrize("path", PAGES)
-def test_every_page_is_for_everybody(browser: Browser, url: str, path: str) -> None:
+def test_every_page_is_for_everybody(tab: Tab, url: str, path: str) -> None:
     """On a phone in the dark; on a desk by day."""
-    page = browser.new_page(locale="en")
-    asked: list[str] = []
-    wrong: list[str] = []
-    page.on("request", lambda request: asked.append(request.url))
-    page.on("console", lambda said: wrong.extend([said.text] * (said.type == "error")))
+    page = tab.page
     page.goto(url + path.removeprefix("/"))
     for width, scheme in _SCREENS:
         page.set_viewport_size({"width": width, "height": 844})
@@ -61,13 +57,12 @@ def test_every_page_is_for_everybody(browser: Browser, url: str, path: str) -> N
         assert barriers(page) == ""
         assert page.evaluate("document.scrollingElement.scrollWidth - innerWidth") <= 0, width
     assert page.locator("main").inner_text().strip()
-    assert all(each.startswith(url) for each in asked)
-    assert [each for each in wrong if "400" not in each] == []
-    page.close()
+    assert all(each.startswith(url) for each in tab.asked)
+    assert [each for each in tab.wrong if "400" not in each] == []
 
 
-def test_the_keyboard_alone_finds_a_unit(browser: Browser, url: str) -> None:
-    page = browser.new_page(locale="en")
+def test_the_keyboard_alone_finds_a_unit(tab: Tab, url: str) -> None:
+    page = tab.page
     page.goto(f"{url}runs")
     page.keyboard.press("Tab")  # over the menu
     page.keyboard.press("Enter")
@@ -76,11 +71,10 @@ def test_the_keyboard_alone_finds_a_unit(browser: Browser, url: str) -> None:
     page.keyboard.press("Enter")
     page.wait_for_url("**search=05003**")
     assert page.locator("tbody tr").count() == 2
-    page.close()
 
 
-def test_a_certificate_is_one_sheet_with_an_annex(browser: Browser, url: str) -> None:
-    page = browser.new_page(locale="en")
+def test_a_certificate_is_one_sheet_with_an_annex(tab: Tab, url: str) -> None:
+    page = tab.page
     page.goto(f"{url}units/certificate?serial=W2605001")
     assert page.locator(".qr svg path").count() == 1
     page.emulate_media(media="print")
@@ -94,4 +88,3 @@ def test_a_certificate_is_one_sheet_with_an_annex(browser: Browser, url: str) ->
     assert heights < 297 - 28  # mm of A4 between its margins
     pages = page.pdf(format="A4", prefer_css_page_size=True).count(b"/Type /Page\n")
     assert pages == 2
-    page.close()
