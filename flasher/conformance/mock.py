@@ -11,7 +11,7 @@ from typing import Final
 
 from flasher.conformance.profile import ConformanceProfile, Value
 from flasher.conformance.results import Unsupported
-from flasher.conformance.simulated import CRASHES, SimulatedPort
+from flasher.conformance.simulated import SimulatedSubject
 from flasher.mock.faults import FaultInjector, InOperation, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
@@ -44,17 +44,12 @@ GOOD_IMAGE: Final = model_image("V2r0r1_20240131", 10 * 128 - 3)
 SECOND_IMAGE: Final = model_image("V1r9r0_20230517", 6 * 128)
 
 
-class MockSubject:
+class MockSubject(SimulatedSubject[MockDevice]):
     """A device model, or a variant of it, with power, readback and the faults of a bus.
 
     `make_device` gets the target's name and the profile (`variant_maker` for a variant). `others`
     are further engines on the same bus.
     """
-
-    has_power = True
-    has_readback = True
-    has_bus_off = True
-    has_timed_cuts = True
 
     def __init__(
         self,
@@ -64,26 +59,20 @@ class MockSubject:
         make_device: Callable[[str, DeviceProfile], MockDevice] | None = None,
         others: Sequence[Engine] = (),
         name: str = "the built-in mock",
-        good_image: bytes = GOOD_IMAGE,
-        second_image: bytes | None = SECOND_IMAGE,
+        good_image: bytes | None = None,
+        second_image: bytes | None = None,
     ) -> None:
-        self.name = name
-        self.target = target
-        self.good_image = good_image
-        self.second_image = second_image
-        self.device = (make_device or plain_device)(target, profile)
-        self.port = SimulatedPort(WELLING.bitrate_bps)
-        self.bus = self.port.bus
+        super().__init__(
+            (make_device or plain_device)(target, profile),
+            target,
+            (GOOD_IMAGE, SECOND_IMAGE),
+            name=name,
+            good_image=good_image,
+            second_image=second_image,
+        )
         self._injector = FaultInjector(self.device)
         for engine in (self._injector, *others):
             self.bus.attach(engine)
-
-    def power(self, *, on: bool) -> None:
-        with CRASHES:
-            if on:
-                self.device.power_on(self.port.now())
-            else:
-                self.device.power_cut(self.port.now())
 
     def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
         self._injector.set(PowerCut(off_s), InOperation(operation, share))
@@ -92,12 +81,6 @@ class MockSubject:
         happened = not self._injector.is_set
         self._injector.clear()
         return happened
-
-    def readback(self) -> bytes:
-        return self.device.readback()
-
-    def bus_off(self, for_s: float) -> None:
-        self.device.bus_off(self.port.now(), for_s)
 
 
 def plain_device(target: str, profile: DeviceProfile) -> MockDevice:

@@ -1,5 +1,5 @@
 """A simulated bus as the suite's way to a device model: exact end times of all frames, on a virtual
-clock, so that no time is spent.
+clock, so that no time is spent; and what all models are as subjects.
 """
 
 from __future__ import annotations
@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from contextlib import AbstractContextManager
-from typing import Final
+from typing import TYPE_CHECKING, Final, Generic, TypeVar
 
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
@@ -16,6 +16,11 @@ from flasher.conformance.subject import Arrival
 from flasher.conformance.wire import RawFrame
 from flasher.errors import BusError, FlasherError
 from flasher.protocol.frame import Frame
+from flasher.protocol.spec import WELLING
+
+if TYPE_CHECKING:
+    from flasher.conformance.dut.device import CompiledDevice
+    from flasher.mock.model import MockDevice
 
 _AT_ONCE: Final = float("-inf")
 
@@ -70,6 +75,46 @@ class SimulatedPort:
         if self.bus.faults.takes_part:
             self._arrived.append((frame, at))
         return (frame,)
+
+
+DeviceT = TypeVar("DeviceT", bound="MockDevice | CompiledDevice")
+
+
+class SimulatedSubject(Generic[DeviceT]):
+    """A device model as a subject; a cut in a flash operation is the business of each. Without a
+    good image of its user it has both of the `own` ones.
+    """
+
+    has_power = has_readback = has_bus_off = has_timed_cuts = True
+
+    def __init__(
+        self,
+        device: DeviceT,
+        target: str,
+        own: tuple[bytes, bytes],
+        *,
+        name: str,
+        good_image: bytes | None,
+        second_image: bytes | None,
+    ) -> None:
+        self.name = name
+        self.target = target
+        self.device = device
+        self.good_image = good_image or own[0]
+        self.second_image = second_image or (None if good_image else own[1])
+        self.port = SimulatedPort(WELLING.bitrate_bps)
+        self.bus = self.port.bus
+
+    def power(self, *, on: bool) -> None:
+        with CRASHES:
+            switch = self.device.power_on if on else self.device.power_cut
+            switch(self.port.now())
+
+    def readback(self) -> bytes:
+        return self.device.readback()
+
+    def bus_off(self, for_s: float) -> None:
+        self.device.bus_off(self.port.now(), for_s)
 
 
 class _Crashes(AbstractContextManager[None]):

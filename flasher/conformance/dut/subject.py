@@ -11,22 +11,17 @@ from flasher.conformance.dut.device import CompiledDevice, application_image
 from flasher.conformance.dut.process import BootloaderError, BootloaderProcess
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
-from flasher.conformance.simulated import CRASHES, SimulatedPort
+from flasher.conformance.simulated import SimulatedSubject
 from flasher.protocol.spec import TARGETS, WELLING
 
 _GOOD: Final = ("V2r0r1_20240131", 10 * 128 - 3)
 _SECOND: Final = ("V1r9r0_20230517", 6 * 128)
 
 
-class CompiledSubject:
+class CompiledSubject(SimulatedSubject[CompiledDevice]):
     """A device with that bootloader, with power, readback and cuts in flash operations. Without
     images it gets those that the suite's own application runs.
     """
-
-    has_power = True
-    has_readback = True
-    has_bus_off = True
-    has_timed_cuts = True
 
     def __init__(
         self,
@@ -38,34 +33,22 @@ class CompiledSubject:
     ) -> None:
         if target not in TARGETS:
             raise Unsupported(f"there is no target {target}")
-        self.target = target
-        self.port = SimulatedPort(WELLING.bitrate_bps)
-        self.device = CompiledDevice(TARGETS[target], process, bitrate_bps=WELLING.bitrate_bps)
-        facts = self.device.facts
-        self.name = f"{facts.name or 'the bootloader'} ({process.subject})"
-        self.good_image = good_image or application_image(*_GOOD)
-        # The built-in second image belongs to the built-in good one.
-        self.second_image = second_image or (None if good_image else application_image(*_SECOND))
-        self.port.bus.attach(self.device)
-
-    def power(self, *, on: bool) -> None:
-        with CRASHES:
-            if on:
-                self.device.power_on(self.port.now())
-            else:
-                self.device.power_cut(self.port.now())
+        device = CompiledDevice(TARGETS[target], process, bitrate_bps=WELLING.bitrate_bps)
+        super().__init__(
+            device,
+            target,
+            (application_image(*_GOOD), application_image(*_SECOND)),
+            name=f"{device.facts.name or 'the bootloader'} ({process.subject})",
+            good_image=good_image,
+            second_image=second_image,
+        )
+        self.bus.attach(device)
 
     def cut_in_operation(self, operation: int, share: float, off_s: float) -> None:
         self.device.set_cut(operation, share, off_s)
 
     def take_cut(self) -> bool:
         return self.device.take_cut()
-
-    def readback(self) -> bytes:
-        return self.device.readback()
-
-    def bus_off(self, for_s: float) -> None:
-        self.device.bus_off(self.port.now(), for_s)
 
 
 @contextmanager
