@@ -212,25 +212,20 @@ class PluginRun:
         image is not back.
         """
         final = self._run.finish() if self._has_begun else FINAL_IMAGE_OK
-        self._write_reports()
-        if final != FINAL_IMAGE_OK:
-            pytest.fail(f"the good image at the end: {final}", pytrace=False)
-
-    def _write_reports(self) -> None:
         keeping, report = self._keeping, self.report()
-        replays = {result.key: keeping.replay(result.case_id) for result in report.results}
+        told_by: dict[str, Any] = {
+            "started_at": self._started_at,
+            "replays": {one.key: keeping.replay(one.case_id) for one in report.results},
+            "trace_files": self._traces,
+        }
         if keeping.json_report is not None:
-            document = report_document(
-                report, started_at=self._started_at, replays=replays, trace_files=self._traces
-            )
-            _write(keeping.json_report, to_bytes(document))
+            _write(keeping.json_report, to_bytes(report_document(report, **told_by)))
         if keeping.html is not None:
             from flasher.conformance.html_report import html_page  # noqa: PLC0415  loads jinja2
 
-            page = html_page(
-                report, started_at=self._started_at, replays=replays, trace_files=self._traces
-            )
-            _write(keeping.html, page.encode("utf-8"))
+            _write(keeping.html, html_page(report, **told_by).encode("utf-8"))
+        if final != FINAL_IMAGE_OK:
+            pytest.fail(f"the good image at the end: {final}", pytrace=False)
 
     def _keep_trace(self, name: str, trace: Sequence[TraceEntry]) -> None:
         if self._keeping.trace_dir is not None:
@@ -310,24 +305,19 @@ def _options(
         return config.getoption(f"btl_{name}")
 
     bus = dict(pair.partition("=")[::2] for pair in given("bus_kwarg"))
-    for name in ("interface", "channel", "bitrate"):
-        if given(name) is not None:
-            bus[name] = given(name)
+    named = {name: given(name) for name in ("interface", "channel", "bitrate")}
+    bus |= {name: value for name, value in named.items() if value is not None}
     if power is None and given("power_cmd") is not None:
         power = PowerCommand(given("power_cmd"))
     if readback is None and given("readback_cmd") is not None:
         readback = ReadbackCommand(given("readback_cmd"))
     uncertainty_s = given("uncertainty")
+    same = ("subject", "variant", "profile", "good_image", "second_image", "allow_implausible")
     return BenchOptions(
+        **{name: given(name) for name in same},
         target=given("target") or "bms",
         is_mock=given("mock"),
-        subject=given("subject"),
-        variant=given("variant"),
         choices=given("set"),
-        profile=given("profile"),
-        good_image=given("good_image"),
-        second_image=given("second_image"),
-        allow_implausible=given("allow_implausible"),
         bus=bus,
         power=power,
         readback=readback,

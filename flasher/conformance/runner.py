@@ -171,14 +171,13 @@ class Run:
         cases: list[Case] = []
         for case_id in chosen:
             case = CASES.get(case_id)
-            if case is None:
-                missing = NOT_IMPLEMENTED[case_id]
-            else:
+            missing = NOT_IMPLEMENTED.get(case_id, "")
+            if case is not None:
                 missing = what_is_missing(case, self._subject, self._profile)
-            if case is None or missing:
-                self._add(CaseResult(case_id, CaseVerdict.UNSUPPORTED, note=missing))
-            else:
+            if case is not None and not missing:
                 cases.append(case)
+            else:
+                self._add(CaseResult(case_id, CaseVerdict.UNSUPPORTED, note=missing))
         self._observer.run_began(len(cases) * self._options.repeat)
         if cases:
             self.begin()

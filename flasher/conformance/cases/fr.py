@@ -295,9 +295,8 @@ def back_to_back(bench: Bench) -> None:
             probe.offer(frames, ACCEPTED, ignoring=(Kind.FEEDBACK, Kind.OTHER))
     with bench.step("the last packet again, then the next one"):
         bench.forget()
-        frames = probe.frames()
-        bench.send(probe.previous() + frames)
-        number = probe.number
+        frames, number = probe.frames(), probe.number
+        bench.send(bench.encoder.packet_of(probe.image, number - 1) + frames)
         first = bench.next_message(bench.limit("ack_s"))
         answers = {"ack": [f"ACK {number - 1}"], "nak_next": [f"NAK {number}"]}
         either = [*answers["ack"], *answers["nak_next"]]

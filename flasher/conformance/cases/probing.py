@@ -113,10 +113,6 @@ class Probe:
         """The next packet, header to tail."""
         return joined(self.frames())
 
-    def previous(self) -> list[RawFrame]:
-        """The packet that was stored last; there has to be one."""
-        return self._bench.encoder.packet_of(self.image, self.number - 1)
-
     # -- stimuli ----------------------------------------------------------------------------------
 
     def plain(self) -> None:

@@ -31,6 +31,7 @@ WALK_STEPS: Final = 24
 """The longest walk."""
 SHRINK_TRIES: Final = 60
 _LIMIT_S: Final = 900.0
+_NO_CHANCE: Final = random.Random(0)  # noqa: S311  all steps are given
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ class Explorer:
                 chance = random.Random(f"{self._seed}/{self._walks}")  # noqa: S311  by the seed
                 length = min(chance.randint(3, WALK_STEPS), steps - self._steps)
                 taken: list[Step] = []
-                found = self._walk(_by_chance(chance, length), taken)
+                found = self._walk([None] * length, taken, chance)
                 self._progress(self._steps)
                 if found is not None:
                     finding = self._shrunk(found, taken)
@@ -119,7 +120,7 @@ class Explorer:
             trouble = self._restored()
             if trouble:
                 return self._explored(_first_trouble(trouble))
-            found = self._walk(_these(steps), taken)
+            found = self._walk(steps, taken)
         except RunStopped:
             return self._explored(stopped=self._stop())
         if found is None:
@@ -129,15 +130,21 @@ class Explorer:
     # -- one walk ----------------------------------------------------------------------------------
 
     def _walk(
-        self, choose: Callable[[Walk], Step | None], taken: list[Step]
+        self,
+        steps: Sequence[Step | None],
+        taken: list[Step],
+        chance: random.Random = _NO_CHANCE,
     ) -> tuple[Violation, Bench] | None:
-        """Take the steps that `choose` gives, then upgrade the device to the good image."""
+        """Take these steps, `chance` choosing those that are None, then upgrade the device to the
+        good image.
+        """
         self._walks += 1
         bench = Bench(self._subject, self._profile, limit_s=_LIMIT_S, stopped=self._stopped)
         bench.tester.hears_feedback = True
         walk = Walk(bench)
         try:
-            while (step := choose(walk)) is not None:
+            for given in steps:
+                step = given or next_step(walk, chance)
                 taken.append(step)
                 self._steps += 1
                 self._met[walk.phase, step.name] += 1
@@ -194,7 +201,7 @@ class Explorer:
                     shorter = best[:start] + best[start + size :]
                     again_taken: list[Step] = []
                     tries += 1
-                    again = self._walk(_these(shorter), again_taken) if shorter or rule else None
+                    again = self._walk(shorter, again_taken) if shorter or rule else None
                     if again is not None and again[0].rule == rule:
                         best, found, was_shorter = again_taken, again, True
                     else:
@@ -237,13 +244,3 @@ class Explorer:
 
 def _first_trouble(trouble: str) -> Finding:
     return Finding("upgrade", f"the good image could not be flashed: {trouble}", (), ())
-
-
-def _by_chance(chance: random.Random, length: int) -> Callable[[Walk], Step | None]:
-    left = iter(range(length))
-    return lambda walk: None if next(left, None) is None else next_step(walk, chance)
-
-
-def _these(steps: Sequence[Step]) -> Callable[[Walk], Step | None]:
-    left = iter(steps)
-    return lambda _: next(left, None)

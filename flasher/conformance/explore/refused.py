@@ -257,3 +257,4 @@ NO_CONCERN: Final[dict[str, Maker]] = {
         lambda _: [RawFrame(0x7A0 + number % 5, bytes(8)) for number in range(_LOAD_FRAMES)]
     ),
 }
+REFUSED: Final = {**PACKETS, **UPDATES, **ENDS, **NO_CONCERN}

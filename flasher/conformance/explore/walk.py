@@ -17,7 +17,7 @@ from math import inf
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.explore.refused import ENDS, NO_CONCERN, PACKETS, UPDATES, Place
+from flasher.conformance.explore.refused import PACKETS, REFUSED, UPDATES, Place
 from flasher.conformance.wire import (
     PACKET_BYTES,
     Kind,
@@ -120,12 +120,8 @@ class Walk:
         the bench raises.
         """
         self._settle()
-        if name in PACKETS:
-            self._bad_packet(name)
-        elif name in UPDATES:
-            self._bad_update(name)
-        elif name in ENDS or name in NO_CONCERN:
-            self._no_concern(name)
+        if name in REFUSED:
+            self._send_refused(name)
         else:
             getattr(self, f"_{name.replace('-', '_')}")(argument)
 
@@ -526,14 +522,6 @@ class Walk:
         self.check_stored(whole)
         self.running, self.is_whole, self.phase = whole, True, Phase.APPLICATION
 
-    def _bad_update(self, name: str) -> None:
-        self._at_version()
-        refused = UPDATES[name](self._place)
-        self._feedback_due += refused.is_intact_write
-        self._naks_due, self._nak_numbers = 1, None
-        self.bench.send(refused.frames)
-        self._quiet()
-
     def _named_image(self, argument: str) -> tuple[bytes, Outcome]:
         """The image of a step, and what comes of it."""
         bench = self.bench
@@ -663,17 +651,6 @@ class Walk:
         payload = packet_payload(self._image, self.wanted)[:rest].ljust(PACKET_BYTES, b"\x00")
         self._packet("", self.bench.encoder.packet(self.wanted, self.total, payload))
 
-    def _bad_packet(self, name: str) -> None:
-        refused = PACKETS[name](self._place)
-        self._feedback_due += refused.is_intact_write
-        self._naks_due = 1 if refused.is_intact_write else 4
-        self._nak_numbers = None
-        if refused.is_intact_write and self.phase in _IN_TRANSFER:
-            named = int.from_bytes(joined(refused.frames)[7:9], "little")
-            self._nak_numbers = frozenset((self.wanted, named, self.wanted - 1))
-        self.bench.send(refused.frames)
-        self._quiet()
-
     # -- end of transfer ---------------------------------------------------------------------------
 
     def _end(self, argument: str) -> None:
@@ -719,15 +696,22 @@ class Walk:
         self._may_restart = self._may_complete = False
         self.check_stored(self.running)
 
-    # -- what is no concern of the device ----------------------------------------------------------
+    # -- what is refused, or no concern of the device ----------------------------------------------
 
-    def _no_concern(self, name: str) -> None:
-        refused = (ENDS.get(name) or NO_CONCERN[name])(self._place)
+    def _send_refused(self, name: str) -> None:
+        if name in UPDATES:
+            self._at_version()
+        refused = REFUSED[name](self._place)
+        self._feedback_due += refused.is_intact_write
+        self._naks_due, self._nak_numbers = 1 if name in UPDATES else 2, None
         if name == "reset-nodes":  # each of them is answered by general feedback
             own = self.bench.encoder.to_all
             self._nodes_asked = frozenset(own | frame.can_id >> 4 & 0xF for frame in refused.frames)
-        self._feedback_due += refused.is_intact_write
-        self._naks_due, self._nak_numbers = 2, None
+        if name in PACKETS:
+            self._naks_due = 1 if refused.is_intact_write else 4
+            if refused.is_intact_write and self.phase in _IN_TRANSFER:
+                named = int.from_bytes(joined(refused.frames)[7:9], "little")
+                self._nak_numbers = frozenset((self.wanted, named, self.wanted - 1))
         self.bench.send(refused.frames)
         self._quiet()
 
@@ -744,4 +728,4 @@ STEPS: Final = (
     *("packet-filler", "packet-open", "read", "end"),
 )
 """Steps that methods of `Walk` take; the others send what has to be refused."""
-ALL_STEPS: Final = (*STEPS, *PACKETS, *UPDATES, *ENDS, *NO_CONCERN)
+ALL_STEPS: Final = (*STEPS, *REFUSED)
