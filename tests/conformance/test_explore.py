@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from flasher.conformance.explore import Explored, Explorer
-from flasher.conformance.explore.refused import ENDS, NO_CONCERN, PACKETS, UPDATES, Place, Refused
+from flasher.conformance.explore.refused import REFUSED, Place, make
 from flasher.conformance.explore.steps import parse_step, reachable_pairs
 from flasher.conformance.explore.walk import ALL_STEPS, filler
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
@@ -154,8 +154,7 @@ def test_every_step_is_written_and_read() -> None:
 
 def test_no_two_messages_that_are_refused_are_the_same_and_none_is_the_right_one() -> None:
     place = Place(Encoder("bms"), filler(640), 2, 0x20000)
-    makers = {**PACKETS, **UPDATES, **ENDS, **NO_CONCERN}
-    made: dict[str, Refused] = {name: make(place) for name, make in makers.items()}
+    made = {name: make(name, place) for name in REFUSED}
     sent = {name: tuple(refused.frames) for name, refused in made.items()}
     assert len(set(sent.values())) == len(sent)
     right = {

@@ -55,8 +55,16 @@ _SETTINGS: Final = range(0x30, 0x50)
     choices=("tx_12",),
 )
 def endless(bench: Bench) -> None:
-    floods = _floods(bench)
-    image = transfer_image(bench)
+    encoder, image = bench.encoder, transfer_image(bench)
+    # As reads: an application has nothing to write.
+    long_message = encoder.message(READ, _UNKNOWN + 253, bytes(range(253)))
+    short_message = encoder.message(READ, _UNKNOWN)
+    floods = {
+        "header after header": encoder.frames((_HEADS * 2) * _FLOOD_FRAMES),
+        "data without an end": encoder.frames(_HEADS + b"\x55\xaa" * (4 * _FLOOD_FRAMES - 2)),
+        "long messages": long_message * (_FLOOD_FRAMES // len(long_message)),
+        "short messages": short_message * (_FLOOD_FRAMES // len(short_message)),
+    }
     for name, frames in floods.items():
         with bench.step(f"to the application: {name}"):
             bench.send(frames)
@@ -87,21 +95,6 @@ def endless(bench: Bench) -> None:
                 bench.finish(image)
         else:
             bench.finish(image, len(floods) + 1)
-
-
-def _floods(bench: Bench) -> dict[str, list[RawFrame]]:
-    encoder = bench.encoder
-    # As reads: an application has nothing to write.
-    long_message = encoder.message(READ, _UNKNOWN + 253, bytes(range(253)))
-    short_message = encoder.message(READ, _UNKNOWN)
-    heads = encoder.frames((_HEADS * 2) * _FLOOD_FRAMES)
-    endless_data = encoder.frames(_HEADS + b"\x55\xaa" * (4 * _FLOOD_FRAMES - 2))
-    return {
-        "header after header": heads,
-        "data without an end": endless_data,
-        "long messages": long_message * (_FLOOD_FRAMES // len(long_message)),
-        "short messages": short_message * (_FLOOD_FRAMES // len(short_message)),
-    }
 
 
 def _flood_window(bench: Bench, frames: list[RawFrame]) -> None:

@@ -7,7 +7,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from flasher.conformance.wire import (
     END,
@@ -64,24 +64,15 @@ class Place:
         return self.packet(self.wanted)
 
 
-@dataclass(frozen=True)
-class Refused:
+class Refused(NamedTuple):
     """What is sent; an intact write may have general feedback (R15)."""
 
     frames: list[RawFrame]
-    is_intact_write: bool = False
+    is_intact_write: bool
 
 
-Maker = Callable[[Place], Refused]
-
-
-def _bytes(make: Callable[[Place], bytes], *, write: bool = False) -> Maker:
-    """Bytes to the device, in frames of 8."""
-    return lambda place: Refused(place.encoder.frames(make(place)), write)
-
-
-def _frames(make: Callable[[Place], list[RawFrame]], *, write: bool = False) -> Maker:
-    return lambda place: Refused(make(place), write)
+Maker = Callable[[Place], bytes | list[RawFrame]]
+"""Bytes go to the device, in frames of 8."""
 
 
 # -- packets ---------------------------------------------------------------------------------------
@@ -89,17 +80,14 @@ def _frames(make: Callable[[Place], list[RawFrame]], *, write: bool = False) -> 
 
 def _with_crc(crc_bytes: Callable[[bytes], bytes]) -> Maker:
     """The next packet with a CRC of its own, made of the bytes between header and CRC."""
-
-    def make(place: Place) -> bytes:
-        raw = place.next_packet
-        return raw[:-5] + crc_bytes(raw[2:-5]) + raw[-1:]
-
-    return _bytes(make)
+    return lambda place: (
+        place.next_packet[:-5] + crc_bytes(place.next_packet[2:-5]) + place.next_packet[-1:]
+    )
 
 
 def _with_frames(change: Callable[[list[RawFrame]], list[RawFrame]]) -> Maker:
     """The next packet, some of its frames lost, doubled or exchanged."""
-    return _frames(lambda place: change(place.encoder.frames(place.next_packet)))
+    return lambda place: change(place.encoder.frames(place.next_packet))
 
 
 def _exchanged(frames: list[RawFrame]) -> list[RawFrame]:
@@ -110,7 +98,7 @@ def _exchanged(frames: list[RawFrame]) -> list[RawFrame]:
 
 
 def _in_mode(mode: int) -> Maker:
-    return _frames(lambda place: place.encoder.message(mode, PACKET, place.next_packet[6:-5]))
+    return lambda place: place.encoder.message(mode, PACKET, place.next_packet[6:-5])
 
 
 def _crc_mirrored(raw: bytes) -> bytes:
@@ -122,41 +110,30 @@ PACKETS: Final[dict[str, Maker]] = {
     "packet-crc-zero": _with_crc(lambda _: bytes(4)),
     "packet-crc-ones": _with_crc(lambda _: b"\xff" * 4),
     "packet-crc-no-id": _with_crc(lambda body: crc(b"\x55\xaa" + body).to_bytes(4, "big")),
-    "packet-crc-little": _bytes(lambda place: _crc_mirrored(place.next_packet)),
-    "packet-tail": _bytes(lambda place: place.next_packet[:-1] + b"\xf1"),
+    "packet-crc-little": lambda place: _crc_mirrored(place.next_packet),
+    "packet-tail": lambda place: place.next_packet[:-1] + b"\xf1",
     "packet-read": _in_mode(READ),
     "packet-report": _in_mode(REPORT),
     "packet-mode": _in_mode(_OTHER_MODE),
-    "packet-skip": _bytes(
-        lambda place: place.packet(place.wanted + 1 + (place.wanted == place.total)), write=True
-    ),
-    "packet-far": _bytes(lambda place: place.packet(place.wanted + 256), write=True),
-    "packet-zero": _bytes(lambda place: place.packet(0), write=True),
-    "packet-beyond": _bytes(lambda place: place.packet(place.total + 1), write=True),
-    "packet-total": _bytes(
-        lambda place: place.packet(place.wanted, total=place.total + 1), write=True
-    ),
-    "packet-total-far": _bytes(
-        lambda place: place.packet(place.wanted, total=place.total + 256), write=True
-    ),
-    "packet-start": _bytes(lambda place: place.packet(place.wanted, start=0), write=True),
+    "packet-skip": lambda place: place.packet(place.wanted + 1 + (place.wanted == place.total)),
+    "packet-far": lambda place: place.packet(place.wanted + 256),
+    "packet-zero": lambda place: place.packet(0),
+    "packet-beyond": lambda place: place.packet(place.total + 1),
+    "packet-total": lambda place: place.packet(place.wanted, total=place.total + 1),
+    "packet-total-far": lambda place: place.packet(place.wanted, total=place.total + 256),
+    "packet-start": lambda place: place.packet(place.wanted, start=0),
     "packet-lost": _with_frames(lambda all_: all_[:_SPOILT_FRAME] + all_[_SPOILT_FRAME + 1 :]),
     "packet-doubled": _with_frames(lambda all_: all_[:_SPOILT_FRAME] + all_[_SPOILT_FRAME - 1 :]),
     "packet-exchanged": _with_frames(_exchanged),
     "packet-half": _with_frames(lambda all_: all_[: len(all_) // 2]),
-    "packet-long": _bytes(  # length byte and data are longer by one than its command says
-        lambda place: build(
-            place.encoder.to_device, WRITE, PACKET, place.next_packet[6:-5] + b"\xff"
-        )
+    # Its length byte and data are longer by one than its command says.
+    "packet-long": lambda place: build(
+        place.encoder.to_device, WRITE, PACKET, place.next_packet[6:-5] + b"\xff"
     ),
 }
 
 
 # -- update commands, ends -------------------------------------------------------------------------
-
-
-def _update(size_bytes: Callable[[Place], int]) -> Maker:
-    return _frames(lambda place: place.encoder.update(size_bytes(place) & 0xFFFF_FFFF), write=True)
 
 
 def _small_update(
@@ -177,37 +154,33 @@ def _for_others(place: Place) -> list[RawFrame]:
     ]
 
 
-def _end(mode: int, data: bytes) -> Callable[[Place], list[RawFrame]]:
-    return lambda place: place.encoder.message(mode, END, data)
-
-
 UPDATES: Final[dict[str, Maker]] = {
-    "update-zero": _update(lambda _: 0),
-    "update-huge": _update(lambda _: -1),
-    "update-large": _update(lambda place: place.largest_bytes + 1),
-    "update-wraps": _update(lambda place: (place.largest_bytes & ~0xFFFF) + 0x10000 + _SMALL_BYTES),
-    "update-crc": _bytes(lambda place: _small_update(place)[:-5] + bytes(4) + b"\xf0"),
-    "update-tail": _bytes(lambda place: _small_update(place)[:-1] + b"\0"),
-    "update-name": _bytes(
-        lambda place: _small_update(place, text=place.encoder.others()[0].update_text), write=True
+    "update-zero": lambda place: place.encoder.update(0),
+    "update-huge": lambda place: place.encoder.update(0xFFFF_FFFF),
+    "update-large": lambda place: place.encoder.update(place.largest_bytes + 1),
+    "update-wraps": lambda place: place.encoder.update(
+        (place.largest_bytes & ~0xFFFF) + 0x10000 + _SMALL_BYTES & 0xFFFF_FFFF
     ),
-    "update-name-end": _bytes(
-        lambda place: _small_update(place, text=place.encoder.update_text[:4] + b"XYZ"), write=True
+    "update-crc": lambda place: _small_update(place)[:-5] + bytes(4) + b"\xf0",
+    "update-tail": lambda place: _small_update(place)[:-1] + b"\0",
+    "update-name": lambda place: _small_update(place, text=place.encoder.others()[0].update_text),
+    "update-name-end": lambda place: _small_update(
+        place, text=place.encoder.update_text[:4] + b"XYZ"
     ),
-    "update-long": _bytes(lambda place: _small_update(place, more=b"\0")),
-    "update-read": _bytes(lambda place: _small_update(place, mode=READ)),
-    "update-others": _frames(_for_others),
+    "update-long": lambda place: _small_update(place, more=b"\0"),
+    "update-read": lambda place: _small_update(place, mode=READ),
+    "update-others": _for_others,
 }
 ENDS: Final[dict[str, Maker]] = {
-    "end-mark": _frames(_end(WRITE, b"\x05"), write=True),
-    "end-read": _frames(_end(READ, b"\x04")),
-    "end-crc": _bytes(lambda place: _crc_mirrored(joined(place.encoder.end()))),
+    "end-mark": lambda place: place.encoder.message(WRITE, END, b"\x05"),
+    "end-read": lambda place: place.encoder.message(READ, END, b"\x04"),
+    "end-crc": lambda place: _crc_mirrored(joined(place.encoder.end())),
 }
 
 # -- no concern ------------------------------------------------------------------------------------
 
 
-def _reset(mode: int, data: Callable[[Encoder], bytes]) -> Callable[[Place], list[RawFrame]]:
+def _reset(mode: int, data: Callable[[Encoder], bytes]) -> Maker:
     return lambda place: place.encoder.message(
         mode, place.encoder.reset_command, data(place.encoder)
     )
@@ -228,33 +201,39 @@ def _junk(place: Place) -> list[RawFrame]:
 
 
 NO_CONCERN: Final[dict[str, Maker]] = {
-    "reset-read": _frames(_reset(READ, lambda encoder: encoder.reset_data)),
-    "reset-text": _frames(
-        _reset(WRITE, lambda encoder: bytes(len(encoder.reset_data))), write=True
+    "reset-read": _reset(READ, lambda encoder: encoder.reset_data),
+    "reset-text": _reset(WRITE, lambda encoder: bytes(len(encoder.reset_data))),
+    "reset-text-end": _reset(WRITE, lambda encoder: encoder.reset_data[:-1] + b"?"),
+    "reset-nodes": _resets_of_nodes,
+    "reset-others": lambda place: [
+        frame for other in place.encoder.others() for frame in other.reset()
+    ],
+    "unknown": lambda place: place.encoder.message(WRITE, _UNKNOWN, b"\0"),
+    "unknown-mode": lambda place: place.encoder.message(_OTHER_MODE, _UNKNOWN, b"\0"),
+    "report": lambda place: place.encoder.message(REPORT, _UNKNOWN, b"\0"),
+    "length-zero": lambda _: b"\x55\xaa\x16\x00\x12\x34\x56\x78\xf0",
+    "length-long": lambda _: b"\x55\xaa\x16\xff\x77\xfd\x01\x02",
+    "header-only": lambda _: b"\x55\xaa",
+    "junk": _junk,
+    "flood": lambda place: (
+        _FLOOD_MESSAGES * place.encoder.message(READ, _LONG_UNKNOWN, bytes(_LONG_UNKNOWN & 0xFF))
     ),
-    "reset-text-end": _frames(
-        _reset(WRITE, lambda encoder: encoder.reset_data[:-1] + b"?"), write=True
-    ),
-    "reset-nodes": _frames(_resets_of_nodes),
-    "reset-others": _frames(
-        lambda place: [frame for other in place.encoder.others() for frame in other.reset()]
-    ),
-    "unknown": _frames(lambda place: place.encoder.message(WRITE, _UNKNOWN, b"\0"), write=True),
-    "unknown-mode": _frames(lambda place: place.encoder.message(_OTHER_MODE, _UNKNOWN, b"\0")),
-    "report": _frames(lambda place: place.encoder.message(REPORT, _UNKNOWN, b"\0")),
-    "length-zero": _bytes(lambda _: b"\x55\xaa\x16\x00\x12\x34\x56\x78\xf0"),
-    "length-long": _bytes(lambda _: b"\x55\xaa\x16\xff\x77\xfd\x01\x02"),
-    "header-only": _bytes(lambda _: b"\x55\xaa"),
-    "junk": _frames(_junk),
-    "flood": _frames(
-        lambda place: (
-            _FLOOD_MESSAGES
-            * place.encoder.message(READ, _LONG_UNKNOWN, bytes(_LONG_UNKNOWN & 0xFF))
-        )
-    ),
-    "own-id": _frames(lambda place: place.encoder.answer(_UNKNOWN, b"\0")),
-    "load": _frames(
-        lambda _: [RawFrame(0x7A0 + number % 5, bytes(8)) for number in range(_LOAD_FRAMES)]
-    ),
+    "own-id": lambda place: place.encoder.answer(_UNKNOWN, b"\0"),
+    "load": lambda _: [RawFrame(0x7A0 + number % 5, bytes(8)) for number in range(_LOAD_FRAMES)],
 }
 REFUSED: Final = {**PACKETS, **UPDATES, **ENDS, **NO_CONCERN}
+_INTACT_WRITES: Final = frozenset(
+    {
+        *("packet-skip", "packet-far", "packet-zero", "packet-beyond", "packet-total"),
+        *("packet-total-far", "packet-start", "update-zero", "update-huge", "update-large"),
+        *("update-wraps", "update-name", "update-name-end", "end-mark", "reset-text"),
+        *("reset-text-end", "unknown"),
+    }
+)
+
+
+def make(name: str, place: Place) -> Refused:
+    """What is sent in the step of that name."""
+    made = REFUSED[name](place)
+    frames = place.encoder.frames(made) if isinstance(made, bytes) else made
+    return Refused(frames, name in _INTACT_WRITES)

@@ -17,7 +17,7 @@ from math import inf
 from typing import Final
 
 from flasher.conformance.bench import Bench
-from flasher.conformance.explore.refused import PACKETS, REFUSED, UPDATES, Place
+from flasher.conformance.explore.refused import PACKETS, REFUSED, UPDATES, Place, make
 from flasher.conformance.wire import (
     PACKET_BYTES,
     Kind,
@@ -701,7 +701,7 @@ class Walk:
     def _send_refused(self, name: str) -> None:
         if name in UPDATES:
             self._at_version()
-        refused = REFUSED[name](self._place)
+        refused = make(name, self._place)
         self._feedback_due += refused.is_intact_write
         self._naks_due, self._nak_numbers = 1 if name in UPDATES else 2, None
         if name == "reset-nodes":  # each of them is answered by general feedback
