@@ -121,7 +121,7 @@ class BmsApplication(Application):
         self._feedback_item = _sent_item(contents.GeneralFeedback, self.dialect)
         self._readers: dict[type[Content], Callable[[float], Content]] = {
             contents.RunningInformation: self._running_information,
-            contents.CellVoltages: self._cell_voltages,
+            contents.CellVoltages: lambda now: contents.CellVoltages(self.battery.at(now).cells_mv),
             contents.VersionInformation: self._version_information,
             contents.History: self._history,
             contents.Ready: lambda _now: contents.Ready(),
@@ -204,7 +204,13 @@ class BmsApplication(Application):
         """Answer a query or a write; anything else of no concern is passed over."""
         decoded = decode(message, self.dialect)
         if decoded is None:
-            self._confirm_unknown(message)
+            # A write that is no row of the dialect is confirmed too, and changes nothing:
+            # 2.2.1(2) has general feedback follow every write, to its sender.
+            answer_id = _FEEDBACK_IDS.get(message.can_id)
+            is_silent = self.profile.is_silent_to(message.can_id, message.command)
+            if answer_id is not None and message.mode == Mode.WRITE and not is_silent:
+                feedback = encode(self._feedback_item, contents.GeneralFeedback())
+                self.port.send(feedback._replace(can_id=answer_id))
             return
         item, content = decoded.item, decoded.content
         if isinstance(content, contents.Ready):
@@ -212,7 +218,10 @@ class BmsApplication(Application):
                 self._shutdown.ready(item.sender)
             return
         answer = answer_of(item)
-        if answer is None or not self._knows(item, answer):
+        if answer is None or self.profile.is_silent_to(item.can_id, item.command):
+            return
+        is_newer = (item.sender, answer.content) in _NEWER_QUERIES
+        if is_newer and self.profile.older_battery == "yes":
             return
         if isinstance(content, contents.Handshake) and content != contents.Handshake():
             return
@@ -221,22 +230,6 @@ class BmsApplication(Application):
         reply = self._reply(answer, content, now)
         if reply is not None:
             self.port.send(encode(answer, reply))
-
-    def _confirm_unknown(self, message: Message) -> None:
-        """A write that is no row of the dialect is confirmed too, and changes nothing: 2.2.1(2) has
-        general feedback follow every write, to its sender.
-        """
-        answer_id = _FEEDBACK_IDS.get(message.can_id)
-        if answer_id is None or message.mode != Mode.WRITE:
-            return
-        if not self.profile.is_silent_to(message.can_id, message.command):
-            feedback = encode(self._feedback_item, contents.GeneralFeedback())
-            self.port.send(feedback._replace(can_id=answer_id))
-
-    def _knows(self, item: Item, answer: Item) -> bool:
-        if self.profile.older_battery == "yes" and (item.sender, answer.content) in _NEWER_QUERIES:
-            return False
-        return not self.profile.is_silent_to(item.can_id, item.command)
 
     def _write(self, item: Item, content: Content) -> None:
         name = item.title.removeprefix(_WRITE)
@@ -281,9 +274,6 @@ class BmsApplication(Application):
             status=reading.status,
             state_of_health_percent=_NO_STATE_OF_HEALTH if is_older else STATE_OF_HEALTH_PERCENT,
         )
-
-    def _cell_voltages(self, now: float) -> Content:
-        return contents.CellVoltages(self.battery.at(now).cells_mv)
 
     def _version_information(self, now: float) -> Content:
         model, serial_number = self.kept["model"], self.kept["serial number"]

@@ -64,7 +64,9 @@ class ClientApplication(Application):
     def __init__(self, node: Node, dialect: Dialect, timings: Timings = DEFAULT_TIMINGS) -> None:
         super().__init__(node, dialect)
         self._timings = timings
-        rows = {item.title: item for item in ITEMS if _sends(node, item, dialect)}
+        rows = {
+            item.title: item for item in ITEMS if item.sender is node and dialect in item.dialects
+        }
         self._questions = [(routine, rows[routine.title]) for routine in ROUTINES[node]]
         self._ready = next(item for item in rows.values() if item.content is contents.Ready)
         self._goodbye = next((i for i in rows.values() if i.content is contents.Shutdown), None)
@@ -161,23 +163,16 @@ class ClientApplication(Application):
         if decoded is None or self._is_asleep:
             return
         if decoded.item.sender is Node.BMS and decoded.content == contents.Shutdown():
-            self._get_ready()
+            # Each announcement asks anew, and each is answered.
+            self._waiting.clear()
+            self._periodic.clear()
+            self._asked = None
+            self._due_at = inf
+            self.port.send(encode(self._ready, contents.Ready()))
+            if self._goodbye is not None and not self._said_goodbye:
+                self._said_goodbye = True
+                self.port.send(encode(self._goodbye, contents.Shutdown()))
         elif self._asked is not None and answer_of(self._asked[1]) is decoded.item:
             title = self._asked[1].title
             self.answers[title] = self.answers.get(title, 0) + 1
             self._ask_next(now)
-
-    def _get_ready(self) -> None:
-        """Answer every announcement, as each one asks anew; ask nothing more."""
-        self._waiting.clear()
-        self._periodic.clear()
-        self._asked = None
-        self._due_at = inf
-        self.port.send(encode(self._ready, contents.Ready()))
-        if self._goodbye is not None and not self._said_goodbye:
-            self._said_goodbye = True
-            self.port.send(encode(self._goodbye, contents.Shutdown()))
-
-
-def _sends(node: Node, item: Item, dialect: Dialect) -> bool:
-    return item.sender is node and dialect in item.dialects

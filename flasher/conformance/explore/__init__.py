@@ -17,7 +17,6 @@ from flasher.conformance.explore.walk import ALL_STEPS, Phase, Violation, Walk
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.restore import BY_POWER, may_need_power, restore
 from flasher.conformance.results import (
-    CaseEnded,
     CaseLimitReached,
     DeviceCrashed,
     RunStopped,
@@ -217,8 +216,6 @@ class Explorer:
         try:
             return not restore(self._subject, self._profile, flash=True, stopped=self._stopped).ok
         except RunStopped:
-            return True
-        except CaseEnded:
             return True
 
     def _finding(

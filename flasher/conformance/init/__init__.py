@@ -221,13 +221,7 @@ class _Asking:
 
     def _restored(self, when: str, *, flash: bool) -> str:
         """Let the good image run; returns what went wrong, or ""."""
-        profile = self._profile()
-        try:
-            done = restore(self._subject, profile, flash=flash, stopped=self._stopped)
-        except RunStopped:
-            raise
-        except CaseEnded as ended:
-            return f"{when}: {ended}"
+        done = restore(self._subject, self._profile(), flash=flash, stopped=self._stopped)
         if done.ok:
             return ""
         said = "; ".join((done.reason, *done.diagnosis))
