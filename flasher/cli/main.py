@@ -146,8 +146,7 @@ def _guarded(run: Callable[[], int], output: Output) -> int:
     try:
         return run()
     except FlasherError as error:
-        output.failure(error)
-        return error.exit_code
+        return output.failure(error)
     except KeyboardInterrupt:
         output.failure(InterruptedByUserError("Interrupted at once.", remedy=_unfinished(output)))
         return ExitCode.INTERRUPTED

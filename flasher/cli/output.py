@@ -88,11 +88,15 @@ class Output:
             _LOG.info("%s", unpainted(text), extra=SAID)
             _print_stdout(wrapped(text, sys.stdout))
 
+    def results(self, lines: Iterable[str]) -> None:
+        """Lines of the result."""
+        for line in lines:
+            self.result(line)
+
     def table(self, rows: Iterable[Sequence[str]], *, indent: int = 0) -> None:
         """Rows of the result, in columns."""
         if not self.json_wanted:
-            for line in columns(rows, indent=indent):
-                self.result(line)
+            self.results(columns(rows, indent=indent))
 
     def text(self, text: str) -> None:
         """A file's worth of the result, as it is; silent when JSON is wanted."""
@@ -109,14 +113,16 @@ class Output:
         *,
         exit_code: ExitCode = ExitCode.OK,
         error: ErrorDocument | None = None,
-    ) -> None:
-        """The one JSON document of a command, the last line of its output, in its envelope."""
-        if not self.json_wanted:
-            return
-        around = Envelope(SCHEMA_VERSION, self.command, exit_code == ExitCode.OK, exit_code)
-        known = {} if document is None else as_json(document)
-        failed = {} if error is None else {"error": as_json(error)}
-        self.line({**as_json(around), **known, **failed})
+    ) -> ExitCode:
+        """The one JSON document of a command, the last line of its output, in its envelope. Returns
+        the exit code.
+        """
+        if self.json_wanted:
+            around = Envelope(SCHEMA_VERSION, self.command, exit_code == ExitCode.OK, exit_code)
+            known = {} if document is None else as_json(document)
+            failed = {} if error is None else {"error": as_json(error)}
+            self.line({**as_json(around), **known, **failed})
+        return exit_code
 
     def line(self, line: object) -> None:
         """A line of JSON that a command prints before its document; silent when no JSON is wanted.
@@ -154,9 +160,9 @@ class Output:
         say = self.result if is_good else self.error_line
         say(f"{word}  {verdict.text}")
 
-    def failure(self, error: FlasherError, known: object = None) -> None:
+    def failure(self, error: FlasherError, known: object = None) -> ExitCode:
         """An error as a person reads it, and as the JSON document of the command, with the document
-        of what was `known` by then.
+        of what was `known` by then. Returns its exit code.
         """
         what, *others = str(error).splitlines()
         text = "\n".join((f"{what} [{error.code}]", *others))
@@ -166,7 +172,7 @@ class Output:
         if self.ending is not None:
             self.verdict(self.ending(error))
         said = document_of(ErrorDocument, error, kind=type(error).__name__)
-        self.document(known, exit_code=error.exit_code, error=said)
+        return self.document(known, exit_code=error.exit_code, error=said)
 
 
 def _plain_stderr(text: str) -> None:

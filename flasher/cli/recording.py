@@ -21,12 +21,13 @@ from typing import Any, Final
 
 from platformdirs import user_state_path
 
-from flasher.api import Connection
+from flasher.api import Connection, Device, Watch
 from flasher.cli.adapters import settled
 from flasher.cli.files import check_not_read
 from flasher.cli.framework import command_line, option, option_set, typed_values
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
+from flasher.cli.stop import stop_on_signal
 from flasher.cli.values import TRACE_SUFFIXES, FilePath, FolderPath
 from flasher.driver import Tap
 from flasher.errors import ExitCode, FlasherError, InterruptedByUserError
@@ -163,6 +164,19 @@ def recorded_connection(
     ):
         record.opened(connection)
         yield connection, record
+
+
+@contextmanager
+def recorded_device(
+    options: RecordingOptions, bus: Bus, output: Output, target: Target
+) -> Iterator[tuple[Device, Recording]]:
+    """A device there, whose calls are recorded, and end when the user wants to."""
+    with (
+        recorded_connection(options, bus, output, target) as (connection, record),
+        stop_on_signal() as stopped,
+    ):
+        watch: Watch = {"taps": record.taps, "cancelled": stopped}
+        yield connection.device(target, dialect=bus.dialect, **watch), record
 
 
 @contextmanager

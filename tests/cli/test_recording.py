@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,6 @@ from flasher.api import Device
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import BUNDLE_FOLDER, RecordingOptions, recording
-from flasher.driver import Tap
 from flasher.errors import (
     BusError,
     ExitCode,
@@ -275,8 +273,8 @@ def test_commands_record_what_they_ask(
 def test_a_silent_device_leaves_a_bundle_that_is_explained(
     flasher: Flasher, bundle_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def silent(*_: object, taps: Sequence[Tap], **__: object) -> None:
-        for tap in taps:
+    def silent(device: Device, _name: str) -> None:
+        for tap in device._watch["taps"]:
             tap(Frame(0x752, b""), sent=True, now=1.0)
         raise NoAnswerError("The BMS did not answer.", remedy="Wake it.")
 

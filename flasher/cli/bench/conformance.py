@@ -313,8 +313,7 @@ def _tell(
     from flasher.conformance.reports import candump, is_traced, trace_file_name  # noqa: PLC0415
 
     replays = replay_commands(report)
-    for line in report_lines(report, replays, verbose=output.verbosity > 0):
-        output.result(line)
+    output.results(report_lines(report, replays, verbose=output.verbosity > 0))
     traces: dict[tuple[str, int], str] = {}
     failed: list[UsageError] = []
     if chosen.trace_dir is not None:
@@ -423,17 +422,14 @@ def _list(selection: Selection, output: Output) -> int:
         )
         for text in texts
     ]
-    for line in list_lines(found, verbose=output.verbosity > 0):
-        output.result(line)
+    output.results(list_lines(found, verbose=output.verbosity > 0))
     bare, full = gaps(BARE, chosen), gaps(set(BARE).difference(FULL_BENCH), chosen)
     for name, missing in (
         ("a bare bench (device, adapter, good image)", bare),
         ("a full bench (with power, readback and a second image)", full),
     ):
-        for line in gap_lines(name, missing):
-            output.result(line)
-    output.document(CaseListDocument(found, bare_bench=bare, full_bench=full))
-    return ExitCode.OK
+        output.results(gap_lines(name, missing))
+    return output.document(CaseListDocument(found, bare_bench=bare, full_bench=full))
 
 
 @conformance.action("diff", exit_codes=(ExitCode.PARTIAL,))
@@ -454,12 +450,10 @@ def diff(output: Output, *, old: Path, new: Path, threshold: float, strict: bool
     """
     found = compare(read_report(old), read_report(new), threshold)
     output.result(f"{printable(str(old))}, then {printable(str(new))}")
-    for line in difference_lines(found):
-        output.result(line)
+    output.results(difference_lines(found))
     is_worse = found.is_worse or (strict and bool(found.slower or found.gone or found.less))
     code = ExitCode.PARTIAL if is_worse else ExitCode.OK
-    output.document(found, exit_code=code)
-    return code
+    return output.document(found, exit_code=code)
 
 
 @conformance.action("compare", exit_codes=())
@@ -478,15 +472,13 @@ def compare_runs(output: Output, *, reports: tuple[Path, ...], html: Path | None
         check_writable(html, "--html")
         check_not_read(html, "--html", reports)
     found = side_by_side(reports, [read_report(path) for path in reports])
-    for line in side_by_side_lines(found, verbose=output.verbosity > 0):
-        output.result(line)
+    output.results(side_by_side_lines(found, verbose=output.verbosity > 0))
     if html is not None:
         from flasher.conformance.html_report import comparison_page  # noqa: PLC0415  loads jinja2
 
         write_whole(html, comparison_page(found).encode("utf-8"), "--html")
         output.progress(f"html: {printable(str(html))}")
-    output.document(found)
-    return ExitCode.OK
+    return output.document(found)
 
 
 @conformance.action("profile", exit_codes=())
@@ -508,8 +500,7 @@ def profile(output: Output, *, mock: bool, choices: tuple[str, ...]) -> int:
         ProfileKeyDocument(key=key.path, default=key.default, allowed=key.allowed, meaning=key.text)
         for key in profile_keys().values()
     ]
-    output.document(ProfileKeysDocument(keys=keys, toml=toml))
-    return ExitCode.OK
+    return output.document(ProfileKeysDocument(keys=keys, toml=toml))
 
 
 @conformance.action("header", exit_codes=())
@@ -528,8 +519,7 @@ def header(output: Output, *, folder: Path) -> int:
         write_whole(folder / name, content, "FOLDER")
         written.append(str(folder / name))
         output.result(printable(written[-1]))
-    output.document(HeaderDocument(written))
-    return ExitCode.OK
+    return output.document(HeaderDocument(written))
 
 
 conformance.add_command(explore, "explore")

@@ -175,7 +175,7 @@ def _tell(
             f"{printable(str(path))}: {count - len(asked.open)} of {count} keys, each with what "
             f"was seen; {len(asked.open)} stay open"
         )
-    output.document(
+    return output.document(
         document_of(
             InitDocument,
             asked,
@@ -185,4 +185,3 @@ def _tell(
         ),
         exit_code=code,
     )
-    return code

@@ -181,8 +181,7 @@ def mock(
                 stopped() or (watcher.images == upgrades and tool.is_quiet(connection.clock.now()))
             ),
         )
-    output.document(MockDocument(images=watcher.images))
-    return ExitCode.OK
+    return output.document(MockDocument(images=watcher.images))
 
 
 def _served(

@@ -93,14 +93,13 @@ def adapters(output: Output, *, network: bool) -> int:
     output.result("")
     output.result("not seen, even when plugged in:")
     output.table(_unseen_rows(unseen), indent=2)
-    output.document(
+    return output.document(
         AdaptersDocument(
             adapters=[_document(each) for each in detected.found],
             serial_ports=None if serial is None else [_document(each) for each in serial],
             not_seen=unseen,
         )
     )
-    return ExitCode.OK
 
 
 def _rows(found: Iterable[Found]) -> list[tuple[str, str]]:

@@ -21,8 +21,7 @@ from flasher.cli.look.info import InfoDocument, info_document, silence
 from flasher.cli.look.memory import intel_hex, read_shown
 from flasher.cli.options import Bus, bus_options, profile_option, target_option
 from flasher.cli.output import Output, byte_count
-from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
-from flasher.cli.stop import stop_on_signal
+from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.host.query import READ_MEMORY
 from flasher.image.load import load
@@ -163,29 +162,23 @@ def backup(
         )
     area = None if no_memory else _area(image, profile, target, bus)
     bus = bus.with_profile(profile)
-    with (
-        recorded_connection(recorded, bus, output, target) as (connection, record),
-        stop_on_signal() as stopped,
-    ):
-        output.progress(f"asking the {target.node.name} on {connection.name} ...")
-        device = connection.device(target, dialect=bus.dialect)
-        found = device.identify(taps=record.taps, cancelled=stopped)
+    with recorded_device(recorded, bus, output, target) as (device, _):
+        output.progress(f"asking the {target.node.name} on {device.connection.name} ...")
+        found = device.identify()
         data = b""
         if area is not None and found.is_there:
-            data = read_shown(device, area.start, area.end, output, record, stopped)
-        made = backup_of(found, area, data, connection.name, file)
+            data = read_shown(device, area.start, area.end, output)
+        made = backup_of(found, area, data, device.connection.name, file)
     document, memory = made.document, made.document.memory
     write_whole(file, made.archive, _OUTPUT)
-    for line in _lines(document):
-        output.result(line)
+    output.results(_lines(document))
     output.table(document.not_in_it.items(), indent=2)
     if memory is not None and memory.names_running_version is False:
         output.error_line(
             f"warning: the version that runs, {made.running_version}, does not stand in this "
             "memory: these may not be the addresses of the application"
         )
-    output.document(document)
-    return ExitCode.OK
+    return output.document(document)
 
 
 def _area(image: str | None, profile: str | None, target: Target, bus: Bus) -> Area:

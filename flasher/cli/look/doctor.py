@@ -136,20 +136,17 @@ def doctor(output: Output, bus: Bus, *, listen: float) -> int:
             examination.look_at_mock(stopped)
         else:
             examination.look_at_adapters(stopped)
-    for line in lines(examination.findings, is_coloured=takes_colour(sys.stdout)):
-        output.result(line)
+    output.results(lines(examination.findings, is_coloured=takes_colour(sys.stdout)))
     worst = max(examination.findings, key=lambda finding: list(Severity).index(finding.severity))
     document = _document(examination)
     if worst.severity is not Severity.PROBLEM:
-        output.document(document)
-        return ExitCode.OK
+        return output.document(document)
     error = BusError(
         f"A problem was found. {worst.about}: {worst.what}.",
         remedy="; ".join(worst.fix),
         code=ErrorCode.DOCTOR,
     )
-    output.failure(error, document)
-    return error.exit_code
+    return output.failure(error, document)
 
 
 def lines(findings: Sequence[Finding], *, is_coloured: bool) -> list[str]:

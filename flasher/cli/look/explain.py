@@ -99,8 +99,7 @@ def explain(
 
         write_whole(html, render(story).encode("utf-8"), _HTML)
         output.progress(f"page: {printable(str(html))}")
-    output.document(ExplainDocument(story=story))
-    return ExitCode.OK
+    return output.document(ExplainDocument(story=story))
 
 
 def _source(trace: Path | None, *, last: bool) -> Path:

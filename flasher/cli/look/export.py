@@ -169,8 +169,7 @@ def _protocol_file(output: Output, file: Path | None, text: str, *, encoding: st
     data = text.encode(encoding)
     write_whole(file, data, _OUT)
     output.result(f"{printable(str(file))}: {len(data):,} bytes")
-    output.document(ExportedFileDocument(file=str(file), size_bytes=len(data)))
-    return 0
+    return output.document(ExportedFileDocument(file=str(file), size_bytes=len(data)))
 
 
 @export.action("dbc", epilog=_DBC_EXAMPLES)
@@ -201,8 +200,7 @@ def trace(output: Output, *, trace: Path, file: Path, joined: bool) -> int:
     shown = f"{printable(str(file))}: {counted(made.frames, 'frame')}"
     output.result(f"{shown}, {counted(made.remarks, 'remark')}" if made.remarks else shown)
     _warn(output, trace, made.damage, made=made.frames)
-    output.document(document_of(ExportedTraceDocument, made, file=str(file)))
-    return 0
+    return output.document(document_of(ExportedTraceDocument, made, file=str(file)))
 
 
 @export.action("csv", epilog=_CSV_EXAMPLES)
@@ -226,8 +224,9 @@ def csv(output: Output, *, trace: Path, file: Path | None, messages: tuple[str, 
         write_whole(file, text.encode("utf-8"), _OUT)
         output.result(f"{printable(str(file))}: {counted(len(found), 'message')}")
     _warn(output, trace, damage, made=len(found))
-    output.document(ExportedSignalsDocument(file=str(file), messages=len(found), damage=damage))
-    return 0
+    return output.document(
+        ExportedSignalsDocument(file=str(file), messages=len(found), damage=damage)
+    )
 
 
 @export.action("mf4", epilog=_MF4_EXAMPLES)
@@ -252,8 +251,9 @@ def mf4(output: Output, *, trace: Path, file: Path, messages: tuple[str, ...]) -
     count = f"{counted(len(found), 'message')}, {counted(channels, 'channel')}"
     output.result(f"{printable(str(file))}: {count}")
     _warn(output, trace, damage, made=len(found))
-    output.document(ExportedSignalsDocument(file=str(file), messages=len(found), damage=damage))
-    return 0
+    return output.document(
+        ExportedSignalsDocument(file=str(file), messages=len(found), damage=damage)
+    )
 
 
 def _rows(trace: Path, messages: tuple[str, ...]) -> tuple[list[Row], str]:

@@ -86,8 +86,7 @@ def help_(ctx: click.Context, output: Output, *, what: str | None) -> int:
         output.table(((name, code.meaning) for name, code in CODES.items()), indent=2)
         told = [CodeDocument(each.code, each.title, "") for each in errors.values()]
         told += [CodeDocument(name, str(code.meaning), "") for name, code in CODES.items()]
-        output.document(CodesDocument(told))
-        return ExitCode.OK
+        return output.document(CodesDocument(told))
     if what in program.command.entries:
         found = program.command.entries[what].load()
         with found.make_context(what, [], parent=program, resilient_parsing=True) as shown:
@@ -115,5 +114,4 @@ def help_(ctx: click.Context, output: Output, *, what: str | None) -> int:
         is_list = paragraph.startswith("- ")
         for line in re.split(r"\n(?=- )", paragraph) if is_list else [paragraph]:
             output.result(" ".join(line.split()))
-    output.document(CodesDocument([one]))
-    return ExitCode.OK
+    return output.document(CodesDocument([one]))

@@ -10,8 +10,7 @@ from flasher.cli.framework import command
 from flasher.cli.look.content import content_lines, heard_document, heard_lines, rows_lines
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output
-from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
-from flasher.cli.stop import stop_on_signal
+from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
 from flasher.errors import ErrorCode, ExitCode, NoAnswerError
 from flasher.procedures import INFO_LISTEN_ONLY_S, DeviceInfo
 from flasher.protocol.spec import Target
@@ -55,23 +54,16 @@ def info(output: Output, target: Target, bus: Bus, recorded: RecordingOptions) -
     history), and show the answers with what it sends by itself. Nothing is written, and nothing is
     reset.
     """
-    with (
-        recorded_connection(recorded, bus, output, target) as (connection, record),
-        stop_on_signal() as stopped,
-    ):
-        output.progress(f"asking the {target.node.name} on {connection.name} ...")
-        device = connection.device(target, dialect=bus.dialect)
-        found = device.identify(taps=record.taps, cancelled=stopped)
+    with recorded_device(recorded, bus, output, target) as (device, record):
+        output.progress(f"asking the {target.node.name} on {device.connection.name} ...")
+        found = device.identify()
         if not found.is_there:
             record.failed(silence(found))
     if not found.is_there:
         error = silence(found)
-        output.failure(error, info_document(found))
-        return error.exit_code
-    for line in _lines(found):
-        output.result(line)
-    output.document(info_document(found))
-    return ExitCode.OK
+        return output.failure(error, info_document(found))
+    output.results(_lines(found))
+    return output.document(info_document(found))
 
 
 def silence(found: DeviceInfo) -> NoAnswerError:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable
 
 from flasher.api import Device
 from flasher.cli.bar import Bar
 from flasher.cli.output import Output
-from flasher.cli.recording import Recording
 from flasher.errors import NoAnswerError
 from flasher.events import QueryAnswered
 from flasher.host.query import piece_of
@@ -17,14 +15,7 @@ from flasher.protocol.contents import Memory
 MEMORY = "memory"
 
 
-def read_shown(
-    device: Device,
-    start: int,
-    end: int,
-    output: Output,
-    record: Recording,
-    cancelled: Callable[[], bool],
-) -> bytes:
+def read_shown(device: Device, start: int, end: int, output: Output) -> bytes:
     """Read memory while a bar shows how far it is. Raises as `Device.read_memory`."""
     done = 0
 
@@ -37,9 +28,7 @@ def read_shown(
 
     with Bar(output, unit="B", unit_scale=True, desc=MEMORY) as bar:
         try:
-            return device.read_memory(
-                start, end, taps=record.taps, on_event=show, cancelled=cancelled
-            )
+            return device.read_memory(start, end, on_event=show)
         except NoAnswerError as error:
             error.remedy = f"{error.remedy} No file was written."
             raise

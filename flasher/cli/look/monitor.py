@@ -151,10 +151,9 @@ def monitor(
         f"{counted(view.messages, 'message')} shown of {counted(watcher.frames, 'frame')}, "
         f"{view.troubles:,} with trouble"
     )
-    output.document(
+    return output.document(
         MonitorDocument(frames=watcher.frames, messages=view.messages, troubles=view.troubles)
     )
-    return ExitCode.OK
 
 
 def check_messages(wanted: Iterable[str]) -> None:

@@ -17,8 +17,7 @@ from flasher.cli.look.content import content_lines
 from flasher.cli.look.memory import MEMORY, intel_hex, read_shown
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output, byte_count
-from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
-from flasher.cli.stop import stop_on_signal
+from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
 from flasher.errors import ExitCode, UsageError
 from flasher.host.items import find, meaningful_fields, readable
 from flasher.host.query import check_range
@@ -128,12 +127,8 @@ def read(
         raise UsageError("--format needs --output FILE.")
     if file is not None:
         check_writable(file, _OUTPUT)
-    with (
-        recorded_connection(recorded, bus, output, BMS) as (connection, record),
-        stop_on_signal() as stopped,
-    ):
-        device = connection.device(BMS, dialect=bus.dialect)
-        data = read_shown(device, first, behind, output, record, stopped)
+    with recorded_device(recorded, bus, output, BMS) as (device, _):
+        data = read_shown(device, first, behind, output)
     if file is not None:
         is_hex = format == "hex" or (format is None and file.suffix.lower() in _HEX_SUFFIXES)
         write_whole(file, intel_hex(first, data) if is_hex else data, _OUTPUT)
@@ -146,27 +141,20 @@ def read(
             text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in line)
             output.result(f"{first + at:08X}  {line.hex(' '):<{_DUMP_WIDTH * 3 - 1}}  {text}")
         document = MemoryDocument(target.name, first, behind, data=data.hex())
-    output.document(document)
-    return ExitCode.OK
+    return output.document(document)
 
 
 def _read_item(
     item: str, target: Target, bus: Bus, recorded: RecordingOptions, output: Output
 ) -> int:
     entry = find(item, readable(target, bus.dialect), target, "read")
-    with (
-        recorded_connection(recorded, bus, output, target) as (connection, record),
-        stop_on_signal() as stopped,
-    ):
-        device = connection.device(target, dialect=bus.dialect)
-        answer = device.read(entry.name, taps=record.taps, cancelled=stopped)
+    with recorded_device(recorded, bus, output, target) as (device, _):
+        answer = device.read(entry.name)
     document = content_document(answer)
-    for line in content_lines(answer, entry.field):
-        output.result(line)
+    output.results(content_lines(answer, entry.field))
     if entry.field:
         document = {entry.field: document[entry.field]}
-    output.document(ItemDocument(target=target.name, item=entry.name, fields=document))
-    return ExitCode.OK
+    return output.document(ItemDocument(target=target.name, item=entry.name, fields=document))
 
 
 # -- memory ---------------------------------------------------------------------------------------
@@ -197,5 +185,6 @@ def _list(target: Target, dialect: Dialect, output: Output) -> int:
         output.table([*rows, (MEMORY, "START END [-o FILE]")])
     else:
         output.result(f"The documents give the tool nothing to read from the {target.node.name}.")
-    output.document(ReadableDocument(items={name: list(labels) for name, labels in items.items()}))
-    return ExitCode.OK
+    return output.document(
+        ReadableDocument(items={name: list(labels) for name, labels in items.items()})
+    )

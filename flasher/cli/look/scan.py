@@ -72,12 +72,9 @@ def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOpt
     document = _bus_document(survey, rate, guessed, why)
     if not survey.heard:
         error = nobody_heard(survey, bitrate_bps)
-        output.failure(error, document)
-        return error.exit_code
-    for line in _lines(survey, rate, dialect, guessed, why):
-        output.result(line)
-    output.document(document)
-    return ExitCode.OK
+        return output.failure(error, document)
+    output.results(_lines(survey, rate, dialect, guessed, why))
+    return output.document(document)
 
 
 def judge_dialect(survey: Survey, bitrate_bps: int) -> tuple[Dialect | None, str]:

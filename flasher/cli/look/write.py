@@ -157,20 +157,19 @@ def write(
             "question for the old value.",
         ):
             output.progress("nothing was written")
-            output.document(NotWrittenDocument(written=False), exit_code=ExitCode.INTERRUPTED)
-            return ExitCode.INTERRUPTED
+            return output.document(
+                NotWrittenDocument(written=False), exit_code=ExitCode.INTERRUPTED
+            )
         with stop_on_signal(lambda: output.error_line("the write ends first ...")):
             written = device.carry_out(plan, old)
         error = written.error()
         if error is not None:
             record.failed(error)
     if error is not None:
-        output.failure(error, _document(written))
-        return error.exit_code
+        return output.failure(error, _document(written))
     read_back = "read back right" if written.read_back else "there is no query to read it back"
     output.result(f"written: confirmed by the device, {read_back}")
-    output.document(_document(written))
-    return ExitCode.OK
+    return output.document(_document(written))
 
 
 def _document(written: Written) -> WrittenDocument:
@@ -204,5 +203,4 @@ def _list(target: Target, dialect: Dialect, output: Output) -> int:
         )
         for name, entry in items.items()
     }
-    output.document(WritableDocument(items=document))
-    return ExitCode.OK
+    return output.document(WritableDocument(items=document))

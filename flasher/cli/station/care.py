@@ -49,8 +49,7 @@ def backup(output: Output, records: RecordsOptions, file: Path) -> int:
     output.result(f"{printable(str(made.path))}: {byte_count(made.size_bytes)}, checked")
     output.result(f"  sha256: {made.sha256}")
     output.result(f"  traces: {printable(made.path.name)}.files beside it")
-    output.document(made)
-    return ExitCode.OK
+    return output.document(made)
 
 
 # -- what was changed -----------------------------------------------------------------------------
@@ -68,8 +67,7 @@ def verify(output: Output, records: RecordsOptions) -> int:
     else:
         _say_what_was_checked(found, output)
     code = ExitCode.VERIFICATION if found.problems else ExitCode.OK
-    output.document(document_of(VerifiedRecordsDocument, found), exit_code=code)
-    return code
+    return output.document(document_of(VerifiedRecordsDocument, found), exit_code=code)
 
 
 def _problem_lines(problems: Sequence[Problem]) -> Iterator[str]:
@@ -132,7 +130,7 @@ def key(
     output.result(f"  public: {public}")
     output.result(f"  file:   {printable(str(file))}" + ("" if is_there else " (NOT THERE)"))
     output.result(f"  heads:  {printable(str(heads))}")
-    output.document(
+    return output.document(
         SigningKeyDocument(
             station=store.station,
             fingerprint=fingerprint(public),
@@ -142,7 +140,6 @@ def key(
             heads=str(heads),
         )
     )
-    return ExitCode.OK
 
 
 def accept(
@@ -157,8 +154,7 @@ def accept(
             lost = store.accept_restored(who, reason)
             said = f"the station goes on; {counted(lost, 'audit row')} of it given up as lost"
     output.result(f"{printable(store.station)}: {said}")
-    output.document(AcceptedDocument(station=store.station, what=what))
-    return ExitCode.OK
+    return output.document(AcceptedDocument(station=store.station, what=what))
 
 
 def migrate(output: Output, records: RecordsOptions) -> int:
@@ -175,8 +171,7 @@ def migrate(output: Output, records: RecordsOptions) -> int:
     for each in done.problems:
         output.result(f"  {printable(each)}")
     code = ExitCode.VERIFICATION if done.problems else ExitCode.OK
-    output.document(done, exit_code=code)
-    return code
+    return output.document(done, exit_code=code)
 
 
 # -- users of a server -----------------------------------------------------------------------------
@@ -200,5 +195,4 @@ def roles(output: Output, records: RecordsOptions, station_role: str, reader_rol
         output.result(f"{printable(role.name)}: may {role.may} records{new}")
     for name in made:
         output.progress(f"Give {printable(name)} a password: in psql, \\password {printable(name)}")
-    output.document(StationRolesDocument(records=location.shown, roles=documents))
-    return ExitCode.OK
+    return output.document(StationRolesDocument(records=location.shown, roles=documents))

@@ -15,7 +15,7 @@ from flasher.cli.station.documents import (
     StationCheckDocument,
 )
 from flasher.cli.station.setup import labels_of
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.adapters import Resolved, detect, resolve
 from flasher.station.config import load_config
@@ -38,16 +38,13 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
             )
             for each in error.faults
         ]
-        output.failure(error, FindingsDocument(findings=findings))
-        return error.exit_code
-    for line in _lines(recipe, day):
-        output.result(line)
+        return output.failure(error, FindingsDocument(findings=findings))
+    output.results(_lines(recipe, day))
     sockets = {} if station_file is None else _check_station(station_file, recipe)
     for name, adapter in sockets.items():
         output.result(f"socket {printable(name)}: {printable(adapter)}")
     output.result("nothing speaks against it")
-    output.document(_document(recipe, sockets))
-    return ExitCode.OK
+    return output.document(_document(recipe, sockets))
 
 
 def _check_station(station_file: Path, recipe: LoadedRecipe) -> dict[str, str]:

@@ -62,8 +62,7 @@ def report(output: Output, options: ReportOptions, records: RecordsOptions) -> i
             if path is not None:
                 check_writable(path, option)
         made = make_report(store.read, _filter(options))
-        for line in figure_lines(made.figures):
-            output.result(line)
+        output.results(figure_lines(made.figures))
         for option, (path, make) in wanted.items():
             if path is not None:
                 write_whole(path, make(made).encode("utf-8"), option)
@@ -77,8 +76,7 @@ def report(output: Output, options: ReportOptions, records: RecordsOptions) -> i
             figures=figures_document(made.figures),
             runs=[run_document(row) for row in made.runs],
         )
-        output.document(document, exit_code=code)
-        return code
+        return output.document(document, exit_code=code)
 
 
 def _filter(options: ReportOptions) -> RunFilter:
@@ -169,13 +167,11 @@ def unit(
                     found = explained(store.files, file)
                     told.setdefault(details.run.run_id, []).append(found)
                     traces.append(_trace_document(details.run.run_id, file, found, full=full))
-        for line in unit_lines(life, told, full=full):
-            output.result(line)
+        output.results(unit_lines(life, told, full=full))
         if page is not None:
             write_whole(page, certificate(store, life), "--certificate")
             output.progress(f"page: {printable(str(page))}")
-        output.document(UnitDocument(unit=life, traces=traces))
-        return ExitCode.OK
+        return output.document(UnitDocument(unit=life, traces=traces))
 
 
 def _trace_document(

@@ -337,8 +337,7 @@ class _Session:
         """Print the summary; returns the exit code."""
         board = self.view.board
         code = ExitCode.PARTIAL if board.bad_units or self._not_done() else ExitCode.OK
-        for line in self._summary():
-            self.output.result(line)
+        self.output.results(self._summary())
         error, stopped = self._failure, board.stopped
         if error is None and stopped is not None:
             is_record = stopped.code == codes.RECORD_NOT_SAVED.name

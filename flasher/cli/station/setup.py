@@ -11,7 +11,7 @@ from flasher.cli.extras import how_to_install
 from flasher.cli.output import Output
 from flasher.cli.station.commands import RunOptions
 from flasher.cli.station.documents import PinDocument
-from flasher.errors import ErrorCode, ExitCode, UsageError
+from flasher.errors import ErrorCode, UsageError
 from flasher.station.config import StationConfig
 from flasher.station.label_printer import LabelPrinter, printer_of
 from flasher.station.label_template import LabelTemplate, sample_of
@@ -73,8 +73,7 @@ def pin(output: Output) -> int:
         raise UsageError("The two were not the same.", remedy="Begin again.")
     document = PinDocument(pin=hash_of(Pin(typed)))
     output.result(document.pin)
-    output.document(document)
-    return ExitCode.OK
+    return output.document(document)
 
 
 def _typed(prompt: str) -> str:

@@ -329,8 +329,7 @@ class _Upgrade:
             for check in checks:
                 output.result(check_line(check))
             output.result("dry run: nothing was sent")
-            output.document(dry_run_document(plan, chosen, checks))
-            return ExitCode.OK
+            return output.document(dry_run_document(plan, chosen, checks))
         level = choices.level(plan, chosen)
         waived = [name for name in OF_DEVICE if choices.allows(name)]
         waived += [OUTSIDE_VECTOR] * (self.image.allow_outside_vector or choices.force)

@@ -11,7 +11,6 @@ from flasher.cli import values
 from flasher.cli.framework import command, option
 from flasher.cli.options import target_option
 from flasher.cli.output import Output, byte_count, counted
-from flasher.errors import ExitCode
 from flasher.history import Flash, History, matching
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
@@ -60,8 +59,7 @@ def history(output: Output, *, target: Target | None, serial: str | None, limit:
     found = list(matching(flashes, target=name, serial_number=serial))
     latest = list(islice(reversed(found), limit))
     for each in latest:
-        for line in _lines(each):
-            output.result(line)
+        output.results(_lines(each))
         output.result("")
     if not latest:
         output.result("nothing flashed" + (" that fits" if flashes else " yet"))
@@ -70,12 +68,11 @@ def history(output: Output, *, target: Target | None, serial: str | None, limit:
     if damaged:
         path = printable(str(kept.path))
         output.error_line(f"warning: {counted(damaged, 'line')} of {path} cannot be read")
-    output.document(
+    return output.document(
         HistoryDocument(
             file=str(kept.path), flashes=latest, total=len(found), damaged_lines=damaged
         )
     )
-    return ExitCode.OK
 
 
 def _lines(flash: Flash) -> Iterator[str]:

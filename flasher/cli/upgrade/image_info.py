@@ -86,8 +86,7 @@ def image_info(
     chosen = settings.upgrade_options(frame_gap_s=frame_gap, packet_gap_s=packet_gap)
     beside = manifest_beside(image.image, loaded, target)
     lines = [*image_lines(loaded), *vector_lines(table), beside_line(beside)]
-    for line in (*lines, *plan_lines(plan, chosen)):
-        output.result(line)
+    output.results((*lines, *plan_lines(plan, chosen)))
     document = ImageInfoDocument(
         image=image_document(loaded, table), manifest=beside, plan=plan_document(plan, chosen)
     )
@@ -99,8 +98,6 @@ def image_info(
     for found in judge_bytes(loaded, identity):
         error = api.refusal(plan, found)
         if error is not None:
-            output.failure(error, document)
-            return error.exit_code
+            return output.failure(error, document)
         output.result(check_line(found.event))
-    output.document(document)
-    return ExitCode.OK
+    return output.document(document)

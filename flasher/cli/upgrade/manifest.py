@@ -187,8 +187,7 @@ def create(
     write_whole(path, to_toml(release).encode("utf-8"), "-o")
     output.result(f"written: {printable(str(path))}")
     output.table(((f"{key}:", value) for key, value in stated_rows(release).items()), indent=2)
-    output.document(ManifestCreateDocument(image.image, str(path), release, warnings))
-    return ExitCode.OK
+    return output.document(ManifestCreateDocument(image.image, str(path), release, warnings))
 
 
 def _check_destination(path: Path, image: str, *, overwrite: bool) -> None:
@@ -248,10 +247,8 @@ def check(output: Output, image: ImageOptions, target: Target | None, *, file: s
         release.check_bytes(loaded)
         check_target(loaded, release, target or release.target)
     except FlasherError as error:
-        output.failure(error, document)
-        return error.exit_code
-    output.document(document)
-    return ExitCode.OK
+        return output.failure(error, document)
+    return output.document(document)
 
 
 # -- in words and as JSON --------------------------------------------------------------------------

@@ -12,7 +12,6 @@ from flasher.cli.framework import argument, group
 from flasher.cli.options import dialect_option, profile_option, target_option
 from flasher.cli.output import Output
 from flasher.cli.values import FilePath
-from flasher.errors import ExitCode
 from flasher.image.plausible import Cpu
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
@@ -98,8 +97,7 @@ def check(output: Output, *, file: str) -> int:
     names = [target.name for target in check_profile(file)]
     own = f"with values of their own for {', '.join(names)}" if names else "for every device alike"
     output.result(f"{printable(file)}: right, {own}")
-    output.document(CheckedProfileDocument(file=file, targets=names))
-    return ExitCode.OK
+    return output.document(CheckedProfileDocument(file=file, targets=names))
 
 
 @profile.action("show")
@@ -116,8 +114,7 @@ def show(output: Output, target: Target, *, dialect_name: str, profile: str | No
     shown = {
         name: SourcedValue(_plain(value), holds.sources[name]) for name, value in holds.values()
     }
-    output.document(ProfileDocument(holds.target.name, holds.dialect.name, shown))
-    return ExitCode.OK
+    return output.document(ProfileDocument(holds.target.name, holds.dialect.name, shown))
 
 
 def _shown(name: str, value: object) -> str:

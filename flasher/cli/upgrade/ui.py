@@ -82,7 +82,5 @@ def ui(output: Output, bus: Bus, *, images: Path | None, no_browser: bool, port:
     error = serve(output, bus, images, port=port, opened=opened)
     document = UiDocument(address)
     if error is not None:
-        output.failure(error, document)
-        return error.exit_code
-    output.document(document)
-    return ExitCode.OK
+        return output.failure(error, document)
+    return output.document(document)
