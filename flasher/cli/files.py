@@ -16,16 +16,26 @@ _LINKS_MAX: Final = 40
 """Links in a row that the operating system follows."""
 
 
-def check_writable(path: Path, option: str, *, is_appended_to: bool = False) -> None:
-    """Check before the work that a file can be written. Raises UsageError with the `option` that
-    named the file. Unless it `is_appended_to` it will be replaced: its folder has to be writable.
+def check_writable(
+    path: Path | None,
+    option: str,
+    others: Iterable[object] = (),
+    *,
+    is_appended_to: bool = False,
+) -> None:
+    """Check before the work that a file can be written, where one is wanted, and that it is none of
+    the `others` (see `check_not_read`). Raises UsageError with the `option` that named the file.
+    Unless it `is_appended_to` it will be replaced: its folder has to be writable.
     """
+    if path is None:
+        return
     if path.is_dir():
         raise _not_written(path, option, "it is a folder")
     if not path.parent.is_dir():
         raise _not_written(path, option, "its folder does not exist")
     if not is_appended_to and not _can_be_replaced(path):
         raise _not_written(path, option, "its folder may not be written into")
+    check_not_read(path, option, others)
 
 
 def _can_be_replaced(path: Path) -> bool:

@@ -35,7 +35,7 @@ from flasher.cli.bench.conformance_text import (
     side_by_side_lines,
 )
 from flasher.cli.documents import document_of
-from flasher.cli.files import check_not_read, check_writable, write_whole
+from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import argument, group, option, option_set, retyped, typed_values
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
@@ -287,9 +287,7 @@ def conformance(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) 
 def _check_files(chosen: Choices) -> None:
     """Make sure that all files can be written. Raises UsageError."""
     for name, option_name in _FILES.items():
-        if getattr(chosen, name) is not None:
-            check_writable(getattr(chosen, name), option_name)
-            check_not_read(getattr(chosen, name), option_name, typed_values(but=name))
+        check_writable(getattr(chosen, name), option_name, typed_values(but=name))
     if chosen.trace_dir is not None:
         try:
             chosen.trace_dir.mkdir(parents=True, exist_ok=True)
@@ -468,9 +466,7 @@ def compare_runs(output: Output, *, reports: tuple[Path, ...], html: Path | None
     """
     if len(reports) < 2:
         raise UsageError("A comparison takes two reports or more.")
-    if html is not None:
-        check_writable(html, "--html")
-        check_not_read(html, "--html", reports)
+    check_writable(html, "--html", reports)
     found = side_by_side(reports, [read_report(path) for path in reports])
     output.results(side_by_side_lines(found, verbose=output.verbosity > 0))
     if html is not None:

@@ -22,7 +22,7 @@ from flasher.cli.bench.conformance_bench import (
     opened,
 )
 from flasher.cli.documents import document_of
-from flasher.cli.files import check_not_read, check_writable, write_whole
+from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import command, option, option_set, retyped, typed_values
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
@@ -134,9 +134,7 @@ def explore(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> i
     from flasher.conformance.explore import Explorer  # noqa: PLC0415  much is loaded
 
     described = bench.described(bus)
-    if chosen.trace_file is not None:
-        check_writable(chosen.trace_file, _TRACE_FILE)
-        check_not_read(chosen.trace_file, _TRACE_FILE, typed_values(but="trace_file"))
+    check_writable(chosen.trace_file, _TRACE_FILE, typed_values(but="trace_file"))
     if not (described.is_simulated or chosen.replay):
         erases = max(1, round(chosen.steps * _WALKS_PER_STEP * _ERASES_A_WALK))
         said = f"{chosen.steps} steps erase and write the device about {erases} times"

@@ -148,8 +148,7 @@ def mock(
             "flasher mock: -t/--target is required.", remedy="Write -t wmc, bms or obc."
         )
     dialect = bus.dialect
-    if save_image is not None:
-        check_writable(save_image, _SAVE_IMAGE)
+    check_writable(save_image, _SAVE_IMAGE)
     profile = set_options(DeviceProfile(), choices).speaking(dialect)
     engine, device = _served(
         target, dialect, profile, variant, is_system=system, has_application=not no_app

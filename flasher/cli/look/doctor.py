@@ -20,23 +20,8 @@ from flasher.cli import values
 from flasher.cli.adapters import only
 from flasher.cli.documents import document_of
 from flasher.cli.framework import command, option
-from flasher.cli.look.findings import (
-    Finding,
-    Listened,
-    Severity,
-    Traffic,
-    adapter_findings,
-    bit_rate_findings,
-    health_findings,
-    interface_findings,
-    nameless_finding,
-    opened_finding,
-    opening_finding,
-    package_findings,
-    setup_findings,
-    traffic_findings,
-    unchosen_finding,
-)
+from flasher.cli.look import findings
+from flasher.cli.look.findings import Finding, Listened, Severity, Traffic
 from flasher.cli.options import Bus, bus_options
 from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
@@ -207,7 +192,7 @@ class Examination:
         """The built-in bicycle in place of an adapter."""
         speed = self._bus.mock_speed
         with api.connect_mock(BMS, self.dialect, speed=speed, system=True) as mock:
-            self._note(opened_finding(mock.name, is_silent=False))
+            self._note(findings.opened(mock.name, is_silent=False))
             self._listen(mock.link, mock.clock, "--mock", stopped)
 
     def look_at_adapters(self, stopped: Callable[[], bool]) -> None:
@@ -216,7 +201,7 @@ class Examination:
 
         from flasher.bus.opening import bus_config  # noqa: PLC0415
 
-        self._note(*setup_findings(self._bus.fallback))
+        self._note(*findings.setup(self._bus.fallback))
         config: dict[str, Any] | None = None
         with contextlib.suppress(BusError):  # none is named: no other failure is one of the bus
             config = bus_config(self._bus.config, self._bus.fallback)
@@ -230,14 +215,14 @@ class Examination:
             self.detected = detection.collect(stopped)
         _check_stopped(is_stopped=stopped())
         looked, self.findings = self.findings, before
-        self._note(*adapter_findings(self.detected), *looked)
+        self._note(*findings.adapter(self.detected), *looked)
         if config is None:
             self._look_at_the_only_one(stopped)
 
     def _look_at_the_only_one(self, stopped: Callable[[], bool]) -> None:
         found = [each for each in self.detected.found if each.channel]
         if len(found) != 1 or self._bus.is_named:
-            self._note(unchosen_finding(self.detected))
+            self._note(findings.unchosen(self.detected))
             return
         from flasher.bus.opening import bus_config  # noqa: PLC0415  loads python-can
 
@@ -255,15 +240,15 @@ class Examination:
         named = named_bit_rate(given, config, self._bus.fallback)
         if named is not None:
             self.bitrate_bps = named.bps
-        self._note(*package_findings(interface))
+        self._note(*findings.package(interface))
         if "bitrate" in given or "timing" in given:  # any other source is refused at the opening
-            self._note(*bit_rate_findings(self.bitrate_bps, self.dialect))
+            self._note(*findings.bit_rate(self.bitrate_bps, self.dialect))
         if interface == "socketcan" and not channel:
-            self._note(nameless_finding())
+            self._note(findings.nameless())
             return
         if interface == "socketcan":
             seen = read_interface(channel)
-            self._note(*interface_findings(seen, channel, self.bitrate_bps))
+            self._note(*findings.interface(seen, channel, self.bitrate_bps))
             if isinstance(seen, Interface) and (
                 not (seen.is_up and seen.is_can)  # it would open, and carry nothing
                 or seen.bitrate_bps not in (None, self.bitrate_bps)  # it would not be opened
@@ -277,11 +262,11 @@ class Examination:
                 **given,
             )
         except BusError as error:
-            self._note(opening_finding(error))
+            self._note(findings.opening(error))
             return
         try:
             is_silent = can_listen_only(interface)
-            self._note(opened_finding(str(link), is_silent=is_silent))
+            self._note(findings.opened(str(link), is_silent=is_silent))
             self._listen(
                 link, MonotonicClock(), bus_words(interface, channel, given), stopped,
                 interface=interface, channel=channel, is_silent=is_silent,
@@ -309,15 +294,15 @@ class Examination:
         try:
             drive(survey, link, clock, taps=(traffic,), cancelled=stopped)
         except BusError as error:
-            self._note(opening_finding(error))
+            self._note(findings.opening(error))
         _check_stopped(is_stopped=survey.cancelled)
         health = link.health()
-        self._note(*health_findings(health, channel, is_socketcan=interface == "socketcan"))
+        self._note(*findings.health(health, channel, is_socketcan=interface == "socketcan"))
         self.listened = Listened(
             traffic, survey, health, listen_s, self.bitrate_bps, self.dialect, is_silent,
             bus_arguments,
         )  # fmt: skip
-        self._note(*traffic_findings(self.listened))
+        self._note(*findings.traffic(self.listened))
 
     def _note(self, *findings: Finding) -> None:
         self.findings += findings

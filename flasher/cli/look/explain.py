@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from flasher.cli import values
-from flasher.cli.files import check_not_read, check_writable, write_whole
+from flasher.cli.files import check_writable, write_whole
 from flasher.cli.framework import argument, command, option
 from flasher.cli.look.explain_text import story_lines
 from flasher.cli.output import Output
@@ -83,12 +83,8 @@ def explain(
     from flasher.trace.source import explain_path  # noqa: PLC0415  loads python-can
 
     source = _source(trace, last=last)
-    if html is not None:
-        check_writable(html, _HTML)
-        read = [source]
-        if source.is_dir():
-            read += [source / name for name in (TRACE, OLDER_TRACE, REPORT)]
-        check_not_read(html, _HTML, read)
+    in_folder = (TRACE, OLDER_TRACE, REPORT) if source.is_dir() else ()
+    check_writable(html, _HTML, [source, *(source / name for name in in_folder)])
     story = explain_path(source, bitrate_bps=bitrate, everything=everything)
     is_coloured = takes_colour(sys.stdout)
     for line in story_lines(story, packets=packets):

@@ -213,9 +213,7 @@ def csv(output: Output, *, trace: Path, file: Path | None, messages: tuple[str, 
 
     if file is None and output.json_wanted:
         raise _needs_file()
-    if file is not None:
-        check_writable(file, _OUT)
-        check_not_read(file, _OUT, [trace])
+    check_writable(file, _OUT, [trace])
     found, damage = _rows(trace, messages)
     text = csv_text(found)
     if file is None:

@@ -68,7 +68,7 @@ _ok, _note, _warning, _problem = (partial(Finding, severity) for severity in Sev
 # -- python-can ------------------------------------------------------------------------------------
 
 
-def setup_findings(fallback: Fallback | None) -> Iterator[Finding]:
+def setup(fallback: Fallback | None) -> Iterator[Finding]:
     """python-can's version, and what configures it besides the command line."""
     import can  # noqa: PLC0415  slow
     import can.util  # noqa: PLC0415
@@ -88,7 +88,7 @@ def setup_findings(fallback: Fallback | None) -> Iterator[Finding]:
         yield _note("python-can", f"{fallback.source} names {printable(named)}")
 
 
-def package_findings(interface: str) -> Iterator[Finding]:
+def package(interface: str) -> Iterator[Finding]:
     """The Python package that the chosen interface needs, when it is missing."""
     needed = needed_extra(interface)
     if needed is not None and importlib.util.find_spec(needed[1]) is None:
@@ -97,7 +97,7 @@ def package_findings(interface: str) -> Iterator[Finding]:
         yield _problem("python-can", what, (f"pip install 'python-can[{extra}]'",))
 
 
-def bit_rate_findings(bitrate_bps: int, dialect: Dialect) -> Iterator[Finding]:
+def bit_rate(bitrate_bps: int, dialect: Dialect) -> Iterator[Finding]:
     """A bit rate that was asked for against the one of the dialect."""
     if bitrate_bps != dialect.bitrate_bps:
         yield _warning(
@@ -111,7 +111,7 @@ def bit_rate_findings(bitrate_bps: int, dialect: Dialect) -> Iterator[Finding]:
 # -- adapters and interfaces -----------------------------------------------------------------------
 
 
-def adapter_findings(detected: Detected) -> Iterator[Finding]:
+def adapter(detected: Detected) -> Iterator[Finding]:
     """The adapters that python-can sees, and the back ends that gave no answer."""
     for found in detected.found[:_SHOWN_AT_MOST]:
         details = " ".join(f"{key}={value}" for key, value in found.details.items())
@@ -131,20 +131,20 @@ def adapter_findings(detected: Detected) -> Iterator[Finding]:
         yield _note("adapters", f"the back end {name} fails: {text}")
 
 
-def opened_finding(name: str, *, is_silent: bool) -> Finding:
+def opened(name: str, *, is_silent: bool) -> Finding:
     """The adapter was opened."""
     how = "listens without acknowledging" if is_silent else "acknowledges as usual"
     return _ok("adapter", f"{printable(name)} opens and {how}")
 
 
-def opening_finding(error: BusError) -> Finding:
+def opening(error: BusError) -> Finding:
     """Why the adapter cannot be opened."""
     cause = f" ({printable(error.cause)})" if error.cause else ""
     what = f"{printable(error.what).rstrip('.')}{cause}"
     return _problem("adapter", what, (printable(error.remedy),))
 
 
-def unchosen_finding(detected: Detected) -> Finding:
+def unchosen(detected: Detected) -> Finding:
     """No adapter was named, on the command line or elsewhere: how to choose one."""
     ways = [f"flasher doctor {printable(each.arguments)}" for each in detected.found]
     return _problem(
@@ -155,15 +155,13 @@ def unchosen_finding(detected: Detected) -> Finding:
     )
 
 
-def nameless_finding() -> Finding:
+def nameless() -> Finding:
     """SocketCAN without a channel listens to all interfaces, and can send to none."""
     what = "no channel is named: without one, SocketCAN can send nothing"
     return _problem("interface", what, (_LIST_INTERFACES, _EXAMPLES[0]))
 
 
-def interface_findings(
-    seen: Interface | Unseen, channel: str, bitrate_bps: int
-) -> Iterator[Finding]:
+def interface(seen: Interface | Unseen, channel: str, bitrate_bps: int) -> Iterator[Finding]:
     """A SocketCAN interface against what flasher needs of it."""
     name = printable(channel)
     if seen is Unseen.CANNOT_TELL:
@@ -250,7 +248,7 @@ def _queue_and_restart(seen: Interface, name: str) -> Iterator[Finding]:
         yield _note("interface", what)
 
 
-def health_findings(health: LinkHealth, channel: str, *, is_socketcan: bool) -> Iterator[Finding]:
+def health(health: LinkHealth, channel: str, *, is_socketcan: bool) -> Iterator[Finding]:
     """The state of the controller and its error counters."""
     counters = ""
     if health.tx_errors is not None:
@@ -323,7 +321,7 @@ class Listened:
         return self.survey.foreign_frames - self.traffic.error_frames
 
 
-def traffic_findings(heard: Listened) -> Iterator[Finding]:
+def traffic(heard: Listened) -> Iterator[Finding]:
     """How the bus sounds, and who is on it."""
     traffic = heard.traffic
     if not traffic.frames:

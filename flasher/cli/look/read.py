@@ -125,8 +125,7 @@ def read(
         raise UsageError(f"The documents give no way to read memory of the {target.node.name}.")
     if file is None and format:
         raise UsageError("--format needs --output FILE.")
-    if file is not None:
-        check_writable(file, _OUTPUT)
+    check_writable(file, _OUTPUT)
     with recorded_device(recorded, bus, output, BMS) as (device, _):
         data = read_shown(device, first, behind, output)
     if file is not None:

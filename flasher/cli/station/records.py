@@ -59,8 +59,7 @@ def report(output: Output, options: ReportOptions, records: RecordsOptions) -> i
             "--junit": (options.junit, Report.to_junit),
         }
         for option, (path, _) in wanted.items():
-            if path is not None:
-                check_writable(path, option)
+            check_writable(path, option)
         made = make_report(store.read, _filter(options))
         output.results(figure_lines(made.figures))
         for option, (path, make) in wanted.items():
@@ -156,8 +155,7 @@ def unit(
     full: bool,
 ) -> int:
     with closing(open_to_read(records)) as store:
-        if page is not None:
-            check_writable(page, "--certificate")
+        check_writable(page, "--certificate")
         life = store.read.unit(serial, part)
         told: dict[RunId, list[str | Story]] = {}
         traces = []

@@ -27,21 +27,10 @@ from flasher.cli.options import (
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording_options
 from flasher.cli.stop import stop_on_signal
+from flasher.cli.upgrade import text
 from flasher.cli.upgrade.carried import Carried
 from flasher.cli.upgrade.progress import Progress
-from flasher.cli.upgrade.text import (
-    DryRunDocument,
-    UpgradeDocument,
-    check_line,
-    dry_run_document,
-    failed,
-    image_lines,
-    link_lines,
-    plan_lines,
-    summary_lines,
-    vector_lines,
-    verdict_of,
-)
+from flasher.cli.upgrade.text import DryRunDocument, UpgradeDocument
 from flasher.errors import ExitCode, FlasherError
 from flasher.host.identity import WAIVABLE, Check
 from flasher.host.options import DEFAULT_ATTEMPTS, DEFAULT_POWER_UP_TIMEOUT_S, UpgradeOptions
@@ -288,7 +277,7 @@ class _Upgrade:
     ) -> int:
         """Returns the exit code."""
         output, choices = self.output, self.choices
-        output.ending = failed
+        output.ending = text.failed
         profile = load_profile(choices.profile, self.target, self.bus.dialect)
         release = api.find_release(self.image.image, choices.manifest)
         image = api.release_checked(self.image.load(force=choices.force), release)
@@ -311,10 +300,11 @@ class _Upgrade:
             power_up_timeout_s=power_up_timeout_s,
         )
         show = output.result if choices.dry_run else output.progress
+        table = vector_table(image)
         for line in (
-            *image_lines(image),
-            *vector_lines(vector_table(image)),
-            *plan_lines(plan, chosen),
+            *text.image_lines(image),
+            *text.vector_lines(table),
+            *text.plan_lines(plan, chosen),
         ):
             show(line)
         identity = profile.identity(
@@ -327,9 +317,16 @@ class _Upgrade:
         if choices.dry_run:
             checks = [each.event for each in found]
             for check in checks:
-                output.result(check_line(check))
+                output.result(text.check_line(check))
             output.result("dry run: nothing was sent")
-            return output.document(dry_run_document(plan, chosen, checks))
+            return output.document(
+                DryRunDocument(
+                    dry_run=True,
+                    image=text.image_document(image, table),
+                    plan=text.plan_document(plan, chosen),
+                    checks=checks,
+                )
+            )
         level = choices.level(plan, chosen)
         waived = [name for name in OF_DEVICE if choices.allows(name)]
         waived += [OUTSIDE_VECTOR] * (self.image.allow_outside_vector or choices.force)
@@ -347,12 +344,12 @@ class _Upgrade:
         error, document = carried.error, carried.document
         show = output.result if error is None else output.progress
         if result.outcome.ok:
-            for line in summary_lines(result, job.plan):
+            for line in text.summary_lines(result, job.plan):
                 show(line)
         if document is not None and document.link is not None:
-            for line in link_lines(document.link):
+            for line in text.link_lines(document.link):
                 output.progress(line, level=1)
-        verdict = verdict_of(result, carried.checks, carried.took_s)
+        verdict = text.verdict_of(result, carried.checks, carried.took_s)
         if error is None:
             output.verdict(verdict)
             output.document(document, exit_code=result.exit_code)

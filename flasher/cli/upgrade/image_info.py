@@ -19,15 +19,8 @@ from flasher.cli.options import (
     target_option,
 )
 from flasher.cli.output import Output
+from flasher.cli.upgrade import text
 from flasher.cli.upgrade.manifest import ManifestBesideDocument, beside_line, manifest_beside
-from flasher.cli.upgrade.text import (
-    check_line,
-    image_document,
-    image_lines,
-    plan_document,
-    plan_lines,
-    vector_lines,
-)
 from flasher.errors import ExitCode, FlasherError
 from flasher.host.identity import Check, judge_bytes
 from flasher.image.cortexm import vector_table
@@ -85,10 +78,12 @@ def image_info(
     )
     chosen = settings.upgrade_options(frame_gap_s=frame_gap, packet_gap_s=packet_gap)
     beside = manifest_beside(image.image, loaded, target)
-    lines = [*image_lines(loaded), *vector_lines(table), beside_line(beside)]
-    output.results((*lines, *plan_lines(plan, chosen)))
+    lines = [*text.image_lines(loaded), *text.vector_lines(table), beside_line(beside)]
+    output.results((*lines, *text.plan_lines(plan, chosen)))
     document = ImageInfoDocument(
-        image=image_document(loaded, table), manifest=beside, plan=plan_document(plan, chosen)
+        image=text.image_document(loaded, table),
+        manifest=beside,
+        plan=text.plan_document(plan, chosen),
     )
     release = None
     with contextlib.suppress(FlasherError):  # told in `beside`
@@ -99,5 +94,5 @@ def image_info(
         error = api.refusal(plan, found)
         if error is not None:
             return output.failure(error, document)
-        output.result(check_line(found.event))
+        output.result(text.check_line(found.event))
     return output.document(document)

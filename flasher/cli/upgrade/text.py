@@ -273,15 +273,3 @@ def upgrade_document(
         shutdown_heard=result.shutdown_heard,
         link=link,
     )
-
-
-def dry_run_document(
-    plan: Plan, options: UpgradeOptions, checks: Iterable[CheckMade]
-) -> DryRunDocument:
-    """The document of a plan that is not carried out."""
-    return DryRunDocument(
-        dry_run=True,
-        image=image_document(plan.image, vector_table(plan.image)),
-        plan=plan_document(plan, options),
-        checks=list(checks),
-    )
