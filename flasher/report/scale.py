@@ -103,13 +103,12 @@ class Axis:
         *,
         from_zero: bool = False,
         intervals: int = 5,
-        may_be_log: bool = True,
     ) -> Axis:
         """An axis that holds `values`, logarithmic where the range needs it. `from_zero` begins a
         linear one at 0. Without values it goes from 0 to 1.
         """
         kept = list(values) or [0.0, 1.0]
-        is_log = may_be_log and wants_log(kept)
+        is_log = wants_log(kept)
         low, high = min(kept), max(kept)
         if is_log:
             places = log_ticks(low, high, intervals)

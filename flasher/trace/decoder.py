@@ -149,13 +149,10 @@ class Decoder:
     not have is marked. Give it every frame, and `tick` at `deadline`.
     """
 
-    def __init__(
-        self,
-        inter_frame_timeout_s: float = DEFAULT_TIMINGS.inter_frame_timeout_s,
-        dialect: Dialect | None = None,
-    ) -> None:
+    def __init__(self, dialect: Dialect | None = None) -> None:
         self._dialect = dialect
-        self._streams = {key: Reassembler(key, inter_frame_timeout_s) for key in ROUTES}
+        timeout_s = DEFAULT_TIMINGS.inter_frame_timeout_s
+        self._streams = {key: Reassembler(key, timeout_s) for key in ROUTES}
         self._holding: dict[int, Reassembler] = {}
         """The streams that hold the beginning of something: seldom more than two or three."""
 
@@ -361,10 +358,8 @@ class _Open:
 class TimedDecoder:
     """Takes the frames of a bus in the order of time, gives what they say."""
 
-    def __init__(
-        self, inter_frame_timeout_s: float = DEFAULT_TIMINGS.inter_frame_timeout_s
-    ) -> None:
-        self._decoder = Decoder(inter_frame_timeout_s)
+    def __init__(self) -> None:
+        self._decoder = Decoder()
         self._open: dict[int, _Open] = {}
 
     def feed(self, frame: Frame, now: float, bits: int) -> Iterator[TimedEvent]:

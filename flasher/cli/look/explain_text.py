@@ -81,7 +81,8 @@ def _upgrade_lines(upgrade: UpgradeStory, *, packets: bool, is_only: bool) -> It
         yield from _verdict_lines(upgrade.verdict, "  ")
     size = upgrade.image_size_bytes
     total = upgrade.total_packets
-    yield _row("image", "size unknown" if size is None else byte_count(size), total)
+    packets_said = "" if total is None else f", {counted(total, 'packet')}"
+    yield f"  image:         {'size unknown' if size is None else byte_count(size)}{packets_said}"
     yield f"  boot version:  {upgrade.boot_version or 'never announced'}"
     yield f"  running:       {upgrade.running_version or 'no version answer'}"
     for remark in upgrade.remarks:
@@ -97,10 +98,6 @@ def _upgrade_lines(upgrade: UpgradeStory, *, packets: bool, is_only: bool) -> It
         yield from _packet_lines(upgrade.packets)
     if upgrade.link is not None:
         yield from _link_lines(upgrade.link)
-
-
-def _row(name: str, text: str, total: int | None) -> str:
-    return f"  {name}:         {text}" + ("" if total is None else f", {counted(total, 'packet')}")
 
 
 def _step_lines(steps: tuple[StoryLine, ...], left_out: int, indent: str = "") -> Iterator[str]:

@@ -108,8 +108,9 @@ def manifest() -> None:
 # -- create ---------------------------------------------------------------------------------------
 
 
-def _stated(name: str, key: str, metavar: str, text: str, *, is_list: bool = False) -> Decorator:
+def _stated(key: str, metavar: str, text: str, *, is_list: bool = False) -> Decorator:
     """An option for a statement of the manifest, read as the manifest's key takes it."""
+    name = key.removesuffix("s" if is_list else "").replace("_", "-")
 
     def read(value: str) -> str:
         try:
@@ -119,7 +120,7 @@ def _stated(name: str, key: str, metavar: str, text: str, *, is_list: bool = Fal
         return value
 
     return option(
-        name, key, type=read, multiple=is_list, metavar=metavar, panel="manifest",
+        f"--{name}", key, type=read, multiple=is_list, metavar=metavar, panel="manifest",
         help=f"{text}; may be given more than once" if is_list else text,
     )  # fmt: skip
 
@@ -128,36 +129,12 @@ def _stated(name: str, key: str, metavar: str, text: str, *, is_list: bool = Fal
 @image_options
 @target_option()
 @allow_implausible_option()
-@_stated(
-    "--firmware-version", "firmware_version", FIRMWARE_VERSION_FORM, "(default: the one inside)"
-)
-@_stated(
-    "--minimum-boot-version",
-    "minimum_boot_version",
-    BOOT_VERSION_FORM,
-    "the oldest bootloader that may receive it",
-)
-@_stated(
-    "--previous-from",
-    "previous_from",
-    FIRMWARE_VERSION_FORM,
-    "the oldest running version that it may replace",
-)
-@_stated("--notes", "notes", "TEXT", "what a person should know")
-@_stated(
-    "--hardware-version",
-    "hardware_versions",
-    "V",
-    "hardware that it fits; * stands for any text",
-    is_list=True,
-)
-@_stated(
-    "--previous-except",
-    "previous_except",
-    "V",
-    "running versions that it must not replace",
-    is_list=True,
-)
+@_stated("firmware_version", FIRMWARE_VERSION_FORM, "(default: the one inside)")
+@_stated("minimum_boot_version", BOOT_VERSION_FORM, "the oldest bootloader that may receive it")
+@_stated("previous_from", FIRMWARE_VERSION_FORM, "the oldest running version that it may replace")
+@_stated("notes", "TEXT", "what a person should know")
+@_stated("hardware_versions", "V", "hardware that it fits; * stands for any text", is_list=True)
+@_stated("previous_except", "V", "running versions that it must not replace", is_list=True)
 @option(
     "-o", "--output", "file", metavar="FILE", type=values.FilePath("toml"), panel="manifest",
     brief=True, help="(default: beside IMAGE, IMAGE.toml)",
@@ -279,9 +256,10 @@ def checks_of(release: Release, image: Image, target: Target | None) -> list[Sta
     for key in (*_FOR_A_DEVICE, "previous_except"):
         if key in rows:
             detail = f"{rows[key]}: not checked, only a device can answer it"
-            checks.append(_unchecked(key, rows[key], detail))
+            checks.append(StatementDocument(key, "unchecked", rows[key], None, detail))
         elif key in _FOR_A_DEVICE:
-            checks.append(_unchecked(key, None, "not stated: any will do"))
+            detail = "not stated: any will do"
+            checks.append(StatementDocument(key, "unchecked", None, None, detail))
     return checks
 
 
@@ -294,20 +272,11 @@ def _held(finding: Comparison, other: str) -> StatementDocument:
             if stated is None
             else f"{stated}: nothing to check against, {other} does not say it"
         )
-        return _unchecked(finding.key, stated, detail, found)
-    return StatementDocument(
-        check=finding.key,
-        result="agrees" if finding.agrees else "differs",
-        stated=stated,
-        found=found,
-        detail=f"{stated}: agrees" if finding.agrees else f"{stated}: differs, {other} has {found}",
-    )
-
-
-def _unchecked(
-    key: str, stated: str | None, detail: str, found: str | None = None
-) -> StatementDocument:
-    return StatementDocument(key, "unchecked", stated, found, detail)
+        return StatementDocument(finding.key, "unchecked", stated, found, detail)
+    if finding.agrees:
+        return StatementDocument(finding.key, "agrees", stated, found, f"{stated}: agrees")
+    detail = f"{stated}: differs, {other} has {found}"
+    return StatementDocument(finding.key, "differs", stated, found, detail)
 
 
 # -- image-info -----------------------------------------------------------------------------------
