@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from contextlib import chdir
 from pathlib import Path
 
 import pytest
@@ -49,7 +50,8 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def without_file(directory: Path) -> Profile:
-    return load_profile(None, BMS, working_directory=directory)
+    with chdir(directory):
+        return load_profile(None, BMS)
 
 
 # -- values and sources ----------------------------------------------------------------------------
@@ -307,16 +309,19 @@ def test_hostile_names_and_keys_are_shown_harmlessly(tmp_path: Path) -> None:
 # -- where it is found -----------------------------------------------------------------------------
 
 
-def test_the_working_directory_goes_before_the_users(tmp_path: Path, home: Path) -> None:
+def test_the_working_directory_goes_before_the_users(
+    tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     here, mine = tmp_path / "here", home / "flasher"
     for directory in (here, mine):
         directory.mkdir(parents=True)
-    assert find_profile(here) is None
+    monkeypatch.chdir(here)
+    assert find_profile() is None
     users = written(mine, "attempts = 4\n")
-    assert find_profile(here) == users
+    assert find_profile() == users
     local = written(here, "attempts = 5\n")
-    assert find_profile(here) == local
-    assert load_profile(None, BMS, working_directory=here).attempts == 5
+    assert find_profile() == local
+    assert load_profile(None, BMS).attempts == 5
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have other places")
@@ -331,7 +336,8 @@ def test_the_users_directory_is_the_systems_own(
     monkeypatch.setenv("HOME", "/h")
     monkeypatch.setenv("XDG_CONFIG_HOME", configured)
     monkeypatch.setattr(Path, "is_file", lambda path: looked_at.append(path))  # noqa: PLW0108
-    find_profile("/here")
+    monkeypatch.setattr(Path, "cwd", lambda: Path("/here"))
+    find_profile()
     assert looked_at == [Path("/here/flasher.toml"), Path(expected, "flasher.toml")]
 
 

@@ -303,18 +303,14 @@ class Profile:
 
 
 def load_profile(
-    path: str | os.PathLike[str] | None,
-    target: Target,
-    dialect: Dialect = WELLING,
-    *,
-    working_directory: str | os.PathLike[str] | None = None,
+    path: str | os.PathLike[str] | None, target: Target, dialect: Dialect = WELLING
 ) -> Profile:
-    """The profile of a target: of the file `path`, else of the first `flasher.toml` that
-    `find_profile` finds, else the defaults. With os.devnull as `path` no file is looked for.
+    """The profile of a target: of the file `path`, else of the `flasher.toml` that `find_profile`
+    finds, else the defaults. With os.devnull as `path` no file is looked for.
 
     Raises UsageError with everything that is wrong with the file.
     """
-    found = Path(path) if path is not None else find_profile(working_directory)
+    found = Path(path) if path is not None else find_profile()
     if found is not None and found != Path(os.devnull):
         return _File(found).profile(target, dialect)
     profile = Profile(
@@ -334,14 +330,13 @@ def check_profile(path: str | os.PathLike[str]) -> tuple[Target, ...]:
     return tuple(target for target in TARGETS.values() if target.name in file.tables)
 
 
-def find_profile(working_directory: str | os.PathLike[str] | None = None) -> Path | None:
+def find_profile() -> Path | None:
     """The `flasher.toml` of the working directory, else the one of the user; None without any."""
-    return next(_found(working_directory), None)
+    return next(_found(), None)
 
 
-def _found(working_directory: str | os.PathLike[str] | None = None) -> Iterator[Path]:
-    here = Path.cwd() if working_directory is None else Path(working_directory)
-    for directory in (here, user_config_path("flasher", appauthor=False, roaming=True)):
+def _found() -> Iterator[Path]:
+    for directory in (Path.cwd(), user_config_path("flasher", appauthor=False, roaming=True)):
         path = directory / FILE_NAME
         if path.is_file():
             yield path
