@@ -116,19 +116,16 @@ def _check_format(document: Mapping[str, Any], shown: str) -> None:
     )
 
 
-def release_of(  # noqa: PLR0913  one argument for each statement
+def release_of(
     image: Image,
     target: Target,
     *,
     source: str = "",
     firmware_version: str | None = None,
-    hardware_versions: Sequence[str] = (),
-    minimum_boot_version: str | None = None,
-    previous_from: str | None = None,
-    previous_except: Sequence[str] = (),
-    notes: str = "",
+    **statements: str | Sequence[str] | None,
 ) -> Release:
-    """The release that an image is; the firmware version is by default the one inside.
+    """The release that an image is, with other `statements` by the keys of a manifest; the firmware
+    version is by default the one inside.
 
     Raises ImageError when the given firmware version is not the one inside, ValueError for a value
     that a manifest cannot hold.
@@ -145,11 +142,7 @@ def release_of(  # noqa: PLR0913  one argument for each statement
         "firmware_version": firmware_version or image.version,
         "size_bytes": image.size_bytes,
         "sha256": image.sha256,
-        "hardware_versions": list(hardware_versions),
-        "minimum_boot_version": minimum_boot_version,
-        "previous_from": previous_from,
-        "previous_except": list(previous_except),
-        "notes": notes,
+        **statements,
     }
     release, faults = reader().check(stated, source=source)
     if release is None or faults:
