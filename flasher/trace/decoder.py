@@ -14,9 +14,10 @@ Pure: the time is an argument.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import Enum
+from math import inf
 from typing import Any, Final, NamedTuple
 
 from flasher.prose import prose
@@ -30,6 +31,7 @@ from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Damage, Message, Reassembler
 
+_TIMEOUT_S: Final = DEFAULT_TIMINGS.inter_frame_timeout_s
 _LONG_ID_BITS: Final = 20
 """What a 29-bit id adds to a frame: 18 id bits, SRR and r1."""
 _ERROR_FRAME_BITS: Final = 20
@@ -151,39 +153,33 @@ class Decoder:
 
     def __init__(self, dialect: Dialect | None = None) -> None:
         self._dialect = dialect
-        timeout_s = DEFAULT_TIMINGS.inter_frame_timeout_s
-        self._streams = {key: Reassembler(key, timeout_s) for key in ROUTES}
+        self._streams = {key: Reassembler(key, _TIMEOUT_S) for key in ROUTES}
         self._holding: dict[int, Reassembler] = {}
         """The streams that hold the beginning of something: seldom more than two or three."""
 
-    def feed(self, frame: Frame, now: float) -> Iterator[BusEvent]:
+    def feed(self, frame: Frame, now: float) -> Sequence[BusEvent]:
         """What the frame completed, in order: usually nothing, sometimes more than one."""
         if frame.is_error:
-            yield BusEvent(now, Kind.ERROR_FRAME, frame.can_id, prose(Kind.ERROR_FRAME))
-            return
+            return (BusEvent(now, Kind.ERROR_FRAME, frame.can_id, prose(Kind.ERROR_FRAME)),)
         stream = self._streams.get(frame.can_id)
         if stream is None or not frame.is_payload:
-            yield _foreign(frame, now)
-            return
-        for found in stream.feed(frame.data, now):
-            yield self._describe(found, now)
-        if stream.held_size:
+            return (_foreign(frame, now),)
+        found = stream.feed(frame.data, now)
+        if stream.due_at < inf:
             self._holding[frame.can_id] = stream
         else:
             self._holding.pop(frame.can_id, None)
+        return [self._describe(each, now) for each in found] if found else ()
 
     def deadline(self) -> float | None:
         """When `tick` has something to drop; None while nothing is held."""
-        deadlines = (stream.deadline() for stream in self._holding.values())
-        return min((at for at in deadlines if at is not None), default=None)
+        return min((stream.due_at for stream in self._holding.values()), default=None)
 
-    def tick(self, now: float) -> Iterator[BusEvent]:
+    def tick(self, now: float) -> list[BusEvent]:
         """What was cut short: the rest of a message that did not come in time (R12)."""
-        for key, stream in list(self._holding.items()):
-            for found in stream.tick(now):
-                yield self._describe(found, now)
-            if not stream.held_size:
-                del self._holding[key]
+        found = [each for stream in self._holding.values() for each in stream.tick(now)]
+        self._holding = {key: held for key, held in self._holding.items() if held.due_at < inf}
+        return [self._describe(each, now) for each in found]
 
     def _describe(self, found: Message | Damage, now: float) -> BusEvent:
         sender, receiver = ROUTES[found.can_id]
@@ -361,30 +357,34 @@ class TimedDecoder:
     def __init__(self) -> None:
         self._decoder = Decoder()
         self._open: dict[int, _Open] = {}
+        self._nothing_due_before = -inf
 
-    def feed(self, frame: Frame, now: float, bits: int) -> Iterator[TimedEvent]:
+    def feed(self, frame: Frame, now: float, bits: int) -> Sequence[TimedEvent]:
         """What was cut short before `now`, then what the frame completed."""
-        due = self._decoder.deadline()
-        if due is not None and due < now:
-            yield from self._cut_short(now)
-        is_ours = frame.is_payload
-        if is_ours:
+        found: list[TimedEvent] = []
+        if now > self._nothing_due_before:
+            found = self._cut_short(now)
+            due = self._decoder.deadline()
+            self._nothing_due_before = now + _TIMEOUT_S if due is None else due
+        if frame.is_payload:
             held = self._open.get(frame.can_id)
             if held is None:
                 held = self._open[frame.can_id] = _Open(now, bits)
             held.bits += bits
             held.end_s = now
         for event in self._decoder.feed(frame, now):
-            yield self._timed(event, bits)
+            found.append(self._timed(event, bits))
+        return found
 
-    def finish(self, now: float) -> Iterator[TimedEvent]:
+    def finish(self, now: float) -> list[TimedEvent]:
         """What is left unfinished at the end."""
-        yield from self._cut_short(now + 2 * DEFAULT_TIMINGS.inter_frame_timeout_s)
+        return self._cut_short(now + 2 * _TIMEOUT_S)
 
-    def _cut_short(self, now: float) -> Iterator[TimedEvent]:
+    def _cut_short(self, now: float) -> list[TimedEvent]:
+        found: list[TimedEvent] = []
         while (due := self._decoder.deadline()) is not None and due < now:
-            for event in self._decoder.tick(due):
-                yield self._timed(event, 0)
+            found += [self._timed(event, 0) for event in self._decoder.tick(due)]
+        return found
 
     def _timed(self, event: BusEvent, bits: int) -> TimedEvent:
         held = None
