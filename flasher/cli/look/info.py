@@ -57,10 +57,10 @@ def info(output: Output, target: Target, bus: Bus, recorded: RecordingOptions) -
     with recorded_device(recorded, bus, output, target) as (device, record):
         output.progress(f"asking the {target.node.name} on {device.connection.name} ...")
         found = device.identify()
-        if not found.is_there:
-            record.failed(silence(found))
-    if not found.is_there:
-        error = silence(found)
+        error = None if found.is_there else silence(found)
+        if error is not None:
+            record.failed(error)
+    if error is not None:
         return output.failure(error, info_document(found))
     output.results(_lines(found))
     return output.document(info_document(found))

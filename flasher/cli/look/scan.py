@@ -59,19 +59,26 @@ def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOpt
     """
     bus = settled(bus, output)
     dialect, rate = bus.dialect, bus.bit_rate
-    bitrate_bps = rate.bps
     with (
         recorded_connection(recorded, bus, output, target or BMS) as (connection, record),
         stop_on_signal() as stopped,
     ):
         output.progress(f"listening for {SCAN_LISTEN_S:g} s on {connection.name} ...")
         survey = connection.scan(dialect, taps=record.taps, cancelled=stopped)
-        if not survey.heard:
-            record.failed(nobody_heard(survey, bitrate_bps))
-    guessed, why = judge_dialect(survey, bitrate_bps)
-    document = _bus_document(survey, rate, guessed, why)
-    if not survey.heard:
-        error = nobody_heard(survey, bitrate_bps)
+        error = None if survey.heard else nobody_heard(survey, rate.bps)
+        if error is not None:
+            record.failed(error)
+    guessed, why = judge_dialect(survey, rate.bps)
+    document = ScanDocument(
+        bitrate_bps=rate.bps,
+        bitrate_source=rate.source,
+        bitrate_is_assumed=True,
+        dialect=guessed.name if guessed else None,
+        dialect_because=why,
+        nodes={node.name.lower(): heard_document(h) for node, h in survey.heard.items()},
+        foreign_frames=survey.foreign_frames,
+    )
+    if error is not None:
         return output.failure(error, document)
     output.results(_lines(survey, rate, dialect, guessed, why))
     return output.document(document)
@@ -105,15 +112,3 @@ def _lines(
     if survey.foreign_frames:
         lines += ["", f"frames under ids of other protocols: {survey.foreign_frames}"]
     return lines
-
-
-def _bus_document(survey: Survey, rate: BitRate, guessed: Dialect | None, why: str) -> ScanDocument:
-    return ScanDocument(
-        bitrate_bps=rate.bps,
-        bitrate_source=rate.source,
-        bitrate_is_assumed=True,
-        dialect=guessed.name if guessed else None,
-        dialect_because=why,
-        nodes={node.name.lower(): heard_document(h) for node, h in survey.heard.items()},
-        foreign_frames=survey.foreign_frames,
-    )
