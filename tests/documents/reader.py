@@ -17,6 +17,7 @@ from typing import Any, Final
 
 import click
 import pytest
+from intelhex import IntelHex
 
 from flasher.cli.main import COMMANDS, main
 from flasher.settings import bus
@@ -31,6 +32,8 @@ KINDS: Final[Mapping[str, Reader[Any]]] = {
 """Files of settings that a page shows a part of."""
 _ADAPTER: Final = re.compile(r" (?:-i|-c|--bus-kwargs) \S+")
 _PROGRAMS: Final = Path(sys.executable).parent
+_SHORT_SIZE: Final = 4096
+"""In bytes."""
 _SILENT: Final = " 2>/dev/null"
 _TIMES: Final = re.compile(
     r"\d+(?:\.\d+)?(?= (?:s|ms|kB/s)\b)|\d+ ?%|^ +\d+\.\d{3}(?=  )|"
@@ -42,15 +45,22 @@ _TIMES: Final = re.compile(
 class PageReader:
     """Runs the blocks of a page in their order; AssertionError where the page is wrong."""
 
-    def __init__(self, folder: Path, *, patient: bool) -> None:
-        """`patient` runs what is slow, too."""
+    def __init__(self, folder: Path, *, patient: bool, shows_samples: bool = True) -> None:
+        """`patient` runs what is slow, too. A page that shows nothing of the samples is followed
+        with a short one of the BMS, unless one is patient.
+        """
         self._folder = folder
         self._patient = patient
         self._code = 0
         self._adapter = False
         """One is named by the environment."""
         self._names: dict[str, Any] = {"__name__": "page"}
-        (folder / "firmware_samples").symlink_to(ROOT / "firmware_samples")
+        samples = folder / "firmware_samples"
+        if patient or shows_samples:
+            samples.symlink_to(ROOT / "firmware_samples")
+        else:
+            shutil.copytree(ROOT / "firmware_samples", samples, ignore=_links)
+            _shorten(samples / "bms")
         (folder / "examples").symlink_to(ROOT / "examples")
 
     def follow(self, block: Block) -> None:
@@ -139,6 +149,14 @@ def _stream() -> TextIOWrapper:
 def _text(stream: TextIOWrapper) -> str:
     assert isinstance(stream.buffer, BytesIO)
     return stream.buffer.getvalue().decode()
+
+
+def _shorten(sample: Path) -> None:
+    """Leave the beginning of a sample (.hex and .bin), with the texts in it."""
+    whole = IntelHex(f"{sample}.hex")
+    short = whole[whole.minaddr() : whole.minaddr() + _SHORT_SIZE]
+    short.write_hex_file(f"{sample}.hex")
+    short.tobinfile(f"{sample}.bin")
 
 
 def _links(folder: str, names: list[str]) -> list[str]:
