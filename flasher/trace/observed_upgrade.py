@@ -314,7 +314,11 @@ class ObservedUpgrade:
                 self._next_attempt(timed.begin_s)
             self._enter(Phase.TRANSFER, timed.begin_s)
         self.total = values["total"]
-        self._look_for_version(bytes.fromhex(values["payload"]))
+        payload = bytes.fromhex(values["payload"])
+        version = find_firmware_version(self._tail + payload)
+        if version is not None and len(self.image_versions) < _MAX_NOTED:
+            self.image_versions.add(version)
+        self._tail = payload[-_VERSION_SIZE:]
         self.link.packet(number, timed)
         packet, current = self._by_number.get(number), self.current
         if packet is None:
@@ -330,33 +334,30 @@ class ObservedUpgrade:
         self._left_s[number] = timed.left_s(self.bitrate_bps)
         self.current = packet
 
-    def _look_for_version(self, payload: bytes) -> None:
-        found = find_firmware_version(self._tail + payload)
-        if found is not None and len(self.image_versions) < _MAX_NOTED:
-            self.image_versions.add(found)
-        self._tail = payload[-_VERSION_SIZE:]
-
     # -- the device --------------------------------------------------------------------------------
 
     def _device_says(self, timed: TimedEvent, values: dict[str, Any]) -> None:
         match timed.event.command:
             case Command.GENERAL_FEEDBACK:
-                self._feedback(timed)
+                self.feedbacks += 1
+                if self.phase is Phase.RESET:
+                    self._enter(Phase.BOOT, timed.end_s)
+                elif self.phase in (Phase.UPDATE, Phase.TRANSFER):
+                    self.feedbacks_after_update += 1
             case Command.BOOT_VERSION:
                 self._boot_version(timed, values)
             case Command.REQUEST_TRANSFER:
                 self._request(timed)
-            case Command.NAK:
-                self._nak(values["number"], timed)
-            case Command.COMPLETE:
-                self._complete(timed)
-
-    def _feedback(self, timed: TimedEvent) -> None:
-        self.feedbacks += 1
-        if self.phase is Phase.RESET:
-            self._enter(Phase.BOOT, timed.end_s)
-        elif self.phase in (Phase.UPDATE, Phase.TRANSFER):
-            self.feedbacks_after_update += 1
+            case Command.NAK if self.phase is Phase.TRANSFER:
+                self.link.answer(values["number"], timed, is_ack=False)
+                if self.current is not None and self.current.number == values["number"]:
+                    self.current.naks += 1
+            case Command.NAK if self.phase in (Phase.END, Phase.CONFIRM):
+                self.end_naks += 1
+            case Command.COMPLETE if not self.ends:
+                self.early_complete = True
+            case Command.COMPLETE if self.completed_at_s is None:
+                self.completed_at_s = timed.end_s
 
     def _boot_version(self, timed: TimedEvent, values: dict[str, Any]) -> None:
         now, text = timed.end_s, f"{values['name']} {values['version']}"
@@ -406,20 +407,6 @@ class ObservedUpgrade:
         packet.answered_at_s = timed.end_s
         packet.answer_s = max(0.0, timed.end_s - self._left_s[number])
         self._progress()
-
-    def _nak(self, number: int, timed: TimedEvent) -> None:
-        if self.phase is Phase.TRANSFER:
-            self.link.answer(number, timed, is_ack=False)
-            if self.current is not None and self.current.number == number:
-                self.current.naks += 1
-        elif self.phase in (Phase.END, Phase.CONFIRM):
-            self.end_naks += 1
-
-    def _complete(self, timed: TimedEvent) -> None:
-        if not self.ends:
-            self.early_complete = True
-        elif self.completed_at_s is None:
-            self.completed_at_s = timed.end_s
 
     # -- phases, attempts and silence --------------------------------------------------------------
 

@@ -222,9 +222,6 @@ class PcapngWriter:
     def __init__(self, path: str | os.PathLike[str], comment: str = "") -> None:
         """`comment` is one of the whole file. Raises OSError."""
         self._file = Path(path).open("wb")  # noqa: SIM115  stop() closes it
-        self._begin(comment)
-
-    def _begin(self, comment: str) -> None:
         section = Struct("<LHHq").pack(_BYTE_ORDER, 1, 0, -1)
         texts = {_OPTION_COMMENT: comment.encode(), _OPTION_APPLICATION: b"flasher"}
         self._block(_SECTION, section + _options(texts))

@@ -5,7 +5,7 @@ right.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 from flasher.api import as_dialect
 from flasher.cli.framework import argument, group
@@ -138,13 +138,8 @@ def _shown(name: str, value: object) -> str:
             return str(value)
 
 
-def _plain(value: object) -> ProfileValue:
-    match value:
-        case bytes():
-            return list(value)
-        case Cpu():
-            return value.value
-        case None | bool() | int() | float() | str():
-            return value
-        case _:
-            raise TypeError(f"a profile has no value like {value!r}")
+def _plain(value: Any) -> ProfileValue:
+    if isinstance(value, bytes):
+        return list(value)
+    plain: ProfileValue = value.value if isinstance(value, Cpu) else value
+    return plain
