@@ -10,13 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-from flasher.host.query import Request
 from flasher.protocol import catalogue
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import BootVersion, decode
-from flasher.protocol.spec import Target, data_size
+from flasher.protocol.spec import data_size
 from flasher.protocol.text import printable
-from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.protocol.wire import Message, Reassembler, encode, split
 from flasher.settings.profile import sent_ids
 from flasher.station.messages import PresenceChanged
@@ -28,52 +26,70 @@ PROBE_S: Final = 0.5
 """How often a unit is asked whether it is there."""
 
 
-class BootWatcher:
-    """A driver's tap that counts the announcements of a device's bootloader."""
+class TargetWatcher:
+    """A driver's tap: what a device says by itself, and what it answers when it is asked for its
+    version.
+    """
 
-    def __init__(self, target: Target, timings: Timings = DEFAULT_TIMINGS) -> None:
-        self._answers = Reassembler(target.answer_id, timings.inter_frame_timeout_s)
-        self._own_ids = frozenset(sent_ids(target))
+    def __init__(self, loaded: LoadedTarget) -> None:
+        limit_s = loaded.profile.timings.inter_frame_timeout_s
+        self._boot = Reassembler(loaded.target.answer_id, limit_s)
+        self._own_ids = frozenset(sent_ids(loaded.target))
+        self.request = loaded.profile.upgrade_options().version_request_for(loaded.target)
+        """How it is asked; None where nobody knows."""
+        item = None if self.request is None else self.request.answer_item
+        self._item = item
+        self._answers = None if item is None else Reassembler(item.can_id, limit_s)
         self.announcements = 0
+        """Of its bootloader."""
         self.version = ""
-        """As announced last, escaped."""
+        """Of its bootloader, as announced last, escaped."""
         self.heard_at: float | None = None
         """When the device last said anything."""
         self.announced_at: float | None = None
+        self.serial: str | None = None
+        """The serial number in its last answer, empty without one; None: it has not answered."""
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
-        if sent or not frame.is_payload or frame.can_id not in self._own_ids:
+        if sent or not frame.is_payload:
             return
-        self.heard_at = now
-        if frame.can_id != self._answers.can_id:
+        if frame.can_id in self._own_ids:
+            self.heard_at = now
+        if frame.can_id == self._boot.can_id:
+            for found in self._boot.feed(frame.data, now):
+                row = decode(found) if isinstance(found, Message) else None
+                if isinstance(row, BootVersion):
+                    self.announcements += 1
+                    self.announced_at = now
+                    self.version = printable(row.version)
+        if self._answers is not None and frame.can_id == self._answers.can_id:
+            for found in self._answers.feed(frame.data, now):
+                if isinstance(found, Message):
+                    self._take(found)
+
+    def _take(self, message: Message) -> None:
+        """A message that may be the answer."""
+        item = self._item
+        if item is None or (message.mode, message.command) != (item.mode, item.command):
             return
-        for found in self._answers.feed(frame.data, now):
-            row = decode(found) if isinstance(found, Message) else None
-            if isinstance(row, BootVersion):
-                self.announcements += 1
-                self.announced_at = now
-                self.version = printable(row.version)
+        if data_size(message.command) == item.content.SIZE_BYTES:
+            version = item.content.from_data(message.data)
+            self.serial = str(getattr(version, "serial_number", ""))
 
 
 class Presence:
     """Watches an idle bus; pure: frames and times come from outside."""
 
     def __init__(self, targets: Sequence[LoadedTarget]) -> None:
-        self._watchers = [BootWatcher(each.target) for each in targets]
-        self._answers: list[tuple[Request, Reassembler]] = []
-        for each in targets:
-            request = each.profile.upgrade_options().version_request_for(each.target)
-            if request is not None:
-                limit_s = each.profile.timings.inter_frame_timeout_s
-                answers = Reassembler(request.answer_item.can_id, limit_s)
-                self._answers.append((request, answers))
+        self._watchers = [TargetWatcher(each) for each in targets]
+        self._requests = [each.request for each in self._watchers if each.request is not None]
         self._probed_at: float | None = None
         self.begin()
 
     @property
     def sees_units(self) -> bool:
         """True when a unit that is there can be asked."""
-        return bool(self._answers)
+        return bool(self._requests)
 
     @property
     def _announced(self) -> int:
@@ -85,8 +101,7 @@ class Presence:
         """None: not known yet."""
         self._heard_at: float | None = None
         self._began_at: float | None = None
-        self._serials: dict[int, str] = {}
-        """What the targets said in their version answers, by the ids of these."""
+        self._forget_serials()
         self._told_serial: str | None = None
         self._announcements = self._announced
 
@@ -96,21 +111,10 @@ class Presence:
             watcher(frame, sent=sent, now=now)
             if watcher.heard_at == now:
                 self._heard_at = now
-        if sent or not frame.is_payload:
-            return
-        for request, answers in self._answers:
-            if frame.can_id == answers.can_id:
-                for found in answers.feed(frame.data, now):
-                    if isinstance(found, Message):
-                        self._take(request, found)
 
-    def _take(self, request: Request, message: Message) -> None:
-        """A message that may answer the question for the version."""
-        item = request.answer_item
-        is_answer = (message.mode, message.command) == (item.mode, item.command)
-        if is_answer and data_size(message.command) == item.content.SIZE_BYTES:
-            version = item.content.from_data(message.data)
-            self._serials[item.can_id] = str(getattr(version, "serial_number", ""))
+    def _forget_serials(self) -> None:
+        for watcher in self._watchers:
+            watcher.serial = None
 
     def probe(self, now: float) -> list[Frame]:
         """What is to be sent now: a question to each target that can be asked, in its time."""
@@ -118,7 +122,7 @@ class Presence:
             return []
         self._probed_at = now
         frames: list[Frame] = []
-        for request, _ in self._answers:
+        for request in self._requests:
             message = catalogue.encode(request.item, request.content)
             frames += split(message.can_id, encode(message))
         return frames
@@ -132,12 +136,14 @@ class Presence:
         if is_soon and not heard:
             return None
         # What the unit says that it is; None before it has said anything.
-        serial = next(filter(None, self._serials.values()), "") if self._serials else None
+        said = [each.serial for each in self._watchers if each.serial is not None]
+        serial = next(filter(None, said), "") if said else None
         if heard == self.is_there and serial == self._told_serial:
             return None
         self.is_there = heard
         if not heard:
-            self._serials, self._told_serial = {}, None
+            self._forget_serials()
+            self._told_serial = None
             return PresenceChanged(is_there=False, how=f"nothing heard for {SILENCE_S:g} s")
         how = "boot version" if self._announced > self._announcements else "traffic"
         self._told_serial, self._announcements = serial, self._announced

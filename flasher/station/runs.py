@@ -73,12 +73,7 @@ def save(store: Store, run: ActiveRun, now_s: Callable[[], float]) -> RunResult:
         # The records know better: it is no PASS. That is a bug, and the unit is not judged.
         run.result = _worse(run.result, codes.INTERNAL, error.what)
         store.finish(run.claim.run_id, _ending(run, run.result))
-    spooled = [run.trace]
-    if run.finished is not None and run.finished.trace is not None:
-        spooled.append(run.finished.trace.path)
-    for path in spooled:  # the records have their own copy
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
+    store.files.forget_spooled(run.claim.run_id)
     return run.result
 
 

@@ -25,7 +25,7 @@ from flasher.protocol.fields import Content
 from flasher.protocol.spec import Command
 from flasher.station.codes import Code
 from flasher.station.power import PowerControl
-from flasher.station.presence import BootWatcher
+from flasher.station.presence import TargetWatcher
 from flasher.station.recipe_file import LoadedTarget
 
 _LOOK_EVERY_S: Final = 0.05
@@ -73,7 +73,7 @@ class UnitTarget:
         self.loaded = loaded
         self.name = loaded.name
         self.clock = connection.clock
-        self.watcher = BootWatcher(loaded.target, loaded.profile.timings)
+        self.watcher = TargetWatcher(loaded)
         # Nobody else has this adapter, and each flash listens itself.
         self.device = connection.device(
             profile=loaded.profile,

@@ -6,7 +6,6 @@ import logging
 import socket
 import threading
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, NamedTuple
 
 import uvicorn
@@ -68,12 +67,7 @@ class Server:
         self._thread.start()
         return self
 
-    def __exit__(
-        self,
-        _kind: type[BaseException] | None,
-        _error: BaseException | None,
-        _trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._server.should_exit = True
         self._thread.join(_END_LIMIT_S)
         self._server.force_exit = True
