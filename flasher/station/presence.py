@@ -144,7 +144,7 @@ class Presence:
         if not heard:
             self._forget_serials()
             self._told_serial = None
-            return PresenceChanged(is_there=False, how=f"nothing heard for {SILENCE_S:g} s")
+            return PresenceChanged(is_there=False)
         how = "boot version" if self._announced > self._announcements else "traffic"
         self._told_serial, self._announcements = serial, self._announced
         return PresenceChanged(is_there=True, how=how, serial=serial)

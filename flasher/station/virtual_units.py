@@ -136,7 +136,7 @@ class VirtualSocket:
                 self._bus.detach(device)
             self.devices.clear()
             self._next_at = now + self._virtual.arrive_after_s
-            return PresenceChanged(is_there=False, how="the virtual unit left", is_certain=True)
+            return PresenceChanged(is_there=False, is_certain=True)
         if self._left == 0:
             return None
         if self._left is not None:

@@ -212,8 +212,7 @@ class Worker:
         sees = self._virtual is not None or self._presence.sees_units
         self._pipe.send(Ready(self._connection.name, sees))
         if self._virtual is not None:
-            how = "no virtual unit yet"
-            self._pipe.send(PresenceChanged(is_there=False, how=how, is_certain=True))
+            self._pipe.send(PresenceChanged(is_there=False, is_certain=True))
         while not self._pipe.is_over:
             self._pipe.look()
             begin = self._pipe.take_begin()

@@ -334,7 +334,13 @@ class Bench:
                 troubles += event.is_trouble
                 board.add(event)
             elif isinstance(event, Pulse):
-                rows = _rows(board, event.at)
+                now = event.at
+                rows = tuple(
+                    SeenMessage(
+                        line.seen, frozenset(line.changed(now)), line.count, line.rate_hz(now)
+                    )
+                    for line in board.lines()
+                )
                 self._set(watched=Watched(self._now() - since_s, messages, troubles, rows))
 
         self._set(doing=Doing.WATCHING, watched=Watched(0.0, 0, 0, ()))
@@ -509,21 +515,6 @@ class Bench:
         if self.state.adapter is None:
             raise UsageError("No adapter is chosen.", remedy="Choose one.")
         return self.state.adapter
-
-
-def _rows(board: Board, now: float) -> tuple[SeenMessage, ...]:
-    return tuple(
-        SeenMessage(
-            line.seen.marked_title,
-            line.seen.route,
-            line.seen.is_trouble,
-            line.seen.fields,
-            frozenset(line.changed(now)),
-            line.count,
-            line.rate_hz(now),
-        )
-        for line in board.lines()
-    )
 
 
 def _known(things: Mapping[str, T], name: str) -> T:

@@ -14,7 +14,7 @@ from flasher.errors import FlasherError
 from flasher.protocol.spec import Target
 from flasher.report.base import visible
 from flasher.settings.area import Area
-from flasher.trace.decoder import Field
+from flasher.trace.decoder import BusEvent
 
 
 class Doing(Enum):
@@ -114,11 +114,7 @@ class Done:
 class SeenMessage:
     """The latest message of one kind on the bus."""
 
-    title: str
-    route: str
-    """Who to whom; empty for an id of no node."""
-    is_trouble: bool
-    fields: tuple[Field, ...]
+    seen: BusEvent
     changed: frozenset[str]
     """Names of the fields that changed a moment ago."""
     count: int

@@ -178,15 +178,17 @@ class Screen:
         word = (state, row.serial, row.code, row.note, row.step)
         self.feed.put(f"socket {name}", replace(row, state=state), word=word)
 
-    def turn(self, board: Board, *, station: tuple[str, str, str], operator: str, lot: Lot) -> None:
-        """Once in each turn of the station's loop. `station`: its name, recipe and part."""
+    def turn(self, board: Board, *, operator: str, lot: Lot) -> None:
+        """Once in each turn of the station's loop."""
         self.feed.beat()
         now = time.monotonic()
         if now - self._turned_at < HEAD_EVERY_S:
             return
         self._turned_at = now
         head = Head(
-            *station,
+            board.station,
+            board.recipe,
+            board.part,
             operator,
             lot,
             board.virtual_words,

@@ -78,10 +78,9 @@ class LineScreen:
         self._thread.join()
 
     def _turn(self) -> None:
-        names = (self.board.station, self.board.recipe, self.board.part)
         while not self._ended.wait(0.05):
             with self._lock:
-                self.screen.turn(self.board, station=names, operator=self.operator, lot=self.lot)
+                self.screen.turn(self.board, operator=self.operator, lot=self.lot)
 
 
 def ended(socket: str, serial: str, outcome: RunState, code: str = "REFUSED") -> RunEnded:

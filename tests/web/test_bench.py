@@ -430,11 +430,11 @@ def test_what_is_said_on_the_bus_is_shown_until_it_is_stopped(
     assert state.trouble is None
     assert state.watched is not None
     assert {each.doing for each in looks} == {Doing.WATCHING, Doing.NOTHING}
-    rows = {each.title: each for each in state.watched.board}
+    rows = {each.seen.marked_title: each.seen for each in state.watched.board}
     running = rows["running information"]
     assert running.route == "BMS > all"
     assert {"voltage", "state of charge"} <= {each.label for each in running.fields}
-    assert any(each.is_trouble for each in state.watched.board)  # the fault of this bike
+    assert any(each.seen.is_trouble for each in state.watched.board)  # the fault of this bike
     assert place.do(order(Bench.use_adapter, Fault.NONE.value)).watched is None
 
 

@@ -435,7 +435,7 @@ def test_the_audit_trail_in_pages(client: TestClient, overview: Overview) -> Non
     first = overview.audit(Cut(), size=10)
     assert first.older is not None
     second = overview.audit(first.older, size=10)
-    assert first.rows[-1].row_id == second.rows[0].row_id + 1
+    assert first.rows[-1].number == second.rows[0].number + 1
     assert "begun" in client.get("/audit?event=begun").text
 
 

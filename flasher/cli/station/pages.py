@@ -80,11 +80,10 @@ class OperatorView:
             self._good = {str(run["serial"]): run["state"] == RunState.PASS for run in runs}
         self._lot = line.lot
         lot = Lot(line.lot, rule.lot.quantity_max or 0, sum(self._good.values()))
-        names = (board.station, board.recipe, board.part)
         operator = line.operator or say("nobody: scan a badge")
         if not board.has_badges:
             operator = say("{name} (no badges)", name=line.operator)
-        self._screen.turn(board, station=names, operator=operator, lot=lot)
+        self._screen.turn(board, operator=operator, lot=lot)
 
 
 @contextmanager

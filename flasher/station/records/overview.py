@@ -130,7 +130,6 @@ class By(StrEnum):
 class AuditRow:
     """A row of the audit trail."""
 
-    row_id: int
     station: str
     number: int
     at: datetime
@@ -342,9 +341,9 @@ class Overview:
     ) -> Page[AuditRow]:
         """A page of the audit trails of all stations."""
         audit = schema.audit.c
-        query = select(
-            schema.audit, audit.id.label("row_id"), schema.station.c.name.label("station")
-        ).join_from(schema.audit, schema.station)
+        query = select(schema.audit, schema.station.c.name.label("station")).join_from(
+            schema.audit, schema.station
+        )
         if event is not None:
             query = query.where(audit.event == event)
         if since is not None:
