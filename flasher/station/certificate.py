@@ -16,6 +16,7 @@ from markupsafe import Markup
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.report.base import Status, render_page
+from flasher.said import say
 from flasher.station.records.errors import UnprovenError
 from flasher.station.records.keys import Head, fingerprint
 from flasher.station.records.model import (
@@ -35,21 +36,24 @@ _WRITES_ON_SHEET: Final = 4
 """With more of them, or longer ones, all stand in the annex in full."""
 _TEXT_ON_SHEET: Final = 40
 _TEXT_IN_CODE: Final = 80
-_WORDS: Final = {
-    UnitState.PASS: (Status.GOOD, "PASS", "This unit passed."),
-    UnitState.FAIL: (Status.BAD, "FAIL", "This unit did not pass: it is no good unit."),
+UNIT_WORDS: Final = {
+    UnitState.PASS: (Status.GOOD, say("PASS"), "This unit passed."),
+    UnitState.FAIL: (Status.BAD, say("FAIL"), "This unit did not pass: it is no good unit."),
     UnitState.RECHECK: (
         Status.WARNING,
-        "RECHECK",
+        say("RECHECK"),
         "The last run of this unit did not come to a result. It has to be checked.",
     ),
-    UnitState.RUNNING: (Status.NEUTRAL, "RUNNING", "This unit is being made: no result yet."),
-    UnitState.NEW: (Status.NEUTRAL, "NEW", "Nothing was done to this unit."),
+    UnitState.RUNNING: (Status.NEUTRAL, say("RUNNING"), "This unit is being made: no result yet."),
+    UnitState.NEW: (Status.NEUTRAL, say("NEW"), "Nothing was done to this unit."),
 }
-_RUN_STATUS: Final = {
-    RunState.PASS: Status.GOOD,
-    RunState.FAIL: Status.BAD,
-    RunState.RUNNING: Status.NEUTRAL,
+RUN_WORDS: Final = {
+    RunState.RUNNING: (say("RUNNING"), Status.NEUTRAL),
+    RunState.PASS: (say("PASS"), Status.GOOD),
+    RunState.FAIL: (say("FAIL"), Status.BAD),
+    RunState.ERROR: (say("ERROR"), Status.WARNING),
+    RunState.ABORTED: (say("ABORTED"), Status.WARNING),
+    RunState.INTERRUPTED: (say("INTERRUPTED"), Status.WARNING),
 }
 
 
@@ -92,7 +96,7 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof) -> dict[str, Any]:
     last = life.last
     if last is None:
         raise UsageError(f"Nothing was done to {life.serial}: there is nothing to certify.")
-    status, word, sentence = _WORDS[life.state]
+    status, word, sentence = UNIT_WORDS[life.state]
     if life.is_virtual:
         status = Status.WARNING  # never the colour of a product that passed
     earlier = life.runs[:-1]
@@ -123,7 +127,7 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof) -> dict[str, Any]:
             for each in step.measurements
         ],
         "earlier": [
-            (run, _RUN_STATUS.get(run.state, Status.WARNING))
+            (run, RUN_WORDS[run.state][1])
             for run in (details.run for details in earlier[-EARLIER_SHOWN:])
         ],
         "earlier_left_out": max(0, len(earlier) - EARLIER_SHOWN),

@@ -11,6 +11,7 @@ from typing import Final
 
 from flasher.protocol.text import printable
 from flasher.said import say
+from flasher.station.board import Board
 
 LITTLE_BYTES: Final = 500 * 1024 * 1024
 """Less free space is told."""
@@ -45,26 +46,18 @@ class Watch:
         self._looked_at = float("-inf")
         self._seen: tuple[Check, ...] = ()
 
-    def look(
-        self,
-        *,
-        records_fault: str,
-        unprinted: Collection[str] = (),
-        lost_scanners: Collection[str] = (),
-    ) -> tuple[Check, ...]:
-        """What is so now; `records_fault`: why records are not saved, empty when they are;
-        `unprinted`: units without their labels; `lost_scanners`: those that cannot be read.
-        """
+    def look(self, board: Board) -> tuple[Check, ...]:
+        """What is so now."""
         now = self._monotonic_s()
         if now - self._looked_at >= LOOK_EVERY_S:
             self._looked_at, self._seen = now, (self._disk(), self._clock())
-        text = records_fault or say("every run is saved")
-        checks = [Check(say("records"), is_good=not records_fault, text=text)]
-        if unprinted:
-            text = say("not printed: {names}", names=_few(unprinted))
+        text = board.records_fault or say("every run is saved")
+        checks = [Check(say("records"), is_good=not board.records_fault, text=text)]
+        if board.unprinted:
+            text = say("not printed: {names}", names=_few(board.unprinted))
             checks.append(Check(say("labels"), is_good=False, text=text))
-        if lost_scanners:
-            text = say("cannot be read: {names}", names=_few(lost_scanners))
+        if board.lost_scanners:
+            text = say("cannot be read: {names}", names=_few(board.lost_scanners))
             checks.append(Check(say("scanners"), is_good=False, text=text))
         return (*checks, *self._seen)
 

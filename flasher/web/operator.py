@@ -193,11 +193,7 @@ class Screen:
             lot,
             board.virtual_words,
             self._tally.output(datetime.now().astimezone()),
-            self._watch.look(
-                records_fault=board.records_fault,
-                unprinted=tuple(board.unprinted),
-                lost_scanners=tuple(board.lost_scanners),
-            ),
+            self._watch.look(board),
             board.stopped,
             board.said,
             board.is_refusal,

@@ -18,12 +18,19 @@ from typing import Any, Final, NamedTuple
 from urllib.parse import urlencode
 
 from flasher.errors import FlasherError, UsageError
-from flasher.report.base import Status
 from flasher.report.chart import WIDTHS, histogram
 from flasher.report.explain_page import status_of, told
 from flasher.said import say
 from flasher.station import codes
-from flasher.station.certificate import limits_of, number, proven, sheet, verdict_of
+from flasher.station.certificate import (
+    RUN_WORDS,
+    UNIT_WORDS,
+    limits_of,
+    number,
+    proven,
+    sheet,
+    verdict_of,
+)
 from flasher.station.records import chain
 from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
 from flasher.station.records.keys import Keeping
@@ -66,21 +73,6 @@ _NAMES: Final = {
     "/audit": say("Audit trail"),
 }
 """The menu."""
-OUTCOMES: Final = {
-    RunState.RUNNING: (say("RUNNING"), Status.NEUTRAL),
-    RunState.PASS: (say("PASS"), Status.GOOD),
-    RunState.FAIL: (say("FAIL"), Status.BAD),
-    RunState.ERROR: (say("ERROR"), Status.WARNING),
-    RunState.ABORTED: (say("ABORTED"), Status.WARNING),
-    RunState.INTERRUPTED: (say("INTERRUPTED"), Status.WARNING),
-}
-UNIT_WORDS: Final = {
-    UnitState.NEW: (say("NEW"), Status.NEUTRAL),
-    UnitState.RUNNING: (say("RUNNING"), Status.NEUTRAL),
-    UnitState.PASS: (say("PASS"), Status.GOOD),
-    UnitState.FAIL: (say("FAIL"), Status.BAD),
-    UnitState.RECHECK: (say("RECHECK"), Status.WARNING),
-}
 BY_WORDS: Final = {
     By.SOCKET: say("socket"),
     By.RECIPE: say("recipe"),
@@ -150,7 +142,7 @@ class Supervisor:
             here=_Addresses(question),
             zone=_zone(now),
             at=lambda moment: "" if moment is None else f"{moment.astimezone():%Y-%m-%d %H:%M:%S}",
-            outcomes=OUTCOMES,
+            outcomes=RUN_WORDS,
             **context,
         )
         return Answer(text.encode("utf-8", "backslashreplace"), status=http)
@@ -213,7 +205,7 @@ class Supervisor:
         newest = self.overview.life(serial, part, Cut(), 1).rows[0]
         shown = page.rows[0]
         story = self._story(shown)
-        state, state_status = UNIT_WORDS[UnitState.after(newest.run.state)]
+        state_status, state, _ = UNIT_WORDS[UnitState.after(newest.run.state)]
         return self._page(
             question,
             "unit.html",

@@ -174,9 +174,10 @@ def test_a_printer_that_fails_touches_no_verdict_and_is_said(bench: Bench) -> No
 
 def test_what_is_not_printed_stays_on_the_page(tmp_path: Path, bench: Bench) -> None:
     watch = Watch(tmp_path, bench.clock.utc, bench.clock.monotonic_s)
-    names = [check.name for check in watch.look(records_fault="")]
+    names = [check.name for check in watch.look(Board())]
     assert names == ["records", "disk", "clock"]
-    check = watch.look(records_fault="", unprinted=("W1", "W2", "W3", "W4"))[1]
+    failed = LabelFailed("A", "W1", "No paper.", "Put some in.")
+    check = watch.look(Board(unprinted=dict.fromkeys(("W1", "W2", "W3", "W4"), failed)))[1]
     assert (check.name, check.is_good) == ("labels", False)
     assert check.text == "not printed: W1, W2, W3 and 1 more"
 
