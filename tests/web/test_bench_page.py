@@ -34,7 +34,7 @@ def page(tab: Tab, place: BenchPlace) -> Iterator[Page]:
     """The page; it asks for nothing from elsewhere, and its script makes no error."""
     with place.served() as url:
         tab.page.goto(url)
-        expect(tab.page.locator("#adapter-1")).to_be_enabled()
+        tab.page.wait_for_selector("#adapter-1:enabled")
         yield tab.page
         root = url.partition("/enter")[0]
         assert all(each.startswith(root) for each in tab.asked)
@@ -49,7 +49,7 @@ def _choose(page: Page, fault: Fault = Fault.NONE, target: str = "bms") -> None:
 
 
 def _claims(page: Page) -> list[str]:
-    expect(page.locator("#next-bike")).to_be_enabled()
+    page.wait_for_selector("#next-bike:enabled", timeout=20_000)
     return page.locator("#result .claim strong").all_inner_texts()
 
 

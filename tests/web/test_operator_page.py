@@ -67,7 +67,7 @@ def page(tab: Tab, line: LineScreen) -> Iterator[Page]:
     """The page of `line`; it asks for nothing from elsewhere, and its script makes no error."""
     tab.page.set_viewport_size({"width": 1920, "height": 1080})
     tab.page.goto(f"{line.url}line")
-    expect(tab.page.locator("article")).to_have_count(4)
+    tab.page.wait_for_function("() => document.querySelectorAll('article').length === 4")
     yield tab.page
     assert all(each.startswith(line.url) for each in tab.asked)
     assert [each for each in tab.wrong if "ERR_" not in each] == []
@@ -89,7 +89,11 @@ def _rounds(page: Page, line: LineScreen, names: Sequence[str]) -> Iterator[None
 
 
 def _shows(page: Page, socket: int, word: str) -> None:
-    expect(page.locator("article .word").nth(socket)).to_have_text(word)
+    # Looked at with every frame: what `expect` waits between two looks adds up.
+    page.wait_for_function(
+        "([at, w]) => document.querySelectorAll('article .word')[at]?.textContent === w",
+        arg=[socket, word],
+    )
 
 
 # -- verdicts --------------------------------------------------------------------------------------
