@@ -7,7 +7,6 @@ device unreachable from one that only leaves an upgrade unfinished.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
@@ -84,7 +83,7 @@ def restore(
             return Restored(how)
         reasons.append(f"{how}: {reason}")
         later_s = bench.tester.began_at - began_at
-        trace += [replace(entry, at_s=entry.at_s + later_s) for entry in bench.tester.trace]
+        trace += [one._replace(at_s=one.at_s + later_s) for one in bench.tester.trace]
     has_wires = subject.port.timestamp_source != "simulated bus"
     diagnosis = [] if crashed else diagnose(trace, bench.encoder, has_wires=has_wires)
     return Restored("", "; ".join(reasons), tuple(trace), tuple(diagnosis))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import Final
+from typing import Final, NamedTuple
 
 from flasher.conformance.wire import RawFrame
 
@@ -72,8 +72,7 @@ class Measurement:
     uncertainty_s: float
 
 
-@dataclass(frozen=True)
-class TraceEntry:
+class TraceEntry(NamedTuple):
     """One frame of a case, in seconds since the case began; `sent` by the suite or received."""
 
     at_s: float
