@@ -20,7 +20,6 @@ from flasher.conformance.results import (
     Check,
     CheckOutcome,
     Gap,
-    Measurement,
     Rescue,
     RunReport,
 )
@@ -170,7 +169,15 @@ def report_document(
         passes_in_full=report.count(CaseVerdict.PASS),
         not_tried=report.not_tried(),
         counts={verdict.value: report.count(verdict) for verdict in CaseVerdict},
-        times=[_times(name, found) for name, found in report.times().items()],
+        times=[
+            TimesDocument(
+                name=name,
+                **asdict(distribution(found)),
+                uncertainty_s=max(one.uncertainty_s for one in found),
+                histogram=_histogram([one.value_s for one in found]),
+            )
+            for name, found in report.times().items()
+        ],
     )
 
 
@@ -195,16 +202,6 @@ def _result(result: CaseResult, replay: str, trace_file: str) -> ResultDocument:
         duration_s=result.duration_s,
         replay=replay,
         trace_file=trace_file,
-    )
-
-
-def _times(name: str, found: Sequence[Measurement]) -> TimesDocument:
-    values_s = [one.value_s for one in found]
-    return TimesDocument(
-        name=name,
-        **asdict(distribution(found)),
-        uncertainty_s=max(one.uncertainty_s for one in found),
-        histogram=_histogram(values_s),
     )
 
 

@@ -76,18 +76,15 @@ class RealPort:
 
     def receive(self, deadline: float) -> Arrival | None:
         while (frame := self._link.receive(deadline)) is not None:
-            at = self._moment()
+            stamped_at = None if self._stamps is None else self._stamps.received_at
+            # Never before that of the frame before it.
+            at = max(self._last_at, self.now() if stamped_at is None else stamped_at)
+            self._last_at = at
             frame = Frame(*frame[:5])  # whose it is, is judged here, and not by the link
             is_own = self._take_own(frame)
             if self.echoes or not is_own:
                 return Arrival(RawFrame(*frame[:5]), at, is_own)
         return None
-
-    def _moment(self) -> float:
-        """The time of the frame received last; never before that of the frame before it."""
-        stamped_at = None if self._stamps is None else self._stamps.received_at
-        self._last_at = max(self._last_at, self.now() if stamped_at is None else stamped_at)
-        return self._last_at
 
     def _take_own(self, frame: Frame) -> bool:
         """True for an own frame that came back. With `echoes`, a lost echo does not hide the

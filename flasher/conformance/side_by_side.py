@@ -120,21 +120,13 @@ def side_by_side(paths: Sequence[Path], reports: Sequence[ReportDocument]) -> Si
         FactRow(f"profile, {key}", [str(report.profile.get(key, "")) for report in reports])
         for key in keys
     ]
-    return SideBySide(
-        columns, rows, [row for row in facts if len(set(row.values)) > 1], _times(reports)
-    )
-
-
-def _times(reports: Sequence[ReportDocument]) -> list[TimeRow]:
-    by_name = [{times.name: times for times in report.times} for report in reports]
-    rows = []
-    for name in dict.fromkeys(name for found in by_name for name in found):
-        measured = [found.get(name) for found in by_name]
-        rows.append(
-            TimeRow(
-                name,
-                [None if one is None else one.median_s for one in measured],
-                [None if one is None else one.p95_s for one in measured],
-            )
+    measured = [{times.name: times for times in report.times} for report in reports]
+    times = [
+        TimeRow(
+            name,
+            [found[name].median_s if name in found else None for found in measured],
+            [found[name].p95_s if name in found else None for found in measured],
         )
-    return rows
+        for name in dict.fromkeys(name for found in measured for name in found)
+    ]
+    return SideBySide(columns, rows, [row for row in facts if len(set(row.values)) > 1], times)

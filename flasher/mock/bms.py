@@ -225,18 +225,13 @@ class BmsApplication(Application):
             return
         if isinstance(content, contents.Handshake) and content != contents.Handshake():
             return
-        if item.mode is Mode.WRITE:
-            self._write(item, content)
+        name = item.title.removeprefix(_WRITE)
+        if item.mode is Mode.WRITE and name in self.kept:  # not so a reset with another text
+            before, self.kept[name] = self.kept[name], content
+            self.port.emit(DeviceWritten(name, _shown(before), _shown(content)))
         reply = self._reply(answer, content, now)
         if reply is not None:
             self.port.send(encode(answer, reply))
-
-    def _write(self, item: Item, content: Content) -> None:
-        name = item.title.removeprefix(_WRITE)
-        if name not in self.kept:  # a reset with another text
-            return
-        before, self.kept[name] = self.kept[name], content
-        self.port.emit(DeviceWritten(name, _shown(before), _shown(content)))
 
     def _reply(self, answer: Item, content: Content, now: float) -> Content | None:
         if isinstance(content, contents.ReadMemory):

@@ -111,7 +111,11 @@ class ClientApplication(Application):
         if now < self._due_at:
             return
         if self._asked is not None and now >= self._give_up_at:
-            self._give_up(now)
+            if self._asked[0].insists:
+                self._waiting.appendleft(self._asked)
+                self._asked, self._due_at = None, now + PAUSE_S
+            else:
+                self._ask_next(now)
         elif self._asked is not None:
             self._say(self._asked[1])
             repeat_s = self._timings.command_repeat_s
@@ -141,14 +145,6 @@ class ClientApplication(Application):
             self._say(self._asked[1])
             self._give_up_at = now + self._timings.command_timeout_s
             self._due_at = now + self._timings.command_repeat_s
-
-    def _give_up(self, now: float) -> None:
-        question, self._asked = self._asked, None
-        if question is not None and question[0].insists:
-            self._waiting.appendleft(question)
-            self._due_at = now + PAUSE_S
-        else:
-            self._ask_next(now)
 
     def _say(self, item: Item) -> None:
         # Never more than one copy unsent: a bus that takes nothing would get them all at once.

@@ -104,7 +104,10 @@ def load(bench: Bench) -> None:
         _babble(bench)
         bench.check_application()
     with bench.step("reset under load"):
-        _load(bench, _LOAD_S)
+        until = bench.now + _LOAD_S
+        while bench.now < until:
+            bench.send(_FOREIGN)
+            bench.wait(_FOREIGN_BITS / bench.port.bitrate_bps)
         bench.send(_under_load(bench.encoder.reset()))
         _expect_under_load(bench, Kind.BOOT_VERSION)
         bench.wait_to_be_heard()
@@ -209,14 +212,6 @@ def application_traffic(bench: Bench) -> None:
 def _under_load(frames: Sequence[RawFrame]) -> list[RawFrame]:
     """Frames of the upgrade, nine frames of other nodes before each of them."""
     return [one for frame in frames for one in (*_FOREIGN, frame)]
-
-
-def _load(bench: Bench, for_s: float) -> None:
-    """Load the bus to 90 %: nine frames of other nodes, then a gap as long as one frame."""
-    until = bench.now + for_s
-    while bench.now < until:
-        bench.send(_FOREIGN)
-        bench.wait(_FOREIGN_BITS / bench.port.bitrate_bps)
 
 
 def _expect_under_load(bench: Bench, kind: Kind) -> Received:

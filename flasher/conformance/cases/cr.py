@@ -386,18 +386,14 @@ def _check_none_taken(
             heard = [] if one is None else [one]
         else:
             heard = bench.collect(probe.settle_s())
-        _require_none_taken(bench, f"a packet with {_name(batch)}", heard)
+        first, last = batch[0][0], batch[-1][0]
+        told = first if len(batch) == 1 else f"one of {len(batch)} damages, {first} to {last}"
+        _require_none_taken(bench, f"a packet with {told}", heard)
     _require_none_taken(bench, "the last ones", bench.collect(probe.settle_s()))
     bench.succeed(f"none of {len(damages)} packets is accepted", "none was")
 
 
-def _name(batch: Sequence[Damage]) -> str:
-    first, last = batch[0][0], batch[-1][0]
-    return first if len(batch) == 1 else f"one of {len(batch)} damages, {first} to {last}"
-
-
 def _require_none_taken(bench: Bench, what: str, heard: Sequence[Received]) -> None:
     """NAK or silence; which of them, with which number, is TX-01."""
-    is_taken = any(one.kind is not Kind.NAK for one in heard)
-    if is_taken:
-        bench.require(not is_taken, f"NAK or no answer to {what}", describe(heard))
+    if any(one.kind is not Kind.NAK for one in heard):
+        bench.require(False, f"NAK or no answer to {what}", describe(heard))  # noqa: FBT003

@@ -94,21 +94,20 @@ class LogsUseless(HangingDevice):
     _log_bytes = 0
 
     def _classify(self, row: AnyRow) -> Event:
-        event = super()._classify(row)
-        if self._message is None or not self._is_useless(event, self._message.command):
+        event, message = super()._classify(row), self._message
+        is_useless = event in _USELESS
+        if event is Event.QUERY and message is not None:
+            is_known = message.command in _APPLICATION_COMMANDS
+            is_useless = self.state is not State.APPLICATION or not is_known
+        if message is None or not is_useless:
             self._log_bytes = 0
             return event
-        self._log_bytes += OVERHEAD_SIZE + len(self._message.data)
+        self._log_bytes += OVERHEAD_SIZE + len(message.data)
         if self._log_bytes > _LOG_BYTES:
             self._log_bytes = 0
             self._hang()
             return Event.NO_CONCERN
         return event
-
-    def _is_useless(self, event: Event, command: int) -> bool:
-        if event is Event.QUERY:
-            return self.state is not State.APPLICATION or command not in _APPLICATION_COMMANDS
-        return event in _USELESS
 
 
 @variant("noise-hangs", "SE-03", also="SE-01 FR-10 FR-02 FR-09 TX-01 BU-01 CR-01 CR-02 FR-06")
