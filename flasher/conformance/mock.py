@@ -7,10 +7,10 @@ bytes does not import them.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 from flasher.conformance.profile import ConformanceProfile, Value
-from flasher.conformance.results import Unsupported
 from flasher.conformance.simulated import SimulatedSubject
 from flasher.mock.faults import FaultInjector, InOperation, PowerCut
 from flasher.mock.model import MockDevice
@@ -63,7 +63,7 @@ class MockSubject(SimulatedSubject[MockDevice]):
         second_image: bytes | None = None,
     ) -> None:
         super().__init__(
-            (make_device or plain_device)(target, profile),
+            (make_device or device_maker(MockDevice))(target, profile),
             target,
             (GOOD_IMAGE, SECOND_IMAGE),
             name=name,
@@ -83,21 +83,16 @@ class MockSubject(SimulatedSubject[MockDevice]):
         return happened
 
 
-def plain_device(target: str, profile: DeviceProfile) -> MockDevice:
-    """The device model as it is. Raises Unsupported for a target that does not exist."""
-    if target not in TARGETS:
-        raise Unsupported(f"there is no target {target}")
-    return MockDevice(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
+def device_maker(kind: Callable[..., MockDevice]) -> Callable[[str, DeviceProfile], MockDevice]:
+    """What makes a device of that kind for a subject."""
+    return lambda target, profile: kind(
+        TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile
+    )
 
 
 def variant_maker(name: str) -> Callable[[str, DeviceProfile], MockDevice]:
     """What makes a deliberately wrong device. Raises UsageError for a name that is none."""
-    variant = find(name)
-
-    def make_variant(target: str, profile: DeviceProfile) -> MockDevice:
-        return make(variant, TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
-
-    return make_variant
+    return device_maker(partial(make, find(name)))
 
 
 # -- the model's choices as the suite's -----------------------------------------------------------

@@ -80,18 +80,7 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
             remedy="Exchange the two, or name another one.",
         )
     if options.is_mock:
-        from flasher.conformance import mock  # noqa: PLC0415  only for the mock
-
-        choices, variant = device_profile(options.choices), options.variant
-        subject = mock.MockSubject(
-            api.as_target(options.target).name,
-            profile=choices,
-            make_device=None if variant is None else mock.variant_maker(variant),
-            name="the built-in mock" + (f", variant {variant}" if variant else ""),
-            good_image=good,
-            second_image=second,
-        )
-        profile = profile or mock.profile_of_mock(choices)
+        subject, profile = _mock(options, profile, good, second)
         _check_size(subject.good_image, profile)
         yield subject, profile
         return
@@ -182,3 +171,23 @@ def _check_size(good: bytes, profile: ConformanceProfile) -> None:
             f"The good image has {len(good):,} bytes, and the profile allows {limit:,}.",
             remedy="Correct device.largest_image_bytes in the profile, or name a smaller image.",
         )
+
+
+def _mock(
+    options: BenchOptions,
+    profile: ConformanceProfile | None,
+    good: bytes | None,
+    second: bytes | None,
+) -> tuple[Subject, ConformanceProfile]:
+    from flasher.conformance import mock  # noqa: PLC0415  only for the mock
+
+    choices, variant = device_profile(options.choices), options.variant
+    subject = mock.MockSubject(
+        api.as_target(options.target).name,
+        profile=choices,
+        make_device=None if variant is None else mock.variant_maker(variant),
+        name="the built-in mock" + (f", variant {variant}" if variant else ""),
+        good_image=good,
+        second_image=second,
+    )
+    return subject, profile or mock.profile_of_mock(choices)

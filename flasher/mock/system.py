@@ -44,9 +44,10 @@ class System:
         self.members: dict[Node, Machine] = {}
         """Each node's machine."""
         for node in dialect.nodes:
-            is_target = node is target.node
             if node is Node.CDL:
                 continue
+            is_target = node is target.node
+            asks = ClientApplication(node, dialect, timings) if node is not Node.BMS else None
             if node in _TARGETS:
                 self.members[node] = MockDevice(
                     _TARGETS[node],
@@ -54,17 +55,10 @@ class System:
                     profile=own_profile if is_target or node is Node.BMS else plain_profile,
                     timings=timings,
                     has_application=has_application or not is_target,
-                    # A BMS answers, with the application of its own; the others ask it.
-                    application=None
-                    if node is Node.BMS
-                    else ClientApplication(node, dialect, timings),
+                    application=asks,  # a BMS answers, with the application of its own
                 )
-            else:
-                self.members[node] = Unit(
-                    ClientApplication(node, dialect, timings),
-                    bitrate_bps=dialect.bitrate_bps,
-                    timings=timings,
-                )
+            elif asks is not None:
+                self.members[node] = Unit(asks, bitrate_bps=dialect.bitrate_bps, timings=timings)
         device = self.members[target.node]
         if not isinstance(device, MockDevice):
             raise TypeError(f"{target.name} is no device that can be upgraded")

@@ -7,14 +7,13 @@ from dataclasses import dataclass, field
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import CASES, Case, Requirement, Selection
-from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock
+from flasher.conformance.mock import MOCK_PROFILE, MockSubject, device_maker, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import CaseResult, CaseVerdict, RunReport
 from flasher.conformance.runner import RunObserver, RunOptions, run
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import TARGETS, WELLING
 
 PROFILE = profile_of_mock()
 
@@ -84,19 +83,10 @@ class Babbler:
         return ()
 
 
-def maker(kind: type[MockDevice]) -> Callable[[str, DeviceProfile], MockDevice]:
-    """Makes devices of that class."""
-
-    def make_device(target: str, profile: DeviceProfile) -> MockDevice:
-        return kind(TARGETS[target], bitrate_bps=WELLING.bitrate_bps, profile=profile)
-
-    return make_device
-
-
 def subject(
     kind: type[MockDevice] = MockDevice, profile: DeviceProfile = MOCK_PROFILE, target: str = "bms"
 ) -> MockSubject:
-    return MockSubject(target, profile=profile, make_device=maker(kind))
+    return MockSubject(target, profile=profile, make_device=device_maker(kind))
 
 
 def one(report: RunReport, case_id: str) -> CaseResult:

@@ -11,7 +11,7 @@ from flasher.cli.bench.conformance import exit_code
 from flasher.conformance.catalogue import Case, Selection
 from flasher.conformance.html_report import html_page
 from flasher.conformance.json_report import report_document, to_bytes
-from flasher.conformance.mock import MockSubject
+from flasher.conformance.mock import MockSubject, device_maker
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.reports import junit_report
 from flasher.conformance.results import CaseVerdict, RunReport
@@ -21,7 +21,7 @@ from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
 from tests.loops import each
 
-from .bench import PROFILE, Babbler, DeafDevice, maker
+from .bench import PROFILE, Babbler, DeafDevice
 
 CASES = ("RS-01", "RS-03", "RS-04", "UP-05", "EN-01", "EN-02")
 SELECTION = Selection(cases=CASES)
@@ -93,7 +93,7 @@ def more_for(make: Callable[..., object]) -> dict[str, dict[tuple[str, int], str
 
 
 def test_a_deaf_device_was_never_judged() -> None:
-    subject = MockSubject("bms", make_device=maker(DeafDevice))
+    subject = MockSubject("bms", make_device=device_maker(DeafDevice))
     assert isinstance(subject.device, DeafDevice)
     subject.device.hangs = subject.device.hangs_for_good = True
     report = run(subject, PROFILE, selection=SELECTION)
@@ -105,7 +105,9 @@ def test_a_deaf_device_was_never_judged() -> None:
 
 
 def test_a_device_that_resets_at_random_fails_and_the_run_goes_on() -> None:
-    report = run(MockSubject("bms", make_device=maker(MoodyDevice)), PROFILE, selection=SELECTION)
+    report = run(
+        MockSubject("bms", make_device=device_maker(MoodyDevice)), PROFILE, selection=SELECTION
+    )
     assert_true_report(report)
     assert report.count(CaseVerdict.FAIL) > 0
     assert exit_code(report, was_stopped=False) is ExitCode.PARTIAL
@@ -131,7 +133,7 @@ class BabblingDevice(MockDevice):
 
 def test_a_device_that_babbles_on_its_own_id_does_not_keep_the_run_from_its_end() -> None:
     report = run(
-        MockSubject("bms", make_device=maker(BabblingDevice)), IMPATIENT, selection=SELECTION
+        MockSubject("bms", make_device=device_maker(BabblingDevice)), IMPATIENT, selection=SELECTION
     )
     assert_true_report(report)
     assert report.count(CaseVerdict.PASS) == 0

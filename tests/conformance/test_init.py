@@ -14,7 +14,13 @@ from flasher.conformance.catalogue import Selection
 from flasher.conformance.dut.subject import open_subject
 from flasher.conformance.init import LIMITS, NOT_ASKED, QUESTIONS, Asked, ask
 from flasher.conformance.init.answers import Trial, decided, limit
-from flasher.conformance.mock import GOOD_IMAGE, MOCK_PROFILE, MockSubject, profile_of_mock
+from flasher.conformance.mock import (
+    GOOD_IMAGE,
+    MOCK_PROFILE,
+    MockSubject,
+    device_maker,
+    profile_of_mock,
+)
 from flasher.conformance.profile import ConformanceProfile, load_profile, profile_keys
 from flasher.conformance.runner import run
 from flasher.conformance.subject import Subject
@@ -27,7 +33,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from tests.campaigns.profiles import AREA_BYTES, faults
 from tests.cli.conftest import Flasher
-from tests.conformance.bench import DeafDevice, maker
+from tests.conformance.bench import DeafDevice
 from tests.conformance.test_other_device import (
     BurstAnnouncer,
     ChoosyDevice,
@@ -150,7 +156,7 @@ class SlowBursts(SlowDevice, BurstAnnouncer):
 
 def mock(kind: type[MockDevice] = MockDevice, target: str = "bms", **choices: Any) -> MockSubject:
     device = replace(MOCK_PROFILE, application_area_bytes=AREA_BYTES, **choices)
-    return MockSubject(target, profile=device, make_device=maker(kind))
+    return MockSubject(target, profile=device, make_device=device_maker(kind))
 
 
 def values(asked: Asked) -> dict[str, Any]:

@@ -10,13 +10,13 @@ import pytest
 from flasher.conformance.catalogue import CASES, WEAR, Selection
 from flasher.conformance.diff import compare
 from flasher.conformance.json_report import report_document
-from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock
+from flasher.conformance.mock import MOCK_PROFILE, MockSubject, device_maker, profile_of_mock
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import CaseVerdict, RunReport
 from flasher.conformance.runner import RunOptions, run
 from flasher.mock.model import MockDevice
 from tests.cli.conftest import Flasher
-from tests.conformance.bench import maker, one
+from tests.conformance.bench import one
 from tests.loops import each
 
 
@@ -47,7 +47,7 @@ def worn(
 ) -> RunReport:
     device = replace(MOCK_PROFILE, **choices)
     return run(
-        MockSubject(profile=device, make_device=maker(kind)),
+        MockSubject(profile=device, make_device=device_maker(kind)),
         profile or profile_of_mock(device),
         selection=Selection((case_id,)),
         options=RunOptions(upgrades=upgrades),

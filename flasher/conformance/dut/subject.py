@@ -10,7 +10,6 @@ from typing import Final
 from flasher.conformance.dut.device import CompiledDevice, application_image
 from flasher.conformance.dut.process import BootloaderError, BootloaderProcess
 from flasher.conformance.profile import ConformanceProfile
-from flasher.conformance.results import Unsupported
 from flasher.conformance.simulated import SimulatedSubject
 from flasher.protocol.spec import TARGETS, WELLING
 
@@ -31,8 +30,6 @@ class CompiledSubject(SimulatedSubject[CompiledDevice]):
         good_image: bytes | None = None,
         second_image: bytes | None = None,
     ) -> None:
-        if target not in TARGETS:
-            raise Unsupported(f"there is no target {target}")
         device = CompiledDevice(TARGETS[target], process, bitrate_bps=WELLING.bitrate_bps)
         super().__init__(
             device,
