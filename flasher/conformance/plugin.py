@@ -7,9 +7,8 @@ from __future__ import annotations
 import re
 import shlex
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
@@ -110,36 +109,21 @@ class BenchTrace:
         path.write_bytes(candump(self.frames))
 
 
-@dataclass(frozen=True)
-class Keeping:
-    """What a run keeps beside the verdicts."""
-
-    trace_dir: Path | None = None
-    json_report: Path | None = None
-    html: Path | None = None
-    replay: Callable[[str], str] = str
-    """From a case id to the command that runs it again."""
-
-
 class PluginRun:
     """The run of a pytest session, on one device."""
 
     def __init__(
-        self,
-        subject: Subject,
-        profile: ConformanceProfile,
-        options: RunOptions,
-        keeping: Keeping,
+        self, subject: Subject, profile: ConformanceProfile, config: pytest.Config
     ) -> None:
         self.subject = subject
         self.profile = profile
         self.measurements = Measurements()
-        self._options = options
-        self._keeping = keeping
+        self._config = config
+        self._seed: str = config.getoption("btl_seed")
+        self._is_strict: bool = config.getoption("btl_strict")
+        options = RunOptions(self._seed, strict=self._is_strict)
         self._started_at = datetime.now(UTC).isoformat(timespec="seconds")
         self._run = Run(subject, profile, options, RunObserver(), stopped=lambda: False)
-        self._left_out: list[CaseResult] = []
-        self._judged: dict[str, None] = {}
         self._traces: dict[tuple[str, int], str] = {}
         self._has_begun = False
 
@@ -147,24 +131,23 @@ class PluginRun:
         """Run a case of the suite; its verdict becomes that of the test."""
         missing = what_is_missing(case, self.subject, self.profile)
         if missing:
-            self._left_out.append(CaseResult(case.id, CaseVerdict.UNSUPPORTED, note=missing))
+            self._run.leave_out(case.id, missing)
             pytest.skip(missing)
         self._begin()
-        self._judged[case.id] = None
         result = self._run.take(case)
         self.measurements.add(result.measurements)
         if is_traced(result):
             self._traces[result.key] = trace_file_name(result)
-            self._keep_trace(self._traces[result.key], result.trace)
+            self._keep("trace_dir", lambda: candump(result.trace), self._traces[result.key])
         _report(node, result)
         said = f"{result.verdict.text}: {result.reason}"
         text = case_text(case.id, self.profile)
-        details = told(text, result, self._keeping.replay(case.id))
+        details = told(text, result, self._replay(case.id))
         match result.verdict:
-            case CaseVerdict.PASS_IN_PART if self._options.strict:
+            case CaseVerdict.PASS_IN_PART if self._is_strict:
                 pytest.fail(said, pytrace=False)
             case CaseVerdict.PASS | CaseVerdict.PASS_IN_PART | CaseVerdict.INFO:
-                if self._options.strict and result.deviation_resolved:
+                if self._is_strict and result.deviation_resolved:
                     pytest.fail(f"passes, but the profile says: {text.deviation}", pytrace=False)
             case CaseVerdict.UNSUPPORTED | CaseVerdict.INCONCLUSIVE:
                 pytest.skip(said)
@@ -175,9 +158,7 @@ class PluginRun:
 
     def report(self) -> RunReport:
         """What came of the cases of the suite so far."""
-        ids = {*self._judged, *(result.case_id for result in self._left_out)}
-        report = self._run.report(in_order(ids))
-        return replace(report, results=(*report.results, *self._left_out))
+        return self._run.report(in_order(self._run.judged))
 
     def bench_for(self, node: pytest.Item) -> Iterator[Bench]:
         """The bench of one test, with the device in the known state before and after it."""
@@ -186,7 +167,7 @@ class PluginRun:
         self._begin()
         if self._run.stopped:
             pytest.fail(f"not run: {self._run.stopped}", pytrace=False)
-        seed = f"{self._options.seed}/{node.name}"
+        seed = f"{self._seed}/{node.name}"
         bench = Bench(self.subject, self.profile, limit_s=LIMIT_S, seed=seed)
         yield bench
         self.measurements.add(bench.judge.measurements)
@@ -204,7 +185,8 @@ class PluginRun:
             trace=bench.tester.trace,
             trace_dropped=bench.tester.trace_dropped,
         )
-        self._keep_trace(f"{_NO_FILE_NAME.sub('-', node.name)}.log", result.trace)
+        name = f"{_NO_FILE_NAME.sub('-', node.name)}.log"
+        self._keep("trace_dir", lambda: candump(result.trace), name)
         _report(node, result)
 
     def finish(self) -> None:
@@ -212,24 +194,47 @@ class PluginRun:
         image is not back.
         """
         final = self._run.finish() if self._has_begun else FINAL_IMAGE_OK
-        keeping, report = self._keeping, self.report()
+        report = self.report()
         told_by: dict[str, Any] = {
             "started_at": self._started_at,
-            "replays": {one.key: keeping.replay(one.case_id) for one in report.results},
+            "replays": {one.key: self._replay(one.case_id) for one in report.results},
             "trace_files": self._traces,
         }
-        if keeping.json_report is not None:
-            _write(keeping.json_report, to_bytes(report_document(report, **told_by)))
-        if keeping.html is not None:
+
+        def page() -> bytes:
             from flasher.conformance.html_report import html_page  # noqa: PLC0415  loads jinja2
 
-            _write(keeping.html, html_page(report, **told_by).encode("utf-8"))
+            return html_page(report, **told_by).encode("utf-8")
+
+        self._keep("json_report", lambda: to_bytes(report_document(report, **told_by)))
+        self._keep("html", page)
         if final != FINAL_IMAGE_OK:
             pytest.fail(f"the good image at the end: {final}", pytrace=False)
 
-    def _keep_trace(self, name: str, trace: Sequence[TraceEntry]) -> None:
-        if self._keeping.trace_dir is not None:
-            _write(self._keeping.trace_dir / name, candump(trace))
+    def _keep(self, option: str, made: Callable[[], bytes], name: str = "") -> None:
+        """Write what is `made` to the file that an option names, or to a file in its folder."""
+        given = self._config.getoption(f"btl_{option}")
+        if given is None:
+            return
+        path = Path(given, name)
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(made())
+        except OSError as error:
+            pytest.fail(f"{path} cannot be written: {error.strerror}", pytrace=False)
+
+    def _replay(self, case_id: str) -> str:
+        """The command that runs a case again."""
+        words = ["pytest"]
+        for name, (_, _, more) in BENCH_OPTIONS.items():
+            value = self._config.getoption(name[2:].replace("-", "_"))
+            if value is True:
+                words.append(name)
+            elif isinstance(value, list):
+                words += [f"{name}={one}" for one in value]
+            elif value not in (None, False, more.get("default")):
+                words.append(f"{name}={value}")
+        return shlex.join([*words, "--btl-suite", "-k", case_id])
 
     def _begin(self) -> None:
         if not self._has_begun:
@@ -247,10 +252,7 @@ def opened_run(
     try:
         with open_bench(_options(config, power, readback)) as (subject, profile):
             check_deviations(profile, known_cases())
-            options = RunOptions(
-                config.getoption("btl_seed"), strict=config.getoption("btl_strict")
-            )
-            run = PluginRun(subject, profile, options, _keeping(config))
+            run = PluginRun(subject, profile, config)
             yield run
             run.finish()
     except FlasherError as error:
@@ -266,34 +268,6 @@ def _report(node: pytest.Item, result: CaseResult) -> None:
         part = excerpt(result, _MESSAGES, _FRAMES)
         lines = [part.text, *map(str, part.messages), *frame_lines(part.frames)]
         node.add_report_section("call", "frames", "\n".join(map(printable, lines)))
-
-
-def _write(path: Path, data: bytes) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(data)
-    except OSError as error:
-        pytest.fail(f"{path} cannot be written: {error.strerror}", pytrace=False)
-
-
-def _keeping(config: pytest.Config) -> Keeping:
-    def path(name: str) -> Path | None:
-        given = config.getoption(f"btl_{name}")
-        return None if given is None else Path(given)
-
-    def replay(case_id: str) -> str:
-        words = ["pytest"]
-        for name, (_, _, more) in BENCH_OPTIONS.items():
-            value = config.getoption(name[2:].replace("-", "_"))
-            if value is True:
-                words.append(name)
-            elif isinstance(value, list):
-                words += [f"{name}={one}" for one in value]
-            elif value not in (None, False, more.get("default")):
-                words.append(f"{name}={value}")
-        return shlex.join([*words, "--btl-suite", "-k", case_id])
-
-    return Keeping(path("trace_dir"), path("json_report"), path("html"), replay)
 
 
 def _options(

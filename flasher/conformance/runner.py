@@ -177,7 +177,7 @@ class Run:
             if case is not None and not missing:
                 cases.append(case)
             else:
-                self._add(CaseResult(case_id, CaseVerdict.UNSUPPORTED, note=missing))
+                self.leave_out(case_id, missing)
         self._observer.run_began(len(cases) * self._options.repeat)
         if cases:
             self.begin()
@@ -186,6 +186,15 @@ class Run:
                     self.take(case, repeat)
             self.finish()
         return self.report(chosen)
+
+    @property
+    def judged(self) -> set[str]:
+        """The ids of the cases that have a result."""
+        return {result.case_id for result in self._results}
+
+    def leave_out(self, case_id: str, why: str) -> None:
+        """Report a case as unsupported."""
+        self._add(CaseResult(case_id, CaseVerdict.UNSUPPORTED, note=why))
 
     def begin(self) -> None:
         """Flash the good image, so that the first case finds the known state."""
