@@ -292,21 +292,16 @@ class Bench:
         application `runs`; None without a difference. Raises Unsupported.
         """
         source = readback_source(self.subject, self.profile)
-        if source == BY_BUS and runs:
-            return self._told_difference(image)
-        if source == BY_BUS:
-            raise Unsupported("only a running application tells the memory over the bus")
         if not source:
             raise Unsupported("the bench has no readback")
-        stored = self.subject.readback()[: len(image)]
-        pairs = enumerate(zip(stored, image, strict=False))
-        at = next((at for at, (one, other) in pairs if one != other), len(stored))
-        return None if at == len(image) else at
-
-    def _told_difference(self, image: bytes) -> int | None:
-        """As `difference`, out of the memory that the running application tells; of a large image
-        some pieces are asked for, by the seed.
-        """
+        if source != BY_BUS:
+            stored = self.subject.readback()[: len(image)]
+            pairs = enumerate(zip(stored, image, strict=False))
+            at = next((at for at, (one, other) in pairs if one != other), len(stored))
+            return None if at == len(image) else at
+        if not runs:
+            raise Unsupported("only a running application tells the memory over the bus")
+        # Of a large image some pieces are asked for, by the seed.
         total = packet_count(len(image))
         numbers = list(range(total))
         if total > _PIECES:

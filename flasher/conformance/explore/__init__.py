@@ -13,7 +13,7 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.explore.steps import Step, next_step, parse_step, reachable_pairs
-from flasher.conformance.explore.walk import ALL_STEPS, Phase, Violation, Walk
+from flasher.conformance.explore.walk import Phase, Violation, Walk
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.restore import BY_POWER, may_need_power, restore
 from flasher.conformance.results import (
@@ -24,7 +24,7 @@ from flasher.conformance.results import (
     Unsupported,
 )
 from flasher.conformance.subject import Subject
-from flasher.errors import BusError, UsageError, did_you_mean
+from flasher.errors import BusError
 
 WALK_STEPS: Final = 24
 """The longest walk."""
@@ -107,13 +107,7 @@ class Explorer:
 
     def replay(self, texts: Sequence[str]) -> Explored:
         """Take these steps, as a finding tells them. Raises UsageError, BusError."""
-        try:
-            steps = [parse_step(text) for text in texts]
-        except ValueError as error:
-            word = next(text for text in texts if f"{text!a}" in str(error))
-            raise UsageError(
-                f"There is no step {word!a}.", remedy=did_you_mean(word, ALL_STEPS).rstrip()
-            ) from error
+        steps = [parse_step(text) for text in texts]
         taken: list[Step] = []
         try:
             trouble = self._restored()

@@ -8,6 +8,7 @@ from typing import Final, NamedTuple
 
 from flasher.conformance.explore.refused import ENDS, NO_CONCERN, PACKETS, UPDATES
 from flasher.conformance.explore.walk import ALL_STEPS, Phase, Walk
+from flasher.errors import UsageError, did_you_mean
 
 _NUMBER: Final = re.compile("[0-9]{1,9}")
 _SHARE: Final = 12 / len(PACKETS)
@@ -117,12 +118,13 @@ _ARGUMENTS: Final = {
 
 
 def parse_step(text: str) -> Step:
-    """A step as it is written. Raises ValueError for one that does not exist."""
+    """A step as it is written. Raises UsageError for one that does not exist."""
     name, _, argument = text.partition("=")
     known = _ARGUMENTS.get(name, set())
     is_number = _NUMBER.fullmatch(argument) and any(map(_NUMBER.fullmatch, known))
     if argument not in known and not is_number:
-        raise ValueError(f"there is no step {text!a}")
+        hint = did_you_mean(text, ALL_STEPS).rstrip()
+        raise UsageError(f"There is no step {text!a}.", remedy=hint)
     return Step(name, argument)
 
 
