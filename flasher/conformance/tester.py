@@ -267,17 +267,17 @@ class BusTester:
         arrival = self.port.receive(min(deadline, self.ends_at, now + _POLL_S))
         if arrival is None:
             return
-        if arrival.is_echo:
+        frame, at, is_echo = arrival
+        self._record(at, frame, sent=is_echo)
+        if is_echo:
             self._echoes_due = max(self._echoes_due - 1, 0)
-            self.left_at = arrival.at
-            self._record(arrival.at, arrival.frame, sent=True)
+            self.left_at = at
             return
-        self._record(arrival.at, arrival.frame, sent=False)
         fault = self._faults.get((True, self.frames_received - self._fault_origin[1]))
         self.frames_received += 1
         copies = 1 if fault is None else {FaultKind.DROP: 0, FaultKind.DOUBLE: 2}[fault.kind]
         for _ in range(copies):
-            heard = self._decoder.feed(arrival.frame, arrival.at)
+            heard = self._decoder.feed(frame, at)
             self._received.extend(filter(self._is_heard, heard))
 
     def _is_heard(self, one: Received) -> bool:
@@ -322,8 +322,9 @@ class BusTester:
         if not self.port.echoes:
             self.wait_until(self.left_at)
             return
-        give_up_at = self.now + _ECHO_LIMIT_S
-        while self._echoes_due and self.now < give_up_at:
+        now = self.port.now
+        give_up_at = now() + _ECHO_LIMIT_S
+        while self._echoes_due and now() < give_up_at:
             self._pump(give_up_at)
         if self._echoes_due:
             self._echoes_due = 0

@@ -26,7 +26,7 @@ from flasher.mock.store import AREA_START
 from tests.loops import each
 
 AREA_BYTES = 34 * 1024
-LONGEST = ("CR-01", "CR-02", "TX-07", "PW-01", "SE-01")
+LONGEST = ("CR-01", "CR-02", "TX-07", "TM-05", "BU-01", "PW-01", "SE-01", "SE-03", "CO-01")
 SHORT = [case_id for case_id in in_order(CASES) if case_id not in LONGEST]
 BENCHES = [("bms", 0), ("bms", AREA_START), ("wmc", AREA_START)]
 """Targets, with the address by which the bench knows the memory that the application tells."""
