@@ -22,7 +22,6 @@ from flasher.station.records.model import (
     TORN_TRACE,
     TRACE,
     AttachmentFile,
-    Claim,
     Ending,
     RunDetails,
     RunState,
@@ -39,7 +38,6 @@ from flasher.station.unit_checks import BEFORE
 class ActiveRun:
     """A claimed run whose outcome is not saved yet."""
 
-    claim: Claim
     trace: Path
     begun_s: float
     order: RunOrder
@@ -65,15 +63,15 @@ def save(store: Store, run: ActiveRun, now_s: Callable[[], float]) -> RunResult:
     if not run.is_save_noted:
         duration_s = max(0.0, now_s() - run.ended_s)
         state = StepState.ERROR if run.result.code == codes.TRACE_NOT_SAVED.name else StepState.PASS
-        store.step(run.claim.run_id, StepName.SAVE.value, state, duration_s=duration_s)
+        store.step(run.order.run_id, StepName.SAVE.value, state, duration_s=duration_s)
         run.is_save_noted = True
     try:
-        store.finish(run.claim.run_id, _ending(run, run.result))
+        store.finish(run.order.run_id, _ending(run, run.result))
     except RuleBrokenError as error:
         # The records know better: it is no PASS. That is a bug, and the unit is not judged.
         run.result = _worse(run.result, codes.INTERNAL, error.what)
-        store.finish(run.claim.run_id, _ending(run, run.result))
-    store.files.forget_spooled(run.claim.run_id)
+        store.finish(run.order.run_id, _ending(run, run.result))
+    store.files.forget_spooled(run.order.run_id)
     return run.result
 
 

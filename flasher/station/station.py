@@ -67,7 +67,6 @@ from flasher.station.records.claims import Order
 from flasher.station.records.errors import ClaimRefusedError, RecordError, Refusal
 from flasher.station.records.model import (
     AuditEvent,
-    Claim,
     Clock,
     Figures,
     RunFilter,
@@ -370,7 +369,7 @@ class Station:
 
     def _end_unknown(self) -> bool:
         """End runs whose claim was saved although it seemed lost; False when that is not saved."""
-        known = {run.claim.run_id for run in self._runs.values()}
+        known = {run.order.run_id for run in self._runs.values()}
         try:
             self._find_interrupted(self.store.end_unknown(known))
         except RecordError as error:
@@ -414,7 +413,7 @@ class Station:
         run_order = RunOrder(claim.run_id, claim.kind, claim.serial, day, order.lot)
         run_order = with_history(run_order, life, self.recipe, is_reworked=bool(order.reason))
         trace = self.store.files.spooled(claim.run_id)
-        self._runs[order.socket] = ActiveRun(claim, trace, self._now, order=run_order)
+        self._runs[order.socket] = ActiveRun(trace, self._now, order=run_order)
         return line.Claimed()
 
     def _begin(self, socket: str) -> None:
@@ -422,8 +421,8 @@ class Station:
         run = self._going(socket)
         if run is None:
             return
-        claim, is_virtual = run.claim, self.line.sockets[socket].is_virtual
-        self.tell(RunStarted(socket, claim.serial, claim.run_id, claim.kind, is_virtual))
+        order, is_virtual = run.order, self.line.sockets[socket].is_virtual
+        self.tell(RunStarted(socket, order.serial, order.run_id, order.kind, is_virtual))
         if not self.supervisor.send(socket, Begin(run.order, run.trace)):
             self._end_lost(socket, codes.PROCESS_DIED.meaning, hung=False)
 
@@ -441,26 +440,26 @@ class Station:
             reply = Reply(number, error="The run is not one of this station.")
             self.supervisor.send(socket, reply)
             return
-        write_id, run_id = None, run.claim.run_id
+        write_id, order = None, run.order
         try:
             match what:
                 case Intent():
-                    write_id = self.store.intent(run_id, what.target, what.what, what.value)
+                    write_id = self.store.intent(order.run_id, what.target, what.what, what.value)
                 case Done():
                     self.store.verified(what.write_id, what.read_back)
                 case StepReport():
-                    self._save_step(socket, run.claim, what)
+                    self._save_step(socket, order, what)
         except RecordError as error:
             run.journal_error = _said(error)
-            self._not_saved(socket, run.claim.serial, run_id, error)
+            self._not_saved(socket, order.serial, order.run_id, error)
             self._feed(socket, line.NotSaved(error.what, error.remedy))
             self.supervisor.send(socket, Reply(number, error=error.what))
         else:
             self.supervisor.send(socket, Reply(number, write_id))
 
-    def _save_step(self, socket: str, claim: Claim, report: StepReport) -> None:
+    def _save_step(self, socket: str, order: RunOrder, report: StepReport) -> None:
         self.store.step(
-            claim.run_id,
+            order.run_id,
             report.name,
             report.state,
             duration_s=report.duration_s,
@@ -468,19 +467,8 @@ class Station:
             text=report.text,
             measurements=report.measurements,
         )
-        self.tell(
-            StepEnded(
-                socket,
-                claim.serial,
-                report.step,
-                report.try_number,
-                report.state,
-                report.duration_s,
-                report.code,
-                report.text,
-                report.target,
-            )
-        )
+        told = {name: value for name, value in vars(report).items() if name != "measurements"}
+        self.tell(StepEnded(socket, order.serial, **told))
 
     # -- its end ----------------------------------------------------------------------------------
 
@@ -506,11 +494,11 @@ class Station:
     def _save(self, socket: str) -> bool:
         """Save the outcome of a run and publish it; False when it is not saved."""
         run = self._runs[socket]
-        claim = run.claim
+        order = run.order
         try:
             result = save(self.store, run, self.clock.monotonic_s)
         except RecordError as error:
-            self._not_saved(socket, claim.serial, claim.run_id, error)
+            self._not_saved(socket, order.serial, order.run_id, error)
             self.line.feed(socket, line.NotSaved(error.what, error.remedy), self._now)
             return False
         del self._runs[socket]
@@ -519,9 +507,9 @@ class Station:
         self.tell(
             RunEnded(
                 socket,
-                claim.serial,
-                claim.run_id,
-                claim.kind,
+                order.serial,
+                order.run_id,
+                order.kind,
                 result.outcome,
                 code.name,
                 text,
@@ -535,19 +523,19 @@ class Station:
         with suppress(RecordError):
             self.tell(FiguresChanged(self.figures))
         if result.outcome is RunState.PASS:
-            self._print(socket, claim)
+            self._print(socket, order)
         return True
 
     # -- labels: nothing of them touches a verdict ------------------------------------------------
 
-    def _print(self, socket: str, claim: Claim) -> None:
+    def _print(self, socket: str, order: RunOrder) -> None:
         """Print the label of a unit whose PASS is on disk."""
         if self._labels is None or not self._labels.prints_each:
             return
         try:
-            run = self.store.read.run(claim.run_id).run
+            run = self.store.read.run(order.run_id).run
         except RecordError as error:
-            self._label_failed(socket, claim.serial, _said(error))
+            self._label_failed(socket, order.serial, _said(error))
             return
         if _not_labelled(run) is None and run.kind is not RunKind.VERIFY_ONLY:
             self._labels.submit(self._label(socket, run))

@@ -72,12 +72,13 @@ class Workplace(Protocol):
 
     dialect: Dialect
 
-    def adapters(self, cancelled: Callable[[], bool]) -> Sequence[Adapter]:
-        """What there is now."""
-
-    def use(self, adapter: Adapter) -> None:
-        """This one was chosen."""
-
+    def adapters(self, cancelled: Callable[[], bool]) -> Sequence[Adapter]: ...
+    def use(self, adapter: Adapter) -> None: ...
+    def profile(self, target: Target) -> Profile: ...
+    def bitrate_bps(self, adapter: Adapter) -> int: ...
+    def images(self) -> Sequence[Path]: ...
+    def dropped(self) -> Sequence[str]: ...
+    def use_folder(self, path: str) -> None: ...
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
         """Open it. With `asks` False nothing will be sent."""
 
@@ -93,21 +94,6 @@ class Workplace(Protocol):
         cancelled: Callable[[], bool],
     ) -> Saved:
         """Save what the battery tells, and the memory of an area, to a file of its own."""
-
-    def profile(self, target: Target) -> Profile:
-        """What the product does its own way."""
-
-    def bitrate_bps(self, adapter: Adapter) -> int:
-        """What its bus runs at."""
-
-    def images(self) -> Sequence[Path]:
-        """Files that may be images."""
-
-    def dropped(self) -> Sequence[str]:
-        """Names of images and manifests that were dropped on the page."""
-
-    def use_folder(self, path: str) -> None:
-        """Offer the images of this folder."""
 
     def upgrade(
         self,

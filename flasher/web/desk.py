@@ -129,24 +129,19 @@ def _answer(question: Question) -> Answer:
         return Answer(str(error).encode("utf-8", "replace"), "text/plain; charset=utf-8", 503)
 
 
-class DeskPages:
+def desk_routes(pages: Pages, ask: Ask, paths: Iterable[str]) -> list[BaseRoute]:
     """The routes of pages that are answered by `ask`."""
 
-    def __init__(self, pages: Pages, ask: Ask, paths: Iterable[str]) -> None:
-        self._pages = pages
-        self._ask = ask
-        self.routes: list[BaseRoute] = [Route(path, partial(self._page, path)) for path in paths]
-
-    async def _page(self, path: str, request: Request) -> Response:
+    async def page(path: str, request: Request) -> Response:
         fields = {
             name: value.strip()[:FIELD_MAX]
             for name, value in request.query_params.items()
             if value.strip()
         }
         run = int(request.path_params.get("run", 0))
-        language, token = self._pages.words_of(request).code, request.session.get("token", "")
+        language, token = pages.words_of(request).code, request.session.get("token", "")
         try:
-            answer = await self._ask(Question(path, fields, run, language, token))
+            answer = await ask(Question(path, fields, run, language, token))
         except TimeoutError:
             return PlainTextResponse("That took too long: narrow it down.", 503)
         if answer.location:
@@ -155,3 +150,5 @@ class DeskPages:
         if answer.file_name:
             headers["content-disposition"] = f'attachment; filename="{answer.file_name}"'
         return Response(answer.body, answer.status, headers, answer.media_type)
+
+    return [Route(path, partial(page, path)) for path in paths]

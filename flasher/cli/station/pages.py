@@ -36,7 +36,7 @@ from flasher.station.records.keys import Keeping
 from flasher.station.records.model import RunFilter, RunState, utc_moment
 from flasher.station.station import Station
 from flasher.station.tally import DEFAULT_SHIFTS, EndedRun, Tally
-from flasher.web.desk import Desk, DeskPages
+from flasher.web.desk import Desk, desk_routes
 from flasher.web.guard import Badges, application
 from flasher.web.operator import LINE, Lot, OperatorPage, Screen
 from flasher.web.pages import Pages
@@ -118,7 +118,7 @@ def operator_page(
     view = OperatorView(screen, station, board)
     # In processes of their own: a page takes no time from the station.
     desk = Desk(partial(open_supervisor, *place_of(store), config.shifts))
-    routes = [*operator.routes, *DeskPages(pages, desk.ask, PAGES).routes]
+    routes = [*operator.routes, *desk_routes(pages, desk.ask, PAGES)]
     server = served(
         options,
         address,
@@ -147,7 +147,7 @@ def serve(output: Output, address: Address, options: PagesOptions, records: Reco
         place = place_of(store)
     pages = Pages(options.language)
     desk = Desk(partial(open_supervisor, *place, shifts))
-    routes = [Route("/", _start), *DeskPages(pages, desk.ask, PAGES).routes]
+    routes = [Route("/", _start), *desk_routes(pages, desk.ask, PAGES)]
     with (
         closing(desk),
         stop_on_signal() as stopped,

@@ -45,7 +45,7 @@ from flasher.web import bench
 from flasher.web.bench import Bench
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Adapter, Doing, Saved
-from flasher.web.desk import Desk, DeskPages
+from flasher.web.desk import Desk, desk_routes
 from flasher.web.guard import BODY_MAX, Entry, application
 from flasher.web.kept import PAGES as KEPT
 from flasher.web.kept import Kept
@@ -308,7 +308,7 @@ def serve(
         machine = Bench(kind(bus, output, shelf, stop, memory), time.monotonic)
         page = BenchPage(pages, machine, shelf, is_mock=bus.mock)
         app = application(
-            [*page.routes, *DeskPages(pages, desk.ask, KEPT).routes],
+            [*page.routes, *desk_routes(pages, desk.ask, KEPT)],
             pages=pages,
             hosts=LOOPBACK,
             secret=secrets.token_urlsafe(32),
