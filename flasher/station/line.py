@@ -163,13 +163,6 @@ class Reprint:
 
 
 @dataclass(frozen=True)
-class Tell:
-    """Publish an event."""
-
-    event: StationEvent
-
-
-@dataclass(frozen=True)
 class Audit:
     """Add an action of a person to the audit trail."""
 
@@ -177,7 +170,8 @@ class Audit:
     data: Mapping[str, str]
 
 
-Effect = ClaimRun | SaveAgain | AbortRun | CheckPin | Reprint | Tell | Audit
+Effect = ClaimRun | SaveAgain | AbortRun | CheckPin | Reprint | Audit | StationEvent
+"""An event is to be published."""
 
 
 # -- the line -------------------------------------------------------------------------------------
@@ -771,7 +765,7 @@ class Line:
     # -- effects ----------------------------------------------------------------------------------
 
     def _tell(self, event: StationEvent) -> None:
-        self._effects.append(Tell(event))
+        self._effects.append(event)
 
     def _refuse(
         self, text: str, code: str, reason: str, remedy: str, socket: Socket | None = None

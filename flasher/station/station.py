@@ -312,8 +312,6 @@ class Station:
         while effects := self.line.take():
             for effect in effects:
                 match effect:
-                    case line.Tell(event):
-                        self.tell(event)
                     case line.ClaimRun():
                         self.line.feed(effect.socket, self._claim(effect), self._now)
                         self._begin(effect.socket)
@@ -330,6 +328,8 @@ class Station:
                         self.line.reprinted(serial, self._reprint(serial, data))
                     case line.Audit(what, data):
                         self._audit(what, data)
+                    case _:
+                        self.tell(effect)
 
     def _hear(self, socket: str, message: FromWorker | WorkerLost) -> None:
         match message:

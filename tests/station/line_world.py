@@ -156,15 +156,15 @@ class World:
         while effects := self.line.take():
             for effect in effects:
                 match effect:
-                    case line.Tell(event):
-                        self.look(event)
                     case line.ClaimRun(socket, serial):
                         self.claim(socket, serial)
                     case line.SaveAgain(sockets):
                         saved = [self.save(name) for name in sockets]
                         self.line.resumed(self.now, all_saved=all(saved))
-                    case _:
+                    case line.AbortRun() | line.CheckPin() | line.Reprint() | line.Audit():
                         pass
+                    case _:
+                        self.look(effect)
 
     def claim(self, socket: str, label: str) -> None:
         if not self.disk_works:
