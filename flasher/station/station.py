@@ -407,8 +407,7 @@ class Station:
             is_changed = error.refusal is Refusal.RECIPE_CHANGED
             return line.NotClaimed(error.refusal.value, error.what, error.remedy, is_changed)
         except RecordError as error:
-            self._not_saved(order.socket, order.serial, None, error)
-            return line.NotSaved(error.what, error.remedy)
+            return self._not_saved(order.socket, order.serial, None, error)
         day = self.clock.utc().astimezone().date()
         run_order = RunOrder(claim.run_id, claim.kind, claim.serial, day, order.lot)
         run_order = with_history(run_order, life, self.recipe, is_reworked=bool(order.reason))
@@ -451,8 +450,7 @@ class Station:
                     self._save_step(socket, order, what)
         except RecordError as error:
             run.journal_error = _said(error)
-            self._not_saved(socket, order.serial, order.run_id, error)
-            self._feed(socket, line.NotSaved(error.what, error.remedy))
+            self._feed(socket, self._not_saved(socket, order.serial, order.run_id, error))
             self.supervisor.send(socket, Reply(number, error=error.what))
         else:
             self.supervisor.send(socket, Reply(number, write_id))
@@ -498,8 +496,8 @@ class Station:
         try:
             result = save(self.store, run, self.clock.monotonic_s)
         except RecordError as error:
-            self._not_saved(socket, order.serial, order.run_id, error)
-            self.line.feed(socket, line.NotSaved(error.what, error.remedy), self._now)
+            not_saved = self._not_saved(socket, order.serial, order.run_id, error)
+            self.line.feed(socket, not_saved, self._now)
             return False
         del self._runs[socket]
         code = CODES[result.code]
@@ -578,8 +576,10 @@ class Station:
 
     def _not_saved(
         self, socket: str, serial: str, run_id: RunId | None, error: RecordError
-    ) -> None:
+    ) -> line.NotSaved:
+        """Tell it; what the line has to know of it."""
         self.tell(RecordNotSaved(socket, serial, run_id, _said(error), error.remedy))
+        return line.NotSaved(error.what, error.remedy)
 
 
 _NOT_PASSED: Final = Refused(
