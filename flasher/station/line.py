@@ -33,7 +33,7 @@ from flasher.station.events import (
     UnitRemoved,
 )
 from flasher.station.messages import AdapterDown, PresenceChanged, Ready
-from flasher.station.people import HIDDEN, Asked, Crew, Person
+from flasher.station.people import HIDDEN, Asked, Crew
 from flasher.station.pins import FORM_WORDS, Pin, is_form
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import AuditEvent, RunState
@@ -374,7 +374,11 @@ class Line:
         elif crew.asked is not None:
             self._take_pin(crew.asked, scanned)
         elif person is not None:
-            self._log_in(person)
+            crew.person = person
+            before, self.operator = self.operator, person.name
+            role = person.role.value
+            self._audit(AuditEvent.OPERATOR, before=before, now=person.name, role=role)
+            self._tell(ScanAccepted(printable(person.name), "badge"))
         elif crew.may_be_pin(scanned) and not self._is_serial(scanned):
             # Typed too late, or too often: it must not be shown in what is said of it.
             reason = say("No PIN is awaited, and it is no serial number of this recipe.")
@@ -420,12 +424,6 @@ class Line:
                 raise Refused("NOT_UNDERSTOOD", why, say("Scan the label again."))
 
     # -- badges and PINs --------------------------------------------------------------------------
-
-    def _log_in(self, person: Person) -> None:
-        self._crew.person = person
-        before, self.operator = self.operator, person.name
-        self._audit(AuditEvent.OPERATOR, before=before, now=person.name, role=person.role.value)
-        self._tell(ScanAccepted(printable(person.name), "badge"))
 
     def _take_pin(self, asked: Asked, scanned: str) -> None:
         """What was scanned while a PIN is awaited: it is never shown."""

@@ -150,7 +150,9 @@ class Supervisor:
         for name, slot in self._slots.items():
             if slot.port is None:
                 if slot.start_at is not None and self._now() >= slot.start_at:
-                    self._start(slot)
+                    slot.port = self._launch(slot.setup)
+                    slot.heard_at = self._now()
+                    slot.is_new, slot.start_at, slot.reason = True, None, ""
                 continue
             messages, is_gone = self._receive(slot)
             found += [(name, message) for message in messages]
@@ -177,11 +179,6 @@ class Supervisor:
             slot.port = slot.start_at = None
 
     # -- one process ------------------------------------------------------------------------------
-
-    def _start(self, slot: _Slot) -> None:
-        slot.port = self._launch(slot.setup)
-        slot.heard_at = self._now()
-        slot.is_new, slot.start_at, slot.reason = True, None, ""
 
     def _receive(self, slot: _Slot) -> tuple[list[FromWorker], bool]:
         """Everything that it said, and whether it is gone."""

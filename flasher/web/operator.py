@@ -168,15 +168,13 @@ class Screen:
                 self._passed[event.socket] = event
         socket = getattr(event, "socket", "")
         for name in (socket,) if socket in board.rows else tuple(board.rows):
-            self._put(name, board.rows[name])
-
-    def _put(self, name: str, row: Row) -> None:
-        """PASS only when the run's end with PASS was told, which is after it is on disk."""
-        state, passed = row.state, self._passed.get(name)
-        if state is SocketState.PASS and (passed is None or passed.serial != row.serial):
-            state = SocketState.SAVING
-        word = (state, row.serial, row.code, row.note, row.step)
-        self.feed.put(f"socket {name}", replace(row, state=state), word=word)
+            row = board.rows[name]
+            state, passed = row.state, self._passed.get(name)
+            # PASS only when the run's end with PASS was told, which is after it is on disk.
+            if state is SocketState.PASS and (passed is None or passed.serial != row.serial):
+                state = SocketState.SAVING
+            word = (state, row.serial, row.code, row.note, row.step)
+            self.feed.put(f"socket {name}", replace(row, state=state), word=word)
 
     def turn(self, board: Board, *, operator: str, lot: Lot) -> None:
         """Once in each turn of the station's loop."""

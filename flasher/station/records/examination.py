@@ -328,17 +328,13 @@ def _contradictions(
     if event == chain.BEGUN and data.get("station") != name:
         yield f"the chain is that of the station {printable(str(data.get('station')))}"
     if event == chain.MIGRATED:
-        yield from (
-            f"found at the migration: {printable(str(x))}" for x in _list(data.get("problems"))
-        )
+        found = data.get("problems")
+        for what in found if isinstance(found, list) else ():
+            yield f"found at the migration: {printable(str(what))}"
 
 
 def _table(value: Any) -> Mapping[str, str]:
     return value if isinstance(value, dict) else {}
-
-
-def _list(value: Any) -> list[Any]:
-    return value if isinstance(value, list) else []
 
 
 def _lost(data: Mapping[str, Any]) -> range:
