@@ -23,7 +23,7 @@ from flasher.cli.bench.conformance_bench import (
 )
 from flasher.cli.documents import document_of
 from flasher.cli.files import check_writable, write_whole
-from flasher.cli.framework import command, option, option_set, retyped, typed_values
+from flasher.cli.framework import command, option, retyped, typed_values
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
 from flasher.errors import ExitCode
@@ -90,33 +90,7 @@ class ExploreDocument:
 DOCUMENTS: Final = (ExploreDocument,)
 
 
-@dataclass(frozen=True)
-class Choices:
-    """How far is walked, and what is written."""
-
-    steps: int
-    seed: str
-    replay: str | None
-    yes: bool
-    trace_file: Path | None
-
-
 _what = partial(option, panel="what is run, and how")
-_choices = option_set(
-    "chosen",
-    Choices,
-    _what(
-        "--steps", type=values.count, default="2000", metavar="N", brief=True,
-        help="end after so many steps",
-    ),
-    _what("--seed", default="1", metavar="SEED", brief=True, help="decides every walk"),
-    _what("--replay", metavar="STEPS", help="take these steps instead, as a finding tells them"),
-    _what("-y", "--yes", is_flag=True, help="do not ask before a device on a bus is worn"),
-    option(
-        _TRACE_FILE, type=values.FilePath("log", gives=Path), metavar="FILE", panel="reports",
-        help="the frames of the walk that found something (candump)",
-    ),
-)  # fmt: skip
 
 
 @command(
@@ -125,20 +99,40 @@ _choices = option_set(
     exit_codes=(ExitCode.IMAGE, ExitCode.BUS, ExitCode.PARTIAL, ExitCode.INTERRUPTED),
 )
 @bench_options
-@_choices
+@_what(
+    "--steps", type=values.count, default="2000", metavar="N", brief=True,
+    help="end after so many steps",
+)  # fmt: skip
+@_what("--seed", default="1", metavar="SEED", brief=True, help="decides every walk")
+@_what("--replay", metavar="STEPS", help="take these steps instead, as a finding tells them")
+@_what("-y", "--yes", is_flag=True, help="do not ask before a device on a bus is worn")
+@option(
+    _TRACE_FILE, type=values.FilePath("log", gives=Path), metavar="FILE", panel="reports",
+    help="the frames of the walk that found something (candump)",
+)  # fmt: skip
 @adapter_options
-def explore(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> int:
+def explore(
+    output: Output,
+    bus: Bus,
+    bench: BenchChoices,
+    *,
+    steps: int,
+    seed: str,
+    replay: str | None,
+    yes: bool,
+    trace_file: Path | None,
+) -> int:
     """Walk through valid and invalid messages in any order until the device breaks a rule, and
     find the shortest walk that breaks it.
     """
     from flasher.conformance.explore import Explorer  # noqa: PLC0415  much is loaded
 
     described = bench.described(bus)
-    check_writable(chosen.trace_file, _TRACE_FILE, typed_values(but="trace_file"))
-    if not (described.is_simulated or chosen.replay):
-        erases = max(1, round(chosen.steps * _WALKS_PER_STEP * _ERASES_A_WALK))
-        said = f"{chosen.steps} steps erase and write the device about {erases} times"
-        confirm_wear(said, is_agreed=chosen.yes)
+    check_writable(trace_file, _TRACE_FILE, typed_values(but="trace_file"))
+    if not (described.is_simulated or replay):
+        erases = max(1, round(steps * _WALKS_PER_STEP * _ERASES_A_WALK))
+        said = f"{steps} steps erase and write the device about {erases} times"
+        confirm_wear(said, is_agreed=yes)
     with (
         opened(described, output) as (subject, profile, stopped),
         Bar(output, leave=False, unit=" steps") as bar,
@@ -146,19 +140,16 @@ def explore(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> i
         explorer = Explorer(
             subject,
             profile,
-            seed=chosen.seed,
+            seed=seed,
             stopped=stopped,
-            progress=lambda steps: bar.move_to(min(steps, chosen.steps), chosen.steps),
+            progress=lambda done: bar.move_to(min(done, steps), steps),
         )
-        if chosen.replay is None:
-            explored = explorer.explore(chosen.steps)
-        else:
-            explored = explorer.replay(chosen.replay.split())
+        explored = explorer.explore(steps) if replay is None else explorer.replay(replay.split())
         was_stopped = stopped()
     code = ExitCode.OK if explored.finding is None else ExitCode.PARTIAL
     if was_stopped and explored.finding is None:
         code = ExitCode.INTERRUPTED
-    _tell(explored, output, chosen.trace_file, code)
+    _tell(explored, output, trace_file, code)
     return code
 
 

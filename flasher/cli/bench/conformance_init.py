@@ -17,7 +17,7 @@ from flasher.cli.bench.conformance_bench import (
 )
 from flasher.cli.documents import document_of
 from flasher.cli.files import check_writable, write_whole
-from flasher.cli.framework import command, option, option_set
+from flasher.cli.framework import command, option
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
 from flasher.errors import ErrorCode, ExitCode, UsageError
@@ -71,26 +71,7 @@ class InitDocument:
 DOCUMENTS: Final = (InitDocument,)
 
 
-@dataclass(frozen=True)
-class Choices:
-    """What is written."""
-
-    output: Path | None
-    force: bool
-    yes: bool
-
-
 _what = partial(option, panel="what is written")
-_choices = option_set(
-    "chosen",
-    Choices,
-    _what(
-        "-o", "--output", type=values.FilePath("toml", gives=Path), metavar="FILE", brief=True,
-        help="the profile (default: the name of the target, as bms.toml)",
-    ),
-    _what("--force", is_flag=True, brief=True, help="write over a file that exists"),
-    _what("-y", "--yes", is_flag=True, help="do not ask before a device on a bus is worn"),
-)  # fmt: skip
 
 
 @command(
@@ -101,9 +82,16 @@ _choices = option_set(
     ),
 )  # fmt: skip
 @bench_options
-@_choices
+@_what(
+    "-o", "--output", "file", type=values.FilePath("toml", gives=Path), metavar="FILE", brief=True,
+    help="the profile (default: the name of the target, as bms.toml)",
+)  # fmt: skip
+@_what("--force", is_flag=True, brief=True, help="write over a file that exists")
+@_what("-y", "--yes", is_flag=True, help="do not ask before a device on a bus is worn")
 @adapter_options
-def init(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> int:
+def init(
+    output: Output, bus: Bus, bench: BenchChoices, *, file: Path | None, force: bool, yes: bool
+) -> int:
     """Ask a device everything that a profile says, on the bus alone, and write the profile with
     what was seen. The good image runs before and after it.
     """
@@ -111,20 +99,20 @@ def init(output: Output, bus: Bus, bench: BenchChoices, chosen: Choices) -> int:
     from flasher.conformance.profile import ConformanceProfile, load_profile  # noqa: PLC0415
 
     described = bench.described(bus)
-    path = chosen.output or Path(f"{described.target}.toml")
-    _check(path, force=chosen.force)
+    path = file or Path(f"{described.target}.toml")
+    _check(path, force=force)
     # What the bench knows of its device besides has to be seen like everything else.
     start = ConformanceProfile() if bench.profile is None else load_profile(bench.profile)
     if not described.is_simulated:
         said = f"the questions erase and write the device about {UPGRADES} times"
-        confirm_wear(said, is_agreed=chosen.yes)
+        confirm_wear(said, is_agreed=yes)
     with (
         opened(described, output) as (subject, _, stopped),
         Bar(output, leave=False, unit=" questions") as bar,
     ):
         asked = ask(subject, start, stopped=stopped, progress=bar.move_to)
         was_stopped = stopped()
-    return _tell(asked, start, path, output, force=chosen.force, was_stopped=was_stopped)
+    return _tell(asked, start, path, output, force=force, was_stopped=was_stopped)
 
 
 def _check(path: Path, *, force: bool) -> None:
