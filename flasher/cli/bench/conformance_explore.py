@@ -149,15 +149,13 @@ def explore(
     code = ExitCode.OK if explored.finding is None else ExitCode.PARTIAL
     if was_stopped and explored.finding is None:
         code = ExitCode.INTERRUPTED
-    _tell(explored, output, trace_file, code)
-    return code
+    return _tell(explored, output, trace_file, code)
 
 
-def _tell(explored: Explored, output: Output, trace_file: Path | None, code: ExitCode) -> None:
+def _tell(explored: Explored, output: Output, trace_file: Path | None, code: ExitCode) -> int:
     ctx, finding = click.get_current_context(), explored.finding
     words = ["flasher", *retyped(ctx, "conformance", without=_REPLACED.__contains__)]
     words.insert(words.index("conformance") + 1, "explore")
-    replay = ""
     met = sum(bool(count) for _, _, count in explored.coverage)
     output.result(
         f"{printable(explored.subject)}: {explored.walks} walks, {explored.steps} steps, seed "
@@ -168,8 +166,11 @@ def _tell(explored: Explored, output: Output, trace_file: Path | None, code: Exi
         for phase in dict.fromkeys(phase for phase, _ in explored.never):
             names = [name for its, name in explored.never if its == phase]
             output.result(f"  never in the phase {phase}: {', '.join(names)}")
+    found = None
     if finding is not None:
         replay = shlex.join([*words, "--replay", " ".join(finding.steps)])
+        steps, first_steps = list(finding.steps), list(finding.first_steps)
+        found = FindingDocument(finding.rule, finding.text, steps, first_steps, replay)
         output.result(f"FOUND {finding.rule}: {printable(finding.text)}")
         output.result(f"  steps: {' '.join(finding.steps) or 'none: the good image is flashed'}")
         output.result(f"  replay: {printable(replay)}")
@@ -182,10 +183,6 @@ def _tell(explored: Explored, output: Output, trace_file: Path | None, code: Exi
             output.result(printable(explored.stopped))
     else:
         output.result(explored.stopped or "nothing was found")
-    found = None
-    if finding is not None:
-        steps, first_steps = list(finding.steps), list(finding.first_steps)
-        found = FindingDocument(finding.rule, finding.text, steps, first_steps, replay)
     coverage = [CoverageDocument(*each) for each in explored.coverage]
     document = document_of(ExploreDocument, explored, finding=found, coverage=coverage)
-    output.document(document, exit_code=code)
+    return output.document(document, exit_code=code)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from flasher.cli import values
 from flasher.cli.bar import Bar
@@ -22,10 +22,6 @@ from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.protocol.text import printable
-
-if TYPE_CHECKING:
-    from flasher.conformance.init import Asked
-    from flasher.conformance.profile import ConformanceProfile
 
 _EXAMPLES: Final = """\
 examples:
@@ -112,31 +108,6 @@ def init(
     ):
         asked = ask(subject, start, stopped=stopped, progress=bar.move_to)
         was_stopped = stopped()
-    return _tell(asked, start, path, output, force=force, was_stopped=was_stopped)
-
-
-def _check(path: Path, *, force: bool) -> None:
-    """Raises UsageError for a file that cannot, or must not, be written."""
-    check_writable(path, _OUTPUT)
-    if path.exists() and not force:
-        raise UsageError(
-            f"{printable(str(path))} exists already.",
-            where=_OUTPUT,
-            remedy="Name another file, or add --force.",
-            code=ErrorCode.FILE_NOT_WRITTEN,
-        )
-
-
-def _tell(
-    asked: Asked,
-    start: ConformanceProfile,
-    path: Path,
-    output: Output,
-    *,
-    force: bool,
-    was_stopped: bool,
-) -> int:
-    """Print what was seen, and write the file unless the questions ended early."""
     rows = []
     for one in asked.answers:
         seen = one.seen
@@ -173,3 +144,15 @@ def _tell(
         ),
         exit_code=code,
     )
+
+
+def _check(path: Path, *, force: bool) -> None:
+    """Raises UsageError for a file that cannot, or must not, be written."""
+    check_writable(path, _OUTPUT)
+    if path.exists() and not force:
+        raise UsageError(
+            f"{printable(str(path))} exists already.",
+            where=_OUTPUT,
+            remedy="Name another file, or add --force.",
+            code=ErrorCode.FILE_NOT_WRITTEN,
+        )
