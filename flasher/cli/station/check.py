@@ -17,7 +17,7 @@ from flasher.cli.station.documents import (
 from flasher.cli.station.setup import labels_of
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
-from flasher.station.adapters import Resolved, detect, resolve
+from flasher.station.adapters import detect, resolve
 from flasher.station.config import load_config
 from flasher.station.people import load_badges
 from flasher.station.recipe import fill
@@ -40,30 +40,39 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
         ]
         return output.failure(error, FindingsDocument(findings=findings))
     output.results(_lines(recipe, day))
-    sockets = {} if station_file is None else _check_station(station_file, recipe)
+    sockets: dict[str, str] = {}
+    if station_file is not None:
+        config = load_config(station_file)
+        if config.badges:
+            load_badges(Path(config.badges), recipe.recipe.serial_number)
+        labels_of(config, recipe)
+        for socket in resolve(config.socket, detect(config.socket)):
+            bus = socket.bus
+            adapter = "virtual units" if bus is None else f"{bus['interface']} {bus['channel']}"
+            sockets[socket.config.name] = adapter
     for name, adapter in sockets.items():
         output.result(f"socket {printable(name)}: {printable(adapter)}")
     output.result("nothing speaks against it")
-    return output.document(_document(recipe, sockets))
-
-
-def _check_station(station_file: Path, recipe: LoadedRecipe) -> dict[str, str]:
-    """The adapter of each socket of a station, when its badges and its label fit the recipe.
-
-    Raises UsageError, BusError.
-    """
-    config = load_config(station_file)
-    if config.badges:
-        load_badges(Path(config.badges), recipe.recipe.serial_number)
-    labels_of(config, recipe)
-    sockets = config.socket
-    return {each.config.name: _adapter(each) for each in resolve(sockets, detect(sockets))}
-
-
-def _adapter(socket: Resolved) -> str:
-    if socket.bus is None:
-        return "virtual units"
-    return f"{socket.bus['interface']} {socket.bus['channel']}"
+    return output.document(
+        document_of(
+            StationCheckDocument,
+            recipe.recipe,
+            recipe=recipe.recipe.name,
+            sha256=recipe.sha256,
+            targets=[
+                CheckedTargetDocument(
+                    target=target.name,
+                    image=printable(target.firmware.image),
+                    sha256=target.image.sha256,
+                    size_bytes=target.image.size_bytes,
+                    version=target.version,
+                    required=target.required.words,
+                )
+                for target in recipe.targets
+            ],
+            sockets=sockets,
+        )
+    )
 
 
 def _lines(recipe: LoadedRecipe, day: date) -> Iterator[str]:
@@ -83,24 +92,3 @@ def _lines(recipe: LoadedRecipe, day: date) -> Iterator[str]:
         yield printable(f"  write:    {write.target.upper()} {write.item}: {values}")
     for kept in said.unchanged:
         yield printable(f"  keep:     {kept.target.upper()} {kept.item}")
-
-
-def _document(recipe: LoadedRecipe, sockets: dict[str, str]) -> StationCheckDocument:
-    return document_of(
-        StationCheckDocument,
-        recipe.recipe,
-        recipe=recipe.recipe.name,
-        sha256=recipe.sha256,
-        targets=[
-            CheckedTargetDocument(
-                target=target.name,
-                image=printable(target.firmware.image),
-                sha256=target.image.sha256,
-                size_bytes=target.image.size_bytes,
-                version=target.version,
-                required=target.required.words,
-            )
-            for target in recipe.targets
-        ],
-        sockets=sockets,
-    )
