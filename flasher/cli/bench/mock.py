@@ -141,8 +141,11 @@ def mock(
     bicycle, which talk to each other.
     """
     if list_variants:
-        _list_variants(output)
-        return ExitCode.OK
+        output.table((each.name, each.clause, each.summary) for each in VARIANTS.values())
+        documents = [
+            document_of(VariantDocument, each, also=list(each.also)) for each in VARIANTS.values()
+        ]
+        return output.document(VariantsDocument(variants=documents))
     if target is None:
         raise UsageError(
             "flasher mock: -t/--target is required.", remedy="Write -t wmc, bms or obc."
@@ -209,14 +212,6 @@ def _served(
         has_application=has_application,
     )
     return device, device
-
-
-def _list_variants(output: Output) -> None:
-    output.table((each.name, each.clause, each.summary) for each in VARIANTS.values())
-    documents = [
-        document_of(VariantDocument, each, also=list(each.also)) for each in VARIANTS.values()
-    ]
-    output.document(VariantsDocument(variants=documents))
 
 
 class _Tool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -92,7 +92,13 @@ def adapters(output: Output, *, network: bool) -> int:
         output.table(_rows(serial))
     output.result("")
     output.result("not seen, even when plugged in:")
-    output.table(_unseen_rows(unseen), indent=2)
+    alike: dict[str, list[str]] = {}  # back ends with the same reason stand together
+    for each in unseen:
+        reason = f"{each.text}: {each.fix}" if each.fix else each.text
+        alike.setdefault(reason, []).append(each.interface)
+    rows = [(", ".join(names), reason) for reason, names in alike.items()]
+    rows.append(("any other", "as long as its maker's driver is not installed"))
+    output.table(rows, indent=2)
     return output.document(
         AdaptersDocument(
             adapters=[_document(each) for each in detected.found],
@@ -154,14 +160,3 @@ def _unseen(detected: Detected, *, on_network: bool, lists_ports: bool) -> Itera
 def _missing(name: str, extra: str) -> NotSeen:
     fix = f"pip install 'python-can[{extra}]'"
     return NotSeen(name, "package_missing", "Python package missing", fix)
-
-
-def _unseen_rows(unseen: Sequence[NotSeen]) -> Iterable[tuple[str, str]]:
-    """The same in as few rows as tell it: back ends with the same reason stand together."""
-    groups: dict[str, list[str]] = {}
-    for each in unseen:
-        reason = f"{each.text}: {each.fix}" if each.fix else each.text
-        groups.setdefault(reason, []).append(each.interface)
-    for reason, names in groups.items():
-        yield ", ".join(names), reason
-    yield "any other", "as long as its maker's driver is not installed"

@@ -212,7 +212,19 @@ def backup_of(
     """What is written into `file`. Raises NoAnswerError for a device that is not there."""
     if not found.is_there:
         raise silence(found)
-    memory = None if area is None else _memory(area, data, found)
+    running = "" if found.version is None else printable(str(found.version.firmware_version))
+    memory = None
+    if area is not None:
+        memory = MemoryInBackup(
+            start=area.start,
+            end=area.end,
+            sha256=hashlib.sha256(data).hexdigest(),
+            range_from=area.source,
+            names_running_version=running.encode("ascii") in data if running else None,
+        )
+    not_in_it = {"other memory": "bootloader, settings, RAM: the documents give no addresses"}
+    if memory is None:
+        not_in_it = {"memory": "left out on request"}
     taken_at = datetime.datetime.now().astimezone()
     info = info_document(found)
     at = taken_at.isoformat(timespec="seconds")
@@ -226,24 +238,9 @@ def backup_of(
         taken_at=at,
         memory=memory,
         items=[*(name for name, answer in info.items.items() if answer is not None), "faults"],
-        not_in_it=dict(_missing(info, memory)),
+        not_in_it=not_in_it | info.unanswered,
     )
-    return Backup(document, archive, _running_version(found))
-
-
-def _memory(area: Area, data: bytes, found: DeviceInfo) -> MemoryInBackup:
-    running = _running_version(found)
-    return MemoryInBackup(
-        start=area.start,
-        end=area.end,
-        sha256=hashlib.sha256(data).hexdigest(),
-        range_from=area.source,
-        names_running_version=running.encode("ascii") in data if running else None,
-    )
-
-
-def _running_version(found: DeviceInfo) -> str:
-    return "" if found.version is None else printable(str(found.version.firmware_version))
+    return Backup(document, archive, running)
 
 
 def _archive(inside: DataInBackup, data: bytes, taken_at: datetime.datetime) -> bytes:
@@ -258,14 +255,6 @@ def _archive(inside: DataInBackup, data: bytes, taken_at: datetime.datetime) -> 
             entry.external_attr = 0o644 << 16
             archive.writestr(entry, content)
     return packed.getvalue()
-
-
-def _missing(info: InfoDocument, memory: MemoryInBackup | None) -> Iterator[tuple[str, str]]:
-    if memory is None:
-        yield "memory", "left out on request"
-    else:
-        yield "other memory", "bootloader, settings, RAM: the documents give no addresses"
-    yield from info.unanswered.items()
 
 
 def _lines(document: BackupDocument) -> Iterator[str]:

@@ -217,17 +217,12 @@ class Examination:
         looked, self.findings = self.findings, before
         self._note(*findings.adapter(self.detected), *looked)
         if config is None:
-            self._look_at_the_only_one(stopped)
-
-    def _look_at_the_only_one(self, stopped: Callable[[], bool]) -> None:
-        found = [each for each in self.detected.found if each.channel]
-        if len(found) != 1 or self._bus.is_named:
-            self._note(findings.unchosen(self.detected))
-            return
-        from flasher.bus.opening import bus_config  # noqa: PLC0415  loads python-can
-
-        self._bus = only(found[0], self._bus, self._output)
-        self._look_at(bus_config(self._bus.config, self._bus.fallback), stopped)
+            found = [each for each in self.detected.found if each.channel]
+            if len(found) != 1 or self._bus.is_named:
+                self._note(findings.unchosen(self.detected))
+                return
+            self._bus = only(found[0], self._bus, self._output)
+            self._look_at(bus_config(self._bus.config, self._bus.fallback), stopped)
 
     def _look_at(self, config: dict[str, Any], stopped: Callable[[], bool]) -> None:
         from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can

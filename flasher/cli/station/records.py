@@ -60,7 +60,15 @@ def report(output: Output, options: ReportOptions, records: RecordsOptions) -> i
         }
         for option, (path, _) in wanted.items():
             check_writable(path, option)
-        made = make_report(store.read, _filter(options))
+        chosen = RunFilter(
+            lot=options.lot,
+            recipe=options.recipe,
+            since=_moment(options.since, "--since"),
+            until=_moment(options.until, "--until"),
+            serial=options.serial,
+            part=options.part,
+        )
+        made = make_report(store.read, chosen)
         output.results(figure_lines(made.figures))
         for option, (path, make) in wanted.items():
             if path is not None:
@@ -76,17 +84,6 @@ def report(output: Output, options: ReportOptions, records: RecordsOptions) -> i
             runs=[run_document(row) for row in made.runs],
         )
         return output.document(document, exit_code=code)
-
-
-def _filter(options: ReportOptions) -> RunFilter:
-    return RunFilter(
-        lot=options.lot,
-        recipe=options.recipe,
-        since=_moment(options.since, "--since"),
-        until=_moment(options.until, "--until"),
-        serial=options.serial,
-        part=options.part,
-    )
 
 
 def _moment(text: str | None, option: str) -> datetime | None:

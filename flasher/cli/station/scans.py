@@ -14,6 +14,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
 from typing import Any, Final, TextIO
 
@@ -120,7 +121,7 @@ class ScanFile:
 
     def _label(self, sockets: Iterable[Socket], borne: Mapping[str, str]) -> None:
         """Give a label to a unit that waits."""
-        ahead = self._until_command()
+        ahead = list(takewhile(self._is_label, self._left))  # up to the next command
         for socket in sockets:
             if not (socket.awaits_label and socket.sees_units):
                 continue
@@ -132,15 +133,6 @@ class ScanFile:
                 self._submit(f"{Word.SOCKET.value} {socket.name}")
                 self._submit(label)
                 return
-
-    def _until_command(self) -> list[str]:
-        """The labels up to the next command."""
-        ahead: list[str] = []
-        for text in self._left:
-            if not self._is_label(text):
-                break
-            ahead.append(text)
-        return ahead
 
     def _is_label(self, text: str) -> bool:
         return isinstance(understand(text), Label) and text not in self._badges

@@ -158,9 +158,13 @@ def create(
     if not allow_implausible:
         check_plausible(loaded)
     release = release_of(loaded, target, source=str(path), notes=notes or "", **statements)
-    warnings = _warnings(loaded, target)
-    for warning in warnings:
-        output.error_line(f"warning: {warning}")
+    warnings, names, node = [], loaded.named_targets, target.node.name
+    if names and names != {target}:
+        also, others = "also " * (target in names), names_of(names - {target})
+        warnings = [
+            f"the image {also}names the {others}; the manifest says that it is for the {node}"
+        ]
+        output.error_line(f"warning: {warnings[0]}")
     write_whole(path, to_toml(release).encode("utf-8"), "-o")
     output.result(f"written: {printable(str(path))}")
     output.table(((f"{key}:", value) for key, value in stated_rows(release).items()), indent=2)
@@ -182,17 +186,6 @@ def _check_destination(path: Path, image: str, *, overwrite: bool) -> None:
             remedy="Look whether it is still wanted; --force writes over it, -o names another.",
             code=ErrorCode.FILE_NOT_WRITTEN,
         )
-
-
-def _warnings(image: Image, target: Target) -> list[str]:
-    names = image.named_targets
-    if not names or names == {target}:
-        return []
-    also = "also names" if target in names else "names"
-    others = names_of(names - {target})
-    return [
-        f"the image {also} the {others}; the manifest says that it is for the {target.node.name}"
-    ]
 
 
 # -- check ----------------------------------------------------------------------------------------
