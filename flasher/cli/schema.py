@@ -45,7 +45,9 @@ def build() -> Schema:
     an event or another line that a command prints before it.
     """
     modules = command_modules()
-    lines = [*event_classes(), *(each for module in modules.values() for each in _lines(module))]
+    lines = event_classes()
+    for module in modules.values():
+        lines += getattr(module, "LINES", ())
     documents = {command: tuple(module.DOCUMENTS) for command, module in modules.items()}
     described = [*lines, *(each for each in documents.values() for each in each), ErrorDocument]
     schemas, shared = TypeAdapter.json_schemas(
@@ -102,10 +104,6 @@ def event_classes() -> list[type]:
 def command_modules() -> dict[str, ModuleType]:
     """The module of every command."""
     return {command: entry.module() for command, entry in COMMANDS.items()}
-
-
-def _lines(module: ModuleType) -> Sequence[type]:
-    return getattr(module, "LINES", ())
 
 
 def _line(kind: type, own: Schema, version: Schema) -> tuple[str, Schema]:

@@ -151,14 +151,12 @@ def channels(_ctx: click.Context) -> list[str]:
     """
     if not _NETWORK.is_dir():
         return []
-    return sorted(link.name for link in _NETWORK.iterdir() if _is_can(link / "type"))
-
-
-def _is_can(kind: Path) -> bool:
-    try:
-        return kind.read_text().strip() == _LINK_TYPE_CAN
-    except OSError:
-        return False
+    found = []
+    for link in _NETWORK.iterdir():
+        with contextlib.suppress(OSError):
+            if (link / "type").read_text().strip() == _LINK_TYPE_CAN:
+                found.append(link.name)
+    return sorted(found)
 
 
 # -- files -----------------------------------------------------------------------------------------

@@ -39,7 +39,9 @@ def convert(trace: Path, to: Path, *, called: Path) -> Converted:
     if to.suffix.lower() == ".pcapng":
         story = explain_path(trace, everything=True)
         remarks = _remarks(story)
-        writer = PcapngWriter(to, _summary(story))
+        verdict = story.verdict
+        said = (verdict.text, verdict.likely, verdict.remedy)
+        writer = PcapngWriter(to, "\n".join(filter(None, said)))
     else:
         writer = writer_of(to, called=str(called))
     damage: list[str] = []
@@ -52,10 +54,10 @@ def convert(trace: Path, to: Path, *, called: Path) -> Converted:
             start = now if start is None else start
             # Each is said once: frames that were accepted together have the same time.
             places = ((frame.can_id, now - start), (_ANY, now - start))
-            said = "\n".join(text for place in places for text in remarks.pop(place, ()))
+            remark = "\n".join(text for place in places for text in remarks.pop(place, ()))
             message = message_of(frame, sent=False, at_s=at)
-            if said and isinstance(writer, PcapngWriter):
-                writer(message, said)
+            if remark and isinstance(writer, PcapngWriter):
+                writer(message, remark)
                 remarked += 1
             else:
                 writer(message)
@@ -93,8 +95,3 @@ def _remarks(story: Story) -> dict[_Place, list[str]]:
         ended = f"{upgrade.target}, end of the upgrade: {upgrade.verdict.text}"
         found[_ANY, upgrade.end_s] += [ended, *upgrade.remarks]
     return found
-
-
-def _summary(story: Story) -> str:
-    verdict = story.verdict
-    return "\n".join(filter(None, (verdict.text, verdict.likely, verdict.remedy)))

@@ -210,15 +210,13 @@ def _judge(message: Message) -> tuple[Kind, str, tuple[Field, ...], bool]:
         row = messages.decode(message)
         if isinstance(row, messages.Malformed):
             return Kind.MALFORMED, prose(Kind.MALFORMED), _undecoded(message, row.problem), False
-        if not isinstance(row, messages.Unknown) and _goes_this_way(row, message.can_id):
+        # Devices report, the tool reads and writes (2.2.1).
+        if not isinstance(row, messages.Unknown) and message.can_id in (
+            _TO_TOOL if row.MODE == Mode.REPORT else _TO_DEVICE
+        ):
             alarm = isinstance(row, messages.Nak)
             return Kind.MESSAGE, TITLES[type(row)], _row_fields(row), alarm
     return Kind.UNKNOWN, prose(Kind.UNKNOWN), _undecoded(message), False
-
-
-def _goes_this_way(row: messages.Row, of_id: int) -> bool:
-    """Devices report, the tool reads and writes (2.2.1)."""
-    return of_id in (_TO_TOOL if row.MODE == Mode.REPORT else _TO_DEVICE)
 
 
 # -- fields ---------------------------------------------------------------------------------------

@@ -275,7 +275,14 @@ class _Reading:
         for target in tuple(self._open):
             self._close(target, until_s)
         upgrades = tuple(story for _, story in sorted(self._upgrades, key=lambda one: one[0]))
-        bitrate_bps = self._rate(bool(upgrades))
+        # What matters most: of the last upgrade of each target, the first bad verdict.
+        verdicts = list({upgrade.target: upgrade.verdict for upgrade in upgrades}.values())
+        bad = [verdict for verdict in verdicts if not verdict.cause.is_good]
+        chief = next(iter(bad or verdicts), None)
+        bitrate_bps = self._bitrate_bps
+        if self._given_bps is None and self._has_hmi and not upgrades:
+            # Only one dialect has displays, and only the other one has upgrades.
+            bitrate_bps = MOTINOVA.bitrate_bps
         bus = self._bus.figures(bitrate_bps)
         told = [TARGETS[upgrade.target.lower()] for upgrade in upgrades]
         talkers = self._bus.talkers(
@@ -291,20 +298,12 @@ class _Reading:
             bus=bus,
             upgrades=upgrades,
             talkers=tuple(talkers[:MAX_TALKERS]),
-            verdict=_chief(upgrades) or self._without_upgrade(),
+            verdict=self._without_upgrade() if chief is None else chief,
             steps=self._outside.lines(),
             steps_left_out=self._outside.left_out,
             talkers_left_out=max(0, len(talkers) - MAX_TALKERS),
             recorded=recorded,
         )
-
-    def _rate(self, has_upgrade: bool) -> int:  # noqa: FBT001  a fact, not an option
-        """The rate that was given; else the dialect's: only one of them has displays, and only the
-        other one has upgrades.
-        """
-        if self._given_bps is None and self._has_hmi and not has_upgrade:
-            return MOTINOVA.bitrate_bps
-        return self._bitrate_bps
 
     def _without_upgrade(self) -> TraceVerdict:
         bus = self._bus
@@ -325,14 +324,6 @@ class _Reading:
             text += f" Error frames: {bus.error_frames:,}."
         likely, remedy = explanation(cause)
         return TraceVerdict(cause, None, None, 0, text, likely, remedy)
-
-
-def _chief(upgrades: tuple[UpgradeStory, ...]) -> TraceVerdict | None:
-    """The verdict that matters most: of the last upgrade of each target, the first bad one."""
-    last = {upgrade.target: upgrade.verdict for upgrade in upgrades}
-    verdicts = list(last.values())
-    bad = [verdict for verdict in verdicts if not verdict.cause.is_good]
-    return next(iter(bad or verdicts), None)
 
 
 class BusCounter:

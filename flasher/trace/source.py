@@ -20,6 +20,7 @@ from flasher.trace.recorder import ONE_TOOL_CHANNEL
 from flasher.trace.story import Cause, Recorded, Story, TraceVerdict
 
 _HEAD_SIZE: Final = 100
+_RATE_MAX_BPS: Final = 10_000_000
 
 
 def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool = False) -> Story:
@@ -30,11 +31,14 @@ def explain_path(path: Path, *, bitrate_bps: int | None = None, everything: bool
     damage: list[str] = []
     trace = trace_file(path)
     report = _report(path / REPORT) if path.is_dir() else {}
+    rate_bps = report.get("bitrate_bps")
+    if not isinstance(rate_bps, int) or not 0 < rate_bps <= _RATE_MAX_BPS:
+        rate_bps = None
     story = explain(
         frames_until_damage(trace, damage),
         source=str(path),
         suffix=_suffix(trace),
-        bitrate_bps=bitrate_bps or _number(report.get("bitrate_bps")),
+        bitrate_bps=bitrate_bps or rate_bps,
         until=report.get("written_at") if isinstance(report.get("written_at"), float) else None,
         everything=everything,
         recorded=_recorded(report) if report else None,
@@ -137,10 +141,6 @@ def _no_report(path: Path, cause: str) -> UsageError:
 def recorded_of(path: Path) -> Recorded:
     """What the command said that has left a bundle. Raises UsageError where its report is none."""
     return _recorded(_report(path / REPORT))
-
-
-def _number(value: object) -> int | None:
-    return value if isinstance(value, int) and 0 < value <= 10_000_000 else None
 
 
 def _recorded(report: dict[str, Any]) -> Recorded:

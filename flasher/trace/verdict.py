@@ -114,7 +114,11 @@ def _spoiled(upgrade: ObservedUpgrade, *, is_alone: bool) -> _Found | None:
         text = f"Only the tool's frames and {upgrade.errors:,} error frame(s) are on this bus."
         return _Found(Cause.NOBODY_ACKNOWLEDGES, text)
     if upgrade.boot_changes or upgrade.extra_acks >= _EXTRA_ACKS:
-        return _Found(Cause.TWO_DEVICES, _two_devices(upgrade))
+        text = f"{upgrade.extra_acks} packets that were sent once had two ACKs."
+        if upgrade.boot_changes:
+            heard = ", ".join(f"{name} ({count})" for name, count in upgrade.boot_versions.items())
+            text = f"On the id of the {node} bootloaders announce different versions: {heard}."
+        return _Found(Cause.TWO_DEVICES, text)
     names = upgrade.boot_names
     is_other = names and (upgrade.target.boot_name not in names or upgrade.is_boot_odd)
     if is_other and upgrade.phase is not Phase.TRANSFER and not upgrade.ends:
@@ -133,14 +137,6 @@ def _spoiled(upgrade: ObservedUpgrade, *, is_alone: bool) -> _Found | None:
         text = f"{upgrade.errors_now:,} error frames came since the last thing that went well."
         return _Found(Cause.BUS_TROUBLE, text)
     return None
-
-
-def _two_devices(upgrade: ObservedUpgrade) -> str:
-    node = upgrade.target.node.name
-    if upgrade.boot_changes:
-        heard = ", ".join(f"{text} ({count})" for text, count in upgrade.boot_versions.items())
-        return f"On the id of the {node} bootloaders announce different versions: {heard}."
-    return f"{upgrade.extra_acks} packets that were sent once had two ACKs."
 
 
 # -- phase by phase -------------------------------------------------------------------------------

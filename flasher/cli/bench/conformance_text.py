@@ -114,7 +114,10 @@ def _not_judged(report: RunReport) -> Iterator[str]:
     reasons: dict[tuple[CaseVerdict, str], list[str]] = {}
     for result in report.results:
         if result.verdict in (CaseVerdict.UNSUPPORTED, CaseVerdict.NOT_RUN):
-            reasons.setdefault((result.verdict, _why(result)), []).append(result.case_id)
+            unsupported = CheckOutcome.UNSUPPORTED
+            whys = [check.got for check in result.checks if check.outcome is unsupported]
+            why = result.note or next(iter(whys), "no reason given")
+            reasons.setdefault((result.verdict, why), []).append(result.case_id)
     for why, case_ids in report.not_tried().items():
         reasons[CaseVerdict.PASS_IN_PART, why] = case_ids
     if reasons:
@@ -122,13 +125,6 @@ def _not_judged(report: RunReport) -> Iterator[str]:
     for (status, why), case_ids in reasons.items():
         named = list(dict.fromkeys(case_ids))
         yield printable(f"{status.text}: {_some(named)}: {_short(why)}")
-
-
-def _why(result: CaseResult) -> str:
-    if result.note:
-        return result.note
-    whys = [check.got for check in result.checks if check.outcome is CheckOutcome.UNSUPPORTED]
-    return whys[0] if whys else "no reason given"
 
 
 def _times(report: RunReport, *, verbose: bool) -> Iterator[str]:

@@ -25,7 +25,10 @@ _TALKERS_SHOWN: Final = 12
 
 def story_lines(story: Story, *, packets: bool = False) -> Iterator[str]:
     """The whole story; `packets` adds a line for each packet."""
-    yield _head(story)
+    at = ""
+    if story.started_at is not None:
+        at = time.strftime(", from %Y-%m-%d %H:%M:%S", time.localtime(story.started_at))
+    yield f"{story.source}: {counted(story.frames, 'frame')} in {duration(story.duration_s)}{at}"
     if story.damage:
         yield f"warning: the file cannot be read to its end; {story.damage}"
     yield from _verdict_lines(story.verdict)
@@ -40,13 +43,6 @@ def story_lines(story: Story, *, packets: bool = False) -> Iterator[str]:
     yield ""
     yield from _bus_lines(story.bus, story.bitrate_bps)
     yield from _talker_lines(story.talkers, story.talkers_left_out)
-
-
-def _head(story: Story) -> str:
-    at = ""
-    if story.started_at is not None:
-        at = time.strftime(", from %Y-%m-%d %H:%M:%S", time.localtime(story.started_at))
-    return f"{story.source}: {counted(story.frames, 'frame')} in {duration(story.duration_s)}{at}"
 
 
 def _verdict_lines(verdict: TraceVerdict, indent: str = "") -> Iterator[str]:

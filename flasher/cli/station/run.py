@@ -304,7 +304,9 @@ class _Session:
             return not self.station.is_running  # nobody is there who could scan RESUME
         # What was submitted last is understood only in the station's next turn.
         was_submitted, self._was_submitted = self._was_submitted, self._scans_used_up()
-        self._is_used_up = was_submitted and self._was_submitted and self._is_quiet()
+        is_busy = any(socket.is_busy for socket in self.station.sockets)
+        is_quiet = not (is_busy or self.view.board.waiting)
+        self._is_used_up = was_submitted and self._was_submitted and is_quiet
         return self._is_used_up
 
     def _check_sockets(self) -> None:
@@ -325,11 +327,6 @@ class _Session:
             wanted = self.options.units
             return wanted is not None and self.view.board.arrivals >= wanted
         return self._pipe is not None and self._pipe.is_at_end
-
-    def _is_quiet(self) -> bool:
-        """True when nothing runs, and no label waits."""
-        is_busy = any(socket.is_busy for socket in self.station.sockets)
-        return not (is_busy or self.view.board.waiting)
 
     # -- its end ----------------------------------------------------------------------------------
 
