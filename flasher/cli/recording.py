@@ -38,20 +38,10 @@ from flasher.trace.taps import FlightRecorder, Unechoed
 
 BUNDLE_FOLDER: Final = "FLASHER_BUNDLE_DIR"
 """The environment variable that names the folder for bundles."""
-_WITH_BUNDLE: Final = frozenset(
-    {
-        ExitCode.INTERNAL,
-        ExitCode.BUS,
-        ExitCode.NO_ANSWER,
-        ExitCode.WRONG_DEVICE,
-        ExitCode.TRANSFER,
-        ExitCode.REFUSED,
-        ExitCode.UNCONFIRMED,
-        ExitCode.VERIFICATION,
-        ExitCode.INTERRUPTED,
-    }
-)
-"""Ends that leave a bundle: failures on the bus, bugs, interruptions; not wrong usage."""
+_WITHOUT_BUNDLE: Final = (
+    ExitCode.USAGE, ExitCode.IMAGE, ExitCode.NOTHING_TO_DO, ExitCode.PARTIAL,
+)  # fmt: skip
+"""Ends of which no frame tells more."""
 _BUNDLES_KEPT: Final = 50
 """Bundles in the default folder; older ones are deleted."""
 
@@ -200,8 +190,8 @@ def _trace_file(options: RecordingOptions, record: Recording, output: Output) ->
 def _leave_bundle(
     options: RecordingOptions, output: Output, record: Recording, error: BaseException | None
 ) -> None:
-    is_usage = isinstance(error, FlasherError) and error.exit_code not in _WITH_BUNDLE
-    if (is_usage and not record.is_alone) or not record.flight.frames:
+    is_told = isinstance(error, FlasherError) and error.exit_code in _WITHOUT_BUNDLE
+    if (is_told and not record.is_alone) or not record.flight.frames:
         return
     from flasher.trace.bundle import keep_last, write_bundle  # noqa: PLC0415  loads python-can
 
