@@ -16,7 +16,7 @@ import can
 import pytest
 from rich.console import Console, ConsoleDimensions
 
-from flasher.cli.look.monitor_table import BoardView
+from flasher.cli.look.monitor_views import BoardView
 from flasher.errors import ExitCode
 from flasher.protocol.frame import Frame
 from flasher.trace.decoder import BusEvent

@@ -12,7 +12,7 @@ from typing import Final
 from flasher.cli import values
 from flasher.cli.adapters import settled
 from flasher.cli.framework import argument, command, option
-from flasher.cli.look.monitor_views import FrameLine, Lines, SeenLine, View
+from flasher.cli.look.monitor_views import FrameLine, Lines, SeenLine, TableView, View
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output, counted
 from flasher.cli.stop import stop_on_signal
@@ -118,11 +118,7 @@ def monitor(
     terminal = sys.stdout.isatty() and os.environ.get("TERM") != "dumb"
     is_live = terminal and trace is None
     wants_table = (table or is_live) and not (lines or raw or output.json_wanted)
-    view: View = Lines(output)
-    if wants_table:
-        from flasher.cli.look.monitor_table import TableView  # noqa: PLC0415  loads rich
-
-        view = TableView(output, live=is_live)
+    view: View = TableView(output, live=is_live) if wants_table else Lines(output)
     watcher = Watcher(
         Filter(frozenset(nodes), messages, errors),
         raw=raw,

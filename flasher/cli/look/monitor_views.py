@@ -1,18 +1,37 @@
-"""How `flasher monitor` shows what a watcher sees: line by line, or as JSON lines."""
+"""How `flasher monitor` shows what a watcher sees: line by line, as JSON lines, or in a table with
+the latest of every message, refreshed in place on a terminal.
+
+Column widths follow from the terminal's width alone, so nothing moves while values change. What the
+bus says enters the table as `Text`, which is never read as markup.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from textwrap import wrap
 from typing import Final, Literal, Self
 
+from rich.box import SIMPLE_HEAD
+from rich.console import Console, ConsoleDimensions, Group, RenderableType
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
 from flasher.cli.documents import FieldValue
-from flasher.cli.output import Output
+from flasher.cli.output import Output, counted
 from flasher.protocol.frame import Frame
-from flasher.trace.decoder import BusEvent, Kind
-from flasher.trace.watcher import Board, Pulse, RawFrame
+from flasher.trace.decoder import NOT_IN_DIALECT, BusEvent, Field, Kind
+from flasher.trace.watcher import Board, MessageHistory, Pulse, RawFrame
 
 _VALUE_WIDTH: Final = 64
 """Longer values are cut in lines, unless -v is given."""
+WIDE: Final = 116
+"""Terminals with fewer columns get a table without who, to whom, and the count."""
+_CHANGED: Final = "bold yellow"
+_TROUBLE: Final = "red"
+_VALUE_MAX: Final = 160
+_FRAME_LINES: Final = 7
+"""Lines around the rows: title, head, rule, two margins, what is left out, and the cursor."""
 
 
 @dataclass(frozen=True)
@@ -146,3 +165,199 @@ class Lines(View):
                 error=frame.is_error,
             )
         )
+
+
+# -- the table ------------------------------------------------------------------------------------
+
+
+class TableView(View):
+    """The board: refreshed in place, or printed once at the end."""
+
+    def __init__(self, output: Output, *, live: bool) -> None:
+        super().__init__(output)
+        self.is_live = live
+        self._console = Console(markup=False, highlight=False, emoji=False)
+        # No thread refreshes: the watcher's pulse does, between two frames. On a screen of its own
+        # lines are written over each other, without erasing them first: nothing flickers.
+        self._live = Live(console=self._console, screen=True, auto_refresh=False) if live else None
+        self._view = BoardView(self._console)
+        self._last_at = 0.0
+
+    def __enter__(self) -> Self:
+        if self._live is not None:
+            self._live.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if self._live is not None:
+            self._live.stop()
+        if kind is None:
+            self._console.print(self._view_now())
+
+    def show(self, seen: BusEvent, at_s: float, changed: frozenset[str]) -> None:
+        self._last_at = seen.at
+
+    def refresh(self, now: float) -> None:
+        self._last_at = now
+        if self._live is not None:
+            self._live.update(self._view_now(), refresh=True)
+
+    def _view_now(self) -> RenderableType:
+        said = f"{self.since(self._last_at):.1f} s, {counted(self.messages, 'message')}"
+        title = f"{self.name}: {said}, {self.troubles:,} with trouble"
+        return self._view.draw(self.board, self._last_at, title)
+
+
+class BoardView:
+    """Draws a board as it fits the console: a row a field, or a row a message where that is too
+    long, and then as many as there is room for.
+    """
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._too_long_for: ConsoleDimensions | None = None
+        """The size that a row a field was too long for: no going back and forth."""
+
+    def draw(self, board: Board, now: float, title: str) -> RenderableType:
+        """The board at `now`."""
+        size = self._console.size
+        lines = list(board.lines())
+        faults = _fault_lines(lines, size.width, size.height - _FRAME_LINES - 1)
+        if size.height <= _FRAME_LINES + 1 and faults:
+            title, faults = faults[0], []
+        table = self._table(lines, now, title, size.height - len(faults))
+        return Group(*(Text(line, style=_TROUBLE, no_wrap=True) for line in faults), table)
+
+    def _table(self, lines: list[MessageHistory], now: float, title: str, height: int) -> Table:
+        size = self._console.size
+        wide = size.width >= WIDE
+        room = max(height - _FRAME_LINES, 1)
+        if size != self._too_long_for and len(lines) <= room:
+            view = _by_field(lines, now, title, wide=wide)
+            if len(self._console.render_lines(view, pad=False)) < height:
+                return view
+        self._too_long_for = size
+        view = _by_message(lines[:room], now, title, wide=wide)
+        if len(lines) > room:
+            more = f"{len(lines) - room} more: make the window higher, or use --node or --message"
+            view.caption = Text(more, style="dim", no_wrap=True, overflow="ellipsis")
+        return view
+
+
+def _fault_lines(lines: list[MessageHistory], width: int, room: int) -> list[str]:
+    """All faults that are set, over the whole width, since the columns of a table cut them. Those
+    that have no room are counted.
+    """
+    wrapped = [
+        part
+        for line in lines
+        for shown in line.seen.fields
+        if line.seen.is_alarm and shown.name == "faults"
+        for part in wrap(f"FAULTS of the {line.seen.sender}: {shown.text}", width)
+    ]
+    if len(wrapped) <= room:
+        return wrapped
+    shown_lines = wrapped[: max(room - 1, 0)]
+    left = " ".join(wrapped[len(shown_lines) :]).count(",") + 1
+    more = "more " if shown_lines else ""
+    return [*shown_lines, f"{left} {more}FAULTS: make the window higher"[:width]]
+
+
+def _by_field(lines: list[MessageHistory], now: float, title: str, *, wide: bool) -> Table:
+    table = _table(title, wide=wide)
+    _column(table, "field", ratio=5)
+    _column(table, "value", ratio=5, right=True, folds=True)
+    _column(table, "unit", width=4, right=True)
+    _figures(table, wide=wide)
+    for line in lines:
+        changed = line.changed(now)
+        head, tail = _head(line, wide=wide), _tail(line, now, wide=wide)
+        if not line.seen.in_dialect:
+            head[-1] = Text(line.seen.marked_title, no_wrap=False, overflow="fold")
+        for shown in line.seen.fields or (None,):
+            cells = [Text(), Text(), Text()] if shown is None else _cells(shown, changed)
+            table.add_row(*head, *cells, *tail)
+            head, tail = [Text()] * len(head), [Text()] * len(tail)
+    return table
+
+
+def _by_message(lines: list[MessageHistory], now: float, title: str, *, wide: bool) -> Table:
+    table = _table(title, wide=wide)
+    _column(table, "fields", ratio=6)
+    _figures(table, wide=wide)
+    for line in lines:
+        changed = line.changed(now)
+        words = []
+        for shown in line.seen.fields:
+            mark, style = ("*", _CHANGED) if shown.name in changed else ("", "")
+            words.append(Text(shown.words(mark=mark), style=style))
+        if not line.seen.in_dialect:  # first: what stands behind may be cut
+            words.insert(0, Text(NOT_IN_DIALECT))
+        fields = Text(", ").join(words)
+        table.add_row(*_head(line, wide=wide), fields, *_tail(line, now, wide=wide))
+    return table
+
+
+def _table(title: str, *, wide: bool) -> Table:
+    table = Table(
+        title=Text(title, style="bold", no_wrap=True, overflow="ellipsis"),
+        title_justify="left",
+        caption_justify="left",
+        box=SIMPLE_HEAD,
+        expand=True,
+        pad_edge=False,
+    )
+    _column(table, "id", width=8 if wide else 3)
+    if wide:
+        _column(table, "from > to", width=9)
+    _column(table, "message", ratio=5)
+    return table
+
+
+def _figures(table: Table, *, wide: bool) -> None:
+    _column(table, "per s", width=6, right=True)
+    if wide:
+        _column(table, "count", width=7, right=True)
+
+
+def _column(
+    table: Table, name: str, *, width: int | None = None, ratio: int | None = None,
+    right: bool = False, folds: bool = False,
+) -> None:  # fmt: skip
+    justify: Final = "right" if right else "left"
+    table.add_column(
+        Text(name),
+        width=width,
+        ratio=ratio,
+        justify=justify,
+        no_wrap=not folds,
+        overflow="fold" if folds else "ellipsis",
+    )
+
+
+def _head(line: MessageHistory, *, wide: bool) -> list[Text]:
+    seen = line.seen
+    style = _TROUBLE if seen.is_trouble else ""
+    cells = [Text(f"{seen.can_id:03X}"), Text(seen.title, style=style)]
+    if wide:
+        cells.insert(1, Text(seen.route))
+    return cells
+
+
+def _tail(line: MessageHistory, now: float, *, wide: bool) -> list[Text]:
+    rate = line.rate_hz(now)
+    cells = [Text("-" if rate is None else f"{rate:.1f}")]
+    if wide:
+        cells.append(Text(f"{line.count:,}"))
+    return cells
+
+
+def _cells(shown: Field, changed: set[str]) -> list[Text]:
+    """Label, value and unit; a change is told by a mark too, for screens without colours."""
+    text = shown.text
+    if len(text) > _VALUE_MAX:  # it folds: not over half the screen
+        text = f"{text[:_VALUE_MAX].rstrip()} ..."
+    if shown.name not in changed:
+        return [Text(shown.label), Text(text), Text(shown.unit)]
+    value = Text(f"*{text}", style=_CHANGED)
+    return [Text(shown.label), value, Text(shown.unit, style=_CHANGED)]
