@@ -1,4 +1,4 @@
-"""What a terminal or a pipe takes: its encoding, its width, its colours."""
+"""What a terminal or a pipe takes: its encoding, its width, its colours; and who answers there."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Final, TextIO
+
+from flasher.errors import InterruptedByUserError
 
 _NO_WINDOW: Final = 10_000
 """Columns where nothing is wrapped."""
@@ -137,3 +139,23 @@ def wrap_line(line: str, width: int) -> list[str]:
         replace_whitespace=False,
         drop_whitespace=True,
     )
+
+
+# -- a question before something that cannot be taken back ----------------------------------------
+
+
+def can_ask() -> bool:
+    """True where somebody reads and answers."""
+    return sys.stdin.isatty() and sys.stderr.isatty()
+
+
+def agrees(question: str, *, interrupted: str) -> bool:
+    """Ask; True for yes. Raises InterruptedByUserError, which says `interrupted`, for Ctrl-C."""
+    sys.stderr.write(f"{question} [y/N] ")
+    sys.stderr.flush()
+    try:
+        answer = sys.stdin.readline()
+    except KeyboardInterrupt as interrupt:
+        sys.stderr.write("\n")
+        raise InterruptedByUserError(f"Interrupted at the question: {interrupted}") from interrupt
+    return answer.strip().lower() in {"y", "yes"}

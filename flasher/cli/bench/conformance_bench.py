@@ -12,8 +12,8 @@ from flasher.cli import values
 from flasher.cli.framework import option, option_set
 from flasher.cli.options import Bus, allow_implausible_option, target_option
 from flasher.cli.output import Output
-from flasher.cli.question import agrees, can_ask
 from flasher.cli.stop import Stop, stop_on_signal
+from flasher.cli.terminal import agrees, can_ask
 from flasher.conformance.real import HOST_UNCERTAINTY_S
 from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.spec import Target

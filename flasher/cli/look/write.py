@@ -13,9 +13,9 @@ from flasher.cli.adapters import check_heard, settled
 from flasher.cli.framework import argument, command, option
 from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output
-from flasher.cli.question import agrees, can_ask
 from flasher.cli.recording import RecordingOptions, recorded_connection, recording_options
 from flasher.cli.stop import stop_on_signal
+from flasher.cli.terminal import agrees, can_ask
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.host.items import writable
 from flasher.host.write import Written, field_changes, plan_write
