@@ -258,8 +258,7 @@ def identity(done: Done) -> list[tuple[str, str]]:
     """What tells the upgraded device from others; empty where it cannot be asked."""
     if done.before is None or done.before.target is not done.target:
         return []
-    answers = (each.answer for each in done.before.readings)
-    version = next((each for each in answers if isinstance(each, VersionInformation)), None)
+    version = done.before.version
     rows = {} if version is None else _rows(version)
     return [rows[name] for name in ("model", "serial_number", "hardware_version") if name in rows]
 
