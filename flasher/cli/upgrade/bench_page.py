@@ -135,18 +135,17 @@ class _Place:
                 remedy="Make room, or make the folder by hand.",
                 code=ErrorCode.FILE_NOT_WRITTEN,
             ) from error
-        watch: Watch = {"on_event": on_event, "cancelled": cancelled}
         with (
             recording(RecordingOptions(), self.bus(adapter), self._output, target=BMS) as record,
             self.connect(adapter) as connection,
         ):
             record.opened(connection)
-            watch["taps"] = record.taps
-            device = connection.device(BMS, dialect=self.dialect)
-            found = device.identify(**watch)
+            watch: Watch = {"taps": record.taps, "on_event": on_event, "cancelled": cancelled}
+            device = connection.device(BMS, dialect=self.dialect, **watch)
+            found = device.identify()
             data = b""
             if area is not None and found.is_there:
-                data = device.read_memory(area.start, area.end, **watch)
+                data = device.read_memory(area.start, area.end)
             path = folder / _backup_name(found)
             made = backup_of(found, area, data, connection.name, path)
         write_whole(path, made.archive, "")
