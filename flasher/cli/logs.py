@@ -87,7 +87,7 @@ class _Screen(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         event = getattr(record, "event", None)
-        if getattr(record, "said", False) or type(event) in self._output.shown_events:
+        if getattr(record, "said", False) or self._output.shows(event):
             return
         if _FORGOTTEN_BUS in str(record.msg):
             return

@@ -54,8 +54,8 @@ class Output:
         """True when each event is to be a JSON line."""
         self.command: str | None = None
         """Name of the command that runs; None before it is known."""
-        self.shown_events: frozenset[type] = frozenset()
-        """Events that the command prints itself while it runs: -v does not log them once more."""
+        self.shows: Callable[[object], bool] = lambda _event: False
+        """Whether the command prints an event itself: -v does not log it once more."""
         self.ending: Callable[[FlasherError], ClosingLine] | None = None
         """What the last line says of an error, for a command that ends with a verdict."""
         self.write_stderr: Callable[[str], None] = _plain_stderr

@@ -215,7 +215,7 @@ def test_what_the_command_prints_is_not_printed_twice(
     path = tmp_path / "x.log"
     phase = events.PhaseEntered(Phase.TRANSFER, 1)
     output.verbosity = 2
-    output.shown_events = frozenset({events.PhaseEntered})
+    output.shows = lambda event: isinstance(event, events.PhaseEntered)
     with Logs(output) as log:
         log.open(2, str(path))
         output.progress("transferring ...")

@@ -48,8 +48,6 @@ Ends with exit code 0 when interrupted.
 
 choices for --set, the first value is the default:
 """
-SHOWN: Final = BY_DEVICE | {events.BytesDamaged}
-"""The events that are printed: the log on stderr leaves them out."""
 
 
 @dataclass(frozen=True)
@@ -157,7 +155,7 @@ def mock(
         target, dialect, profile, variant, is_system=system, has_application=not no_app
     )
     watcher = _Watcher(device, save_image, output)
-    output.shown_events = SHOWN
+    output.shows = lambda event: type(event) in {*BY_DEVICE, events.BytesDamaged}
     tool = _Tool(target)
     with (
         api.connect(dialect, holder=None, fallback=bus.fallback, **bus.config) as connection,

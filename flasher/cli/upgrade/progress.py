@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final, Self
+from typing import Self
 
 from flasher import events
 from flasher.cli.bar import Bar
@@ -11,25 +11,6 @@ from flasher.cli.terminal import painted
 from flasher.host.told import line_of, warning_of
 from flasher.image.plan import Plan
 from flasher.protocol.spec import PACKET_DATA_SIZE
-
-SHOWN: Final = frozenset(
-    {
-        events.PacketAcknowledged,
-        events.PhaseEntered,
-        events.BootVersionSeen,
-        events.AttemptStarted,
-        events.MessageRepeated,
-        events.Reported,
-        events.CheckMade,
-        events.PowerCycleAwaited,
-        events.ShutdownHeard,
-        events.ForeignQuery,
-        events.AdapterLost,
-        events.AdapterBack,
-        events.BytesDamaged,
-    }
-)
-"""The events that have lines or a bar of their own here: the log on stderr leaves them out."""
 
 
 class Progress:
@@ -42,12 +23,12 @@ class Progress:
         self._repetitions = 0
 
     def __enter__(self) -> Self:
-        self._output.shown_events = SHOWN
+        self._output.shows = _is_shown
         return self
 
     def __exit__(self, *_: object) -> None:
         self._bar.close()
-        self._output.shown_events = frozenset()
+        self._output.shows = lambda _event: False
 
     def __call__(self, event: object) -> None:
         """Show one event."""
@@ -75,3 +56,9 @@ class Progress:
         elif line := line_of(event):
             text, level = line
             self._output.progress(text, level=level)
+
+
+def _is_shown(event: object) -> bool:
+    """True for what has a line or a bar of its own here."""
+    has_more = isinstance(event, events.PacketAcknowledged | events.PowerCycleAwaited)
+    return has_more or bool(warning_of(event) or line_of(event))
