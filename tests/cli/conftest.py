@@ -13,6 +13,7 @@ import pytest
 from flasher.bus.detect import Detected
 from flasher.cli.main import main
 from tests import schema_document
+from tests.firmware import shorten
 
 SAMPLES = Path(__file__).parents[2] / "firmware_samples"
 
@@ -34,6 +35,14 @@ class Run:
 
 
 Flasher = Callable[..., Run]
+
+
+@pytest.fixture(scope="session")
+def short_bms(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The beginning of the BMS sample, for tests of something else than its size."""
+    path = tmp_path_factory.mktemp("samples") / "bms"
+    shorten(SAMPLES / "bms", path)
+    return path.with_suffix(".hex")
 
 
 @pytest.fixture(autouse=True)

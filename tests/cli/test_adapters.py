@@ -9,6 +9,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -265,11 +266,13 @@ def test_another_device_on_the_bus_is_not_the_one(flasher: Flasher, machine: Mac
     assert machine.wire.link.health().frames_sent == 0
 
 
-def test_flash_goes_on_where_it_is_heard_and_says_so(flasher: Flasher, machine: Machine) -> None:
+def test_flash_goes_on_where_it_is_heard_and_says_so(
+    flasher: Flasher, machine: Machine, short_bms: Path
+) -> None:
     machine.detected.found = [CAN0]
     with connect_mock("bms", speed=0) as wire:
         machine.wire = wire
-        run = flasher("flash", BMS, "-t", "bms")
+        run = flasher("flash", short_bms, "-t", "bms")
     assert run.code == ExitCode.OK
     said = run.err.index
     assert said("using the only one found") < said("the BMS is there") < said("resetting")

@@ -47,9 +47,9 @@ def test_an_image_that_is_too_large_for_the_device_is_rejected_even_by_force(
     assert "more than the device takes" in run.err
 
 
-def test_an_image_that_fits_is_flashed(flash: Flasher) -> None:
+def test_an_image_that_fits_is_flashed(flash: Flasher, short_bms: Path) -> None:
     area = "[bms.application_area]\nstart = 0x08008000\nsize_bytes = 0x20000\n"
-    assert flash(area, BMS, "-t", "bms").code == ExitCode.OK
+    assert flash(area, short_bms, "-t", "bms").code == ExitCode.OK
 
 
 def test_a_profile_enables_the_upgrade_in_the_dialect_that_cancelled_it(flash: Flasher) -> None:

@@ -17,13 +17,13 @@ from typing import Any, Final
 
 import click
 import pytest
-from intelhex import IntelHex
 
 from flasher.cli.main import COMMANDS, main
 from flasher.settings import bus
 from flasher.settings.reading import Reader
 from flasher.station import config
 from tests.documents.blocks import ROOT, Block
+from tests.firmware import shorten
 
 KINDS: Final[Mapping[str, Reader[Any]]] = {
     "bus": bus.READER,
@@ -32,8 +32,6 @@ KINDS: Final[Mapping[str, Reader[Any]]] = {
 """Files of settings that a page shows a part of."""
 _ADAPTER: Final = re.compile(r" (?:-i|-c|--bus-kwargs) \S+")
 _PROGRAMS: Final = Path(sys.executable).parent
-_SHORT_SIZE: Final = 4096
-"""In bytes."""
 _SILENT: Final = " 2>/dev/null"
 _TIMES: Final = re.compile(
     r"\d+(?:\.\d+)?(?= (?:s|ms|kB/s)\b)|\d+ ?%|^ +\d+\.\d{3}(?=  )|"
@@ -60,7 +58,7 @@ class PageReader:
             samples.symlink_to(ROOT / "firmware_samples")
         else:
             shutil.copytree(ROOT / "firmware_samples", samples, ignore=_links)
-            _shorten(samples / "bms")
+            shorten(ROOT / "firmware_samples" / "bms", samples / "bms")
         (folder / "examples").symlink_to(ROOT / "examples")
 
     def follow(self, block: Block) -> None:
@@ -149,14 +147,6 @@ def _stream() -> TextIOWrapper:
 def _text(stream: TextIOWrapper) -> str:
     assert isinstance(stream.buffer, BytesIO)
     return stream.buffer.getvalue().decode()
-
-
-def _shorten(sample: Path) -> None:
-    """Leave the beginning of a sample (.hex and .bin), with the texts in it."""
-    whole = IntelHex(f"{sample}.hex")
-    short = whole[whole.minaddr() : whole.minaddr() + _SHORT_SIZE]
-    short.write_hex_file(f"{sample}.hex")
-    short.tobinfile(f"{sample}.bin")
 
 
 def _links(folder: str, names: list[str]) -> list[str]:
