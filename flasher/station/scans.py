@@ -234,30 +234,23 @@ def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
     if last is not None and last.serial != serial:
         raise still_there(socket, last)
     if socket.is_of_another(serial):
-        raise Refused(
-            codes.WRONG_UNIT.name,
-            say(
-                "The unit in socket {socket} says that it is {own}.",
-                socket=socket.name,
-                own=printable(socket.own or ""),
-            ),
-            codes.WRONG_UNIT.action,
-        )
+        raise Refused(codes.WRONG_UNIT.name, _said_by(socket), codes.WRONG_UNIT.action)
     for each in sockets.values():
         if each is not socket and each.is_there and each.own == serial:
             raise Refused(
                 codes.WRONG_UNIT.name,
-                say(
-                    "The unit in socket {socket} says that it is {own}.",
-                    socket=each.name,
-                    own=printable(serial),
-                ),
+                _said_by(each),
                 say(
                     "Compare the labels of the units in the sockets {one} and {other}.",
                     one=each.name,
                     other=socket.name,
                 ),
             )
+
+
+def _said_by(socket: Socket) -> str:
+    own = printable(socket.own or "")
+    return say("The unit in socket {socket} says that it is {own}.", socket=socket.name, own=own)
 
 
 def check_one_socket(sockets: Sockets, socket: Socket, serial: str) -> None:

@@ -74,6 +74,7 @@ from flasher.station.records.model import (
     RunKind,
     RunRecord,
     RunState,
+    UnitLife,
 )
 from flasher.station.records.store import Store, SystemClock
 from flasher.station.runs import ActiveRun, save, verified_words, with_history
@@ -388,10 +389,9 @@ class Station:
 
     def _claim(self, order: line.ClaimRun) -> line.SocketInput:
         """Claim the run in the records."""
-        socket, part = self.line.sockets[order.socket], self.recipe.recipe.part
+        socket = self.line.sockets[order.socket]
         try:
-            lives = self.store.read.units(order.serial)
-            life = next((life for life in lives if life.part == part), None)
+            life = self._life(order.serial)
             claim = self.store.claim(
                 Order(
                     order.serial,
@@ -414,6 +414,11 @@ class Station:
         trace = self.store.files.spooled(claim.run_id)
         self._runs[order.socket] = ActiveRun(trace, self._now, order=run_order)
         return line.Claimed()
+
+    def _life(self, serial: str) -> UnitLife | None:
+        """What was done to a unit of this recipe's part. Raises RecordError."""
+        lives, part = self.store.read.units(serial), self.recipe.recipe.part
+        return next((life for life in lives if life.part == part), None)
 
     def _begin(self, socket: str) -> None:
         """Let the process of a socket work on what was claimed, if anything was."""
@@ -544,8 +549,7 @@ class Station:
             reason = say("This station has no printer.")
             return Refused("NO_PRINTER", reason, say("Set it up in the station's file."))
         try:
-            lives = self.store.read.units(serial)
-            life = next((e for e in lives if e.part == self.recipe.recipe.part), None)
+            life = self._life(serial)
             last = None if life is None else life.last
             refused = _NOT_PASSED if last is None else _not_labelled(last.run)
             if refused is not None or last is None:

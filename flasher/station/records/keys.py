@@ -96,23 +96,19 @@ class SigningKey:
                     )
             data = read(path, KEY_MAX_SIZE, error=RecordError)
             key = load_pem_private_key(data, password=None)
-        except (ValueError, TypeError, UnsupportedAlgorithm) as error:
-            raise _no_key(shown) from error
+        except (ValueError, TypeError, UnsupportedAlgorithm):
+            key = None
         if not isinstance(key, Ed25519PrivateKey):
-            raise _no_key(shown)
+            raise KeyMissingError(
+                "The signing key of the station cannot be used: the file holds no Ed25519 key.",
+                where=shown,
+                remedy="Put the right file back; if it is lost: flasher station key --lost.",
+            )
         return cls(key)
 
     def sign(self, row_hash: str) -> str:
         """The signature of a row's hash, in base64."""
         return base64.b64encode(self._key.sign(_CONTEXT + row_hash.encode())).decode("ascii")
-
-
-def _no_key(shown: str) -> KeyMissingError:
-    return KeyMissingError(
-        "The signing key of the station cannot be used: the file holds no Ed25519 key.",
-        where=shown,
-        remedy="Put the right file back; if it is lost: flasher station key --lost.",
-    )
 
 
 HEADS_MAX_SIZE: Final = 256 * 1024 * 1024
