@@ -110,10 +110,6 @@ class LoadedRecipe:
             raise ValueError(f"{serial!a:.80} is of lot {own_lot!a:.40}, not of {lot!a:.40}")
         return Scan(serial, day, own_lot or lot, groups)
 
-    def write_plans(self, scan: Scan) -> tuple[WritePlan, ...]:
-        """What to write to this unit, in order. Raises UsageError for a value that does not fit."""
-        return tuple(self.write_plan(write, scan) for write in self.recipe.write)
-
     def write_plan(self, write: Write, scan: Scan) -> WritePlan:
         """What one `[[write]]` comes to. Raises UsageError for a value that does not fit."""
         try:

@@ -43,6 +43,16 @@ class EndedRun:
     code: str
 
 
+def shift_began(shifts: Iterable[time], now: datetime) -> datetime | None:
+    """When the shift began that goes on; `shifts`: when each begins, in the time zone of `now`."""
+    starts = (
+        datetime.combine(now.date() - timedelta(days=days), each, now.tzinfo)
+        for each in shifts
+        for days in (0, 1)
+    )
+    return max((start for start in starts if start <= now), default=None)
+
+
 class Tally:
     """Runs of the shift that goes on; those of the shift before are forgotten. `shifts`: when each
     begins, in the local time of the moments that are given.
@@ -51,7 +61,7 @@ class Tally:
     def __init__(
         self, shifts: Sequence[time] = DEFAULT_SHIFTS, runs: Iterable[EndedRun] = ()
     ) -> None:
-        self._shifts = sorted(shifts)
+        self._shifts = shifts
         self._runs = list(runs)
 
     def add(self, run: EndedRun) -> None:
@@ -59,9 +69,7 @@ class Tally:
 
     def began(self, now: datetime) -> datetime:
         """When the shift began that goes on."""
-        today = [datetime.combine(now, each, now.tzinfo) for each in self._shifts]
-        before = [each for each in today if each <= now]
-        return before[-1] if before else today[-1] - timedelta(days=1)
+        return shift_began(self._shifts, now) or now
 
     def output(self, now: datetime) -> Output:
         """The figures at this moment, which has a time zone."""

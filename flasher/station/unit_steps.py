@@ -85,7 +85,7 @@ class UnitSteps:
         self._flashed: set[str] = set()
         """Targets that confirmed the complete image in this run."""
         scan = recipe.scan(order.serial, order.day, order.lot)
-        self._plans = recipe.write_plans(scan)
+        self._plans = [recipe.write_plan(write, scan) for write in recipe.recipe.write]
         self._written: set[str] = set()
         self._reads = UnitReads(order, recipe, scan, targets)
 

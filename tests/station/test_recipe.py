@@ -53,7 +53,8 @@ def test_a_good_recipe_is_read_with_its_images(tmp_path: Path) -> None:
     assert loaded.targets[0].image.data == IMAGES[BMS].data
     assert loaded.recipe.rule(StepName.FLASH).tries == 3
     assert loaded.recipe.rule(StepName.WRITE).tries == 1
-    (plan,) = loaded.write_plans(loaded.scan(SERIAL, DAY))
+    (write,) = loaded.recipe.write
+    plan = loaded.write_plan(write, loaded.scan(SERIAL, DAY))
     assert plan.writable.name == "serial-number"
     assert SERIAL in str(plan.content)
 

@@ -30,6 +30,7 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.rows import insert, named
 from flasher.station.records.schema import recipe, run, socket, station, unit
+from flasher.station.tally import shift_began
 
 CLOCK_TOLERANCE: Final = timedelta(minutes=5)
 """Network time may set the clock back a little."""
@@ -342,15 +343,5 @@ def is_due(rule: Golden, last_pass: datetime | None, now: datetime) -> bool:
         return True
     if rule.every_h is not None and now - last_pass >= timedelta(hours=rule.every_h):
         return True
-    start = last_shift_start(rule, now)
+    start = shift_began(rule.shift_starts, now)
     return start is not None and last_pass < start
-
-
-def last_shift_start(rule: Golden, now: datetime) -> datetime | None:
-    """When the shift that runs at `now` began; None where the rule names no shifts."""
-    starts = [
-        datetime.combine(now.date() - timedelta(days=days), start, now.tzinfo)
-        for start in rule.shift_starts
-        for days in (0, 1)
-    ]
-    return max((start for start in starts if start <= now), default=None)

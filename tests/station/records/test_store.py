@@ -10,7 +10,7 @@ import pytest
 
 from flasher.errors import UsageError
 from flasher.station.recipe import Golden
-from flasher.station.records.claims import Order, is_due, last_shift_start
+from flasher.station.records.claims import Order, is_due
 from flasher.station.records.errors import (
     ClaimRefusedError,
     NotFoundError,
@@ -27,6 +27,7 @@ from flasher.station.records.model import (
     UnitState,
     Verified,
 )
+from flasher.station.tally import shift_began
 from tests.station.factory import BMS_VERSION, SERIAL, USUAL, Bench
 
 GOLDEN = '\n[golden]\nserial_numbers = ["W2600001"]\nevery_h = 8\n'
@@ -226,8 +227,8 @@ def test_shifts_start_by_the_clock_on_the_wall() -> None:
     def at(day: int, hour: int) -> datetime:
         return datetime(2026, 5, day, hour, tzinfo=zone)
 
-    assert last_shift_start(rule, at(17, 5)) == at(16, 22)
-    assert last_shift_start(rule, at(17, 6)) == at(17, 6)
+    assert shift_began(rule.shift_starts, at(17, 5)) == at(16, 22)
+    assert shift_began(rule.shift_starts, at(17, 6)) == at(17, 6)
     assert is_due(rule, None, at(17, 5))
     assert not is_due(rule, at(16, 23), at(17, 5))
     assert is_due(rule, at(16, 23), at(17, 6))
