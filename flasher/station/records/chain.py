@@ -20,6 +20,7 @@ from flasher.station.records.keys import Head, SigningKey
 from flasher.station.records.model import AuditEvent, utc_text
 from flasher.station.records.rows import grouped, named
 from flasher.station.records.schema import audit, station
+from flasher.station.records.triggers import fingerprint_of
 
 GENESIS: Final = "0" * 64
 """The hash before the first row."""
@@ -87,6 +88,17 @@ class Trail:
         )
         head = Head(self.station, number, row["at"], found, signature, self.key.public)
         self.heads.append(head)
+
+    def begin(self, now: datetime, records_id: str) -> None:
+        """Add the first row of the chain."""
+        begun = {
+            "key": self.key.public,
+            "station": self.station,
+            "records": records_id,
+            "version": schema.SCHEMA_VERSION,
+            "schema": fingerprint_of(self.connection),
+        }
+        self.append(now, BEGUN, begun)
 
 
 def canonical(data: Any) -> str:

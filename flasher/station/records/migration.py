@@ -24,7 +24,7 @@ from flasher.station.records.database import Database, StationLock, copy_sqlite,
 from flasher.station.records.files import whole_file
 from flasher.station.records.keys import Keeping, SigningKey
 from flasher.station.records.rows import batches
-from flasher.station.records.triggers import final_table, fingerprint_of, trigger_statements
+from flasher.station.records.triggers import final_table, trigger_statements
 
 _OLD: Final = Table(
     "audit_1",
@@ -133,14 +133,7 @@ def _vouch(trail: Trail, records_id: str) -> tuple[tuple[str, ...], int]:
     now = datetime.now(UTC)
     problems = tuple(_old_problems(connection))
     end = connection.execute(select(_OLD.c.hash).order_by(_OLD.c.id.desc()).limit(1))
-    begun = {
-        "key": trail.key.public,
-        "station": trail.station,
-        "records": records_id,
-        "version": schema.SCHEMA_VERSION,
-        "schema": fingerprint_of(connection),
-    }
-    trail.append(now, chain.BEGUN, begun)
+    trail.begin(now, records_id)
     was = {"version": 1, "hash": end.scalar_one_or_none(), "problems": problems}
     trail.append(now, chain.MIGRATED, was)
     run = schema.run

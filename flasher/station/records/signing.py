@@ -22,8 +22,7 @@ from flasher.station.records.errors import (
     RecordsCutError,
 )
 from flasher.station.records.keys import Head, HeadsFile, Keeping, SigningKey, fingerprint
-from flasher.station.records.schema import SCHEMA_VERSION, schema_info
-from flasher.station.records.triggers import fingerprint_of
+from flasher.station.records.schema import schema_info
 
 
 class Signer:
@@ -162,7 +161,8 @@ class Signer:
         loaded = SigningKey.load(path)
         if public is None:
             self._key = loaded or SigningKey.make(path)
-            self._begin_chain()
+            with self.writing() as trail:
+                trail.begin(self._now(), self.records_id)
             return
         if loaded is None or loaded.public != public:
             # A rotation that was committed, and not ended.
@@ -184,18 +184,6 @@ class Signer:
 
     def _following(self) -> Path:
         return self.key_file.with_suffix(".new")
-
-    def _begin_chain(self) -> None:
-        assert self._key is not None  # noqa: S101
-        with self.writing() as trail:
-            data = {
-                "key": self._key.public,
-                "station": self._station,
-                "records": self.records_id,
-                "version": SCHEMA_VERSION,
-                "schema": fingerprint_of(trail.connection),
-            }
-            trail.append(self._now(), chain.BEGUN, data)
 
     def _kept(self) -> list[Head]:
         return [each for each in self.heads_file.read() if isinstance(each, Head)]
