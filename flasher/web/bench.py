@@ -25,7 +25,7 @@ from flasher.host.outcome import AGAIN
 from flasher.host.query import piece_of
 from flasher.host.told import line_of, warning_of
 from flasher.procedures import nobody_heard
-from flasher.protocol.contents import Memory, RunningInformation, VersionInformation
+from flasher.protocol.contents import Memory, RunningInformation
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
 from flasher.protocol.text import printable
 from flasher.report.base import visible
@@ -411,11 +411,9 @@ class Bench:
         bike = self.state.bike
         if bike is None or self.state.is_rescue or job.plan.target is not bike.target:
             return
-        answers = {type(each.answer): each.answer for each in bike.readings}
-        version = answers.get(VersionInformation)
-        running = answers.get(RunningInformation)
-        assert running is None or isinstance(running, RunningInformation)  # noqa: S101  by its key
-        seen = DeviceAnswers(version, running)
+        answers = (each.answer for each in bike.readings)
+        running = next((each for each in answers if isinstance(each, RunningInformation)), None)
+        seen = DeviceAnswers(bike.version, running)
         for found in judge_device(job.plan.image, job.plan.target, job.identity, seen):
             error = None if found.check is Check.IN_USE else refusal(job.plan, found)
             if error is not None:
