@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, Final
@@ -48,12 +49,7 @@ class Report:
 
     def to_csv(self) -> str:
         """One row a run under a line of headings, for a spreadsheet; empty without runs."""
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\r\n")
-        if self.runs:
-            writer.writerow(self.runs[0])
-        writer.writerows(map(csv_cell, run.values()) for run in self.runs)
-        return out.getvalue()
+        return csv_text([*self.runs[:1], *(run.values() for run in self.runs)])
 
     def to_junit(self) -> str:
         """One test case a run: FAIL is a failure, ERROR and INTERRUPTED are errors, ABORTED is
@@ -70,6 +66,13 @@ class Report:
 def make_report(records: Records, chosen: RunFilter) -> Report:
     """The report of a filter. Raises RecordError."""
     return Report(chosen, records.figures(chosen), records.table(chosen))
+
+
+def csv_text(rows: Iterable[Iterable[object]]) -> str:
+    """Rows for a spreadsheet."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\r\n").writerows(map(csv_cell, row) for row in rows)
+    return out.getvalue()
 
 
 def csv_cell(value: object) -> str:

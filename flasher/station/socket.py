@@ -8,22 +8,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Final
 
 from flasher.protocol.text import printable
 from flasher.said import say
 from flasher.station.events import LineStopped, SocketState
 from flasher.station.messages import PresenceChanged
-from flasher.station.records.model import RunState
+from flasher.station.records.model import RunState, UnitState
 
 Shown = tuple[SocketState, str, str]
 """State, serial number and text of a socket."""
-_STATES: Final = {
-    RunState.PASS: SocketState.PASS,
-    RunState.FAIL: SocketState.FAIL,
-    RunState.ERROR: SocketState.RECHECK,
-    RunState.ABORTED: SocketState.RECHECK,
-}
 
 
 class Phase(Enum):
@@ -64,6 +57,10 @@ class LastRun:
     """Its unit was heard after the run."""
     has_said: bool = False
     """Its unit said its serial number after the run."""
+
+
+def _state_after(outcome: RunState) -> SocketState:
+    return SocketState(UnitState.after(outcome).value)
 
 
 @dataclass
@@ -254,7 +251,7 @@ class Socket:
             return SocketState.SCAN, self.label, words
         last = self.verdict
         if last is not None and last.outcome is not None:
-            return _STATES[last.outcome], last.serial, last.action
+            return _state_after(last.outcome), last.serial, last.action
         if self.out_of_service is not None:
             state = SocketState.ERROR if self.out_of_service else SocketState.STARTING
             return state, self.label, self.out_of_service or (self.wanted if self.label else "")
@@ -303,7 +300,7 @@ class Socket:
         return say(
             "After {state} of {serial} nothing was heard. If this is another unit, scan its"
             " label{card}.",
-            state=_STATES[last.outcome].value,
+            state=_state_after(last.outcome).value,
             serial=printable(last.serial),
             card=card,
         )

@@ -5,8 +5,6 @@ Times are those of the clock on the wall where the server is; the pages name its
 
 from __future__ import annotations
 
-import csv
-import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -47,7 +45,7 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.overview import By, Cut, Overview, Span
 from flasher.station.records.store import Store
-from flasher.station.reports import Report, csv_cell, make_report
+from flasher.station.reports import Report, csv_text, make_report
 from flasher.station.stories import explained
 from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.trace.figures import Distribution
@@ -251,14 +249,14 @@ class Supervisor:
         )
 
     def file_of_holders(self, question: Question) -> Answer:
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\r\n")
-        writer.writerow(["serial", "part", "target", "confirmed", "run", "outcome", "begun_at"])
+        rows: list[tuple[object, ...]] = [
+            ("serial", "part", "target", "confirmed", "run", "outcome", "begun_at")
+        ]
         for each in self.overview.all_holders(question.fields.get("sha256", "")):
             row = (each.serial, each.part, each.target, each.is_confirmed, each.run_id)
             moment = each.begun_at.isoformat(timespec="seconds")
-            writer.writerow(map(csv_cell, (*row, each.state.value, moment)))
-        return Answer(out.getvalue().encode("utf-8"), "text/csv", file_name="units.csv")
+            rows.append((*row, each.state.value, moment))
+        return Answer(csv_text(rows).encode("utf-8"), "text/csv", file_name="units.csv")
 
     # -- figures ----------------------------------------------------------------------------------
 
