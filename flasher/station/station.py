@@ -273,16 +273,6 @@ class Station:
         return any(socket.is_running for socket in self.line.sockets.values())
 
     @property
-    def is_line_stopped(self) -> bool:
-        """True from `LineStopped` to `LineResumed`."""
-        return self.line.stopped is not None
-
-    @property
-    def sockets(self) -> tuple[Socket, ...]:
-        """All sockets as they are now, to look at."""
-        return tuple(self.line.sockets.values())
-
-    @property
     def figures(self) -> Figures:
         """Totals of this recipe since the station started. Raises RecordError."""
         chosen = RunFilter(

@@ -196,7 +196,7 @@ def test_a_stopped_line_goes_on_only_by_the_pin(line: LineBench) -> None:
     line.scan("RESUME")
     line.scan(WRONG)
     assert refusal(line) == "WRONG_PIN"
-    assert line.station.is_line_stopped
+    assert line.station.line.stopped is not None
     line.scan(PIN)
     assert line.of(LineResumed) == [LineResumed()]
 
@@ -332,13 +332,13 @@ def test_a_supervisor_has_to_allow_virtual_units_among_real_ones(bench: Bench) -
     line.scan(SUPERVISOR)
     line.scan("RESUME")
     line.scan(PIN)
-    assert not line.station.is_line_stopped
+    assert line.station.line.stopped is None
     assert audit(line)[-1] == ("resume", {"code": "VIRTUAL_MIXED", "by": "Sue"})
 
 
 def test_records_of_one_kind_need_nobody_to_allow_it(bench: Bench) -> None:
     bench.make()
-    assert not LineBench(bench, mixes_virtual=True, crew=crew()).station.is_line_stopped
+    assert LineBench(bench, mixes_virtual=True, crew=crew()).station.line.stopped is None
 
 
 # -- the table ------------------------------------------------------------------------------------

@@ -377,7 +377,7 @@ def test_a_wrong_scan_changes_nothing_and_says_what_to_do(
     refused = line.last(ScanRefused)
     assert refused.code == code
     assert refused.remedy.endswith(".")
-    assert {view.state for view in line.station.sockets} == {SocketState.EMPTY}
+    assert {view.state for view in line.station.line.sockets.values()} == {SocketState.EMPTY}
 
 
 def test_a_label_behind_a_refused_socket_goes_to_no_other(line: LineBench) -> None:
@@ -527,7 +527,7 @@ def test_a_run_of_which_a_part_is_not_saved_cannot_pass(
     ended = line.last(RunEnded)
     assert (ended.outcome, ended.code) == (RunState.ERROR, "RECORD_NOT_SAVED")
     assert line.state("A") is SocketState.RECHECK
-    assert line.station.is_line_stopped
+    assert line.station.line.stopped is not None
 
 
 def test_a_full_disk_under_a_run_is_never_green(line: LineBench, bench: Bench) -> None:
@@ -547,7 +547,7 @@ def test_a_full_disk_under_a_run_is_never_green(line: LineBench, bench: Bench) -
         if line.ask("A", Intent("bms", "flash", "V" * 200)).error:
             break
     line.end("A")
-    assert SocketState.PASS not in {view.state for view in line.station.sockets}
+    assert SocketState.PASS not in {view.state for view in line.station.line.sockets.values()}
     assert all(ended.outcome is not RunState.PASS for ended in line.of(RunEnded))
     assert "disk is full" in line.last(LineStopped).reason
     event.remove(engine, "connect", no_room)
@@ -599,7 +599,7 @@ def test_a_claim_that_was_saved_although_it_seemed_lost_keeps_no_unit_from_being
         line.scan(SERIAL)
         line.arrive("A")
     assert line.of(RunStarted) == []
-    assert line.station.is_line_stopped
+    assert line.station.line.stopped is not None
     line.scan("RESUME")
     line.scan(SERIAL)
     line.scan("SOCKET A")
@@ -841,7 +841,7 @@ def test_what_is_not_saved_is_said_in_one_line(line: LineBench, bench: Bench) ->
     assert told.remedy not in told.reason
     away.rename(bench.path)
     line.scan("RESUME")
-    assert not line.station.is_line_stopped
+    assert line.station.line.stopped is None
 
 
 def test_a_pass_of_a_first_run_that_flashed_nothing_is_none(line: LineBench) -> None:

@@ -105,7 +105,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
         if scans is not None:
             session.file = ScanFile(
                 scans,
-                [each.name for each in session.station.sockets],
+                list(session.station.line.sockets),
                 session.station.submit,
                 badges=frozenset() if crew is None else crew.codes,
             )
@@ -293,18 +293,18 @@ class _Session:
             return True
         try:
             self._check_sockets()
-            is_held = self.station.is_line_stopped or bool(self.view.board.pin_of)
+            is_held = self.station.line.stopped is not None or bool(self.view.board.pin_of)
             if self.file is not None and not is_held:
-                self.file.turn(self.station.sockets, self.view.board.labels)
+                self.file.turn(self.station.line.sockets.values(), self.view.board.labels)
         except FlasherError as error:
             self._failure = error
             return True
         is_alone = (self.file or self.scans_itself) and not (self._typing or self._page)
-        if self.station.is_line_stopped and is_alone:
+        if self.station.line.stopped is not None and is_alone:
             return not self.station.is_running  # nobody is there who could scan RESUME
         # What was submitted last is understood only in the station's next turn.
         was_submitted, self._was_submitted = self._was_submitted, self._scans_used_up()
-        is_busy = any(socket.is_busy for socket in self.station.sockets)
+        is_busy = any(socket.is_busy for socket in self.station.line.sockets.values())
         is_quiet = not (is_busy or self.view.board.waiting)
         self._is_used_up = was_submitted and self._was_submitted and is_quiet
         return self._is_used_up
@@ -312,7 +312,7 @@ class _Session:
     def _check_sockets(self) -> None:
         """Raises BusError when no socket will ever work again."""
         broken = self.view.board.broken
-        if broken.keys() >= {each.name for each in self.station.sockets}:
+        if broken.keys() >= self.station.line.sockets.keys():
             name, reason = next(iter(broken.items()))
             raise BusError(
                 f"No socket can work; socket {printable(name)}: {printable(reason)}",

@@ -139,6 +139,7 @@ class AuditRow:
     hash: str
 
 
+_ROWS: Final = TypeAdapter(tuple[dict[str, Any], ...])
 _RUNS: Final = TypeAdapter(tuple[RunRecord, ...])
 _HOLDERS: Final = TypeAdapter(tuple[Holder, ...])
 _AUDIT: Final = TypeAdapter(tuple[AuditRow, ...])
@@ -153,9 +154,8 @@ class Overview:
     def runs(self, chosen: RunFilter, cut: Cut, size: int = PAGE_SIZE) -> Page[RunRecord]:
         run_id = schema.run.c.id
         query = filtered(run_query(schema.run.c.verification_reached.label("verified")), chosen)
-        rows, older, newer = self._cut(query, run_id, cut, size)
         # What no station writes is shown nowhere else: reports and `verify` name it.
-        return Page(_RUNS.validate_python(rows), older, newer)
+        return self._page(_RUNS, query, run_id, cut, size)
 
     def parts(self, serial: str) -> tuple[str, ...]:
         unit = schema.unit.c
@@ -166,10 +166,10 @@ class Overview:
     def life(self, serial: str, part: str, cut: Cut, size: int = LIFE_SIZE) -> Page[RunDetails]:
         run_id = schema.run.c.id
         query = filtered(joined(run_id), RunFilter(serial=serial, part=part))
-        rows, older, newer = self._cut(query, run_id, cut, size)
+        page = self._page(_ROWS, query, run_id, cut, size)
         with self._database.reading() as connection:
-            found = tuple(details_of(connection, run_id.in_([row["id"] for row in rows])))
-        return Page(found[::-1], older, newer)
+            found = tuple(details_of(connection, run_id.in_([row["id"] for row in page.rows])))
+        return Page(found[::-1], page.older, page.newer)
 
     def recipes(self) -> tuple[tuple[str, str], ...]:
         recipe = schema.recipe.c
@@ -220,8 +220,7 @@ class Overview:
 
     def holders(self, sha256: str, cut: Cut, size: int = PAGE_SIZE) -> Page[Holder]:
         """A page of the units whose last transfer was that of the image with this hash."""
-        rows, older, newer = self._cut(_holders(sha256), schema.run_target.c.id, cut, size)
-        return Page(_HOLDERS.validate_python(rows), older, newer)
+        return self._page(_HOLDERS, _holders(sha256), schema.run_target.c.id, cut, size)
 
     def all_holders(self, sha256: str) -> tuple[Holder, ...]:
         """All of them, in the order in which they were made."""
@@ -350,12 +349,16 @@ class Overview:
             query = query.where(audit.at >= utc_text(since))
         if until is not None:
             query = query.where(audit.at < utc_text(until))
-        rows, older, newer = self._cut(query, audit.id, cut, size)
-        return Page(_AUDIT.validate_python(rows), older, newer)
+        return self._page(_AUDIT, query, audit.id, cut, size)
 
-    def _cut(
-        self, query: Select[Any], row_id: Any, cut: Cut, size: int
-    ) -> tuple[list[dict[str, Any]], Cut | None, Cut | None]:
+    def _page(
+        self,
+        rows_of: TypeAdapter[tuple[_Row, ...]],
+        query: Select[Any],
+        row_id: Any,
+        cut: Cut,
+        size: int,
+    ) -> Page[_Row]:
         query = query.add_columns(row_id.label("cut_id"))
         if cut.after is not None:
             query = query.where(row_id > cut.after).order_by(row_id)
@@ -372,8 +375,8 @@ class Overview:
         if cut.after is not None:
             rows, ids = rows[::-1], ids[::-1]
             has_older, has_newer = True, has_more
-        return (
-            rows,
+        return Page(
+            rows_of.validate_python(rows),
             Cut(before=ids[-1]) if ids and has_older else None,
             Cut(after=ids[0]) if ids and has_newer else None,
         )
