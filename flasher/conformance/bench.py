@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final
 
 from flasher.conformance.host import UPDATES_MAX, PatientHost
-from flasher.conformance.judge import Judge
+from flasher.conformance.judge import Judge, Times
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import BY_BUS, Subject, readback_source
@@ -151,7 +151,7 @@ class Bench:
         if heard is not None and heard.kind is not Kind.REQUEST:
             heard = None
         found = self.require_received(heard, Kind.REQUEST.value, limit_s)
-        self.measure("update command to request transfer", found.at - sent.left_at)
+        self.measure(Times.REQUEST, found.at - sent.left_at)
         return found
 
     def start_transfer(self, size_bytes: int) -> None:
@@ -165,7 +165,7 @@ class Bench:
         """Send a packet of `image`; its ACK has to come."""
         sent = self.send_packet(image, number)
         heard = self.expect(Kind.ACK, number=number)
-        self.measure("packet to ACK", heard.at - sent.left_at)
+        self.measure(Times.ANSWER, heard.at - sent.left_at)
 
     def packets(self, image: bytes, first: int = 1, last: int | None = None) -> None:
         """Packets `first` to `last` (the last one of the image), each one acknowledged."""
@@ -211,7 +211,7 @@ class Bench:
         """End of transfer; complete has to come."""
         sent = self.send(self.encoder.end())
         heard = self.expect(Kind.COMPLETE)
-        self.measure("end of transfer to complete", heard.at - sent.left_at)
+        self.measure(Times.COMPLETE, heard.at - sent.left_at)
 
     def finish(self, image: bytes, first: int = 1) -> None:
         """Send the packets from `first` on and the end; the application of the image has to run."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from math import ceil, inf
+from typing import Final
 
 from flasher.conformance.results import (
     CaseStopped,
@@ -19,6 +20,23 @@ from flasher.conformance.results import (
 )
 from flasher.conformance.tester import BusTester
 from flasher.conformance.wire import Kind, Received, describe
+
+
+class Times:
+    """Names of the times that more than one case or question measures."""
+
+    FEEDBACK: Final = "reset to general feedback"
+    FIRST: Final = "reset to first boot version"
+    POWERED: Final = "power to first boot version"
+    SPACING: Final = "boot version to boot version"
+    GAP: Final = "boot version to boot version without an application"
+    LATE: Final = "pause to boot version, beyond the shortest one"
+    REQUEST: Final = "update command to request transfer"
+    ANSWER: Final = "packet to ACK"
+    COMPLETE: Final = "end of transfer to complete"
+    RESTARTED: Final = "complete to boot version"
+    START: Final = "complete to an application that answers"
+    START_AGAIN: Final = "last boot version to an application that answers"
 
 
 class Judge:

@@ -9,6 +9,7 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probing import ACCEPTED, EITHER, REJECTED, Probe, is_as
 from flasher.conformance.catalogue import DESTRUCTIVE, case
+from flasher.conformance.judge import Times
 from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
     END,
@@ -270,7 +271,7 @@ def padded(bench: Bench) -> None:
         if heard is None:
             bench.end_transfer()
         else:
-            bench.measure("end of transfer to complete", heard.at - sent.left_at)
+            bench.measure(Times.COMPLETE, heard.at - sent.left_at)
         bench.check_image(image)
 
 

@@ -15,9 +15,9 @@ from flasher.conformance.cases.tm import (
     measure_packets,
 )
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, WEAR, case
+from flasher.conformance.judge import Times
 from flasher.conformance.wire import Kind, told_version
 
-_START: Final = "complete to an application that answers"
 _START_AGAIN: Final = "window's end to an application that answers"
 _TAKEN: Final = "last boot version to an update command that is taken"
 _NOT_TAKEN: Final = "last boot version to an update command that is not taken"
@@ -56,9 +56,9 @@ def answer_times(bench: Bench) -> None:
             bench.reset_to_bootloader()
             bench.update(len(image))
             measure_packets(bench, image)
-            _measure_start(bench, _START, end_measured(bench).at, is_asked=tells)
+            _measure_start(bench, Times.START, end_measured(bench).at, is_asked=tells)
     check_times(bench)
-    for name in (_START, _START_AGAIN) if tells else ():
+    for name in (Times.START, _START_AGAIN) if tells else ():
         bench.judge.check_measured(name, high_s=bench.limit("start_s"))
     bench.info(f"flash wear: the application was erased and written {bench.upgrades} times")
 

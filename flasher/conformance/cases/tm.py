@@ -8,6 +8,7 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probing import ACCEPTED, EITHER, Probe
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, TIMING, case
+from flasher.conformance.judge import Times
 from flasher.conformance.wire import (
     PACKET_FRAMES,
     Kind,
@@ -15,13 +16,6 @@ from flasher.conformance.wire import (
     packet_count,
 )
 
-_FEEDBACK: Final = "reset to general feedback"
-_FIRST: Final = "reset to first boot version"
-_SPACING: Final = "boot version to boot version"
-_REQUEST: Final = "update command to request transfer"
-_ANSWER: Final = "packet to ACK"
-_COMPLETE: Final = "end of transfer to complete"
-"""Names of the times, as all cases measure them."""
 _SHARES: Final = (0.0, 0.01, 0.1, 0.25, 0.5, 0.75, 0.9)
 """Gaps between frames, as shares of `limits.inter_frame_s`."""
 _RESETS: Final = 5
@@ -103,12 +97,12 @@ def check_times(bench: Bench) -> None:
     """Judge all that was measured by the profile's limits."""
     check, limit = bench.judge.check_measured, bench.limit
     spacing_s, tolerance_s = limit("version_spacing_s"), limit("version_spacing_tolerance_s")
-    check(_FIRST, high_s=limit("first_version_s"))
+    check(Times.FIRST, high_s=limit("first_version_s"))
     if bench.number("versions") > 1:
-        check(_SPACING, low_s=spacing_s - tolerance_s, high_s=spacing_s + tolerance_s)
-    check(_REQUEST, high_s=limit("erase_s"))
-    check(_ANSWER, high_s=limit("ack_s"))
-    check(_COMPLETE, high_s=limit("complete_s"))
+        check(Times.SPACING, low_s=spacing_s - tolerance_s, high_s=spacing_s + tolerance_s)
+    check(Times.REQUEST, high_s=limit("erase_s"))
+    check(Times.ANSWER, high_s=limit("ack_s"))
+    check(Times.COMPLETE, high_s=limit("complete_s"))
 
 
 def _enter(bench: Bench) -> Received:
@@ -119,11 +113,11 @@ def _enter(bench: Bench) -> Received:
         sent = bench.send(bench.encoder.reset())
         feedback = bench.next_message(limit_s)
     if feedback is not None and feedback.kind is Kind.FEEDBACK:
-        bench.measure(_FEEDBACK, feedback.at - sent.left_at)
+        bench.measure(Times.FEEDBACK, feedback.at - sent.left_at)
     is_there = feedback is not None and feedback.kind is Kind.BOOT_VERSION
     first = feedback if is_there else bench.wait_for(Kind.BOOT_VERSION, within_s=limit_s)
     found = bench.require_received(first, Kind.BOOT_VERSION.value, limit_s)
-    bench.measure(_FIRST, found.at - sent.left_at)
+    bench.measure(Times.FIRST, found.at - sent.left_at)
     return found
 
 
@@ -135,7 +129,7 @@ def measure_burst(bench: Bench, *, wait: bool = True) -> Received:
         heard = bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)
         if heard is None:
             break
-        bench.measure(_SPACING, heard.at - last.at)
+        bench.measure(Times.SPACING, heard.at - last.at)
         last = heard
     if wait:
         bench.collect(bench.host.burst_s)
@@ -148,7 +142,7 @@ def measure_packets(bench: Bench, image: bytes) -> None:
     for number in range(1, packet_count(len(image)) + 1):
         sent = bench.send_packet(image, number)
         heard = bench.expect(Kind.ACK, within_s=limit_s, number=number)
-        bench.measure(_ANSWER, heard.at - sent.left_at)
+        bench.measure(Times.ANSWER, heard.at - sent.left_at)
 
 
 def end_measured(bench: Bench) -> Received:
@@ -156,5 +150,5 @@ def end_measured(bench: Bench) -> Received:
     sent = bench.send(bench.encoder.end())
     within_s = _PATIENCE * bench.limit("complete_s")
     heard = bench.await_message(Kind.COMPLETE, within_s=within_s)
-    bench.measure(_COMPLETE, heard.at - sent.left_at)
+    bench.measure(Times.COMPLETE, heard.at - sent.left_at)
     return heard

@@ -10,6 +10,7 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
+from flasher.conformance.judge import Times
 from flasher.conformance.restore import needs_power
 from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
@@ -354,7 +355,7 @@ def _send_all(bench: Bench, image: bytes) -> bool:
         if heard is None or (heard.kind, heard.number) != (Kind.ACK, number):
             bench.fail(f"ACK {number}", heard or "nothing")
             return False
-        bench.measure("packet to ACK", heard.at - sent.left_at)
+        bench.measure(Times.ANSWER, heard.at - sent.left_at)
     bench.succeed(f"ACK 1 to {total}", "all of them")
     return True
 

@@ -12,20 +12,8 @@ from typing import Final
 
 from flasher.conformance.init import entering, transferring
 from flasher.conformance.init.answers import Answer, Findings, Trial, decided, limit
-from flasher.conformance.init.session import (
-    ANSWER,
-    COMPLETE,
-    FEEDBACK,
-    FIRST,
-    GAP,
-    LATE,
-    POWERED,
-    REQUEST,
-    RESTARTED,
-    START,
-    START_AGAIN,
-    Session,
-)
+from flasher.conformance.init.session import Session
+from flasher.conformance.judge import Times
 from flasher.conformance.profile import ConformanceProfile, Value, profile_keys
 from flasher.conformance.restore import restore
 from flasher.conformance.results import CaseEnded, RunStopped
@@ -75,12 +63,15 @@ QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
 an earlier one found.
 """
 LIMITS: Final[dict[str, tuple[float, tuple[str, ...]]]] = {
-    "limits.feedback_s": (0.2, (FEEDBACK,)),
-    "limits.first_version_s": (0.5, (FIRST, POWERED, GAP, LATE, RESTARTED)),
-    "limits.start_s": (1.0, (START, START_AGAIN)),
-    "limits.erase_s": (0.5, (REQUEST,)),
-    "limits.ack_s": (0.1, (ANSWER,)),
-    "limits.complete_s": (0.5, (COMPLETE,)),
+    "limits.feedback_s": (0.2, (Times.FEEDBACK,)),
+    "limits.first_version_s": (
+        0.5,
+        (Times.FIRST, Times.POWERED, Times.GAP, Times.LATE, Times.RESTARTED),
+    ),
+    "limits.start_s": (1.0, (Times.START, Times.START_AGAIN)),
+    "limits.erase_s": (0.5, (Times.REQUEST,)),
+    "limits.ack_s": (0.1, (Times.ANSWER,)),
+    "limits.complete_s": (0.5, (Times.COMPLETE,)),
 }
 """Limits: the least that is written, in seconds, and the times that they are made of."""
 NOT_ASKED: Final = {

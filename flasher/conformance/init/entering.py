@@ -8,17 +8,8 @@ from statistics import median
 from typing import Final
 
 from flasher.conformance.init.answers import Answer, Findings, Trial
-from flasher.conformance.init.session import (
-    GAP,
-    POWERED,
-    REPEATS,
-    REQUEST,
-    RESTARTED,
-    START,
-    START_AGAIN,
-    Session,
-    told,
-)
+from flasher.conformance.init.session import REPEATS, Session, told
+from flasher.conformance.judge import Times
 from flasher.conformance.restore import needs_power
 from flasher.conformance.wire import (
     IMAGE_BYTES_MAX,
@@ -56,7 +47,7 @@ def burst(it: Session) -> Findings:
             bench.power_cycle()
             on_at = bench.now
             first = bench.await_message(Kind.BOOT_VERSION)
-            bench.measure(POWERED, first.at - on_at)
+            bench.measure(Times.POWERED, first.at - on_at)
         else:
             first = it.enter()
         versions = [first, *it.more_versions()]
@@ -104,13 +95,13 @@ def upgrade(it: Session) -> Findings:
         complete_at = bench.now
         heard = _first_sign(it)
         if heard is not None and heard.kind is Kind.BOOT_VERSION:
-            bench.measure(RESTARTED, heard.at - complete_at)
+            bench.measure(Times.RESTARTED, heard.at - complete_at)
             yield Trial("restarts", "a boot version", "complete", "after")
         else:
             yield Trial("starts", "no boot version", "complete", "after")
-        it.await_application(START, complete_at)
+        it.await_application(Times.START, complete_at)
         last = it.enter(bench.number("versions"))
-        it.await_application(START_AGAIN, last.at)
+        it.await_application(Times.START_AGAIN, last.at)
 
 
 def _first_sign(it: Session) -> Received | None:
@@ -206,7 +197,7 @@ def _offer_at(it: Session, offset_s: float) -> tuple[float, bool]:
     if heard is None:
         it.await_application()
     else:
-        bench.measure(REQUEST, heard.at - sent.left_at)
+        bench.measure(Times.REQUEST, heard.at - sent.left_at)
         it.stored = 0
         it.finish()
     return sent.left_at - last.at, heard is not None
@@ -338,7 +329,7 @@ def without_application(it: Session) -> Findings:
             heard = bench.wait_for(Kind.BOOT_VERSION, within_s=_SILENT_S)
             if heard is None:
                 break
-            bench.measure(GAP, heard.at - last_at)
+            bench.measure(Times.GAP, heard.at - last_at)
             more, last_at = more + 1, heard.at
         value = "listens" if more == count - 1 else "announces" if more >= 2 * count else ""
         answer = f"{more} boot versions more" + ("" if value == "announces" else ", then silence")
@@ -359,7 +350,7 @@ def largest_image(it: Session) -> Findings:
     it.begin()
     if not restarts_at_once:
         bench.leave_transfer()
-    erase_s = max(one.value_s for one in bench.judge.measurements if one.name == REQUEST)
+    erase_s = max(one.value_s for one in bench.judge.measurements if one.name == Times.REQUEST)
 
     def is_taken(size_bytes: int) -> bool:
         share = packet_count(size_bytes) / it.total
@@ -399,7 +390,7 @@ def _is_size_taken(it: Session, frames: list[RawFrame], within_s: float) -> bool
         if heard is None or heard.kind is Kind.NAK:
             break
         if heard.kind is Kind.REQUEST:
-            bench.measure(REQUEST, heard.at - sent.left_at)
+            bench.measure(Times.REQUEST, heard.at - sent.left_at)
             return True
         versions += heard.at > sent.left_at + _AGAIN
     return False

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import Final
 
 from flasher.conformance.bench import QUIET_S, Bench
+from flasher.conformance.judge import Times
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
 from flasher.conformance.subject import Subject
@@ -24,17 +25,6 @@ from flasher.conformance.wire import (
 
 REPEATS: Final = 3
 """How often a question is asked."""
-FEEDBACK: Final = "reset to general feedback"
-FIRST: Final = "reset to first boot version"
-POWERED: Final = "power to first boot version"
-GAP: Final = "boot version to boot version without an application"
-LATE: Final = "pause to boot version, beyond the shortest one"
-RESTARTED: Final = "complete to boot version"
-REQUEST: Final = "update command to request transfer"
-ANSWER: Final = "packet to ACK"
-COMPLETE: Final = "end of transfer to complete"
-START: Final = "complete to an application that answers"
-START_AGAIN: Final = "last boot version to an application that answers"
 _LIMIT_S: Final = 7200.0
 _ASK_S: Final = 0.05
 _BURST_GAP_S: Final = 1.5
@@ -97,10 +87,10 @@ class Session:
             sent = bench.send(bench.encoder.reset())
             heard = bench.wait_for(Kind.FEEDBACK, Kind.BOOT_VERSION, within_s=limit_s)
         if heard is not None and heard.kind is Kind.FEEDBACK:
-            bench.measure(FEEDBACK, heard.at - sent.left_at)
+            bench.measure(Times.FEEDBACK, heard.at - sent.left_at)
             heard = bench.wait_for(Kind.BOOT_VERSION, within_s=limit_s)
         found = bench.require_received(heard, Kind.BOOT_VERSION.value, limit_s)
-        bench.measure(FIRST, found.at - sent.left_at)
+        bench.measure(Times.FIRST, found.at - sent.left_at)
         for _ in range(version - 1):
             found = bench.await_message(Kind.BOOT_VERSION, within_s=_BURST_GAP_S)
         return found
@@ -121,7 +111,7 @@ class Session:
         sent = bench.send(frames)
         heard = bench.wait_for(Kind.REQUEST)
         if heard is not None:
-            bench.measure(REQUEST, heard.at - sent.left_at)
+            bench.measure(Times.REQUEST, heard.at - sent.left_at)
             self.stored = 0
         return heard is not None
 

@@ -7,7 +7,8 @@ from math import floor
 from typing import Final
 
 from flasher.conformance.init.answers import Answer, Findings, Trial
-from flasher.conformance.init.session import COMPLETE, LATE, REPEATS, Session, told
+from flasher.conformance.init.session import REPEATS, Session, told
+from flasher.conformance.judge import Times
 from flasher.conformance.wire import (
     FRAME_BYTES,
     PACKET_BYTES,
@@ -240,7 +241,7 @@ def padded(it: Session) -> Findings:
             bench.forget()
             bench.end_transfer()
         else:
-            bench.measure(COMPLETE, heard.at - sent.left_at)
+            bench.measure(Times.COMPLETE, heard.at - sent.left_at)
         it.await_application()
 
 
@@ -308,7 +309,7 @@ def pause(it: Session) -> Findings:
     digit = 10 if min(found_s) >= 1 else 100
     shortest_s = floor(min(found_s) * digit + 1e-6) / digit
     for one_s in found_s:
-        bench.measure(LATE, one_s - shortest_s)
+        bench.measure(Times.LATE, one_s - shortest_s)
     seen = f"a boot version after pauses of {min(found_s):.3f} to {max(found_s):.3f} s"
     yield Answer("limits.pause_s", shortest_s, f"{seen}; the shortest, rounded down")
 

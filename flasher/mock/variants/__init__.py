@@ -12,7 +12,6 @@ from types import MappingProxyType
 from typing import Any, Final
 
 from flasher.errors import UsageError, did_you_mean
-from flasher.mock.application import Application
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.mock.variants import (  # noqa: F401  each declares its variants
@@ -55,11 +54,9 @@ def make(
     variant: Variant | str,
     target: Target,
     *,
-    bitrate_bps: int,
     profile: DeviceProfile = _DEFAULT_PROFILE,
     timings: Timings = DEFAULT_TIMINGS,
-    has_application: bool = True,
-    application: Application | None = None,
+    **others: Any,
 ) -> MockDevice:
     """A wrong device, with the keywords of `MockDevice`. The variant's own choices and timings
     replace those given. Raises UsageError for an unknown name and as `MockDevice` does.
@@ -69,9 +66,7 @@ def make(
     faults: dict[str, Any] = dict(chosen.timings)
     return chosen.device_type(
         target,
-        bitrate_bps=bitrate_bps,
         profile=dataclasses.replace(profile, **choices),
         timings=dataclasses.replace(timings, **faults),
-        has_application=has_application,
-        application=application,
+        **others,
     )
