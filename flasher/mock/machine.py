@@ -74,7 +74,7 @@ class Machine(ABC):
             self.application.heard(now)
         can_id, payload, is_extended, is_remote, is_error = frame[:5]
         reassembler = self._reassemblers.get(can_id)
-        if reassembler is None or is_extended or is_remote or is_error:
+        if reassembler is None or not payload or is_extended or is_remote or is_error:
             return
         for found in reassembler.feed(payload, now):
             self._take(found, now)

@@ -113,6 +113,10 @@ def test_a_device_that_looks_behind_a_wrong_tail_does_not_drop_what_is_there() -
     assert failed(report(only=("FR-04",), judged_by={"fr_04": "either"})) == []
 
 
+def test_a_device_that_drops_short_frames_minds_no_empty_ones() -> None:
+    assert failed(report("short-frame-ends-message", only=("FR-09",))) == []
+
+
 def test_gaps_that_no_product_promises_are_observed_only() -> None:
     done = report("drops-after-20-ms-gap", only=("TM-02",), judged_by={"tm_02": "either"})
     assert failed(done) == []
