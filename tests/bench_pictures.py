@@ -17,8 +17,8 @@ from typing import Final, Literal
 from playwright.sync_api import Browser, Page, expect
 
 from flasher import events
+from flasher.web.translation import NAMES
 from flasher.web.virtual_bike import Fault
-from flasher.web.words import NAMES
 from tests.end_to_end.stage import NEW, image_of
 from tests.firmware import VECTORS
 from tests.web.barriers import barriers

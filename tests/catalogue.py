@@ -27,7 +27,7 @@ from flasher.protocol.contents import Fault
 from flasher.protocol.fields import flag_names, label
 from flasher.station.scans import Word
 from flasher.trace.decoder import message_titles
-from flasher.web.words import NAMES
+from flasher.web.translation import NAMES
 
 ROOT: Final = Path(__file__).parent.parent / "flasher"
 FOLDER: Final = ROOT / "web" / "locale"

@@ -3,5 +3,5 @@ the `Device` says, and hands on what a person does.
 
 `server` runs an ASGI application in a thread; `guard` lets nobody else in; `feed` carries states to
 the pages, each message with the whole state of its subject, so that a page that lost its connection
-needs no replay; `words` says it in another language.
+needs no replay; `translation` says it in another language.
 """

@@ -26,7 +26,7 @@ from flasher.trace.decoder import Field, content_fields
 from flasher.web.bench import Bench
 from flasher.web.bench_state import Done, State
 from flasher.web.pages import Pages, streamed
-from flasher.web.words import Words
+from flasher.web.translation import Translator
 
 UPLOAD_MAX: Final = 32 * 1024 * 1024
 """In bytes: the largest image as Intel HEX has less."""
@@ -158,14 +158,14 @@ class BenchPage:
         return page
 
     async def _events(self, request: Request) -> Response:
-        return streamed(self._messages(self._pages.words_of(request)))
+        return streamed(self._messages(self._pages.translator_of(request)))
 
-    async def _messages(self, words: Words) -> AsyncIterator[dict[str, Any]]:
+    async def _messages(self, translate: Translator) -> AsyncIterator[dict[str, Any]]:
         sent: dict[str, str] = {}
         async for batch in self._bench.feed.follow():
             message: dict[str, Any] = {}
             for _, state in batch.changes[-1:]:
-                parts = self._parts(words, state)
+                parts = self._parts(translate, state)
                 message["parts"] = {
                     name: text for name, text in parts.items() if sent.get(name) != text
                 }
@@ -173,9 +173,9 @@ class BenchPage:
             yield message
         yield {"ended": True}
 
-    def _parts(self, words: Words, state: State) -> dict[str, str]:
+    def _parts(self, translate: Translator, state: State) -> dict[str, str]:
         return self._pages.parts(
-            words, "bench_parts.html", state=state, targets=TARGETS.values(),
+            translate, "bench_parts.html", state=state, targets=TARGETS.values(),
             folder=str(self._shelf.folder), is_mock=self._is_mock, facts=facts(state),
             left_s=left_s(state), told=told(state), waivers=WAIVERS,
         )  # fmt: skip

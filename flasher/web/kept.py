@@ -1,6 +1,6 @@
 """What this computer keeps: its history, bundles, backups, and the stories of traces.
 
-It is answered in processes of their own (`flasher.web.desk`), so that no upgrade waits for it.
+It is answered in processes of their own (`flasher.web.answers`), so that no upgrade waits for it.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from flasher.report.base import visible
 from flasher.report.explain_page import told
 from flasher.trace.bundle import bundles
 from flasher.trace.source import explain_path, recorded_of
-from flasher.web.desk import HTML, Answer, Question
+from flasher.web.answers import HTML, Answer, Question
 from flasher.web.pages import Pages
-from flasher.web.words import words
+from flasher.web.translation import translator
 
 SHOWN_MAX: Final = 50
 """Of flashes, and of files of one kind."""
@@ -72,7 +72,7 @@ class Kept:
     ) -> Answer:
         text = self._pages.text(
             template,
-            words(question.language),
+            translator(question.language),
             question.token,
             layout="bench_layout.html",
             **context,

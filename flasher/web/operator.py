@@ -25,7 +25,7 @@ from flasher.station.health import Check, Watch
 from flasher.station.tally import EndedRun, Output, Tally
 from flasher.web.feed import Feed
 from flasher.web.pages import Pages, streamed
-from flasher.web.words import Words
+from flasher.web.translation import Translator
 
 TAIL_DIGITS: Final = 6
 """Of a serial number, shown large: enough to tell the units on a bench apart."""
@@ -81,67 +81,73 @@ class Head:
     is_secret: bool
     """What is typed now must not be shown."""
 
-    def said(self, words: Words) -> dict[str, Any]:
+    def said(self, translate: Translator) -> dict[str, Any]:
         """The head in a language, for the page's script."""
         stopped, lot = self.stopped, self.lot
-        name = lot.name or words(say("no lot"))
+        name = lot.name or translate(say("no lot"))
         left = max(lot.size - lot.good, 0)
         return {
             "station": self.station,
             "recipe": self.recipe,
             "part": self.part,
-            "operator": words(self.operator),
-            "lot": words(say("{name}, {left} left"), name=name, left=left) if lot.size else name,
-            "virtual": words(self.virtual),
-            "spoken": words(self.spoken),
+            "operator": translate(self.operator),
+            "lot": translate(say("{name}, {left} left"), name=name, left=left)
+            if lot.size
+            else name,
+            "virtual": translate(self.virtual),
+            "spoken": translate(self.spoken),
             "is_refusal": self.is_refusal,
             "is_secret": self.is_secret,
             "stopped": None
             if stopped is None
             else {
                 "code": stopped.code,
-                "reason": words(stopped.reason),
-                "remedy": words(stopped.remedy),
+                "reason": translate(stopped.reason),
+                "remedy": translate(stopped.remedy),
             },
-            "hour": _counted(self.output.hour, words),
-            "shift": _counted(self.output.shift, words),
+            "hour": _counted(self.output.hour, translate),
+            "shift": _counted(self.output.shift, translate),
             "first": "-"
             if self.output.first_pass_share is None
             else f"{int(self.output.first_pass_share * 1000) / 10:g} %",
             "causes": [f"{code} {count}" for code, count in self.output.causes],
             "health": [
-                {"name": words(check.name), "is_good": check.is_good, "text": words(check.text)}
+                {
+                    "name": translate(check.name),
+                    "is_good": check.is_good,
+                    "text": translate(check.text),
+                }
                 for check in self.health
             ],
         }
 
 
-def _counted(count: tuple[int, int], words: Words) -> str:
-    return words(say("{good} good, {bad} bad"), good=count[0], bad=count[1])
+def _counted(count: tuple[int, int], translate: Translator) -> str:
+    return translate(say("{good} good, {bad} bad"), good=count[0], bad=count[1])
 
 
-def _left(left_s: float, words: Words) -> str:
+def _left(left_s: float, translate: Translator) -> str:
     whole = round(max(left_s, 0.0))
     text = f"{whole} s" if whole < 100 else f"{whole // 60}:{whole % 60:02d} min"
-    return words(say("{time} left"), time=text)
+    return translate(say("{time} left"), time=text)
 
 
-def _tile(row: Row, words: Words) -> dict[str, Any]:
+def _tile(row: Row, translate: Translator) -> dict[str, Any]:
     """One socket in a language, for the page's script."""
     serial = row.serial or row.borne
     return {
         "socket": row.socket,
         "state": row.state.value.lower(),
-        "word": words(WORDS[row.state]),
+        "word": translate(WORDS[row.state]),
         "serial": serial,
         "tail": serial[-TAIL_DIGITS:],
         "is_label": bool(row.serial),
         "share": row.share,
-        "left": "" if row.left_s is None else _left(row.left_s, words),
-        "step": words(row.step),
+        "left": "" if row.left_s is None else _left(row.left_s, translate),
+        "step": translate(row.step),
         "code": row.code,
-        "line": words(row.note),
-        "virtual": words(say("virtual unit: no product")) if row.is_virtual else "",
+        "line": translate(row.note),
+        "virtual": translate(say("virtual unit: no product")) if row.is_virtual else "",
     }
 
 
@@ -228,7 +234,7 @@ class OperatorPage:
         return self._pages.show(request, "line.html", sound_volume=self._sound_volume)
 
     async def _events(self, request: Request) -> Response:
-        return streamed(_messages(self._feed, self._pages.words_of(request)))
+        return streamed(_messages(self._feed, self._pages.translator_of(request)))
 
     async def _scan(self, request: Request) -> Response:
         try:
@@ -243,15 +249,15 @@ class OperatorPage:
         return JSONResponse({})
 
 
-async def _messages(feed: Feed, words: Words) -> AsyncIterator[dict[str, Any]]:
+async def _messages(feed: Feed, translate: Translator) -> AsyncIterator[dict[str, Any]]:
     async for batch in feed.follow():
         message: dict[str, Any] = {}
         if batch.is_all:
             message["all"] = True
-        tiles = [_tile(state, words) for _, state in batch.changes if isinstance(state, Row)]
+        tiles = [_tile(state, translate) for _, state in batch.changes if isinstance(state, Row)]
         heads = [state for _, state in batch.changes if isinstance(state, Head)]
         if tiles:
             message["tiles"] = tiles
         if heads:
-            message["head"] = heads[-1].said(words)
+            message["head"] = heads[-1].said(translate)
         yield message

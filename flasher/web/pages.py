@@ -14,7 +14,7 @@ from starlette.responses import HTMLResponse, Response, StreamingResponse
 
 from flasher import __version__
 from flasher.report.base import environment
-from flasher.web.words import NAMES, Words, chosen
+from flasher.web.translation import NAMES, Translator, chosen
 
 _PART: Final = "part_"
 
@@ -49,17 +49,17 @@ class Pages:
             )
         )
 
-    def words_of(self, request: Request) -> Words:
+    def translator_of(self, request: Request) -> Translator:
         accepted = request.headers.get("accept-language", "").replace(" ", "").split(",")
         wanted = request.query_params.get("lang")
         if self._remembers_language:
             wanted = request.session["lang"] = wanted or request.session.get("lang", "")
         return chosen(wanted or self._language, accepted)
 
-    def parts(self, words: Words, template: str, **context: Any) -> dict[str, str]:
+    def parts(self, translate: Translator, template: str, **context: Any) -> dict[str, str]:
         """The pieces of a page: what each macro `part_...` of a template gives, by its name."""
         found = self._environment.get_template(template).make_module(
-            {"_": words, "lang": words.code, **context}
+            {"_": translate, "lang": translate.code, **context}
         )
         return {
             name.removeprefix(_PART): str(macro())
@@ -72,13 +72,15 @@ class Pages:
     ) -> Response:
         """A page, in the language of its request."""
         token = request.session.get("token", "")
-        return HTMLResponse(self.text(template, self.words_of(request), token, **context), status)
+        return HTMLResponse(
+            self.text(template, self.translator_of(request), token, **context), status
+        )
 
-    def text(self, template: str, words: Words, token: str, **context: Any) -> str:
+    def text(self, template: str, translate: Translator, token: str, **context: Any) -> str:
         """A page. Templates know `_` (the language), `token`, `languages` and `version`."""
         return self._environment.get_template(template).render(
-            _=words,
-            lang=words.code,
+            _=translate,
+            lang=translate.code,
             languages=NAMES,
             token=token,
             version=__version__,

@@ -50,10 +50,10 @@ from flasher.station.stories import explained
 from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.trace.figures import Distribution
 from flasher.trace.story import Story
+from flasher.web.answers import Answer, Question
 from flasher.web.charts import SERIES_MAX, lines, stacked_bars
-from flasher.web.desk import Answer, Question
 from flasher.web.pages import Pages
-from flasher.web.words import Words, words
+from flasher.web.translation import Translator, translator
 
 USUAL_DAYS: Final = 30
 """Figures are of the last so many days that have runs, unless the form says another time."""
@@ -127,7 +127,7 @@ class Supervisor:
     def _page(
         self, question: Question, template: str, *, http: int = 200, **context: Any
     ) -> Answer:
-        said = words(question.language)
+        said = translator(question.language)
         now = self.now()
         context.setdefault("path", question.path)
         text = self._pages.text(
@@ -271,7 +271,7 @@ class Supervisor:
 
     def yields(self, question: Question) -> Answer:
         chosen, span = self._figured(question)
-        said = words(question.language)
+        said = translator(question.language)
         spans = list(spans_of(span))
         rows = [each for each in self.overview.yields(chosen, spans) if each.units]
         by = By(question.fields["by"]) if question.fields.get("by") in set(By) else By.SOCKET
@@ -313,7 +313,7 @@ class Supervisor:
         )
 
     def _causes(
-        self, chosen: RunFilter, span: Span, by: By, said: Words
+        self, chosen: RunFilter, span: Span, by: By, said: Translator
     ) -> tuple[list[str], list[PartOfCauses]]:
         """The groups, and the codes from the most frequent one on."""
         shifts = list(shifts_of(span, self.shifts)) if by is By.SHIFT else []

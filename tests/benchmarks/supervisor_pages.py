@@ -29,11 +29,11 @@ from flasher.station.records.keys import Keeping
 from flasher.station.records.model import AuditEvent, RunState, utc_text
 from flasher.station.records.store import Store
 from flasher.station.tally import DEFAULT_SHIFTS
-from flasher.web.desk import Desk, Question
+from flasher.web.answers import AnswerProcesses, Question
 from flasher.web.supervisor import open_supervisor, place_of
 from tests.benchmarks.station_records import SERIAL_NUMBER, fill
 from tests.station.factory import HEAD, SERIAL, Bench, make_recipe, target_table
-from tests.web.desk import app_of, client_of
+from tests.web.answering import app_of, client_of
 
 REPEATS: Final = 5
 SOCKETS: Final = tuple("ABCDEFGH")
@@ -210,12 +210,12 @@ def measure_station(bench: Bench) -> None:
     store = Store.open(
         str(bench.path), station="line-2", clock=bench.clock, keeping=Keeping(bench.keys)
     )
-    desk = Desk(partial(open_supervisor, *place_of(store), DEFAULT_SHIFTS))
-    with closing(store), closing(desk):
+    answering = AnswerProcesses(partial(open_supervisor, *place_of(store), DEFAULT_SHIFTS))
+    with closing(store), closing(answering):
         store.recover()
         _commits(store, "alone")
         ended = threading.Event()
-        asking = threading.Thread(target=lambda: asyncio.run(_ask(desk, ended)))
+        asking = threading.Thread(target=lambda: asyncio.run(_ask(answering, ended)))
         asking.start()
         time.sleep(5.0)  # the processes have begun
         _commits(store, "while pages are asked for")
@@ -240,14 +240,14 @@ def _commits(store: Store, when: str) -> None:
         )
 
 
-async def _ask(desk: Desk, ended: threading.Event) -> None:
+async def _ask(answering: AnswerProcesses, ended: threading.Event) -> None:
     asked = 0
 
     async def ask_on(paths: tuple[str, ...]) -> None:
         nonlocal asked
         while not ended.is_set():
             for path in paths:
-                answer = await desk.ask(Question(path, {"search": "4321"}))
+                answer = await answering.ask(Question(path, {"search": "4321"}))
                 asked += answer.status == 200
 
     began = time.perf_counter()

@@ -17,10 +17,10 @@ from flasher.cli.stop import Stop
 from flasher.cli.upgrade.bench_page import Memory, VirtualBikes, backup_folder
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.web import bench
+from flasher.web.answers import Answer, Question, answer_routes
 from flasher.web.bench import Bench, Order
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Adapter, State
-from flasher.web.desk import Answer, Question, desk_routes
 from flasher.web.guard import BODY_MAX, Entry, application
 from flasher.web.kept import PAGES as KEPT
 from flasher.web.kept import Kept
@@ -97,7 +97,7 @@ class BenchPlace:
         entry = Entry(pages)
         page = BenchPage(pages, self.bench, self.shelf, is_mock=True)
         app = application(
-            [*page.routes, *desk_routes(pages, ask, KEPT)], pages=pages, hosts={"127.0.0.1"},
+            [*page.routes, *answer_routes(pages, ask, KEPT)], pages=pages, hosts={"127.0.0.1"},
             secret=_KEY, now=lambda: 0.0, entry=entry, uploads=upload_limit(BODY_MAX),
         )  # fmt: skip
         worker = threading.Thread(target=self.bench.run, daemon=True)

@@ -33,8 +33,8 @@ from flasher.settings.manifest import manifest_path, to_toml
 from flasher.web.bench import Bench, Order
 from flasher.web.bench_page import told
 from flasher.web.bench_state import Doing, Done, State
+from flasher.web.translation import translator
 from flasher.web.virtual_bike import Fault
-from flasher.web.words import words
 from tests.end_to_end.stage import NEW, OLD, image_of
 from tests.web.bench_place import IMAGE, PACKETS, BenchPlace, order
 
@@ -290,7 +290,7 @@ def test_a_bad_end_is_said_in_the_language_of_the_page(place: BenchPlace) -> Non
     error = _done(place, Fault.POWER).error
     assert error is not None
     assert "Then rescue this device." in error.remedy
-    german = words("de")
+    german = translator("de")
     assert german(error.what).startswith("BMS: ein Paket wurde nicht bestätigt")
     assert german(error.where) == "wird übertragen, Paket 8 von 20, Versuch 3"
     assert "Dann dieses Gerät retten." in german(error.remedy)
@@ -509,4 +509,4 @@ def test_what_the_battery_told_is_said_in_the_words_of_the_command(place: BenchP
     assert "not answered" not in found
     ((_, faults),) = dict(told(place.do(order(Bench.use_adapter, Fault.HARDWARE.value))))["faults"]
     assert faults == "over discharge protection"
-    assert words("de")(faults) == "Schutz: Tiefentladung"
+    assert translator("de")(faults) == "Schutz: Tiefentladung"

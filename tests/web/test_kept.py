@@ -10,7 +10,7 @@ import pytest
 
 from flasher.trace.bundle import write_bundle
 from flasher.trace.taps import FlightRecorder
-from flasher.web.desk import Answer, Question
+from flasher.web.answers import Answer, Question
 from flasher.web.kept import Kept
 
 

@@ -34,7 +34,7 @@ from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.web.supervisor import open_supervisor, shifts_of, spans_of
 from tests.station.factory import BMS_VERSION, IMAGES, Bench
 from tests.station.postgres import Server
-from tests.web.desk import app_of, app_with, client_of
+from tests.web.answering import app_of, app_with, client_of
 
 IMAGE = IMAGES[TARGET].sha256
 HOSTILE = "<script>alert(1)</script>\u202e\x07" + "W" * 150

@@ -12,9 +12,9 @@ import pytest
 from flasher.station.records.model import Measurement, RunState, StepState
 from flasher.web.server import Server
 from tests.station.factory import Bench
+from tests.web.answering import app_of
 from tests.web.barriers import barriers
 from tests.web.conftest import Tab
-from tests.web.desk import app_of
 
 LONG = "W" * 90
 PAGES = (

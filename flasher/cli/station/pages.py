@@ -36,7 +36,7 @@ from flasher.station.records.keys import Keeping
 from flasher.station.records.model import RunFilter, RunState, utc_moment
 from flasher.station.station import Station
 from flasher.station.tally import DEFAULT_SHIFTS, EndedRun, Tally
-from flasher.web.desk import Desk, desk_routes
+from flasher.web.answers import AnswerProcesses, answer_routes
 from flasher.web.guard import Badges, application
 from flasher.web.operator import LINE, Lot, OperatorPage, Screen
 from flasher.web.pages import Pages
@@ -117,8 +117,8 @@ def operator_page(
     operator = OperatorPage(pages, screen.feed, station.submit, sound_volume=config.sound_volume)
     view = OperatorView(screen, station, board)
     # In processes of their own: a page takes no time from the station.
-    desk = Desk(partial(open_supervisor, *place_of(store), config.shifts))
-    routes = [*operator.routes, *desk_routes(pages, desk.ask, PAGES)]
+    answering = AnswerProcesses(partial(open_supervisor, *place_of(store), config.shifts))
+    routes = [*operator.routes, *answer_routes(pages, answering.ask, PAGES)]
     server = served(
         options,
         address,
@@ -128,7 +128,7 @@ def operator_page(
         people=people,
         is_supervised=lambda path: path != "/" and not path.startswith(LINE),
     )
-    with closing(desk), server as url:
+    with closing(answering), server as url:
         try:
             yield view, url
         finally:
@@ -146,10 +146,10 @@ def serve(output: Output, address: Address, options: PagesOptions, records: Reco
     with closing(open_to_read(records)) as store:  # what is wrong with them is said before
         place = place_of(store)
     pages = Pages(options.language)
-    desk = Desk(partial(open_supervisor, *place, shifts))
-    routes = [Route("/", _start), *desk_routes(pages, desk.ask, PAGES)]
+    answering = AnswerProcesses(partial(open_supervisor, *place, shifts))
+    routes = [Route("/", _start), *answer_routes(pages, answering.ask, PAGES)]
     with (
-        closing(desk),
+        closing(answering),
         stop_on_signal() as stopped,
         served(
             options,
@@ -161,7 +161,7 @@ def serve(output: Output, address: Address, options: PagesOptions, records: Reco
             is_supervised=lambda _path: True,
         ) as url,
     ):
-        desk.begin()
+        answering.begin()
         output.progress(f"The supervisor pages: {url}; Ctrl-C ends them")
         while not stopped():
             time.sleep(_TURN_S)

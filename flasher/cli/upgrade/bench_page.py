@@ -42,10 +42,10 @@ from flasher.said import say
 from flasher.settings.area import Area
 from flasher.settings.profile import Profile, load_profile
 from flasher.web import bench
+from flasher.web.answers import AnswerProcesses, answer_routes
 from flasher.web.bench import Bench
 from flasher.web.bench_page import BenchPage, Shelf, upload_limit
 from flasher.web.bench_state import Adapter, Doing, Saved
-from flasher.web.desk import Desk, desk_routes
 from flasher.web.guard import BODY_MAX, Entry, application
 from flasher.web.kept import PAGES as KEPT
 from flasher.web.kept import Kept
@@ -301,13 +301,13 @@ def serve(
     ):
         memory = Memory()
         shelf = Shelf(_folder(images, memory), Path(dropped), IMAGE_SUFFIXES, TRACE_SUFFIXES)
-        desk = Desk(partial(Kept, bundle_folder(), backup_folder(), shelf.traces))
-        stack.callback(desk.close)
+        answering = AnswerProcesses(partial(Kept, bundle_folder(), backup_folder(), shelf.traces))
+        stack.callback(answering.close)
         kind = VirtualBikes if bus.mock else Adapters
         machine = Bench(kind(bus, output, shelf, stop, memory), time.monotonic)
         page = BenchPage(pages, machine, shelf, is_mock=bus.mock)
         app = application(
-            [*page.routes, *desk_routes(pages, desk.ask, KEPT)],
+            [*page.routes, *answer_routes(pages, answering.ask, KEPT)],
             pages=pages,
             hosts=LOOPBACK,
             secret=secrets.token_urlsafe(32),

@@ -6,7 +6,7 @@ from contextlib import closing
 from functools import partial
 
 from flasher.errors import UsageError
-from flasher.web.desk import Answer, Answering, Desk, Question
+from flasher.web.answers import Answer, Answering, AnswerProcesses, Question
 from tests.web.own_loop import in_own_loop
 
 
@@ -25,10 +25,13 @@ def _broken(what: str) -> Answering:
 
 def test_a_question_is_answered_and_what_is_wrong_is_said() -> None:
     """A place that cannot be opened is an answer, and no process that dies again and again."""
-    with closing(Desk(_echo)) as desk, closing(Desk(partial(_broken, "no such place"))) as broken:
+    with (
+        closing(AnswerProcesses(_echo)) as answering,
+        closing(AnswerProcesses(partial(_broken, "no such place"))) as broken,
+    ):
 
         async def ask() -> list[Answer]:
-            return [await each.ask(Question("/runs")) for each in (desk, broken, broken)]
+            return [await each.ask(Question("/runs")) for each in (answering, broken, broken)]
 
         good, *bad = in_own_loop(ask())
     assert good.body == b"/runs"

@@ -10,7 +10,7 @@ from starlette.types import ASGIApp
 
 from flasher.station.records.keys import Keeping
 from flasher.station.tally import DEFAULT_SHIFTS
-from flasher.web.desk import Answer, Question, desk_routes
+from flasher.web.answers import Answer, Question, answer_routes
 from flasher.web.guard import application
 from flasher.web.pages import Pages
 from flasher.web.supervisor import PAGES, Supervisor, open_supervisor
@@ -32,7 +32,7 @@ def app_with(supervisor: Supervisor) -> ASGIApp:
 
     pages = Pages()
     return application(
-        desk_routes(pages, ask, PAGES),
+        answer_routes(pages, ask, PAGES),
         pages=pages,
         hosts={"127.0.0.1"},
         secret=_KEY,

@@ -18,8 +18,8 @@ NAMES: Final = {"en": "English", "de": "Deutsch", "zh": "\u4e2d\u6587"}
 """The languages by their codes, each by its own name. English needs no catalogue."""
 
 
-class Words:
-    """One language. `code` is what a page's `lang` attribute has."""
+class Translator:
+    """Says texts in one language. `code` is what a page's `lang` attribute has."""
 
     def __init__(self, code: str, translate: Callable[[str], str]) -> None:
         self.code = code
@@ -32,23 +32,23 @@ class Words:
 
 
 @cache
-def words(code: str) -> Words:
-    """The language of a code. Raises KeyError for one that there is not."""
+def translator(code: str) -> Translator:
+    """The translator to the language of a code. Raises KeyError for one that there is not."""
     if code not in NAMES:
         raise KeyError(code)
     if code == "en":
-        return Words(code, str)
+        return Translator(code, str)
     source = resources.files("flasher.web").joinpath("locale", f"{code}.po")
     compiled = io.BytesIO()
     with source.open("rb") as file:
         write_mo(compiled, read_po(file, locale=code))
     compiled.seek(0)
-    return Words(code, gettext.GNUTranslations(compiled).gettext)
+    return Translator(code, gettext.GNUTranslations(compiled).gettext)
 
 
-def chosen(wanted: str | None, accepted: Iterable[str]) -> Words:
-    """The language that an address asks for, else the first that the browser takes."""
+def chosen(wanted: str | None, accepted: Iterable[str]) -> Translator:
+    """To the language that an address asks for, else to the first that the browser takes."""
     for code in (wanted or "", *accepted):
         if code.split("-")[0].lower() in NAMES:
-            return words(code.split("-")[0].lower())
-    return words("en")
+            return translator(code.split("-")[0].lower())
+    return translator("en")

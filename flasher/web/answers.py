@@ -66,7 +66,7 @@ class Answering(Protocol):
 Ask = Callable[[Question], Awaitable[Answer]]
 
 
-class Desk:
+class AnswerProcesses:
     """Processes that answer. `make` makes who answers in each of them; it and what it makes of are
     sent there. `close` ends them.
     """
@@ -129,7 +129,7 @@ def _answer(question: Question) -> Answer:
         return Answer(str(error).encode("utf-8", "replace"), "text/plain; charset=utf-8", 503)
 
 
-def desk_routes(pages: Pages, ask: Ask, paths: Iterable[str]) -> list[BaseRoute]:
+def answer_routes(pages: Pages, ask: Ask, paths: Iterable[str]) -> list[BaseRoute]:
     """The routes of pages that are answered by `ask`."""
 
     async def page(path: str, request: Request) -> Response:
@@ -139,7 +139,7 @@ def desk_routes(pages: Pages, ask: Ask, paths: Iterable[str]) -> list[BaseRoute]
             if value.strip()
         }
         run = int(request.path_params.get("run", 0))
-        language, token = pages.words_of(request).code, request.session.get("token", "")
+        language, token = pages.translator_of(request).code, request.session.get("token", "")
         try:
             answer = await ask(Question(path, fields, run, language, token))
         except TimeoutError:
