@@ -53,20 +53,18 @@ def check_not_read(path: str | Path, option: str, others: Iterable[object]) -> N
     line that may name files which the command reads.
     """
     for other in others:
-        if isinstance(other, str | Path) and _is_same(Path(path), Path(other)):
+        if not isinstance(other, str | Path):
+            continue
+        is_same = Path(path).absolute() == Path(other).absolute()
+        with contextlib.suppress(OSError, ValueError):  # else by what the names lead to
+            is_same = Path(path).samefile(other)
+        if is_same:
             raise UsageError(
                 f"{printable(str(path))} is a file of the command itself.",
                 where=option,
                 remedy="Name another file: this one would be written over.",
                 code=ErrorCode.FILE_NOT_WRITTEN,
             )
-
-
-def _is_same(path: Path, other: Path) -> bool:
-    """True when both names lead to one file."""
-    with contextlib.suppress(OSError, ValueError):
-        return path.samefile(other)
-    return path.absolute() == other.absolute()
 
 
 def write_whole(path: Path, data: bytes, option: str) -> None:

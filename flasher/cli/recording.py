@@ -123,9 +123,15 @@ def recording(
     """Record what goes over the bus while the block runs. Raises UsageError for a trace file that
     cannot be written.
     """
-    facts = _circumstances(bus, target)
-    record = Recording(target, facts["bitrate_bps"])
-    record.facts |= facts
+    record = Recording(target, bus.bit_rate.bps)
+    record.facts |= {
+        "command_line": ["flasher", *map(printable, command_line())],
+        "target": None if target is None else target.name,
+        "dialect": bus.dialect_name,
+        "bus": {} if bus.mock else bus.config,
+        "bitrate_bps": bus.bit_rate.bps,
+        "bitrate_source": bus.bit_rate.source,
+    }
     try:
         with _trace_file(options, record, output):
             yield record
@@ -211,17 +217,6 @@ def _leave_bundle(
         output.error_line(f"bundle: {printable(str(path))}")
         if is_own:
             output.error_line("        flasher explain --last tells what happened")
-
-
-def _circumstances(bus: Bus, target: Target | None) -> dict[str, Any]:
-    return {
-        "command_line": ["flasher", *map(printable, command_line())],
-        "target": None if target is None else target.name,
-        "dialect": bus.dialect_name,
-        "bus": {} if bus.mock else bus.config,
-        "bitrate_bps": bus.bit_rate.bps,
-        "bitrate_source": bus.bit_rate.source,
-    }
 
 
 def _error(error: BaseException) -> dict[str, Any]:

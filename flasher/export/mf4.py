@@ -14,7 +14,7 @@ from flasher.export.names import key
 from flasher.export.signals import Row
 from flasher.protocol import messages
 from flasher.protocol.catalogue import BY_KEY
-from flasher.protocol.fields import Codec, Flags, flag_names
+from flasher.protocol.fields import Flags, flag_names
 from flasher.trace.decoder import BusEvent, Kind
 from flasher.trace.explain import WALL_TIME_FROM
 
@@ -64,7 +64,9 @@ def write_mf4(rows: Iterable[Row], to: Path) -> int:
 
 def _numbers(event: BusEvent) -> Iterator[tuple[str, str, int]]:
     """Name, unit and value of what can be plotted."""
-    codecs, prefix = _codecs(event), key(event.title)
+    prefix, command = key(event.title), event.command or 0
+    item = BY_KEY.get((event.can_id, command))
+    codecs = dict(messages.ROWS[command].LAYOUT if item is None else item.content.LAYOUT)
     for shown in event.fields:
         name, codec = f"{prefix}.{shown.name}", codecs[shown.name]
         if isinstance(codec, Flags):
@@ -76,10 +78,3 @@ def _numbers(event: BusEvent) -> Iterator[tuple[str, str, int]]:
         elif isinstance(shown.value, list):
             for at, value in enumerate(shown.value, 1):
                 yield f"{name}.{at}", codec.unit, value
-
-
-def _codecs(event: BusEvent) -> dict[str, Codec]:
-    """The codecs of the fields of a message."""
-    command = event.command or 0
-    item = BY_KEY.get((event.can_id, command))
-    return dict(messages.ROWS[command].LAYOUT if item is None else item.content.LAYOUT)

@@ -247,7 +247,10 @@ class _Watcher:
             case events.PacketStored(number, total) if number == 1:
                 self._say("packets", f"first of {total:,} stored", event)
             case events.ImageStored(size_bytes, sha256):
-                self._save()
+                image = self._device.stored_image
+                if self._save_to and image is not None:
+                    write_whole(self._save_to, image, _SAVE_IMAGE)
+                    self._output.result(f"saved:   {printable(str(self._save_to))}")
                 self.images += 1
                 self._say("image", f"{byte_count(size_bytes)}, sha256 {sha256}", event)
             case events.DeviceWritten(name, before, after):
@@ -268,9 +271,3 @@ class _Watcher:
     def _say(self, kind: str, text: str, event: object) -> None:
         self._output.result(f"{kind + ':':<9}{text}")
         self._output.line({**to_json(event), "text": text})
-
-    def _save(self) -> None:
-        image = self._device.stored_image
-        if self._save_to and image is not None:
-            write_whole(self._save_to, image, _SAVE_IMAGE)
-            self._output.result(f"saved:   {printable(str(self._save_to))}")

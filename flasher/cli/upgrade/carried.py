@@ -83,7 +83,13 @@ class Carried:
                         self._began(connection.name)
 
                         def on_event(event: object) -> None:
-                            self._heard(event)
+                            match event:
+                                case CheckMade():
+                                    self.checks.append(event)
+                                    record.facts["checks"] = self.checks
+                                case QueryAnswered(content=VersionInformation() as version):
+                                    serial_number = printable(str(version.serial_number))
+                                    self._serial_number = serial_number or None
                             tell = watch.get("on_event")
                             if tell is not None:
                                 tell(event)
@@ -115,13 +121,6 @@ class Carried:
                 self.on_failure(error)
                 record.failed(error)
         return result
-
-    def _heard(self, event: object) -> None:
-        if isinstance(event, CheckMade) and self.record is not None:
-            self.checks.append(event)
-            self.record.facts["checks"] = self.checks
-        if isinstance(event, QueryAnswered) and isinstance(event.content, VersionInformation):
-            self._serial_number = printable(str(event.content.serial_number)) or None
 
     # -- the history -------------------------------------------------------------------------------
 
