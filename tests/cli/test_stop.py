@@ -191,7 +191,7 @@ def test_ctrl_c_ends_in_no_time_at_any_setting(tmp_path: Path, options: tuple[st
         began = time.monotonic()
         told(process)("cancelled by the user")
         took_s = time.monotonic() - began
-    assert took_s < 0.6  # 0.3 s, and room for a busy computer
+    assert took_s < 1.0  # 0.3 s, and room for a busy computer
 
 
 @signals_reach_processes
