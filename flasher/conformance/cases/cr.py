@@ -98,9 +98,13 @@ def bursts(bench: Bench) -> None:
         # Those after which no intact packet is left: the first or the last frame doubled leaves
         # one, and behind the last frame there is none to swap it with.
         last = PACKET_FRAMES - 1
-        faults = [Fault(FaultKind.DROP, index) for index in range(PACKET_FRAMES)]
-        faults += [Fault(FaultKind.DOUBLE, index) for index in range(1, last)]
-        faults += [Fault(FaultKind.SWAP, index) for index in range(last)]
+        faults: list[Fault] = []
+        for index in range(PACKET_FRAMES):
+            faults.append(Fault(FaultKind.DROP, index))
+            if 0 < index < last:
+                faults.append(Fault(FaultKind.DOUBLE, index))
+            if index < last:
+                faults.append(Fault(FaultKind.SWAP, index))
         for fault in faults:
             probe.keep_alive()
             frames = probe.frames()
