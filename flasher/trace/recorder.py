@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sqlite3
 import time
 from pathlib import Path
 from typing import Final, Protocol, Self
@@ -16,6 +17,8 @@ from flasher.trace.pcapng import PcapngWriter
 
 _CANDUMP_ERROR: Final = 0x2000_0080
 """Error frame, bus error."""
+_COMMIT_FRAMES: Final = 500
+"""Frames that a process which is killed leaves unwritten, at the most."""
 ONE_TOOL_CHANNEL: Final = "conformance"
 """Channel of a log in which one tool breaks the protocol on purpose."""
 
@@ -69,6 +72,63 @@ class CandumpWriter:
         self._file.close()
 
 
+class DatabaseWriter:
+    """Writes messages into an SQLite file, in the table that python-can reads. python-can's own
+    writer ends with frames still in its queue, and adds to a file that is there.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        """Raises OSError."""
+        Path(path).write_bytes(b"")
+        # The tap of an asynchronous program is called in several threads, one after the other.
+        self._connection = sqlite3.connect(path, check_same_thread=False)
+        self._frames = 0
+        self._is_closed = False
+        self._execute("PRAGMA synchronous = OFF")  # an upgrade does not wait for the disk
+        self._execute(
+            "CREATE TABLE messages (ts REAL, arbitration_id INTEGER, extended INTEGER,"
+            " remote INTEGER, error INTEGER, dlc INTEGER, data BLOB)"
+        )
+
+    def __call__(self, message: can.Message) -> None:
+        """Write one frame. Raises OSError."""
+        self._execute(
+            "INSERT INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)",
+            message.timestamp,
+            message.arbitration_id,
+            message.is_extended_id,
+            message.is_remote_frame,
+            message.is_error_frame,
+            message.dlc,
+            bytes(message.data),
+        )
+        self._frames += 1
+        if self._frames % _COMMIT_FRAMES == 0:
+            self._commit()
+
+    def stop(self) -> None:
+        """Close the file; ValueError when that was done before. Raises OSError."""
+        if self._is_closed:
+            raise ValueError("it is closed")
+        self._is_closed = True
+        try:
+            self._commit()
+        finally:
+            self._connection.close()
+
+    def _execute(self, statement: str, *values: object) -> None:
+        try:
+            self._connection.execute(statement, values)
+        except sqlite3.Error as error:
+            raise OSError(None, str(error)) from error
+
+    def _commit(self) -> None:
+        try:
+            self._connection.commit()
+        except sqlite3.Error as error:
+            raise OSError(None, str(error)) from error
+
+
 def writer_of(path: str | os.PathLike[str], *, called: str = "") -> Writer:
     """What writes the format that the suffix names; in messages it is `called` so. Raises
     UsageError for a suffix that is not known, or whose format needs a package that is not
@@ -80,6 +140,8 @@ def writer_of(path: str | os.PathLike[str], *, called: str = "") -> Writer:
             return PcapngWriter(path)
         if suffix == ".log":
             return CandumpWriter(path)
+        if suffix == ".db":
+            return DatabaseWriter(path)
         return can.Logger(path)
     except ValueError as error:
         raise UsageError(

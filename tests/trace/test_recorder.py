@@ -12,7 +12,7 @@ import pytest
 
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.frame import Frame
-from flasher.trace.recorder import Recorder
+from flasher.trace.recorder import Recorder, message_of, writer_of
 from tests.loops import each
 
 SENT = Frame(0x752, b"\x55\xaa\x16\x07")
@@ -86,6 +86,22 @@ def test_extended_remote_and_error_frames_are_recorded_for_what_they_are(
     assert error.is_error_frame
     assert (empty.is_extended_id, empty.is_remote_frame, empty.is_error_frame) == (False,) * 3
     assert len(empty.data) == 0
+
+
+def test_a_database_holds_every_frame_and_none_of_the_recording_before(tmp_path: Path) -> None:
+    path = tmp_path / "trace.db"
+    for count in (10, 2_501):
+        record(path, *((at / 1000, True, SENT) for at in range(count)))
+        assert len(read(path)) == count
+
+
+def test_a_database_that_cannot_be_written_any_more_ends_the_recording_and_says_why(
+    tmp_path: Path,
+) -> None:
+    writer = writer_of(tmp_path / "trace.db")
+    writer.stop()
+    with pytest.raises(OSError, match="closed database"):
+        writer(message_of(SENT, sent=True, at_s=0.0))
 
 
 def test_the_recorded_frames_keep_their_spacing_though_the_wall_clock_jumps(
