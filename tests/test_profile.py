@@ -324,6 +324,19 @@ def test_the_working_directory_goes_before_the_users(
     assert load_profile(None, BMS).attempts == 5
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows keeps a folder that is in use")
+def test_a_working_directory_that_was_deleted_has_no_profile(
+    tmp_path: Path, home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (home / "flasher").mkdir(parents=True)
+    users = written(home / "flasher", "attempts = 4\n")
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert find_profile() == users
+
+
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have other places")
 @pytest.mark.parametrize(
     ("configured", "expected"),

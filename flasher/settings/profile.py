@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields, make_dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -336,7 +337,10 @@ def find_profile() -> Path | None:
 
 
 def _found() -> Iterator[Path]:
-    for directory in (Path.cwd(), user_config_path("flasher", appauthor=False, roaming=True)):
+    directories = [user_config_path("flasher", appauthor=False, roaming=True)]
+    with suppress(FileNotFoundError):  # the working directory was deleted
+        directories.insert(0, Path.cwd())
+    for directory in directories:
         path = directory / FILE_NAME
         if path.is_file():
             yield path
