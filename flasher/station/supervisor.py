@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from typing import Any, Final, Protocol
 
+from flasher.station.children import deaf_from_birth
 from flasher.station.messages import CannotWork, FromWorker, Quit, ToWorker, WorkerSetup
 from flasher.station.worker import worker_main
 
@@ -55,7 +56,8 @@ class ProcessPort:
         self._process = context.Process(
             target=worker_main, args=(theirs, setup), name=f"socket {setup.socket}", daemon=True
         )
-        self._process.start()
+        with deaf_from_birth():
+            self._process.start()
         # The child has its own: only without this one its end is seen here.
         theirs.close()
 

@@ -20,6 +20,7 @@ from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from flasher.errors import FlasherError
+from flasher.station.children import deaf_from_birth
 from flasher.web.pages import Pages
 
 PROCESSES: Final = 2
@@ -79,7 +80,8 @@ class AnswerProcesses:
         """Start the processes, which the first question does else."""
         if self._pool is None:
             context = multiprocessing.get_context("spawn")
-            self._pool = context.Pool(PROCESSES, _begin, (self._make,))
+            with deaf_from_birth():
+                self._pool = context.Pool(PROCESSES, _begin, (self._make,))
 
     async def ask(self, question: Question) -> Answer:
         """The answer to a question. Raises TimeoutError, or what the process raised."""
