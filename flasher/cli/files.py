@@ -38,6 +38,18 @@ def check_writable(
     check_not_read(path, option, others)
 
 
+def check_new(path: Path, option: str, *, force: bool) -> None:
+    """`check_writable` for a file that is replaced by `force` alone. Raises UsageError."""
+    check_writable(path, option)
+    if path.exists() and not force:
+        raise UsageError(
+            f"{printable(str(path))} exists already.",
+            where=option,
+            remedy="Name another file, or add --force.",
+            code=ErrorCode.FILE_NOT_WRITTEN,
+        )
+
+
 def _can_be_replaced(path: Path) -> bool:
     """False where this user cannot create files in the folder; pipes and devices stay in place."""
     try:

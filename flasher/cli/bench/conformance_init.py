@@ -16,11 +16,11 @@ from flasher.cli.bench.conformance_bench import (
     opened,
 )
 from flasher.cli.documents import document_of
-from flasher.cli.files import check_writable, write_whole
+from flasher.cli.files import check_new, write_whole
 from flasher.cli.framework import command, option
 from flasher.cli.options import Bus, adapter_options
 from flasher.cli.output import Output
-from flasher.errors import ErrorCode, ExitCode, UsageError
+from flasher.errors import ExitCode
 from flasher.protocol.text import printable
 
 _EXAMPLES: Final = """\
@@ -96,7 +96,7 @@ def init(
 
     described = bench.described(bus)
     path = file or Path(f"{described.target}.toml")
-    _check(path, force=force)
+    check_new(path, _OUTPUT, force=force)
     # What the bench knows of its device besides has to be seen like everything else.
     start = ConformanceProfile() if bench.profile is None else load_profile(bench.profile)
     if not described.is_simulated:
@@ -127,7 +127,7 @@ def init(
     else:
         head = f"# What {printable(asked.subject)} answered, target {asked.target}."
         toml = head + "\n" + asked.profile(start).to_toml(asked.open)
-        _check(path, force=force)
+        check_new(path, _OUTPUT, force=force)
         write_whole(path, toml.encode("utf-8"), _OUTPUT)
         count = len(asked.answers)
         output.result(
@@ -144,15 +144,3 @@ def init(
         ),
         exit_code=code,
     )
-
-
-def _check(path: Path, *, force: bool) -> None:
-    """Raises UsageError for a file that cannot, or must not, be written."""
-    check_writable(path, _OUTPUT)
-    if path.exists() and not force:
-        raise UsageError(
-            f"{printable(str(path))} exists already.",
-            where=_OUTPUT,
-            remedy="Name another file, or add --force.",
-            code=ErrorCode.FILE_NOT_WRITTEN,
-        )

@@ -15,14 +15,14 @@ from typing import Final
 from flasher import __version__
 from flasher.cli import values
 from flasher.cli.documents import as_json
-from flasher.cli.files import check_writable, write_whole
+from flasher.cli.files import check_new, write_whole
 from flasher.cli.framework import command, option
 from flasher.cli.look.info import InfoDocument, info_document, silence
 from flasher.cli.look.memory import intel_hex, read_shown
 from flasher.cli.options import Bus, bus_options, profile_option, target_option
 from flasher.cli.output import Output, byte_count
 from flasher.cli.recording import RecordingOptions, recorded_device, recording_options
-from flasher.errors import ErrorCode, ExitCode, UsageError
+from flasher.errors import ExitCode, UsageError
 from flasher.host.query import READ_MEMORY
 from flasher.image.load import load
 from flasher.mock.store import AREA_START
@@ -152,14 +152,7 @@ def backup(
             "memory, and no question to ask it.",
             remedy="Use -t bms; keep the image file that was flashed.",
         )
-    check_writable(file, _OUTPUT)
-    if file.exists() and not force:
-        raise UsageError(
-            f"{printable(str(file))} is there already.",
-            where=_OUTPUT,
-            remedy="Name another file, or add --force.",
-            code=ErrorCode.FILE_NOT_WRITTEN,
-        )
+    check_new(file, _OUTPUT, force=force)
     area = None if no_memory else _area(image, profile, target, bus)
     bus = bus.with_profile(profile)
     with recorded_device(recorded, bus, output, target) as (device, _):
