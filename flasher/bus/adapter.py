@@ -271,9 +271,7 @@ class CanLink:
         self._health.received += 1
         if filtered or self._bus is None:
             return frame
-        # As recv() does.
-        has_filters = self._bus._filters is not None  # noqa: SLF001
-        is_wanted = not has_filters or self._bus._matches_filters(message)  # noqa: SLF001
+        is_wanted = self._bus._matches_filters(message)  # noqa: SLF001  as recv() does
         return frame if is_wanted else None
 
     def _pause(self) -> None:

@@ -177,9 +177,6 @@ class Reassembler:
     def _align(self) -> bool:
         """Move everything before the next header to the junk; False when no header may be left."""
         buffer = self._buffer
-        if not buffer:
-            self._needed = len(HEADER)
-            return False
         if not buffer.startswith(HEADER):
             start = buffer.find(HEADER)
             if start < 0:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Final, Protocol, Self
 
@@ -84,16 +85,17 @@ class DatabaseWriter:
         self._connection = sqlite3.connect(path, check_same_thread=False)
         self._frames = 0
         self._is_closed = False
-        self._execute("PRAGMA synchronous = OFF")  # an upgrade does not wait for the disk
-        self._execute(
+        # An upgrade does not wait for the disk.
+        self._do(self._connection.execute, "PRAGMA synchronous = OFF")
+        self._do(
+            self._connection.execute,
             "CREATE TABLE messages (ts REAL, arbitration_id INTEGER, extended INTEGER,"
-            " remote INTEGER, error INTEGER, dlc INTEGER, data BLOB)"
+            " remote INTEGER, error INTEGER, dlc INTEGER, data BLOB)",
         )
 
     def __call__(self, message: can.Message) -> None:
         """Write one frame. Raises OSError."""
-        self._execute(
-            "INSERT INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)",
+        row = (
             message.timestamp,
             message.arbitration_id,
             message.is_extended_id,
@@ -102,9 +104,10 @@ class DatabaseWriter:
             message.dlc,
             bytes(message.data),
         )
+        self._do(self._connection.execute, "INSERT INTO messages VALUES (?, ?, ?, ?, ?, ?, ?)", row)
         self._frames += 1
         if self._frames % _COMMIT_FRAMES == 0:
-            self._commit()
+            self._do(self._connection.commit)
 
     def stop(self) -> None:
         """Close the file; ValueError when that was done before. Raises OSError."""
@@ -112,19 +115,14 @@ class DatabaseWriter:
             raise ValueError("it is closed")
         self._is_closed = True
         try:
-            self._commit()
+            self._do(self._connection.commit)
         finally:
             self._connection.close()
 
-    def _execute(self, statement: str, *values: object) -> None:
+    def _do(self, work: Callable[..., object], *arguments: object) -> None:
+        """Raises OSError for what the database says."""
         try:
-            self._connection.execute(statement, values)
-        except sqlite3.Error as error:
-            raise OSError(None, str(error)) from error
-
-    def _commit(self) -> None:
-        try:
-            self._connection.commit()
+            work(*arguments)
         except sqlite3.Error as error:
             raise OSError(None, str(error)) from error
 
