@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import errno
+import sqlite3
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import can
 import pytest
@@ -102,6 +103,24 @@ def test_a_database_that_cannot_be_written_any_more_ends_the_recording_and_says_
     writer.stop()
     with pytest.raises(OSError, match="closed database"):
         writer(message_of(SENT, sent=True, at_s=0.0))
+
+
+def test_a_disk_that_fills_up_leaves_what_a_database_held_before_and_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def small(*arguments: Any, **options: Any) -> sqlite3.Connection:
+        connection: sqlite3.Connection = connect(*arguments, **options)
+        connection.execute("PRAGMA max_page_count = 20")
+        return connection
+
+    connect = sqlite3.connect
+    monkeypatch.setattr("flasher.trace.recorder.sqlite3.connect", small)
+    with Recorder(tmp_path / "trace.db") as recorder:
+        for at in range(5_000):
+            recorder(SENT, sent=True, now=at / 1000)
+    monkeypatch.undo()
+    assert recorder.failure == "database or disk is full"
+    assert len(read(tmp_path / "trace.db")) >= 500
 
 
 def test_the_recorded_frames_keep_their_spacing_though_the_wall_clock_jumps(
