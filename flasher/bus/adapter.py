@@ -170,7 +170,7 @@ class CanLink:
             except _FAILURES as error:
                 if not self._is_queue_full(error):
                     raise self._failure("sending", error) from error
-                now = time.monotonic()
+                now = time.perf_counter()
                 if give_up_at is None:
                     give_up_at = now + SEND_LIMIT_S
                 elif now >= give_up_at:
@@ -180,7 +180,7 @@ class CanLink:
             else:
                 self._health.sent += 1
                 sent = frame._replace(data=b"") if frame[3] else frame  # as it comes back
-                self._echoes.sent(sent, time.monotonic())
+                self._echoes.sent(sent, time.perf_counter())
                 return
 
     def receive(self, deadline: float) -> Frame | None:
@@ -190,9 +190,9 @@ class CanLink:
             return waited
         if deadline == AT_ONCE:
             return self._receive_once(0.0)
-        frame = self._receive_once(max(0.0, deadline - time.monotonic()))
+        frame = self._receive_once(max(0.0, deadline - time.perf_counter()))
         # A filtered or foreign frame ends a wait early.
-        while frame is None and (remaining_s := deadline - time.monotonic()) > 0:
+        while frame is None and (remaining_s := deadline - time.perf_counter()) > 0:
             frame = self._receive_once(remaining_s)
         return frame
 
@@ -228,7 +228,7 @@ class CanLink:
         self._waiting.clear()
         self._use(self._open_again())
         self._health.reset()
-        self._echoes.held_up(time.monotonic())
+        self._echoes.held_up(time.perf_counter())
 
     @property
     def is_off(self) -> bool:
@@ -263,7 +263,7 @@ class CanLink:
             message.is_error_frame,
         )
         if can_id in self._echoes.ids:
-            frame = self._echoes.mark(frame, time.monotonic())
+            frame = self._echoes.mark(frame, time.perf_counter())
         # What filters hide was received all the same; what an adapter reports passes them.
         if message.is_error_frame:
             self._health.hear(frame)
@@ -312,7 +312,7 @@ class CanLink:
 def _moment_of(message: can.Message) -> float | None:
     """The kernel's stamp on the monotonic clock, by how long ago it was."""
     age_s = time.time() - message.timestamp
-    return time.monotonic() - age_s if 0.0 <= age_s <= _STAMP_AGE_MAX_S else None
+    return time.perf_counter() - age_s if 0.0 <= age_s <= _STAMP_AGE_MAX_S else None
 
 
 def _is_foreign_datagram(error: Exception) -> bool:

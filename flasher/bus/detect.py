@@ -127,7 +127,7 @@ class Detection:
         self._asks_kernel = SOCKETCAN in names
         others = BUILT_IN | SERIAL_PORTS | {SOCKETCAN}
         self._names = [name for name in names if name not in others]
-        self._ends_at = time.monotonic() + limit_s
+        self._ends_at = time.perf_counter() + limit_s
         self._cancelled: Callable[[], bool] = lambda: False
         self._processes = [self._start(self._names)] if self._names else []
 
@@ -183,11 +183,11 @@ class Detection:
     def _wait_for(self, process: subprocess.Popen[str]) -> tuple[str, bool]:
         """What a process said, and whether it ended by itself; else it is ended."""
         while True:
-            remaining_s = max(self._ends_at - time.monotonic(), 0.01)
+            remaining_s = max(self._ends_at - time.perf_counter(), 0.01)
             try:
                 return process.communicate(timeout=min(remaining_s, _SLICE_S))[0], True
             except subprocess.TimeoutExpired:
-                if time.monotonic() < self._ends_at and not self._cancelled():
+                if time.perf_counter() < self._ends_at and not self._cancelled():
                     continue
             process.kill()
             return process.communicate()[0], False

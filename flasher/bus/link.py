@@ -99,14 +99,14 @@ class StampingLink(Link, Protocol):
 
 
 class MonotonicClock:
-    """The computer's monotonic clock: jumps of the wall clock do not touch it."""
+    """The computer's finest clock, `time.perf_counter`: jumps of the wall clock do not touch it."""
 
     speed: Final = 1.0
-    now = staticmethod(time.monotonic)
+    now = staticmethod(time.perf_counter)
 
     def wait_until(self, moment: float) -> None:
         """Sleep until `moment`."""
-        remaining_s = moment - time.monotonic()
+        remaining_s = moment - time.perf_counter()
         if remaining_s > 0:
             time.sleep(remaining_s)
 
@@ -119,19 +119,19 @@ class PacedClock:
 
     def __init__(self, speed: float = 1.0) -> None:
         self.speed = speed
-        self._origin = time.monotonic()
+        self._origin = time.perf_counter()
 
     def now(self) -> float:
         """Simulated seconds since the clock was made."""
-        return (time.monotonic() - self._origin) * self.speed
+        return (time.perf_counter() - self._origin) * self.speed
 
     def wait_until(self, moment: float) -> None:
         """Sleep until the simulated `moment`."""
         until = self._origin + moment / self.speed
-        remaining_s = until - time.monotonic()
+        remaining_s = until - time.perf_counter()
         if remaining_s > _AWAKE_S:
             time.sleep(remaining_s - _AWAKE_S)
-        while time.monotonic() < until:
+        while time.perf_counter() < until:
             pass
 
 

@@ -118,11 +118,11 @@ def printer_of(config: LabelConfig) -> Send:
 
 
 def send_tcp(address: tuple[str, int], data: bytes, limit_s: float) -> None:
-    until = time.monotonic() + limit_s
+    until = time.perf_counter() + limit_s
     try:
         with socket.create_connection(address, timeout=limit_s) as connection:
             while data:
-                connection.settimeout(max(until - time.monotonic(), 0.001))
+                connection.settimeout(max(until - time.perf_counter(), 0.001))
                 data = data[connection.send(data) :]
             # A printer that is switched off in between resets it: that is seen here.
             connection.shutdown(socket.SHUT_WR)
@@ -134,7 +134,7 @@ def send_tcp(address: tuple[str, int], data: bytes, limit_s: float) -> None:
 
 def write_file(path: Path, data: bytes, limit_s: float) -> None:
     """Append to a file, or write to a device. A device that takes nothing is not waited for."""
-    until = time.monotonic() + limit_s
+    until = time.perf_counter() + limit_s
     flags = os.O_WRONLY | os.O_APPEND | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
     if not path.is_relative_to("/dev"):  # a device that is unplugged must not become a file
         flags |= os.O_CREAT
@@ -142,7 +142,7 @@ def write_file(path: Path, data: bytes, limit_s: float) -> None:
         handle = os.open(path, flags, 0o644)
         try:
             while data:
-                left_s = until - time.monotonic()
+                left_s = until - time.perf_counter()
                 if left_s <= 0 or not (_IS_WINDOWS or select.select([], [handle], [], left_s)[1]):
                     raise _too_slow(limit_s)
                 data = data[os.write(handle, data) :]

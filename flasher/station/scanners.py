@@ -181,7 +181,7 @@ class SerialScanner:
         self._port.timeout = limit_s
         data = self._port.read(1)
         data += self._port.read(self._port.in_waiting) if data else b""
-        now = time.monotonic()
+        now = time.perf_counter()
         for byte in data:
             if byte in _ENDS:
                 self._builder.end(now)

@@ -251,7 +251,7 @@ class Worker:
             self._pipe.send(change)
 
     def _reopen(self) -> None:
-        now = time.monotonic()
+        now = time.perf_counter()
         if now < self._reopen_at:
             self._pipe.look(IDLE_S)
             return
@@ -350,7 +350,7 @@ def worker_main(channel: Channel, setup: WorkerSetup) -> None:
     for name in ("SIGINT", "SIGHUP"):  # Windows has no SIGHUP
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
-    pipe = StationPipe(channel, time.monotonic)
+    pipe = StationPipe(channel, time.perf_counter)
     with suppress(StationGoneError):
         try:
             recipe = load_same(setup)
@@ -369,6 +369,6 @@ def worker_main(channel: Channel, setup: WorkerSetup) -> None:
                 if not is_down:
                     pipe.send(AdapterDown(error.what))
                 is_down = True
-                wait_until = time.monotonic() + _REOPEN_S
-                while time.monotonic() < wait_until and not pipe.is_over:
+                wait_until = time.perf_counter() + _REOPEN_S
+                while time.perf_counter() < wait_until and not pipe.is_over:
                     pipe.look(IDLE_S)

@@ -157,7 +157,7 @@ class Screen:
     """
 
     def __init__(self, tally: Tally, watch: Watch) -> None:
-        self.feed = Feed(time.monotonic, silence_limit_s=SILENCE_LIMIT_S)
+        self.feed = Feed(time.perf_counter, silence_limit_s=SILENCE_LIMIT_S)
         self._tally = tally
         self._watch = watch
         self._turned_at = float("-inf")
@@ -185,7 +185,7 @@ class Screen:
     def turn(self, board: Board, *, operator: str, lot: Lot) -> None:
         """Once in each turn of the station's loop."""
         self.feed.beat()
-        now = time.monotonic()
+        now = time.perf_counter()
         if now - self._turned_at < HEAD_EVERY_S:
             return
         self._turned_at = now

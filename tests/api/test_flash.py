@@ -96,9 +96,9 @@ def test_events_arrive_in_order_while_it_runs() -> None:
 
 
 def test_the_mock_takes_the_time_of_a_real_bus_unless_told_otherwise() -> None:
-    began = time.monotonic()
+    began = time.perf_counter()
     outcome = flasher.flash(IMAGE, "bms", mock=True).outcome
-    assert time.monotonic() - began >= outcome.statistics.duration_s * 0.99
+    assert time.perf_counter() - began >= outcome.statistics.duration_s * 0.99
     assert outcome.statistics.transfer_s is not None
     assert outcome.statistics.transfer_s >= 3 * 0.009
 
@@ -332,8 +332,8 @@ def test_the_adapter_is_closed_when_the_event_handler_fails() -> None:
 @pytest.mark.usefixtures("fake")
 def test_the_clock_of_an_adapter_is_the_monotonic_one() -> None:
     with flasher.connect() as connection:
-        before = time.monotonic()
-        assert before <= connection.clock.now() <= time.monotonic()
+        before = time.perf_counter()
+        assert before <= connection.clock.now() <= time.perf_counter()
         connection.clock.wait_until(before - 1.0)
 
 
@@ -356,12 +356,12 @@ def test_a_babbling_bus_keeps_an_upgrade_neither_from_its_deadline_nor_from_bein
     link = Babbling()
     connection = api.Connection(link, MonotonicClock(), "babbling")
     plan = flasher.make_plan(IMAGE, "bms")
-    began = time.monotonic()
+    began = time.perf_counter()
     outcome = connection.device().upgrade(plan, options=UpgradeOptions(timeout_s=0.1)).outcome
     assert outcome.ending is flasher.Ending.OUT_OF_TIME
     outcome = connection.device().upgrade(plan, cancelled=lambda: True).outcome
     assert outcome.ending is flasher.Ending.CANCELLED
-    assert time.monotonic() - began < 2.0
+    assert time.perf_counter() - began < 2.0
     assert link.received > 10_000
 
 

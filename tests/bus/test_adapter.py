@@ -164,13 +164,13 @@ def test_the_kinds_of_frames_are_told_apart(bus: FakeBus) -> None:
 def test_can_fd_frames_are_no_part_of_this_bus(bus: FakeBus) -> None:
     bus.inbox.extend([message(0x725, bytes(12), is_fd=True), message(0x725, b"\x01")])
     link = CanLink(bus, "fake")
-    assert link.receive(time.monotonic() + 1.0) == Frame(0x725, b"\x01")
+    assert link.receive(time.perf_counter() + 1.0) == Frame(0x725, b"\x01")
 
 
 def test_filters_that_the_back_end_leaves_to_python_can_hold(bus: FakeBus) -> None:
     bus.set_filters([{"can_id": 0x725, "can_mask": 0x7FF, "extended": False}])
     bus.inbox.extend([message(0x123), message(0x725)])
-    assert CanLink(bus, "fake").receive(time.monotonic() + 1.0) == Frame(0x725, b"\x01")
+    assert CanLink(bus, "fake").receive(time.perf_counter() + 1.0) == Frame(0x725, b"\x01")
 
 
 def test_a_receive_error_is_the_adapters_failure(bus: FakeBus) -> None:
@@ -186,9 +186,9 @@ def test_a_jump_of_the_wall_clock_does_not_lengthen_a_receive(
     wall = iter([1000.0] + [-2600.0] * 1000)
     monkeypatch.setattr("can.bus.time", lambda: next(wall))
     link = open_adapter(250_000, interface="virtual", channel=uuid.uuid4().hex)
-    began = time.monotonic()
+    began = time.perf_counter()
     assert link.receive(began + 0.01) is None
-    assert time.monotonic() - began < 1.0
+    assert time.perf_counter() - began < 1.0
     link.close()
 
 
@@ -328,7 +328,7 @@ def test_a_foreign_datagram_on_the_multicast_port_is_passed_over(bus: FakeBus) -
         [can.CanOperationError("could not unpack received message"), message(0x725, b"x")]
     )
     link = CanLink(bus, "udp_multicast")
-    assert link.receive(time.monotonic() + 1.0) == Frame(0x725, b"x")
+    assert link.receive(time.perf_counter() + 1.0) == Frame(0x725, b"x")
 
 
 # -- opening again --------------------------------------------------------------------------------
@@ -486,7 +486,7 @@ def test_error_frames_pass_filters_and_filtered_frames_count_as_received(bus: Fa
     bus.inbox.extend([message(0x123), NO_ACK])
     link = CanLink(bus, "gs_usb")
     link.send(FRAME)
-    frame = link.receive(time.monotonic() + 1.0)
+    frame = link.receive(time.perf_counter() + 1.0)
     assert frame is not None
     assert frame.is_error
     assert not link.health().not_acknowledged

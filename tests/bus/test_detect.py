@@ -37,10 +37,10 @@ COMMAND = (sys.executable, "-S", "-c", CHILD)
 
 
 def test_one_back_end_that_hangs_does_not_hide_the_others() -> None:
-    began = time.monotonic()
+    began = time.perf_counter()
     with Detection(["hangs", "good"], command=COMMAND, limit_s=0.5) as detection:
         detected = detection.collect()
-    assert time.monotonic() - began < 5.0
+    assert time.perf_counter() - began < 5.0
     assert detected.found == [Found("good", "ch0", {"serial": 7})]
     assert detected.hung == ["hangs"]
     assert detection._processes[0][1].returncode is not None
@@ -69,10 +69,10 @@ def test_no_process_is_left_when_nobody_collects() -> None:
 
 
 def test_who_does_not_want_to_wait_gets_what_there_is() -> None:
-    began = time.monotonic()
+    began = time.perf_counter()
     with Detection(["hangs", "good"], command=COMMAND, limit_s=60.0) as detection:
-        detected = detection.collect(lambda: time.monotonic() - began > 0.3)
-    assert time.monotonic() - began < 10.0
+        detected = detection.collect(lambda: time.perf_counter() - began > 0.3)
+    assert time.perf_counter() - began < 10.0
     assert [found.interface for found in detected.found] == ["good"]
 
 

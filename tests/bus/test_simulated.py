@@ -205,10 +205,10 @@ def test_a_paced_bus_takes_the_real_time_divided_by_its_speed() -> None:
     frames = [Frame(0x725, bytes([number % 256] * 8)) for number in range(1000)]
     bus.attach(Talker(*frames))
     link = bus.link()
-    began = time.monotonic()
+    began = time.perf_counter()
     for _ in frames:
         link.receive(clock.now() + 10.0)
-    took_s = time.monotonic() - began
+    took_s = time.perf_counter() - began
     assert took_s >= seconds(*frames) / speed * 0.98
     assert bus.busy_s == pytest.approx(seconds(*frames))
 

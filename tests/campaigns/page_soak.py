@@ -81,15 +81,15 @@ def main() -> int:
             except Exception:  # noqa: BLE001  it is still starting
                 time.sleep(0.1)
         page.evaluate(_LOG)
-        began, looked = time.monotonic(), 0.0
+        began, looked = time.perf_counter(), 0.0
         is_over = False
         while not is_over:
             is_over = station.poll() is not None
             page.wait_for_timeout(500)
             for socket, state, serial in page.evaluate("() => window.shown.splice(0)"):
                 _add(shown, socket, state, serial)
-            if time.monotonic() - looked > 60.0 and not is_over:
-                looked = time.monotonic()
+            if time.perf_counter() - looked > 60.0 and not is_over:
+                looked = time.perf_counter()
                 minutes = (looked - began) / 60
                 mib = f"server {_server_mib(station.pid):.1f} MiB, page {_page_mib(page):.2f} MiB"
                 sys.stdout.write(f"{minutes:.0f} min: {mib}\n")

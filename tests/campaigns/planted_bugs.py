@@ -60,13 +60,13 @@ def plant(bug: str, folder: Path) -> Path:
 def run(name: str, sources: Path, arguments: list[str]) -> Outcome:
     """The suite on a build with sanitizers."""
     make("host", sources / "build", f"DUT={_DUT}", source=sources)
-    began = time.monotonic()
+    began = time.perf_counter()
     command = [sys.executable, "-m", "flasher", "conformance", "-t", "bms", "--json"]
     command += ["--subject", str(sources / "build" / "boot"), "--profile", str(PROFILE), *arguments]
     ran = subprocess.run(
         command, capture_output=True, text=True, timeout=_RUN_MAX_S, check=False, cwd=sources
     )
-    took_s = time.monotonic() - began
+    took_s = time.perf_counter() - began
     report = json.loads(ran.stdout)["report"]
     found = {
         result["id"]: f"{check['expected']}; got {check['got']}"

@@ -111,7 +111,7 @@ class _Bench:
         ports = {bus.fileno(): port for port, bus in self._buses.items()}
         while True:
             ready, _, _ = select.select([sys.stdin.fileno(), *ports], [], [], _LOOK_S)
-            now = time.monotonic()
+            now = time.perf_counter()
             for handle in ready:
                 if handle in ports:
                     self._receive(ports[handle], now)

@@ -116,10 +116,10 @@ class Campaign:
         station = self._open()
         operator = self.operator
         moment = operator.moments + self._random.randint(1, _MOMENTS_MAX)
-        latest = time.monotonic() + _KILL_LIMIT_S
-        operator.work(lambda: operator.moments >= moment or time.monotonic() >= latest)
-        pause_until = time.monotonic() + self._random.choice((0.0, 0.01, 0.05, 0.3))
-        operator.work(lambda: time.monotonic() >= pause_until)
+        latest = time.perf_counter() + _KILL_LIMIT_S
+        operator.work(lambda: operator.moments >= moment or time.perf_counter() >= latest)
+        pause_until = time.perf_counter() + self._random.choice((0.0, 0.01, 0.05, 0.3))
+        operator.work(lambda: time.perf_counter() >= pause_until)
         if not worker:
             self._orphans = station.kill()
             self._left("kills of the station")
@@ -134,8 +134,8 @@ class Campaign:
         """Every unit that is in a socket gets through; then the station ends."""
         station = self._open()
         operator = self.operator
-        latest = time.monotonic() + PEACE_LIMIT_S
-        operator.work(lambda: operator.is_done or time.monotonic() >= latest, bring_units=False)
+        latest = time.perf_counter() + PEACE_LIMIT_S
+        operator.work(lambda: operator.is_done or time.perf_counter() >= latest, bring_units=False)
         self.problems += operator.stuck()
         code = station.stop()
         if code not in (0, 12):  # 12: a run that a kill ended is no PASS
@@ -160,8 +160,8 @@ class Campaign:
     # -- what has to hold -------------------------------------------------------------------------
 
     def _check(self) -> None:
-        give_up_at = time.monotonic() + _WORKERS_END_S
-        while any(map(is_running, self._orphans)) and time.monotonic() < give_up_at:
+        give_up_at = time.perf_counter() + _WORKERS_END_S
+        while any(map(is_running, self._orphans)) and time.perf_counter() < give_up_at:
             time.sleep(0.05)
         left = [pid for pid in self._orphans if is_running(pid)]
         self.problems += [f"process {pid} of a socket outlives its station" for pid in left]
@@ -229,7 +229,7 @@ def main() -> int:
     parser.add_argument("--sockets", type=int, default=2)
     parser.add_argument("--postgres", action="store_true", help="records on a server of its own")
     options = parser.parse_args()
-    began = time.monotonic()
+    began = time.perf_counter()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         os.environ["XDG_DATA_HOME"] = str(folder / "data")  # what a station keeps of its own
@@ -248,7 +248,7 @@ def main() -> int:
             for _ in range(min(KILLS_IN_A_ROW, options.times - made.kills)):
                 made.kill_once(worker=chance.random() < 0.4)
             made.in_peace()
-            at_s = time.monotonic() - began
+            at_s = time.perf_counter() - began
             print(f"{at_s:5.0f} s: {made.kills} kills, {len(made.problems)} problems", flush=True)  # noqa: T201
         for what, count in sorted(made.counts.items()):
             print(f"{what:<40} {count}")  # noqa: T201
@@ -257,7 +257,7 @@ def main() -> int:
             print(f"PROBLEM {problem}")  # noqa: T201
         errors = (folder / "stderr").read_text(errors="replace").strip()
         print("\n".join(dict.fromkeys(errors.splitlines()))[-2000:])  # noqa: T201
-    print(f"{len(made.problems)} problems, {time.monotonic() - began:.0f} s")  # noqa: T201
+    print(f"{len(made.problems)} problems, {time.perf_counter() - began:.0f} s")  # noqa: T201
     return 1 if made.problems else 0
 
 

@@ -169,7 +169,7 @@ class Operator:
         self._is_open = self._stopped = False
         for place in self.places.values():
             place.state, place.serial, place.text, place.tries = "starting", "", "", 0
-            place.changed_at = time.monotonic()
+            place.changed_at = time.perf_counter()
 
     def work(
         self, over: Callable[[], bool], *, bring_units: bool = True, scans: bool = True
@@ -226,7 +226,7 @@ class Operator:
             case "OperatorPrompted" if not _CYCLE.search(event["text"]):
                 self._said.append(event["text"])
             case "LineStopped":
-                self._stopped, self._resume_at = True, time.monotonic() + 1.0
+                self._stopped, self._resume_at = True, time.perf_counter() + 1.0
                 self.counts["line stopped"] += 1
             case "LineResumed":
                 self._stopped = False
@@ -238,7 +238,7 @@ class Operator:
         match event["event"]:
             case "SocketChanged":
                 place.state, place.serial = event["state"], event["serial"]
-                place.text, place.changed_at = event["text"], time.monotonic()
+                place.text, place.changed_at = event["text"], time.perf_counter()
             case "RunStarted":
                 self.shown.append(event)
                 if place.unit != event["serial"]:
@@ -270,7 +270,7 @@ class Operator:
     # -- doing ------------------------------------------------------------------------------------
 
     def _look_after(self, place: Place, over: Callable[[], bool], *, bring_units: bool) -> None:
-        now = time.monotonic()
+        now = time.perf_counter()
         if self._stopped:
             if now >= self._resume_at:
                 self._resume_at = now + 1.0
@@ -294,7 +294,7 @@ class Operator:
     def _take_out(self, place: Place) -> None:
         self.units.out(place.unit)
         self.counts["units passed"] += 1
-        place.unit, place.changed_at = "", time.monotonic()
+        place.unit, place.changed_at = "", time.perf_counter()
 
     def _bring(self, place: Place, over: Callable[[], bool]) -> None:
         """A new unit: into the socket first, or its label first."""
@@ -324,7 +324,7 @@ class Operator:
         return bool(_CARD.search(" ".join(self._said)))
 
     def _put(self, label: str, place: Place) -> None:
-        place.unit, place.changed_at, place.tries = label, time.monotonic(), 0
+        place.unit, place.changed_at, place.tries = label, time.perf_counter(), 0
         self.units.put(label, place.port, self._own[label])
 
     def _scan_unit(self, place: Place, over: Callable[[], bool]) -> None:
@@ -351,13 +351,13 @@ class Operator:
                 self.counts["unit moved, as the station said"] += 1
         if self._answer == "accepted":
             self._see_run(place.unit, place, over)
-        place.changed_at = time.monotonic()
+        place.changed_at = time.perf_counter()
 
     def _see_run(self, label: str, place: Place, over: Callable[[], bool]) -> None:
         """Wait until the run has begun, while the other sockets go on by themselves."""
-        give_up_at = time.monotonic() + _ATTEMPT_S
+        give_up_at = time.perf_counter() + _ATTEMPT_S
         refusals = len(self._said)
-        while time.monotonic() < give_up_at and self._is_there() and not over():
+        while time.perf_counter() < give_up_at and self._is_there() and not over():
             self._read(_TURN_S)
             if len(self._said) > refusals or label in self._passed or self._stopped:
                 return
@@ -375,8 +375,8 @@ class Operator:
         self._said.clear()
         self._answer = ""
         self.station.scan(text)
-        give_up_at = time.monotonic() + _ANSWER_S
-        while not self._answer and time.monotonic() < give_up_at and self._is_there():
+        give_up_at = time.perf_counter() + _ANSWER_S
+        while not self._answer and time.perf_counter() < give_up_at and self._is_there():
             self._read(_TURN_S)
         return self._answer == "accepted"
 

@@ -33,23 +33,23 @@ def start_once(made: Campaign, number: int, chance: random.Random) -> None:
     operator._own[label] = chance.choice(("", label))
     operator._put(label, second)
     station = made._open()
-    pause_until = time.monotonic() + chance.uniform(0.0, 4.0)
-    operator.work(lambda: time.monotonic() >= pause_until, bring_units=False, scans=False)
-    give_up_at = time.monotonic() + _LIMIT_S
-    while label not in operator.passed and time.monotonic() < give_up_at:
+    pause_until = time.perf_counter() + chance.uniform(0.0, 4.0)
+    operator.work(lambda: time.perf_counter() >= pause_until, bring_units=False, scans=False)
+    give_up_at = time.perf_counter() + _LIMIT_S
+    while label not in operator.passed and time.perf_counter() < give_up_at:
         if operator._scan(label):
             if operator._wants_card():
                 operator._scan(f"SOCKET {second.name}")
             operator._see_run(label, second, lambda: False)
             operator.work(
-                lambda: label in operator.passed or time.monotonic() >= give_up_at,
+                lambda: label in operator.passed or time.perf_counter() >= give_up_at,
                 bring_units=False,
                 scans=False,
             )
         else:
             made.counts["refused, and scanned again"] += 1
-            until = time.monotonic() + _AGAIN_S
-            operator.work(lambda until=until: time.monotonic() >= until, scans=False)  # type: ignore[misc]
+            until = time.perf_counter() + _AGAIN_S
+            operator.work(lambda until=until: time.perf_counter() >= until, scans=False)  # type: ignore[misc]
     if label not in operator.passed:
         made.problems.append(f"{label} did not get through: {second.state} {second.text}")
     station.stop()

@@ -48,7 +48,7 @@ class ThreadPort:
 
 
 def _work(channel: Connection[Any, Any], setup: WorkerSetup) -> None:
-    pipe = StationPipe(channel, time.monotonic)
+    pipe = StationPipe(channel, time.perf_counter)
     with suppress(StationGoneError):
         recipe = load_same(setup)
         with open_socket(setup, recipe) as (connection, virtual):

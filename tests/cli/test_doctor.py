@@ -491,9 +491,9 @@ def test_a_line_a_finding_with_its_commands_below() -> None:
 
 
 def test_it_is_over_when_it_has_listened(flasher: Flasher) -> None:
-    began = time.monotonic()
+    began = time.perf_counter()
     flasher("doctor", "--mock", "--listen", "0.1")
-    assert time.monotonic() - began < 5.0
+    assert time.perf_counter() - began < 5.0
 
 
 @each(

@@ -51,11 +51,11 @@ def test_each_sample_is_flashed_to_the_mock(
 
 def test_the_paced_mock_takes_the_time_that_the_plan_says(flasher: Flasher) -> None:
     speed = 20.0
-    began = time.monotonic()
+    began = time.perf_counter()
     run = flasher(
         "flash", SAMPLES / "wmc.hex", "-t", "wmc", "--mock", "--mock-speed", speed, "--json"
     )
-    took_s = (time.monotonic() - began) * speed
+    took_s = (time.perf_counter() - began) * speed
     document = run.document
     transfer_s = document["outcome"]["statistics"]["transfer_s"]
     assert transfer_s >= document["plan"]["wire_s"] * 0.97
@@ -263,12 +263,12 @@ def test_an_adapter_that_cannot_be_opened_is_exit_code_4_and_names_the_fix(
 
 
 def test_a_silent_bus_is_exit_code_5_in_bounded_time(flasher: Flasher) -> None:
-    began = time.monotonic()
+    began = time.perf_counter()
     run = flasher(
         "flash", BMS, "-t", "bms", "-i", "virtual", "-c", uuid.uuid4().hex, "--timeout", "0.2"
     )
     assert run.code == ExitCode.NO_ANSWER
-    assert time.monotonic() - began < 3.0
+    assert time.perf_counter() - began < 3.0
     assert "State of the device: this run erased nothing" in run.err
 
 

@@ -148,9 +148,9 @@ def flashing(
 
 
 def seconds_until_the_end(process: subprocess.Popen[str]) -> tuple[float, str]:
-    began = time.monotonic()
+    began = time.perf_counter()
     _, said = process.communicate()
-    return time.monotonic() - began, said
+    return time.perf_counter() - began, said
 
 
 def told(process: subprocess.Popen[str]) -> Callable[[str], list[str]]:
@@ -188,9 +188,9 @@ def test_ctrl_c_ends_in_no_time_at_any_setting(tmp_path: Path, options: tuple[st
     with flashing(tmp_path, *options, command="rescue") as process:
         told(process)("transferring ...")
         process.send_signal(signal.SIGINT)
-        began = time.monotonic()
+        began = time.perf_counter()
         told(process)("cancelled by the user")
-        took_s = time.monotonic() - began
+        took_s = time.perf_counter() - began
     assert took_s < 1.0  # 0.3 s, and room for a busy computer
 
 

@@ -158,9 +158,9 @@ def test_an_interface_that_goes_down_ends_the_upgrade_and_says_what_is_left(tmp_
         lines_until(host.stderr, "transferring ...")
         mock.wait_for("first of")
         with taken_down("vx0"):
-            began = time.monotonic()
+            began = time.perf_counter()
             _, said = host.communicate()
-            took_s = time.monotonic() - began
+            took_s = time.perf_counter() - began
         assert host.returncode == ExitCode.BUS
         assert "State of the device: its application is erased" in said
         assert "what to do:" in said

@@ -148,8 +148,8 @@ def test_the_server_ends_within_two_seconds_though_a_stream_is_open(
     with served(own_line, closes_feed=False) as url:
         tab.page.goto(f"{url}line")
         expect(tab.page.locator("article")).to_have_count(4)
-        began = time.monotonic()
-    assert time.monotonic() - began < 2.0
+        began = time.perf_counter()
+    assert time.perf_counter() - began < 2.0
 
 
 def test_a_station_that_hangs_and_a_script_that_died_cover_their_pages(

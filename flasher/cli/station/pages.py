@@ -211,7 +211,7 @@ def served(
         hosts=_hosts(address),
         secret=secret,
         signed=hmac.digest(secret.encode(), known.encode(), "sha256").hex(),
-        now=time.monotonic,
+        now=time.perf_counter,
         password=password,
         badges=badges,
         is_tls=tls is not None,

@@ -107,7 +107,7 @@ class Lines(View):
 class Table(View):
     """The board, refreshed in place."""
 
-    def __init__(self, output: Output, now: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, output: Output, now: Callable[[], float] = time.perf_counter) -> None:
         super().__init__(output)
         # No thread refreshes: the station's own turn does. On a screen of its own lines are
         # written over each other, without erasing them first: nothing flickers.

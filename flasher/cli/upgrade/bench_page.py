@@ -304,14 +304,14 @@ def serve(
         answering = AnswerProcesses(partial(Kept, bundle_folder(), backup_folder(), shelf.traces))
         stack.callback(answering.close)
         kind = VirtualBikes if bus.mock else Adapters
-        machine = Bench(kind(bus, output, shelf, stop, memory), time.monotonic)
+        machine = Bench(kind(bus, output, shelf, stop, memory), time.perf_counter)
         page = BenchPage(pages, machine, shelf, is_mock=bus.mock)
         app = application(
             [*page.routes, *answer_routes(pages, answering.ask, KEPT)],
             pages=pages,
             hosts=LOOPBACK,
             secret=secrets.token_urlsafe(32),
-            now=time.monotonic,
+            now=time.perf_counter,
             entry=entry,
             uploads=upload_limit(BODY_MAX),
         )

@@ -72,7 +72,7 @@ class SystemClock:
         return datetime.now(UTC)
 
     def monotonic_s(self) -> float:
-        return time.monotonic()
+        return time.perf_counter()
 
 
 class Store:

@@ -56,10 +56,10 @@ def test_a_locked_database_is_waited_for_and_then_an_error(bench: Bench) -> None
     ending = bench.ending()
     with contextlib.closing(sqlite3.connect(bench.path, isolation_level=None)) as holder:
         holder.execute("BEGIN IMMEDIATE")
-        began = time.monotonic()
+        began = time.perf_counter()
         with pytest.raises(RecordsLockedError, match="RECORD NOT SAVED: another program"):
             bench.store.finish(run_id, ending)
-        assert time.monotonic() - began < 1.0
+        assert time.perf_counter() - began < 1.0
         assert bench.store.read.run(run_id).run.state is RunState.RUNNING  # reading goes on
     bench.store.finish(run_id, ending)
     assert bench.store.read.run(run_id).run.state is RunState.PASS

@@ -82,10 +82,10 @@ def test_a_server_that_is_not_there_or_says_nothing_is_an_error(tmp_path: Path) 
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         url = f"postgresql://jo@127.0.0.1:{port}/records"
-        began = time.monotonic()
+        began = time.perf_counter()
         with pytest.raises(RecordError, match="cannot be reached"):
             Store.open(url, station="x", folder=tmp_path, lock_timeout_s=0.1)
-        assert time.monotonic() - began < 10.0
+        assert time.perf_counter() - began < 10.0
     with pytest.raises(RecordError, match="cannot be reached") as caught:
         Store.open(url, station="x", folder=tmp_path)
     assert "refused" in caught.value.cause
