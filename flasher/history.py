@@ -15,17 +15,19 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from secrets import token_hex
-from typing import Any, Final, TypeVar
+from typing import Any, Final, TypeVar, get_args, get_type_hints
 
 from filelock import FileLock
 from platformdirs import user_data_path
 
+from flasher.errors import UsageError
 from flasher.files import opened
 from flasher.said import say
 
 SIZE_MAX: Final = 2 * 1024 * 1024
 """In bytes: beyond it the older half is dropped, some thousand flashes."""
 _READ_MAX: Final = 2 * SIZE_MAX
+"""In bytes, from the end of the file: other programs may have made it larger."""
 _LOCK_LIMIT_S: Final = 3.0
 _BEGAN: Final = "began"
 _ENDED: Final = "ended"
@@ -131,22 +133,32 @@ class History:
         begun: dict[str, Began] = {}
         ended: dict[str, Ended] = {}
         damaged = 0
-        for line in self._lines():
+        for line in self._lines(_READ_MAX):
             try:
                 found = json.loads(line)
-                if found["event"] == _BEGAN:
-                    begun[found["flash"]] = _made(Began, found)
-                else:
-                    ended[found["flash"]] = _made(Ended, found)
+                name, event = found["flash"], found["event"]
+                if not isinstance(name, str) or not isinstance(event, str):
+                    raise TypeError(name)
+                if event == _BEGAN:
+                    begun[name] = _made(Began, found)
+                elif event == _ENDED:
+                    ended[name] = _made(Ended, found)
             except (ValueError, LookupError, TypeError, RecursionError):
                 damaged += 1
         return [Flash(each, ended.get(name)) for name, each in begun.items()], damaged
 
-    def _lines(self) -> list[bytes]:
-        if not self.path.exists():
-            return []
-        with opened(self.path, _READ_MAX, what="history", may_grow=True) as (file, size):
-            return file.read(size).splitlines()
+    def _lines(self, max_size: int) -> list[bytes]:
+        """The lines in the last `max_size` bytes."""
+        try:
+            with opened(self.path, None, what="history", may_grow=True) as (file, size):
+                file.seek(max(0, size - max_size))
+                lines = file.read(max_size).splitlines()
+        except UsageError as error:
+            if isinstance(error.__cause__, FileNotFoundError):
+                return []
+            error.remedy = "Move it away, or make it readable for this user."
+            raise
+        return lines if size <= max_size else lines[1:]
 
     def _add(self, line: dict[str, Any]) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -163,11 +175,11 @@ class History:
                 os.fsync(descriptor)
 
     def _drop_older_half(self) -> None:
-        lines = self._lines()
+        lines = self._lines(SIZE_MAX // 2)
         part = self.path.with_name(f".{self.path.name}-{token_hex(4)}.part")
         try:
             with open(part, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
-                file.writelines(b"%s\n" % each for each in lines[len(lines) // 2 :])
+                file.writelines(b"%s\n" % each for each in lines)
             part.replace(self.path)
         except BaseException:
             with contextlib.suppress(OSError):
@@ -191,8 +203,9 @@ def _made(kind: type[T], found: dict[str, Any]) -> T:
         for each in dataclasses.fields(kind)
         if each.default is dataclasses.MISSING or each.name in found
     }
+    types = get_type_hints(kind)
     for name, value in values.items():
-        if not isinstance(value, str | int | None):
+        if type(value) not in (get_args(types[name]) or (types[name],)):
             raise TypeError(name)
     return kind(**values)
 

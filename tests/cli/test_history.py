@@ -208,6 +208,79 @@ def test_what_stands_in_it_is_shown_escaped(flasher: Flasher) -> None:
     assert "\\x1b[2J.hex" in out
 
 
+def line_of(**changes: object) -> bytes:
+    """A flash that began, with these values in place of good ones."""
+    values = {"flash": "x", "event": "began", **vars(BEGAN), **changes}
+    return json.dumps(values).encode() + b"\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "shown", "damaged"),
+    [
+        pytest.param(b"", 0, 0, id="empty"),
+        pytest.param(bytes(range(256)) * 4_000, 0, 4_000 * 2 + 1, id="binary"),
+        pytest.param(b"\0" * 10_000_000, 0, 0, id="zeros, larger than what is read"),
+        pytest.param((b"x" * 99 + b"\n") * 60_000 + line_of(), 1, None, id="huge, with a flash at its end"),
+        pytest.param(b"[" * 3_000_000, 0, 1, id="nested"),
+        pytest.param(b"\r\n\n" + line_of() + b"\r\n", 1, None, id="blank lines"),
+        pytest.param(b"1" * 5_000 + b"\n\xef\xbb\xbf{}", 0, 2, id="a long number, a byte order mark"),
+        pytest.param(line_of(at=1), 0, 1, id="a number for a text"),
+        pytest.param(line_of(image_size_bytes="3"), 0, 1, id="a text for a number"),
+        pytest.param(line_of(image_size_bytes=True), 0, 1, id="true for a number"),
+        pytest.param(line_of(target=None), 0, 1, id="null for a text"),
+        pytest.param(line_of(waived=["size"]), 0, 1, id="a list for a text"),
+        pytest.param(line_of(flash=["x"]), 0, 1, id="a list for its name"),
+        pytest.param(line_of(event=None), 0, 1, id="null for its event"),
+        pytest.param(line_of(event="paused"), 0, 0, id="an event of a newer flasher"),
+        pytest.param(line_of(image="\ud800\x1b[2J\n"), 1, 0, id="half a character"),
+        pytest.param(
+            line_of() + line_of(event="ended", exit_code="0"), 1, 1, id="a text for an exit code"
+        ),
+    ],
+)  # fmt: skip
+def test_whatever_is_in_the_file_is_survived(
+    flasher: Flasher, file: Path, content: bytes, shown: int, damaged: int | None
+) -> None:
+    file.parent.mkdir(parents=True)
+    file.write_bytes(content)
+    assert flasher("history").code == ExitCode.OK
+    document = flasher("history", "--json").document
+    assert document["total"] == shown
+    assert damaged is None or document["damaged_lines"] == damaged
+    kept = History()
+    kept.end(kept.begin(BEGAN), ENDED)
+    assert flasher("history", "--json").document["flashes"][0]["ended"]["exit_code"] == 0
+    assert file.stat().st_size <= history.SIZE_MAX + 10_000
+
+
+def a_directory(file: Path) -> None:
+    file.mkdir(parents=True)
+
+
+def a_link_to_itself(file: Path) -> None:
+    file.parent.mkdir(parents=True)
+    file.symlink_to(file)
+
+
+@pytest.mark.parametrize("make", [a_directory, a_link_to_itself])
+def test_what_is_no_file_is_refused_in_one_sentence(
+    flasher: Flasher, file: Path, make: Callable[[Path], None]
+) -> None:
+    make(file)
+    run = flasher("history")
+    assert run.code == ExitCode.USAGE
+    assert "Move it away" in run.err
+    run = flasher("flash", WMC, "-t", "wmc", *MOCK)
+    assert run.code == ExitCode.OK
+    assert "warning: no history in" in run.err
+
+
+def test_a_link_that_leads_nowhere_is_an_empty_history(flasher: Flasher, file: Path) -> None:
+    file.parent.mkdir(parents=True)
+    file.symlink_to("nowhere.jsonl")
+    assert flasher("history").out == "nothing flashed yet\n"
+
+
 def test_a_pipe_in_its_place_is_not_waited_for(flasher: Flasher, file: Path) -> None:
     file.parent.mkdir(parents=True)
     os.mkfifo(file)
