@@ -19,7 +19,7 @@ from typing import Any, Final, NoReturn
 import can
 
 from flasher.bus.bit_rate import BitRate, bit_rate
-from flasher.bus.echoes import Echoes
+from flasher.bus.echoes import FLAGGED_SENDER, Echoes, Sender
 from flasher.bus.fallback import Fallback
 from flasher.bus.health import (
     LAYOUTS,
@@ -94,7 +94,14 @@ def open_adapter(
     channel = str(merged.get("channel") or "")
     give_back = hold(merged, holder)
     try:
-        link = CanLink(open_bus(settled), interface, channel, open_again, give_back)
+        link = CanLink(
+            open_bus(settled),
+            interface,
+            channel,
+            open_again,
+            give_back,
+            gives_own=interface != "socketcan" or bool(merged.get("receive_own_messages")),
+        )
     except BaseException:
         give_back()
         raise
@@ -112,6 +119,8 @@ class CanLink:
         channel: str = "",
         open_again: Callable[[], can.BusABC] | None = None,
         give_back: Callable[[], None] = lambda: None,
+        *,
+        gives_own: bool = True,
     ) -> None:
         self._give_back = give_back
         self._interface = interface
@@ -126,7 +135,8 @@ class CanLink:
         self.received_at: float | None = None
         """Of the frame that `receive` returned last (`StampingLink`)."""
         self._health = HealthKeeper(LAYOUTS.get(interface, Layout.UNKNOWN))
-        self._echoes = Echoes()
+        sender = FLAGGED_SENDER.get(interface, Sender.UNKNOWN)
+        self._echoes = Echoes(sender, gives_own=gives_own)
         self._send_options: dict[str, float] = {}
         if interface == "slcan":
             # The serial port would block for ever; elsewhere the option costs time or is ignored.
@@ -180,7 +190,7 @@ class CanLink:
             else:
                 self._health.sent += 1
                 sent = frame._replace(data=b"") if frame[3] else frame  # as it comes back
-                self._echoes.sent(sent, time.perf_counter())
+                self._echoes.sent(sent)
                 return
 
     def receive(self, deadline: float) -> Frame | None:
@@ -228,7 +238,7 @@ class CanLink:
         self._waiting.clear()
         self._use(self._open_again())
         self._health.reset()
-        self._echoes.held_up(time.perf_counter())
+        self._echoes.reopened()
 
     @property
     def is_off(self) -> bool:
@@ -263,7 +273,7 @@ class CanLink:
             message.is_error_frame,
         )
         if can_id in self._echoes.ids:
-            frame = self._echoes.mark(frame, time.perf_counter())
+            frame = self._echoes.mark(frame, message.timestamp, is_rx=message.is_rx)
         # What filters hide was received all the same; what an adapter reports passes them.
         if message.is_error_frame:
             self._health.hear(frame)

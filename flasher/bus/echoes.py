@@ -1,56 +1,102 @@
-"""Frames that come back: some adapters deliver what they were given to send, when it has left.
+"""Own frames that come back: recognises the echoes that an adapter gives of what it sent.
 
-A link marks them once, as `Frame.is_echo`; nobody else has to know them again. An adapter that
-gives none, not all, or some of them twice (a network with two ways, a driver's own) is fine.
+A link marks them once, as `Frame.is_echo`, and nothing else has to recognise them again. How late
+an echo is read proves nothing: this computer may have stalled meanwhile. An echo is recognised by
+the back end's own flag where that means this handle, else by content and order. Echoes may be
+missing, a few frames out of order, or come twice (a network with two ways).
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
+from enum import Enum
 from typing import Final
 
 from flasher.protocol.frame import Frame
 
-ECHO_LIMIT_S: Final = 0.5
-"""An echo comes when the frame has left: within the time that an adapter's queue takes to drain."""
 ECHO_FRAMES: Final = 1024
-"""Frames that may be on their way at once: more than a full bus carries in that time."""
+"""Frames that may be on their way at once: 57 packets, of which the host sends one at a time."""
+REORDER_FRAMES: Final = 64
+"""How far an echo may be behind a later one: three packets and a half."""
 DOUBLE_LIMIT_S: Final = 0.1
-"""A second copy of an echo comes right behind it."""
+"""A second copy of an echo bears a time stamp at most this much later."""
+
+
+class Sender(Enum):
+    """Who sent a frame that python-can flags as transmitted (`is_rx` False)."""
+
+    THIS_HANDLE = "this handle"
+    THIS_COMPUTER = "any program on this computer"
+    UNKNOWN = "not documented, or the flag is never set"
+
+
+FLAGGED_SENDER: Final[Mapping[str, Sender]] = {
+    "cantact": Sender.THIS_HANDLE,  # the frame's loopback flag; the USB device has one user
+    "gs_usb": Sender.THIS_HANDLE,  # the frame's echo id; the USB device has one user
+    "virtual": Sender.THIS_HANDLE,  # compares the queues
+    "socketcan": Sender.THIS_COMPUTER,  # MSG_DONTROUTE; MSG_CONFIRM would be this socket
+    "etas": Sender.UNKNOWN,  # self-reception of a controller that programs may share
+    "kvaser": Sender.UNKNOWN,  # acknowledgement of another local handle's frame
+    "neovi": Sender.UNKNOWN,  # sent by the device, whichever program asked for it
+    "nixnet": Sender.UNKNOWN,  # sent by the interface, whichever session asked for it
+    "pcan": Sender.UNKNOWN,  # several programs may share a channel
+    "vector": Sender.UNKNOWN,  # several programs may share a channel
+}
+"""For each interface of python-can 4.6 that sets the flag at all."""
 
 
 class Echoes:
-    """Remembers what was sent through a link, and marks it when it comes back."""
+    """Remembers what was sent through a link, and marks it when it comes back.
 
-    def __init__(self) -> None:
+    `gives_own` is False where the handle is known to receive nothing of what it sends itself (a
+    SocketCAN socket unless asked to): what looks like an echo there has another sender.
+    """
+
+    def __init__(self, flagged: Sender = Sender.UNKNOWN, *, gives_own: bool = True) -> None:
         self.ids: set[int] = set()
         """CAN ids that were sent on."""
-        self._sent: deque[tuple[float, Frame]] = deque(maxlen=ECHO_FRAMES)
-        self._echoed: deque[tuple[float, Frame]] = deque(maxlen=ECHO_FRAMES)
+        self._flagged = flagged
+        self._gives_own = gives_own
+        self._expected: deque[Frame] = deque(maxlen=ECHO_FRAMES)
+        """Frames whose echo has not been seen, oldest first."""
+        self._unreturned: deque[Frame] = deque(maxlen=ECHO_FRAMES)
+        """Frames that this handle sent and is not going to receive."""
+        self._echoed: deque[tuple[float, Frame]] = deque(maxlen=REORDER_FRAMES)
 
-    def sent(self, frame: Frame, now: float) -> None:
-        """A frame was handed to the adapter, at `now` in seconds."""
-        self._sent.append((now, frame))
+    def sent(self, frame: Frame) -> None:
+        """Note a frame that was handed to the adapter."""
+        (self._expected if self._gives_own else self._unreturned).append(frame)
         self.ids.add(frame[0])
 
-    def held_up(self, now: float) -> None:
-        """The adapter was off the bus: what waited in its queue leaves only from `now` on."""
-        self._sent = deque(((now, frame) for _, frame in self._sent), maxlen=ECHO_FRAMES)
+    def reopened(self) -> None:
+        """Note that the link has a new handle: frames that a driver's queue still held are sent
+        later, and the new handle receives them.
+        """
+        self._expected.extend(self._unreturned)
+        self._unreturned.clear()
 
-    def mark(self, frame: Frame, now: float) -> Frame:
-        """A received frame, marked when it is the echo of a sent one, which is forgotten then, or a
-        second copy of such an echo.
+    def mark(self, frame: Frame, stamp_s: float, *, is_rx: bool) -> Frame:
+        """Return a received frame, marked if it is the echo of a sent frame or a second copy.
+
+        `stamp_s` is the frame's time stamp in seconds on the adapter's own clock, `is_rx` the back
+        end's flag.
         """
         if frame[0] not in self.ids:
             return frame
-        sent = self._sent
-        while sent and now - sent[0][0] > ECHO_LIMIT_S:
-            sent.popleft()
-        for index, (_, own) in enumerate(sent):
+        if self._flagged is Sender.THIS_HANDLE:
+            return frame if is_rx else frame._replace(is_echo=True)
+        if is_rx and self._flagged is Sender.THIS_COMPUTER:
+            return frame
+        expected = self._expected
+        for index, own in enumerate(expected):
             if own == frame:
-                del sent[index]
-                self._echoed.append((now, frame))
+                del expected[index]
+                for _ in range(index - REORDER_FRAMES):
+                    expected.popleft()  # its echo was lost
+                self._echoed.append((stamp_s, frame))
                 return frame._replace(is_echo=True)
-        if any(own == frame and now - at <= DOUBLE_LIMIT_S for at, own in self._echoed):
-            return frame._replace(is_echo=True)
+        for first_s, own in self._echoed:
+            if own == frame and 0 <= stamp_s - first_s <= DOUBLE_LIMIT_S:
+                return frame._replace(is_echo=True)
         return frame
