@@ -136,13 +136,10 @@ class History:
         for line in self._lines(_READ_MAX):
             try:
                 found = json.loads(line)
-                name, event = found["flash"], found["event"]
-                if not isinstance(name, str) or not isinstance(event, str):
-                    raise TypeError(name)
-                if event == _BEGAN:
-                    begun[name] = _made(Began, found)
-                elif event == _ENDED:
-                    ended[name] = _made(Ended, found)
+                if found["event"] == _BEGAN:
+                    begun[found["flash"]] = _made(Began, found)
+                elif found["event"] == _ENDED:
+                    ended[found["flash"]] = _made(Ended, found)
             except (ValueError, LookupError, TypeError, RecursionError):
                 damaged += 1
         return [Flash(each, ended.get(name)) for name, each in begun.items()], damaged
