@@ -8,33 +8,45 @@ default (a wrong one disturbs a live bus), a full transmit queue is waited for (
 from __future__ import annotations
 
 import contextlib
-import errno
 import platform
-import re
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any, Final, NoReturn
 
 import can
 
+from flasher.bus.back_ends import (
+    SERIAL_PORTS,
+    SILENT_WHEN_GONE,
+    TAKES_SEND_TIMEOUT,
+    Meaning,
+    causes,
+    is_foreign_datagram,
+    meaning_in_receiving,
+    meaning_in_sending,
+    words_of,
+)
 from flasher.bus.bit_rate import BitRate, bit_rate
 from flasher.bus.echoes import FLAGGED_SENDER, Echoes, Sender
 from flasher.bus.fallback import Fallback
 from flasher.bus.health import (
     LAYOUTS,
+    BusTrouble,
     ControllerState,
     HealthKeeper,
     Layout,
     LinkHealth,
     bus_off_error,
+    unreadable_error,
 )
 from flasher.bus.inspect_interface import Interface, read_interface
 from flasher.bus.link import AT_ONCE, SEND_LIMIT_S
 from flasher.bus.lock import hold
-from flasher.bus.opening import bus_config, open_bus, words_of
+from flasher.bus.opening import bus_config, open_bus
 from flasher.errors import BusError, ErrorCode, TransmitBlockedError
-from flasher.protocol.frame import Frame
+from flasher.protocol.frame import EXTENDED_ID_MAX, STANDARD_ID_MAX, Frame
+from flasher.protocol.spec import FRAME_DATA_SIZE
 
 _FULL_QUEUE_PAUSE_S: Final = 0.0005
 """Between two tries on a full queue: about one frame on the wire. Frames are received meanwhile."""
@@ -43,21 +55,13 @@ _KERNEL_STAMPS: Final = frozenset({"socketcan", "udp_multicast"})
 """Back ends whose messages bear the time at which Linux had them, by the wall clock."""
 _STAMP_AGE_MAX_S: Final = 1.0
 """A frame that seems to have waited for longer: rather the wall clock was set meanwhile."""
-_FAILURES: Final = (can.CanError, OSError)
-
-_QUEUE_FULL_CODES: Final[Mapping[str, frozenset[int]]] = {
-    "socketcan": frozenset({errno.ENOBUFS, errno.EAGAIN}),
-    "kvaser": frozenset({-13}),  # canERR_TXBUFOFL
-    "vector": frozenset({11}),  # XL_ERR_QUEUE_IS_FULL
-    "systec": frozenset({0x01, 0x80}),  # CANERR_XMTFULL, CANERR_QXMTFULL
-}
-"""Error codes of back ends that hand on the driver's code."""
-_QUEUE_FULL_TEXT: Final = re.compile(
-    r"(transmit|send|tx|xmt)[ _-]?(queue|buffer|fifo)?.*\b(full|overflow)|TXQUEUE_FULL|XMTFULL",
-    re.IGNORECASE,
-)
-"""What the others say in words (PCAN, IXXAT, and SocketCAN's own "Transmit buffer full")."""
-_BUS_OFF_TEXT: Final = re.compile(r"bus[ _-]?off", re.IGNORECASE)
+_UNREADABLE_LIMIT: Final = 100
+"""So many times in a row nothing could be read: rather the adapter is broken than its line."""
+_WAIT_MIN_S: Final = 0.02
+"""A shorter wait may end early by rounding."""
+_HASTE_LIMIT_S: Final = 0.25
+_HASTE_LIMIT: Final = 100
+"""For so long, and so often, a back end returned nothing without waiting for it."""
 _PCAN_BUS_OFF: Final = 0x00010
 _PCAN_PASSIVE: Final = 0x40000
 _PCAN_WARNING: Final = 0x00004 | 0x00008
@@ -137,15 +141,23 @@ class CanLink:
         self._health = HealthKeeper(LAYOUTS.get(interface, Layout.UNKNOWN))
         sender = FLAGGED_SENDER.get(interface, Sender.UNKNOWN)
         self._echoes = Echoes(sender, gives_own=gives_own)
-        self._send_options: dict[str, float] = {}
-        if interface == "slcan":
-            # The serial port would block for ever; elsewhere the option costs time or is ignored.
-            self._send_options["timeout"] = SEND_LIMIT_S
+        takes_timeout = interface in TAKES_SEND_TIMEOUT
+        self._send_options = {"timeout": SEND_LIMIT_S} if takes_timeout else {}
         self._use(bus)
 
     def _use(self, bus: can.BusABC | None) -> None:
         """Send to and receive from this bus; None while there is none."""
         self._bus = bus
+        self._port: Any = getattr(bus, SERIAL_PORTS.get(self._interface, ""), None)
+        """The serial port that a back end works on, if it does."""
+        if self._port is not None and not self._send_options:
+            self._port.write_timeout = SEND_LIMIT_S  # a full port would block for ever
+        self._unreadable_in_a_row = 0
+        self._hasty = 0
+        """Waits in a row that a back end has ended at once, with nothing."""
+        self._hasty_since = 0.0
+        self._was_passed_over = False
+        """The last receive has consumed something that is no frame for the caller."""
         self._send_raw: Callable[..., None] = _no_bus if bus is None else bus.send
         # recv() measures its timeout by the wall clock, so that a jump of it can hang the call;
         # what it wraps does not. No filters are set that would need the wrapper, unless the back
@@ -177,15 +189,18 @@ class CanLink:
             message = _message_of(frame)
             try:
                 self._send_raw(message, **self._send_options)
-            except _FAILURES as error:
-                if not self._is_queue_full(error):
-                    raise self._failure("sending", error) from error
+            except MemoryError:
+                raise
+            except Exception as error:
+                meaning = meaning_in_sending(error, self._interface)
+                if meaning is not Meaning.QUEUE_FULL:
+                    raise self._failure("sending", error, meaning) from error
                 now = time.perf_counter()
-                if give_up_at is None:
-                    give_up_at = now + SEND_LIMIT_S
-                elif now >= give_up_at:
+                has_waited = self._send_options or self._port is not None
+                if has_waited or (give_up_at is not None and now >= give_up_at):
                     self._health.is_blocked = True
                     raise self._blocked(error) from error
+                give_up_at = give_up_at or now + SEND_LIMIT_S
                 self._pause()
             else:
                 self._health.sent += 1
@@ -199,7 +214,10 @@ class CanLink:
             waited, self.received_at = self._waiting.popleft()
             return waited
         if deadline == AT_ONCE:
-            return self._receive_once(0.0)
+            frame = self._receive_once(0.0)
+            while frame is None and self._is_more_waiting():
+                frame = self._receive_once(0.0)
+            return frame
         frame = self._receive_once(max(0.0, deadline - time.perf_counter()))
         # A filtered or foreign frame ends a wait early.
         while frame is None and (remaining_s := deadline - time.perf_counter()) > 0:
@@ -210,7 +228,7 @@ class CanLink:
         """Throw away what is waiting, bounded on a babbling bus."""
         count = len(self._waiting)
         self._waiting.clear()
-        while count < _DRAIN_FRAMES and self._receive_once(0.0) is not None:
+        while count < _DRAIN_FRAMES and self.receive(AT_ONCE) is not None:
             count += 1
         return count
 
@@ -221,8 +239,13 @@ class CanLink:
 
     def _shut_down(self) -> None:
         if self._bus is not None:
-            with contextlib.suppress(*_FAILURES):
+            with contextlib.suppress(Exception):
                 self._bus.shutdown()
+        if self._port is not None:
+            # A back end that fails leaves it open, and Linux gives the adapter that is plugged in
+            # again another name then.
+            with contextlib.suppress(Exception):
+                self._port.close()
 
     def reopen(self) -> None:
         """Close the adapter and open it again as it was. Raises BusError while it is not back.
@@ -253,26 +276,36 @@ class CanLink:
                 return self._health.health(seen.state, seen.tx_errors, seen.rx_errors)
         return self._health.health(_asked_state(self._bus, self._interface))
 
+    def _is_more_waiting(self) -> bool:
+        """True when a receive that returned no frame does not mean that none is waiting."""
+        if self._was_passed_over or self._port is None:
+            return self._was_passed_over
+        try:  # a serial back end returns for each line, whatever it is
+            return bool(self._port.in_waiting)
+        except Exception:  # noqa: BLE001  the next receive reports what is wrong with the port
+            return False
+
     def _receive_once(self, timeout_s: float) -> Frame | None:
+        began = time.perf_counter() if self._interface in SILENT_WHEN_GONE else 0.0
         try:
             message, filtered = self._receive_raw(timeout_s)
-        except _FAILURES as error:
-            if _is_foreign_datagram(error):
-                return None
-            raise self._failure("receiving", error) from error
-        if message is None or message.is_fd:
+            frame = None if message is None or message.is_fd else _frame_of(message)
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001  a back end may raise anything
+            self._judge(error)
             return None
+        self._was_passed_over = message is not None
+        if message is None:
+            if began:
+                self._check_haste(began, timeout_s)
+            return None
+        if frame is None:
+            return None
+        self._unreadable_in_a_row = self._hasty = 0
         if self.stamp_source:
             self.received_at = _moment_of(message)
-        can_id = message.arbitration_id
-        frame = Frame(
-            can_id,
-            bytes(message.data),
-            message.is_extended_id,
-            message.is_remote_frame,
-            message.is_error_frame,
-        )
-        if can_id in self._echoes.ids:
+        if frame[0] in self._echoes.ids:
             frame = self._echoes.mark(frame, message.timestamp, is_rx=message.is_rx)
         # What filters hide was received all the same; what an adapter reports passes them.
         if message.is_error_frame:
@@ -284,23 +317,55 @@ class CanLink:
         is_wanted = self._bus._matches_filters(message)  # noqa: SLF001  as recv() does
         return frame if is_wanted else None
 
+    def _judge(self, error: Exception) -> None:
+        """Return if the adapter works on after this error in receiving, else raise BusError."""
+        meaning = meaning_in_receiving(error, self._interface)
+        self._was_passed_over = meaning is Meaning.UNREADABLE
+        if isinstance(meaning, BusTrouble):
+            self._health.report(meaning)
+        elif meaning is Meaning.UNREADABLE:
+            self._health.add_unreadable(words_of(error))
+            if is_foreign_datagram(error):
+                return
+            self._unreadable_in_a_row += 1
+            if self._unreadable_in_a_row > _UNREADABLE_LIMIT:
+                raise self._failure("receiving", error, meaning) from error
+            if any(isinstance(each, UnicodeDecodeError) for each in causes(error)):
+                # slcan keeps a line that is no text, and trips over it again.
+                with contextlib.suppress(Exception):
+                    self._bus.flush()  # type: ignore[union-attr]
+        else:
+            raise self._failure("receiving", error, meaning) from error
+
+    def _check_haste(self, began: float, timeout_s: float) -> None:
+        """Raise BusError when a back end has kept returning nothing without waiting for it."""
+        now = time.perf_counter()
+        if timeout_s < _WAIT_MIN_S:
+            return
+        if now - began > timeout_s / 2:
+            self._hasty = 0
+            return
+        if not self._hasty:
+            self._hasty_since = began
+        self._hasty += 1
+        if self._hasty > _HASTE_LIMIT and now - self._hasty_since > _HASTE_LIMIT_S:
+            gone = can.CanOperationError("it returns at once, with nothing")
+            raise self._failure("receiving", gone, Meaning.LOST)
+
     def _pause(self) -> None:
         """Wait for room in the transmit queue, and lose nothing that arrives meanwhile."""
         frame = self._receive_once(_FULL_QUEUE_PAUSE_S)
         if frame is not None:
             self._waiting.append((frame, self.received_at))
 
-    def _is_queue_full(self, error: Exception) -> bool:
-        code = getattr(error, "error_code", None)
-        if code is not None and code in _QUEUE_FULL_CODES.get(self._interface, ()):
-            return True
-        return _QUEUE_FULL_TEXT.search(str(error)) is not None
-
-    def _failure(self, doing: str, error: Exception) -> BusError:
+    def _failure(self, doing: str, error: Exception, meaning: Meaning) -> BusError:
         what = f"The adapter failed while {doing}: {words_of(error)}."
-        if _BUS_OFF_TEXT.search(str(error)):
+        if meaning is Meaning.BUS_OFF:
             self._health.state = ControllerState.BUS_OFF
             return bus_off_error(str(self), what)
+        if meaning is Meaning.UNREADABLE:
+            how_often = f"{self._unreadable_in_a_row} times in a row"
+            return unreadable_error(str(self), how_often, words_of(error))
         return BusError(
             what,
             where=str(self),
@@ -323,11 +388,6 @@ def _moment_of(message: can.Message) -> float | None:
     """The kernel's stamp on the monotonic clock, by how long ago it was."""
     age_s = time.time() - message.timestamp
     return time.perf_counter() - age_s if 0.0 <= age_s <= _STAMP_AGE_MAX_S else None
-
-
-def _is_foreign_datagram(error: Exception) -> bool:
-    """Something else than a CAN frame on udp_multicast's port, which anybody may send to."""
-    return "could not unpack" in str(error)
 
 
 def _no_bus(*_arguments: object, **_options: object) -> NoReturn:
@@ -355,6 +415,23 @@ def _pcan_state(status: int) -> ControllerState:
     if status & _PCAN_PASSIVE:
         return ControllerState.PASSIVE
     return ControllerState.UNKNOWN if status & ~_PCAN_WARNING else ControllerState.ACTIVE
+
+
+def _frame_of(message: can.Message) -> Frame:
+    """The frame that a message is; it may have more data than it says. Raises whatever a message
+    leads to that is none: of a damaged line slcan makes ids and lengths that no frame has.
+    """
+    can_id, is_extended, data = message.arbitration_id, message.is_extended_id, message.data
+    if message.is_error_frame:
+        return Frame(can_id, bytes(data), is_extended, message.is_remote_frame, is_error=True)
+    if not 0 <= can_id <= (EXTENDED_ID_MAX if is_extended else STANDARD_ID_MAX):
+        raise ValueError(f"no frame has the id 0x{can_id:X}")
+    if message.is_remote_frame:
+        return Frame(can_id, b"", is_extended, is_remote=True)
+    size = min(message.dlc, FRAME_DATA_SIZE)
+    if len(data) < size:
+        raise ValueError(f"a frame of {size} bytes has only {len(data)}")
+    return Frame(can_id, bytes(data[:size]), is_extended)
 
 
 def _message_of(frame: Frame) -> can.Message:

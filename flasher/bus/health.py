@@ -200,6 +200,10 @@ class LinkHealth:
     not_acknowledged: bool
     """True when frames were sent, nothing at all was ever received, and error frames, the state or
     the full queue say that nobody acknowledges."""
+    unreadable: int
+    """What the adapter delivered and no frame could be made of, over all its reopenings."""
+    last_unreadable: str
+    """What was wrong with the last of it, in words."""
 
     def error(self, where: str = "") -> BusError | None:
         """The adapter's or the bus's failure that this health shows; None when it shows none."""
@@ -215,6 +219,8 @@ class LinkHealth:
                 remedy="Check power, wiring and bit rate; flasher doctor looks at the adapter.",
                 code=ErrorCode.NOBODY_ACKNOWLEDGES,
             )
+        if self.unreadable and not self.frames_received:
+            return unreadable_error(where, f"{self.unreadable} times so far", self.last_unreadable)
         return None
 
     @property
@@ -237,15 +243,28 @@ def bus_off_error(where: str, what: str = "The adapter has left the bus.") -> Bu
     )
 
 
+def unreadable_error(where: str, how_often: str, words: str) -> BusError:
+    """The error for an adapter of which nothing can be read."""
+    return BusError(
+        f"Nothing that the adapter delivers can be read, {how_often}: {words}.",
+        where=where,
+        cause="its serial speed is another one, or its cable or plug is bad",
+        remedy="Try another cable; for slcan, `--bus-kwargs tty_baudrate=...` sets the speed.",
+        code=ErrorCode.ADAPTER_LOST,
+    )
+
+
 class HealthKeeper:
     """Counts for one link and remembers the troubles that it was told of."""
 
     def __init__(self, layout: Layout = Layout.UNKNOWN) -> None:
         self._layout = layout
+        self._unreadable = 0
+        self._last_unreadable = ""
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything: the adapter was opened anew."""
+        """Forget everything but what was unreadable: the adapter was opened anew."""
         self.sent = 0
         self.received = 0
         self.error_frames = 0
@@ -261,8 +280,17 @@ class HealthKeeper:
         if not frame.is_error:
             self.received += 1
             return
+        self.report(decode_error_frame(frame, self._layout))
+
+    def add_unreadable(self, words: str) -> None:
+        """The adapter delivered something that is no frame."""
+        self._unreadable += 1
+        self._last_unreadable = words
+
+    def report(self, trouble: BusTrouble) -> None:
+        """The controller reported trouble, by an error frame or otherwise."""
         self.error_frames += 1
-        trouble = self._last = decode_error_frame(frame, self._layout)
+        self._last = trouble
         if trouble.tx_errors is not None:
             self._tx_errors, self._rx_errors = trouble.tx_errors, trouble.rx_errors
         if TroubleKind.NOT_ACKNOWLEDGED in trouble.kinds:
@@ -297,5 +325,9 @@ class HealthKeeper:
             error_frames=self.error_frames,
             is_blocked=self.is_blocked,
             last_trouble=self._last,
-            not_acknowledged=bool(self.sent) and not self.received and says_so,
+            not_acknowledged=bool(self.sent)
+            and not (self.received or self._unreadable)
+            and says_so,
+            unreadable=self._unreadable,
+            last_unreadable=self._last_unreadable,
         )

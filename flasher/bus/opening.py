@@ -11,6 +11,7 @@ from typing import Any, Final
 import can
 import can.util
 
+from flasher.bus.back_ends import causes, words_of
 from flasher.bus.fallback import Fallback
 from flasher.bus.health import bus_off_error
 from flasher.bus.inspect_interface import Unseen, look_up
@@ -134,11 +135,6 @@ def open_bus(config: Mapping[str, Any]) -> can.BusABC:
     return bus
 
 
-def words_of(error: Exception) -> str:
-    """What the back end said, without a full stop, or the kind of error when it said nothing."""
-    return str(error).strip().rstrip(".!") or type(error).__name__
-
-
 def start_command(channel: object, bitrate_bps: object) -> str:
     """How root starts a SocketCAN interface; virtual ones, told by their name, take no options."""
     if str(channel).startswith(("vcan", "vxcan")):
@@ -187,12 +183,10 @@ def _no_interface(error: Exception) -> UsageError | BusError:
 
 def _code(error: BaseException) -> int | None:
     """The operating system's code, which back ends wrap once or twice."""
-    found: BaseException | None = error
-    while found is not None:
-        code = getattr(found, "errno", None) or getattr(found, "error_code", None)
+    for each in causes(error):
+        code = getattr(each, "errno", None) or getattr(each, "error_code", None)
         if isinstance(code, int):
             return code
-        found = found.__cause__ or found.__context__
     return None
 
 

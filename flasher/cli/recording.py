@@ -15,7 +15,7 @@ import os
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -85,6 +85,7 @@ class Recording:
         self.flight = FlightRecorder()
         self.facts: dict[str, Any] = {}
         """What goes into the bundle's report; anything that JSON knows."""
+        self._connection: Connection | None = None
         self._meter = None if target is None else LinkMeter(target, bitrate_bps)
         self.recorders: list[Tap] = [self.flight]
         if self._meter is not None:
@@ -99,6 +100,7 @@ class Recording:
 
     def opened(self, connection: Connection) -> None:
         """The bus is open."""
+        self._connection = connection
         self.facts["connection"] = connection.name
 
     def failed(self, error: BaseException) -> None:
@@ -113,7 +115,10 @@ class Recording:
 
     def link_report(self) -> LinkReport | None:
         """How the transfer used the bus so far; None before the first packet."""
-        return None if self._meter is None else self._meter.report()
+        report = None if self._meter is None else self._meter.report()
+        if report is None or self._connection is None:
+            return report
+        return replace(report, unreadable=self._connection.link.health().unreadable)
 
 
 @contextmanager

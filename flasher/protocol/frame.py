@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
+
+STANDARD_ID_MAX: Final = 0x7FF
+EXTENDED_ID_MAX: Final = 0x1FFF_FFFF
 
 
 class Frame(NamedTuple):

@@ -76,6 +76,8 @@ class LinkReport:
     device_answer: Distribution | None
     """From a packet's last frame on the wire to the last frame of its ACK or NAK; None without
     any. What was sent more than once is left out: nobody knows which copy was answered."""
+    unreadable: int | None = None
+    """How often the adapter delivered what is no frame; None where only its frames are known."""
 
 
 class Transfer:

@@ -29,7 +29,7 @@ import can
 
 from flasher.errors import ErrorCode, UsageError
 from flasher.files import opened
-from flasher.protocol.frame import Frame
+from flasher.protocol.frame import EXTENDED_ID_MAX, STANDARD_ID_MAX, Frame
 from flasher.protocol.text import printable
 from flasher.trace.blf import UnpackedBlf
 from flasher.trace.bounds import FILE_MAX_SIZE, Bounds, Lines, UnfitError, check_unpacked
@@ -54,7 +54,6 @@ _WHOLE_MAX_SIZE: Final = 64 * 1024 * 1024
 _PIECE_SIZE: Final = 65_536
 _TIME_MAX_S: Final = 1e11
 """About the year 5000. Beyond, and before its negative, no clock tells the time."""
-_STANDARD_ID_MAX, _EXTENDED_ID_MAX = 0x7FF, 0x1FFF_FFFF
 _DATA_MAX: Final = 8
 _LINE_READERS: Final = {
     ".asc": can.ASCReader,
@@ -164,7 +163,7 @@ def _check(at_s: float, frame: Frame) -> None:
     if not math.isfinite(at_s) or abs(at_s) > _TIME_MAX_S:
         raise UnfitError(f"a frame has the time {at_s!r}")
     is_long = frame.is_extended or frame.is_error
-    if not 0 <= frame.can_id <= (_EXTENDED_ID_MAX if is_long else _STANDARD_ID_MAX):
+    if not 0 <= frame.can_id <= (EXTENDED_ID_MAX if is_long else STANDARD_ID_MAX):
         raise UnfitError(f"a frame has the id {frame.can_id:#x}")
 
 

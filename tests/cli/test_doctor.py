@@ -97,7 +97,7 @@ def test_the_figures_are_in_the_json(flasher: Flasher, monkeypatch: pytest.Monke
     assert 0 < traffic["bus_load"] < 0.02
     assert (traffic["nodes"], traffic["foreign_frames"]) == (["bms"], 0)
     assert run.document["health"] == {
-        "state": "active", "tx_errors": None, "rx_errors": None, "error_frames": 0
+        "state": "active", "tx_errors": None, "rx_errors": None, "error_frames": 0, "unreadable": 0
     }  # fmt: skip
 
 
@@ -414,6 +414,16 @@ def test_some_error_frames_among_the_traffic_are_a_warning(examine: Doctor) -> N
     run = examine(*ON_CAN0)
     assert run.code == ExitCode.OK
     assert one(run, "1 error frame among 1 frames")[0] == "warning"
+
+
+@pytest.mark.parametrize(("frames", "severity"), [(0, "problem"), (1, "warning")])
+def test_what_is_no_frame_is_counted(examine: Doctor, frames: int, severity: str) -> None:
+    bad = ValueError("invalid literal for int() with base 16")
+    examine.inbox = [message(0x720, b"\x01")] * frames + [bad, bad]
+    run = examine("-i", "slcan", "-c", "ttyACM0")
+    assert one(run, "2 times the adapter delivered what is no frame")[0] == severity
+    assert run.document["health"]["unreadable"] == 2
+    assert not any("the bus was silent" in what for what in found(run))
 
 
 def test_the_adapter_is_opened_silent_where_it_can_be(examine: Doctor) -> None:

@@ -63,6 +63,8 @@ class HealthDocument:
     tx_errors: int | None
     rx_errors: int | None
     error_frames: int
+    unreadable: int
+    """How often the adapter delivered what is no frame."""
 
 
 @dataclass(frozen=True)

@@ -323,9 +323,23 @@ class Listened:
 
 def traffic(heard: Listened) -> Iterator[Finding]:
     """How the bus sounds, and who is on it."""
-    traffic = heard.traffic
+    traffic, unreadable = heard.traffic, heard.health.unreadable
+    if unreadable:
+        what = f"{counted(unreadable, 'time')} the adapter delivered what is no frame, "
+        yield Finding(
+            Severity.WARNING if traffic.frames else Severity.PROBLEM,
+            "adapter",
+            f"{what}the last: {printable(heard.health.last_unreadable)}",
+            (
+                "try another cable, port or adapter",
+                "check the speed of a serial adapter (of slcan: --bus-kwargs tty_baudrate=...)",
+            ),
+        )
     if not traffic.frames:
-        yield _only_errors(heard) if traffic.error_frames else _silence(heard)
+        if traffic.error_frames:
+            yield _only_errors(heard)
+        elif not unreadable:
+            yield _silence(heard)
         return
     nodes = ", ".join(sorted(node.name for node in heard.survey.heard)) or "no node of the system"
     what = f"{heard.frames_per_s:.0f} frames/s, {heard.load:.0%} load, from {nodes}"

@@ -349,6 +349,8 @@ class _Upgrade:
         if document is not None and document.link is not None:
             for line in text.link_lines(document.link):
                 output.progress(line, level=1)
+            if document.link.unreadable:
+                output.error_line(f"warning: {text.unreadable_line(document.link.unreadable)}")
         verdict = text.verdict_of(result, carried.checks, carried.took_s)
         if error is None:
             output.verdict(verdict)

@@ -1,0 +1,176 @@
+"""What exceptions of python-can's back ends mean: a damaged frame, a full queue, a lost adapter.
+
+A back end may raise anything: its own CanError, what a serial port or a USB library raises, and
+whatever its parser trips over. `tests/bus/test_back_ends.py` has the table of what each can raise.
+"""
+
+from __future__ import annotations
+
+import errno
+import re
+from collections.abc import Iterator, Mapping
+from enum import Enum, auto
+from typing import Final
+
+import can
+
+from flasher.bus.health import BusTrouble, TroubleKind
+
+
+class Meaning(Enum):
+    """What an exception of a back end says about its adapter."""
+
+    UNREADABLE = auto()
+    """What came cannot be read as a frame; the adapter works."""
+    QUEUE_FULL = auto()
+    BUS_OFF = auto()
+    LOST = auto()
+    """The adapter or its driver does not work any more."""
+
+
+SERIAL_PORTS: Final[Mapping[str, str]] = {
+    "robotell": "serialPortOrig",
+    "seeedstudio": "ser",
+    "serial": "_ser",
+    "slcan": "serialPortOrig",
+}
+"""The attribute of a back end that is its serial port, of pyserial."""
+TAKES_SEND_TIMEOUT: Final = frozenset({"nixnet", "robotell", "slcan"})
+"""Back ends that wait for room for ever unless `send` is given a timeout. Others wait for something
+else then, or ignore it."""
+SILENT_WHEN_GONE: Final = frozenset({"gs_usb", "seeedstudio", "socketcand"})
+"""Back ends that take the error of a lost adapter for silence, and return without waiting."""
+_LOSES_ITS_PLACE: Final = frozenset({"socketcand"})
+"""Back ends that cannot be used after an error: what they tripped over stays in their buffer."""
+
+_QUEUE_FULL_CODES: Final[Mapping[str, frozenset[int]]] = {
+    "iscan": frozenset({7}),  # device is transmitting a message
+    "kvaser": frozenset({-13}),  # canERR_TXBUFOFL
+    "nixnet": frozenset({0xBFF63008, 0xBFF6300A}),  # output queue overflow, event timeout
+    "socketcan": frozenset({errno.ENOBUFS, errno.EAGAIN}),
+    "systec": frozenset({0x0B}),  # ERR_DLL_TXFULL
+    "usb2can": frozenset({9, 21, 32}),  # FIFO_FULL, TRM_FULL, TIMEOUT
+    "vector": frozenset({11}),  # XL_ERR_QUEUE_IS_FULL
+}
+"""Codes of the drivers, which python-can hands on."""
+_QUEUE_FULL_TEXT: Final = re.compile(
+    r"(transmit|send|tx|xmt|write)[ _-]?(queue|buffer|fifo)?.*\b(full|overflow)"
+    r"|TXQUEUE_FULL|XMTFULL",
+    re.IGNORECASE,
+)
+"""What others say in words (PCAN, IXXAT, NI-CAN, and SocketCAN's own "Transmit buffer full")."""
+_BUS_OFF_CODES: Final[Mapping[str, int]] = {"iscan": 17, "usb2can": 2}
+_BUS_OFF_TEXT: Final = re.compile(r"bus[ _-]?off", re.IGNORECASE)
+_REPORT_CODES: Final[Mapping[str, Mapping[int, TroubleKind]]] = {
+    "iscan": {
+        11: TroubleKind.OTHER,  # buffer overrun
+        16: TroubleKind.OTHER,  # bus error
+        18: TroubleKind.PASSIVE,
+        19: TroubleKind.OTHER,  # data overrun
+        20: TroubleKind.WARNING,
+    },
+    "usb2can": {
+        3: TroubleKind.PASSIVE,
+        4: TroubleKind.WARNING,
+        18: TroubleKind.OTHER,  # overrun
+        22: TroubleKind.OTHER,  # stuff error
+        23: TroubleKind.OTHER,  # form error
+        24: TroubleKind.NOT_ACKNOWLEDGED,
+        25: TroubleKind.OTHER,  # bit errors
+        26: TroubleKind.OTHER,
+        27: TroubleKind.OTHER,  # CRC error
+    },
+    "vector": {216: TroubleKind.OTHER},  # XL_ERR_QUEUE_OVERRUN
+}
+_REPORT_TEXTS: Final = (
+    (re.compile(r"error[ -]?passive", re.IGNORECASE), TroubleKind.PASSIVE),
+    (re.compile(r"warning limit", re.IGNORECASE), TroubleKind.WARNING),
+    (re.compile(r"overrun|read too late", re.IGNORECASE), TroubleKind.OTHER),
+)
+"""Of PCAN and IXXAT, whose exceptions bear no code."""
+_UNREADABLE_TEXT: Final = re.compile(r"invalid delimiter|could not unpack|out of range")
+"""Damaged frames that a back end refuses by a CanError of its own (serial, udp_multicast)."""
+_FOREIGN_DATAGRAM: Final = "could not unpack"
+
+
+def meaning_in_sending(error: Exception, interface: str) -> Meaning:
+    """What an exception of the back end `interface` means that its `send` raised."""
+    chain = list(causes(error))
+    if _is_bus_off(chain, interface):
+        return Meaning.BUS_OFF
+    is_full = (
+        not _codes(chain).isdisjoint(_QUEUE_FULL_CODES.get(interface, ()))
+        or any(_QUEUE_FULL_TEXT.search(str(each)) for each in chain)
+        or any(map(_is_timeout, chain))
+    )
+    return Meaning.QUEUE_FULL if is_full else Meaning.LOST
+
+
+def meaning_in_receiving(error: Exception, interface: str) -> Meaning | BusTrouble:
+    """What an exception means that its `recv` raised; the trouble where the controller reports
+    trouble on the bus by it, and the adapter works.
+    """
+    chain = list(causes(error))
+    if _is_bus_off(chain, interface):
+        return Meaning.BUS_OFF
+    kind = _reported_trouble(chain, interface)
+    if kind is not None:
+        return BusTrouble(frozenset({kind}), words_of(error))
+    if interface in _LOSES_ITS_PLACE or any(isinstance(each, OSError) for each in chain):
+        return Meaning.LOST
+    is_own = isinstance(chain[-1], can.CanError)
+    is_damage = not is_own or _UNREADABLE_TEXT.search(str(chain[-1]))
+    return Meaning.UNREADABLE if is_damage else Meaning.LOST
+
+
+def is_foreign_datagram(error: Exception) -> bool:
+    """Something else than a CAN frame on udp_multicast's port, which anybody may send to."""
+    return _FOREIGN_DATAGRAM in str(error)
+
+
+def causes(error: BaseException) -> Iterator[BaseException]:
+    """The exception and those that it was raised from: back ends wrap what matters."""
+    found: BaseException | None = error
+    while found is not None:
+        yield found
+        found = found.__cause__ or (None if found.__suppress_context__ else found.__context__)
+
+
+def words_of(error: BaseException) -> str:
+    """What the back end said, without a full stop, or the kind of error when it said nothing."""
+    said: list[str] = []
+    for each in causes(error):
+        words = str(each).strip().rstrip(".!")
+        if words and not any(words in earlier for earlier in said):
+            said.append(words)
+    return ": ".join(said) or type(error).__name__
+
+
+def _codes(chain: list[BaseException]) -> set[int]:
+    codes = (getattr(each, "error_code", None) for each in chain)
+    return {int(code) for code in codes if isinstance(code, int)}
+
+
+def _is_bus_off(chain: list[BaseException], interface: str) -> bool:
+    is_code = _BUS_OFF_CODES.get(interface) in _codes(chain)
+    return is_code or any(_BUS_OFF_TEXT.search(str(each)) for each in chain)
+
+
+def _reported_trouble(chain: list[BaseException], interface: str) -> TroubleKind | None:
+    known = _REPORT_CODES.get(interface, {})
+    by_code = (known[code] for code in _codes(chain) if code in known)
+    by_text = (
+        kind
+        for pattern, kind in _REPORT_TEXTS
+        for each in chain
+        if isinstance(each, can.CanError) and pattern.search(str(each))
+    )
+    return next(by_code, None) or next(by_text, None)
+
+
+def _is_timeout(error: BaseException) -> bool:
+    """Nothing was taken for as long as the back end waits: what pyserial and pyusb raise then is
+    no TimeoutError.
+    """
+    is_named_so = type(error).__name__ in ("SerialTimeoutException", "USBTimeoutError")
+    return is_named_so or isinstance(error, TimeoutError)
