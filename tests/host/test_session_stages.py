@@ -176,7 +176,7 @@ class Echoing:
 
     def send(self, frame: Frame) -> None:
         self._link.send(frame)
-        self._marks.sent(frame, self._clock.now())
+        self._marks.sent(frame)
         self._count += 1
         at = self._clock.now() + self._delay_s
         self._echoes.extend([(at, frame)] * self._copies(self._count))
@@ -185,7 +185,7 @@ class Echoing:
         until = min(deadline, self._echoes[0][0]) if self._echoes else deadline
         frame = self._link.receive(until)
         if frame is None and self._echoes and self._echoes[0][0] <= self._clock.now():
-            return self._marks.mark(self._echoes.popleft()[1], self._clock.now())
+            return self._marks.mark(self._echoes.popleft()[1], self._clock.now(), is_rx=True)
         return frame
 
     def drain(self) -> int:
