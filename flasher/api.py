@@ -338,14 +338,14 @@ def _never() -> bool:
     return False
 
 
-def _teller(watch: Watch) -> EventHandler:
-    """Logs an event, and tells it who wants to know."""
-    on_event = watch.get("on_event")
+def _teller(watch: Watch, of_step: EventHandler | None = None) -> EventHandler:
+    """Logs an event, and hands it to the step and to the caller."""
+    handlers = [each for each in (of_step, watch.get("on_event")) if each is not None]
 
     def tell(event: object) -> None:
         log_event(event)
-        if on_event is not None:
-            on_event(event)
+        for handle in handlers:
+            handle(event)
 
     return tell
 
@@ -534,7 +534,7 @@ class Device(_OnBus):
                     link,
                     clock,
                     taps=(*watch.get("taps", ()), *step.taps),
-                    on_event=_teller(watch),
+                    on_event=_teller(watch, step.on_event),
                     cancelled=self._cancelled(step, watch),
                 )
             case WaitUntil():
@@ -662,7 +662,7 @@ class AsyncDevice(_OnBus):
                     link,
                     clock,
                     taps=(*watch.get("taps", ()), *step.taps),
-                    on_event=_teller(watch),
+                    on_event=_teller(watch, step.on_event),
                     cancelled=self._cancelled(step, watch),
                 )
             case WaitUntil():

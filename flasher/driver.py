@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Sequence
 from typing import Final, Protocol
 
+from flasher import events
 from flasher.bus.link import AT_ONCE, Clock, Link
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
@@ -19,6 +20,9 @@ from flasher.protocol.frame import Frame
 MAX_WAIT_S: Final = 0.1
 """Longest blocking receive, in real seconds: the time after which a cancellation is seen at the
 latest."""
+STALL_S: Final = 0.25
+"""A pause of the loop that is reported, in real seconds: half the time that a device has for an
+ACK (R12)."""
 _CATCH_UP_FRAMES: Final = 10_000
 """Frames received before a due `tick` at the most: a babbling bus must not stop the timers."""
 
@@ -42,8 +46,9 @@ def drive(
 ) -> None:
     """Run `engine` until it is done.
 
-    `on_event` gets every event the engine reports; `cancelled` is asked between frames, and ends
-    the engine at its next message boundary. Raises BusError when the link fails.
+    `on_event` gets every event the engine reports, and HostStalled where this computer paused the
+    loop for more than `STALL_S`; `cancelled` is asked between frames, and ends the engine at its
+    next message boundary. Raises BusError when the link fails.
     """
     turns = _turns(engine, link, clock, taps, on_event, cancelled)
     until = next(turns, None)
@@ -117,8 +122,11 @@ def _turns(
     link.drain()
     cancel_seen = False
     came = None
+    late_s = 0.0
+    """How much later than asked the last wait ended, and how long callbacks took before it."""
     while True:
         heard_until = _hear(came, engine, link, clock, taps)
+        sending_s = 0.0
         if cancelled is not None and not cancel_seen and cancelled():
             cancel_seen = True
             engine.cancel(clock.now())
@@ -128,18 +136,26 @@ def _turns(
         now = clock.now()
         while (frame := engine.next_frame(now)) is not None:
             link.send(frame)
-            now = clock.now()
+            asked_at, now = now, clock.now()
+            sending_s += now - asked_at
             engine.frame_sent(now)
             for tap in taps:
                 tap(frame, sent=True, now=now)
+        stalled_s = (late_s + now - heard_until - sending_s) / clock.speed
+        if stalled_s > STALL_S and on_event is not None:
+            on_event(events.HostStalled(round(stalled_s, 3)))
         for event in engine.take_events():
             if on_event is not None:
                 on_event(event)
         if engine.done:
             return
+        rests_at = clock.now()
         wanted = engine.deadline()
-        latest = clock.now() + MAX_WAIT_S * clock.speed
-        came = yield latest if wanted is None else min(wanted, latest)
+        until = rests_at + MAX_WAIT_S * clock.speed
+        if wanted is not None and wanted < until:
+            until = wanted
+        came = yield until
+        late_s = rests_at - now + max(0.0, clock.now() - max(until, rests_at))
 
 
 def _hear(

@@ -90,6 +90,13 @@ class AdapterBack:
 
 
 @dataclass(frozen=True)
+class HostStalled:
+    """This computer did not run the loop for `stalled_s` longer than it meant to wait."""
+
+    stalled_s: float
+
+
+@dataclass(frozen=True)
 class PacketAcknowledged:
     """The device has packet `number` of `total`; it was sent `tries` times."""
 

@@ -36,6 +36,7 @@ _INFO: Final = frozenset(
 """Phases, and what a person waits for."""
 _WARNING: Final = frozenset(
     {
+        events.HostStalled,
         events.MessageRepeated,
         events.Reported,
         events.AttemptStarted,

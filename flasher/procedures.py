@@ -81,13 +81,14 @@ class Run:
     """A step: run this engine until it is done. `taps` see the frames beside those of the caller.
 
     Without `may_cancel` the user does not end it; a terminal that hangs up ends it only while
-    `hang_up_ends` says so.
+    `hang_up_ends` says so. `on_event` gets its events before the caller does.
     """
 
     engine: Engine
     taps: Sequence[Tap] = ()
     may_cancel: bool = True
     hang_up_ends: Callable[[], bool] | None = None
+    on_event: Callable[[object], None] | None = None
 
 
 @dataclass(frozen=True)
@@ -429,7 +430,15 @@ class Procedures:
         return self._session(Session(plan, chosen, level, identity or Identity()), chosen)
 
     def _session(self, session: Session, options: UpgradeOptions) -> Procedure[Result]:
-        run = Run(session, taps=(self._end_when_off,), hang_up_ends=_may_end(session))
+        stalls_s: list[float] = []
+
+        def note_stall(event: object) -> None:
+            if isinstance(event, events.HostStalled):
+                stalls_s.append(event.stalled_s)
+
+        run = Run(
+            session, (self._end_when_off,), hang_up_ends=_may_end(session), on_event=note_stall
+        )
         link = self.link
         before = link.health()
         self._check_bus("before anything was sent", session, before)
@@ -463,7 +472,7 @@ class Procedures:
             )
             _say_what_is_left(interrupted, session)
             raise interrupted from interrupt
-        result = session.result
+        result = replace(session.result, stalled_s=sum(stalls_s))
         silence = result.error()
         if isinstance(silence, NoAnswerError):
             self._check_bus(silence.where, session, before)

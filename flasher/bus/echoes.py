@@ -20,7 +20,7 @@ ECHO_FRAMES: Final = 1024
 REORDER_FRAMES: Final = 64
 """How far an echo may be behind a later one: three packets and a half."""
 DOUBLE_LIMIT_S: Final = 0.1
-"""A second copy of an echo bears a time stamp at most this much later."""
+"""The time stamps of two copies of an echo differ by at most this."""
 
 
 class Sender(Enum):
@@ -62,7 +62,8 @@ class Echoes:
         """Frames whose echo has not been seen, oldest first."""
         self._unreturned: deque[Frame] = deque(maxlen=ECHO_FRAMES)
         """Frames that this handle sent and is not going to receive."""
-        self._echoed: deque[tuple[float, Frame]] = deque(maxlen=REORDER_FRAMES)
+        self._echoed: dict[Frame, float] = {}
+        """The last echoes that were seen, each with its time stamp."""
 
     def sent(self, frame: Frame) -> None:
         """Note a frame that was handed to the adapter."""
@@ -88,15 +89,18 @@ class Echoes:
             return frame if is_rx else frame._replace(is_echo=True)
         if is_rx and self._flagged is Sender.THIS_COMPUTER:
             return frame
+        echoed_s = self._echoed.get(frame)
+        if echoed_s is not None and abs(stamp_s - echoed_s) <= DOUBLE_LIMIT_S:
+            return frame._replace(is_echo=True)
         expected = self._expected
         for index, own in enumerate(expected):
             if own == frame:
                 del expected[index]
                 for _ in range(index - REORDER_FRAMES):
                     expected.popleft()  # its echo was lost
-                self._echoed.append((stamp_s, frame))
-                return frame._replace(is_echo=True)
-        for first_s, own in self._echoed:
-            if own == frame and 0 <= stamp_s - first_s <= DOUBLE_LIMIT_S:
+                self._echoed.pop(frame, None)
+                self._echoed[frame] = stamp_s
+                if len(self._echoed) > REORDER_FRAMES:
+                    del self._echoed[next(iter(self._echoed))]
                 return frame._replace(is_echo=True)
         return frame

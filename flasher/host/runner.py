@@ -52,7 +52,7 @@ class Runner(Generic[T]):
     ) -> None:
         self.timings = timings
         self.bitrate_bps = bitrate_bps
-        self.tx = Transmitter(bitrate_bps, frame_gap_s)
+        self.tx = Transmitter(bitrate_bps, frame_gap_s, timings.inter_frame_timeout_s)
         self.next_frame: Callable[[float], Frame | None] = self.tx.next_frame
         """The next frame to send."""
         self.frame_sent: Callable[[float], Any] = self.tx.frame_sent

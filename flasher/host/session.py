@@ -42,8 +42,8 @@ from flasher.prose import prose
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.frame import Frame
 
-_BY_LOST_POWER: Final = (NoAnswerError, TransferError, UnconfirmedError, VerificationError)
-"""Errors that a battery which switched off explains."""
+_NO_CONTACT: Final = (NoAnswerError, TransferError, UnconfirmedError, VerificationError)
+"""Errors that a battery which switched off explains, or a computer that paused."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +57,8 @@ class Result:
     previous_version: str | None = None
     """What the application answered before the upgrade, escaped; None when it was not asked or did
     not answer."""
+    stalled_s: float = 0.0
+    """All pauses of this computer during the session (`events.HostStalled`)."""
 
     @property
     def ok(self) -> bool:
@@ -79,8 +81,12 @@ class Result:
     def error(self) -> FlasherError | None:
         """The error that stands for it; None when it is good, or there was nothing to do."""
         error = self.outcome.error() or self.verification.error(self.outcome.target)
-        if self.shutdown_heard and isinstance(error, _BY_LOST_POWER):
-            error.cause = f"the battery sent SHUTDOWN and switched off; else {error.cause}"
+        if isinstance(error, _NO_CONTACT):
+            if self.stalled_s:
+                paused = f"this computer paused for {self.stalled_s:.1f} s meanwhile"
+                error.cause = f"{paused}; else {error.cause}"
+            if self.shutdown_heard:
+                error.cause = f"the battery sent SHUTDOWN and switched off; else {error.cause}"
         return error
 
 

@@ -41,6 +41,8 @@ def line_of(event: object) -> tuple[str, int] | None:
             return f"check: {verdict}: {text}", 1 if verdict == "passed" else 0
         case events.AdapterBack():
             return "the adapter is back", 0
+        case events.HostStalled(stalled_s):
+            return f"this computer paused for {stalled_s:.1f} s", 1
         case events.Reported(what):
             return f"note: {what}", 1
         case events.BytesDamaged(can_id, reason, data):

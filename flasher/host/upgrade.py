@@ -20,6 +20,7 @@ from flasher.host.runner import Came, Runner, Signal, Stage
 from flasher.host.table import TABLE, TIMERS, Ending, Event, Reason, State
 from flasher.image.plan import Plan
 from flasher.protocol import catalogue
+from flasher.protocol.engine import WELL_BEYOND
 from flasher.protocol.fields import Content
 from flasher.protocol.messages import (
     Ack,
@@ -63,9 +64,6 @@ _PHASES: Final = {
 """Phases that people are told, by state; the other states leave the phase as it is."""
 _RESUMED: Final = frozenset({State.TRANSFERRING, State.SETTLING, State.ENDING, State.CONFIRMING})
 """States that go on where they stood when a lost adapter is back."""
-_WELL_BEYOND: Final = 1.5
-"""Silence after a message that was cut short, as a multiple of the time after which its receiver
-drops it (R12)."""
 _LEFT_SO: Final = {
     Ending.COMPLETED: DeviceLeft.NEW,
     Ending.CONFIRMED_BY_VERSION: DeviceLeft.NEW,
@@ -250,7 +248,7 @@ class UpgradeStage:
             try:
                 came = yield None if is_stopping else min(self._timer_at, self._deadline_at)
             except LinkBack:
-                self._tx.abandon(self._run.now + self._timings.inter_frame_timeout_s * _WELL_BEYOND)
+                self._tx.abandon(self._run.now + self._timings.inter_frame_timeout_s * WELL_BEYOND)
                 self._heard_at = self._run.now  # nobody knows what it said meanwhile
                 self._dispatch(Event.LINK_BACK)
             except SecondTool as heard:

@@ -9,10 +9,14 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from math import inf
-from typing import NamedTuple, Protocol
+from typing import Final, NamedTuple, Protocol
 
 from flasher.protocol.bittime import frame_bits, message_bits
 from flasher.protocol.frame import Frame
+
+WELL_BEYOND: Final = 1.5
+"""Silence after a message that was cut short, as a multiple of the time after which its receiver
+drops it (R12)."""
 
 
 class Engine(Protocol):
@@ -64,15 +68,22 @@ class Transmitter:
     starts, so it is never interleaved with its own repetition.
 
     `frame_gap_s` keeps frames of one message apart for receivers that cannot take them at once.
+    Where a computer paused for longer than `dropped_after_s` between two frames, their receiver has
+    dropped the message (R12): it is sent anew after a silence that is longer than that.
     """
 
-    def __init__(self, bitrate_bps: int, frame_gap_s: float = 0.0) -> None:
+    def __init__(
+        self, bitrate_bps: int, frame_gap_s: float = 0.0, dropped_after_s: float = inf
+    ) -> None:
         self._bitrate_bps = bitrate_bps
         self._frame_gap_s = frame_gap_s
+        self._dropped_after_s = dropped_after_s
         self._queue: deque[_Outgoing] = deque()
         self._sent_frames = 0
         self._quiet_until = -inf
         self._message_began_at = 0.0
+        self._asked_at = 0.0
+        self._frame_sent_at = 0.0
         self.due_at = inf
         """When `next_frame` has something to give; infinite while nothing waits."""
         self.left_at = -inf
@@ -152,6 +163,11 @@ class Transmitter:
         """The next frame to send, or None while a gap lasts or nothing waits."""
         if now < self.due_at:
             return None
+        if self._sent_frames and now - self._frame_sent_at > self._dropped_after_s:
+            self._sent_frames = 0
+            self.due_at = now + self._dropped_after_s * WELL_BEYOND
+            return None
+        self._asked_at = now
         return self._queue[0].frames[self._sent_frames]
 
     def frame_sent(self, now: float) -> bool:
@@ -163,6 +179,9 @@ class Transmitter:
             self._message_began_at = max(now, self.left_at)
         self._sent_frames += 1
         if self._sent_frames < len(frames):
+            # A pause while it was handed over came before it or after it, which is not known.
+            was_paused = now - self._asked_at > self._dropped_after_s
+            self._frame_sent_at = -inf if was_paused else now
             if self._frame_gap_s:
                 self.due_at = now + self._frame_gap_s
             return False

@@ -7,9 +7,10 @@ from collections.abc import Callable
 
 import pytest
 
+from flasher import events
 from flasher.bus.health import HealthKeeper, LinkHealth
 from flasher.bus.link import VirtualClock
-from flasher.driver import MAX_WAIT_S, drive
+from flasher.driver import MAX_WAIT_S, STALL_S, drive
 from flasher.errors import BusError
 from flasher.protocol.frame import Frame
 
@@ -247,3 +248,48 @@ def test_a_failing_adapter_ends_the_loop_with_its_error(
     with pytest.raises(BusError, match="unplugged"):
         drive(engine, link, clock)
     assert len(link.sent) == 3
+
+
+# -- a computer that pauses -----------------------------------------------------------------------
+
+
+class PausingLink(FakeLink):
+    """The computer pauses once while it waits for a frame."""
+
+    def __init__(self, clock: VirtualClock, pause_s: float) -> None:
+        super().__init__(clock)
+        self.pause_s = pause_s
+
+    def receive(self, deadline: float) -> Frame | None:
+        came = super().receive(deadline)
+        if deadline > 0.0 and self.pause_s:
+            self.clock.wait_until(self.clock.now() + self.pause_s)
+            self.pause_s = 0.0
+        return came
+
+
+@pytest.mark.parametrize(("pause_s", "is_reported"), [(2.0, True), (STALL_S, False), (0.0, False)])
+def test_a_pause_of_the_computer_is_reported(
+    clock: VirtualClock, pause_s: float, is_reported: bool
+) -> None:
+    told: list[object] = []
+    drive(Recorder(ticks=2), PausingLink(clock, pause_s), clock, on_event=told.append)
+    assert told == ([events.HostStalled(pause_s)] if is_reported else [])
+
+
+def test_a_slow_callback_is_a_pause_and_a_slow_adapter_is_none(
+    clock: VirtualClock, link: FakeLink
+) -> None:
+    engine = Recorder()
+    link.send_takes_s = 1.5
+    engine.outbox.append(Frame(0x752, b"\x01"))
+    engine.events = ["slow"]
+    told: list[object] = []
+
+    def on_event(event: object) -> None:
+        told.append(event)
+        if event == "slow":
+            clock.wait_until(clock.now() + 0.5)
+
+    drive(engine, link, clock, on_event=on_event)
+    assert told == ["slow", events.HostStalled(0.5)]

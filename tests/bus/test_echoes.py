@@ -92,11 +92,11 @@ def test_frames_without_any_echo_are_forgotten_by_number(frames_later: int) -> N
     assert is_echo(echoes, OWN) == (frames_later < ECHO_FRAMES)
 
 
-@each("later_s", [0.0, DOUBLE_LIMIT_S, DOUBLE_LIMIT_S + 0.001, -0.001])
+@each("later_s", [0.0, DOUBLE_LIMIT_S, DOUBLE_LIMIT_S + 0.001, -0.001, -0.2])
 def test_a_second_copy_bears_nearly_the_same_stamp(later_s: float) -> None:
     echoes = sent(OWN)
     assert is_echo(echoes, OWN, 0.0)
-    assert is_echo(echoes, OWN, later_s) == (0 <= later_s <= 0.1)
+    assert is_echo(echoes, OWN, later_s) == (abs(later_s) <= 0.1)
 
 
 @each("others", [REORDER_FRAMES - 1, REORDER_FRAMES])
@@ -116,7 +116,11 @@ FATE = strategies.tuples(
 
 
 @given(
-    strategies.lists(strategies.tuples(strategies.integers(0, 40), FATE), max_size=300),
+    strategies.integers(0, 40).flatmap(
+        lambda most: strategies.lists(
+            strategies.tuples(strategies.integers(0, most), FATE), max_size=300
+        )
+    ),
     strategies.integers(1, 80),
 )
 def test_no_delay_loss_doubling_or_reordering_makes_an_own_frame_a_strangers(

@@ -185,7 +185,8 @@ class Echoing:
         until = min(deadline, self._echoes[0][0]) if self._echoes else deadline
         frame = self._link.receive(until)
         if frame is None and self._echoes and self._echoes[0][0] <= self._clock.now():
-            return self._marks.mark(self._echoes.popleft()[1], self._clock.now(), is_rx=True)
+            at, echo = self._echoes.popleft()
+            return self._marks.mark(echo, at, is_rx=True)
         return frame
 
     def drain(self) -> int:
@@ -205,7 +206,7 @@ class Echoing:
         return self._link.health()
 
 
-@each("delay_s", [0.0, 0.002, 0.3])
+@each("delay_s", [0.0, 0.002, 0.3, 0.7])
 @each(
     "copies",
     [lambda _n: 1, lambda n: int(n % 3 > 0), lambda _n: 2, lambda n: n % 3],

@@ -225,3 +225,32 @@ def test_at_half_the_bit_rate_a_message_takes_twice_as_long() -> None:
     transmitter.queue(_FIRST)
     _send_all(transmitter, 0.0)
     assert transmitter.left_at == pytest.approx(2 * _wire_s(_FIRST))
+
+
+@pytest.mark.parametrize(("pause_s", "is_sent_anew"), [(0.1, False), (0.101, True), (60.0, True)])
+def test_a_message_that_its_receiver_has_dropped_meanwhile_is_sent_anew_after_a_silence(
+    pause_s: float, is_sent_anew: bool
+) -> None:
+    """The computer paused between two frames (R12)."""
+    transmitter = Transmitter(_BITRATE_BPS, dropped_after_s=0.1)
+    transmitter.queue(_FIRST)
+    assert transmitter.next_frame(0.0) == _FIRST[0]
+    transmitter.frame_sent(0.0)
+    if not is_sent_anew:
+        assert _send_all(transmitter, pause_s) == _FIRST[1:]
+        return
+    assert transmitter.next_frame(pause_s) is None
+    assert not transmitter.begun
+    silent_until = transmitter.deadline()
+    assert silent_until == pytest.approx(pause_s + 0.15)
+    assert _send_all(transmitter, silent_until) == _FIRST
+    assert transmitter.idle
+
+
+def test_the_message_after_one_that_was_sent_anew_follows_it() -> None:
+    transmitter = Transmitter(_BITRATE_BPS, dropped_after_s=0.1)
+    transmitter.queue(_FIRST)
+    transmitter.queue(_SECOND)
+    transmitter.frame_sent(0.0)
+    assert transmitter.next_frame(1.0) is None
+    assert _send_all(transmitter, 2.0) == [*_FIRST, *_SECOND]
