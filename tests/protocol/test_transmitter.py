@@ -241,7 +241,7 @@ def test_a_message_that_its_receiver_has_dropped_meanwhile_is_sent_anew_after_a_
         return
     assert transmitter.next_frame(pause_s) is None
     assert not transmitter.begun
-    silent_until = transmitter.deadline()
+    silent_until = transmitter.due_at
     assert silent_until == pytest.approx(pause_s + 0.15)
     assert _send_all(transmitter, silent_until) == _FIRST
     assert transmitter.idle
