@@ -5,6 +5,10 @@ Usage: python make_samples.py [FOLDER]
 The samples are no programs: a Cortex-M vector table, the device's name and a version of the
 document's form, and bytes that look like Thumb code, so that time on the wire is realistic. The
 bad files are tiny, one for each way in which a firmware file is refused; the name says which.
+
+So that no sample gets into a real device, all of them carry a mark by which flasher knows them
+(flasher/image/sample.py): in the reserved words of the vector table, and all over the code, so that
+any part of a sample that could be taken for a program has it too.
 """
 
 from __future__ import annotations
@@ -22,12 +26,16 @@ OBC_BASE, OBC_SIZE = 0x0800_2000, 4_000
 STATION_SIZE = 24_000
 STACK_TOP = 0x2000_5000
 IDENTITY_SIZE = 32
+MARK = b"#flasher:sample#"
+MARK_DISTANCE = 256
+RESERVED_WORDS_AT = 0x1C
+"""Four words of a Cortex-M vector table have no meaning: the size of the mark."""
 
 _THUMB = (0x4600, 0x6800, 0x6000, 0x2000, 0xB500, 0xBD00, 0xD000, 0xE000, 0x4400, 0xF000, 0x1C00)
 
 
 def code(seed: int, size: int) -> bytes:
-    """Halfwords drawn from the shapes of Thumb instructions, and some literals."""
+    """Halfwords drawn from the shapes of Thumb instructions, some literals, and marks."""
     draw = random.Random(seed)  # noqa: S311  reproducible, no secret
     halfwords = bytearray()
     while len(halfwords) < size:
@@ -35,6 +43,8 @@ def code(seed: int, size: int) -> bytes:
         halfwords += struct.pack("<H", shape | draw.getrandbits(9))
         if draw.getrandbits(5) == 0:
             halfwords += struct.pack("<I", 0x4000_0000 | draw.getrandbits(16))
+    for at in range(0, size - len(MARK) + 1, MARK_DISTANCE):
+        halfwords[at : at + len(MARK)] = MARK
     return bytes(halfwords[:size])
 
 
@@ -42,7 +52,9 @@ def vector_table(base: int, size: int, entry_offset: int) -> bytes:
     """Stack pointer, reset vector and handlers that lie one behind the other from the entry on."""
     words = [STACK_TOP]
     words += [(base + entry_offset + 4 * index) | 1 for index in range(size // 4 - 1)]
-    return struct.pack(f"<{len(words)}I", *words)
+    table = bytearray(struct.pack(f"<{len(words)}I", *words))
+    table[RESERVED_WORDS_AT : RESERVED_WORDS_AT + len(MARK)] = MARK
+    return bytes(table)
 
 
 def identity(name: str, version: str) -> bytes:
@@ -179,7 +191,7 @@ def _bad_hex(base: int, first: bytes, second: bytes) -> dict[str, bytes]:
         "hex_inside.bin": lines([one[0], damaged, *two, HEX_END]),
         "lost_first_line.bin": lines([one[1][9:], *two * 4, HEX_END]),
         "outside_vector.hex": lines(
-            [*hex_data(base, struct.pack("<2I", STACK_TOP, 0x0800_0101)), HEX_END]
+            [*hex_data(base, struct.pack("<4I", STACK_TOP, 0x0800_0101, 0, 0) + second), HEX_END]
         ),
     }
 
@@ -230,12 +242,12 @@ def _bad_elf(base: int, first: bytes, second: bytes) -> dict[str, bytes]:
 
 def bad_files() -> dict[str, bytes]:
     """Name to content of every file that is refused."""
-    base, first, second = 0x0800_0000, code(4, 16), code(5, 16)
+    base, first, second = 0x0800_0000, MARK, MARK
     return {
         "empty.bin": b"",
-        "text.bin": b"Firmware of the BMS: see the release page.\n",
-        "zip.bin": b"PK\x03\x04" + bytes(26),
-        "utf_16.bin": "\ufeff:00000001FF\n".encode("utf-16-le"),
+        "text.bin": b"Firmware of the BMS: see the release page.\n" + MARK + b"\n",
+        "zip.bin": b"PK\x03\x04" + bytes(26) + MARK,
+        "utf_16.bin": ("\ufeff" + ":00000001FF\n" * 3).encode("utf-16-le") + MARK,
         **_bad_hex(base, first, second),
         **_bad_s_records(base, first, second),
         **_bad_elf(base, first, second),

@@ -78,6 +78,7 @@ class ErrorCode(StrEnum):
     IMAGE_IMPLAUSIBLE = "E306"
     IMAGE_OUTSIDE = "E307"
     MANIFEST = "E308"
+    IMAGE_SAMPLE = "E309"
     BUS = "E400"
     ADAPTER_NOT_OPENED = "E401"
     ADAPTER_IN_USE = "E402"

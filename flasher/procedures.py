@@ -54,6 +54,7 @@ from flasher.host.verify import (
 from flasher.host.write import WritePlan, Written, plan_write
 from flasher.image.image import Image
 from flasher.image.plan import Plan, make_plan
+from flasher.image.sample import is_sample, refused_sample
 from flasher.prose import prose
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import Memory, Reset, VersionInformation
@@ -410,7 +411,8 @@ class Procedures:
         verify: Level | None,
         identity: Identity | None,
     ) -> Procedure[Result]:
-        """Run one upgrade to its end, good or bad, and verify a good one.
+        """Run one upgrade to its end, good or bad, and verify a good one. Raises ImageError for a
+        firmware sample on a physical adapter.
 
         A lost adapter is opened again for the time of the options while an attempt is left. Raises
         BusError, saying how far it had come and in what state the device is left, when the adapter
@@ -418,6 +420,7 @@ class Procedures:
         interrupts a second time.
         """
         plan = self.plan(image)
+        check_sample(plan.image, self.link)
         chosen = options or self.profile.upgrade_options()
         level = default_level(plan.target, chosen) if verify is None else verify
         check_level(plan, level, chosen)
@@ -539,6 +542,12 @@ def plan_for(image: Image, profile: Profile, bitrate_bps: int | None) -> Plan:
         bitrate_bps=bitrate_bps,
         has_upgrade=profile.has_upgrade,
     )
+
+
+def check_sample(image: Image, link: Link) -> None:
+    """Raise ImageError for a firmware sample that would go out on a physical adapter."""
+    if is_sample(image) and link.is_physical:
+        raise refused_sample(image, str(link))
 
 
 def _may_end(session: Session) -> Callable[[], bool]:

@@ -44,6 +44,7 @@ from flasher.bus.inspect_interface import Interface, read_interface
 from flasher.bus.link import AT_ONCE, SEND_LIMIT_S
 from flasher.bus.lock import hold
 from flasher.bus.opening import bus_config, open_bus
+from flasher.bus.physical import is_physical
 from flasher.errors import BusError, ErrorCode, TransmitBlockedError
 from flasher.protocol.frame import EXTENDED_ID_MAX, STANDARD_ID_MAX, Frame
 from flasher.protocol.spec import FRAME_DATA_SIZE
@@ -267,6 +268,11 @@ class CanLink:
     def is_off(self) -> bool:
         """True while the adapter is bus-off by its own report."""
         return self._health.state is ControllerState.BUS_OFF
+
+    @property
+    def is_physical(self) -> bool:
+        """True unless the bus is known to exist in computers alone."""
+        return is_physical(self._interface, self._channel)
 
     def health(self) -> LinkHealth:
         """What is known of the adapter and its bus. Sends nothing; takes up to 2 s on SocketCAN."""

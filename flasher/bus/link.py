@@ -1,4 +1,4 @@
-"""The edge between an engine and a bus: seven methods, and a clock to go with them.
+"""The edge between an engine and a bus: eight methods, and a clock to go with them.
 
 A link and its clock belong together: the deadlines that a link is given are times of that clock. A
 real adapter goes with `MonotonicClock`; a simulated bus makes the time itself.
@@ -74,6 +74,11 @@ class Link(Protocol):
     @property
     def is_off(self) -> bool:
         """True while the adapter is bus-off by its own report. Asks nobody."""
+        ...
+
+    @property
+    def is_physical(self) -> bool:
+        """True unless the bus is known to exist in computers alone. Takes 2 s at most."""
         ...
 
     def health(self) -> LinkHealth:

@@ -309,6 +309,10 @@ class SimulatedLink:
         """True while the adapter is bus-off by its own report."""
         return self._health.state is ControllerState.BUS_OFF
 
+    @property
+    def is_physical(self) -> bool:
+        return False
+
     def health(self) -> LinkHealth:
         """As an adapter on Linux tells it: error-active unless something befell it."""
         faults = self._bus.faults

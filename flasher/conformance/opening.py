@@ -21,9 +21,11 @@ from flasher.conformance.real import (
 )
 from flasher.conformance.subject import Subject
 from flasher.errors import UsageError
+from flasher.image.image import Image
 from flasher.image.load import load
 from flasher.image.plausible import check_plausible
 from flasher.mock.profile import DeviceProfile
+from flasher.procedures import check_sample
 from flasher.protocol.spec import WELLING
 from flasher.protocol.text import printable
 from flasher.settings.device_model import set_options
@@ -71,8 +73,8 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
     """The device under test and its profile. Raises UsageError, ImageError and BusError."""
     check_bench(options)
     profile = None if options.profile is None else load_profile(options.profile)
-    good = _image(options.good_image, options)
-    second = _image(options.second_image, options)
+    images = [_image(path, options) for path in (options.good_image, options.second_image)]
+    good, second = (None if image is None else image.data for image in images)
     if second is not None and good is not None and len(second) >= len(good):
         raise UsageError(
             f"The second image is not smaller than the good one: {len(second):,} bytes, "
@@ -106,6 +108,8 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
     with api.connect(
         WELLING, holder="flasher conformance", fallback=options.fallback, **bus
     ) as connection:
+        for image in filter(None, images):
+            check_sample(image, connection.link)
         connection.listen_first(WELLING)
         port = RealPort(
             connection.link,
@@ -128,14 +132,14 @@ def open_bench(options: BenchOptions) -> Iterator[tuple[Subject, ConformanceProf
         )
 
 
-def _image(path: str | None, options: BenchOptions) -> bytes | None:
-    """The bytes of an image file, which a real device has to run."""
+def _image(path: str | None, options: BenchOptions) -> Image | None:
+    """An image file, which a real device has to run."""
     if path is None:
         return None
     image = load(path)
     if not options.allow_implausible:
         check_plausible(image)
-    return image.data
+    return image
 
 
 def check_bench(options: BenchOptions) -> None:

@@ -20,7 +20,9 @@ from flasher.bus.detect import (
     serial_ports,
 )
 from flasher.bus.inspect_interface import SYSFS
+from flasher.bus.physical import is_physical
 from flasher.errors import BusError, ErrorCode, UsageError
+from flasher.image.sample import is_sample, refused_sample
 from flasher.protocol.text import printable
 from flasher.station.config import SocketConfig
 from flasher.station.messages import VirtualUnits, WorkerSetup
@@ -91,6 +93,18 @@ def _resolve(socket: SocketConfig, detected: Sequence[Found]) -> Resolved:
     return Resolved(socket, bus | {"channel": channels[0]})
 
 
+def check_samples(sockets: Iterable[Resolved], recipe: LoadedRecipe) -> None:
+    """Raise ImageError when the recipe has a firmware sample and a socket a physical adapter."""
+    samples = [target.image for target in recipe.targets if is_sample(target.image)]
+    for each in sockets if samples else ():
+        if each.bus is None:
+            continue
+        interface, channel = str(each.bus["interface"]), str(each.bus["channel"])
+        if is_physical(interface, channel):
+            socket = printable(f"socket {each.config.name}, {interface} {channel}")
+            raise refused_sample(samples[0], socket)
+
+
 def worker_setups(
     sockets: Sequence[Resolved],
     recipe: LoadedRecipe,
@@ -101,8 +115,10 @@ def worker_setups(
     leave_after_s: float = 1.0,
 ) -> list[WorkerSetup]:
     """What each socket's process needs. Virtual units are numbered from `first_number` on, no
-    number twice, and dealt out like cards: `units` in all, or without end.
+    number twice, and dealt out like cards: `units` in all, or without end. Raises ImageError as
+    `check_samples`.
     """
+    check_samples(sockets, recipe)
     files = {str(path): sha256 for path, sha256 in recipe.files.items()}
     total = len(sockets)
     setups = []

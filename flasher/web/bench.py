@@ -24,6 +24,8 @@ from flasher.host.identity import Check, DeviceAnswers, judge_device, new_versio
 from flasher.host.outcome import AGAIN
 from flasher.host.query import piece_of
 from flasher.host.told import line_of, warning_of
+from flasher.image.image import Image
+from flasher.image.sample import is_sample, refused_sample
 from flasher.procedures import nobody_heard
 from flasher.protocol.contents import Memory, RunningInformation
 from flasher.protocol.spec import BMS, TARGETS, Dialect, Target
@@ -76,6 +78,7 @@ class Workplace(Protocol):
     def use(self, adapter: Adapter) -> None: ...
     def profile(self, target: Target) -> Profile: ...
     def bitrate_bps(self, adapter: Adapter) -> int: ...
+    def is_physical(self, adapter: Adapter) -> bool: ...
     def images(self) -> Sequence[Path]: ...
     def dropped(self) -> Sequence[str]: ...
     def use_folder(self, path: str) -> None: ...
@@ -375,6 +378,7 @@ class Bench:
     def _judged(self, path: Path) -> Offer:
         try:
             job = self._job(path, self.state.target)
+            self._check_sample(job.plan.image)
             self._check_device(job)
         except FlasherError as error:
             return Offer(path, refusal=error)
@@ -403,6 +407,12 @@ class Bench:
             at_power_up=self.state.is_rescue,
             waived=[waiver for waived, waiver in self.state.waived if waived == name],
         )
+
+    def _check_sample(self, image: Image) -> None:
+        """Raises ImageError for a firmware sample on a real bus; the upgrade looks again."""
+        adapter = self._adapter()
+        if is_sample(image) and self._place.is_physical(adapter):
+            raise refused_sample(image, adapter.name)
 
     def _check_device(self, job: Job) -> None:
         """Raises WrongDeviceError for an image that does not belong into the device that answered;

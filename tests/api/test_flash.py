@@ -281,6 +281,7 @@ class FakeLink:
         raise BusError("the adapter is not back")
 
     is_off = False
+    is_physical = True
 
     def health(self) -> LinkHealth:
         return HealthKeeper().health()

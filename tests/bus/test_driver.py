@@ -52,6 +52,7 @@ class FakeLink:
         pass
 
     is_off = False
+    is_physical = True
 
     def health(self) -> LinkHealth:
         return HealthKeeper().health()

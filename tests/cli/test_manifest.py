@@ -13,7 +13,7 @@ from flasher.settings.manifest import read_release
 from tests.cli.conftest import SAMPLES, Flasher
 from tests.firmware import VECTORS
 
-BMS_SHA256 = "5084b23b11e875b6041d23a7ba3918f28bf537aa30c136f03db8b9550481a823"
+BMS_SHA256 = "3524689d5cbc63c91a5c02a4259adac30edf582dc83c920a5109f83142426397"
 
 
 @pytest.fixture

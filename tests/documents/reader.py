@@ -60,6 +60,8 @@ class PageReader:
             shutil.copytree(ROOT / "firmware_samples", samples, ignore=_links)
             shorten(ROOT / "firmware_samples" / "bms", samples / "bms")
         (folder / "examples").symlink_to(ROOT / "examples")
+        # What a page with a real adapter says in the place of the image that a reader has.
+        shutil.copy(samples / "bms.hex", folder / "YOUR_IMAGE.hex")
 
     def follow(self, block: Block) -> None:
         """Do what it says."""

@@ -31,7 +31,11 @@ def follow(found: list[Block], folder: Path, *, patient: bool) -> None:
         # What it leaves for later pages it would find there.
         for name in ("XDG_DATA_HOME", "XDG_STATE_HOME", "FLASHER_BUNDLE_DIR"):
             patch.setenv(name, str(folder / name.lower()))
-        shown = any(block.language == "console" and "bms.hex" in block.text for block in found)
+        images = ("bms.hex", "YOUR_IMAGE.hex")
+        shown = any(
+            block.language == "console" and any(image in block.text for image in images)
+            for block in found
+        )
         reader = PageReader(folder, patient=patient, shows_samples=shown)
         for block in found:
             try:

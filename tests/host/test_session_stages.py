@@ -202,6 +202,10 @@ class Echoing:
     def is_off(self) -> bool:
         return self._link.is_off
 
+    @property
+    def is_physical(self) -> bool:
+        return self._link.is_physical
+
     def health(self) -> LinkHealth:
         return self._link.health()
 

@@ -17,7 +17,7 @@ from flasher.cli.station.documents import (
 from flasher.cli.station.setup import labels_of
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
-from flasher.station.adapters import detect, resolve
+from flasher.station.adapters import check_samples, detect, resolve
 from flasher.station.config import load_config
 from flasher.station.people import load_badges
 from flasher.station.recipe import fill
@@ -46,7 +46,9 @@ def check(output: Output, path: Path, station_file: Path | None) -> int:
         if config.badges:
             load_badges(Path(config.badges), recipe.recipe.serial_number)
         labels_of(config, recipe)
-        for socket in resolve(config.socket, detect(config.socket)):
+        resolved = resolve(config.socket, detect(config.socket))
+        check_samples(resolved, recipe)
+        for socket in resolved:
             bus = socket.bus
             adapter = "virtual units" if bus is None else f"{bus['interface']} {bus['channel']}"
             sockets[socket.config.name] = adapter

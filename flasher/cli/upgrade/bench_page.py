@@ -24,6 +24,7 @@ from platformdirs import user_data_path, user_state_path
 
 from flasher.api import Connection, Job, Watch, connect
 from flasher.bus.opening import bus_config
+from flasher.bus.physical import is_physical
 from flasher.cli.adapters import described, detected_until, ports, using
 from flasher.cli.files import write_whole
 from flasher.cli.look.backup import DEVICE_MODEL, backup_of
@@ -106,6 +107,9 @@ class _Place:
 
     def bitrate_bps(self, adapter: Adapter) -> int:
         return self.bus(adapter).bit_rate.bps
+
+    def is_physical(self, _adapter: Adapter) -> bool:
+        return False
 
     def bus(self, _adapter: Adapter) -> Bus:
         """The bus of an adapter."""
@@ -244,6 +248,11 @@ class Adapters(_Place):
 
     def use(self, adapter: Adapter) -> None:
         self._memory.keep(adapter=adapter.name)
+
+    def is_physical(self, adapter: Adapter) -> bool:
+        bus = self.bus(adapter)
+        merged = bus_config(bus.config, bus.fallback)
+        return is_physical(str(merged["interface"]), str(merged.get("channel") or ""))
 
     def bus(self, adapter: Adapter) -> Bus:
         return self._buses[adapter.name]

@@ -12,8 +12,6 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from flasher.api import Connection, Job, Watch
-from flasher.bus.detect import BUILT_IN, SOCKETCAN
-from flasher.bus.inspect_interface import VIRTUAL_KINDS
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording
@@ -80,7 +78,7 @@ class Carried:
                     record.opened(connection)
                     began_at = connection.clock.now()
                     with watching(connection, record) as watch:
-                        self._began(connection.name)
+                        self._began(connection)
 
                         def on_event(event: object) -> None:
                             match event:
@@ -124,15 +122,15 @@ class Carried:
 
     # -- the history -------------------------------------------------------------------------------
 
-    def _began(self, adapter: str) -> None:
+    def _began(self, connection: Connection) -> None:
         """The upgrade begins on this adapter."""
-        image, is_mock = self.job.plan.image, self.bus.mock
+        image = self.job.plan.image
         began = Began(
             at=_now(),
             command="rescue" if self.job.options.at_power_up else "flash",
             target=self.job.plan.target.name,
-            is_virtual=is_mock or _is_virtual(adapter),
-            adapter=_MOCK if is_mock else printable(adapter),
+            is_virtual=not connection.link.is_physical,
+            adapter=_MOCK if self.bus.mock else printable(connection.name),
             image=printable(image.source),
             image_sha256=image.sha256,
             image_size_bytes=image.size_bytes,
@@ -180,13 +178,6 @@ class Carried:
 
 def _now() -> str:
     return datetime.datetime.now().astimezone().isoformat(timespec="seconds")
-
-
-def _is_virtual(adapter: str) -> bool:
-    """A bus of python-can, or of the kernel, without hardware."""
-    interface, _, channel = adapter.partition(" ")
-    is_vcan = interface == SOCKETCAN and channel.startswith(tuple(VIRTUAL_KINDS))
-    return interface in BUILT_IN or is_vcan
 
 
 def _exit_code(error: BaseException | None) -> ExitCode:

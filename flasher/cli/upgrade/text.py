@@ -25,6 +25,7 @@ from flasher.image.cortexm import VectorTable, vector_table
 from flasher.image.image import Image
 from flasher.image.plan import Plan
 from flasher.image.release import names_of
+from flasher.image.sample import is_sample
 from flasher.prose import prose
 from flasher.protocol.spec import DIALECTS
 from flasher.protocol.text import printable
@@ -79,6 +80,8 @@ def image_lines(image: Image) -> list[str]:
     lines.append(f"  version: {image.version or 'none found inside'}")
     lines.append(f"  names:   {names_of(image.named_targets) or 'no target found inside'}")
     lines.append(f"  sha256:  {image.sha256}")
+    if is_sample(image):
+        lines.append("  sample:  a firmware sample of flasher, refused on a physical controller")
     return lines
 
 

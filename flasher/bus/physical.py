@@ -1,0 +1,41 @@
+"""Tells an adapter on a real bus from a bus that exists in computers alone."""
+
+from __future__ import annotations
+
+import os
+import platform
+import stat
+from typing import Final
+
+from flasher.bus.detect import BUILT_IN, SERIAL_PORTS, SOCKETCAN
+from flasher.bus.inspect_interface import VIRTUAL_KINDS, Interface, read_interface
+
+_PSEUDO_TERMINAL_MAJORS: Final = range(136, 144)
+"""Linux: Documentation/admin-guide/devices.txt, "Unix98 PTY slaves"."""
+
+
+def is_physical(interface: str, channel: str) -> bool:
+    """False for python-can's own buses, for a vcan or vxcan by the kernel's word, whatever it is
+    called, and for a serial adapter at a pseudo terminal. What cannot be found out is physical.
+    Takes 2 s at most; never raises.
+    """
+    if interface in BUILT_IN:
+        return False
+    if interface == SOCKETCAN:
+        seen = read_interface(channel)
+        return not (isinstance(seen, Interface) and seen.kind in VIRTUAL_KINDS)
+    if interface in SERIAL_PORTS:
+        # python-can takes PORT@BAUD.
+        return not _is_pseudo_terminal(channel.partition("@")[0])
+    return True
+
+
+def _is_pseudo_terminal(port: str) -> bool:
+    """Asks the kernel for what the name leads to."""
+    try:
+        found = os.stat(port)  # noqa: PTH116  a name that is no path fails here
+    except (OSError, ValueError):
+        return False
+    is_linux = platform.system() == "Linux"
+    is_device = stat.S_ISCHR(found.st_mode)
+    return is_linux and is_device and os.major(found.st_rdev) in _PSEUDO_TERMINAL_MAJORS
