@@ -181,6 +181,7 @@ def connect(
     dialect: str | Dialect = "welling",
     *,
     holder: str | None = "a program",
+    sends: bool = True,
     fallback: Fallback | None = None,
     **bus: Any,
 ) -> Iterator[Connection]:
@@ -190,13 +191,15 @@ def connect(
     files and CAN_* variables hold too, and behind them the `fallback`. The bit rate is the
     dialect's unless `bus` itself names another one. Meanwhile no other program of this user may
     speak as the tool on this adapter: `holder` names this program to them; None does not lock the
-    adapter, for programs that never speak as the tool (a device model, a monitor). Raises
-    UsageError or BusError.
+    adapter, for programs that never speak as the tool (a device model, a monitor). A program that
+    never `sends` can use an interface that only listens. Raises UsageError or BusError.
     """
     from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can
     from flasher.bus.link import MonotonicClock  # noqa: PLC0415
 
-    link = open_adapter(as_dialect(dialect).bitrate_bps, holder=holder, fallback=fallback, **bus)
+    link = open_adapter(
+        as_dialect(dialect).bitrate_bps, holder=holder, sends=sends, fallback=fallback, **bus
+    )
     try:
         yield Connection(link, MonotonicClock(), str(link), link.bit_rate)
     finally:

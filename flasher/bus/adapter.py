@@ -72,6 +72,7 @@ def open_adapter(
     default_bitrate_bps: int,
     *,
     holder: str | None = None,
+    sends: bool = True,
     listen_only: bool = False,
     fallback: Fallback | None = None,
     **config: Any,
@@ -80,8 +81,9 @@ def open_adapter(
     `fallback` describe.
 
     `default_bitrate_bps` is the dialect's, and what holds unless `config` itself names another bit
-    rate. As `holder` it is locked until it is closed (`lock.hold`). `listen_only` keeps the adapter
-    from acknowledging, where its back end can be told (`opening.can_listen_only`).
+    rate. As `holder` it is locked until it is closed (`lock.hold`). Who `sends` cannot use an
+    interface that only listens. `listen_only` keeps the adapter from acknowledging, where its back
+    end can be told (`opening.can_listen_only`).
 
     Raises UsageError for an interface that python-can does not know or a value that is no bit rate,
     BusError when the bit rate is another one, the adapter cannot be opened, or somebody holds it.
@@ -93,14 +95,14 @@ def open_adapter(
     def open_again() -> can.BusABC:
         # An interface that is back may have been set up anew, and otherwise.
         bit_rate(default_bitrate_bps, config, merged, fallback)
-        return open_bus(settled)
+        return open_bus(settled, sends=sends)
 
     interface = str(merged["interface"])
     channel = str(merged.get("channel") or "")
     give_back = hold(merged, holder)
     try:
         link = CanLink(
-            open_bus(settled),
+            open_bus(settled, sends=sends),
             interface,
             channel,
             open_again,

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from flasher.bus.fallback import Fallback
-from flasher.bus.inspect_interface import Interface, read_interface
+from flasher.bus.inspect_interface import Interface, change_commands, read_interface
 from flasher.errors import BusError, ErrorCode, UsageError
 from flasher.protocol.text import printable
 
@@ -131,8 +131,8 @@ def _refuse_other(found: BitRate, wanted: BitRate, merged: Mapping[str, Any]) ->
     if abs(found.bps - wanted.bps) <= wanted.bps * _TOLERANCE:
         return
     if found.source.startswith("the kernel"):
-        link = f"ip link set {merged['channel']}"
-        change = f"`{link} down; {link} type can bitrate {wanted.bps}; {link} up` (as root) sets it"
+        commands = change_commands(merged["channel"], f"bitrate {wanted.bps}")
+        change = f"`{'; '.join(commands)}` (as root) sets it"
     else:
         change = f"take it out of {found.source}"
     raise BusError(

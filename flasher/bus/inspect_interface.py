@@ -1,4 +1,5 @@
-"""What Linux says about a SocketCAN interface, without sending anything and without being root.
+"""What Linux says about a SocketCAN interface, without sending anything and without being root; and
+the commands by which root sets one up.
 
 `ip -details -json link show` tells most; where it is missing or too old, /sys tells whether the
 interface is there and up.
@@ -18,6 +19,8 @@ from typing import Any, Final
 from flasher.bus.health import ControllerState
 
 SYSFS: Final = Path("/sys/class/net")
+_WITHOUT_RESTART: Final = frozenset({"can327", "gs_usb", "slcan"})
+"""Drivers for which the kernel refuses every restart after bus-off, by itself or asked for."""
 VIRTUAL_KINDS: Final = frozenset({"vcan", "vxcan"})
 """Interfaces without a controller: no bit rate, no error states."""
 _IP_LIMIT_S: Final = 2.0
@@ -57,11 +60,23 @@ class Interface:
     queue_frames: int | None = None
     modes: frozenset[str] = frozenset()
     """Control modes that are on: LISTEN-ONLY, LOOPBACK, ONE-SHOT, FD, ..."""
+    driver: str = ""
+    """The driver's name as its bit timing limits give it; empty when not told."""
 
     @property
     def state(self) -> ControllerState:
         """The state of its controller."""
         return _STATES.get(self.state_name, ControllerState.UNKNOWN)
+
+    @property
+    def only_listens(self) -> bool:
+        """True when it acknowledges nothing and drops what it is given to send."""
+        return "LISTEN-ONLY" in self.modes
+
+    @property
+    def can_restart(self) -> bool:
+        """True when its driver takes `restart-ms`; False also when the driver is not known."""
+        return bool(self.driver) and self.driver not in _WITHOUT_RESTART
 
 
 _STATES: Final = {
@@ -99,6 +114,26 @@ def look_up(name: str, *, sysfs: Path = SYSFS) -> Interface | Unseen:
     )
 
 
+def start_command(channel: object, bitrate_bps: object) -> str:
+    """How root starts a SocketCAN interface; virtual ones, told by their name, take no options."""
+    if str(channel).startswith(tuple(VIRTUAL_KINDS)):
+        return f"ip link set {channel} up"
+    return f"ip link set {channel} up type can bitrate {bitrate_bps}"
+
+
+def restart_commands(channel: object) -> tuple[str, str]:
+    """How root starts an interface again after bus-off, with the settings that it has. `type can
+    restart` does so only where the driver has it.
+    """
+    return (f"ip link set {channel} down", f"ip link set {channel} up")
+
+
+def change_commands(channel: object, *options: str) -> tuple[str, str, str]:
+    """How root changes options of a CAN interface, which it takes only while it is down."""
+    down, up = restart_commands(channel)
+    return (down, f"ip link set {channel} type can {' '.join(options)}", up)
+
+
 def _is_a_name(name: str) -> bool:
     odd = any(letter in "/:" or letter.isspace() for letter in name)
     return 0 < len(name) <= _NAME_SIZE_MAX and not odd and name not in (".", "..")
@@ -130,7 +165,8 @@ def _from_ip(link: dict[str, Any]) -> Interface:
         str(link["ifname"]),
         is_can=link.get("link_type") == "can",
         is_up="UP" in flags,
-        has_carrier="NO-CARRIER" not in flags if "UP" in flags else None,
+        # NO-CARRIER stays set for up to a second after an interface was started.
+        has_carrier="LOWER_UP" in flags if "UP" in flags else None,
         kind=str(info.get("info_kind", "")),
         bitrate_bps=details.get("bittiming", {}).get("bitrate"),
         state_name=str(details.get("state", "")),
@@ -139,6 +175,7 @@ def _from_ip(link: dict[str, Any]) -> Interface:
         restart_ms=details.get("restart_ms", 0 if info.get("info_kind") == "can" else None),
         queue_frames=link.get("txqlen"),
         modes=frozenset(str(mode) for mode in details.get("ctrlmode", ())),
+        driver=str(details.get("bittiming_const", {}).get("name", "")),
     )
 
 

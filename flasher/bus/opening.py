@@ -13,8 +13,14 @@ import can.util
 
 from flasher.bus.back_ends import causes, words_of
 from flasher.bus.fallback import Fallback
-from flasher.bus.health import bus_off_error
-from flasher.bus.inspect_interface import Unseen, look_up
+from flasher.bus.health import ControllerState, bus_off_error
+from flasher.bus.inspect_interface import (
+    Unseen,
+    change_commands,
+    read_interface,
+    restart_commands,
+    start_command,
+)
 from flasher.errors import BusError, ErrorCode, UsageError
 from flasher.protocol.text import printable
 
@@ -113,8 +119,10 @@ def names_adapter(given: Mapping[str, Any], fallback: Fallback | None = None) ->
         return bus_config({**given, "interface": "virtual"}).get("channel") is not None
 
 
-def open_bus(config: Mapping[str, Any]) -> can.BusABC:
-    """Open what `bus_config` gave. Raises BusError with cause and remedy."""
+def open_bus(config: Mapping[str, Any], *, sends: bool = True) -> can.BusABC:
+    """Open what `bus_config` gave. Raises BusError with cause and remedy, also for an interface
+    that is open and carries nothing, or that `sends` needs and that only listens.
+    """
     interface, channel = str(config["interface"]), config.get("channel")
     try:
         bus = can.Bus(**config, ignore_config=True)
@@ -127,7 +135,7 @@ def open_bus(config: Mapping[str, Any]) -> can.BusABC:
             code=ErrorCode.ADAPTER_NOT_OPENED,
         ) from error
     if interface == "socketcan":
-        failure = _unusable(str(channel), config.get("bitrate"))
+        failure = _unusable(str(channel), config.get("bitrate"), sends=sends)
         if failure is not None:
             with contextlib.suppress(can.CanError, OSError):
                 bus.shutdown()
@@ -135,16 +143,11 @@ def open_bus(config: Mapping[str, Any]) -> can.BusABC:
     return bus
 
 
-def start_command(channel: object, bitrate_bps: object) -> str:
-    """How root starts a SocketCAN interface; virtual ones, told by their name, take no options."""
-    if str(channel).startswith(("vcan", "vxcan")):
-        return f"ip link set {channel} up"
-    return f"ip link set {channel} up type can bitrate {bitrate_bps} restart-ms 100"
-
-
-def _unusable(channel: str, bitrate_bps: object) -> BusError | None:
-    """A SocketCAN interface opens while it is down or bus-off, and then carries nothing."""
-    seen = look_up(channel)
+def _unusable(channel: str, bitrate_bps: object, *, sends: bool) -> BusError | None:
+    """A SocketCAN interface opens while it is down, bus-off or only listens. The carrier does not
+    tell: gs_usb keeps it after bus-off.
+    """
+    seen = read_interface(channel)
     if isinstance(seen, Unseen) or not seen.is_can:
         return None
     where = f"interface socketcan, channel {channel}"
@@ -156,14 +159,25 @@ def _unusable(channel: str, bitrate_bps: object) -> BusError | None:
             remedy=f"`{start_command(channel, bitrate_bps)}` (as root) starts it.",
             code=ErrorCode.ADAPTER_NOT_OPENED,
         )
-    if seen.has_carrier is False:
-        error = bus_off_error(where, f"The adapter cannot be used: {channel} has no carrier.")
-        error.cause += ", or the other end of a vxcan pair is down"
+    if seen.state is ControllerState.BUS_OFF or seen.has_carrier is False:
+        what = "is bus-off" if seen.state is ControllerState.BUS_OFF else "has no carrier"
+        error = bus_off_error(where, f"The adapter cannot be used: {channel} {what}.")
+        if seen.has_carrier is False:
+            error.cause += ", or the other end of a vxcan pair is down"
         error.remedy = (
-            f"Check bit rate and wiring; `ip link set {channel} type can restart` (as root) "
+            f"Check bit rate and wiring; `{'; '.join(restart_commands(channel))}` (as root) "
             "starts the controller again."
         )
         return error
+    if sends and seen.only_listens:
+        return BusError(
+            f"The adapter cannot be used: {channel} only listens, and nothing was sent.",
+            where=where,
+            cause="its listen-only mode is on, in which it acknowledges and sends no frame",
+            remedy=f"`{'; '.join(change_commands(channel, 'listen-only off'))}` (as root) lets it "
+            "send; flasher monitor works as it is.",
+            code=ErrorCode.ADAPTER_NOT_OPENED,
+        )
     return None
 
 

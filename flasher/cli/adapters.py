@@ -11,7 +11,7 @@ import click
 
 from flasher.api import Device, Watch
 from flasher.bus.detect import SLOW, SOCKETCAN, Detected, Detection, Found, serial_ports
-from flasher.bus.inspect_interface import VIRTUAL_KINDS, Interface, read_interface
+from flasher.bus.inspect_interface import VIRTUAL_KINDS, Interface, read_interface, start_command
 from flasher.cli.framework import retyped
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
@@ -59,8 +59,6 @@ def interface_of(found: Found) -> Interface | None:
 
 def described(found: Found, dialect: Dialect) -> str:
     """An adapter in words: its state where the kernel tells it, its name, its serial number."""
-    from flasher.bus.opening import start_command  # noqa: PLC0415  loads python-can
-
     words = []
     seen = interface_of(found)
     if seen is not None and seen.is_up:

@@ -20,8 +20,10 @@ from flasher.protocol.text import printable
 
 LOG_FILE: Final = "--log-file"
 _PYTHON_CAN: Final = "can"
-_FORGOTTEN_BUS: Final = "was not properly shut down"
-"""A remark of python-can on a bus that it could not open, beside the error."""
+_ALSO_RAISED: Final = ("was not properly shut down", "Could not access SocketCAN device")
+"""What python-can logs of a bus that it cannot open, beside the error that it raises: a command
+that waits for an adapter tries again.
+"""
 _NOWHERE: Final = logging.NullHandler()
 _NOTHING: Final = logging.CRITICAL + 1
 _ON_STDERR: Final = {
@@ -89,7 +91,7 @@ class _Screen(logging.Handler):
         event = getattr(record, "event", None)
         if getattr(record, "said", False) or self._output.shows(event):
             return
-        if _FORGOTTEN_BUS in str(record.msg):
+        if any(words in str(record.msg) for words in _ALSO_RAISED):
             return
         try:
             name = record.name.removeprefix(f"{ROOT}.")

@@ -236,7 +236,11 @@ class Bus:
                 target, self.dialect, speed=self.mock_speed, system=True, profile=riding
             )
         return connect(
-            self.dialect, holder=holder() if asks else None, fallback=self.fallback, **self.config
+            self.dialect,
+            holder=holder() if asks else None,
+            sends=asks,
+            fallback=self.fallback,
+            **self.config,
         )
 
 

@@ -7,6 +7,7 @@ import errno
 import time
 import uuid
 from collections import deque
+from dataclasses import replace
 from typing import Any
 
 import can
@@ -17,7 +18,7 @@ from flasher.bus.adapter import CanLink, open_adapter
 from flasher.bus.health import ControllerState
 from flasher.bus.inspect_interface import Interface, Unseen
 from flasher.bus.link import SEND_LIMIT_S
-from flasher.errors import BusError, ExitCode, TransmitBlockedError, UsageError
+from flasher.errors import BusError, ErrorCode, ExitCode, TransmitBlockedError, UsageError
 from flasher.protocol.frame import Frame
 
 FRAME = Frame(0x752, b"\x55\xaa\x16\x07")
@@ -374,28 +375,69 @@ def test_a_link_that_was_handed_a_bus_cannot_be_opened_again(bus: FakeBus) -> No
 
 @pytest.mark.usefixtures("no_configuration")
 @pytest.mark.parametrize(
-    ("seen", "words"),
+    ("seen", "code", "words"),
     [
         (
             Interface("can0", is_can=True, is_up=False),
+            ErrorCode.ADAPTER_NOT_OPENED,
             "ip link set can0 up type can bitrate 250000",
         ),
         (
             Interface("can0", is_can=True, is_up=True, has_carrier=False),
-            "ip link set can0 type can restart",
+            ErrorCode.BUS_OFF,
+            "`ip link set can0 down; ip link set can0 up` (as root)",
+        ),
+        (
+            Interface("can0", is_can=True, is_up=True, has_carrier=True, state_name="BUS-OFF"),
+            ErrorCode.BUS_OFF,
+            "`ip link set can0 down; ip link set can0 up` (as root)",
+        ),
+        (
+            Interface("can0", is_can=True, is_up=True, modes=frozenset({"LISTEN-ONLY"})),
+            ErrorCode.ADAPTER_NOT_OPENED,
+            "`ip link set can0 down; ip link set can0 type can listen-only off; ip link",
         ),
     ],
 )
 def test_an_interface_that_opens_but_carries_nothing_is_not_taken_for_open(
-    monkeypatch: pytest.MonkeyPatch, seen: Interface, words: str
+    monkeypatch: pytest.MonkeyPatch, seen: Interface, code: ErrorCode, words: str
 ) -> None:
     fake = FakeBus()
     monkeypatch.setattr("can.Bus", lambda **_config: fake)
-    monkeypatch.setattr("flasher.bus.opening.look_up", lambda _name: seen)
+    monkeypatch.setattr("flasher.bus.opening.read_interface", lambda _name: seen)
     with pytest.raises(BusError) as caught:
         open_adapter(250_000, interface="socketcan", channel="can0")
     assert words in caught.value.remedy
+    assert caught.value.code is code
     assert fake._is_shutdown
+
+
+@pytest.mark.usefixtures("no_configuration")
+def test_an_interface_that_only_listens_is_open_for_who_never_sends(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    seen = Interface("can0", is_can=True, is_up=True, modes=frozenset({"LISTEN-ONLY"}))
+    monkeypatch.setattr("can.Bus", lambda **_config: FakeBus())
+    monkeypatch.setattr("flasher.bus.opening.read_interface", lambda _name: seen)
+    link = open_adapter(250_000, sends=False, interface="socketcan", channel="can0")
+    link.reopen()
+    link.close()
+
+
+@pytest.mark.usefixtures("no_configuration")
+def test_an_adapter_that_is_bus_off_is_not_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """gs_usb keeps its carrier, and a socket on it opens."""
+    on = Interface("can0", is_can=True, is_up=True, has_carrier=True, state_name="ERROR-ACTIVE")
+    states = [on, replace(on, state_name="BUS-OFF"), on]
+    monkeypatch.setattr("can.Bus", lambda **_config: FakeBus())
+    monkeypatch.setattr("flasher.bus.opening.read_interface", lambda _name: states.pop(0))
+    link = open_adapter(250_000, interface="socketcan", channel="can0")
+    with pytest.raises(BusError) as caught:
+        link.reopen()
+    assert caught.value.code is ErrorCode.BUS_OFF
+    link.reopen()
+    link.send(FRAME)
+    link.close()
 
 
 @pytest.mark.usefixtures("no_configuration")

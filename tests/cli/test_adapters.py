@@ -48,8 +48,15 @@ class Machine:
 
     @contextmanager
     def open(
-        self, _dialect: object, *, holder: object, fallback: object = None, **bus: Any
+        self,
+        _dialect: object,
+        *,
+        holder: object,
+        sends: bool = True,
+        fallback: object = None,
+        **bus: Any,
     ) -> Iterator[Connection]:
+        assert sends == (holder is not None)
         self.opened.append(bus)
         yield self.wire
 

@@ -209,9 +209,8 @@ class Doctor:
         monkeypatch.setattr("flasher.cli.look.doctor.Detection", self._detection)
         monkeypatch.setattr("can.Bus", self._open)
         monkeypatch.setattr("can.util.CONFIG_FILES", [])
-        for name in ("flasher.bus.inspect_interface", "flasher.bus.adapter"):
+        for name in ("flasher.bus.inspect_interface", "flasher.bus.adapter", "flasher.bus.opening"):
             monkeypatch.setattr(f"{name}.read_interface", lambda _name: self.interface)
-        monkeypatch.setattr("flasher.bus.opening.look_up", lambda _name: self.interface)
 
     @contextmanager
     def _detection(self, names: Iterable[str]) -> Iterator[Doctor]:
@@ -298,12 +297,7 @@ AGAIN = ["ip link set can0 down", "ip link set can0 type can {}", "ip link set c
 @pytest.mark.parametrize(
     ("change", "words", "severity", "fix"),
     [
-        (
-            {"bitrate_bps": 500_000},
-            "runs at 500 kbit/s",
-            "problem",
-            "bitrate 250000 restart-ms 100",
-        ),
+        ({"bitrate_bps": 500_000}, "runs at 500 kbit/s", "problem", "bitrate 250000"),
         (
             {"modes": frozenset({"LISTEN-ONLY"})},
             "nothing can be sent",
@@ -312,7 +306,12 @@ AGAIN = ["ip link set can0 down", "ip link set can0 type can {}", "ip link set c
         ),
         ({"modes": frozenset({"LOOPBACK"})}, "itself only", "problem", "loopback off"),
         ({"modes": frozenset({"ONE-SHOT"})}, "is lost", "warning", "one-shot off"),
-        ({"restart_ms": 0}, "stays off the bus", "warning", "restart-ms 100"),
+        (
+            {"restart_ms": 0, "driver": "sja1000"},
+            "stays off the bus",
+            "warning",
+            "restart-ms 100",
+        ),
     ],
 )
 def test_each_wrong_setting_has_its_commands(
@@ -322,6 +321,22 @@ def test_each_wrong_setting_has_its_commands(
     run = examine(*ON_CAN0)
     assert run.code == (ExitCode.BUS if severity == "problem" else ExitCode.OK)
     assert one(run, words) == (severity, [line.format(fix) for line in AGAIN])
+
+
+@pytest.mark.parametrize("driver", ["gs_usb", "slcan", ""])
+def test_a_restart_that_the_driver_does_not_have_is_not_recommended(
+    examine: Doctor, driver: str
+) -> None:
+    examine.interface = replace(CAN0, restart_ms=0, driver=driver)
+    assert one(examine(*ON_CAN0), "stays off the bus") == ("note", [])
+
+
+def test_an_interface_that_only_listens_acknowledges_nothing(examine: Doctor) -> None:
+    examine.interface = replace(CAN0, modes=frozenset({"LISTEN-ONLY"}))
+    run = examine(*ON_CAN0)
+    assert one(run, "can0 opens and")[0] == "ok"
+    assert "listens without acknowledging" in one_text(run, "can0 opens and")
+    assert run.document["traffic"]["listen_only"]
 
 
 def test_settings_that_are_fine_are_noted_without_a_command(examine: Doctor) -> None:
@@ -340,7 +355,7 @@ def test_settings_that_are_fine_are_noted_without_a_command(examine: Doctor) -> 
         (
             replace(CAN0, is_up=False, has_carrier=None, bitrate_bps=None),
             "can0 is down",
-            "ip link set can0 up type can bitrate 250000 restart-ms 100",
+            "ip link set can0 up type can bitrate 250000",
         ),
     ],
 )
@@ -388,7 +403,7 @@ def test_the_state_of_the_controller(examine: Doctor, state: str, frames: int, c
     severity, fix = one(run, "error counters: transmit 136")
     assert (severity == "problem") == (code == ExitCode.BUS)
     if state == "BUS-OFF":
-        assert fix == ["ip link set can0 type can restart"]
+        assert fix == ["ip link set can0 down", "ip link set can0 up"]
 
 
 def test_error_frames_and_nothing_else_are_a_wrong_bit_rate_or_a_device_alone(

@@ -303,6 +303,9 @@ def test_a_bus_that_could_not_be_opened_is_no_warning_beside_its_failure(
 ) -> None:
     def fails(**_config: object) -> None:
         logging.getLogger("can.bus").warning("%s was not properly shut down", "FakeBus")
+        logging.getLogger("can.interfaces.socketcan.socketcan").error(
+            "Could not access SocketCAN device %s (%s)", "can0", "No such device"
+        )
         logging.getLogger("can.bus").warning("something else")
         raise OSError("no socket")
 
@@ -311,3 +314,4 @@ def test_a_bus_that_could_not_be_opened_is_no_warning_beside_its_failure(
     assert "The adapter cannot be opened" in said
     assert "something else" in said
     assert "properly" not in said
+    assert "Could not access" not in said

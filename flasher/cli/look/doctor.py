@@ -14,7 +14,7 @@ from typing import Any, Final
 
 from flasher import api
 from flasher.bus.detect import SLOW, Detected, Detection
-from flasher.bus.health import ControllerState
+from flasher.bus.health import ControllerState, HealthKeeper
 from flasher.bus.link import Clock, Link, MonotonicClock
 from flasher.cli import values
 from flasher.cli.adapters import only
@@ -243,17 +243,24 @@ class Examination:
         if interface == "socketcan" and not channel:
             self._note(findings.nameless())
             return
+        only_listens = False
         if interface == "socketcan":
             seen = read_interface(channel)
+            only_listens = isinstance(seen, Interface) and seen.only_listens
             self._note(*findings.interface(seen, channel, self.bitrate_bps))
             if isinstance(seen, Interface) and (
                 not (seen.is_up and seen.is_can)  # it would open, and carry nothing
                 or seen.bitrate_bps not in (None, self.bitrate_bps)  # it would not be opened
             ):
                 return
+            if isinstance(seen, Interface) and seen.state is ControllerState.BUS_OFF:
+                health = HealthKeeper().health(seen.state, seen.tx_errors, seen.rx_errors)
+                self._note(*findings.health(health, channel, is_socketcan=True))
+                return
         try:
             link = open_adapter(
                 self.dialect.bitrate_bps,
+                sends=False,
                 listen_only=True,
                 fallback=self._bus.fallback,
                 **given,
@@ -262,7 +269,7 @@ class Examination:
             self._note(findings.opening(error))
             return
         try:
-            is_silent = can_listen_only(interface)
+            is_silent = can_listen_only(interface) or only_listens
             self._note(findings.opened(str(link), is_silent=is_silent))
             self._listen(
                 link, MonotonicClock(), bus_words(interface, channel, given), stopped,

@@ -16,8 +16,15 @@ from typing import Final
 from flasher.bus.detect import Detected
 from flasher.bus.fallback import Fallback
 from flasher.bus.health import ControllerState, LinkHealth
-from flasher.bus.inspect_interface import VIRTUAL_KINDS, Interface, Unseen
-from flasher.bus.opening import needed_extra, start_command
+from flasher.bus.inspect_interface import (
+    VIRTUAL_KINDS,
+    Interface,
+    Unseen,
+    change_commands,
+    restart_commands,
+    start_command,
+)
+from flasher.bus.opening import needed_extra
 from flasher.cli.output import counted
 from flasher.errors import BusError
 from flasher.host.survey import Survey
@@ -197,12 +204,6 @@ def _kind(seen: Interface, name: str, bitrate_bps: int) -> Iterator[Finding]:
     yield from _queue_and_restart(seen, name)
 
 
-def _again(name: str, *options: str) -> tuple[str, ...]:
-    """Options of a CAN interface change only while it is down."""
-    changes = f"ip link set {name} type can {' '.join(options)}"
-    return (f"ip link set {name} down", changes, f"ip link set {name} up")
-
-
 def _bit_rate(seen: Interface, name: str, bitrate_bps: int) -> Iterator[Finding]:
     wanted = f"{bitrate_bps / 1000:g} kbit/s"
     if seen.bitrate_bps is None:
@@ -214,7 +215,7 @@ def _bit_rate(seen: Interface, name: str, bitrate_bps: int) -> Iterator[Finding]
         yield _problem(
             "interface",
             f"{name} runs at {seen.bitrate_bps / 1000:g} kbit/s, {wanted} is needed",
-            _again(name, f"bitrate {bitrate_bps}", "restart-ms 100"),
+            change_commands(name, f"bitrate {bitrate_bps}"),
         )
     else:
         yield _ok("interface", f"{name} runs at {wanted}")
@@ -229,7 +230,7 @@ def _modes(seen: Interface, name: str) -> Iterator[Finding]:
     for mode, (severity, why) in harm.items():
         if mode in seen.modes:
             what = f"{name} is in {mode.lower()} mode: {why}"
-            yield Finding(severity, "interface", what, _again(name, f"{mode.lower()} off"))
+            yield Finding(severity, "interface", what, change_commands(name, f"{mode.lower()} off"))
     if "FD" in seen.modes:
         what = f"{name} takes CAN FD; the protocol is classic CAN, which works there as well"
         yield _note("interface", what)
@@ -237,11 +238,12 @@ def _modes(seen: Interface, name: str) -> Iterator[Finding]:
 
 def _queue_and_restart(seen: Interface, name: str) -> Iterator[Finding]:
     if seen.restart_ms == 0:
-        yield _warning(
-            "interface",
-            f"{name} stays off the bus after a bus-off (restart-ms 0)",
-            _again(name, "restart-ms 100"),
-        )
+        what = f"{name} stays off the bus after a bus-off"
+        if seen.can_restart:
+            fix = change_commands(name, "restart-ms 100")
+            yield _warning("interface", f"{what} (restart-ms 0)", fix)
+        else:
+            yield _note("interface", f"{what}, until it is taken down and up again")
     if seen.queue_frames is not None and seen.queue_frames < FRAMES_PER_PACKET:
         what = f"the transmit queue of {name} holds {counted(seen.queue_frames, 'frame')}, a packet"
         what += f" has {FRAMES_PER_PACKET}: flasher waits for room, nothing is to be done"
@@ -253,7 +255,7 @@ def health(health: LinkHealth, channel: str, *, is_socketcan: bool) -> Iterator[
     counters = ""
     if health.tx_errors is not None:
         counters = f", error counters: transmit {health.tx_errors}, receive {health.rx_errors}"
-    restart = (f"ip link set {channel} type can restart",) if is_socketcan else ()
+    restart = restart_commands(channel) if is_socketcan else ()
     what = f"the controller is {prose(health.state)}{counters}"
     if health.state is ControllerState.ACTIVE:
         yield _ok("bus", what)

@@ -260,7 +260,7 @@ class Adapters(_Place):
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
         bus = self.bus(adapter)
         asking = holder() if asks else None
-        return connect(self.dialect, holder=asking, fallback=bus.fallback, **bus.config)
+        return connect(self.dialect, holder=asking, sends=asks, fallback=bus.fallback, **bus.config)
 
 
 @dataclass
