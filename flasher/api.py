@@ -312,10 +312,11 @@ class _OnBus:
         verify: Level | str | None,
         identity: Identity | None,
         *,
+        in_session: bool,
         at_power_up: bool = False,
     ) -> Job:
         rate = self.connection.bit_rate
-        return prepare(
+        job = prepare(
             image,
             self.profile,
             bitrate_bps=None if rate is None else rate.bps,
@@ -324,6 +325,7 @@ class _OnBus:
             identity=identity,
             at_power_up=at_power_up,
         )
+        return job.in_session() if in_session else job
 
     def _cancelled(self, step: Run | WaitUntil, watch: Watch) -> Callable[[], bool] | None:
         """What ends a step before its end."""
@@ -437,16 +439,19 @@ class Device(_OnBus):
         options: UpgradeOptions | None = None,
         verify: Level | str | None = None,
         identity: Identity | None = None,
+        in_session: bool = False,
         **watch: Unpack[Watch],
     ) -> Result:
         """Upgrade it with an image file (or a loaded `Image`), and verify it.
 
         `verify` is "none", "version" or "memory"; None chooses (`default_level`). `identity` None
-        takes the manifest beside the file, if there is one, and waives no check. Returns the result
-        of a good session, or of one that found nothing to do; every other one is raised as the
-        FlasherError that stands for it (see flasher.errors).
+        takes the manifest beside the file, if there is one, and waives no check. With `in_session`
+        a device that answers nothing gets an update command (R26): an upgrade of it was broken off,
+        and it may still wait in it. Returns the result of a good session, or of one that found
+        nothing to do; every other one is raised as the FlasherError that stands for it (see
+        flasher.errors).
         """
-        job = self._job(image, options, verify, identity)
+        job = self._job(image, options, verify, identity, in_session=in_session)
         return _checked(self._run(job.procedure(self._steps), watch))
 
     def rescue(
@@ -456,12 +461,14 @@ class Device(_OnBus):
         options: UpgradeOptions | None = None,
         verify: Level | str | None = None,
         identity: Identity | None = None,
+        in_session: bool = False,
         **watch: Unpack[Watch],
     ) -> Result:
         """`flash` for a device whose application does not run: waits until it announces its
-        bootloader at power-up, for `power_up_timeout_s` of the options, and upgrades it then.
+        bootloader at power-up, for `power_up_timeout_s` of the options, and upgrades it then. With
+        `in_session` it is looked for as by `flash` before.
         """
-        job = self._job(image, options, verify, identity, at_power_up=True)
+        job = self._job(image, options, verify, identity, in_session=in_session, at_power_up=True)
         return _checked(self._run(job.procedure(self._steps), watch))
 
     def upgrade(
@@ -587,11 +594,14 @@ class AsyncDevice(_OnBus):
         options: UpgradeOptions | None = None,
         verify: Level | str | None = None,
         identity: Identity | None = None,
+        in_session: bool = False,
         **watch: Unpack[Watch],
     ) -> Result:
         import asyncio  # noqa: PLC0415  for programs that have it already
 
-        job = await asyncio.to_thread(self._job, image, options, verify, identity)
+        job = await asyncio.to_thread(
+            partial(self._job, image, options, verify, identity, in_session=in_session)
+        )
         return _checked(await self._run(job.procedure(self._steps), watch))
 
     async def rescue(
@@ -601,12 +611,15 @@ class AsyncDevice(_OnBus):
         options: UpgradeOptions | None = None,
         verify: Level | str | None = None,
         identity: Identity | None = None,
+        in_session: bool = False,
         **watch: Unpack[Watch],
     ) -> Result:
         import asyncio  # noqa: PLC0415  for programs that have it already
 
         job = await asyncio.to_thread(
-            partial(self._job, image, options, verify, identity, at_power_up=True)
+            partial(
+                self._job, image, options, verify, identity, in_session=in_session, at_power_up=True
+            )
         )
         return _checked(await self._run(job.procedure(self._steps), watch))
 
@@ -698,6 +711,10 @@ class Job:
     """What was found; nothing that speaks against it."""
     waived: tuple[str, ...] = ()
     """Names of the checks that somebody has waived (flasher.host.waivers)."""
+
+    def in_session(self) -> Job:
+        """The same for a device that an earlier upgrade may have left in its session (R26)."""
+        return replace(self, options=replace(self.options, in_session=True))
 
     def procedure(self, steps: Procedures) -> Procedure[Result]:
         """What carries it out, to its end, good or bad."""

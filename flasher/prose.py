@@ -64,7 +64,8 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "request_late": "the device requested the transfer anew in the middle of it",
         "restarted": "the device restarted",
         "boot_given_up": "the device did not announce its bootloader",
-        "boot_silent": "the device neither answered the reset nor announced its bootloader",
+        "boot_silent": "the device answers nothing, as one in an open session, and gets an update "
+        "command",
         "request_given_up": "the device did not request the transfer in time",
         "end_refused": "the device refused the {what}",
         "end_unanswered": "the device did not answer the {what} in time",
@@ -169,7 +170,8 @@ _EXPLANATIONS: Final[dict[str, Explanation]] = {
     "no_boot_version": Explanation(
         "the device has no power, sleeps, is not on this bus, or its bootloader announces itself "
         "only at power-up",
-        "Check supply and wiring. A device that announces itself at power-up only is reached by "
+        "Check supply and wiring. A device whose upgrade was broken off may still wait in it: "
+        "--in-session reaches that. One that announces itself at power-up only is reached by "
         "flasher rescue and a power cycle.",
     ),
     "no_request": Explanation(

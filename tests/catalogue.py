@@ -18,7 +18,7 @@ from babel.messages.pofile import read_po, write_po
 
 from flasher.events import Phase
 from flasher.host.items import meaningful_fields
-from flasher.host.outcome import _EXPLANATIONS, AGAIN, DeviceLeft, _late
+from flasher.host.outcome import _EXPLANATIONS, _NO_SESSION_EITHER, AGAIN, DeviceLeft, _late
 from flasher.host.table import Ending
 from flasher.host.verify import Verdict
 from flasher.prose import prose
@@ -47,6 +47,7 @@ def said() -> Iterator[str]:
     yield from (prose(each) for kind in (Phase, Ending, Verdict, DeviceLeft) for each in kind)
     explained = [
         *_EXPLANATIONS.values(),
+        _NO_SESSION_EITHER,
         *itertools.starmap(_late, itertools.product(Phase, DeviceLeft)),
     ]
     for each in explained:

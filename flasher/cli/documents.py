@@ -178,6 +178,9 @@ class OutcomeDocument:
     running_version: str | None
     detail: str
     statistics: Statistics
+    sent_into_silence: bool
+    """The device answered nothing, and got an update command: it might sit in a session that an
+    earlier upgrade had left open (R26)."""
 
 
 # -- surveys ---------------------------------------------------------------------------------------

@@ -56,6 +56,9 @@ class UpgradeOptions:
     """Oldest bootloader, as `Vx.x.x`, that may be given the image; None is any."""
     at_power_up: bool = False
     """Send no reset: wait for the announcement of a device that is switched on."""
+    in_session: bool = False
+    """An earlier upgrade may have left the device in its session: when it stays silent, and answers
+    no reset, it gets an update command (R26); only after that is a power cycle asked for."""
     power_up_timeout_s: float = DEFAULT_POWER_UP_TIMEOUT_S
     """How long such an announcement is waited for."""
     adapter_return_s: float = DEFAULT_ADAPTER_RETURN_S
@@ -119,4 +122,8 @@ def default_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
     transfer_s = plan.wire_s + gaps_s(plan, options) + answers_s
     end_s = timings.complete_timeout_s * timings.end_tries + timings.application_start_timeout_s
     away_s = (options.attempts - 1) * options.adapter_return_s
-    return options.attempts * (begin_s + transfer_s) + away_s + end_s
+    silence_s = 0.0
+    if options.in_session:
+        silence_s = max(timings.boot_version_timeout_s, timings.request_transfer_timeout_s)
+        silence_s += timings.command_timeout_s + timings.request_transfer_timeout_s
+    return silence_s + options.attempts * (begin_s + transfer_s) + away_s + end_s

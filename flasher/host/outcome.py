@@ -96,6 +96,9 @@ class Outcome:
     """What was seen, where the ending alone does not say it."""
     waiver: str = ""
     """The check that refused, where a person may waive it and the ending alone does not say it."""
+    sent_into_silence: bool = False
+    """An update command was sent to a device that answered neither reset nor anything else, as it
+    might sit in a session that was left open (R26)."""
 
     @property
     def ok(self) -> bool:
@@ -128,11 +131,12 @@ class Outcome:
         """
         if self.ok or self.nothing_to_do:
             return None
-        kind, cause, remedy, code = (
-            _late(self.phase, self.device_left)
-            if self.ending is Ending.OUT_OF_TIME
-            else _EXPLANATIONS[self.ending]
-        )
+        explained = _EXPLANATIONS.get(self.ending)
+        if explained is None:
+            explained = _late(self.phase, self.device_left)
+        elif self.ending is Ending.NO_BOOT_VERSION and self.sent_into_silence:
+            explained = _NO_SESSION_EITHER
+        kind, cause, remedy, code = explained
         node, ending = self.target.node.name, say(prose(self.ending))
         what = say("{node}: {ending}.", node=node, ending=ending)
         if self.detail:
@@ -204,8 +208,9 @@ _EXPLANATIONS: Final = {
         NoAnswerError,
         "the device has no power, sleeps, is not on this bus, the bit rate differs, or its "
         "bootloader announces itself only at power-up",
-        "Check supply, wiring, termination and bit rate (flasher doctor). A device that announces "
-        "itself at power-up only is reached by flasher rescue and a power cycle.",
+        "Check supply, wiring, termination and bit rate (flasher doctor). A device whose upgrade "
+        "was broken off may still wait in it: --in-session reaches that. One that announces itself "
+        "at power-up only is reached by flasher rescue and a power cycle.",
         code=ErrorCode.NO_BOOT_VERSION,
     ),
     Ending.NO_ANNOUNCEMENT: _Explanation(
@@ -219,7 +224,7 @@ _EXPLANATIONS: Final = {
     Ending.NO_REQUEST: _Explanation(
         NoAnswerError,
         "erasing takes longer than allowed, or the device refuses this size or target",
-        "Power-cycle the device. {again}",
+        "{again} Power-cycle the device if it stays silent.",
         code=ErrorCode.NO_REQUEST,
     ),
     Ending.UNHEARING: _Explanation(
@@ -315,10 +320,14 @@ _EXPLANATIONS: Final = {
     Ending.CANCELLED: _Explanation(
         InterruptedByUserError,
         "",
-        "{again} Give a bootloader that was receiving some seconds to time out first, or "
-        "power-cycle the device if it does not.",
+        "{again} A bootloader that was receiving may need some seconds to time out first.",
     ),
 }
+_NO_SESSION_EITHER: Final = _EXPLANATIONS[Ending.NO_BOOT_VERSION]._replace(
+    remedy="Check supply, wiring, termination and bit rate (flasher doctor), then reach the device "
+    "by flasher rescue and a power cycle."
+)
+"""For a device that did not answer the update command into its silence (R26) either."""
 
 
 def _late(phase: Phase, left: DeviceLeft) -> _Explanation:

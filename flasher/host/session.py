@@ -23,7 +23,14 @@ from flasher.errors import (
 from flasher.events import Phase
 from flasher.host.guard import Guard
 from flasher.host.identify import Identify
-from flasher.host.identity import CheckResult, DeviceAnswers, Identity, judge_device, judge_image
+from flasher.host.identity import (
+    CheckResult,
+    CheckVerdict,
+    DeviceAnswers,
+    Identity,
+    judge_device,
+    judge_image,
+)
 from flasher.host.options import UpgradeOptions, firmware_version, overall_timeout_s
 from flasher.host.outcome import DeviceLeft, Outcome, before_the_start
 from flasher.host.runner import Runner, Stage
@@ -41,6 +48,8 @@ from flasher.image.plan import Plan
 from flasher.prose import prose
 from flasher.protocol.catalogue import BY_KEY
 from flasher.protocol.frame import Frame
+from flasher.protocol.spec import Node, can_id
+from flasher.said import say
 
 _NO_CONTACT: Final = (NoAnswerError, TransferError, UnconfirmedError, VerificationError)
 """Errors that a battery which switched off explains, or a computer that paused."""
@@ -95,7 +104,7 @@ class Session(Runner[Result]):
 
     It listens for a second tool before it sends anything. With `identity` the device is then asked
     who it is, and the image is held against the answer, before anything is written; a device that
-    is waited for at power-up cannot be asked.
+    is waited for at power-up cannot be asked, but where it may sit in a session that was left open.
     """
 
     def __init__(
@@ -123,8 +132,12 @@ class Session(Runner[Result]):
         """The commands of those that were reported."""
         self._losses = 0
         self._began_at = 0.0
-        # At power-up no application runs, and nothing is sent before the device's announcement.
-        self._identify = None if self._options.at_power_up else self._new_identify()
+        # At power-up no application runs, and nothing is sent before the device's announcement. One
+        # that may sit in an open session is asked first: an application that runs would answer.
+        waits = self._options.at_power_up and not self._options.in_session
+        self._identify = None if waits else self._new_identify()
+        receivers = (each for each in (*Node, None) if each not in (plan.target.node, Node.CDL))
+        self._application_ids = frozenset(can_id(plan.target.node, each) for each in receivers)
         self._upgrade = UpgradeStage(self, plan, self._options)
         self._checking: Level | None = None
         """What is being verified, once the upgrade is over."""
@@ -176,7 +189,7 @@ class Session(Runner[Result]):
         identity = self._identity
         if identity is not None:
             refused = self._judge(judge_image(self._plan.image, self._plan.target, identity))
-            if refused is None and self._options.at_power_up:
+            if refused is None and self._identify is None:
                 refused = self._judge_device(identity, DeviceAnswers())
             if refused is not None:
                 return refused
@@ -222,12 +235,29 @@ class Session(Runner[Result]):
         if len(asked.answers) > 1:
             versions = " and ".join(firmware_version(each) for each in asked.answers)
             return self._end_early(Ending.TWO_DEVICES, f"they answer {versions}")
+        if asked.answers or asked.seen != DeviceAnswers():
+            self._upgrade.in_session = False
         if self._identity is None:
             return None
-        return self._judge_device(self._identity, asked.seen)
+        return self._judge_device(self._identity, asked.seen, is_silent=asked.heard is None)
 
-    def _judge_device(self, identity: Identity, seen: DeviceAnswers) -> Result | None:
-        return self._judge(judge_device(self._plan.image, self._plan.target, identity, seen))
+    def _judge_device(
+        self, identity: Identity, seen: DeviceAnswers, *, is_silent: bool = False
+    ) -> Result | None:
+        findings = judge_device(self._plan.image, self._plan.target, identity, seen)
+        if is_silent and self._upgrade.in_session:
+            return self._judge(map(self._postponed, findings))
+        return self._judge(findings)
+
+    def _postponed(self, finding: CheckResult) -> CheckResult:
+        """A rule that no answer came for does not end the session before the device has shown
+        whether it has an application at all.
+        """
+        if finding.ending is None or not finding.is_unchecked:
+            return finding
+        self._upgrade.unchecked = finding
+        text = say("{text}: only a device in an open session is upgraded", text=finding.text)
+        return finding._replace(verdict=CheckVerdict.WARNED, text=text)
 
     def _judge(self, findings: Iterable[CheckResult]) -> Result | None:
         """Report what was found; what is refused ends the session."""
@@ -279,6 +309,8 @@ class Session(Runner[Result]):
         """Look for a second tool, and for the battery's SHUTDOWN."""
         if frame[0] == self._plan.target.answer_id:
             return False
+        if frame[0] in self._application_ids and frame.is_payload:
+            self._upgrade.in_session = False  # a bootloader speaks to the tool only
         foreign = self._guard.see(frame, self.now)
         for event in self._guard.take_events():
             self.tell(event)

@@ -90,7 +90,6 @@ BEFORE_THE_START: Final = frozenset(
     {
         Ending.IMPLAUSIBLE,
         Ending.NOT_FOR_DEVICE,
-        Ending.UNCHECKED,
         Ending.IN_USE,
         Ending.UP_TO_DATE,
     }
@@ -116,7 +115,7 @@ class Reason(Enum):
     BOOT_GIVEN_UP = "boot_given_up"
     """No boot version of a device that was told to update, an attempt left."""
     BOOT_SILENT = "boot_silent"
-    """No boot version and no answer to the reset for the erase limit, an attempt left."""
+    """No boot version and no answer to the reset for the erase limit: an update command is sent."""
     END_REFUSED = "end_refused"
     """First NAK after end of transfer."""
     END_UNANSWERED = "end_unanswered"
@@ -152,7 +151,9 @@ _EVERYWHERE: Final[_Row] = {
     _E.OUT_OF_TIME: _do("end_out_of_time", _X.OUT_OF_TIME),
     _E.CANCEL: _do("end_cancelled", _X.CANCELLED),
 }
-_ANSWER_BOOT: Final = _do("answer_boot", _S.AWAITING_REQUEST, _X.WRONG_DEVICE, _X.BOOT_TOO_OLD)
+_ANSWER_BOOT: Final = _do(
+    "answer_boot", _S.AWAITING_REQUEST, _X.WRONG_DEVICE, _X.BOOT_TOO_OLD, _X.UNCHECKED
+)
 _ANSWERED: Final = _do(
     "take_answer", _S.TRANSFERRING, _S.SETTLING, _S.ENDING, _S.RESETTING, _X.PACKET_FAILED
 )
@@ -183,10 +184,13 @@ TABLE: Final[Mapping[State, _Row]] = {
     _S.AWAITING_REQUEST: _EVERYWHERE | {
         _E.BOOT_VERSION: _do(
             "answer_boot_again", _S.AWAITING_REQUEST,
-            _X.WRONG_DEVICE, _X.TWO_DEVICES, _X.UNHEARING,
+            _X.WRONG_DEVICE, _X.TWO_DEVICES, _X.UNHEARING, _X.UNCHECKED,
         ),
         _E.REQUEST: _do("send_first_packet", _S.TRANSFERRING),
-        _E.REQUEST_MISSING: _do("miss_request", _S.RESETTING, _X.NO_REQUEST, _X.PACKET_FAILED),
+        _E.REQUEST_MISSING: _do(
+            "miss_request", _S.RESETTING, _S.AWAITING_BOOT,
+            _X.NO_REQUEST, _X.NO_BOOT_VERSION, _X.PACKET_FAILED,
+        ),
         _E.LINK_BACK: _do("await_request_or_begin_again", _S.AWAITING_REQUEST, _S.RESETTING),
     },
     _S.TRANSFERRING: _EVERYWHERE | {

@@ -14,6 +14,7 @@ from typing import Any, Final
 
 from flasher import events
 from flasher.events import Phase
+from flasher.host.identity import CheckResult
 from flasher.host.options import UpgradeOptions, firmware_version, overall_timeout_s
 from flasher.host.outcome import DeviceLeft, Outcome, Statistics, standing
 from flasher.host.runner import Came, Runner, Signal, Stage
@@ -136,10 +137,18 @@ class UpgradeStage:
         }
         self.heard: Message | None = None
         """A boot version that was received before the beginning."""
+        self.in_session = options.in_session
+        """An earlier upgrade may have left the device in its session (R26): no application was
+        detected, and no update command was sent yet."""
+        self.unchecked: CheckResult | None = None
+        """A rule that the silent device could not be asked for. It refuses the device unless that
+        turns out to sit in a session, and so to have no application."""
         self.state = State.RESETTING
         """The row of the table that is in force."""
         self._state_since = 0.0
         self._phase = Phase.BOOT if options.at_power_up else Phase.RESET
+        self._asks_for_power = options.at_power_up
+        """The user is asked to switch the device off and on."""
         self._timer_at = inf
         self._deadline_at = inf
         self._began_at = 0.0
@@ -155,6 +164,8 @@ class UpgradeStage:
         """When the last update command left."""
         self._silence_was_answered = False
         """An update command was sent into the silence of a device (R26)."""
+        self._attempts = options.attempts
+        """How many there may be. Those that look for a session left open are not among them."""
         self._last_boot: BootVersion | None = None
         self._erased = False
         """Request transfer came: the old application is gone."""
@@ -165,10 +176,7 @@ class UpgradeStage:
         self._second_tool = ""
         """What somebody else was seen to send."""
 
-        self._acknowledged = 0
-        self._repetitions = 0
-        self._naks = 0
-        self._timeouts = 0
+        self._acknowledged = self._repetitions = self._naks = self._timeouts = 0
         self._transfer_s: float | None = None
 
     # -- how it stands ---------------------------------------------------------------------------
@@ -219,7 +227,19 @@ class UpgradeStage:
 
     @property
     def _is_last_attempt(self) -> bool:
-        return self._attempt >= self._options.attempts
+        return self._attempt >= self._attempts
+
+    @property
+    def _was_heard(self) -> bool:
+        """False when all that was sent went into silence."""
+        return self._last_boot is not None or self._erased
+
+    @property
+    def _boot_timeout_s(self) -> float:
+        options = self._options
+        return (
+            options.boot_timeout_s if self._asks_for_power else self._timings.boot_version_timeout_s
+        )
 
     @property
     def _is_last_try(self) -> bool:
@@ -234,8 +254,10 @@ class UpgradeStage:
             deadline_at = self._run.now + overall_timeout_s(self._plan, self._options)
         self._deadline_at = deadline_at
         self._run.listen_always(self._plan.target.answer_id)
-        if self._options.at_power_up or self.heard is not None:
-            self.state, self._phase = State.AWAITING_BOOT, Phase.BOOT
+        self._asks_for_power = self._options.at_power_up and not self.in_session
+        is_awaited = self._asks_for_power or self.heard is not None
+        self.state = State.AWAITING_BOOT if is_awaited else State.RESETTING
+        self._phase = _PHASES[self.state]
         self._run.tell(events.PhaseEntered(self._phase, self._attempt))
         if self.state is State.RESETTING:
             self._send_reset()
@@ -290,7 +312,7 @@ class UpgradeStage:
         row = decode(message)
         event = _EVENTS.get(type(row), Event.UNEXPECTED)
         if event is Event.FEEDBACK:
-            self._at.feedback_came = True
+            self._at.feedback_came, self.in_session = True, False
         elif event is Event.NAK:
             self._naks += 1
         self._dispatch(event, row)
@@ -342,6 +364,7 @@ class UpgradeStage:
         self._tx.drop_unstarted()
         size_bytes = self._plan.image.size_bytes
         not_before = self._update_left_at + self._timings.update_spacing_s
+        self.in_session, self._asks_for_power = False, self._options.at_power_up
         self._send(UpdateCommand(self._plan.target.update_text, size_bytes), not_before)
 
     def _send_packet(self) -> None:
@@ -382,7 +405,7 @@ class UpgradeStage:
             case (Command.RESET, State.RESETTING) | (Command.READ_VERSION, State.CONFIRMING):
                 wait_s = timings.command_repeat_s
             case Command.RESET, State.AWAITING_BOOT:
-                wait_s = self._options.boot_timeout_s
+                wait_s = self._boot_timeout_s
         if wait_s is not None:
             self._timer_at = left_at + wait_s
 
@@ -450,9 +473,9 @@ class UpgradeStage:
 
     def _wait_for_boot(self) -> None:
         self._tx.drop_unstarted()
-        wait_s = self._options.boot_timeout_s
+        wait_s = self._boot_timeout_s
         self._timer_at = max(self._run.now, self._tx.left_at) + wait_s
-        if self._options.at_power_up and self.heard is None:
+        if self._asks_for_power and self.heard is None:
             self._run.tell(events.PowerCycleAwaited(wait_s))
 
     def _wait_or_begin_again(self, row: Received) -> None:
@@ -469,6 +492,8 @@ class UpgradeStage:
             self._end(Ending.WRONG_DEVICE, boot)
         elif minimum is not None and (number is None or number < minimum):
             self._end(Ending.BOOT_TOO_OLD, boot)
+        elif self.unchecked is not None:
+            self._end(Ending.UNCHECKED, None, self.unchecked.detail)
         else:
             self._note_boot(boot)
             self._go(State.AWAITING_REQUEST)
@@ -491,11 +516,13 @@ class UpgradeStage:
             self._run.tell(events.CheckMade("boot-version", "passed", text))
 
     def _miss_boot(self, row: Received) -> None:
-        """No boot version came; a device that was told to update is not left alone (R26)."""
-        if self._was_told_to_update and not self._is_last_attempt:
-            silent_since = max(self._heard_at, self._update_left_at)
+        """No boot version came; a device that may sit in a session is not left alone (R26)."""
+        was_told = self._was_told_to_update and self._was_heard
+        if self.in_session or (was_told and not self._is_last_attempt):
+            silent_since = max(self._heard_at, self._update_left_at, self._began_at)
             erased_at = silent_since + self._timings.request_transfer_timeout_s
-            if self._at.feedback_came or self._silence_was_answered:
+            was_tried = self._at.feedback_came or self._silence_was_answered
+            if was_tried and not self.in_session:
                 self._begin_again(row, Reason.BOOT_GIVEN_UP)
             elif self._run.now < erased_at:
                 self._timer_at = erased_at
@@ -503,11 +530,15 @@ class UpgradeStage:
                 # It may sit in a session that never ends and knows no reset: once, and only here,
                 # an update command goes into silence.
                 self._silence_was_answered = True
+                self._attempts += self.in_session
                 self._start_over(row, Reason.BOOT_SILENT)
         elif self._failed_packet is not None:
             self._end(Ending.PACKET_FAILED, row)
-        elif self._options.at_power_up:
+        elif self._asks_for_power:
             self._end(Ending.NO_ANNOUNCEMENT, row)
+        elif self._options.at_power_up:
+            self._asks_for_power = True
+            self._wait_for_boot()
         else:
             self._end(Ending.NO_BOOT_VERSION, row)
 
@@ -517,6 +548,8 @@ class UpgradeStage:
         first_at = at.first_update_left_at
         if self._is_foreign(boot):
             self._end(Ending.WRONG_DEVICE, boot)
+        elif self.unchecked is not None:
+            self._end(Ending.UNCHECKED, None, self.unchecked.detail)
         elif at.boot is not None and boot != at.boot:
             self._end(Ending.TWO_DEVICES, boot)
         elif not self._tx.idle or now - self._update_left_at < timings.update_spacing_s:
@@ -528,7 +561,13 @@ class UpgradeStage:
             self._send_update()
 
     def _miss_request(self, row: Received) -> None:
-        if not self._is_last_attempt:
+        if not self._was_heard and self._asks_for_power:
+            self._attempts += 1
+            self._next_attempt(Reason.REQUEST_GIVEN_UP)
+            self._await_boot(row)
+        elif not self._was_heard:
+            self._end(Ending.NO_BOOT_VERSION, row, "nor an answer to the update command")
+        elif not self._is_last_attempt:
             self._begin_again(row, Reason.REQUEST_GIVEN_UP)
         elif self._failed_packet is not None and self._at.boot is None:
             self._end(Ending.PACKET_FAILED, row)
@@ -548,6 +587,11 @@ class UpgradeStage:
             return
         self._go(State.TRANSFERRING)
         self._tx.drop_unstarted()
+        minimum = self._options.minimum_boot_version
+        if minimum is not None and not self._was_heard:
+            text = f"no boot version in an open session; the manifest asks for {minimum}"
+            self._run.tell(events.CheckMade("boot-version", "unknown", text))
+        self.unchecked = None
         self._at.request_at, self._erased = self._run.now, True
         self._next_packet(1)
 
@@ -799,6 +843,8 @@ class UpgradeStage:
                 transfer_s=self._transfer_s,
             ),
             detail=detail,
+            waiver="" if self.unchecked is None else self.unchecked.waiver,
+            sent_into_silence=self._silence_was_answered,
         )
 
 

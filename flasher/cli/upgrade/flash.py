@@ -97,6 +97,7 @@ class UpgradeChoices:
     frame_gap: float | None
     packet_gap: float | None
     nak_next_is_ack: bool
+    in_session: bool
     allow_implausible: bool
     allow_other_target: bool
     allow_hardware: bool
@@ -127,6 +128,7 @@ class UpgradeChoices:
             frame_gap_s=self.frame_gap,
             packet_gap_s=self.packet_gap,
             nak_next_is_ack=self.nak_next_is_ack or None,
+            in_session=self.in_session,
             allow_boot_name=self.allows("boot-name") or None,
         )
         return chosen if self.allows("boot-version") else api.release_options(chosen, release)
@@ -182,6 +184,11 @@ _upgrade_options: Final = option_set(
     option(
         "--nak-next-is-ack", is_flag=True, panel="upgrade",
         help="for bootloaders that answer a repeated packet n with NAK n+1",
+    ),
+    option(
+        "--in-session", is_flag=True, panel="upgrade",
+        help="an upgrade of this device was broken off, and it may still wait in it: when it "
+        "answers nothing, send it an update command",
     ),
     *(
         option(

@@ -188,7 +188,7 @@ def summary_lines(result: Result, plan: Plan) -> list[str]:
     return [
         f"transferred:  {sent}, {duration(transfer_s)}{_rate(plan, transfer_s)}",
         f"              {faults}, {whole}",
-        f"boot version: {outcome.boot_version}",
+        f"boot version: {outcome.boot_version or 'not announced: it sat in an open session'}",
         f"completed:    {prose(outcome.ending)}",
         f"running:      {_running(result)}",
     ]

@@ -1,0 +1,155 @@
+"""A device whose host was killed sits in its session: the next run finds it (R26), and touches no
+device that runs its application.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from flasher import events
+from flasher.errors import ExitCode
+from flasher.host.identity import Check, Identity
+from flasher.host.options import UpgradeOptions
+from flasher.host.outcome import DeviceLeft
+from flasher.host.table import Ending
+from flasher.image.release import Release
+from flasher.mock.profile import DeviceProfile
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import BMS, TARGETS, Node, can_id
+from flasher.settings.manifest import release_of
+from tests.campaigns.lost_contact import STUBBORN
+from tests.end_to_end.stage import IMAGE, SMALL, Speaker, Stage
+from tests.loops import each
+
+UPDATE = bytes.fromhex("55AA160DA10B")
+OPEN = UpgradeOptions(in_session=True)
+RESCUE = UpgradeOptions(in_session=True, at_power_up=True)
+
+
+class Killed(BaseException):
+    """The host is gone in the middle of what it did."""
+
+
+def left_open(packet: int = 3, target: str = "bms", profile: DeviceProfile = STUBBORN) -> Stage:
+    """A device whose host was killed while it sent a packet."""
+    stage = Stage(target, profile=profile)
+
+    def kill() -> None:
+        raise Killed
+
+    stage.at_packet[packet] = kill
+    with pytest.raises(Killed):
+        stage.flash()
+    stage.wait(1.0)
+    assert stage.has is None
+    return stage
+
+
+def updates(stage: Stage) -> int:
+    return sum(frame.data.startswith(UPDATE) for frame in stage.heard)
+
+
+def with_hardware(hardware: str) -> Release:
+    return release_of(IMAGE, BMS, hardware_versions=[hardware])
+
+
+def test_without_knowing_of_the_session_it_stays_unreachable() -> None:
+    stage = left_open()
+    result = stage.flash()
+    assert result.exit_code == ExitCode.NO_ANSWER
+    assert updates(stage) == 0
+    error = result.error()
+    assert error is not None
+    assert "--in-session" in error.remedy
+
+
+@each("target", TARGETS)
+@each("packet", [1, 3, 4])
+@each("options", [OPEN, RESCUE, replace(OPEN, attempts=1)])
+def test_an_open_session_is_found_without_a_power_cycle(
+    target: str, packet: int, options: UpgradeOptions
+) -> None:
+    stage = left_open(packet, target)
+    result = stage.flash(options=options)
+    assert result.exit_code == ExitCode.OK
+    assert result.outcome.sent_into_silence
+    assert stage.has == IMAGE.data
+    assert updates(stage) == 1
+    assert not stage.seen(events.PowerCycleAwaited)
+
+
+@each("target", TARGETS)
+def test_a_healthy_device_is_upgraded_the_normal_way(target: str) -> None:
+    stage = Stage(target)
+    result = stage.flash(options=OPEN)
+    assert result.exit_code == ExitCode.OK
+    assert not result.outcome.sent_into_silence
+    assert stage.has == IMAGE.data
+
+
+def test_a_battery_that_answers_is_waited_for_by_a_rescue_and_gets_nothing() -> None:
+    stage = Stage()
+    result = stage.flash(options=replace(RESCUE, power_up_timeout_s=20.0))
+    assert result.outcome.ending is Ending.NO_ANNOUNCEMENT
+    assert len(stage.seen(events.PowerCycleAwaited)) == 1
+    assert updates(stage) == 0
+    assert not any(b"RESET" in frame.data for frame in stage.heard)
+
+
+def test_an_application_that_speaks_to_others_gets_no_update_command() -> None:
+    """It answers neither the question nor the reset, but it asks the battery."""
+    stage = Stage("wmc", profile=replace(STUBBORN, upgrade_in_application="silence"))
+    stage.cut_power()
+    handshake = Frame(can_id(Node.WMC, Node.BMS), bytes.fromhex("55AA110230090000"))
+    stage.bus.attach(Speaker(handshake, every_s=0.5))
+    result = stage.flash(options=OPEN)
+    assert result.exit_code == ExitCode.NO_ANSWER
+    assert result.outcome.device_left is DeviceLeft.UNTOUCHED
+    assert updates(stage) == 0
+
+
+def test_a_device_that_is_not_there_ends_it_within_the_limits_of_both_waits() -> None:
+    stage = Stage()
+    stage.cut_power()
+    result = stage.flash(options=OPEN)
+    assert result.exit_code == ExitCode.NO_ANSWER
+    assert updates(stage) == 1
+    assert stage.clock.now() < 25.0
+
+
+# -- what a manifest asks for ----------------------------------------------------------------------
+
+
+@each("options", [OPEN, RESCUE])
+def test_a_rule_that_nobody_can_check_does_not_keep_it_from_being_found(
+    options: UpgradeOptions,
+) -> None:
+    stage = left_open()
+    identity = Identity(with_hardware("V1r2r0_*"), goes_on_unchecked=options.at_power_up)
+    result = stage.flash(options=options, identity=identity)
+    assert result.exit_code == ExitCode.OK
+    (check,) = (each for each in stage.seen(events.CheckMade) if each.check == "hardware")
+    assert check.verdict == ("unknown" if options.at_power_up else "warned")
+    assert stage.has == IMAGE.data
+
+
+def test_an_application_that_tells_no_hardware_is_refused_as_without_the_option() -> None:
+    """A motor controller has no question for it, and answers the reset: no open session."""
+    stage = Stage("wmc")
+    identity = Identity(with_hardware("V1r2r0_*"), waived=frozenset({Check.TARGET}))
+    result = stage.flash(options=OPEN, identity=identity)
+    assert result.outcome.ending is Ending.UNCHECKED
+    assert result.outcome.device_left is DeviceLeft.UNTOUCHED
+    assert result.outcome.waiver == Check.HARDWARE.value
+    assert updates(stage) == 0
+    assert stage.device.erase_count == 0
+
+
+def test_hardware_that_does_not_fit_refuses_a_battery_that_answers() -> None:
+    stage = Stage(profile=SMALL)
+    identity = Identity(with_hardware("V9r9r9_*"), goes_on_unchecked=True)
+    result = stage.flash(options=RESCUE, identity=identity)
+    assert result.outcome.ending is Ending.NOT_FOR_DEVICE
+    assert updates(stage) == 0
