@@ -17,8 +17,10 @@ from flasher.host.table import Ending
 from flasher.image.release import Release
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import BMS, TARGETS, Node, can_id
+from flasher.protocol.spec import BMS, TARGETS, Mode, Node, can_id
+from flasher.protocol.wire import Message, encode, split
 from flasher.settings.manifest import release_of
+from flasher.settings.profile import VersionQuery
 from tests.campaigns.lost_contact import STUBBORN
 from tests.end_to_end.stage import IMAGE, SMALL, Speaker, Stage
 from tests.loops import each
@@ -107,6 +109,22 @@ def test_an_application_that_speaks_to_others_gets_no_update_command() -> None:
     result = stage.flash(options=OPEN)
     assert result.exit_code == ExitCode.NO_ANSWER
     assert result.outcome.device_left is DeviceLeft.UNTOUCHED
+    assert updates(stage) == 0
+
+
+def test_an_application_that_answers_a_product_s_own_question_gets_no_update_command() -> None:
+    """Its answer has the id that the bootloader answers on."""
+    query = VersionQuery(0x3900, BMS.answer_id, 0x5210, 0, 16)
+    stage = Stage()
+    stage.cut_power()
+    answer = Message(BMS.answer_id, Mode.REPORT, 0x5210, b"V1r0r0_20220512.")
+    frames = split(BMS.answer_id, encode(answer))
+    stage.bus.attach(Speaker(*frames, every_s=0.01, begins_at=0.2, limit=len(frames)))
+    result = stage.flash(
+        options=replace(OPEN, version_request=query.request(BMS)), identity=Identity()
+    )
+    assert result.previous_version == "V1r0r0_20220512"
+    assert result.exit_code == ExitCode.NO_ANSWER
     assert updates(stage) == 0
 
 
