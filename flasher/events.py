@@ -122,6 +122,18 @@ class Reported:
 
 
 @dataclass(frozen=True)
+class UpgradeLeftOpen:
+    """The upgrade that began at `at` with `image` has no end (`has_end` False), or left the device
+    without an application, or perhaps so. A device that stays silent may still sit in it, and gets
+    an update command (R26).
+    """
+
+    at: str
+    image: str
+    has_end: bool
+
+
+@dataclass(frozen=True)
 class AttemptStarted:
     """The transfer starts over; attempts count from 1."""
 

@@ -3,6 +3,9 @@
 Two lines a flash: one when it begins, one when it has ended. So a flash whose program was killed
 shows as begun, without an end. Lines are only added, under a lock; what is torn is left out when it
 is read. Only its owner may read the file: serial numbers and paths are nobody else's business.
+
+Beside it, while a flash is under way, stand a lock, which the operating system releases whatever
+happens to the program, and how far the flash has come. What a killed program leaves of them stays.
 """
 
 from __future__ import annotations
@@ -17,11 +20,13 @@ from pathlib import Path
 from secrets import token_hex
 from typing import Any, Final, TypeVar, get_args, get_type_hints
 
-from filelock import FileLock
+from filelock import FileLock, Timeout
 from platformdirs import user_data_path
 
-from flasher.errors import UsageError
+from flasher.errors import UsageError, printable
+from flasher.events import Phase
 from flasher.files import opened
+from flasher.prose import prose_of
 from flasher.said import say
 
 SIZE_MAX: Final = 2 * 1024 * 1024
@@ -31,7 +36,17 @@ _READ_MAX: Final = 2 * SIZE_MAX
 _LOCK_LIMIT_S: Final = 3.0
 _BEGAN: Final = "began"
 _ENDED: Final = "ended"
-
+_REACHED_SIZE: Final = 32
+"""In bytes: written over in one piece."""
+MOCK: Final = "the built-in mock"
+"""In the place of an adapter: the device is gone with the program."""
+_LEFT_IN: Final = {
+    Phase.UPDATE.value: "perhaps_erased",
+    Phase.TRANSFER.value: "no_application",
+    Phase.END.value: "unknown",
+    Phase.CONFIRM.value: "unknown",
+}
+"""Words of `flasher.host.outcome.DeviceLeft`, by the phase that was reached."""
 
 _TRANSFERRED: Final = {
     True: say("transferred"),
@@ -65,6 +80,10 @@ class Began:
     image_version: str | None
     waived: str = ""
     """Checks that somebody has waived, by their names, a comma between two."""
+    again: str = ""
+    """The command line, as a shell takes it; empty for a page."""
+    folder: str = ""
+    """Where it was typed."""
 
 
 @dataclass(frozen=True)
@@ -100,11 +119,44 @@ class Ended:
 
 
 @dataclass(frozen=True)
+class Reached:
+    """How far a flash without an end has come, once the device was told to erase."""
+
+    phase: str
+    packet: int
+    """The last one that the device has acknowledged; 0 before the first."""
+
+
+@dataclass(frozen=True)
 class Flash:
     """One flash; `ended` is null when no end was recorded."""
 
     began: Began
     ended: Ended | None
+    is_running: bool = False
+    """A program is at work on it."""
+    reached: Reached | None = None
+    """Where it has no end."""
+
+    @property
+    def device_left(self) -> str:
+        """The state in which a flash without an end has left the device, in a sentence."""
+        if self.reached is None:
+            return say("as far as is known it was not told to erase anything")
+        return say(prose_of("DeviceLeft", _LEFT_IN[self.reached.phase]))
+
+    @property
+    def left_device_open(self) -> bool:
+        """The device may sit in the session that it began."""
+        return not self.is_running and (self.ended is None or self.ended.needs_rescue)
+
+    @property
+    def shows_application(self) -> bool:
+        """The device had an application at its end."""
+        ended = self.ended
+        if ended is None or ended.needs_rescue:
+            return False
+        return bool(ended.completed or ended.running_version or ended.previous_version)
 
 
 T = TypeVar("T", Began, Ended)
@@ -115,16 +167,77 @@ class History:
 
     def __init__(self, path: Path | None = None) -> None:
         self.path = path or user_data_path("flasher", appauthor=False) / "history.jsonl"
+        self._held: dict[str, FileLock] = {}
+        """The locks of flashes that are under way here."""
 
     def begin(self, began: Began) -> str:
         """Add a flash that begins; returns what `end` wants."""
         name = token_hex(8)
-        self._add({"flash": name, "event": _BEGAN, **dataclasses.asdict(began)})
+        for folder in (self.path.parent, self._folder):
+            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        lock = FileLock(self._lock_of(name), timeout=0, thread_local=False, mode=0o600)
+        with lock:
+            self._add({"flash": name, "event": _BEGAN, **dataclasses.asdict(began)})
+            self._held[name] = lock
+            lock.acquire()  # once more: it stays
         return name
+
+    def reached(self, name: str, reached: Reached) -> None:
+        """Note how far the flash `name` has come. This may be called for every packet: nothing is
+        synced, so that it survives the program but not the computer. A phase in which nothing is
+        erased takes nothing back: a later attempt begins with those.
+        """
+        if reached.phase not in _LEFT_IN:
+            return
+        descriptor = _private(str(self._place_of(name)), os.O_WRONLY | os.O_CREAT)
+        try:
+            text = f"{reached.phase} {reached.packet}"
+            os.write(descriptor, text.ljust(_REACHED_SIZE).encode())
+        finally:
+            os.close(descriptor)
 
     def end(self, name: str, ended: Ended) -> None:
         """Add how the flash `name` ended."""
-        self._add({"flash": name, "event": _ENDED, **dataclasses.asdict(ended)})
+        try:
+            self._add({"flash": name, "event": _ENDED, **dataclasses.asdict(ended)})
+        finally:
+            self._forget(name)
+
+    @property
+    def _folder(self) -> Path:
+        return self.path.parent / "running"
+
+    def _lock_of(self, name: str) -> Path:
+        return self._folder / f"{name}.lock"
+
+    def _place_of(self, name: str) -> Path:
+        return self._folder / f"{name}.reached"
+
+    def _forget(self, name: str) -> None:
+        """It is under way no more."""
+        self._held.pop(name).release()
+        for path in (self._lock_of(name), self._place_of(name)):
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+
+    def _is_running(self, name: str) -> bool:
+        path = self._lock_of(name)
+        try:
+            if path.exists():
+                with FileLock(path, timeout=0):
+                    pass
+        except Timeout:
+            return True
+        except OSError:
+            return False
+        return False
+
+    def _reached(self, name: str) -> Reached | None:
+        try:
+            phase, packet = self._place_of(name).read_text("ascii").split()
+            return Reached(phase, int(packet)) if phase in _LEFT_IN else None
+        except (OSError, ValueError):
+            return None
 
     def flashes(self) -> tuple[list[Flash], int]:
         """Every flash, the latest last, and how many lines could not be read. Raises UsageError
@@ -142,7 +255,12 @@ class History:
                     ended[found["flash"]] = _made(Ended, found)
             except (ValueError, LookupError, TypeError, RecursionError):
                 damaged += 1
-        return [Flash(each, ended.get(name)) for name, each in begun.items()], damaged
+        return [
+            Flash(each, ended[name])
+            if name in ended
+            else Flash(each, None, self._is_running(name), self._reached(name))
+            for name, each in begun.items()
+        ], damaged
 
     def _lines(self, max_size: int) -> list[bytes]:
         """The lines in the last `max_size` bytes."""
@@ -175,13 +293,22 @@ class History:
         lines = self._lines(SIZE_MAX // 2)
         part = self.path.with_name(f".{self.path.name}-{token_hex(4)}.part")
         try:
-            with open(part, "xb", opener=lambda name, flags: os.open(name, flags, 0o600)) as file:
+            with open(part, "xb", opener=_private) as file:
                 file.writelines(b"%s\n" % each for each in lines)
             part.replace(self.path)
         except BaseException:
             with contextlib.suppress(OSError):
                 part.unlink(missing_ok=True)
             raise
+        kept = b"".join(lines)
+        for path in self._folder.glob("*"):
+            if path.stem.encode() not in kept and not self._is_running(path.stem):
+                path.unlink(missing_ok=True)
+
+
+def _private(name: str, flags: int) -> int:
+    """Open for the owner alone."""
+    return os.open(name, flags, 0o600)
 
 
 def _ends_whole(descriptor: int) -> bool:
@@ -205,6 +332,29 @@ def _made(kind: type[T], found: dict[str, Any]) -> T:
         if type(value) not in (get_args(types[name]) or (types[name],)):
             raise TypeError(name)
     return kind(**values)
+
+
+def working_folder() -> str:
+    """Where file names count from, escaped; empty for a folder that was deleted."""
+    try:
+        return printable(str(Path.cwd()))
+    except OSError:
+        return ""
+
+
+def left_open(flashes: list[Flash], *, target: str, adapter: str) -> Flash | None:
+    """The latest flash of a target on an adapter that may have left its device in a session; None
+    where there is none, or where the device had an application after it.
+    """
+    found = None
+    for each in flashes:
+        if (each.began.target, each.began.adapter) != (target, adapter) or adapter == MOCK:
+            continue
+        if each.left_device_open:
+            found = each
+        elif each.shows_application:
+            found = None
+    return found
 
 
 def matching(

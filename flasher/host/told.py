@@ -33,6 +33,10 @@ def line_of(event: object) -> tuple[str, int] | None:
             return f"{prose(phase)} ...", 0
         case events.AttemptStarted(attempt, reason):
             return f"{because(reason)}: beginning again, attempt {attempt}", 0
+        case events.UpgradeLeftOpen(at, image, has_end):
+            left = "left the device without an application" if has_end else "has no end"
+            text = f"the upgrade of {at.replace('T', ' ')} with {image} {left}: the device gets an "
+            return f"{text}update command if it stays silent", 0
         case events.MessageRepeated(what, reason, tries):
             return f"{because(reason, what)}: sending {what} again, try {tries}", 1
         case events.BootVersionSeen(name, version):

@@ -55,6 +55,14 @@ def bundle_folder(
     return folder
 
 
+@pytest.fixture(autouse=True)
+def data_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the history lies: what one test has left unfinished is not known to the next."""
+    folder = tmp_path_factory.mktemp("data")
+    monkeypatch.setenv("XDG_DATA_HOME", str(folder))
+    return folder
+
+
 @pytest.fixture(scope="session")
 def schema() -> dict[str, Any]:
     """What `--json` prints, as it is published."""

@@ -30,11 +30,10 @@ ENDED = Ended(
 )
 
 
-@pytest.fixture(autouse=True)
-def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+@pytest.fixture
+def file(data_folder: Path) -> Path:
     """The file of a user who has flashed nothing yet."""
-    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
-    return tmp_path / "data" / "flasher" / "history.jsonl"
+    return data_folder / "flasher" / "history.jsonl"
 
 
 def latest(flasher: Flasher, *words: str) -> dict[str, Any]:
@@ -131,7 +130,7 @@ def full(*_: object) -> int:
 
 
 def broken_folder(file: Path, _patch: pytest.MonkeyPatch) -> None:
-    file.parent.parent.mkdir()
+    file.parent.parent.mkdir(exist_ok=True)
     file.parent.write_text("a file in the place of the folder")
 
 
@@ -306,4 +305,4 @@ def test_keys_of_a_newer_flasher_are_no_damage(file: Path) -> None:
     kept.begin(BEGAN)
     line = json.loads(file.read_text())
     file.write_text(json.dumps({**line, "mood": ["good"]}) + "\n")
-    assert kept.flashes() == ([history.Flash(BEGAN, None)], 0)
+    assert kept.flashes() == ([history.Flash(BEGAN, None, is_running=True)], 0)

@@ -257,7 +257,7 @@ def sample(hint: Any) -> Any:
         return (sample(get_args(hint)[0]),) * 2
     if hint is object:
         return UserString(Text(b"a\x1b"))
-    return {int: 7, float: 0.5, str: "text", bytes: b"\x00\xff"}[hint]
+    return {int: 7, float: 0.5, bool: True, str: "text", bytes: b"\x00\xff"}[hint]
 
 
 def make(event: Any) -> Any:

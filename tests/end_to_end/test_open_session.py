@@ -34,7 +34,9 @@ class Killed(BaseException):
     """The host is gone in the middle of what it did."""
 
 
-def left_open(packet: int = 3, target: str = "bms", profile: DeviceProfile = STUBBORN) -> Stage:
+def left_in_session(
+    packet: int = 3, target: str = "bms", profile: DeviceProfile = STUBBORN
+) -> Stage:
     """A device whose host was killed while it sent a packet."""
     stage = Stage(target, profile=profile)
 
@@ -46,6 +48,7 @@ def left_open(packet: int = 3, target: str = "bms", profile: DeviceProfile = STU
         stage.flash()
     stage.wait(1.0)
     assert stage.has is None
+    stage.heard.clear()
     return stage
 
 
@@ -58,7 +61,7 @@ def with_hardware(hardware: str) -> Release:
 
 
 def test_without_knowing_of_the_session_it_stays_unreachable() -> None:
-    stage = left_open()
+    stage = left_in_session()
     result = stage.flash()
     assert result.exit_code == ExitCode.NO_ANSWER
     assert updates(stage) == 0
@@ -73,7 +76,7 @@ def test_without_knowing_of_the_session_it_stays_unreachable() -> None:
 def test_an_open_session_is_found_without_a_power_cycle(
     target: str, packet: int, options: UpgradeOptions
 ) -> None:
-    stage = left_open(packet, target)
+    stage = left_in_session(packet, target)
     result = stage.flash(options=options)
     assert result.exit_code == ExitCode.OK
     assert result.outcome.sent_into_silence
@@ -144,7 +147,7 @@ def test_a_device_that_is_not_there_ends_it_within_the_limits_of_both_waits() ->
 def test_a_rule_that_nobody_can_check_does_not_keep_it_from_being_found(
     options: UpgradeOptions,
 ) -> None:
-    stage = left_open()
+    stage = left_in_session()
     identity = Identity(with_hardware("V1r2r0_*"), goes_on_unchecked=options.at_power_up)
     result = stage.flash(options=options, identity=identity)
     assert result.exit_code == ExitCode.OK

@@ -8,14 +8,17 @@ from pathlib import Path
 
 import pytest
 
+from flasher.history import History, Reached
 from flasher.trace.bundle import write_bundle
 from flasher.trace.taps import FlightRecorder
 from flasher.web.answers import Answer, Question
 from flasher.web.kept import Kept
+from tests.cli.test_history import BEGAN
 
 
 @pytest.fixture
-def kept(tmp_path: Path) -> Kept:
+def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Kept:
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path))
     facts = {"target": "bms", "error": {"what": "The <b>bus</b> broke.", "exit_code": 4}}
     write_bundle(tmp_path / "bundles", FlightRecorder(), facts)
     for folder, name in (("backups", "bms-1.zip"), ("backups", "else.txt"), ("traces", "a.log")):
@@ -80,3 +83,14 @@ def test_a_story_names_the_file_and_not_where_it_was_put(kept: Kept, tmp_path: P
     assert answer.status == 400
     assert "a.log is not a trace" in answer.body.decode()
     assert str(tmp_path) not in answer.body.decode()
+
+
+def test_an_upgrade_without_an_end_names_what_it_left(kept: Kept) -> None:
+    history = History()
+    name = history.begin(BEGAN)
+    assert "it is still running" in _asked(kept, "/kept").body.decode()
+    history.reached(name, Reached("transfer", 12))
+    del history
+    page = _asked(kept, "/kept").body.decode()
+    assert "the program was killed" in page
+    assert "its application is erased" in page

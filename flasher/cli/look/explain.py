@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +16,9 @@ from flasher.cli.look.explain_text import story_lines
 from flasher.cli.output import Output
 from flasher.cli.recording import bundle_folder
 from flasher.cli.terminal import painted, takes_colour
-from flasher.errors import ExitCode, UsageError
+from flasher.cli.upgrade.history import again, reached
+from flasher.errors import ErrorCode, ExitCode, UsageError
+from flasher.history import MOCK, Flash, History
 from flasher.protocol.text import printable
 from flasher.trace.story import Story
 
@@ -110,6 +114,9 @@ def _source(trace: Path | None, *, last: bool) -> Path:
         return trace
     folder = bundle_folder()
     found = bundles(folder)
+    unfinished = _unfinished(found[-1] if found else None)
+    if unfinished is not None:
+        raise unfinished
     if not found:
         raise UsageError(
             f"There is no bundle in {printable(str(folder))}.",
@@ -117,3 +124,35 @@ def _source(trace: Path | None, *, last: bool) -> Path:
             remedy="Name the folder that the failed command has printed.",
         )
     return found[-1]
+
+
+def _unfinished(bundle: Path | None) -> UsageError | None:
+    """The error for a latest upgrade that has no end, which is later than the latest bundle."""
+    with suppress(UsageError, ValueError):
+        flashes, _ = History().flashes()
+        latest = flashes[-1] if flashes else None
+        if latest is None or latest.ended is not None or latest.is_running:
+            return None
+        began_at = datetime.fromisoformat(latest.began.at).timestamp()  # in whole seconds
+        if bundle is None or began_at >= int(bundle.stat().st_mtime):
+            return _without_end(latest)
+    return None
+
+
+def _without_end(flash: Flash) -> UsageError:
+    began = flash.began
+    error = UsageError(
+        printable(f"{began.command} {began.image} has no end, and left no bundle."),
+        where=printable(
+            f"{began.target.upper()} on {began.adapter}, begun {began.at.replace('T', ' ')}; "
+            f"{reached(flash)}"
+        ),
+        cause="the program was killed, or the computer lost power",
+        remedy="The device model is gone with the program: nothing needs repair.",
+        code=ErrorCode.UNFINISHED,
+    )
+    if began.adapter != MOCK:
+        folder = f" The command was typed in {printable(began.folder)}." if began.folder else ""
+        error.remedy = f"State of the device: {flash.device_left}.{folder}"
+        error.command = printable(again(began))
+    return error

@@ -5,11 +5,11 @@ warning.
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from typing import Final
 
 from flasher.api import Connection, Job, Watch
 from flasher.cli.options import Bus
@@ -17,13 +17,19 @@ from flasher.cli.output import Output
 from flasher.cli.recording import Recording, RecordingOptions, recording
 from flasher.cli.upgrade.text import UpgradeDocument, plan_document, upgrade_document
 from flasher.errors import ExitCode, FlasherError
-from flasher.events import CheckMade, QueryAnswered
-from flasher.history import Began, Ended, History
+from flasher.events import (
+    CheckMade,
+    PacketAcknowledged,
+    Phase,
+    PhaseEntered,
+    QueryAnswered,
+    UpgradeLeftOpen,
+)
+from flasher.history import MOCK, Began, Ended, History, Reached, left_open, working_folder
 from flasher.host.session import Result
 from flasher.protocol.contents import VersionInformation
 from flasher.protocol.text import printable
 
-_MOCK: Final = "the built-in mock"
 Watching = Callable[[Connection, Recording], AbstractContextManager[Watch]]
 """Begins when the bus is open, and says who watches the upgrade."""
 
@@ -38,6 +44,8 @@ class Carried:
     output: Output
     on_failure: Callable[[FlasherError], None] = lambda _error: None
     """Completes an error before it is kept."""
+    again: str = ""
+    """What begins it again after this program was killed; empty where a page has begun it."""
     checks: list[CheckMade] = field(default_factory=list)
     record: Recording | None = None
     document: UpgradeDocument | None = None
@@ -67,21 +75,29 @@ class Carried:
     def _recorded(
         self, connect: Callable[[], AbstractContextManager[Connection]], watching: Watching
     ) -> Result:
-        job, plan = self.job, self.job.plan
+        plan = self.job.plan
         with recording(self.recorded, self.bus, self.output, target=plan.target) as record:
             self.record = record
-            record.facts["plan"] = plan_document(plan, job.options)
-            record.facts["waived"] = job.waived
+            record.facts["plan"] = plan_document(plan, self.job.options)
+            record.facts["waived"] = self.job.waived
             record.facts["image_sha256"] = plan.image.sha256
             try:
                 with connect() as connection:
                     record.opened(connection)
                     began_at = connection.clock.now()
+                    left = self._left_open(connection.name)
+                    if left is not None:
+                        self.job = self.job.in_session()
+                    job = self.job
                     with watching(connection, record) as watch:
                         self._began(connection)
 
                         def on_event(event: object) -> None:
                             match event:
+                                case PhaseEntered(phase):
+                                    self._reached(phase, 0)
+                                case PacketAcknowledged(number):
+                                    self._reached(Phase.TRANSFER, number)
                                 case CheckMade():
                                     self.checks.append(event)
                                     record.facts["checks"] = self.checks
@@ -92,6 +108,8 @@ class Carried:
                             if tell is not None:
                                 tell(event)
 
+                        if left is not None:
+                            on_event(left)
                         device = connection.device(plan.target, dialect=self.bus.dialect)
                         result = device.upgrade(
                             plan,
@@ -122,6 +140,23 @@ class Carried:
 
     # -- the history -------------------------------------------------------------------------------
 
+    def _left_open(self, adapter: str) -> UpgradeLeftOpen | None:
+        """The upgrade that may have left the device on this adapter in its session (R26)."""
+        if self.bus.mock:
+            return None
+        target, adapter = self.job.plan.target.name, printable(adapter)
+        found = None
+        with contextlib.suppress(FlasherError, OSError):
+            found = left_open(self._history.flashes()[0], target=target, adapter=adapter)
+        if found is None:
+            return None
+        return UpgradeLeftOpen(found.began.at, found.began.image, found.ended is not None)
+
+    def _reached(self, phase: Phase, packet: int) -> None:
+        if self._name is not None:
+            with contextlib.suppress(OSError):
+                self._history.reached(self._name, Reached(phase.value, packet))
+
     def _began(self, connection: Connection) -> None:
         """The upgrade begins on this adapter."""
         image = self.job.plan.image
@@ -130,12 +165,14 @@ class Carried:
             command="rescue" if self.job.options.at_power_up else "flash",
             target=self.job.plan.target.name,
             is_virtual=not connection.link.is_physical,
-            adapter=_MOCK if self.bus.mock else printable(connection.name),
+            adapter=MOCK if self.bus.mock else printable(connection.name),
             image=printable(image.source),
             image_sha256=image.sha256,
             image_size_bytes=image.size_bytes,
             image_version=image.version,
             waived=", ".join(self.job.waived),
+            again=printable(self.again),
+            folder=working_folder(),
         )
 
         def write() -> None:

@@ -342,10 +342,12 @@ class _Upgrade:
 
     def _carry_out(self, job: api.Job) -> int:
         output = self.output
-        carried = Carried(job, self.bus, self.recorded, output, self._add_repair)
+        ctx = click.get_current_context()
+        again = shlex.join(["flasher", *retyped(ctx, str(ctx.info_name))])
+        carried = Carried(job, self.bus, self.recorded, output, self._add_repair, again)
         result = carried.carry_out(
             lambda: self._connect(at_power_up=job.options.at_power_up),
-            lambda connection, record: self._watching(job, connection, record),
+            lambda connection, record: self._watching(carried.job, connection, record),
         )
         # The bundle is told of before the error, so that the verdict stands at the end.
         error, document = carried.error, carried.document
@@ -390,7 +392,8 @@ class _Upgrade:
                 output.event(event)
                 progress(event)
 
-            if not job.options.at_power_up:  # there its announcement is waited for, nothing sent
+            # A device that is waited for, or that may sit in an open session, need not be heard.
+            if not job.options.at_power_up and not job.options.in_session:
                 device = connection.device(self.target, dialect=self.bus.dialect)
                 check_heard(device, self.bus, output, taps=record.taps, cancelled=stop.asked)
             yield {"on_event": on_event, "cancelled": stop.asked, "hung_up": hung_up}

@@ -11,7 +11,9 @@ from flasher.cli import values
 from flasher.cli.framework import command, option
 from flasher.cli.options import target_option
 from flasher.cli.output import Output, byte_count, counted
-from flasher.history import Flash, History, matching
+from flasher.errors import ExitCode
+from flasher.history import Began, Flash, History, left_open, matching, working_folder
+from flasher.prose import prose_of
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 
@@ -22,7 +24,7 @@ examples:
   flasher history -t bms --limit 5 --json | jq '.flashes[].ended.exit_code'
 
 flash and rescue keep it, dry runs and stations do not. "No end recorded": the program was killed,
-the computer lost power, or the flash is still running.
+or the computer lost power. The command that is shown below it brings the device its image.
 """
 
 
@@ -59,7 +61,9 @@ def history(output: Output, *, target: Target | None, serial: str | None, limit:
     found = list(matching(flashes, target=name, serial_number=serial))
     latest = list(islice(reversed(found), limit))
     for each in latest:
-        output.results(_lines(each))
+        began = each.began
+        is_open = each is left_open(flashes, target=began.target, adapter=began.adapter)
+        output.results(_lines(each, is_open=is_open))
         output.result("")
     if not latest:
         output.result("nothing flashed" + (" that fits" if flashes else " yet"))
@@ -75,7 +79,7 @@ def history(output: Output, *, target: Target | None, serial: str | None, limit:
     )
 
 
-def _lines(flash: Flash) -> Iterator[str]:
+def _lines(flash: Flash, *, is_open: bool) -> Iterator[str]:
     began, ended = flash.began, flash.ended
     serial = f" {ended.serial_number}" if ended and ended.serial_number else ""
     virtual = ", virtual" if began.is_virtual else ""
@@ -87,8 +91,15 @@ def _lines(flash: Flash) -> Iterator[str]:
     yield printable(f"  adapter  {began.adapter}")
     if began.waived:
         yield printable(f"  waived   {began.waived}")
+    if flash.is_running:
+        yield "  end      none yet: the flash is still running"
+        return
     if ended is None:
-        yield "  end      began, no end recorded"
+        yield "  end      began, no end recorded: the program was killed or the computer lost power"
+        yield printable(f"  reached  {reached(flash)}")
+        if is_open:
+            yield printable(f"  device   {flash.device_left}")
+            yield from _repair_lines(began)
         return
     if ended.previous_version:
         yield printable(f"  before   {ended.previous_version}")
@@ -99,3 +110,26 @@ def _lines(flash: Flash) -> Iterator[str]:
         yield "           the device had no application then, or perhaps none: flasher rescue"
     if ended.bundle:
         yield printable(f"  bundle   {ended.bundle}")
+    # An image that the device has refused repairs nothing.
+    if is_open and ended.exit_code != ExitCode.REFUSED:
+        yield from _repair_lines(began)
+
+
+def _repair_lines(began: Began) -> Iterator[str]:
+    yield printable(f"  repair   {again(began)}")
+    if began.folder not in ("", working_folder()):
+        yield printable(f"           (in {began.folder})")
+
+
+def reached(flash: Flash) -> str:
+    """How far a flash without an end came."""
+    found = flash.reached
+    if found is None:
+        return "nothing that erases, as far as is known"
+    packet = f", packet {found.packet} acknowledged" if found.packet else ""
+    return f"{prose_of('Phase', found.phase)}{packet}"
+
+
+def again(began: Began) -> str:
+    """The command that brings the device of such a flash its image."""
+    return began.again or "flasher ui"
