@@ -85,6 +85,13 @@ class AdapterLost:
 
 
 @dataclass(frozen=True)
+class AdapterAwaited:
+    """The lost adapter is waited for `left_s` seconds more. Reported every second."""
+
+    left_s: int
+
+
+@dataclass(frozen=True)
 class AdapterBack:
     """The adapter works again; the attempt that follows is reported as every other."""
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
+from math import ceil
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from flasher import events
@@ -27,7 +28,7 @@ from flasher.errors import (
 from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.identity import Identity
 from flasher.host.items import Readable, find, readable
-from flasher.host.options import UpgradeOptions
+from flasher.host.options import BRIEF_ADAPTER_RETURN_S, UpgradeOptions
 from flasher.host.outcome import AGAIN
 from flasher.host.query import (
     READ_MEMORY,
@@ -434,14 +435,18 @@ class Procedures:
 
     def _session(self, session: Session, options: UpgradeOptions) -> Procedure[Result]:
         stalls_s: list[float] = []
+        has_sent = False
 
         def note_stall(event: object) -> None:
             if isinstance(event, events.HostStalled):
                 stalls_s.append(event.stalled_s)
 
-        run = Run(
-            session, (self._end_when_off,), hang_up_ends=_may_end(session), on_event=note_stall
-        )
+        def note_sent(frame: Frame, *, sent: bool, now: float) -> None:  # noqa: ARG001  a tap
+            nonlocal has_sent
+            has_sent = has_sent or sent
+
+        taps = (note_sent, self._end_when_off)
+        run = Run(session, taps, hang_up_ends=_may_end(session), on_event=note_stall)
         link = self.link
         before = link.health()
         self._check_bus("before anything was sent", session, before)
@@ -456,9 +461,10 @@ class Procedures:
                     wait_s = options.adapter_return_s
                     if not is_lost or not session.may_begin_again or not wait_s:
                         raise
+                    if not has_sent:
+                        wait_s = min(wait_s, BRIEF_ADAPTER_RETURN_S)
                     yield Tell(events.AdapterLost(error.what, wait_s))
-                    if not (yield from self._reopened(session, error, wait_s)):
-                        raise
+                    yield from self._reopen(session, error, wait_s)
                     yield Tell(events.AdapterBack())
                     session.link_back(self.clock.now())
         except (BusError, InterruptedByUserError) as error:
@@ -501,14 +507,16 @@ class Procedures:
             _say_what_is_left(error, session)
             raise error
 
-    def _reopened(self, session: Session, lost: BusError, wait_s: float) -> Procedure[bool]:
-        """Try to open a lost adapter again, within the overall deadline and until the user has
-        enough.
+    def _reopen(self, session: Session, lost: BusError, wait_s: float) -> Procedure[None]:
+        """Open a lost adapter again, as soon as it is back. Raises BusError when it is not within
+        the time given and the overall deadline, InterruptedByUserError when the user has enough.
         """
         now = self.clock.now()
         give_up_at = now + wait_s
         if session.deadline_at is not None:
             give_up_at = min(give_up_at, session.deadline_at)
+        told_s = ceil(wait_s)
+        yield Tell(events.AdapterAwaited(told_s))
         is_cancelled = yield WaitUntil(now, _may_end(session))
         while True:
             if is_cancelled:
@@ -520,14 +528,24 @@ class Procedures:
                 ) from lost
             try:
                 self.link.reopen()
-            except BusError:
+            except BusError as error:
                 now = self.clock.now()
                 if now >= give_up_at:
-                    return False
+                    # Why it does not open now says what to do; why it was lost may be over.
+                    error.where = error.where or lost.where
+                    error.remedy = f"{error.remedy} {AGAIN}" if error.remedy else lost.remedy
+                    error.cause = f"{error.cause}; it was lost with: {lost.what.rstrip('.')}"
+                    if error.code is ErrorCode.ADAPTER_NOT_OPENED:
+                        error.code = ErrorCode.ADAPTER_LOST
+                    raise
+                left_s = ceil(give_up_at - now)
+                if left_s < told_s:
+                    told_s = left_s
+                    yield Tell(events.AdapterAwaited(left_s))
                 until = min(give_up_at, now + _REOPEN_PAUSE_S)
                 is_cancelled = yield WaitUntil(until, _may_end(session))
             else:
-                return True
+                return
 
 
 def plan_for(image: Image, profile: Profile, bitrate_bps: int | None) -> Plan:

@@ -28,7 +28,7 @@ class Bar:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def move_to(self, done: int, total: int, *, note: str = "") -> None:
+    def move_to(self, done: float, total: float, *, note: str = "") -> None:
         """So much of the total is done; the first call opens the bar."""
         if not self._is_wanted:
             return
@@ -57,7 +57,7 @@ class Bar:
                 self._bar.close()
             self._forget()
 
-    def _open(self, total: int) -> None:
+    def _open(self, total: float) -> None:
         from tqdm import tqdm  # noqa: PLC0415  only where a bar is shown
 
         self._bar = tqdm(total=total, file=sys.stderr, dynamic_ncols=True, **self._look)

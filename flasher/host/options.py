@@ -16,8 +16,10 @@ from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 DEFAULT_ATTEMPTS: Final = 3
 DEFAULT_POWER_UP_TIMEOUT_S: Final = 60.0
 """Long enough to walk to the bicycle and unplug its battery."""
-DEFAULT_ADAPTER_RETURN_S: Final = 0.8
-"""A bus-off recovers and an interface comes up again within this; a pulled plug ends within 1 s."""
+DEFAULT_ADAPTER_RETURN_S: Final = 5.0
+"""Long enough to plug a USB adapter in again."""
+BRIEF_ADAPTER_RETURN_S: Final = 0.8
+"""As long as nothing was sent there is nothing to be saved. A bus-off recovers within this."""
 FRAME_GAP_SHARE: Final = 0.8
 """The largest gap between two frames, as a share of the time after which their receiver drops the
 message (R12): the rest is for a computer that wakes up late."""
@@ -62,7 +64,7 @@ class UpgradeOptions:
     power_up_timeout_s: float = DEFAULT_POWER_UP_TIMEOUT_S
     """How long such an announcement is waited for."""
     adapter_return_s: float = DEFAULT_ADAPTER_RETURN_S
-    """How long a lost adapter is tried to be opened again."""
+    """How long a lost adapter may take to come back, once anything was sent."""
 
     def __post_init__(self) -> None:
         limit_s = FRAME_GAP_SHARE * self.timings.inter_frame_timeout_s

@@ -442,7 +442,8 @@ class Bench:
         adapter = self._adapter()
         self._set(
             doing=Doing.UPGRADING, done=None, checks=(), notes=(), packet=0, furthest=0,
-            repetitions=0, phase=None, transfer_began_s=None, power_cycle_s=None, watched=None,
+            repetitions=0, phase=None, transfer_began_s=None, power_cycle_s=None,
+            adapter_left_s=None, watched=None,
         )  # fmt: skip
         job = self._job(offer.path, chosen)
         if job.plan.image.sha256 != offer.sha256:
@@ -461,7 +462,7 @@ class Bench:
             self._date(), adapter, job.plan.target, offer, state.checks, state.bike, state.furthest,
             carried.result, carried.error, carried.bundle, warning=carried.warning,
         )  # fmt: skip
-        self._set(done=done, power_cycle_s=None, phase=None)
+        self._set(done=done, power_cycle_s=None, adapter_left_s=None, phase=None)
         is_new = carried.result is not None and carried.result.outcome.ok
         if is_new and done.target.has_version_query:
             self._set(doing=Doing.LOOKING_AGAIN)
@@ -473,8 +474,8 @@ class Bench:
         match event:
             case events.PacketAcknowledged(number, _, _):
                 changes |= {"packet": number, "furthest": max(number, self.state.furthest)}
-                if self.state.transfer_began_s is None:
-                    changes["transfer_began_s"] = self._now()
+                began_s = self.state.transfer_began_s
+                changes["transfer_began_s"] = self._now() if began_s is None else began_s
             case events.PhaseEntered(phase, _):
                 changes["phase"] = phase
                 if phase is not events.Phase.BOOT:
@@ -485,12 +486,14 @@ class Bench:
                 changes["repetitions"] = self.state.repetitions + 1
             case events.PowerCycleAwaited(limit_s):
                 changes |= {"power_cycle_s": limit_s, "power_cycle_since_s": self._now()}
+            case events.AdapterAwaited(left_s):
+                changes["adapter_left_s"] = left_s
+            case events.AdapterBack():
+                changes["adapter_left_s"] = None
             case events.CheckMade():
                 changes["checks"] = (*self.state.checks, event)
-        line = line_of(event)
-        said = warning_of(event) or (line[0] if line and line[1] < 2 else "")
-        if said and not isinstance(event, events.CheckMade):
-            changes["notes"] = (*self.state.notes, said)[-NOTES_KEPT:]
+        if note := _note_of(event):
+            changes["notes"] = (*self.state.notes, note)[-NOTES_KEPT:]
         if changes:
             self._set(**changes)
 
@@ -509,6 +512,13 @@ class Bench:
         if self.state.adapter is None:
             raise UsageError("No adapter is chosen.", remedy="Choose one.")
         return self.state.adapter
+
+
+def _note_of(event: object) -> str:
+    """What is told of an event; checks have a place of their own."""
+    line = line_of(event)
+    said = warning_of(event) or (line[0] if line and line[1] < 2 else "")
+    return "" if isinstance(event, events.CheckMade) else said
 
 
 def _known(things: Mapping[str, T], name: str) -> T:

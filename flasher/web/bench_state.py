@@ -187,6 +187,8 @@ class State:
     """The device has to be switched off and on; it is waited for so long."""
     power_cycle_since_s: float = 0.0
     """On the clock of the bench."""
+    adapter_left_s: int | None = None
+    """The adapter is lost, and waited for so long."""
     checks: tuple[events.CheckMade, ...] = ()
     notes: tuple[str, ...] = ()
     is_stopping: bool = False

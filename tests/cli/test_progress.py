@@ -106,6 +106,23 @@ def flash_on(terminal: Terminal, *words: str, **environment: str) -> tuple[int, 
     return process.returncode, written
 
 
+def test_the_wait_for_a_lost_adapter_is_counted_down_in_one_line(
+    terminal: Terminal, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.stderr", terminal.file)
+    plan = make_plan(Image.from_bytes(bytes(200)), "bms", "welling")
+    with Progress(plan, Output()) as show:
+        show(events.AdapterLost("unplugged.", 5.0))
+        for left_s in (5, 4, 3):
+            show(events.AdapterAwaited(left_s))
+        show(events.AdapterBack())
+    lines = [line for line in screen(terminal.read()) if line]
+    assert lines[0] == "warning: unplugged. Waiting 5 s for the adapter ..."
+    assert lines[1].startswith("waiting for the adapter, 3 s left |")
+    assert lines[2] == "the adapter is back"
+    assert len(lines) == 3
+
+
 # -- a real process on a terminal -----------------------------------------------------------------
 
 

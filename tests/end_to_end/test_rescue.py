@@ -12,7 +12,8 @@ from dataclasses import replace
 import pytest
 
 from flasher import api, events
-from flasher.errors import BusError, ExitCode
+from flasher.bus.simulated import SimulatedLink
+from flasher.errors import BusError, ErrorCode, ExitCode
 from flasher.events import Phase
 from flasher.host.options import UpgradeOptions
 from flasher.host.outcome import DeviceLeft
@@ -233,6 +234,81 @@ def test_with_one_attempt_a_lost_adapter_is_the_end() -> None:
     with pytest.raises(BusError):
         stage.flash(LONG, ONCE)
     assert not stage.seen(events.AdapterLost)
+
+
+def test_the_wait_for_a_lost_adapter_is_five_seconds_and_counted_down() -> None:
+    stage = Stage()
+    lost_at: list[float] = []
+
+    def pull_out() -> None:
+        lost_at.append(stage.clock.now())
+        stage.bus.unplug()
+
+    stage.at_packet[2] = pull_out
+    with pytest.raises(BusError):
+        stage.flash(LONG)
+    assert stage.clock.now() - lost_at[0] == pytest.approx(5.0, abs=0.3)
+    assert [each.left_s for each in stage.seen(events.AdapterAwaited)] == [5, 4, 3, 2, 1]
+
+
+def test_an_adapter_that_comes_back_after_four_seconds_is_no_failure() -> None:
+    stage = Stage()
+    stage.at_packet[2] = lambda: stage.bus.unplug(4.0)
+    assert stage.flash(LONG).exit_code == ExitCode.OK
+    assert stage.has == LONG.data
+    assert stage.seen(events.AdapterBack)
+
+
+@each("at_power_up", [False, True])
+def test_an_adapter_that_is_lost_before_anything_was_sent_ends_it_within_a_second(
+    at_power_up: bool,
+) -> None:
+    """BU-05, whatever the time that it is given."""
+    stage = Stage()
+    when(stage, Phase.BOOT if at_power_up else Phase.LISTEN, stage.bus.unplug)
+    with pytest.raises(BusError) as caught:
+        stage.flash(options=UpgradeOptions(adapter_return_s=60.0, at_power_up=at_power_up))
+    assert stage.clock.now() < 1.0
+    assert stage.heard == []
+    assert "this run erased nothing" in caught.value.remedy
+
+
+def test_the_error_at_the_end_is_that_of_the_last_try_to_open_it() -> None:
+    """An interface that comes back at another bit rate is not "no such device"."""
+    stage = Stage()
+    reopen = SimulatedLink.reopen
+
+    class Changed(SimulatedLink):
+        def reopen(self) -> None:
+            reopen(self)
+            raise BusError(
+                "The bus runs at 500 kbit/s.",
+                where="interface socketcan, channel can0",
+                cause="somebody has set it so",
+                remedy="Set it to 250 kbit/s.",
+                code=ErrorCode.OTHER_BIT_RATE,
+            )
+
+    stage.wrap = lambda link: Changed(link._bus, link._host, link._queue_frames)
+    stage.at_packet[2] = lambda: stage.bus.unplug(1.0)
+    with pytest.raises(BusError) as caught:
+        stage.flash(LONG)
+    error = caught.value
+    assert error.what == "The bus runs at 500 kbit/s."
+    assert error.code is ErrorCode.OTHER_BIT_RATE
+    assert "packet 2 of 40" in error.where
+    assert "it was lost with: The adapter failed while" in error.cause
+    assert error.remedy.startswith("Set it to 250 kbit/s. Run the same command again.")
+    assert error.needs_rescue
+
+
+def test_an_adapter_that_does_not_come_back_is_a_lost_one() -> None:
+    stage = Stage()
+    stage.at_packet[2] = stage.bus.unplug
+    with pytest.raises(BusError) as caught:
+        stage.flash(LONG)
+    assert caught.value.code is ErrorCode.ADAPTER_LOST
+    assert "is not there" in caught.value.what
 
 
 PHASES = list(Phase)[:-1]

@@ -313,6 +313,20 @@ def test_a_device_whose_upgrade_failed_is_rescued_with_the_same_image(place: Ben
     assert place.bench.state.power_cycle_s is None
 
 
+def test_the_wait_for_a_lost_adapter_is_counted_down(place: BenchPlace) -> None:
+    seen: list[int | None] = []
+    put = place.bench.feed.put
+
+    def watched(subject: str, state: State, *, word: object) -> None:
+        put(subject, state, word=word)
+        if seen[-1:] != [state.adapter_left_s]:
+            seen.append(state.adapter_left_s)
+
+    place.bench.feed.put = watched  # type: ignore[method-assign]
+    assert isinstance(_done(place, Fault.PULLED).error, BusError)
+    assert seen == [None, 5, 4, 3, 2, 1, None]
+
+
 def test_the_wait_for_the_power_is_counted_down(tmp_path: Path) -> None:
     ticks = itertools.count(0.0, 0.25)
     place = BenchPlace(tmp_path, lambda: next(ticks))

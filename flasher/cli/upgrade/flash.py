@@ -177,8 +177,8 @@ _upgrade_options: Final = option_set(
     ),
     option(
         "--adapter-wait", type=values.seconds, metavar="S", panel="upgrade",
-        help="seconds that a lost adapter may take to come back "
-        f"(default {UpgradeOptions.adapter_return_s})",
+        help="seconds that a lost adapter may take to come back, once anything was sent "
+        f"(default {UpgradeOptions.adapter_return_s:g})",
     ),
     gap_options,
     option(

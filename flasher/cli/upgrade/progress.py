@@ -21,6 +21,8 @@ class Progress:
         self._output = output
         self._bar = Bar(output, unit="B", unit_scale=True, desc=plan.target.node.name)
         self._repetitions = 0
+        self._wait = Bar(output, bar_format="{desc} |{bar}|")
+        self._wait_s = 0.0
 
     def __enter__(self) -> Self:
         self._output.shows = _is_shown
@@ -28,6 +30,7 @@ class Progress:
 
     def __exit__(self, *_: object) -> None:
         self._bar.close()
+        self._wait.close()
         self._output.shows = lambda _event: False
 
     def __call__(self, event: object) -> None:
@@ -45,6 +48,13 @@ class Progress:
                 self._bar.close()
             case events.MessageRepeated():
                 self._repetitions += 1
+            case events.AdapterLost(_, wait_s):
+                self._wait_s = wait_s
+            case events.AdapterAwaited(left_s):
+                self._wait.move_to(self._wait_s - left_s, self._wait_s)
+                self._wait.describe(f"waiting for the adapter, {left_s} s left")
+            case events.AdapterBack():
+                self._wait.close()
             case events.PowerCycleAwaited(limit_s):
                 # What the user has to do now, so that it is seen.
                 text = f"power-cycle the device now (waiting {limit_s:g} s)"
@@ -60,5 +70,7 @@ class Progress:
 
 def _is_shown(event: object) -> bool:
     """True for what has a line or a bar of its own here."""
-    has_more = isinstance(event, events.PacketAcknowledged | events.PowerCycleAwaited)
+    has_more = isinstance(
+        event, events.PacketAcknowledged | events.AdapterAwaited | events.PowerCycleAwaited
+    )
     return has_more or bool(warning_of(event) or line_of(event))
