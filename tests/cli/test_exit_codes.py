@@ -240,7 +240,7 @@ CASES = [
     Case("not the manifest's bytes", ExitCode.IMAGE, manifest_of_another_build,
          "image.bin.toml", "another build", "same release"),
     Case("no adapter", ExitCode.BUS, no_adapter, "nocan7", " ", " "),
-    Case("unplugged", ExitCode.BUS, unplugged, "packet 2 of 4", "unplugged", "Plug it in"),
+    Case("unplugged", ExitCode.BUS, unplugged, "packet 2 of 4", "not plugged in", "Plug it in"),
     Case("bus-off", ExitCode.BUS, bus_off, "transferring", "bus-off", "bit rate"),
     Case("bus-off at once", ExitCode.BUS, bus_off_from_the_beginning,
          "before anything was sent; the simulated bus", "bus-off", "bit rate"),
