@@ -15,6 +15,7 @@ from typing import Final
 import can
 
 from flasher.bus.health import BusTrouble, TroubleKind
+from flasher.errors import FlasherError
 
 
 class Meaning(Enum):
@@ -129,9 +130,11 @@ def is_foreign_datagram(error: Exception) -> bool:
 
 
 def causes(error: BaseException) -> Iterator[BaseException]:
-    """The exception and those that it was raised from: back ends wrap what matters."""
+    """The exception and those that it was raised from: back ends wrap what matters. What flasher
+    was doing when it was raised is none of them.
+    """
     found: BaseException | None = error
-    while found is not None:
+    while found is not None and not isinstance(found, FlasherError):
         yield found
         found = found.__cause__ or (None if found.__suppress_context__ else found.__context__)
 

@@ -16,23 +16,10 @@ from typing import Final
 
 import can
 
+from flasher.protocol.frame import Frame
+from tests.end_to_end.lawicel import Program
+
 READY: Final = "plugged in"
-
-
-def _line(message: can.Message) -> bytes:
-    return f"t{message.arbitration_id:03X}{message.dlc}{message.data.hex().upper()}\r".encode()
-
-
-def _message(line: bytes) -> can.Message | None:
-    """What a line sends; None for one that sets something."""
-    if not line.startswith(b"t"):
-        return None
-    size = int(line[4:5])
-    return can.Message(
-        arbitration_id=int(line[1:4], 16),
-        is_extended_id=False,
-        data=bytes.fromhex(line[5 : 5 + 2 * size].decode()),
-    )
 
 
 def main() -> None:
@@ -45,6 +32,7 @@ def main() -> None:
     bus = can.Bus(
         interface="udp_multicast", channel=group, port=port, hop_limit=0, ignore_config=True
     )
+    program = Program()
     sent: set[tuple[int, bytes]] = set()
 
     def to_computer() -> None:
@@ -53,19 +41,19 @@ def main() -> None:
             if key in sent:  # a multicast bus hears itself, an slcan adapter does not
                 sent.discard(key)
             else:
-                os.write(ours, _line(message))
+                os.write(ours, program.line_of(Frame(*key)))
 
     threading.Thread(target=to_computer, daemon=True).start()
     sys.stdout.write(f"{READY}\n")
     sys.stdout.flush()
-    held = b""
     while True:
-        held += os.read(ours, 4096)
-        *lines, held = held.split(b"\r")
-        for message in map(_message, lines):
-            if message is not None:
-                sent.add((message.arbitration_id, bytes(message.data)))
-                bus.send(message)
+        for answer, frame in program.take(os.read(ours, 4096)):
+            os.write(ours, answer)
+            if frame is not None:
+                sent.add((frame.can_id, frame.data))
+                bus.send(
+                    can.Message(arbitration_id=frame.can_id, is_extended_id=False, data=frame.data)
+                )
 
 
 if __name__ == "__main__":

@@ -1,0 +1,166 @@
+"""python-can's real slcan at a pseudo terminal, with an adapter that says anything, or nothing.
+
+Everything takes real time here; `python -m tests.campaigns.slcan` has more of it.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("pty", reason="there are no pseudo terminals here")
+
+from flasher import api, events
+from flasher.bus.link import Link
+from flasher.errors import BusError, ErrorCode, ExitCode, TransmitBlockedError
+from flasher.host.options import UpgradeOptions
+from flasher.host.session import Result
+from flasher.mock.model import MockDevice
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import BMS, WELLING
+from flasher.protocol.timing import DEFAULT_TIMINGS
+from tests.end_to_end.lawicel import ERROR, Damage, Lawicel, Program
+from tests.end_to_end.stage import SMALL, image_of
+
+IMAGE = image_of(8)
+HASTY = UpgradeOptions(timings=replace(DEFAULT_TIMINGS, ack_timeout_s=0.1), adapter_return_s=2.0)
+
+
+@pytest.fixture
+def adapter(tmp_path: Path) -> Iterator[Lawicel]:
+    with Lawicel(tmp_path / "port") as plugged:
+        yield plugged
+
+
+class Flashed:
+    """One upgrade over the adapter, the device on its other side, and what was reported."""
+
+    def __init__(self, adapter: Lawicel, options: UpgradeOptions = HASTY) -> None:
+        self.device = MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=SMALL)
+        self.seen: list[object] = []
+        self.error: BusError | None = None
+        self.result: Result | None = None
+        with (
+            adapter.device(self.device),
+            api.connect(interface="slcan", channel=str(adapter.port), sleep_after_open=0.0) as bus,
+        ):
+            try:
+                self.result = bus.device("bms").upgrade(
+                    IMAGE, options=options, on_event=self.seen.append
+                )
+            except BusError as error:
+                self.error = error
+            self.health = bus.link.health()
+
+    @property
+    def is_good(self) -> bool:
+        """Claimed, and true."""
+        claimed = self.result is not None and self.result.exit_code is ExitCode.OK
+        assert not claimed or self.device.stored_image == IMAGE.data
+        return claimed
+
+
+def test_an_upgrade_over_an_adapter_that_is_as_its_manual_says(adapter: Lawicel) -> None:
+    flashed = Flashed(adapter)
+    assert flashed.is_good
+    assert flashed.health.unreadable == 0
+    assert adapter.program.commands == [b"C", b"S5", b"", b"O", b"O", b"C"]
+    assert not adapter.program.is_open
+
+
+def test_damaged_lines_are_counted_and_sent_again(adapter: Lawicel) -> None:
+    damage = adapter.damage = Damage(0.08, seed=3)
+    flashed = Flashed(adapter, replace(HASTY, attempts=9))
+    assert flashed.is_good
+    assert damage.lines > 5
+    assert 0 < flashed.health.unreadable <= 3 * damage.lines
+
+
+def test_lines_in_pieces_and_with_time_stamps_are_understood(adapter: Lawicel) -> None:
+    adapter.is_slow = adapter.program.has_stamps = True
+    flashed = Flashed(adapter)
+    assert flashed.is_good
+    assert flashed.health.unreadable == 0
+
+
+def test_an_adapter_that_confirms_nothing_or_refuses_frames_is_overcome(adapter: Lawicel) -> None:
+    draw = random.Random(4)
+    adapter.program.confirms_frames = False
+    adapter.program.refuses = lambda: draw.random() < 0.01
+    assert Flashed(adapter).is_good
+
+
+def test_an_adapter_that_is_pulled_out_and_plugged_in_again_goes_on(adapter: Lawicel) -> None:
+    adapter.at_frame[100] = lambda: adapter.pull(0.3)
+    flashed = Flashed(adapter)
+    assert flashed.is_good
+    kinds = [type(event) for event in flashed.seen]
+    assert events.AdapterLost in kinds
+    assert events.AdapterBack in kinds
+
+
+def test_an_adapter_that_is_pulled_out_for_good_ends_it_with_the_state_of_the_device(
+    adapter: Lawicel,
+) -> None:
+    adapter.at_frame[100] = adapter.pull
+    began = time.perf_counter()
+    flashed = Flashed(adapter, replace(HASTY, adapter_return_s=0.5))
+    assert time.perf_counter() - began < 5.0
+    assert flashed.error is not None
+    assert flashed.error.code is ErrorCode.ADAPTER_LOST
+    assert flashed.error.needs_rescue
+    assert "could not open port" in flashed.error.what
+    assert "failed while" not in flashed.error.what
+    assert "it was lost with: The adapter failed while" in flashed.error.cause
+
+
+def test_an_adapter_whose_serial_speed_is_another_is_named_as_the_cause(adapter: Lawicel) -> None:
+    draw = random.Random(1)
+    adapter.damage = lambda line: bytes(draw.randrange(128, 256) for _ in line[:-1]) + b"\r"
+    timings = replace(HASTY.timings, boot_version_timeout_s=0.3, command_timeout_s=0.3)
+    flashed = Flashed(adapter, replace(HASTY, timings=timings, attempts=1))
+    assert flashed.error is not None
+    assert "Nothing that the adapter delivers can be read" in flashed.error.what
+    assert not flashed.error.needs_rescue
+
+
+def test_an_adapter_that_takes_nothing_ends_a_send_in_bounded_time(
+    adapter: Lawicel, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("flasher.bus.adapter.SEND_LIMIT_S", 0.1)
+    began = time.perf_counter()
+
+    def fill(link: Link) -> None:
+        for _ in range(10_000):
+            link.send(Frame(0x752, bytes(8)))
+
+    with (
+        api.connect(interface="slcan", channel=str(adapter.port), sleep_after_open=0.0) as bus,
+        pytest.raises(TransmitBlockedError),
+    ):
+        fill(bus.link)
+    assert time.perf_counter() - began < 5.0
+
+
+def test_the_adapter_of_the_tests_refuses_what_the_manual_does_not_allow() -> None:
+    program = Program()
+
+    def answers(*lines: bytes) -> list[bytes]:
+        return [answer for line in lines for answer, _ in program.take(line + b"\r")]
+
+    frame = b"t7521AB"
+    assert answers(b"O", b"C", b"F", b"Z2", b"S9", b"x", frame) == [ERROR] * 7
+    assert answers(b"V", b"N", b"S5", b"O", b"F", b"") == [
+        b"V1013\r", b"NA123\r", b"\r", b"\r", b"F00\r", b"\r"
+    ]  # fmt: skip
+    assert answers(b"O", b"S5", b"Z1", b"t7529", b"t75", b"tFFF0", b"t7521A", b"r7521A") == (
+        [ERROR] * 8
+    )
+    assert list(program.take(frame + b"\r" + b"T0000075")) == [(b"z\r", Frame(0x752, b"\xab"))]
+    assert list(program.take(b"20\r")) == [(b"Z\r", Frame(0x752, b"", is_extended=True))]
+    assert answers(b"C", b"L", frame) == [b"\r", b"\r", ERROR]
