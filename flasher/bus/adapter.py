@@ -42,7 +42,7 @@ from flasher.bus.health import (
 )
 from flasher.bus.inspect_interface import Interface, read_interface
 from flasher.bus.link import AT_ONCE, SEND_LIMIT_S
-from flasher.bus.lock import hold
+from flasher.bus.lock import hold, place_of
 from flasher.bus.opening import bus_config, open_bus
 from flasher.bus.physical import is_physical
 from flasher.errors import BusError, ErrorCode, TransmitBlockedError
@@ -92,21 +92,36 @@ def open_adapter(
     rate = bit_rate(default_bitrate_bps, config, merged, fallback)
     settled = merged if "timing" in merged else {**merged, "bitrate": rate.bps}
 
+    interface = str(merged["interface"])
+    channel = str(merged.get("channel") or "")
+    place, give_back = place_of(merged), hold(merged, holder)
+
     def open_again() -> can.BusABC:
         # An interface that is back may have been set up anew, and otherwise.
         bit_rate(default_bitrate_bps, config, merged, fallback)
-        return open_bus(settled, sends=sends)
+        nonlocal place, give_back
+        # A serial port that is named by a link may be back as another one.
+        new_place, give_new_back = place_of(merged), None
+        if new_place != place:
+            give_new_back = hold(merged, holder)
+        try:
+            bus = open_bus(settled, sends=sends)
+        except BaseException:
+            if give_new_back is not None:
+                give_new_back()
+            raise
+        if give_new_back is not None:
+            give_back()
+            place, give_back = new_place, give_new_back
+        return bus
 
-    interface = str(merged["interface"])
-    channel = str(merged.get("channel") or "")
-    give_back = hold(merged, holder)
     try:
         link = CanLink(
             open_bus(settled, sends=sends),
             interface,
             channel,
             open_again,
-            give_back,
+            lambda: give_back(),  # noqa: PLW0108  another one after a reopening
             gives_own=interface != "socketcan" or bool(merged.get("receive_own_messages")),
         )
     except BaseException:

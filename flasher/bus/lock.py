@@ -53,7 +53,7 @@ def hold(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]:
     try:
         folder = user_state_path("flasher", appauthor=False) / "locks"
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
-        path = folder / f"{_file_name(config)}.lock"
+        path = folder / f"{place_of(config)}.lock"
         lock = FileLock(path, timeout=0, thread_local=False)
         lock.acquire()
     except Timeout:
@@ -85,8 +85,10 @@ def hold(config: Mapping[str, Any], holder: str | None) -> Callable[[], None]:
     return give_back
 
 
-def _file_name(config: Mapping[str, Any]) -> str:
-    """Of one adapter, whoever names it. The folder may be shared with other computers."""
+def place_of(config: Mapping[str, Any]) -> str:
+    """One adapter, whoever names it, as the name of a file. The folder may be shared with other
+    computers.
+    """
     interface = str(config["interface"])
     place = {key: str(config[key]) for key in _PLACE if config.get(key) is not None}
     if interface == _ON_A_PORT:

@@ -34,6 +34,7 @@ ERROR: Final = b"\a"
 BIT_RATES: Final = (10, 20, 50, 100, 125, 250, 500, 800, 1000)
 """In kbit/s, of the commands S0 to S8."""
 _FRAME: Final = re.compile(rb"([tr])([0-9A-Fa-f]{3})([0-8])|([TR])([0-9A-Fa-f]{8})([0-8])")
+_LINE: Final = re.compile(rb"[^\r]+\r?|\r")
 _PIECE: Final = 4096
 _GONE_S: Final = 0.01
 """Between two looks whether it is plugged in again."""
@@ -170,6 +171,9 @@ class Lawicel:
         self.port = port
         self.program = program or Program()
         self.damage: Callable[[bytes], bytes] = lambda line: line
+        """What becomes of a line to the computer."""
+        self.damage_of_computer: Callable[[bytes], bytes] = lambda line: line
+        """What becomes of a line from there."""
         self.is_slow = False
         """It writes in pieces of a few bytes, and reads as slowly."""
         self.traffic: Callable[[], list[Frame]] = list
@@ -279,7 +283,9 @@ class Lawicel:
         return HealthKeeper().health()
 
     def _look(self, ours: int) -> None:
-        for answer, frame in self.program.take(os.read(ours, 5 if self.is_slow else _PIECE)):
+        lines = _LINE.findall(os.read(ours, 5 if self.is_slow else _PIECE))
+        came = b"".join(map(self.damage_of_computer, lines))
+        for answer, frame in self.program.take(came):
             self._write(self.damage(answer))
             if frame is None:
                 continue

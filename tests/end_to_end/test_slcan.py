@@ -10,6 +10,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -17,6 +18,7 @@ pytest.importorskip("pty", reason="there are no pseudo terminals here")
 
 from flasher import api, events
 from flasher.bus.link import Link
+from flasher.bus.lock import hold
 from flasher.errors import BusError, ErrorCode, ExitCode, TransmitBlockedError
 from flasher.host.options import UpgradeOptions
 from flasher.host.session import Result
@@ -102,6 +104,25 @@ def test_an_adapter_that_is_pulled_out_and_plugged_in_again_goes_on(adapter: Law
     kinds = [type(event) for event in flashed.seen]
     assert events.AdapterLost in kinds
     assert events.AdapterBack in kinds
+
+
+def test_an_adapter_that_is_back_under_another_name_is_locked_there(
+    adapter: Lawicel, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The link leads to the new port; the lock is on what it leads to."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    options: dict[str, Any] = {"interface": "slcan", "sleep_after_open": 0.0}
+    with api.connect(channel=str(adapter.port), **options) as bus, Lawicel(tmp_path / "x") as other:
+        first = adapter.port.resolve()
+        adapter.pull()
+        with pytest.raises(BusError, match="could not open port"):
+            bus.link.reopen()
+        adapter.port.symlink_to(other.port.resolve())
+        bus.link.reopen()
+        with pytest.raises(BusError, match="in use by a program"):
+            hold({"channel": str(other.port), **options}, "another")
+        hold({"channel": str(first), **options}, "another")()
+    hold({"channel": str(other.port), **options}, "another")()
 
 
 def test_an_adapter_that_is_pulled_out_for_good_ends_it_with_the_state_of_the_device(
