@@ -18,7 +18,18 @@ _PASSWORD: Final = re.compile(r"(:/+[^\s:@]*):[^@\n]*@(?:[^\s@]*@)*")
 """Between the user and the last @ of a URL: a password may hold an @ of its own."""
 _NO_PORT: Final = re.compile(r"(:/+[^\s:/@]*):(?!\d+\b|\*+@)[^\s/@]+")
 """In the place of a port there is no number: the host was forgotten."""
-_PASSWORD_KEY: Final = re.compile(r"(?i)([?&][^\s=&]*password=)[^\s&]*")
+_SECRET_NAME: Final = r"[\w-]*(?:password|passwd|passphrase|secret|token|api_?key)[\w-]*"  # noqa: S105  a pattern
+_SECRET: Final = re.compile(_SECRET_NAME, re.IGNORECASE)
+_IN_QUERY: Final = re.compile(rf"(?i)([?&]{_SECRET_NAME}=)[^\s&]*")
+"""In the query of a URL."""
+_ARGUMENT: Final = re.compile(
+    rf"(?i)(?<![\w?&-])({_SECRET_NAME}=)(?!\*\*\*['\")]*(?:[\s,]|$))(?:'[^']*'|\"[^\"]*\"|\S+?(?=['\"]?(?:\s|$)))"
+)
+"""Among words: `--bus-kwargs password=X`, `Bus(password='X')`."""
+_WORD: Final = re.compile(rf"(?is)((?:--[\w-]+=)?{_SECRET_NAME}=).*")
+"""A whole word of a command line, whatever its value has in it."""
+_IN_DICT: Final = re.compile(rf"(?i)((['\"]){_SECRET_NAME}\2: )(?:'[^']*'|\"[^\"]*\"|[^\s,}}]+)")
+"""In a dictionary of Python, or in JSON."""
 
 
 class ExitCode(IntEnum):
@@ -57,6 +68,7 @@ class ErrorCode(StrEnum):
     NOT_CONFIRMED = "E206"
     PAGES_NOT_SERVED = "E207"
     UNFINISHED = "E208"
+    FILE_NOT_TRUSTED = "E209"
     RECORDS = "E210"
     RECORDS_NO_ROOM = "E211"
     RECORDS_LOCKED = "E212"
@@ -129,9 +141,22 @@ def did_you_mean(
 
 
 def hide_passwords(text: str) -> str:
-    """A text that may hold the URL of a database, without the password in it."""
+    """A text that may hold the URL of a database, or arguments, without the passwords in it."""
     text = _NO_PORT.sub(r"\1:***", _PASSWORD.sub(r"\1:***@", text))
-    return _PASSWORD_KEY.sub(r"\1***", text)
+    for secret in (_IN_QUERY, _ARGUMENT, _IN_DICT):
+        text = secret.sub(r"\1***", text)
+    return text
+
+
+def without_password(word: str) -> str:
+    """A word of a command line, without the password in it."""
+    whole = _WORD.fullmatch(word)
+    return hide_passwords(word) if whole is None else f"{whole[1]}***"
+
+
+def is_secret(name: str) -> bool:
+    """Whether an argument of this name holds what nobody else may know."""
+    return _SECRET.fullmatch(name) is not None
 
 
 def printable(text: str) -> str:

@@ -1,4 +1,5 @@
-"""The one gate for every file that is read, and for what TOML and JSON files hold.
+"""The one gate for every file that is read, and for what TOML and JSON files hold; and what makes a
+file readable by its owner alone.
 
 A name may lead to anything: a pipe that nobody writes to, a device, a link to itself, a file larger
 than the memory. Only a regular file of a stated size passes, and it is opened for reading alone.
@@ -9,10 +10,11 @@ from __future__ import annotations
 import json
 import math
 import os
+import shlex
 import stat
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BufferedReader
 from typing import Any, Final
 
@@ -26,6 +28,8 @@ _DEPTH_MAX: Final = 32
 _NUMBER_BITS_MAX: Final = 64
 _DOTS_MAX: Final = 128
 """In a line of TOML. The time that tomllib takes grows with the square of the parts of a key."""
+_OWNER_ONLY: Final = 0o600
+_OF_OTHERS: Final = 0o077
 _OPEN_FLAGS: Final = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """Not to wait for a pipe that took the place of the file in this moment; no line end translated."""
 
@@ -39,12 +43,15 @@ def opened(
     error: type[FlasherError] = UsageError,
     if_missing: str = "Correct the name.",
     may_grow: bool = False,
+    was_named: bool = True,
 ) -> Iterator[tuple[BufferedReader, int]]:
     """A regular file of at most `max_size` bytes, or of any size, open for reading; and its size
     in bytes.
 
     `what` says in messages what kind of file was wanted. A recording that is still written to
-    `may_grow`; any other file must not change until the end of the block.
+    `may_grow`; any other file must not change until the end of the block. Unless it `was_named` by
+    the user, it has to be the user's own or root's, and nobody else may write it (Windows: not
+    looked at).
 
     Raises UsageError when there is no such file or it is no regular one; `error` when it is too
     large, changes, or cannot be read, here or in the block.
@@ -66,6 +73,8 @@ def opened(
         with open(descriptor, "rb") as file:  # noqa: PTH123  a descriptor is no path
             before = os.fstat(descriptor)
             _check_regular(before, subject)
+            if not was_named:
+                _check_trusted(path, before, subject)
             if max_size is not None and before.st_size > max_size:
                 raise error(
                     f"{subject} is too large: {before.st_size:,} bytes, where at most "
@@ -94,9 +103,12 @@ def read(
     what: str = "",
     error: type[FlasherError] = UsageError,
     if_missing: str = "Correct the name.",
+    was_named: bool = True,
 ) -> bytes:
     """All bytes of a file. Raises as `opened`."""
-    with opened(path, max_size, what=what, error=error, if_missing=if_missing) as (file, size):
+    with opened(
+        path, max_size, what=what, error=error, if_missing=if_missing, was_named=was_named
+    ) as (file, size):
         return file.read(size)
 
 
@@ -106,9 +118,12 @@ def read_toml(
     what: str,
     error: type[FlasherError] = UsageError,
     if_missing: str = "Correct the name.",
+    was_named: bool = True,
 ) -> dict[str, Any]:
     """What a TOML file of settings holds. Raises as `opened`, and `error` when it is none."""
-    raw = read(path, TOML_MAX_SIZE, what=what, error=error, if_missing=if_missing)
+    raw = read(
+        path, TOML_MAX_SIZE, what=what, error=error, if_missing=if_missing, was_named=was_named
+    )
     return parse_file(raw, path, what=what, error=error)
 
 
@@ -176,6 +191,35 @@ def _check_values(document: object, *, all_finite: bool) -> None:
         raise ValueError("nested too deep")
 
 
+def owner_only(path: str, flags: int) -> int:
+    """An opener for `open`: a file that it creates is readable by its owner alone."""
+    return os.open(path, flags, _OWNER_ONLY)
+
+
+def make_private(path: str | os.PathLike[str], *, is_appended_to: bool = False) -> None:
+    """Create a file that its owner alone may read, for somebody who opens it by its name; one that
+    is there is emptied, unless it `is_appended_to`, and others lose their rights. Pipes and devices
+    are left alone. Raises OSError, also for a file of another user.
+    """
+    with suppress(FileNotFoundError):
+        if not stat.S_ISREG(os.stat(path).st_mode):  # noqa: PTH116  a name that is no path
+            return
+    how = os.O_WRONLY | os.O_CREAT | (0 if is_appended_to else os.O_TRUNC)
+    descriptor = owner_only(os.fspath(path), how)
+    try:
+        status = os.fstat(descriptor)
+        if os.name != "posix" or not status.st_mode & _OF_OTHERS:
+            return
+        try:
+            os.fchmod(descriptor, _OWNER_ONLY)
+        except PermissionError as error:
+            # A disk without rights (FAT) refuses its owner, or root who has mounted it.
+            if status.st_uid not in (os.geteuid(), 0):
+                raise PermissionError(error.errno, "it belongs to another user") from error
+    finally:
+        os.close(descriptor)
+
+
 def _check_regular(status: os.stat_result, subject: str) -> None:
     if stat.S_ISDIR(status.st_mode):
         raise UsageError(
@@ -185,6 +229,46 @@ def _check_regular(status: os.stat_result, subject: str) -> None:
         )
     if not stat.S_ISREG(status.st_mode):
         raise _no_regular(subject)
+
+
+def _check_trusted(path: str | os.PathLike[str], status: os.stat_result, subject: str) -> None:
+    """Raises UsageError for an open file that another user has laid, or may write, where it is
+    looked for. Its folder does not matter: who puts another file there is the owner of that one.
+    """
+    if os.name != "posix":
+        return
+    own = {os.geteuid(), 0}
+    if not os.geteuid() and os.environ.get("SUDO_UID", "").isdecimal():
+        own.add(int(os.environ["SUDO_UID"]))  # who became root by sudo
+    quoted = shlex.quote(os.fspath(path))
+    laid = os.lstat(path)
+    if laid.st_uid not in own or status.st_uid not in own:
+        why = "it belongs to another user"
+        mended = f"cp {quoted} {quoted}.own && mv -f {quoted}.own {quoted}"
+    elif status.st_mode & stat.S_IWOTH or (
+        status.st_mode & stat.S_IWGRP and not _is_own_group(status)
+    ):
+        why, mended = "other users may write it", f"chmod go-w {quoted}"
+    else:
+        return
+    raise UsageError(
+        f"{subject} is not taken: {why}.",
+        cause="it was not named; it was found where such a file is looked for",
+        remedy=f"Read what is in it; then `{printable(mended)}` lets it be taken.",
+        code=ErrorCode.FILE_NOT_TRUSTED,
+    )
+
+
+def _is_own_group(status: os.stat_result) -> bool:
+    """True for the group that many systems give each user alone, with the right to write."""
+    import grp  # noqa: PLC0415  not on Windows
+    import pwd  # noqa: PLC0415
+
+    try:
+        owner, group = pwd.getpwuid(status.st_uid), grp.getgrgid(status.st_gid)
+    except KeyError:
+        return False
+    return group.gr_name == owner.pw_name and set(group.gr_mem) <= {owner.pw_name}
 
 
 def _no_regular(subject: str) -> UsageError:

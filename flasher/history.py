@@ -25,7 +25,7 @@ from platformdirs import user_data_path
 
 from flasher.errors import UsageError, printable
 from flasher.events import Phase
-from flasher.files import opened
+from flasher.files import opened, owner_only
 from flasher.prose import prose_of
 from flasher.said import say
 
@@ -189,7 +189,7 @@ class History:
         """
         if reached.phase not in _LEFT_IN:
             return
-        descriptor = _private(str(self._place_of(name)), os.O_WRONLY | os.O_CREAT)
+        descriptor = owner_only(str(self._place_of(name)), os.O_WRONLY | os.O_CREAT)
         try:
             text = f"{reached.phase} {reached.packet}"
             os.write(descriptor, text.ljust(_REACHED_SIZE).encode())
@@ -280,7 +280,7 @@ class History:
         with FileLock(f"{self.path}.lock", timeout=_LOCK_LIMIT_S, mode=0o600):
             if self.path.exists() and self.path.stat().st_size > SIZE_MAX:
                 self._drop_older_half()
-            descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o600)
+            descriptor = owner_only(str(self.path), os.O_RDWR | os.O_APPEND | os.O_CREAT)
             with open(descriptor, "r+b", buffering=0) as file:  # noqa: PTH123  a descriptor
                 text = f"{json.dumps(line)}\n".encode()
                 if not _ends_whole(file.fileno()):
@@ -293,7 +293,7 @@ class History:
         lines = self._lines(SIZE_MAX // 2)
         part = self.path.with_name(f".{self.path.name}-{token_hex(4)}.part")
         try:
-            with open(part, "xb", opener=_private) as file:
+            with open(part, "xb", opener=owner_only) as file:
                 file.writelines(b"%s\n" % each for each in lines)
             part.replace(self.path)
         except BaseException:
@@ -304,11 +304,6 @@ class History:
         for path in self._folder.glob("*"):
             if path.stem.encode() not in kept and not self._is_running(path.stem):
                 path.unlink(missing_ok=True)
-
-
-def _private(name: str, flags: int) -> int:
-    """Open for the owner alone."""
-    return os.open(name, flags, 0o600)
 
 
 def _ends_whole(descriptor: int) -> bool:

@@ -10,6 +10,7 @@ from secrets import token_hex
 from typing import Final
 
 from flasher.errors import ErrorCode, UsageError
+from flasher.files import make_private
 from flasher.protocol.text import printable
 
 _LINKS_MAX: Final = 40
@@ -79,9 +80,10 @@ def check_not_read(path: str | Path, option: str, others: Iterable[object]) -> N
             )
 
 
-def write_whole(path: Path, data: bytes, option: str) -> None:
-    """Write a file whole or not at all. A link is followed, unless another user created it; a pipe
-    or device is written into, not replaced. Raises UsageError with the `option` that named it.
+def write_whole(path: Path, data: bytes, option: str, *, is_private: bool = False) -> None:
+    """Write a file whole or not at all; one that `is_private` only its owner may read. A link is
+    followed, unless another user created it; a pipe or device is written into, not replaced. Raises
+    UsageError with the `option` that named it.
     """
     try:
         # Inside: a link that leads to itself cannot be resolved.
@@ -91,7 +93,7 @@ def write_whole(path: Path, data: bytes, option: str) -> None:
         if is_special:
             path.write_bytes(data)
         else:
-            _replace(path, data)
+            _replace(path, data, is_private=is_private)
     except (OSError, RuntimeError) as error:
         reason = getattr(error, "strerror", None) or type(error).__name__
         raise _not_written(path, option, reason) from error
@@ -100,7 +102,8 @@ def write_whole(path: Path, data: bytes, option: str) -> None:
 @contextlib.contextmanager
 def writing(path: Path, option: str) -> Iterator[Path]:
     """A name beside `path`, with its suffixes, for what is written piece by piece: it takes the
-    place of `path` when the block ends well, else it is removed. Raises UsageError with the
+    place of `path` when the block ends well, else it is removed. Its owner alone may read it.
+    Raises UsageError with the
     `option` that named the file.
     """
     check_writable(path, option)
@@ -109,7 +112,9 @@ def writing(path: Path, option: str) -> Iterator[Path]:
     part = path.with_name(f".flasher-{token_hex(8)}-part{''.join(path.suffixes[-2:])}")
     try:
         _check_links(path, option)
+        make_private(part)
         yield part
+        make_private(part, is_appended_to=True)  # whoever wrote it may have made it anew
         part.replace(path.resolve(strict=False))
     except OSError as error:
         raise _not_written(path, option, error.strerror or type(error).__name__) from error
@@ -130,11 +135,13 @@ def _check_links(path: Path, option: str) -> None:
         path = path.parent / path.readlink()
 
 
-def _replace(path: Path, data: bytes) -> None:
+def _replace(path: Path, data: bytes, *, is_private: bool) -> None:
     # A name that nobody knows before, and "x": what is laid there already is never followed.
     part = path.with_name(f".flasher-{token_hex(8)}.part")
     try:
         with part.open("xb") as file:
+            if is_private:
+                make_private(part)
             file.write(data)
         part.replace(path)
     except BaseException:  # an interrupt too leaves nothing half written

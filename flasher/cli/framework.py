@@ -31,7 +31,7 @@ from flasher.cli.help import BRIEF, HelpedCommand
 from flasher.cli.logs import LOG_FILE, Logs
 from flasher.cli.output import SAID, Output
 from flasher.cli.values import FilePath
-from flasher.errors import ExitCode, UsageError, hide_passwords
+from flasher.errors import ExitCode, UsageError, without_password
 from flasher.protocol.text import printable
 
 _LOG: Final = logging.getLogger("flasher.cli")
@@ -45,7 +45,7 @@ class Session:
 
     def __init__(self, output: Output, logs: Logs, words: Sequence[str]) -> None:
         self.output = output
-        self.command_line = [hide_passwords(word) for word in words]
+        self.command_line = [without_password(word) for word in words]
         """As typed, but for passwords."""
         self._logs = logs
         self._verbosity = 0
@@ -196,7 +196,7 @@ def retyped(
         words += [*own, "--", *positional]
     else:
         words += [*positional, *own]
-    return [hide_passwords(word) for word in words]
+    return [without_password(word) for word in words]
 
 
 def _typed(ctx: click.Context) -> dict[str, Any]:

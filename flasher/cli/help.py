@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import platform
 import re
 import sys
 import textwrap
@@ -46,10 +47,20 @@ _MEANINGS: Final[Mapping[ExitCode, str]] = {
     ExitCode.INTERRUPTED: "interrupted",
 }
 _ALWAYS: Final = (ExitCode.OK, ExitCode.INTERNAL, ExitCode.USAGE)
+CAN_FILES: Final = {
+    "Linux": ("~/.canrc", "~/.can", "/etc/can.conf", "~/can.conf"),
+    "Darwin": ("~/.canrc", "~/.can", "/etc/can.conf", "~/can.conf"),
+    "Windows": (r"%APPDATA%\can.ini", "can.ini", "~/can.conf"),
+}
+"""python-can's configuration files on each system; what an earlier one says goes first."""
+_OWN_CAN_FILES: Final = CAN_FILES.get(platform.system(), ("~/can.conf",))
+
+
 _READ_FOR: Final = {
-    "--interface": """\
+    "--interface": f"""\
   CAN_INTERFACE, CAN_CHANNEL, ...    the adapter, where -i and -c do not name it
-  can.conf, ~/.canrc, /etc/can.conf  the same in python-can's configuration files
+  {", ".join(_OWN_CAN_FILES)}
+                                     the same in python-can's configuration; an earlier one first
   flasher.toml                       the same in its table [bus], where nothing above names it:
                                      of the working directory, else of the user's configuration
 """,

@@ -15,6 +15,7 @@ from typing import Final, Self
 from flasher.cli.files import check_not_read, check_writable
 from flasher.cli.output import Output
 from flasher.errors import ErrorCode, UsageError, hide_passwords
+from flasher.files import make_private
 from flasher.log import ROOT
 from flasher.protocol.text import printable
 
@@ -107,6 +108,7 @@ class _File(logging.FileHandler):
     def __init__(self, path: Path) -> None:
         check_writable(path, LOG_FILE, is_appended_to=True)
         try:
+            make_private(path, is_appended_to=True)
             super().__init__(path, encoding="utf-8", errors="backslashreplace")
         except OSError as error:
             raise UsageError(

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import os
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,7 +30,7 @@ from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.values import TRACE_SUFFIXES, FilePath, FolderPath
 from flasher.driver import Tap
-from flasher.errors import ExitCode, FlasherError, InterruptedByUserError
+from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, is_secret
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.trace.figures import LinkMeter, LinkReport
@@ -133,7 +133,7 @@ def recording(
         "command_line": ["flasher", *map(printable, command_line())],
         "target": None if target is None else target.name,
         "dialect": bus.dialect_name,
-        "bus": {} if bus.mock else bus.config,
+        "bus": {} if bus.mock else _without_passwords(bus.config),
         "bitrate_bps": bus.bit_rate.bps,
         "bitrate_source": bus.bit_rate.source,
     }
@@ -149,6 +149,10 @@ def recording(
     finally:
         if (record.is_alone or record.failure is not None) and not options.no_bundle:
             _leave_bundle(options, output, record, record.failure)
+
+
+def _without_passwords(config: Mapping[str, Any]) -> dict[str, Any]:
+    return {key: "***" if is_secret(key) else value for key, value in config.items()}
 
 
 @contextmanager

@@ -52,7 +52,8 @@ from flasher.conformance.results import (
 )
 from flasher.conformance.runner import Run, RunObserver, RunOptions
 from flasher.conformance.subject import Subject
-from flasher.errors import FlasherError, printable
+from flasher.errors import FlasherError, printable, without_password
+from flasher.files import make_private
 from flasher.trace.figures import Distribution
 from pytest_flasher import BENCH_OPTIONS
 
@@ -106,6 +107,7 @@ class BenchTrace:
 
     def save(self, path: Path) -> None:
         """Write them as a candump log."""
+        make_private(path)
         path.write_bytes(candump(self.frames))
 
 
@@ -219,6 +221,8 @@ class PluginRun:
         path = Path(given, name)
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            if name:  # a trace
+                make_private(path)
             path.write_bytes(made())
         except OSError as error:
             pytest.fail(f"{path} cannot be written: {error.strerror}", pytrace=False)
@@ -234,7 +238,7 @@ class PluginRun:
                 words += [f"{name}={one}" for one in value]
             elif value not in (None, False, more.get("default")):
                 words.append(f"{name}={value}")
-        return shlex.join([*words, "--btl-suite", "-k", case_id])
+        return shlex.join([*map(without_password, words), "--btl-suite", "-k", case_id])
 
     def _begin(self) -> None:
         if not self._has_begun:

@@ -313,7 +313,7 @@ def load_profile(
     """
     found = Path(path) if path is not None else find_profile()
     if found is not None and found != Path(os.devnull):
-        return _File(found).profile(target, dialect)
+        return _File(found, was_named=path is not None).profile(target, dialect)
     profile = Profile(
         target, dialect, has_upgrade=dialect.has_upgrade, version_query=documented_query(target)
     )
@@ -355,8 +355,10 @@ def find_bus(path: str | os.PathLike[str] | None = None) -> Fallback | None:
     """
     if path is not None and Path(path) == Path(os.devnull):
         return None
-    for place in (*([] if path is None else [Path(path)]), *_found()):
-        document = read_toml(place, what="profile")
+    named = [] if path is None else [Path(path)]
+    for place in (*named, *_found()):
+        was_named = place.resolve() in [each.resolve() for each in named]
+        document = read_toml(place, what="profile", was_named=was_named)
         if _BUS in document:
             from flasher.settings.bus import read_bus  # noqa: PLC0415  loads python-can
 
@@ -375,13 +377,14 @@ def reader() -> Reader[Profile]:
 class _File:
     """A file whose keys and values are right, each taken by itself. Raises UsageError."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, was_named: bool = True) -> None:
         self._path = path
         self._common: dict[str, Any] = {}
         self.tables: dict[str, Any] = {}
         """By the name of the target."""
         faults: list[Fault] = []
-        for key, value in read_toml(path, what="profile").items():
+        document = read_toml(path, what="profile", was_named=was_named)
+        for key, value in document.items():
             target = find_target(key)
             if key == _BUS:
                 from flasher.settings.bus import bus_faults  # noqa: PLC0415  loads python-can

@@ -24,6 +24,7 @@ from typing import Any, Final, Protocol
 
 from flasher.api import Connection, connect
 from flasher.errors import BusError, FlasherError, TransmitBlockedError, UsageError
+from flasher.files import make_private
 from flasher.log import log_event
 from flasher.protocol.text import printable
 from flasher.station import codes
@@ -307,6 +308,7 @@ class Worker:
 def pack(path: Path) -> TraceFile:
     """A trace compressed beside itself, with its hash; the plain one is deleted. Raises OSError."""
     packed = path.with_name(path.name + ".gz")
+    make_private(packed)
     with path.open("rb") as plain, packed.open("wb") as raw:
         # Without a name and time of its own: equal traces are equal files.
         with gzip.GzipFile(filename="", mode="wb", compresslevel=6, fileobj=raw, mtime=0) as out:

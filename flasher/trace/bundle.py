@@ -26,6 +26,7 @@ from typing import Any, Final
 
 import can
 
+from flasher.files import make_private
 from flasher.protocol.text import printable
 from flasher.trace.decoder import BusEvent, TimedDecoder, bits_of
 from flasher.trace.recorder import message_of
@@ -61,6 +62,8 @@ def write_bundle(
     stamp = time.strftime("%Y%m%d-%H%M%S", time.localtime(now))
     path, part = _names(folder, f"{PREFIX}{facts.get('target') or 'bus'}-{stamp}")
     try:
+        for name in (TRACE, TRANSCRIPT, REPORT):
+            make_private(part / name)
         _write_trace(part / TRACE, recorder)
         with (part / TRANSCRIPT).open("w", encoding="utf-8") as file:
             file.writelines(f"{line}\n" for line in transcript(recorder))

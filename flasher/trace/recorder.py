@@ -12,6 +12,7 @@ from typing import Final, Protocol, Self
 import can
 
 from flasher.errors import ErrorCode, UsageError
+from flasher.files import make_private
 from flasher.protocol.frame import Frame
 from flasher.protocol.text import printable
 from flasher.trace.pcapng import PcapngWriter
@@ -128,12 +129,13 @@ class DatabaseWriter:
 
 
 def writer_of(path: str | os.PathLike[str], *, called: str = "") -> Writer:
-    """What writes the format that the suffix names; in messages it is `called` so. Raises
-    UsageError for a suffix that is not known, or whose format needs a package that is not
-    installed, and for a file that cannot be written.
+    """What writes the format that the suffix names, for its owner's eyes alone; in messages it is
+    `called` so. Raises UsageError for a suffix that is not known, or whose format needs a package
+    that is not installed, and for a file that cannot be written.
     """
     suffix, shown = Path(path).suffix.lower(), printable(called or os.fspath(path)) or "''"
     try:
+        make_private(path)
         if suffix == ".pcapng":
             return PcapngWriter(path)
         if suffix == ".log":

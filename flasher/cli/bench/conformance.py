@@ -318,7 +318,9 @@ def _tell(
         for result in filter(is_traced, report.results):
             name = trace_file_name(result)
             try:
-                write_whole(chosen.trace_dir / name, candump(result.trace), _TRACE_DIR)
+                write_whole(
+                    chosen.trace_dir / name, candump(result.trace), _TRACE_DIR, is_private=True
+                )
                 traces[result.key] = name
             except UsageError as error:
                 failed.append(error)

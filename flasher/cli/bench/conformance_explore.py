@@ -177,7 +177,7 @@ def _tell(explored: Explored, output: Output, trace_file: Path | None, code: Exi
         if trace_file is not None:
             from flasher.conformance.reports import candump  # noqa: PLC0415
 
-            write_whole(trace_file, candump(finding.trace), _TRACE_FILE)
+            write_whole(trace_file, candump(finding.trace), _TRACE_FILE, is_private=True)
             output.progress(f"trace: {printable(str(trace_file))}")
         if explored.stopped:
             output.result(printable(explored.stopped))

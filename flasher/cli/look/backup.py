@@ -163,7 +163,7 @@ def backup(
             data = read_shown(device, area.start, area.end, output)
         made = backup_of(found, area, data, device.connection.name, file)
     document, memory = made.document, made.document.memory
-    write_whole(file, made.archive, _OUTPUT)
+    write_whole(file, made.archive, _OUTPUT, is_private=True)
     output.results(_lines(document))
     output.table(document.not_in_it.items(), indent=2)
     if memory is not None and memory.names_running_version is False:

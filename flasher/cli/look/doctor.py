@@ -27,7 +27,13 @@ from flasher.cli.output import Output
 from flasher.cli.stop import stop_on_signal
 from flasher.cli.terminal import painted, takes_colour
 from flasher.driver import drive
-from flasher.errors import BusError, ErrorCode, ExitCode, InterruptedByUserError
+from flasher.errors import (
+    BusError,
+    ErrorCode,
+    ExitCode,
+    InterruptedByUserError,
+    without_password,
+)
 from flasher.host.survey import Survey
 from flasher.protocol.spec import BMS
 from flasher.protocol.text import printable
@@ -319,7 +325,7 @@ def bus_words(interface: str, channel: str, given: Mapping[str, Any]) -> str:
         words += ["-b", str(given["bitrate"])]
     for key, value in given.items():
         if key not in _OWN_OPTIONS and isinstance(value, str | int | float):
-            words += ["--bus-kwargs", f"{key}={value}"]
+            words += ["--bus-kwargs", without_password(f"{key}={value}")]
     return printable(shlex.join(words))
 
 

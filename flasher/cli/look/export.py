@@ -219,7 +219,7 @@ def csv(output: Output, *, trace: Path, file: Path | None, messages: tuple[str, 
     if file is None:
         output.text(text)
     else:
-        write_whole(file, text.encode("utf-8"), _OUT)
+        write_whole(file, text.encode("utf-8"), _OUT, is_private=True)
         output.result(f"{printable(str(file))}: {counted(len(found), 'message')}")
     _warn(output, trace, damage, made=len(found))
     return output.document(

@@ -26,7 +26,7 @@ from flasher.bus.inspect_interface import (
 )
 from flasher.bus.opening import needed_extra
 from flasher.cli.output import counted
-from flasher.errors import BusError
+from flasher.errors import BusError, hide_passwords
 from flasher.host.survey import Survey
 from flasher.prose import prose
 from flasher.protocol import contents
@@ -87,7 +87,8 @@ def setup(fallback: Fallback | None) -> Iterator[Finding]:
             yield _note("python-can", f"the configuration file {printable(str(path))} is in effect")
     for variable in _VARIABLES:
         if os.environ.get(variable):
-            yield _note("python-can", f"{variable}={printable(os.environ[variable])} is set")
+            value = printable(hide_passwords(os.environ[variable]))
+            yield _note("python-can", f"{variable}={value} is set")
     if fallback is not None:
         named = " ".join(
             str(fallback.bus[k]) for k in ("interface", "channel") if k in fallback.bus

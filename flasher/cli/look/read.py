@@ -130,7 +130,7 @@ def read(
         data = read_shown(device, first, behind, output)
     if file is not None:
         is_hex = format == "hex" or (format is None and file.suffix.lower() in _HEX_SUFFIXES)
-        write_whole(file, intel_hex(first, data) if is_hex else data, _OUTPUT)
+        write_whole(file, intel_hex(first, data) if is_hex else data, _OUTPUT, is_private=True)
         output.result(f"{byte_count(len(data))} from 0x{first:08X} in {printable(str(file))}")
         name: Literal["hex", "bin"] = "hex" if is_hex else "bin"
         document = MemoryDocument(target.name, first, behind, file=str(file), format=name)

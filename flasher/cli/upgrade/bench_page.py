@@ -152,7 +152,7 @@ class _Place:
                 data = device.read_memory(area.start, area.end)
             path = folder / _backup_name(found)
             made = backup_of(found, area, data, connection.name, path)
-        write_whole(path, made.archive, "")
+        write_whole(path, made.archive, "", is_private=True)
         document = made.document
         return Saved(
             path,
