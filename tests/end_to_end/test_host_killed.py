@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from flasher.history import History
 from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment, run_flasher
 from tests.end_to_end.test_processes import GROUP, bus, free_port
 from tests.firmware import VECTORS
@@ -22,6 +23,19 @@ SLOW = ("--packet-gap", "0.02")
 """So that the kill hits while packets go."""
 PAUSE_S = "transfer_timeout_s=0.3"
 """The device does not wait long for a host that is gone."""
+NEVER_ENDS = tuple(
+    word
+    for choice in ("pause_in_transfer=waits", "reset_in_transfer=ignored")
+    for word in ("--set", choice)
+)
+"""The device waits for ever, and knows no reset meanwhile."""
+IMPATIENT = """\
+[timings]
+command_timeout_s = 0.3
+boot_version_timeout_s = 0.3
+request_transfer_timeout_s = 0.5
+"""
+"""A profile: silence means something sooner."""
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs a kill that nobody can catch")
@@ -33,6 +47,32 @@ def test_a_host_that_is_killed_at_any_packet_is_repaired_by_the_same_command(
     one.
     """
     kill_and_repair(bus, tmp_path, (1, PACKETS - 1))
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a kill that nobody can catch")
+def test_a_session_that_a_killed_host_left_open_is_finished_by_the_same_command(
+    bus: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A sample of `python -m tests.campaigns.killed_hosts`."""
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
+    (tmp_path / "image.bin").write_bytes(IMAGE)
+    (tmp_path / "flasher.toml").write_text(IMPATIENT)
+    flash = ("flash", "-t", "bms", *bus, "image.bin")
+    with MockProcess(
+        "-t", "bms", *NEVER_ENDS, "--save-image", "out.bin", *bus, folder=tmp_path
+    ) as mock:
+        kill_at(7, (*flash, *SLOW), tmp_path)
+        (left,), _ = History().flashes()
+        assert left.left_device_open
+        assert left.reached is not None
+        assert (left.reached.phase, left.reached.packet >= 7) == ("transfer", True)
+        done = run_flasher(*flash, folder=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert "power-cycle" not in done.stderr
+        mock.wait_for("image:")
+    assert (tmp_path / "out.bin").read_bytes() == IMAGE
 
 
 def kill_and_repair(bus: tuple[str, ...], tmp_path: Path, numbers: Iterable[int]) -> None:
