@@ -113,6 +113,23 @@ HOLDERS: Final = {
             "tests/host/test_attempts.py::"
             "test_a_session_that_was_left_over_is_found_by_the_update_command_into_the_silence"
         ),
+        (
+            "tests/host/test_open_session.py::"
+            "test_a_silent_device_gets_one_update_command_when_the_erase_limit_has_passed"
+        ),
+        ("tests/cli/test_open_session.py::test_nothing_else_lets_an_update_command_into_silence"),
+    ),
+    "R27": (
+        (
+            "tests/host/test_session_stages.py::"
+            "test_two_devices_that_tell_different_versions_are_refused_before_the_reset"
+        ),
+    ),
+    "R28": (
+        (
+            "tests/host/test_transfer.py::"
+            "test_a_later_boot_version_starts_the_transfer_over_as_a_new_attempt"
+        ),
     ),
 }
 """Tests of the host, the reader and the device model that hold a reading."""
@@ -121,7 +138,7 @@ _INTRODUCTION: Final = """\
 # Readings of the documents
 
 What `flasher conformance` judges a bootloader by: the clauses of the vendor's document, and R1 to
-R26, how this project reads the places where the documents are silent or contradict themselves. Each
+R28, how this project reads the places where the documents are silent or contradict themselves. Each
 reading is a default. Drawn from `flasher/conformance/clauses.py` by
 `python -m tests.readings_document`; a test keeps it so, and that the tests named here exist.
 

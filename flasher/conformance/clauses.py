@@ -262,10 +262,25 @@ READINGS: Final = {
         "a device that sits silent in a broken transfer gets one update command into the silence",
         "No end of a transfer is given, so a device whose tool was lost may wait for ever, without "
         "an announcement and without knowing reset. When both stayed unanswered and the erase "
-        "limit has passed, the tool tries the update command once, as a new attempt.",
+        "limit has passed in silence, the tool tries the update command once, as a new attempt. It "
+        "does so for the upgrade of an earlier run too: where the history of this computer knows "
+        "one of this device on this adapter that did not end, or left it without an application, "
+        "or where --in-session says so. A station does not: it has a rule of its own.",
         suite=("tx_12", "tx_13"),
-        host=("attempts",),
+        host=("attempts", "timings.request_transfer_timeout_s"),
         model=("pause_in_transfer",),
+    ),
+    "R27": Reading(
+        "a question that is answered twice, a packet with more answers than copies, announcements "
+        "that overlap: two devices of one kind are on the bus",
+        "The document has one device of a kind. Nothing is written then, and in a transfer no "
+        "success is claimed. Two that answer bit for bit alike in the same slot cannot be told "
+        "apart.",
+    ),
+    "R28": Reading(
+        "an announcement that the tool did not cause means another unit, or a lost supply",
+        "The announcement after power-up is that after a reset, and names no unit. An upgrade takes "
+        "it for a restart of the device that it has reset (R11).",
     ),
 }
 CLAUSES: Final = {

@@ -3,7 +3,7 @@
 What came over the wire, or which timer fired, is the event; `TABLE[state][event]` names the action,
 a method of `flasher.host.upgrade.UpgradeStage`, and all that it may lead to: states, and endings of
 the upgrade. The guards (is it the packet in work, is a try left) are in the actions, the readings
-R1 to R26 with them. A pair that is not listed cannot happen: it is a bug. The state diagram in the
+R1 to R28 with them. A pair that is not listed cannot happen: it is a bug. The state diagram in the
 documentation is drawn from this table.
 """
 

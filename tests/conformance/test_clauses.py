@@ -45,7 +45,7 @@ def test_every_reading_has_a_case_or_a_test_that_exists() -> None:
 
 def test_the_options_that_readings_name_exist() -> None:
     """The project's numbers are complete, and no option was renamed."""
-    assert list(READINGS) == [f"R{number}" for number in range(1, 27)]
+    assert list(READINGS) == [f"R{number}" for number in range(1, 29)]
     area = ApplicationArea(start=0, size_bytes=1)
     of_host = dict(Profile(TARGETS["bms"], application_area=area).values())
     of_model = {known.name for known in fields(DeviceProfile)}

@@ -64,8 +64,9 @@ examples:
 
 Start it, then take the device's supply away for some seconds and give it back. It works for a
 device that announces itself at power-up only as well as for one that announces itself for ever.
-Nothing is sent before the device announces itself; hardware and running version cannot be checked,
-since no application runs.
+Nothing is sent before the device announces itself, unless an upgrade of it has no end: a device that
+still waits in that is found without a power cycle, which is asked for only after that. Hardware and
+running version cannot be checked, since no application runs.
 """
 _EXIT_CODES: Final = (
     ExitCode.IMAGE,
@@ -230,8 +231,8 @@ def flash(
 ) -> int:
     """Upgrade a device: ask it who it is, check that the image belongs there, reset it into its
     bootloader, transfer, wait for the final answer, verify. A device that sits in its bootloader
-    already, and announces itself, goes straight on; one that announces itself only at power-up
-    needs `flasher rescue`.
+    already, and announces itself, goes straight on, and so does one that still waits in an upgrade
+    that has no end; one that announces itself only at power-up needs `flasher rescue`.
     """
     upgrade = _Upgrade(output, target, image, choices, bus, recorded)
     return upgrade.run(skip_same_version=skip_same_version)
