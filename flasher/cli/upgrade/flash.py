@@ -64,9 +64,9 @@ examples:
 
 Start it, then take the device's supply away for some seconds and give it back. It works for a
 device that announces itself at power-up only as well as for one that announces itself for ever.
-Nothing is sent before the device announces itself, unless an upgrade of it has no end: a device that
-still waits in that is found without a power cycle, which is asked for only after that. Hardware and
-running version cannot be checked, since no application runs.
+Nothing is sent before the device announces itself, unless an upgrade of it has no end: a device
+that still waits in that is found without a power cycle, which is asked for only after that.
+Hardware and running version cannot be checked, since no application runs.
 """
 _EXIT_CODES: Final = (
     ExitCode.IMAGE,
