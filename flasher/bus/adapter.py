@@ -58,11 +58,15 @@ _STAMP_AGE_MAX_S: Final = 1.0
 """A frame that seems to have waited for longer: rather the wall clock was set meanwhile."""
 _UNREADABLE_LIMIT: Final = 100
 """So many times in a row nothing could be read: rather the adapter is broken than its line."""
+_PASSED_OVER_LIMIT: Final = 1000
+"""What is no frame is passed over so often before a frame: a port that babbles is never empty."""
 _WAIT_MIN_S: Final = 0.02
 """A shorter wait may end early by rounding."""
+_HASTE_S: Final = 0.0005
+"""A back end that returns nothing sooner has not waited for it."""
 _HASTE_LIMIT_S: Final = 0.25
 _HASTE_LIMIT: Final = 100
-"""For so long, and so often, a back end returned nothing without waiting for it."""
+"""For so long, and so often, it has not: the adapter is gone."""
 _PCAN_BUS_OFF: Final = 0x00010
 _PCAN_PASSIVE: Final = 0x40000
 _PCAN_WARNING: Final = 0x00004 | 0x00008
@@ -232,10 +236,11 @@ class CanLink:
             waited, self.received_at = self._waiting.popleft()
             return waited
         if deadline == AT_ONCE:
-            frame = self._receive_once(0.0)
-            while frame is None and self._is_more_waiting():
+            for _ in range(_PASSED_OVER_LIMIT):
                 frame = self._receive_once(0.0)
-            return frame
+                if frame is not None or not self._is_more_waiting():
+                    return frame
+            return None
         frame = self._receive_once(max(0.0, deadline - time.perf_counter()))
         # A filtered or foreign frame ends a wait early.
         while frame is None and (remaining_s := deadline - time.perf_counter()) > 0:
@@ -365,8 +370,9 @@ class CanLink:
         now = time.perf_counter()
         if timeout_s < _WAIT_MIN_S:
             return
-        if now - began > timeout_s / 2:
-            self._hasty = 0
+        if now - began > _HASTE_S:
+            # A computer that is busy makes every call slow.
+            self._hasty = 0 if now - began > _WAIT_MIN_S / 2 else self._hasty
             return
         if not self._hasty:
             self._hasty_since = began

@@ -5,7 +5,10 @@ Everything takes real time here; `python -m tests.campaigns.slcan` has more of i
 
 from __future__ import annotations
 
+import itertools
+import json
 import random
+import subprocess
 import time
 from collections.abc import Iterator
 from dataclasses import replace
@@ -27,6 +30,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from tests.end_to_end.lawicel import ERROR, Damage, Lawicel, Program
+from tests.end_to_end.processes import run_flasher
 from tests.end_to_end.stage import SMALL, image_of
 
 IMAGE = image_of(8)
@@ -185,3 +189,40 @@ def test_the_adapter_of_the_tests_refuses_what_the_manual_does_not_allow() -> No
     assert list(program.take(frame + b"\r" + b"T0000075")) == [(b"z\r", Frame(0x752, b"\xab"))]
     assert list(program.take(b"20\r")) == [(b"Z\r", Frame(0x752, b"", is_extended=True))]
     assert answers(b"C", b"L", frame) == [b"\r", b"\r", ERROR]
+
+
+# -- as a user has it ------------------------------------------------------------------------------
+
+
+def flash(adapter: Lawicel, *more: str) -> subprocess.CompletedProcess[str]:
+    """`flasher flash` as a process, on the adapter with a device."""
+    folder = adapter.port.parent
+    (folder / "image.bin").write_bytes(IMAGE.data)
+    device = MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=SMALL)
+    bus = ("-i", "slcan", "-c", str(adapter.port), "--bus-kwargs", "sleep_after_open=0")
+    with adapter.device(device):
+        return run_flasher("flash", "image.bin", "-t", "bms", *bus, *more, folder=folder)
+
+
+def test_a_user_is_told_of_damaged_lines(adapter: Lawicel) -> None:
+    count = itertools.count(1)
+
+    def damage(line: bytes) -> bytes:
+        return line + b"t72\r" if next(count) % 20 == 0 else line
+
+    adapter.damage = damage
+    run = flash(adapter, "--json", "--no-bundle")
+    assert run.returncode == ExitCode.OK
+    link = json.loads(run.stdout)["link"]
+    assert link["unreadable"] > 1
+    assert f"{link['unreadable']} times the adapter delivered what is no frame" in run.stderr
+
+
+def test_a_user_is_told_how_to_go_on_when_the_adapter_is_gone(adapter: Lawicel) -> None:
+    adapter.at_frame[100] = adapter.pull
+    run = flash(adapter, "--adapter-wait", "0.5", "--no-bundle")
+    assert run.returncode == ExitCode.BUS
+    assert "Waiting 0.5 s for the adapter ..." in run.stderr
+    assert "State of the device: " in run.stderr
+    assert "flasher rescue image.bin -t bms" in run.stderr
+    assert "Traceback" not in run.stderr
