@@ -17,9 +17,10 @@ import can
 import pytest
 
 from flasher import api
+from flasher.bus.adapter import CanLink
 from flasher.cli.bench import mock as mock_command
 from flasher.driver import drive
-from flasher.errors import ExitCode
+from flasher.errors import BusError, ExitCode
 from flasher.host.outcome import Outcome
 from flasher.mock.variants import VARIANTS
 from flasher.protocol.wire import Message, encode
@@ -226,6 +227,57 @@ def test_ctrl_c_ends_it_with_exit_code_0(serve: Serve, host: Host) -> None:
     run = serve()
     assert run.code == ExitCode.OK
     assert "Ctrl-C ends it" in run.err
+
+
+def test_the_device_outlives_an_adapter_that_is_lost_and_comes_back(
+    serve: Serve, host: Host, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With an upgrade before and one after it."""
+    real, tries = CanLink.reopen, iter([True, True, False])
+    is_lost, was_noticed = threading.Event(), threading.Event()
+    receive = CanLink.receive
+
+    def receive_or_fail(link: CanLink, deadline: float) -> Any:
+        if is_lost.is_set() and threading.current_thread() is threading.main_thread():
+            is_lost.clear()
+            was_noticed.set()
+            raise BusError("The adapter has left the bus.")
+        return receive(link, deadline)
+
+    def reopen(link: CanLink) -> None:
+        if next(tries):
+            raise BusError("The adapter cannot be used: it is bus-off.", remedy="Start it.")
+        real(link)
+
+    def upgrade_twice() -> None:
+        host.upgrade()
+        is_lost.set()
+        assert was_noticed.wait(5.0)
+        host.upgrade()
+
+    monkeypatch.setattr(CanLink, "receive", receive_or_fail)
+    monkeypatch.setattr(CanLink, "reopen", reopen)
+    monkeypatch.setattr(mock_command, "_REOPEN_S", 0.01)
+    host.do(upgrade_twice)
+    run = serve("--upgrades", "2")
+    assert run.code == ExitCode.OK
+    assert "warning: The adapter has left the bus. Waiting for the adapter" in run.err
+    assert run.err.count("not yet: The adapter cannot be used: it is bus-off. Start it.") == 1
+    assert "the adapter is back" in run.err
+    assert [outcome.error() for outcome in host.outcomes] == [None, None]
+
+
+def test_ctrl_c_ends_the_wait_for_a_lost_adapter(
+    serve: Serve, host: Host, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_link: CanLink, *_: object) -> None:
+        host.interrupt()
+        raise BusError("It is gone.")
+
+    monkeypatch.setattr(CanLink, "receive", fail)
+    monkeypatch.setattr(CanLink, "reopen", fail)
+    monkeypatch.setattr(mock_command, "_REOPEN_S", 0.01)
+    assert serve().code == ExitCode.OK
 
 
 def test_json_is_one_document_a_line_and_the_last_has_the_exit_code(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 from flasher import api, events
+from flasher.api import Connection
 from flasher.cli import values
 from flasher.cli.documents import document_of, to_json
 from flasher.cli.files import check_writable, write_whole
@@ -16,7 +18,7 @@ from flasher.cli.options import Bus, bus_options, target_option
 from flasher.cli.output import Output, byte_count
 from flasher.cli.stop import stop_on_signal
 from flasher.driver import drive
-from flasher.errors import ExitCode, UsageError
+from flasher.errors import BusError, ExitCode, UsageError
 from flasher.log import BY_DEVICE, log_event
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
@@ -33,6 +35,8 @@ from flasher.settings.device_model import describe_options, set_options
 _SAVE_IMAGE: Final = "--save-image"
 _QUIET_S: Final = 2.5 * DEFAULT_TIMINGS.command_repeat_s
 """A tool that is quiet for this long has verified what it sent."""
+_REOPEN_S: Final = 0.25
+"""Between two tries to open a lost adapter again."""
 _EXAMPLES: Final = """\
 examples:
   flasher mock -t bms -i socketcan -c vcan0
@@ -44,7 +48,8 @@ examples:
   flasher mock --list-variants
   flasher mock -t bms -i socketcan -c vcan0 --variant accepts-early-end
 
-Ends with exit code 0 when interrupted.
+Ends with exit code 0 when interrupted. Outlives an adapter that is unplugged
+or bus-off: the device goes on as it was when the adapter is back.
 
 choices for --set, the first value is the default:
 """
@@ -171,16 +176,25 @@ def mock(
             found = find(variant)
             served = f"{served} that is wrong ({found.clause}: {found.summary})"
         output.progress(f"{served} on {connection.name}; Ctrl-C ends it")
-        drive(
-            engine,
-            connection.link,
-            connection.clock,
-            taps=[tool],
-            on_event=watcher,
-            cancelled=lambda: (
-                stopped() or (watcher.images == upgrades and tool.is_quiet(connection.clock.now()))
-            ),
-        )
+        clock = connection.clock
+        is_over = False
+        while not is_over:
+            try:
+                drive(
+                    engine,
+                    connection.link,
+                    clock,
+                    taps=[tool],
+                    on_event=watcher,
+                    cancelled=lambda: (
+                        stopped() or (watcher.images == upgrades and tool.is_quiet(clock.now()))
+                    ),
+                )
+                is_over = True
+            except BusError as error:
+                output.error_line(f"warning: {error.what} Waiting for the adapter; Ctrl-C ends it")
+                is_over = not _is_back(connection, stopped, output)
+                device.bus_off(clock.now(), off_s=0.0)
     return output.document(MockDocument(images=watcher.images))
 
 
@@ -210,6 +224,25 @@ def _served(
         has_application=has_application,
     )
     return device, device
+
+
+def _is_back(connection: Connection, stopped: Callable[[], bool], output: Output) -> bool:
+    """Wait until the adapter can be opened again, as a device outlives trouble of its bus; False
+    when the user has enough. Each reason why it cannot is told once.
+    """
+    told = ""
+    while not stopped():
+        try:
+            connection.link.reopen()
+        except BusError as error:
+            if str(error) != told:
+                told = str(error)
+                output.progress(f"not yet: {error.what} {error.remedy}".rstrip())
+            connection.clock.wait_until(connection.clock.now() + _REOPEN_S)
+        else:
+            output.progress("the adapter is back")
+            return True
+    return False
 
 
 class _Tool:
