@@ -13,7 +13,6 @@ import signal
 import socket
 import struct
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -26,14 +25,8 @@ from flasher.bus.adapter import open_adapter
 from flasher.errors import ExitCode
 from flasher.protocol.frame import Frame
 from tests.cli.conftest import SAMPLES
-from tests.end_to_end.processes import (
-    FLASHER,
-    MockProcess,
-    clean_environment,
-    lines_until,
-    run_flasher,
-    transfer,
-)
+from tests.end_to_end.forks import Device, Forked, run
+from tests.end_to_end.kernel import figure, on, root
 from tests.firmware import VECTORS
 
 QUEUE_FRAMES = 64
@@ -52,42 +45,41 @@ needs_vcan = pytest.mark.skipif(not exists("vcan0"), reason="there is no interfa
 needs_pair = pytest.mark.skipif(not exists("vx0", "vx1"), reason="there is no pair vx0/vx1")
 
 
-def figure(text: str) -> None:
-    """Something measured; `pytest -rP` shows it."""
-    sys.stdout.write(f"{text}\n")
-
-
-def on(channel: str) -> tuple[str, ...]:
-    return ("-i", "socketcan", "-c", channel)
+def transfer(device: Device, folder: Path, image: bytes, channel: str) -> Forked:
+    """Flash `image` and see that the device stored the same bytes."""
+    (folder / "image.bin").write_bytes(image)
+    done = run("flash", "-t", "bms", *on(channel), "image.bin", folder=folder)
+    assert done.end() == ExitCode.OK, done.said
+    device.until("image:")
+    assert (folder / "out.bin").read_bytes() == image
+    return done
 
 
 @needs_vcan
 def test_images_of_every_edge_size_arrive_over_vcan(tmp_path: Path) -> None:
     sizes = (16, 127, 128, 129)
     data = random.Random(21)
-    serving = ("-t", "bms", "--save-image", "out.bin", "--upgrades", str(len(sizes)))
-    with MockProcess(*serving, *on("vcan0"), folder=tmp_path) as mock:
+    with Device("--upgrades", str(len(sizes)), *on("vcan0"), folder=tmp_path) as device:
         for size_bytes in sizes:
-            transfer(mock, tmp_path, VECTORS + data.randbytes(size_bytes - 16), *on("vcan0"))
-        assert mock.end() == 0
+            transfer(device, tmp_path, VECTORS + data.randbytes(size_bytes - 16), "vcan0")
+        assert device.end() == 0
 
 
 @needs_vcan
 def test_nobody_on_vcan_is_exit_code_5(tmp_path: Path) -> None:
     image = str(SAMPLES / "obc.bin")
-    done = run_flasher("flash", image, "-t", "obc", *on("vcan0"), "--timeout", "1", folder=tmp_path)
-    assert done.returncode == ExitCode.NO_ANSWER
+    done = run("flash", image, "-t", "obc", *on("vcan0"), "--timeout", "1", folder=tmp_path)
+    assert done.end() == ExitCode.NO_ANSWER, done.said
     assert "this run erased nothing" in done.stderr
 
 
 @needs_pair
 def test_an_upgrade_over_a_line_with_a_short_transmit_queue(tmp_path: Path) -> None:
     image = VECTORS + random.Random(22).randbytes(19_984)
-    serving = ("-t", "bms", "--save-image", "out.bin", "--upgrades", "1", *on("vx1"))
-    with MockProcess(*serving, folder=tmp_path) as mock:
-        done = transfer(mock, tmp_path, image, *on("vx0"))
+    with Device("--upgrades", "1", *on("vx1"), folder=tmp_path) as device:
+        done = transfer(device, tmp_path, image, "vx0")
         figure(done.stdout)
-        assert mock.end() == 0
+        assert device.end() == 0
 
 
 def fill_queue(channel: str) -> int:
@@ -136,7 +128,7 @@ def taken_down(channel: str) -> Iterator[None]:
     try:
         yield
     finally:
-        subprocess.run(["ip", "link", "set", channel, "up"], check=True)
+        root(f"ip link set {channel} up")
 
 
 @needs_pair
@@ -144,26 +136,17 @@ def test_an_interface_that_goes_down_ends_the_upgrade_and_says_what_is_left(tmp_
     """BU-05."""
     (tmp_path / "image.bin").write_bytes(VECTORS + random.Random(23).randbytes(59_984))
     with (
-        MockProcess("-t", "bms", *on("vx1"), folder=tmp_path) as mock,
-        subprocess.Popen(
-            [*FLASHER, "flash", "-t", "bms", *on("vx0"), "image.bin"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=tmp_path,
-            env=clean_environment(),
-        ) as host,
+        Device(*on("vx1"), folder=tmp_path) as device,
+        Forked("flash", "-t", "bms", *on("vx0"), "image.bin", folder=tmp_path) as host,
     ):
-        assert host.stderr is not None
-        lines_until(host.stderr, "transferring ...")
-        mock.wait_for("first of")
+        host.until("transferring ...")
+        device.until("first of")
         with taken_down("vx0"):
             began = time.perf_counter()
-            _, said = host.communicate()
+            assert host.end() == ExitCode.BUS
             took_s = time.perf_counter() - began
-        assert host.returncode == ExitCode.BUS
-        assert "State of the device: its application is erased" in said
-        assert "what to do:" in said
+        assert "State of the device: its application is erased" in host.stderr
+        assert "what to do:" in host.stderr
         figure(f"the host ended {took_s:.2f} s after vx0 went down")
 
 
@@ -175,20 +158,10 @@ def test_ctrl_c_on_a_real_line_ends_cleanly_and_the_device_can_be_flashed_again(
     (tmp_path / "image.bin").write_bytes(image)
     # A device that waits in its transfer for ever would need a power cycle first.
     impatient = ("--set", "pause_in_transfer=announces", "--set", "transfer_timeout_s=0.5")
-    serving = ("-t", "bms", "--save-image", "out.bin", *impatient, *on("vx1"))
-    with MockProcess(*serving, folder=tmp_path) as mock:
-        with subprocess.Popen(
-            [*FLASHER, "flash", "-t", "bms", *on("vx0"), "image.bin"],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            cwd=tmp_path,
-            env=clean_environment(),
-        ) as host:
-            assert host.stderr is not None
-            lines_until(host.stderr, "transferring ...")
-            host.send_signal(signal.SIGINT)
-            _, said = host.communicate()
-        assert host.returncode == ExitCode.INTERRUPTED
-        assert "State of the device: its application is erased" in said
-        transfer(mock, tmp_path, image, *on("vx0"))
+    with Device(*impatient, *on("vx1"), folder=tmp_path) as device:
+        with Forked("flash", "-t", "bms", *on("vx0"), "image.bin", folder=tmp_path) as host:
+            host.until("transferring ...")
+            host.signal(signal.SIGINT)
+            assert host.end() == ExitCode.INTERRUPTED
+        assert "State of the device: its application is erased" in host.stderr
+        transfer(device, tmp_path, image, "vx0")

@@ -1,0 +1,223 @@
+"""flasher on candleLight adapters: the kernel's driver gs_usb, a bus with exact bit times."""
+
+from __future__ import annotations
+
+import random
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from flasher.errors import ExitCode
+from tests.end_to_end.forks import Device, Forked, run
+from tests.end_to_end.kernel import (
+    Candlelights,
+    background,
+    figure,
+    needs_candlelight,
+    on,
+    root,
+    start,
+    state_of,
+    wait_until,
+)
+from tests.firmware import VECTORS
+
+pytestmark = [pytest.mark.socketcan, pytest.mark.timeout(240), needs_candlelight]
+IMAGE = VECTORS + random.Random(25).randbytes(19_984)
+IMPATIENT = ("--set", "pause_in_transfer=announces", "--set", "transfer_timeout_s=2")
+"""A device that waits in its transfer for ever would need a power cycle."""
+
+
+@pytest.fixture
+def bus(tmp_path: Path) -> Candlelights:
+    """Both adapters plugged in and started, and an image in the folder."""
+    (tmp_path / "image.bin").write_bytes(IMAGE)
+    adapters = Candlelights()
+    start(adapters.tool)
+    start(adapters.device)
+    return adapters
+
+
+@pytest.fixture
+def device(bus: Candlelights, tmp_path: Path) -> Iterator[Device]:
+    with Device(*on(bus.device), *IMPATIENT, folder=tmp_path) as serving:
+        yield serving
+
+
+def flashing(bus: Candlelights, folder: Path, *arguments: str) -> Forked:
+    """A flash that has begun to transfer."""
+    host = Forked("flash", "image.bin", "-t", "bms", *on(bus.tool), *arguments, folder=folder)
+    host.until("transferring ...")
+    return host
+
+
+def check_flash(bus: Candlelights, folder: Path, *arguments: str) -> Forked:
+    """A flash that has to succeed, and that the device stored."""
+    (folder / "out.bin").unlink(missing_ok=True)
+    done = bus.flasher("flash", "image.bin", "-t", "bms", *arguments, folder=folder)
+    assert done.end() == ExitCode.OK, done.said
+    assert (folder / "out.bin").read_bytes() == IMAGE
+    return done
+
+
+# -- an ordinary bus ------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("device")
+def test_a_flash_uses_most_of_the_line(bus: Candlelights, tmp_path: Path) -> None:
+    done = check_flash(bus, tmp_path)
+    share = re.search(r"(\d+)% of a 250 kbit/s line", done.said)
+    assert share is not None, done.said
+    figure(f"{share[0]}")
+    assert int(share[1]) > 40
+
+
+# -- adapters that go and come --------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("device")
+def test_an_adapter_that_is_put_back_in_a_transfer_goes_on(
+    bus: Candlelights, tmp_path: Path
+) -> None:
+    """BU-05."""
+    with flashing(bus, tmp_path) as host:
+        bus.unplug(0)
+        bus.plug(0)
+        start(bus.tool)
+        assert host.end() == ExitCode.OK, host.said
+    assert (tmp_path / "out.bin").read_bytes() == IMAGE
+    assert "error: can." not in host.stderr, "python-can's own line is no error of this command"
+
+
+@pytest.mark.usefixtures("device")
+def test_an_adapter_that_stays_away_ends_the_flash_and_the_same_command_brings_the_image_in(
+    bus: Candlelights, tmp_path: Path
+) -> None:
+    with flashing(bus, tmp_path) as host:
+        bus.unplug(0)
+        assert host.end() == ExitCode.BUS, host.said
+    assert "State of the device: its application is erased" in host.stderr
+    assert "Traceback" not in host.said
+    assert "error: can." not in host.stderr
+    bus.plug(0)
+    start(bus.tool)
+    check_flash(bus, tmp_path)
+
+
+def test_the_device_model_outlives_its_adapter(
+    bus: Candlelights, device: Device, tmp_path: Path
+) -> None:
+    bus.unplug(1)
+    bus.plug(1)
+    start(bus.device)
+    device.until("is back")
+    check_flash(bus, tmp_path)
+
+
+# -- bus-off --------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("device")
+def test_a_controller_that_is_bus_off_is_refused_at_the_opening(
+    bus: Candlelights, tmp_path: Path
+) -> None:
+    bus.leave_bus()
+    done = bus.flasher("flash", "image.bin", "-t", "bms", folder=tmp_path)
+    assert done.end() == ExitCode.BUS
+    assert "[E406]" in done.stderr
+    restart = f"ip link set {bus.tool} down; ip link set {bus.tool} up"
+    assert f"`{restart}` (as root)" in done.stderr
+    root(restart)
+    check_flash(bus, tmp_path)
+
+
+@pytest.mark.usefixtures("device")
+def test_bus_off_in_a_transfer_ends_it_as_bus_off(bus: Candlelights, tmp_path: Path) -> None:
+    """BU-02."""
+    with flashing(bus, tmp_path) as host:
+        bus.short(300)
+        assert host.end() == ExitCode.BUS, host.said
+    assert "[E406]" in host.stderr
+    assert "its application is erased" in host.stderr
+    start(bus.device)
+    start(bus.tool)
+    check_flash(bus, tmp_path)
+
+
+@pytest.mark.usefixtures("device")
+def test_bus_off_that_somebody_ends_in_time_does_not_end_a_transfer(
+    bus: Candlelights, tmp_path: Path
+) -> None:
+    """BU-02, with a device whose adapter left the bus too."""
+    with flashing(bus, tmp_path) as host:
+        bus.short(300)
+        wait_until(lambda: state_of(bus.tool) == "BUS-OFF", "bus-off")
+        bus.short(0)
+        start(bus.device)
+        start(bus.tool)
+        assert host.end() == ExitCode.OK, host.said
+    assert (tmp_path / "out.bin").read_bytes() == IMAGE
+
+
+# -- a bus that cannot work -----------------------------------------------------------------------
+
+
+def test_nobody_acknowledges(bus: Candlelights, tmp_path: Path) -> None:
+    root(f"ip link set {bus.device} down")
+    done = bus.flasher("flash", "image.bin", "-t", "bms", folder=tmp_path)
+    assert done.end() == ExitCode.BUS
+    assert "[E405]" in done.stderr
+    assert "erased nothing" in done.stderr
+
+
+def test_a_device_at_another_bit_rate(bus: Candlelights, tmp_path: Path) -> None:
+    start(bus.device, bitrate_bps=500_000)
+    done = bus.flasher("flash", "image.bin", "-t", "bms", folder=tmp_path)
+    assert done.end() == ExitCode.BUS, done.said
+    assert "erased nothing" in done.stderr
+
+
+def test_a_kernel_that_is_set_to_another_bit_rate_is_refused(
+    bus: Candlelights, tmp_path: Path
+) -> None:
+    start(bus.tool, bitrate_bps=500_000)
+    done = bus.flasher("flash", "image.bin", "-t", "bms", folder=tmp_path)
+    assert done.end() == ExitCode.BUS
+    assert "[E408]" in done.stderr
+
+
+@pytest.mark.usefixtures("device")
+def test_an_interface_that_only_listens_is_refused_for_sending_and_not_for_listening(
+    bus: Candlelights, tmp_path: Path
+) -> None:
+    start(bus.tool, "listen-only on")
+    done = bus.flasher("flash", "image.bin", "-t", "bms", folder=tmp_path)
+    assert done.end() == ExitCode.BUS, done.said
+    assert "only listens" in done.stderr
+    assert "resetting" not in done.said
+    looked = bus.flasher("doctor", folder=tmp_path)
+    assert looked.end() == ExitCode.BUS
+    assert "listens without acknowledging" in looked.stdout
+    assert bus.flasher("monitor", "--duration", "0.5", folder=tmp_path).end() == ExitCode.OK
+
+
+# -- other traffic --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("can_id", "gap_ms", "load"),
+    [("100", 0.62, 0.8), ("7FF", 0.0, 0.95)],
+    ids=["80 % of higher priority", "all that is left, of lower priority"],
+)
+@pytest.mark.usefixtures("device")
+def test_a_flash_beside_noise(
+    bus: Candlelights, tmp_path: Path, can_id: str, gap_ms: float, load: float
+) -> None:
+    noise = f"cangen {bus.device} -I {can_id} -L 8 -D r -g {gap_ms} -p 10"
+    with background(noise):
+        check_flash(bus, tmp_path, "--trace-file", "noise.log")
+    told = run("explain", "noise.log", folder=tmp_path).stdout
+    figure("\n".join(line for line in told.splitlines() if "load" in line))
+    assert load
