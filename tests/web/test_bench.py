@@ -524,3 +524,9 @@ def test_what_the_battery_told_is_said_in_the_words_of_the_command(place: BenchP
     ((_, faults),) = dict(told(place.do(order(Bench.use_adapter, Fault.HARDWARE.value))))["faults"]
     assert faults == "over discharge protection"
     assert translator("de")(faults) == "Schutz: Tiefentladung"
+
+
+def test_the_upgrade_that_has_no_end_is_among_the_notes(place: BenchPlace) -> None:
+    place.bench._happened(events.UpgradeLeftOpen("2026-05-17T10:31:02+02:00", "a.hex", False))
+    (note,) = place.bench.state.notes
+    assert "2026-05-17 10:31:02+02:00 with a.hex has no end" in note
