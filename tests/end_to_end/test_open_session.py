@@ -4,6 +4,7 @@ device that runs its application.
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import replace
 
 import pytest
@@ -83,6 +84,20 @@ def test_an_open_session_is_found_without_a_power_cycle(
     assert stage.has == IMAGE.data
     assert updates(stage) == 1
     assert not stage.seen(events.PowerCycleAwaited)
+
+
+@each("name", ["flash", "rescue"])
+def test_a_program_says_so_by_a_keyword(name: str) -> None:
+    for is_async in (False, True):
+        stage = left_in_session()
+        connection = stage.connection()
+        if is_async:
+            call = getattr(connection.async_device(stage.target), name)
+            result = asyncio.run(call(IMAGE, in_session=True))
+        else:
+            result = getattr(connection.device(stage.target), name)(IMAGE, in_session=True)
+        assert result.outcome.sent_into_silence
+        assert stage.has == IMAGE.data
 
 
 @each("target", TARGETS)

@@ -85,6 +85,42 @@ def _watch_update_commands(bench: Bench, said: list[tuple[float, Row]]) -> None:
         assert bench.outcome.device_left is DeviceLeft.UNTOUCHED
 
 
+@given(script, st.booleans(), st.integers(1, 2))
+@settings(max_examples=100, deadline=None, derandomize=True)
+def test_one_update_command_at_most_goes_into_silence_and_none_to_an_application(
+    steps: list[tuple[float, Row | Frame]],
+    at_power_up: bool,
+    attempts: int,
+) -> None:
+    """R26, for a device that an earlier upgrade may have left in its session."""
+    options = UpgradeOptions(
+        timeout_s=120.0, attempts=attempts, in_session=True, at_power_up=at_power_up
+    )
+    bench = Bench(300, options=options)
+    said: list[tuple[float, Row]] = []
+    for pause_s, what in steps:
+        bench.wait(pause_s)
+        if not isinstance(what, Frame):
+            said.append((bench.now, what))
+            bench.say(what)
+    bench.wait(121.0)
+    commands = [at for at, row in bench.sent if isinstance(row, UpdateCommand)]
+    asking = [at for at, row in said if isinstance(row, BootVersion | RequestTransfer)]
+    assert len(commands) <= len(asking) + bench.outcome.sent_into_silence
+
+    def unheard(until_s: float) -> list[float]:
+        """The commands before which nothing was said for the erase limit, until so long before."""
+        return [
+            at for at in commands if not any(at - 9.9 < each <= at - until_s for each, _ in said)
+        ]
+
+    leaving_s = 0.0015  # what is said while it leaves does not call it back
+    assert len(unheard(0.0)) <= bench.outcome.sent_into_silence <= len(unheard(leaving_s))
+    for at in unheard(0.0):
+        if at == commands[0]:
+            assert GeneralFeedback() not in [row for said_at, row in said if said_at < at]
+
+
 @given(st.lists(rows, min_size=1, max_size=6))
 @settings(max_examples=40, deadline=None, derandomize=True)
 def test_memory_and_time_are_bounded_when_a_device_repeats_itself_for_ever(
