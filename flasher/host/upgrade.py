@@ -230,9 +230,10 @@ class UpgradeStage:
         return self._attempt >= self._attempts
 
     @property
-    def _was_heard(self) -> bool:
-        """False when all that was sent went into silence."""
-        return self._last_boot is not None or self._erased
+    def _has_begun(self) -> bool:
+        """The device was told to update, and not only into its silence."""
+        was_heard = self._last_boot is not None or self._erased
+        return was_heard and self._was_told_to_update
 
     @property
     def _boot_timeout_s(self) -> float:
@@ -480,7 +481,7 @@ class UpgradeStage:
 
     def _wait_or_begin_again(self, row: Received) -> None:
         """Nothing is sent to a device that has not announced itself at power-up."""
-        if self._options.at_power_up and not self._was_told_to_update:
+        if self._asks_for_power and not self._has_begun:
             self._wait_for_boot()
         else:
             self._begin_again(row)
@@ -517,8 +518,7 @@ class UpgradeStage:
 
     def _miss_boot(self, row: Received) -> None:
         """No boot version came; a device that may sit in a session is not left alone (R26)."""
-        was_told = self._was_told_to_update and self._was_heard
-        if self.in_session or (was_told and not self._is_last_attempt):
+        if self.in_session or (self._has_begun and not self._is_last_attempt):
             silent_since = max(self._heard_at, self._update_left_at, self._began_at)
             erased_at = silent_since + self._timings.request_transfer_timeout_s
             was_tried = self._at.feedback_came or self._silence_was_answered
@@ -561,11 +561,11 @@ class UpgradeStage:
             self._send_update()
 
     def _miss_request(self, row: Received) -> None:
-        if not self._was_heard and self._asks_for_power:
+        if not self._has_begun and self._asks_for_power:
             self._attempts += 1
             self._next_attempt(Reason.REQUEST_GIVEN_UP)
             self._await_boot(row)
-        elif not self._was_heard:
+        elif not self._has_begun:
             self._end(Ending.NO_BOOT_VERSION, row, "nor an answer to the update command")
         elif not self._is_last_attempt:
             self._begin_again(row, Reason.REQUEST_GIVEN_UP)
@@ -588,7 +588,7 @@ class UpgradeStage:
         self._go(State.TRANSFERRING)
         self._tx.drop_unstarted()
         minimum = self._options.minimum_boot_version
-        if minimum is not None and not self._was_heard:
+        if minimum is not None and not self._has_begun:
             text = f"no boot version in an open session; the manifest asks for {minimum}"
             self._run.tell(events.CheckMade("boot-version", "unknown", text))
         self.unchecked = None
@@ -843,7 +843,7 @@ class UpgradeStage:
                 transfer_s=self._transfer_s,
             ),
             detail=detail,
-            waiver="" if self.unchecked is None else self.unchecked.waiver,
+            waiver=self.unchecked.waiver if self.unchecked and ending is Ending.UNCHECKED else "",
             sent_into_silence=self._silence_was_answered,
         )
 

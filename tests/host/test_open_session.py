@@ -178,11 +178,15 @@ def test_the_silence_is_counted_from_the_last_message_of_the_device() -> None:
     bench.expect(UpdateCommand, within_s=0.1)
 
 
-def test_an_adapter_that_was_away_has_heard_nothing_meanwhile() -> None:
-    bench = Bench(options=OPEN)
+@each("options", [OPEN, RESCUE])
+def test_an_adapter_that_was_away_has_heard_nothing_meanwhile(options: UpgradeOptions) -> None:
+    """Nor an answer to the reset, which is sent again."""
+    bench = Bench(options=options)
     bench.wait(6.0)
+    assert resets(bench)
     bench.engine.link_back(bench.now)
     bench.wait(ERASE_S - 0.01)
+    assert isinstance(bench.unread[0], Reset)
     resets(bench)
     assert bench.unread == []
     bench.expect(UpdateCommand, within_s=0.1)
@@ -204,6 +208,17 @@ def test_a_rescue_asks_for_the_power_only_when_the_update_command_was_not_answer
     bench.expect(UpdateCommand)
     finish(bench)
     assert bench.outcome.ok
+
+
+def test_an_adapter_that_is_back_while_the_power_is_waited_for_sends_nothing() -> None:
+    bench = Bench(options=RESCUE)
+    to_silence(bench)
+    bench.wait(ERASE_S + 1.0)
+    bench.engine.link_back(bench.now)
+    bench.wait(20.0)
+    assert bench.unread == []
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
 
 
 def test_a_rescue_that_nobody_answers_ends_after_one_wait_for_the_power() -> None:
@@ -269,6 +284,15 @@ def test_a_device_that_announces_itself_after_all_is_refused_by_that_rule(after_
     assert bench.outcome.waiver == Check.HARDWARE.value
     assert "nobody told its hardware" in bench.outcome.detail
     assert bench.unread == []
+
+
+def test_a_silent_device_is_not_refused_by_that_rule() -> None:
+    """Nobody is offered to waive what is not the trouble."""
+    bench = unchecked_bench()
+    to_silence(bench)
+    bench.wait(ERASE_S + 0.1)
+    assert bench.outcome.ending is Ending.NO_BOOT_VERSION
+    assert bench.outcome.waiver == ""
 
 
 def test_after_the_session_was_found_the_rule_is_no_matter_any_more() -> None:
