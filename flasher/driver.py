@@ -152,8 +152,8 @@ def _turns(
         rests_at = clock.now()
         wanted = engine.deadline()
         until = rests_at + MAX_WAIT_S * clock.speed
-        if wanted is not None and wanted < until:
-            until = wanted
+        if wanted is not None:
+            until = min(until, wanted)
         came = yield until
         late_s = rests_at - now + max(0.0, clock.now() - max(until, rests_at))
 
@@ -170,7 +170,7 @@ def _hear(
         frame = receive(AT_ONCE)
     for _ in range(_CATCH_UP_FRAMES):
         if frame is None:
-            break
+            return now
         for tap in taps:
             tap(frame, sent=False, now=now)
         hear(frame, now)

@@ -12,7 +12,6 @@ from hypothesis import given, strategies
 
 from flasher.bus.echoes import (
     DOUBLE_LIMIT_S,
-    ECHO_FRAMES,
     FLAGGED_SENDER,
     REORDER_FRAMES,
     Echoes,
@@ -73,23 +72,23 @@ def test_the_same_frame_sent_again_has_its_own_echo() -> None:
 
 def test_a_frame_whose_echo_was_lost_long_ago_in_the_order_is_a_strangers() -> None:
     """A RESET of the beginning does not hide a second tool's in the middle of the transfer."""
-    reset, *frames = numbered(REORDER_FRAMES + 2)
+    reset, *frames = numbered(66)
     echoes = sent(reset, *frames)
     assert is_echo(echoes, frames[-1])
     assert not is_echo(echoes, reset)
 
 
 def test_an_echo_may_be_out_of_order_by_some_packets() -> None:
-    late, *frames = numbered(REORDER_FRAMES + 1)
+    late, *frames = numbered(65)
     echoes = sent(late, *frames)
     assert is_echo(echoes, frames[-1])
     assert is_echo(echoes, late)
 
 
-@each("frames_later", [ECHO_FRAMES - 1, ECHO_FRAMES])
+@each("frames_later", [1023, 1024])
 def test_frames_without_any_echo_are_forgotten_by_number(frames_later: int) -> None:
     echoes = sent(OWN, *numbered(frames_later))
-    assert is_echo(echoes, OWN) == (frames_later < ECHO_FRAMES)
+    assert is_echo(echoes, OWN) == (frames_later == 1023)
 
 
 @each("later_s", [0.0, DOUBLE_LIMIT_S, DOUBLE_LIMIT_S + 0.001, -0.001, -0.2])
@@ -99,13 +98,21 @@ def test_a_second_copy_bears_nearly_the_same_stamp(later_s: float) -> None:
     assert is_echo(echoes, OWN, later_s) == (abs(later_s) <= 0.1)
 
 
-@each("others", [REORDER_FRAMES - 1, REORDER_FRAMES])
+@each("others", [63, 64])
 def test_a_second_copy_comes_soon_in_the_order(others: int) -> None:
     """For adapters that stamp nothing, or all alike."""
     frames = numbered(others)
     echoes = sent(OWN, *frames)
     assert all(is_echo(echoes, frame) for frame in (OWN, *frames))
-    assert is_echo(echoes, OWN) == (others < REORDER_FRAMES)
+    assert is_echo(echoes, OWN) == (others == 63)
+
+
+def test_a_second_copy_comes_soon_after_the_latest_of_equal_frames() -> None:
+    frames = numbered(100)
+    echoes = sent(OWN, *frames[:40], OWN, *frames[40:])
+    for number, frame in enumerate((OWN, *frames[:40], OWN, *frames[40:])):
+        assert is_echo(echoes, frame, number * 1.0)
+    assert is_echo(echoes, OWN, 41.0)
 
 
 FATE = strategies.tuples(
@@ -184,6 +191,7 @@ def test_a_socket_that_receives_nothing_of_its_own_has_no_echoes() -> None:
 def test_what_the_drivers_queue_held_is_an_echo_for_the_handle_that_is_opened_anew() -> None:
     """A kernel's queue keeps the frames, and sends them when the controller has restarted."""
     echoes = sent(OWN, echoes=Echoes(Sender.THIS_COMPUTER, gives_own=False))
+    echoes.reopened()
     echoes.reopened()
     assert is_echo(echoes, OWN, 100.0, is_rx=False)
     assert not is_echo(echoes, OWN, 101.0, is_rx=False)
