@@ -30,6 +30,8 @@ _IN_PROCESS: Final = "virtual"
 """python-can's bus inside of a process: the same channel of another process is another bus."""
 _OPENED_ONCE: Final = frozenset({"slcan", "robotell", "seeedstudio", "serial"})
 """On serial ports: who opens one sets it up anew, and so ends what another program does with it."""
+_LONG_PORT: Final = re.compile(r"^[\\/]{2}[.?][\\/](?=COM\d+$)", re.IGNORECASE)
+r"""Before the name of a serial port of Windows: \\.\COM3 is COM3."""
 _ON_A_PORT: Final = "udp_multicast"
 """Hears every multicast group on its port, so the port is the bus."""
 _MULTICAST_PORT: Final = 43113
@@ -93,9 +95,9 @@ def place_of(config: Mapping[str, Any]) -> str:
     place = {key: str(config[key]) for key in _PLACE if config.get(key) is not None}
     if interface == _ON_A_PORT:
         place = {"port": str(config.get("port", _MULTICAST_PORT))}
-    channel = place.get("channel", "").partition("@")[0]  # slcan: DEVICE@BAUDRATE
-    if channel.startswith("/"):
-        place["channel"] = os.path.realpath(channel)
+    if interface in _OPENED_ONCE and "channel" in place:
+        port = _LONG_PORT.sub("", place["channel"].partition("@")[0])  # slcan: DEVICE@BAUDRATE
+        place["channel"] = os.path.realpath(port) if port.startswith("/") else port
     words = [platform.node(), interface, *(f"{key}={place[key]}" for key in place)]
     text = "-".join(words).casefold()
     readable = re.sub(r"[^a-z0-9.=-]+", "_", text)[:80]

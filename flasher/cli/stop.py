@@ -1,17 +1,29 @@
-"""Ctrl-C, SIGTERM and SIGHUP: the first one asks for a clean end, a second Ctrl-C ends at once.
+"""Ctrl-C, Ctrl-Break, SIGTERM and SIGHUP: the first one asks for a clean end, a second Ctrl-C ends
+at once.
 
 SIGHUP, from a terminal that was closed or a connection that was lost, is asked for apart: what must
-not be left half done goes on without anybody who listens. Under `nohup` it stays ignored.
+not be left half done goes on without anybody who listens. Under `nohup` it stays ignored. Windows
+ends the programs of a console that is closed within 5 s: there it asks for a clean end.
 """
 
 from __future__ import annotations
 
+import ctypes
+import os
 import signal
+import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from types import FrameType
+from typing import Any, Final
 
 _HANGUP: signal.Signals | None = getattr(signal, "SIGHUP", None)  # not on Windows
+_BREAK: signal.Signals | None = getattr(signal, "SIGBREAK", None)  # on Windows only
+_IS_WINDOWS: Final = os.name == "nt"
+_CLOSING: Final = frozenset({2, 5, 6})
+"""Windows: CTRL_CLOSE_EVENT, CTRL_LOGOFF_EVENT, CTRL_SHUTDOWN_EVENT."""
+_CLOSING_LIMIT_S: Final = 10.0
+"""Longer than Windows waits for a program whose console is closed."""
 
 
 class Stop:
@@ -66,10 +78,37 @@ def stop_on_signal(
     numbers = [signal.SIGINT, signal.SIGTERM]
     if _HANGUP is not None and signal.getsignal(_HANGUP) is not signal.SIG_IGN:
         numbers.append(_HANGUP)
+    if _BREAK is not None:
+        numbers.append(_BREAK)
     before = {number: signal.signal(number, handle) for number in numbers}
     try:
-        yield stop
+        with _asked_by_console(stop) if _IS_WINDOWS else nullcontext():
+            yield stop
     finally:
         for number, handler in before.items():
             # None: it was not set from Python, which cannot set it again.
             signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+
+@contextmanager
+def _asked_by_console(stop: Stop) -> Iterator[None]:
+    """Windows: a console that is closed, the user's log-off and a shutdown ask to stop.
+
+    The system calls the handler in a thread of its own, and ends the process as soon as it returns:
+    so it waits. A process that ends meanwhile ends its threads.
+    """
+
+    def handle(event: int) -> bool:
+        if event in _CLOSING:
+            stop.is_asked = True
+            threading.Event().wait(_CLOSING_LIMIT_S)
+        return event in _CLOSING
+
+    windows: Any = ctypes
+    kernel32 = windows.WinDLL("kernel32")
+    handler = windows.WINFUNCTYPE(ctypes.c_int, ctypes.c_uint)(handle)
+    kernel32.SetConsoleCtrlHandler(handler, True)  # noqa: FBT003
+    try:
+        yield
+    finally:
+        kernel32.SetConsoleCtrlHandler(handler, False)  # noqa: FBT003

@@ -60,6 +60,7 @@ class LabelPrinter:
         self._jobs: queue.Queue[LabelJob | None] = queue.Queue(BACKLOG_MAX)
         self._done: deque[tuple[LabelJob, str]] = deque()
         self._thread = threading.Thread(target=self._work, name="labels", daemon=True)
+        self._sending: threading.Thread | None = None
 
     def start(self, wake: Callable[[], None]) -> None:
         """`wake` is called in the printer's thread when something can be taken."""
@@ -93,13 +94,41 @@ class LabelPrinter:
         while (job := self._jobs.get()) is not None:
             reason = ""
             try:
-                self._send(self._template.fill(job.values), self._limit_s)
+                self._send_in_time(self._template.fill(job.values))
             except NotPrinted as error:
                 reason = error.args[0]
             except Exception as error:  # noqa: BLE001  of a template: a station has to know it
                 reason = say("The label cannot be made: {why}.", why=printable(str(error))[:200])
             self._done.append((job, reason))
             self._wake()
+
+    def _send_in_time(self, data: bytes) -> None:
+        """Send a label, and give it up after the time limit: Windows knows no limit for a device,
+        nor for a program whose own programs go on. While it hangs, nothing else is sent. Raises
+        NotPrinted, and whatever sending raises.
+        """
+        self._await_sent()
+        failures: list[Exception] = []
+
+        def send() -> None:
+            try:
+                self._send(data, self._limit_s)
+            except Exception as error:  # noqa: BLE001  raised again below
+                failures.append(error)
+
+        self._sending = threading.Thread(target=send, name="label", daemon=True)
+        self._sending.start()
+        self._await_sent()
+        if failures:
+            raise failures[0]
+
+    def _await_sent(self) -> None:
+        """Wait for the label that is sent, if one is. Raises NotPrinted."""
+        if self._sending is not None:
+            self._sending.join(self._limit_s)
+            if self._sending.is_alive():
+                raise _too_slow(self._limit_s)
+            self._sending = None
 
 
 # -- printers -------------------------------------------------------------------------------------

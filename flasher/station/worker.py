@@ -349,7 +349,7 @@ def load_same(setup: WorkerSetup) -> LoadedRecipe:
 
 def worker_main(channel: Channel, setup: WorkerSetup) -> None:
     # Ctrl-C and a closed terminal are the station's business: it tells its processes what to do.
-    for name in ("SIGINT", "SIGHUP"):  # Windows has no SIGHUP
+    for name in ("SIGINT", "SIGHUP", "SIGBREAK"):  # Windows has no SIGHUP, others no SIGBREAK
         if hasattr(signal, name):
             signal.signal(getattr(signal, name), signal.SIG_IGN)
     pipe = StationPipe(channel, time.perf_counter)

@@ -61,6 +61,11 @@ def test_a_second_holder_is_told_who_has_it_and_since_when() -> None:
             {"interface": "slcan", "channel": "com3"},
             True,
         ),
+        (SLCAN, SLCAN | {"channel": r"\\.\COM3"}, True),
+        (SLCAN, SLCAN | {"channel": "//./com3"}, True),
+        (SLCAN, SLCAN | {"channel": r"\\?\COM3@115200"}, True),
+        (SLCAN, SLCAN | {"channel": "COM3@115200"}, True),
+        (SLCAN, SLCAN | {"channel": r"\\.\COM33"}, False),
         (
             {"interface": "udp_multicast", "channel": "239.74.163.2"},
             {"interface": "udp_multicast", "channel": "239.74.163.9", "port": 43113},

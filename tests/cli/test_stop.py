@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import os
 import pty
@@ -105,6 +106,56 @@ def test_nohup_is_respected() -> None:
         assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)
+
+
+def test_ctrl_break_asks_as_ctrl_c_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("flasher.cli.stop._BREAK", signal.SIGUSR1)  # for the one of Windows
+    before = signal.getsignal(signal.SIGUSR1)
+    with stop_on_signal() as stopped:
+        signal.raise_signal(signal.SIGUSR1)
+        assert stopped.asked()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGUSR1)
+    assert signal.getsignal(signal.SIGUSR1) is before
+
+
+class Console:
+    """kernel32 of Windows, as far as it is asked."""
+
+    def __init__(self, _name: str) -> None:
+        self.handlers: list[Callable[[int], int]] = []
+        consoles.append(self)
+
+    def SetConsoleCtrlHandler(  # noqa: N802  Windows' own name
+        self, handler: Callable[[int], int], add: bool
+    ) -> None:
+        if add:
+            self.handlers.append(handler)
+        else:
+            self.handlers.remove(handler)
+
+
+consoles: list[Console] = []
+
+
+@pytest.mark.parametrize("event", [2, 5, 6])
+def test_a_console_that_is_closed_asks_and_its_handler_waits_for_the_end(
+    monkeypatch: pytest.MonkeyPatch, event: int
+) -> None:
+    """Windows ends a process whose handler returns."""
+    monkeypatch.setattr("flasher.cli.stop._IS_WINDOWS", True)
+    monkeypatch.setattr("flasher.cli.stop._CLOSING_LIMIT_S", 0.05)
+    monkeypatch.setattr(ctypes, "WinDLL", Console, raising=False)
+    monkeypatch.setattr(ctypes, "WINFUNCTYPE", ctypes.CFUNCTYPE, raising=False)
+    with stop_on_signal() as stopped:
+        (handler,) = consoles[-1].handlers
+        assert not handler(0), "Ctrl-C is another handler's"
+        assert not stopped()
+        began = time.perf_counter()
+        assert handler(event)
+        assert time.perf_counter() - began >= 0.05
+        assert stopped.asked()
+    assert consoles[-1].handlers == []
 
 
 # -- in this process ------------------------------------------------------------------------------

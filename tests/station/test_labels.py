@@ -28,7 +28,7 @@ from flasher.station.events import (
     SocketState,
 )
 from flasher.station.health import Watch
-from flasher.station.label_printer import LabelPrinter, NotPrinted, printer_of
+from flasher.station.label_printer import LabelJob, LabelPrinter, NotPrinted, printer_of
 from flasher.station.label_template import LabelTemplate, sample_of, values_of
 from flasher.station.people import Crew, Person, Role
 from flasher.station.records.errors import DiskFullError
@@ -151,6 +151,33 @@ def test_a_printer_that_hangs_delays_nothing(bench: Bench) -> None:
     goes_on.set()
     finished(line)
     assert [event.serial for event in line.of(LabelPrinted)] == [SERIAL, OTHER]
+
+
+def test_the_time_limit_holds_for_a_printer_that_knows_none(bench: Bench) -> None:
+    """Windows has none for a device. What hangs is not sent to; then labels are printed again."""
+    begun, goes_on, done = threading.Semaphore(0), threading.Event(), threading.Semaphore(0)
+
+    def hang(_data: bytes, _limit_s: float) -> None:
+        begun.release()
+        goes_on.wait(LIMIT_S)
+
+    labels = LabelPrinter(template(bench), hang, limit_s=0.05)
+    labels.start(done.release)
+    values = sample_of(bench.recipe.recipe, "line-2")
+    for serial in ("1", "2"):
+        labels.submit(LabelJob("A", serial, values))
+        assert done.acquire(timeout=LIMIT_S)
+    assert [(job.serial, reason) for job, reason in labels.take()] == [
+        ("1", "The printer took longer than 0.05 s."),
+        ("2", "The printer took longer than 0.05 s."),
+    ]
+    assert begun.acquire(blocking=False)
+    assert not begun.acquire(blocking=False), "two labels at once"
+    goes_on.set()
+    labels.submit(LabelJob("A", "3", values))
+    assert done.acquire(timeout=LIMIT_S)
+    assert [(job.serial, reason) for job, reason in labels.take()] == [("3", "")]
+    labels.close()
 
 
 def test_a_printer_that_fails_touches_no_verdict_and_is_said(bench: Bench) -> None:
