@@ -122,6 +122,8 @@ class Connection:
     name: str
     bit_rate: BitRate | None = None
     """What the bus runs at, and where that comes from; None where that is not known."""
+    channel: str = ""
+    """The adapter's, as python-can has it; empty where there is none."""
     _turn: Lock = field(default_factory=Lock, init=False, repr=False, compare=False)
     """Held by the call that is under way: two at once would take each other's frames."""
 
@@ -201,7 +203,7 @@ def connect(
         as_dialect(dialect).bitrate_bps, holder=holder, sends=sends, fallback=fallback, **bus
     )
     try:
-        yield Connection(link, MonotonicClock(), str(link), link.bit_rate)
+        yield Connection(link, MonotonicClock(), str(link), link.bit_rate, link.channel)
     finally:
         link.close()
 

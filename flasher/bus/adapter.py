@@ -192,6 +192,11 @@ class CanLink:
         else:
             self._receive_raw = lambda timeout: (bus.recv(timeout), True)
 
+    @property
+    def channel(self) -> str:
+        """Which adapter of its kind; empty where that was not said."""
+        return self._channel
+
     def __str__(self) -> str:
         """The adapter as the user named it."""
         return self._name

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from platformdirs import user_state_path
 
@@ -35,6 +35,9 @@ from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.trace.figures import LinkMeter, LinkReport
 from flasher.trace.taps import FlightRecorder, Unechoed
+
+if TYPE_CHECKING:
+    from flasher.trace.recorder import Recorder
 
 BUNDLE_FOLDER: Final = "FLASHER_BUNDLE_DIR"
 """The environment variable that names the folder for bundles."""
@@ -90,6 +93,8 @@ class Recording:
         self.recorders: list[Tap] = [self.flight]
         if self._meter is not None:
             self.recorders.append(self._meter)
+        self.file: Recorder | None = None
+        """The trace file, where one is wanted."""
         self.taps: tuple[Tap, ...] = (Unechoed(lambda: self.recorders),)
         """For the driver."""
         self.failure: BaseException | None = None
@@ -102,6 +107,8 @@ class Recording:
         """The bus is open."""
         self._connection = connection
         self.facts["connection"] = connection.name
+        if self.file is not None:
+            self.file.channel = connection.channel
 
     def failed(self, error: BaseException) -> None:
         """The command reports this error itself, and does not raise it."""
@@ -195,6 +202,7 @@ def _trace_file(options: RecordingOptions, record: Recording, output: Output) ->
     from flasher.trace.recorder import Recorder  # noqa: PLC0415  loads python-can
 
     with Recorder(path) as recorder:
+        record.file = recorder
         record.recorders.append(recorder)
         yield
     if recorder.failure is not None:

@@ -273,6 +273,7 @@ class Worker:
         recorder: Recorder | None = None
         try:
             with Recorder(begin.trace) as recorder:
+                recorder.channel = self._connection.channel
                 result = UnitRun(
                     begin.order,
                     self._recipe,

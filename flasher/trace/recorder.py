@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sqlite3
 import time
 from collections.abc import Callable
@@ -19,6 +20,9 @@ from flasher.trace.pcapng import PcapngWriter
 
 _CANDUMP_ERROR: Final = 0x2000_0080
 """Error frame, bus error."""
+_INTERFACE_MAX: Final = 15
+"""Characters in the name of an interface of Linux, which is all that can-utils have room for."""
+_NOT_IN_NAME: Final = re.compile(r"[^A-Za-z0-9.:_-]")
 _COMMIT_FRAMES: Final = 500
 """Frames that a process which is killed leaves unwritten, at the most."""
 ONE_TOOL_CHANNEL: Final = "conformance"
@@ -56,6 +60,8 @@ class CandumpWriter:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Raises OSError."""
         self._file = Path(path).open("w", encoding="ascii")  # noqa: SIM115  stop() closes it
+        self.interface = "can0"
+        """Written with every frame; one word."""
 
     def __call__(self, message: can.Message) -> None:
         """Write one frame. Raises OSError."""
@@ -67,7 +73,7 @@ class CandumpWriter:
         if message.is_remote_frame:
             data = "R"
         kind = "##0" if message.is_fd else "#"
-        self._file.write(f"({message.timestamp:f}) can0 {can_id}{kind}{data}\n")
+        self._file.write(f"({message.timestamp:f}) {self.interface} {can_id}{kind}{data}\n")
 
     def stop(self) -> None:
         """Close the file. Raises OSError."""
@@ -182,7 +188,20 @@ class Recorder:
                 code=ErrorCode.FILE_NOT_WRITTEN,
             )
         self._writer = writer_of(self._path)
+        self._channel = ""
         self._wall_offset_s: float | None = None
+
+    @property
+    def channel(self) -> str:
+        """Which adapter the frames come from. Only `.log` names it, `can0` where it is empty."""
+        return self._channel
+
+    @channel.setter
+    def channel(self, channel: str) -> None:
+        self._channel = channel
+        name = _NOT_IN_NAME.sub("_", channel.rpartition("/")[2])[:_INTERFACE_MAX]
+        if name and isinstance(self._writer, CandumpWriter):
+            self._writer.interface = name
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         if self.failure is not None:

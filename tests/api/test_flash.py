@@ -259,6 +259,7 @@ class FakeLink:
     """An adapter that counts how often it is closed, and may fail."""
 
     bit_rate = None
+    channel = "0"
 
     def __init__(self, failure: Exception | None = None) -> None:
         self.closed = 0

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import can
 import pytest
 
-from flasher.api import Device
+from flasher.api import Connection, Device
+from flasher.bus.link import VirtualClock
+from flasher.bus.simulated import SimulatedBus
 from flasher.cli.options import Bus
 from flasher.cli.output import Output
 from flasher.cli.recording import BUNDLE_FOLDER, RecordingOptions, recording
@@ -46,6 +49,17 @@ def report_of(bundle: Path) -> dict[str, Any]:
     loaded = json.loads((bundle / "report.json").read_text())
     assert isinstance(loaded, dict)
     return loaded
+
+
+def test_a_trace_names_the_channel_that_was_opened(tmp_path: Path) -> None:
+    path = tmp_path / "trace.log"
+    clock = VirtualClock()
+    connection = Connection(SimulatedBus(250_000, clock).link(), clock, "socketcan can2")
+    options = RecordingOptions(trace_file=str(path))
+    with recording(options, Bus(), Output(), target=BMS) as record:
+        record.opened(replace(connection, channel="can2"))
+        record.taps[0](Frame(0x752, b"x"), sent=True, now=0.0)
+    assert path.read_text().split()[1] == "can2"
 
 
 def run_into(error: BaseException, options: RecordingOptions = NOTHING) -> None:

@@ -68,6 +68,28 @@ def test_a_log_is_what_candump_writes(tmp_path: Path) -> None:
     ]
 
 
+@each(
+    "channel, name",
+    [
+        ("can2", "can2"),
+        ("PCAN_USBBUS1", "PCAN_USBBUS1"),
+        ("/dev/ttyACM0@115200", "ttyACM0_115200"),
+        ("239.74.163.2", "239.74.163.2"),
+        ("a channel\n(1.0) x", "a_channel__1.0_"),
+        ("", "can0"),
+    ],
+)
+def test_a_log_names_the_channel_in_one_word_that_can_utils_take(
+    tmp_path: Path, channel: str, name: str
+) -> None:
+    path = tmp_path / "trace.log"
+    with Recorder(path) as recorder:
+        recorder.channel = channel
+        recorder(SENT, sent=True, now=1.0)
+    assert path.read_text(encoding="ascii").split()[1] == name
+    assert [message.arbitration_id for message in read(path)] == [SENT.can_id]
+
+
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".csv", ".db", ".log"])
 def test_extended_remote_and_error_frames_are_recorded_for_what_they_are(
     tmp_path: Path, suffix: str
