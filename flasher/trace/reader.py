@@ -203,10 +203,11 @@ def _frames_of_database(source: BufferedIOBase, path: Path) -> Iterator[tuple[fl
             )
             if not all(kinds):
                 raise UnfitError("a row lacks its time, its id or its data")
-            yield (
-                float(at_s),
-                Frame(can_id, data, bool(extended) and not error, bool(remote), bool(error)),
-            )
+            if len(data) <= _DATA_MAX:  # the table does not mark CAN FD
+                yield (
+                    float(at_s),
+                    Frame(can_id, data, bool(extended) and not error, bool(remote), bool(error)),
+                )
 
 
 @contextmanager

@@ -157,6 +157,29 @@ def test_a_database_that_is_still_written_is_read_whole_and_left_alone(
         assert {each.name: each.read_bytes() for each in tmp_path.iterdir()} == before
 
 
+def test_a_database_of_python_can_is_read_to_its_last_row(tmp_path: Path) -> None:
+    """Its writer drops what is still queued when it is stopped: `num_frames` are in the file."""
+    path = tmp_path / "trace.db"
+    writer = can.SqliteWriter(path)
+    for number in range(12_000):
+        kind = number % 4
+        writer(
+            can.Message(
+                timestamp=1.7e9 + number / 1000,
+                arbitration_id=number % 0x700,
+                is_extended_id=kind == 1,
+                is_remote_frame=kind == 2,
+                is_fd=kind == 3,
+                data=(b"ab", b"", None, bytes(64))[kind],
+            )
+        )
+    writer.stop()
+    assert 500 < writer.num_frames <= 12_000
+    read = [at for at, _ in read_trace(path)]
+    written = range(writer.num_frames)
+    assert read == [1.7e9 + number / 1000 for number in written if number % 4 != 3]
+
+
 def test_a_format_whose_package_is_missing_is_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
