@@ -4,10 +4,11 @@
 for each message, each stretch of damaged bytes and each foreign frame, with its fields both typed
 and as text that is safe on any screen. `TimedDecoder` adds the time that each of them took.
 
-A time stamp means different things: adapters stamp a received frame when it has ended, a recorder
-of our own stamps a sent frame when the adapter accepted it, and a queue accepts a whole message at
-once. `TimedEvent.left_s` copes with both: frames whose stamps lie closer together than they can be
-on the wire were accepted, not sent, and their message ended when the wire could have carried it.
+A time stamp means different things: adapters, and candump, stamp a frame when it has ended; a
+recorder of our own stamps a sent frame when it was handed over, and a queue accepts a whole message
+at once. `TimedEvent` tells beginning and end on the wire for both: frames whose stamps lie closer
+together than they can be on the wire were handed over, and their message ended when the wire could
+have carried it.
 
 Pure: the time is an argument.
 """
@@ -331,12 +332,24 @@ class TimedEvent:
     first_bits: int
     """Bits of the first frame alone."""
 
+    def began_s(self, bitrate_bps: int) -> float:
+        """When the first frame began on the wire, as well as the stamps tell."""
+        if self._bears_ends(bitrate_bps):
+            return self.begin_s - self.first_bits / bitrate_bps
+        return self.begin_s
+
     def left_s(self, bitrate_bps: int) -> float:
         """When the last frame had left the wire, as well as the stamps tell."""
-        between_s = (self.bits - self.first_bits) / bitrate_bps
-        if self.end_s - self.begin_s >= ACCEPTED_SHARE * between_s:
+        if self._bears_ends(bitrate_bps):
             return self.end_s
         return max(self.end_s, self.begin_s + self.bits / bitrate_bps)
+
+    def _bears_ends(self, bitrate_bps: int) -> bool:
+        """True when its stamps tell when each frame ended, False when they tell when it was handed
+        over.
+        """
+        between_s = (self.bits - self.first_bits) / bitrate_bps
+        return self.end_s - self.begin_s >= ACCEPTED_SHARE * between_s
 
 
 @dataclass(slots=True)

@@ -114,8 +114,9 @@ class Transfer:
         self._number = self._highest = self._copies = 0
 
     def packet(self, number: int, timed: TimedEvent) -> None:
+        began_s = timed.began_s(self._bitrate_bps)
         if self._begin_s is None:
-            self._begin_s = timed.begin_s
+            self._begin_s = began_s
         if number > self._highest:
             self._packets += 1
             self._highest = number
@@ -125,7 +126,7 @@ class Transfer:
             self._copies += 1
         else:
             if self._acked_at_s is not None and number == self._number + 1:
-                self._turnarounds.append(max(0.0, timed.begin_s - self._acked_at_s))
+                self._turnarounds.append(max(0.0, began_s - self._acked_at_s))
             self._number, self._copies = number, 1
         self._bits = timed.bits
         self._left_s = timed.left_s(self._bitrate_bps)

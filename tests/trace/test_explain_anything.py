@@ -64,6 +64,7 @@ def test_frames_accepted_at_once_leave_as_late_as_the_wire_lets_them() -> None:
     pieces = TimedDecoder()
     (piece,) = [piece for each in frames for piece in pieces.feed(each, 5.0, bits_of(each))]
     assert piece.left_s(250_000) == pytest.approx(5.0 + wire_s)
+    assert piece.began_s(250_000) == 5.0
 
 
 def test_frames_stamped_as_they_ended_leave_with_the_last_stamp() -> None:
@@ -73,3 +74,4 @@ def test_frames_stamped_as_they_ended_leave_with_the_last_stamp() -> None:
         now += bits_of(frame) / 250_000
         found += pieces.feed(frame, now, bits_of(frame))
     assert [piece.left_s(250_000) for piece in found] == [now]
+    assert [piece.began_s(250_000) for piece in found] == [pytest.approx(5.0)]

@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+from collections import deque
+from dataclasses import astuple
+from typing import Final
+
+import pytest
+
 from flasher.protocol.spec import BMS, WELLING
-from flasher.trace.figures import LinkMeter
+from flasher.trace.decoder import bits_of
+from flasher.trace.figures import LinkMeter, LinkReport
 from tests.trace.tape import FRAME_S, Tape
 
 
@@ -33,3 +40,40 @@ def test_where_frames_take_less_time_than_on_the_line_it_is_not_known() -> None:
     assert report.share_of_line_rate > 1
     assert report.device_answer is None
     assert report.host_turnaround is not None
+
+
+QUEUE_FRAMES: Final = 10
+"""A driver takes so many at once, then one for each that has left."""
+
+
+def recorded(*, by_candump: bool) -> LinkReport:
+    """Seven packets on a wire, by candump, which stamps what was sent when it has ended, or by a
+    recorder of our own, which stamps it when it was handed over.
+    """
+    meter, now, ends = LinkMeter(BMS, WELLING.bitrate_bps), 10.0, deque([0.0], QUEUE_FRAMES)
+    is_sent = False
+    for _, frame in Tape().to_packet(7).frames:
+        if is_sent != (frame.can_id == BMS.request_id):
+            is_sent = not is_sent
+            now += 0.002  # either side thinks
+            ends.extend([now] * QUEUE_FRAMES)
+        handed_over_s = ends[0]
+        now += bits_of(frame) / WELLING.bitrate_bps
+        ends.append(now)
+        meter(frame, sent=is_sent, now=now if by_candump or not is_sent else handed_over_s)
+    report = meter.report()
+    assert report is not None
+    return report
+
+
+def test_the_figures_are_the_same_whether_what_was_sent_is_stamped_before_or_after() -> None:
+    """`candump` and a recorder of our own, on one bus."""
+    theirs, ours = recorded(by_candump=True), recorded(by_candump=False)
+    assert ours.host_turnaround is not None
+    assert theirs.host_turnaround is not None
+    assert ours.host_turnaround.median_s == pytest.approx(0.002, abs=1e-6)
+    assert theirs.host_turnaround.median_s == pytest.approx(0.002, abs=1e-6)
+    assert ours.device_answer is not None
+    assert theirs.device_answer is not None
+    assert astuple(ours.device_answer) == pytest.approx(astuple(theirs.device_answer))
+    assert ours.transfer_s == pytest.approx(theirs.transfer_s)
