@@ -109,9 +109,15 @@ def trial(number: int, seed: int, whole_s: float, bus: Sequence[str], folder: Pa
     if number % TWICE == 0:
         moments.append(draw.uniform(0.0, whole_s + 10.0))
     before = len(History().flashes()[0])
+    killed: list[Flash] = []
     for moment in moments:
-        killed_after(moment, (*flash, *GAP), folder)
-    killed = History().flashes()[0][before:]
+        is_first, at_s = not killed, moment
+        while True:
+            killed_after(at_s, (*flash, *GAP), folder)
+            killed = History().flashes()[0][before:]
+            if not is_first or killed[-1].ended is None:
+                break
+            before, at_s = before + len(killed), 0.7 * at_s  # the computer was faster than before
     stored.unlink(missing_ok=True)
     began_at = time.perf_counter()
     done = run_flasher(*flash, folder=folder)

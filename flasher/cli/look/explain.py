@@ -152,7 +152,10 @@ def _without_end(flash: Flash) -> UsageError:
         code=ErrorCode.UNFINISHED,
     )
     if began.adapter != MOCK:
-        folder = f" The command was typed in {printable(began.folder)}." if began.folder else ""
-        error.remedy = f"State of the device: {flash.device_left}.{folder}"
+        where = f" in {printable(began.folder)}" if began.folder else ""
+        error.remedy = (
+            f"Run the command below{where}: it finds a device that still waits in the upgrade. "
+            f"State of the device: {flash.device_left}."
+        )
         error.command = printable(again(began))
     return error
