@@ -206,6 +206,20 @@ def test_a_trace_is_its_owners_in_every_format(
     assert path.stat().st_size > len(b"of before")
 
 
+@each("name", ["notes.md", "x\x1b.y", "trace.asc.zip", "upgrade"])
+def test_a_file_that_no_trace_can_be_written_to_is_neither_made_nor_emptied(
+    tmp_path_factory: pytest.TempPathFactory, name: str
+) -> None:
+    path = tmp_path_factory.mktemp("traces") / name
+    with pytest.raises(UsageError, match="no trace format"):
+        Recorder(path)
+    assert list(path.parent.iterdir()) == []
+    path.write_bytes(b"of before")
+    with pytest.raises(UsageError, match="no trace format"):
+        Recorder(path)
+    assert path.read_bytes() == b"of before"
+
+
 def test_what_a_device_told_is_its_owners(
     flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -6,7 +6,8 @@ import os
 import re
 import sqlite3
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, Protocol, Self
 
@@ -141,14 +142,14 @@ def writer_of(path: str | os.PathLike[str], *, called: str = "") -> Writer:
     """
     suffix, shown = Path(path).suffix.lower(), printable(called or os.fspath(path)) or "''"
     try:
-        make_private(path)
-        if suffix == ".pcapng":
-            return PcapngWriter(path)
-        if suffix == ".log":
-            return CandumpWriter(path)
-        if suffix == ".db":
-            return DatabaseWriter(path)
-        return can.Logger(path)
+        with _created_for_its_owner(path):
+            if suffix == ".pcapng":
+                return PcapngWriter(path)
+            if suffix == ".log":
+                return CandumpWriter(path)
+            if suffix == ".db":
+                return DatabaseWriter(path)
+            return can.Logger(path)
     except ValueError as error:
         raise UsageError(
             f"{shown}: no trace format has this suffix.",
@@ -165,6 +166,22 @@ def writer_of(path: str | os.PathLike[str], *, called: str = "") -> Writer:
         raise UsageError(
             f"{shown} cannot be written: {error.strerror}.", code=ErrorCode.FILE_NOT_WRITTEN
         ) from error
+
+
+@contextmanager
+def _created_for_its_owner(path: str | os.PathLike[str]) -> Iterator[None]:
+    """The file is there, readable by its owner alone, when somebody opens it in the block. If that
+    fails, none is left, and one that was there is as it was. Raises OSError.
+    """
+    was_there = os.path.lexists(path)
+    make_private(path, is_appended_to=True)
+    try:
+        yield
+    except BaseException:
+        if not was_there:
+            with suppress(OSError):
+                Path(path).unlink()
+        raise
 
 
 class Recorder:
