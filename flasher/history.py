@@ -322,11 +322,20 @@ def _made(kind: type[T], found: dict[str, Any]) -> T:
         for each in dataclasses.fields(kind)
         if each.default is dataclasses.MISSING or each.name in found
     }
-    types = get_type_hints(kind)
+    types = _TYPES[kind.__name__]
     for name, value in values.items():
-        if type(value) not in (get_args(types[name]) or (types[name],)):
+        if type(value) not in types[name]:
             raise TypeError(name)
     return kind(**values)
+
+
+_TYPES: Final = {
+    kind.__name__: {
+        name: get_args(found) or (found,) for name, found in get_type_hints(kind).items()
+    }
+    for kind in (Began, Ended)
+}
+"""The types of each key."""
 
 
 def working_folder() -> str:
