@@ -17,9 +17,10 @@ from flasher.bus import adapter
 from flasher.bus.adapter import CanLink, open_adapter
 from flasher.bus.health import ControllerState
 from flasher.bus.inspect_interface import Interface, Unseen
-from flasher.bus.link import SEND_LIMIT_S
+from flasher.bus.link import AT_ONCE, SEND_LIMIT_S
 from flasher.errors import BusError, ErrorCode, ExitCode, TransmitBlockedError, UsageError
 from flasher.protocol.frame import Frame
+from tests.loops import each
 
 FRAME = Frame(0x752, b"\x55\xaa\x16\x07")
 
@@ -592,3 +593,33 @@ def test_a_full_queue_is_remembered(bus: FakeBus, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(TransmitBlockedError):
         link.send(FRAME)
     assert link.health().not_acknowledged
+
+
+# -- echoes of own frames -------------------------------------------------------------------------
+
+
+@each(
+    "interface, asked, is_rx, is_echo",
+    [
+        ("gs_usb", None, False, True),
+        ("gs_usb", None, True, False),
+        ("socketcan", None, False, False),  # another program on this computer
+        ("socketcan", True, False, True),
+        ("socketcan", True, True, False),  # another dongle, on the wire
+        ("udp_multicast", None, True, True),
+    ],
+)
+def test_an_echo_is_told_from_a_second_tool_by_what_the_back_end_knows(
+    interface: str, asked: bool | None, *, is_rx: bool, is_echo: bool
+) -> None:
+    """The frame is the very same one that this link has sent."""
+    fake = FakeBus()
+    own = {} if asked is None else {"receive_own_messages": asked}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(adapter, "open_bus", lambda _config: fake)
+        link = open_adapter(250_000, interface=interface, channel="x", **own)
+    link.send(FRAME)
+    fake.inbox.append(message(FRAME.can_id, FRAME.data, is_rx=is_rx))
+    received = link.receive(AT_ONCE)
+    link.close()
+    assert received == FRAME._replace(is_echo=is_echo)
