@@ -614,9 +614,9 @@ def test_an_echo_is_told_from_a_second_tool_by_what_the_back_end_knows(
 ) -> None:
     """The frame is the very same one that this link has sent."""
     fake = FakeBus()
-    own = {} if asked is None else {"receive_own_messages": asked}
+    own: dict[str, Any] = {} if asked is None else {"receive_own_messages": asked}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(adapter, "open_bus", lambda _config: fake)
+        patch.setattr(adapter, "open_bus", lambda _config, **_options: fake)
         link = open_adapter(250_000, interface=interface, channel="x", **own)
     link.send(FRAME)
     fake.inbox.append(message(FRAME.can_id, FRAME.data, is_rx=is_rx))
