@@ -36,6 +36,13 @@ def test_the_page_tells_each_code_in_order() -> None:
     assert list(told.error_codes()) == [code.value for code in ErrorCode]
 
 
+def test_each_code_is_told_to_its_end() -> None:
+    page = (PACKAGE / "error_codes.md").read_text(encoding="utf-8")
+    for code, one in told.error_codes().items():
+        section = page.partition(f"## {code}: ")[2].partition("\n## ")[0]
+        assert f"{one.title}\n\n{one.text}" == section.strip().replace("**", "")
+
+
 def test_the_code_of_a_class_has_its_exit_code() -> None:
     for kind in KINDS.values():
         assert exit_code_in(kind.default_code) == kind.exit_code, kind

@@ -22,7 +22,7 @@ examples:
   flasher help codes        all codes
   flasher help flash        the same as flasher flash --help
 """
-_SECTION: Final = re.compile(r"^## (E\d+): (.+)\n([^#]*)", re.MULTILINE)
+_SECTION: Final = re.compile(r"^## (E\d+): (.+)\n((?:(?!#).*\n?)*)", re.MULTILINE)
 _ALL: Final = "codes"
 
 
