@@ -77,6 +77,16 @@ class ForeignQuery:
 
 
 @dataclass(frozen=True)
+class SecondToolAwaited:
+    """Another tool writes to the device, which has no application any more; `seen` is what it sent.
+    Nothing is sent until it was silent for `quiet_s`, then the upgrade begins again.
+    """
+
+    seen: str
+    quiet_s: float
+
+
+@dataclass(frozen=True)
 class AdapterLost:
     """The adapter failed; for `wait_s` it is tried to be opened again."""
 
@@ -89,6 +99,16 @@ class AdapterAwaited:
     """The lost adapter is waited for `left_s` seconds more. Reported every second."""
 
     left_s: int
+
+
+@dataclass(frozen=True)
+class BusBlocked:
+    """The adapter's frames do not leave any more; for `limit_s`, until the overall deadline, the
+    upgrade of a device that has no application goes on trying.
+    """
+
+    reason: str
+    limit_s: float
 
 
 @dataclass(frozen=True)
@@ -142,10 +162,13 @@ class UpgradeLeftOpen:
 
 @dataclass(frozen=True)
 class AttemptStarted:
-    """The transfer starts over; attempts count from 1."""
+    """The transfer starts over; attempts count from 1. `left_s` is the time until the overall
+    deadline where only that ends the attempts, 0 where their number does.
+    """
 
     attempt: int
     reason: str
+    left_s: float = 0.0
 
 
 # -- queries --------------------------------------------------------------------------------------

@@ -43,7 +43,9 @@ _WARNING: Final = frozenset(
         events.QueryUnanswered,
         events.ShutdownHeard,
         events.ForeignQuery,
+        events.SecondToolAwaited,
         events.AdapterLost,
+        events.BusBlocked,
         events.BytesDamaged,
         events.DeviceReported,
     }

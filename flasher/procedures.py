@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
-from math import ceil
+from math import ceil, inf
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from flasher import events
@@ -22,6 +22,7 @@ from flasher.errors import (
     FlasherError,
     InterruptedByUserError,
     NoAnswerError,
+    TransferError,
     TransmitBlockedError,
     UsageError,
 )
@@ -59,7 +60,7 @@ from flasher.image.sample import is_sample, refused_sample
 from flasher.prose import prose
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import Memory, Reset, VersionInformation
-from flasher.protocol.engine import Engine
+from flasher.protocol.engine import WELL_BEYOND, Engine
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, Command, Dialect, Target
@@ -111,6 +112,25 @@ class Tell:
 
 
 Step = Run | WaitUntil | Tell
+
+
+@dataclass(frozen=True)
+class _Blocked:
+    """The adapter's frames did not leave."""
+
+    error: TransmitBlockedError
+    received: int
+    """How many frames had arrived by then."""
+    again_at: float
+    """When it was tried again."""
+
+    def check(self, session: Session, now: float) -> None:
+        """Raise the error for a session that has failed before it could be raised again."""
+        is_late = now <= self.again_at + WELL_BEYOND * session.timings.inter_frame_timeout_s
+        if is_late and isinstance(session.result.error(), NoAnswerError | TransferError):
+            raise self.error
+
+
 T = TypeVar("T")
 Procedure = Generator[Step, bool, T]
 
@@ -450,23 +470,21 @@ class Procedures:
         link = self.link
         before = link.health()
         self._check_bus("before anything was sent", session, before)
+        blocked: _Blocked | None = None
         try:
             while True:
                 try:
                     yield run
                     break
+                except TransmitBlockedError as error:
+                    blocked = yield from self._await_contact(session, error, blocked)
                 except BusError as error:
-                    # A bus that takes no frame is no lost adapter.
-                    is_lost = not isinstance(error, TransmitBlockedError)
-                    wait_s = options.adapter_return_s
-                    if not is_lost or not session.may_begin_again or not wait_s:
-                        raise
-                    if not has_sent:
-                        wait_s = min(wait_s, BRIEF_ADAPTER_RETURN_S)
-                    yield Tell(events.AdapterLost(error.what, wait_s))
-                    yield from self._reopen(session, error, wait_s)
-                    yield Tell(events.AdapterBack())
-                    session.link_back(self.clock.now())
+                    limit_s = inf if has_sent else BRIEF_ADAPTER_RETURN_S
+                    wait_s = min(options.adapter_return_s, limit_s)
+                    yield from self._await_adapter(session, error, wait_s)
+                session.link_back(self.clock.now())
+            if blocked is not None:
+                blocked.check(session, self.clock.now())
         except (BusError, InterruptedByUserError) as error:
             # The adapter does not know what it was used for.
             error.where = f"{session.standing}; {error.where}".removesuffix("; ")
@@ -507,6 +525,31 @@ class Procedures:
             _say_what_is_left(error, session)
             raise error
 
+    def _await_contact(
+        self, session: Session, error: TransmitBlockedError, before: _Blocked | None
+    ) -> Procedure[_Blocked]:
+        """Let a session go on whose frames do not leave: a device without power acknowledges none.
+        Reported unless nothing has arrived since it was `before`. Raises the error where there is
+        something to lose, and at the overall deadline.
+        """
+        left_s = (session.deadline_at or inf) - self.clock.now()
+        if not session.goes_on or left_s <= _REOPEN_PAUSE_S:
+            raise error
+        received = self.link.health().frames_received
+        if before is None or received != before.received:
+            yield Tell(events.BusBlocked(error.what, left_s))
+        again_at = self.clock.now() + _REOPEN_PAUSE_S
+        yield WaitUntil(again_at, _may_end(session))
+        return _Blocked(error, received, again_at)
+
+    def _await_adapter(self, session: Session, lost: BusError, wait_s: float) -> Procedure[None]:
+        """Wait for a lost adapter, where an attempt is left for it; raises BusError without."""
+        if not session.may_begin_again or not wait_s:
+            raise lost
+        yield Tell(events.AdapterLost(lost.what, wait_s))
+        yield from self._reopen(session, lost, wait_s)
+        yield Tell(events.AdapterBack())
+
     def _reopen(self, session: Session, lost: BusError, wait_s: float) -> Procedure[None]:
         """Open a lost adapter again, as soon as it is back. Raises BusError when it is not within
         the time given and the overall deadline, InterruptedByUserError when the user has enough.
@@ -514,6 +557,8 @@ class Procedures:
         now = self.clock.now()
         give_up_at = now + wait_s
         if session.deadline_at is not None:
+            if now >= session.deadline_at:
+                raise lost
             give_up_at = min(give_up_at, session.deadline_at)
         told_s = ceil(wait_s)
         yield Tell(events.AdapterAwaited(told_s))

@@ -69,6 +69,7 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "request_given_up": "the device did not request the transfer in time",
         "end_refused": "the device refused the {what}",
         "end_unanswered": "the device did not answer the {what} in time",
+        "second_tool": "another tool wrote to the device, and is silent now",
         "link_back": "the adapter was away for a while",
         "query_unanswered": "no answer came",
     },

@@ -36,8 +36,9 @@ _INTRODUCTION: Final = """\
 
 Drawn from the tables in the code by `python -m tests.diagram`; a test keeps them so. Left out are
 events that are ignored or only reported, and those that are possible in every state: for the host
-the overall deadline, the user's cancellation and a second tool (all end the upgrade; a mere query
-of it is reported, and no event of the table), for the device a power cut.
+the overall deadline, the user's cancellation (both end the upgrade) and a second tool (that ends it
+too, or leads from every state to *yielding to another tool*; a mere query of it is reported, and no
+event of the table), for the device a power cut.
 """
 
 _Arrow = tuple[Enum, Enum, str, Enum | None]

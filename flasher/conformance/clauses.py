@@ -262,7 +262,8 @@ READINGS: Final = {
         "a device that sits silent in a broken transfer gets one update command into the silence",
         "No end of a transfer is given, so a device whose tool was lost may wait for ever, without "
         "an announcement and without knowing reset. When both stayed unanswered and the erase "
-        "limit has passed in silence, the tool tries the update command once, as a new attempt. It "
+        "limit has passed in silence, the tool tries the update command once, as a new attempt; "
+        "where the device has no application to lose, again after each further erase limit. It "
         "does so for the upgrade of an earlier run too: where the history of this computer knows "
         "one of this device on this adapter that did not end, or left it without an application, "
         "or where --in-session says so. A station does not: it has a rule of its own.",

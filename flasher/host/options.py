@@ -14,6 +14,14 @@ from flasher.protocol.spec import Command, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 
 DEFAULT_ATTEMPTS: Final = 3
+PATIENT_TRIES: Final = 60
+"""How often a packet is sent to a device that has no application to lose before the transfer begins
+anew: for 30 s where nothing answers."""
+ERASURES_MAX: Final = 20
+"""How often a device may erase in one upgrade that nobody has limited: flash wears. In the campaign
+of tests/campaigns/world no device was saved after more than ten."""
+OTHER_TOOL_QUIET_S: Final = 2.0
+"""Silence of another tool that wrote to an erased device, before the device is upgraded again."""
 DEFAULT_POWER_UP_TIMEOUT_S: Final = 60.0
 """Long enough to walk to the bicycle and unplug its battery."""
 DEFAULT_ADAPTER_RETURN_S: Final = 5.0
@@ -35,9 +43,17 @@ class UpgradeOptions:
     """
 
     timings: Timings = DEFAULT_TIMINGS
-    attempts: int = DEFAULT_ATTEMPTS
+    attempts: int | None = None
     """How often the upgrade may begin: after a restart of the device, an adapter that was lost and
-    came back, or a packet whose tries are exhausted."""
+    came back, or a packet whose tries are exhausted. None: `DEFAULT_ATTEMPTS` times, and as often
+    as the overall deadline allows once the device has no application."""
+    waits_for_other_tool: bool = True
+    """Upgrade an erased device again when another tool that wrote to it is silent, as long as an
+    attempt is left. False: end at once."""
+    patient_tries: int | None = None
+    """How often a packet is sent in one attempt once the device has no application and `attempts`
+    is None. None: `PATIENT_TRIES` times, or as often as `timings` says where that is not the
+    default."""
     timeout_s: float | None = None
     """Overall deadline; None computes one from the plan."""
     frame_gap_s: float = 0.0
@@ -85,6 +101,19 @@ class UpgradeOptions:
             )
 
     @property
+    def planned_attempts(self) -> int:
+        """How often the upgrade may begin while the device may still have its application."""
+        return DEFAULT_ATTEMPTS if self.attempts is None else self.attempts
+
+    @property
+    def tries_without_application(self) -> int:
+        """How often a packet is sent in one attempt where nothing is lost by trying on."""
+        if self.patient_tries is not None:
+            return self.patient_tries
+        tries = self.timings.packet_tries
+        return PATIENT_TRIES if tries == DEFAULT_TIMINGS.packet_tries else tries
+
+    @property
     def boot_timeout_s(self) -> float:
         """How long a boot version is waited for."""
         return self.power_up_timeout_s if self.at_power_up else self.timings.boot_version_timeout_s
@@ -123,9 +152,9 @@ def default_timeout_s(plan: Plan, options: UpgradeOptions) -> float:
     begin_s += timings.request_transfer_timeout_s
     transfer_s = plan.wire_s + gaps_s(plan, options) + answers_s
     end_s = timings.complete_timeout_s * timings.end_tries + timings.application_start_timeout_s
-    away_s = (options.attempts - 1) * options.adapter_return_s
+    away_s = (options.planned_attempts - 1) * options.adapter_return_s
     silence_s = 0.0
     if options.in_session:
         silence_s = max(timings.boot_version_timeout_s, timings.request_transfer_timeout_s)
         silence_s += timings.command_timeout_s + timings.request_transfer_timeout_s
-    return silence_s + options.attempts * (begin_s + transfer_s) + away_s + end_s
+    return silence_s + options.planned_attempts * (begin_s + transfer_s) + away_s + end_s

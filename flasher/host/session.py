@@ -164,9 +164,15 @@ class Session(Runner[Result]):
         return self._upgrade.has_begun_to_erase
 
     @property
+    def goes_on(self) -> bool:
+        """True while only the overall deadline ends the attempts."""
+        return self._is_upgrading and self._upgrade.goes_on
+
+    @property
     def may_begin_again(self) -> bool:
         """True when a lost adapter may be opened again: an attempt is left for it."""
-        if self.done or self._losses + 1 >= self._options.attempts:
+        is_last = self._losses + 1 >= self._options.planned_attempts
+        if self.done or (is_last and not self.goes_on):
             return False
         return not self._is_upgrading or self._upgrade.may_begin_again
 
@@ -317,7 +323,8 @@ class Session(Runner[Result]):
         if foreign is None:
             return frame.is_echo
         has_its_program = self._is_upgrading and not self._upgrade.has_begun_to_erase
-        if self._identify is not None or has_its_program or not foreign.is_harmless:
+        ends = self._identify is not None or has_its_program or not foreign.is_harmless
+        if ends or self._upgrade.is_yielding:
             self.interrupt(SecondTool(foreign.seen))
         elif foreign.query is not None and foreign.query not in self._foreign_queries:
             # It writes nothing, CRC and repetition protect the data: to end here would leave a

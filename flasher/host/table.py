@@ -26,6 +26,7 @@ class State(Enum):
     SETTLING = "settling"
     ENDING = "ending"
     CONFIRMING = "confirming"
+    YIELDING = "yielding to another tool"
     STOPPING = "stopping"
     DONE = "done"
 
@@ -51,6 +52,7 @@ class Event(Enum):
     QUIET = "no answer to a copy came any more"
     END_UNANSWERED = "end of transfer not answered, or its announcements stopped"
     VERSION_UNANSWERED = "version not answered"
+    TOOL_QUIET = "the other tool is silent"
 
     LINK_BACK = "the adapter was lost and is back"
     SECOND_TOOL = "somebody else speaks as the tool"
@@ -119,6 +121,8 @@ class Reason(Enum):
     END_REFUSED = "end_refused"
     """First NAK after end of transfer."""
     END_UNANSWERED = "end_unanswered"
+    SECOND_TOOL = "second_tool"
+    """Another tool wrote to the device, and is silent now."""
     LINK_BACK = "link_back"
     """The adapter was lost and is back."""
     QUERY_UNANSWERED = "query_unanswered"
@@ -141,16 +145,22 @@ REPORTED: Final = _do("report")
 _Row = dict[Event, Move]
 _S, _E, _X = State, Event, Ending
 
+_OF_THE_DEVICE: Final = (
+    _E.BOOT_VERSION, _E.REQUEST, _E.ACK, _E.NAK, _E.COMPLETE, _E.UNEXPECTED
+)  # fmt: skip
 _EVERYWHERE: Final[_Row] = {
     # What the wire brings where nobody waits for it.
-    **dict.fromkeys((_E.BOOT_VERSION, _E.REQUEST, _E.ACK, _E.NAK, _E.COMPLETE), REPORTED),
-    _E.UNEXPECTED: REPORTED,
+    **dict.fromkeys(_OF_THE_DEVICE, REPORTED),
     _E.FEEDBACK: IGNORED,
     _E.LINK_BACK: _do("begin_again", _S.RESETTING),
-    _E.SECOND_TOOL: _do("end_for_second_tool", _X.SECOND_TOOL),
-    _E.OUT_OF_TIME: _do("end_out_of_time", _X.OUT_OF_TIME),
+    _E.SECOND_TOOL: _do("yield_or_end", _S.YIELDING, _X.SECOND_TOOL),
+    _E.OUT_OF_TIME: _do(
+        "end_out_of_time",
+        _X.OUT_OF_TIME, _X.PACKET_FAILED, _X.RESTARTED, _X.NO_REQUEST, _X.NO_BOOT_VERSION,
+        _X.NO_ANNOUNCEMENT, _X.UNHEARING, _X.SECOND_TOOL,
+    ),
     _E.CANCEL: _do("end_cancelled", _X.CANCELLED),
-}
+}  # fmt: skip
 _ANSWER_BOOT: Final = _do(
     "answer_boot", _S.AWAITING_REQUEST, _X.WRONG_DEVICE, _X.BOOT_TOO_OLD, _X.UNCHECKED
 )
@@ -183,7 +193,7 @@ TABLE: Final[Mapping[State, _Row]] = {
     # Silence is not answered (R2): the device may be erasing.
     _S.AWAITING_REQUEST: _EVERYWHERE | {
         _E.BOOT_VERSION: _do(
-            "answer_boot_again", _S.AWAITING_REQUEST,
+            "answer_boot_again", _S.AWAITING_REQUEST, _S.RESETTING,
             _X.WRONG_DEVICE, _X.TWO_DEVICES, _X.UNHEARING, _X.UNCHECKED,
         ),
         _E.REQUEST: _do("send_first_packet", _S.TRANSFERRING),
@@ -239,6 +249,11 @@ TABLE: Final[Mapping[State, _Row]] = {
         _E.BOOT_VERSION: _do("take_boot_after_end", _S.AWAITING_REQUEST, _X.RESTARTED),
         _E.LINK_BACK: _do("query_version", _S.CONFIRMING),
     },
+    # Nothing is sent, whatever the device answers to the other tool.
+    _S.YIELDING: _EVERYWHERE | dict.fromkeys(_OF_THE_DEVICE, IGNORED) | {
+        _E.TOOL_QUIET: _do("take_turn", _S.RESETTING),
+        _E.LINK_BACK: _do("yield_on", _S.YIELDING),
+    },
     # The outcome is known; what was begun to be sent is finished, so that the bus is left at a
     # message boundary. Nothing that arrives is looked at any more.
     _S.STOPPING: {},
@@ -253,5 +268,6 @@ TIMERS: Final[Mapping[State, Event]] = {
     _S.SETTLING: _E.QUIET,
     _S.ENDING: _E.END_UNANSWERED,
     _S.CONFIRMING: _E.VERSION_UNANSWERED,
+    _S.YIELDING: _E.TOOL_QUIET,
 }
 """What the timer of each state means when it fires; a state has one."""

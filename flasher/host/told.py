@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from flasher import events
 from flasher.prose import prose, prose_of
+
+_MINUTES_FROM_S: Final = 180.0
 
 
 def because(reason: str, what: str = "") -> str:
@@ -20,6 +24,13 @@ def warning_of(event: object) -> str:
             return f"another tool asks the device ({title}); the upgrade goes on. End that tool."
         case events.AdapterLost(reason, wait_s):
             return f"{reason} Waiting {wait_s:g} s for the adapter ..."
+        case events.BusBlocked(reason, limit_s):
+            return f"{reason} Trying on for {_span(limit_s)}: has the device power and contact?"
+        case events.SecondToolAwaited(seen, quiet_s):
+            return (
+                f"another tool writes to the device ({seen}). It has no application any more: "
+                f"beginning again when the other tool has been silent for {quiet_s:g} s."
+            )
         case events.CheckMade(_, "warned" | "waived", text):
             return text
         case _:
@@ -31,8 +42,9 @@ def line_of(event: object) -> tuple[str, int] | None:
     match event:
         case events.PhaseEntered(phase, _):
             return f"{prose(phase)} ...", 0
-        case events.AttemptStarted(attempt, reason):
-            return f"{because(reason)}: beginning again, attempt {attempt}", 0
+        case events.AttemptStarted(attempt, reason, left_s):
+            left = f" ({_span(left_s)} left)" if left_s else ""
+            return f"{because(reason)}: beginning again, attempt {attempt}{left}", 0
         case events.UpgradeLeftOpen(at, image, has_end):
             left = "left the device without an application" if has_end else "has no end"
             text = f"the upgrade of {at.replace('T', ' ')} with {image} {left}: the device gets an "
@@ -54,3 +66,7 @@ def line_of(event: object) -> tuple[str, int] | None:
             return f"bytes on 0x{can_id:03X} ignored: {why}: {data[:24].hex(' ')}", 2
         case _:
             return None
+
+
+def _span(seconds: float) -> str:
+    return f"{seconds / 60:.0f} min" if seconds >= _MINUTES_FROM_S else f"{seconds:.0f} s"

@@ -15,7 +15,13 @@ from typing import Any, Final
 from flasher import events
 from flasher.events import Phase
 from flasher.host.identity import CheckResult
-from flasher.host.options import UpgradeOptions, firmware_version, overall_timeout_s
+from flasher.host.options import (
+    ERASURES_MAX,
+    OTHER_TOOL_QUIET_S,
+    UpgradeOptions,
+    firmware_version,
+    overall_timeout_s,
+)
 from flasher.host.outcome import DeviceLeft, Outcome, Statistics, standing
 from flasher.host.runner import Came, Runner, Signal, Stage
 from flasher.host.table import TABLE, TIMERS, Ending, Event, Reason, State
@@ -65,6 +71,9 @@ _PHASES: Final = {
 """Phases that people are told, by state; the other states leave the phase as it is."""
 _RESUMED: Final = frozenset({State.TRANSFERRING, State.SETTLING, State.ENDING, State.CONFIRMING})
 """States that go on where they stood when a lost adapter is back."""
+_FROM_THE_UPDATE: Final = frozenset({Reason.RESTARTED, Reason.REQUEST_LATE, Reason.BOOT_SILENT})
+"""Reasons for an attempt that begins with the update command: the bootloader is there."""
+_SILENT: Final = frozenset({Ending.NO_BOOT_VERSION, Ending.NO_ANNOUNCEMENT})
 _LEFT_SO: Final = {
     Ending.COMPLETED: DeviceLeft.NEW,
     Ending.CONFIRMED_BY_VERSION: DeviceLeft.NEW,
@@ -164,11 +173,14 @@ class UpgradeStage:
         """When the last update command left."""
         self._silence_was_answered = False
         """An update command was sent into the silence of a device (R26)."""
-        self._attempts = options.attempts
+        self._attempts = options.planned_attempts
         """How many there may be. Those that look for a session left open are not among them."""
         self._last_boot: BootVersion | None = None
-        self._erased = False
-        """Request transfer came: the old application is gone."""
+        self._erasures = self._whole_transfers = 0
+        """How often request transfer came (the old application is gone then), and in how many of
+        the attempts end of transfer left."""
+        self._failure: tuple[Ending, Received] | None = None
+        """How an attempt before would have ended the upgrade, had it been the last."""
         self._failed_packet: int | None = None
         """The packet that ended an earlier attempt."""
         self._nak_next_seen = False
@@ -189,6 +201,10 @@ class UpgradeStage:
     @property
     def _packet(self) -> int | None:
         return self._at.packet if self._phase is Phase.TRANSFER else None
+
+    @property
+    def _erased(self) -> bool:
+        return self._erasures > 0
 
     @property
     def _was_told_to_update(self) -> bool:
@@ -226,8 +242,27 @@ class UpgradeStage:
         return self.state is State.AWAITING_REQUEST and at.first_update_left_at is not None
 
     @property
+    def goes_on(self) -> bool:
+        """True when only the overall deadline ends the attempts: the device has no application to
+        lose, as far as is known, and nobody has limited them.
+        """
+        options = self._options
+        if options.attempts is not None or self._erasures >= ERASURES_MAX:
+            return False
+        # An image that was taken as a whole and not accepted is as good as refused.
+        if self._whole_transfers >= options.planned_attempts:
+            return False
+        # An application that answers the reset is not erased.
+        return self._has_begun and (self._erased or not self._at.feedback_came)
+
+    @property
+    def is_yielding(self) -> bool:
+        """True while another tool is waited for to be silent."""
+        return self.state is State.YIELDING
+
+    @property
     def _is_last_attempt(self) -> bool:
-        return self._attempt >= self._attempts
+        return self._attempt >= self._attempts and not self.goes_on
 
     @property
     def _has_begun(self) -> bool:
@@ -244,7 +279,9 @@ class UpgradeStage:
 
     @property
     def _is_last_try(self) -> bool:
-        return self._at.tries >= self._timings.packet_tries
+        options = self._options
+        tries = options.tries_without_application if self.goes_on else options.timings.packet_tries
+        return self._at.tries >= tries
 
     # -- the stage -------------------------------------------------------------------------------
 
@@ -341,7 +378,7 @@ class UpgradeStage:
             return
         self.state, self._state_since = state, self._run.now
         self._timer_at = inf
-        phase = _PHASES[state]
+        phase = _PHASES.get(state, self._phase)
         if phase is not self._phase:
             self._phase = phase
             self._run.tell(events.PhaseEntered(phase, self._attempt))
@@ -400,6 +437,7 @@ class UpgradeStage:
                 if state is State.AWAITING_REQUEST:
                     wait_s = timings.request_transfer_timeout_s
             case Command.END_OF_TRANSFER, state:
+                self._whole_transfers += not at.end_copies_left
                 at.end_copies_left += 1
                 if state is State.ENDING and at.announced_at is None:
                     wait_s = timings.complete_timeout_s
@@ -428,8 +466,23 @@ class UpgradeStage:
                 what += f": {type(row).__name__.upper()} {number}"
         self._run.tell(events.Reported(what))
 
+    def _fail(self, ending: Ending, row: Received, reason: Reason) -> None:
+        """Begin another attempt, or end where none is left."""
+        if self._is_last_attempt:
+            self._end(ending, row)
+            return
+        if self._failure is None or ending not in _SILENT:
+            self._failure = (ending, row)  # that it is silent since then says less
+        if reason in _FROM_THE_UPDATE:
+            self._start_over(row, reason)
+        else:
+            self._begin_again(row, reason)
+
     def _begin_again(self, row: Received, reason: Reason = Reason.LINK_BACK) -> None:
         """Another attempt, from the reset on."""
+        if self.state is State.RESETTING and self.goes_on:
+            self._send_reset()  # nothing was begun in this attempt
+            return
         self._next_attempt(reason)
         self._go(State.RESETTING)
         self._send_reset()
@@ -447,7 +500,8 @@ class UpgradeStage:
             self._failed_packet = self._at.packet
         self._at = _Attempt()
         self._attempt += 1
-        self._run.tell(events.AttemptStarted(self._attempt, reason.value))
+        left_s = self._deadline_at - self._run.now if self.goes_on else 0.0
+        self._run.tell(events.AttemptStarted(self._attempt, reason.value, left_s))
 
     def _repeated(self, what: str, reason: Reason, tries: int) -> None:
         self._repetitions += 1
@@ -455,10 +509,7 @@ class UpgradeStage:
 
     def _restarted(self, row: BootVersion | RequestTransfer, reason: Reason) -> None:
         """The device has lost what it had received."""
-        if self._is_last_attempt:
-            self._end(Ending.RESTARTED, row)
-        else:
-            self._start_over(row, reason)
+        self._fail(Ending.RESTARTED, row, reason)
 
     # -- actions: up to the update command --------------------------------------------------------
 
@@ -476,7 +527,10 @@ class UpgradeStage:
         self._tx.drop_unstarted()
         wait_s = self._boot_timeout_s
         self._timer_at = max(self._run.now, self._tx.left_at) + wait_s
-        if self._asks_for_power and self.heard is None:
+        is_silent = self._silence_was_answered and self._heard_at < self._update_left_at
+        if is_silent and self.goes_on:
+            self._run.tell(events.PowerCycleAwaited(self._deadline_at - self._run.now))
+        elif self._asks_for_power and self.heard is None:
             self._run.tell(events.PowerCycleAwaited(wait_s))
 
     def _wait_or_begin_again(self, row: Received) -> None:
@@ -521,26 +575,29 @@ class UpgradeStage:
         if self.in_session or (self._has_begun and not self._is_last_attempt):
             silent_since = max(self._heard_at, self._update_left_at, self._began_at)
             erased_at = silent_since + self._timings.request_transfer_timeout_s
-            was_tried = self._at.feedback_came or self._silence_was_answered
-            if was_tried and not self.in_session:
-                self._begin_again(row, Reason.BOOT_GIVEN_UP)
+            was_tried = self._silence_was_answered and not self.goes_on
+            if (self._at.feedback_came or was_tried) and not self.in_session:
+                self._fail(self._silent_ending, row, Reason.BOOT_GIVEN_UP)
             elif self._run.now < erased_at:
                 self._timer_at = erased_at
             else:
-                # It may sit in a session that never ends and knows no reset: once, and only here,
-                # an update command goes into silence.
+                # It may sit in a session that never ends and knows no reset: an update command goes
+                # into the silence, once, or, where nothing can be lost, after each erase limit.
                 self._silence_was_answered = True
                 self._attempts += self.in_session
-                self._start_over(row, Reason.BOOT_SILENT)
-        elif self._failed_packet is not None:
-            self._end(Ending.PACKET_FAILED, row)
-        elif self._asks_for_power:
-            self._end(Ending.NO_ANNOUNCEMENT, row)
-        elif self._options.at_power_up:
+                self._fail(self._silent_ending, row, Reason.BOOT_SILENT)
+        elif self._options.at_power_up and self._silent_ending is Ending.NO_BOOT_VERSION:
             self._asks_for_power = True
             self._wait_for_boot()
         else:
-            self._end(Ending.NO_BOOT_VERSION, row)
+            self._end(self._silent_ending, row)
+
+    @property
+    def _silent_ending(self) -> Ending:
+        """How it ends where the device stays silent."""
+        if self._failed_packet is not None:
+            return Ending.PACKET_FAILED
+        return Ending.NO_ANNOUNCEMENT if self._asks_for_power else Ending.NO_BOOT_VERSION
 
     def _answer_boot_again(self, boot: BootVersion) -> None:
         """After an update command was sent, before request transfer (R2)."""
@@ -555,10 +612,17 @@ class UpgradeStage:
         elif not self._tx.idle or now - self._update_left_at < timings.update_spacing_s:
             pass  # too soon to be an answer to the update command
         elif first_at is not None and now - first_at > timings.request_transfer_timeout_s:
-            self._end(Ending.UNHEARING, boot)
+            self._miss_hearing(boot)
         else:
             self._note_boot(boot)
             self._send_update()
+
+    def _miss_hearing(self, boot: BootVersion) -> None:
+        """It announces itself for as long as an erase may take, whatever it is told."""
+        if self._erased:
+            self._fail(Ending.UNHEARING, boot, Reason.REQUEST_GIVEN_UP)
+        else:
+            self._end(Ending.UNHEARING, boot)
 
     def _miss_request(self, row: Received) -> None:
         if not self._has_begun and self._asks_for_power:
@@ -567,12 +631,10 @@ class UpgradeStage:
             self._await_boot(row)
         elif not self._has_begun:
             self._end(Ending.NO_BOOT_VERSION, row, "nor an answer to the update command")
-        elif not self._is_last_attempt:
-            self._begin_again(row, Reason.REQUEST_GIVEN_UP)
-        elif self._failed_packet is not None and self._at.boot is None:
-            self._end(Ending.PACKET_FAILED, row)
         else:
-            self._end(Ending.NO_REQUEST, row)
+            is_silent = self._failed_packet is not None and self._at.boot is None
+            ending = Ending.PACKET_FAILED if is_silent else Ending.NO_REQUEST
+            self._fail(ending, row, Reason.REQUEST_GIVEN_UP)
 
     def _await_request_or_begin_again(self, row: Received) -> None:
         if self._is_updating:
@@ -592,7 +654,8 @@ class UpgradeStage:
             text = f"no boot version in an open session; the manifest asks for {minimum}"
             self._run.tell(events.CheckMade("boot-version", "unknown", text))
         self.unchecked = None
-        self._at.request_at, self._erased = self._run.now, True
+        self._at.request_at = self._run.now
+        self._erasures += 1
         self._next_packet(1)
 
     # -- actions: the transfer --------------------------------------------------------------------
@@ -663,10 +726,7 @@ class UpgradeStage:
         self._repeated(f"packet {self._at.packet}", reason, self._at.tries)
 
     def _packet_lost(self, row: Received) -> None:
-        if self._is_last_attempt:
-            self._end(Ending.PACKET_FAILED, row)
-        else:
-            self._begin_again(row, Reason.PACKET_GIVEN_UP)
+        self._fail(Ending.PACKET_FAILED, row, Reason.PACKET_GIVEN_UP)
 
     def _resend_packet(self, row: Received) -> None:
         self._send_packet()
@@ -786,16 +846,45 @@ class UpgradeStage:
         else:
             self._end(Ending.OTHER_VERSION, answer, f"{running} instead of {expected}")
 
+    # -- actions: beside another tool -------------------------------------------------------------
+
+    def _yield_or_end(self, row: Received) -> None:
+        """Another tool writes. A device that has no application is upgraded again when that tool is
+        silent; one that may be complete, or untouched, is left to who looks at it.
+        """
+        is_complete_perhaps = self._at.end_copies_left > 0
+        is_erased_perhaps = self._was_told_to_update and not is_complete_perhaps
+        may_wait = self._options.waits_for_other_tool and not self._is_last_attempt
+        if not (is_erased_perhaps and may_wait):
+            self._end(Ending.SECOND_TOOL, row, self._second_tool)
+            return
+        if not self.is_yielding:
+            self._run.tell(events.SecondToolAwaited(self._second_tool, OTHER_TOOL_QUIET_S))
+        self._go(State.YIELDING)
+        self._yield_on(row)
+
+    def _yield_on(self, row: Received) -> None:
+        self._timer_at = self._run.now + OTHER_TOOL_QUIET_S
+
+    def _take_turn(self, row: Received) -> None:
+        self._fail(Ending.SECOND_TOOL, row, Reason.SECOND_TOOL)
+
     # -- the end ---------------------------------------------------------------------------------
 
     def _end_broken(self, row: Received) -> None:
         self._end(Ending.BROKEN_PROTOCOL, row)
 
-    def _end_for_second_tool(self, row: Received) -> None:
-        self._end(Ending.SECOND_TOOL, row, self._second_tool)
-
     def _end_out_of_time(self, row: Received) -> None:
-        self._end(Ending.OUT_OF_TIME, row)
+        """End as an attempt before would have, where it went on only for nothing to lose."""
+        ending = Ending.OUT_OF_TIME
+        if self.is_yielding:
+            ending = Ending.SECOND_TOOL
+        elif self._failure is not None and self._attempt > self._attempts:
+            ending, row = self._failure
+        if ending is Ending.SECOND_TOOL:
+            self._end(ending, row, self._second_tool)
+        else:
+            self._end(ending, row)
 
     def _end_cancelled(self, row: Received) -> None:
         self._end(Ending.CANCELLED, row)

@@ -29,7 +29,7 @@ from flasher.errors import ErrorCode, Fault, ImageError, UsageError
 from flasher.files import read_toml
 from flasher.form import Bounds, Form
 from flasher.host.identity import Identity
-from flasher.host.options import PACKET_GAP_MAX_S, UpgradeOptions
+from flasher.host.options import DEFAULT_ATTEMPTS, PACKET_GAP_MAX_S, UpgradeOptions
 from flasher.host.query import Request
 from flasher.image.image import Image
 from flasher.image.plausible import Cpu
@@ -197,8 +197,8 @@ class Profile:
     has_upgrade: bool = WELLING.has_upgrade
     """Upgrade, even where the document has cancelled it (section 6)."""
     timings: Timings = DEFAULT_TIMINGS
-    attempts: Tries = UpgradeOptions.attempts
-    """How often the upgrade may begin."""
+    attempts: Tries = DEFAULT_ATTEMPTS
+    """How often the upgrade may begin. The default holds until the device is erased."""
     timeout_s: Time | None = None
     """Overall deadline; without it one is computed from the plan."""
     power_up_timeout_s: Time = UpgradeOptions.power_up_timeout_s
@@ -271,10 +271,18 @@ class Profile:
         query = self.version_query
         if query is not None and query != documented_query(self.target):
             options["version_request"] = query.request(self.target)
+        if self.attempts == DEFAULT_ATTEMPTS and not self._is_chosen("attempts"):
+            options["attempts"] = None
         options |= given
         base: Timings = options["timings"]
-        options["timings"] = replace(base, **timings)
+        options["timings"] = chosen = replace(base, **timings)
+        if "packet_tries" in timings or self._is_chosen("timings.packet_tries"):
+            options.setdefault("patient_tries", chosen.packet_tries)
         return UpgradeOptions(**options)
+
+    def _is_chosen(self, name: str) -> bool:
+        """True when somebody has set this value, be it to its default."""
+        return self.sources.get(name, DEFAULT) != DEFAULT
 
     def identity(self, **overrides: Any) -> Identity:
         """What is checked before an upgrade, with the limits of this product. `overrides` are the

@@ -90,8 +90,12 @@ class UnitTarget:
         self._cancelled = cancelled
 
     def options(self, **overrides: object) -> UpgradeOptions:
-        """The options of an upgrade, those of the product."""
-        chosen = self.loaded.profile.upgrade_options(**overrides)
+        """The options of an upgrade, those of the product. A unit that does not take its image in
+        some attempts is a failed one, and another tool a fault of the station.
+        """
+        profile = self.loaded.profile
+        limited = {"attempts": profile.attempts, "waits_for_other_tool": False}
+        chosen = profile.upgrade_options(**(limited | overrides))
         return release_options(chosen, self.loaded.release)
 
     # -- asking -----------------------------------------------------------------------------------

@@ -474,12 +474,11 @@ class Bench:
         match event:
             case events.PacketAcknowledged(number, _, _):
                 changes |= {"packet": number, "furthest": max(number, self.state.furthest)}
+                changes["power_cycle_s"] = None
                 began_s = self.state.transfer_began_s
                 changes["transfer_began_s"] = self._now() if began_s is None else began_s
             case events.PhaseEntered(phase, _):
                 changes["phase"] = phase
-                if phase is not events.Phase.BOOT:
-                    changes["power_cycle_s"] = None
             case events.AttemptStarted():
                 changes |= {"packet": 0, "transfer_began_s": None}
             case events.MessageRepeated():
@@ -488,8 +487,8 @@ class Bench:
                 changes |= {"power_cycle_s": limit_s, "power_cycle_since_s": self._now()}
             case events.AdapterAwaited(left_s):
                 changes["adapter_left_s"] = left_s
-            case events.AdapterBack():
-                changes["adapter_left_s"] = None
+            case events.AdapterBack() | events.BootVersionSeen():
+                changes |= {"adapter_left_s": None, "power_cycle_s": None}
             case events.CheckMade():
                 changes["checks"] = (*self.state.checks, event)
         if note := _note_of(event):

@@ -116,7 +116,7 @@ def refused_by_the_driver(scene: Scene) -> Words:
         real(link, frame)
 
     scene.patch.setattr(SimulatedLink, "send", send)
-    return scene.flash()
+    return scene.flash("--attempts", "3")
 
 
 def second_tool(scene: Scene) -> Words:
@@ -126,7 +126,7 @@ def second_tool(scene: Scene) -> Words:
         stage.bus.attach(Speaker(OTHER_TOOL, every_s=60.0, begins_at=stage.clock.now()))
 
     stage.at_packet[2] = speak
-    return scene.flash()
+    return scene.flash("--attempts", "1")
 
 
 def second_tool_forced(scene: Scene) -> Words:
@@ -163,7 +163,7 @@ def restarts(scene: Scene) -> Words:
         scene.stage.cycle_power()
 
     scene.stage.at_packet[3] = again
-    return scene.flash()
+    return scene.flash("--attempts", "3")
 
 
 def refuses(scene: Scene) -> Words:

@@ -94,7 +94,7 @@ def test_the_host_copes_with_a_device_that_strays(script: DeviceScript) -> None:
             Ending.TWO_DEVICES,
             ExitCode.WRONG_DEVICE,
         ),
-        (DeviceScript(nak={7: 99}), Ending.PACKET_FAILED, ExitCode.TRANSFER),
+        (DeviceScript(nak={7: 9999}), Ending.PACKET_FAILED, ExitCode.TRANSFER),
         (DeviceScript(silent_after=0), Ending.PACKET_FAILED, ExitCode.TRANSFER),
         (DeviceScript(silent_after=6), Ending.PACKET_FAILED, ExitCode.TRANSFER),
         (DeviceScript(complete_at=4), Ending.BROKEN_PROTOCOL, ExitCode.TRANSFER),

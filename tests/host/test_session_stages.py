@@ -87,6 +87,7 @@ class Witness:
 def test_a_second_tool_ends_the_session_in_every_stage_and_not_one_frame_more_is_sent(
     phase: Phase | str, frame: Frame
 ) -> None:
+    """Where an attempt is left, a device that is erased gets it: not here (see below)."""
     stage, witness = Stage(), Witness()
     if phase is Phase.CONFIRM:
         stage.disturb = lose_complete_and_what_the_new_application_says
@@ -96,7 +97,7 @@ def test_a_second_tool_ends_the_session_in_every_stage_and_not_one_frame_more_is
         stage.bus.attach(Speaker(frame, every_s=60.0, begins_at=now + 0.0011))
 
     once(stage, phase, speak)
-    result = stage.flash(taps=[witness])
+    result = stage.flash(options=UpgradeOptions(attempts=1), taps=[witness])
     assert witness.has_heard
     assert witness.sent_after == []
     assert result.exit_code == ExitCode.BUS
@@ -232,8 +233,99 @@ def test_a_second_tool_is_heard_among_echoes() -> None:
     stage.at_packet[2] = lambda: stage.bus.attach(
         Speaker(OTHER_TOOL, every_s=60.0, begins_at=stage.clock.now())
     )
-    assert stage.flash(taps=[witness]).exit_code == ExitCode.BUS
+    result = stage.flash(options=UpgradeOptions(attempts=1), taps=[witness])
+    assert result.exit_code == ExitCode.BUS
     assert witness.sent_after == []
+
+
+# -- another tool that writes while the device is erased ------------------------------------------
+
+
+class Timed(Witness):
+    """A witness that knows when."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.heard_at = 0.0
+        self.sent_again_at: float | None = None
+
+    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
+        super().__call__(frame, sent=sent, now=now)
+        if self.has_heard and not sent and frame.can_id == OTHER_TOOL.can_id:
+            self.heard_at = now
+        if self.sent_after and self.sent_again_at is None:
+            self.sent_again_at = now
+
+
+def interrupted_by(*frames: Frame, every_s: float, limit: int) -> tuple[Stage, Timed]:
+    """Another tool sends these in turn from packet 2 on."""
+    stage, witness = Stage(), Timed()
+    stage.at_packet[2] = lambda: stage.bus.attach(
+        Speaker(*frames, every_s=every_s, begins_at=stage.clock.now() + 0.0011, limit=limit)
+    )
+    return stage, witness
+
+
+@each("frames, every_s", [((OTHER_TOOL,), 1.9), ((OTHER_TOOL, *QUERY), 1.9)])
+def test_an_erased_device_is_upgraded_again_when_the_other_tool_was_silent_for_two_seconds(
+    frames: tuple[Frame, ...], every_s: float
+) -> None:
+    """CO-03. Whatever the other tool says meanwhile, a query too, is no silence."""
+    stage, witness = interrupted_by(*frames, every_s=every_s, limit=6)
+    result = stage.flash(taps=[witness])
+    assert result.exit_code == ExitCode.OK
+    assert stage.has == IMAGE.data
+    assert witness.sent_again_at is not None
+    assert 2.0 <= witness.sent_again_at - witness.heard_at < 2.01
+    (told,) = stage.seen(events.SecondToolAwaited)
+    assert OTHER_TOOL.data.hex(" ") in told.seen
+    assert told.quiet_s == 2.0
+    (started,) = stage.seen(events.AttemptStarted)
+    assert (started.attempt, started.reason) == (2, "second_tool")
+
+
+def test_another_tool_that_does_not_fall_silent_ends_it_at_the_overall_deadline() -> None:
+    stage, witness = interrupted_by(OTHER_TOOL, every_s=1.5, limit=1000)
+    result = stage.flash(options=UpgradeOptions(timeout_s=20.0), taps=[witness])
+    assert witness.sent_after == []
+    assert result.outcome.ending is Ending.SECOND_TOOL
+    assert result.exit_code == ExitCode.BUS
+    assert stage.clock.now() == pytest.approx(20.0)
+    assert OTHER_TOOL.data.hex(" ") in result.outcome.detail
+    assert result.outcome.device_left is DeviceLeft.NO_APPLICATION
+
+
+def test_another_tool_can_be_waited_for_as_often_as_attempts_are_left() -> None:
+    stage, witness = interrupted_by(OTHER_TOOL, every_s=2.5, limit=100)
+    result = stage.flash(options=UpgradeOptions(attempts=3), taps=[witness])
+    assert result.outcome.ending is Ending.SECOND_TOOL
+    assert result.outcome.statistics.attempts == 3
+
+
+def test_the_user_ends_the_wait_for_another_tool() -> None:
+    stage, _ = interrupted_by(OTHER_TOOL, every_s=1.0, limit=1000)
+    stage.cancelled = lambda: stage.clock.now() > 5.0
+    result = stage.flash()
+    assert result.outcome.ending is Ending.CANCELLED
+    assert stage.clock.now() < 5.2
+
+
+def test_a_packet_of_another_tool_that_begins_as_an_own_one_is_noticed() -> None:
+    """Its first frame is equal to one that was sent, so that it is taken for an echo."""
+    stage = Stage()
+    other = image_of(4, seed=77)
+    foreign = stage.plan(other).packet_frames(2)
+    assert foreign[0] == stage.plan().packet_frames(2)[0]
+    stage.wrap = lambda link: Echoing(link, stage, lambda _number: 1, 0.001)
+
+    def tamper() -> None:
+        begins_at = stage.clock.now() + 0.0005
+        stage.bus.attach(Speaker(*foreign, every_s=0.0, begins_at=begins_at, limit=len(foreign)))
+
+    stage.at_packet[3] = tamper
+    assert stage.flash().exit_code == ExitCode.OK
+    assert stage.has == IMAGE.data
+    assert stage.seen(events.SecondToolAwaited)
 
 
 # -- two devices ----------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -36,6 +36,7 @@ from flasher.cli.upgrade.carried import Carried
 from flasher.cli.values import IMAGE_SUFFIXES, TRACE_SUFFIXES
 from flasher.errors import ErrorCode, FlasherError, UsageError
 from flasher.files import parse_json, read
+from flasher.host.options import DEFAULT_ATTEMPTS
 from flasher.procedures import DeviceInfo
 from flasher.protocol.spec import BMS, Target
 from flasher.protocol.text import printable
@@ -280,6 +281,18 @@ class VirtualBikes(_Place):
 
     def connect(self, adapter: Adapter, *, asks: bool = True) -> AbstractContextManager[Connection]:
         return self._bikes[adapter.name].connect()
+
+    def upgrade(
+        self,
+        adapter: Adapter,
+        job: Job,
+        *,
+        on_event: Callable[[object], None],
+        cancelled: Callable[[], bool],
+    ) -> bench.Carried:
+        """What is wrong with a bike is shown, and not waited for until the overall deadline."""
+        limited = replace(job, options=replace(job.options, attempts=DEFAULT_ATTEMPTS))
+        return super().upgrade(adapter, limited, on_event=on_event, cancelled=cancelled)
 
     def _told(
         self, adapter: Adapter, job: Job, on_event: Callable[[object], None]

@@ -33,7 +33,12 @@ from flasher.cli.upgrade.progress import Progress
 from flasher.cli.upgrade.text import DryRunDocument, UpgradeDocument
 from flasher.errors import ExitCode, FlasherError
 from flasher.host.identity import WAIVABLE, Check
-from flasher.host.options import DEFAULT_ATTEMPTS, DEFAULT_POWER_UP_TIMEOUT_S, UpgradeOptions
+from flasher.host.options import (
+    DEFAULT_ATTEMPTS,
+    DEFAULT_POWER_UP_TIMEOUT_S,
+    PATIENT_TRIES,
+    UpgradeOptions,
+)
 from flasher.host.outcome import AGAIN
 from flasher.host.verify import Level
 from flasher.host.waivers import OF_DEVICE, OUTSIDE_VECTOR
@@ -164,12 +169,14 @@ _upgrade_options: Final = option_set(
     ),
     option(
         "--retries", type=values.count, metavar="N", panel="upgrade",
-        help=f"send a packet up to N times (default {DEFAULT_TIMINGS.packet_tries})",
+        help=f"send a packet up to N times (default {DEFAULT_TIMINGS.packet_tries}, and "
+        f"{PATIENT_TRIES} once the device has no application)",
     ),
     option(
         "--attempts", type=values.count, metavar="N", panel="upgrade",
         help="begin the upgrade up to N times: when the device restarts, a packet is lost for good "
-        f"or the adapter comes back (default {DEFAULT_ATTEMPTS})",
+        f"or the adapter comes back (default {DEFAULT_ATTEMPTS}, and until the overall deadline "
+        "once the device has no application)",
     ),
     option(
         "--timeout", type=values.seconds, metavar="S", panel="upgrade",
