@@ -428,7 +428,8 @@ class ObservedUpgrade:
 
     def _next_attempt(self, at_s: float) -> None:
         """The tool starts over: what belongs to one attempt alone begins anew."""
-        if self.phase in (Phase.TRANSFER, Phase.END):
+        is_first = self.phase is Phase.UPDATE and self.earlier is None
+        if is_first or self.phase in (Phase.TRANSFER, Phase.END):
             self.earlier = self.judge(self, at_s)
         self._leave(at_s)
         self.phase = None

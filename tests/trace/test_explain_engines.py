@@ -48,7 +48,7 @@ class Tapped(Traffic):
         (DeviceScript(wrong_name=True), Ending.WRONG_DEVICE, Cause.WRONG_DEVICE),
         (DeviceScript(no_request=True), Ending.NO_REQUEST, Cause.NO_REQUEST),
         (DeviceScript(nak={7: 2}), Ending.COMPLETED, Cause.COMPLETED),
-        (DeviceScript(nak={7: 99}), Ending.PACKET_FAILED, Cause.PACKET_REFUSED),
+        (DeviceScript(nak={7: 9999}), Ending.PACKET_FAILED, Cause.PACKET_REFUSED),
         (DeviceScript(silent_after=6), Ending.PACKET_FAILED, Cause.PACKET_UNANSWERED),
         (DeviceScript(restart_at=5), Ending.COMPLETED, Cause.COMPLETED),
         (DeviceScript(drop_ack=frozenset({3, 9})), Ending.COMPLETED, Cause.COMPLETED),

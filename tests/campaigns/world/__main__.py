@@ -104,13 +104,16 @@ def report(found: Sequence[tuple[int, Verdict]]) -> bool:
 def compare(found: Sequence[tuple[int, Verdict]], chosen: argparse.Namespace) -> None:
     """What other patience saves of the runs that left the device without an application."""
     lost = [(seed, v) for seed, v in found if v.left.startswith("none") and v.ending != "cancelled"]
-    rows: list[tuple[object, ...]] = [_row("default", lost)]
+    rows: list[tuple[object, ...]] = [_row(chosen.options or "default", lost)]
     before = dict(lost)
     for each in chosen.settings:
         again = list(verdicts([seed for seed, _ in lost], chosen, each))
-        rows.append(_row(each, again))
+        rows.append(_row(each or "default", again))
         saved = Counter(before[s].ending for s, v in again if v.is_good)
-        say(f"{each}: saved " + ", ".join(f"{n} {ending}" for ending, n in saved.most_common()))
+        say(
+            f"{each or 'default'}: saved "
+            + ", ".join(f"{n} {ending}" for ending, n in saved.most_common())
+        )
     say()
     table(rows, ("setting", "lost", "saved", "median time to give up", "longest", "faults"))
 

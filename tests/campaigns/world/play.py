@@ -319,8 +319,10 @@ class Player:
             runs += 1
             began_at = self.clock.now()
             had = self._word_for(self.units[0])
-            limit_s = overall_timeout_s(self._image_plan, self._options)
-            claim = self._run(began_at + limit_s * 1.5 + 60.0)
+            # This computer's history knows of a run that has no end.
+            options = replace(self._options, in_session=runs > 1)
+            limit_s = overall_timeout_s(self._image_plan, options)
+            claim = self._run(options, began_at + limit_s * 1.5 + 60.0)
             took_s = self.clock.now() - began_at
             if claim is None:
                 assert self._kill is not None
@@ -365,7 +367,7 @@ class Player:
     def _image_plan(self) -> ImagePlan:
         return image_plan(self.image, self.target, WELLING.bitrate_bps)
 
-    def _run(self, overdue_at: float) -> _Claim | None:
+    def _run(self, options: UpgradeOptions, overdue_at: float) -> _Claim | None:
         """One run of the command; None when its process was killed."""
         self._may_have_erased = False
         self._link = link = WorldLink(self.bus, self.plan.adapter)
@@ -375,7 +377,7 @@ class Player:
         try:
             result = device.upgrade(
                 self._image_plan,
-                options=self._options,
+                options=options,
                 identity=Identity(),
                 on_event=self._note,
                 cancelled=lambda: self._is_interrupted,

@@ -1,0 +1,92 @@
+"""Plans of the campaign `tests.campaigns.world`: read, replayed, and judged by an honest oracle."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from flasher.host.outcome import Outcome
+from tests.campaigns.world import plans
+from tests.campaigns.world.draw import drawn
+from tests.campaigns.world.plans import Plan
+from tests.campaigns.world.play import play
+from tests.campaigns.world.stranger import frames_of
+from tests.loops import each
+
+VECTORS = Path(__file__).parent.parent / "vectors.json"
+SHORT = "world packets=3 ; stranger erase=0.05"
+
+
+@each("name", ["stranger", "mock"])
+def test_an_undisturbed_device_is_upgraded(name: str) -> None:
+    verdict = play(Plan.parse(f"world packets=3 ; {name}"))
+    assert verdict.is_good
+    assert (verdict.ending, verdict.left, verdict.faults) == ("completed", "new", ())
+
+
+def test_the_strangers_messages_are_those_of_the_document() -> None:
+    for vector in json.loads(VECTORS.read_text())["vectors"]:
+        head = (int(vector["can_id"], 16), int(vector["mode"], 16), int(vector["command"], 16))
+        frames = frames_of(*head, bytes.fromhex(vector["data"]))
+        assert [frame.data.hex() for frame in frames] == vector["can_frames"], vector["name"]
+
+
+def test_a_plan_that_is_printed_is_read_as_the_same() -> None:
+    for seed in range(300):
+        plan = drawn(seed)
+        assert Plan.parse(str(plan)) == plan
+        assert Plan.parse("\n".join(map(str, plan.clauses))) == plan
+        assert drawn(seed) == plan
+
+
+@each(
+    "line",
+    [
+        "nonsense",
+        "@noon lose",
+        "lose count=many",
+        "lose colour=red",
+        "stranger erase=soon",
+        "@packet3 tool does=sing",
+        "mock nonsense=1",
+    ],
+)
+def test_what_is_no_plan_is_refused(line: str) -> None:
+    with pytest.raises(ValueError, match=r"\w"):
+        Plan.parse(line)
+
+
+@each("seed", range(100, 112))
+def test_a_line_replays_a_run_frame_by_frame(seed: int) -> None:
+    plan = drawn(seed)
+    assert play(plan) == play(Plan.parse(str(plan)))
+
+
+def test_random_plans_end_in_no_false_success_and_no_false_claim() -> None:
+    for seed in range(60):
+        verdict = play(drawn(seed, twin_share=0.0))
+        assert verdict.faults == (), verdict
+
+
+def test_the_oracle_finds_a_success_that_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It believes the devices' flash only."""
+    monkeypatch.setattr(Outcome, "ok", property(lambda _outcome: True))
+    plan = Plan.parse("world target=wmc ; stranger ; @packet2 power ; @packet2+0.5 interrupt")
+    verdict = play(plan)
+    assert verdict.left == "none"
+    assert verdict.is_false
+
+
+def test_the_oracle_finds_a_twin_that_was_left_behind() -> None:
+    """The twin comes when all is transferred, and keeps what it had."""
+    joins = "@end+0.001 stranger begins=off"
+    verdict = play(Plan.parse(f"{SHORT} ; {joins}"))
+    assert verdict.left == "new / old"
+    assert verdict.is_false
+
+
+def test_each_clause_of_a_plan_is_drawn_by_some_seed() -> None:
+    names = {clause.NAME for seed in range(400) for clause in drawn(seed).clauses}
+    assert names == set(plans.CLAUSES)
