@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from flasher import events
 from flasher.bus.health import LinkHealth, TroubleKind, bus_off_error
-from flasher.bus.link import Clock, Link
+from flasher.bus.link import SEND_LIMIT_S, Clock, Link
 from flasher.driver import Tap
 from flasher.errors import (
     BusError,
@@ -22,7 +22,6 @@ from flasher.errors import (
     FlasherError,
     InterruptedByUserError,
     NoAnswerError,
-    TransferError,
     TransmitBlockedError,
     UsageError,
 )
@@ -60,7 +59,7 @@ from flasher.image.sample import is_sample, refused_sample
 from flasher.prose import prose
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import Memory, Reset, VersionInformation
-from flasher.protocol.engine import WELL_BEYOND, Engine
+from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, Command, Dialect, Target
@@ -112,23 +111,6 @@ class Tell:
 
 
 Step = Run | WaitUntil | Tell
-
-
-@dataclass(frozen=True)
-class _Blocked:
-    """The adapter's frames did not leave."""
-
-    error: TransmitBlockedError
-    received: int
-    """How many frames had arrived by then."""
-    again_at: float
-    """When it was tried again."""
-
-    def check(self, session: Session, now: float) -> None:
-        """Raise the error for a session that has failed before it could be raised again."""
-        is_late = now <= self.again_at + WELL_BEYOND * session.timings.inter_frame_timeout_s
-        if is_late and isinstance(session.result.error(), NoAnswerError | TransferError):
-            raise self.error
 
 
 T = TypeVar("T")
@@ -470,21 +452,19 @@ class Procedures:
         link = self.link
         before = link.health()
         self._check_bus("before anything was sent", session, before)
-        blocked: _Blocked | None = None
+        received: int | None = None
         try:
             while True:
                 try:
                     yield run
                     break
                 except TransmitBlockedError as error:
-                    blocked = yield from self._await_contact(session, error, blocked)
+                    received = yield from self._await_contact(session, error, received)
                 except BusError as error:
                     limit_s = inf if has_sent else BRIEF_ADAPTER_RETURN_S
                     wait_s = min(options.adapter_return_s, limit_s)
                     yield from self._await_adapter(session, error, wait_s)
                 session.link_back(self.clock.now())
-            if blocked is not None:
-                blocked.check(session, self.clock.now())
         except (BusError, InterruptedByUserError) as error:
             # The adapter does not know what it was used for.
             error.where = f"{session.standing}; {error.where}".removesuffix("; ")
@@ -526,21 +506,21 @@ class Procedures:
             raise error
 
     def _await_contact(
-        self, session: Session, error: TransmitBlockedError, before: _Blocked | None
-    ) -> Procedure[_Blocked]:
+        self, session: Session, blocked: TransmitBlockedError, told_at: int | None
+    ) -> Procedure[int]:
         """Let a session go on whose frames do not leave: a device without power acknowledges none.
-        Reported unless nothing has arrived since it was `before`. Raises the error where there is
-        something to lose, and at the overall deadline.
+        Reported unless nothing has arrived since it was, at `told_at` frames; returns how many
+        have. Raises the error where there is something to lose, and where the overall deadline
+        leaves no time for another try.
         """
         left_s = (session.deadline_at or inf) - self.clock.now()
-        if not session.goes_on or left_s <= _REOPEN_PAUSE_S:
-            raise error
+        if not session.goes_on or left_s <= SEND_LIMIT_S + _REOPEN_PAUSE_S:
+            raise blocked
         received = self.link.health().frames_received
-        if before is None or received != before.received:
-            yield Tell(events.BusBlocked(error.what, left_s))
-        again_at = self.clock.now() + _REOPEN_PAUSE_S
-        yield WaitUntil(again_at, _may_end(session))
-        return _Blocked(error, received, again_at)
+        if received != told_at:
+            yield Tell(events.BusBlocked(blocked.what, left_s))
+        yield WaitUntil(self.clock.now() + _REOPEN_PAUSE_S, _may_end(session))
+        return received
 
     def _await_adapter(self, session: Session, lost: BusError, wait_s: float) -> Procedure[None]:
         """Wait for a lost adapter, where an attempt is left for it; raises BusError without."""

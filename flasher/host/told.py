@@ -8,6 +8,8 @@ from flasher import events
 from flasher.prose import prose, prose_of
 
 _MINUTES_FROM_S: Final = 180.0
+_TRIES_SHOWN: Final = 10
+"""Every so many tries of a message, 5 s of them without an answer, it is seen without -v."""
 
 
 def because(reason: str, what: str = "") -> str:
@@ -50,7 +52,8 @@ def line_of(event: object) -> tuple[str, int] | None:
             text = f"the upgrade of {at.replace('T', ' ')} with {image} {left}: the device gets an "
             return f"{text}update command if it stays silent", 0
         case events.MessageRepeated(what, reason, tries):
-            return f"{because(reason, what)}: sending {what} again, try {tries}", 1
+            level = 1 if tries % _TRIES_SHOWN else 0
+            return f"{because(reason, what)}: sending {what} again, try {tries}", level
         case events.BootVersionSeen(name, version):
             return f"boot version: {name} {version}", 0
         case events.CheckMade(_, verdict, text):

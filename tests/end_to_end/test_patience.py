@@ -50,7 +50,7 @@ def test_a_bus_that_stays_blocked_ends_it_at_the_overall_deadline() -> None:
     assert raised.value.exit_code == ExitCode.BUS
     assert raised.value.needs_rescue
     limit_s = default_timeout_s(stage.plan(), options)
-    assert limit_s - 3.0 < stage.clock.now() <= limit_s + 2.1
+    assert limit_s - 5.0 < stage.clock.now() <= limit_s
     assert len(stage.seen(events.BusBlocked)) == 1
 
 

@@ -57,7 +57,7 @@ class Progress:
                 self._wait.close()
             case events.PowerCycleAwaited(limit_s):
                 # What the user has to do now, so that it is seen.
-                text = f"power-cycle the device now (waiting {limit_s:g} s)"
+                text = f"power-cycle the device now (waiting {limit_s:.0f} s)"
                 bold = painted(text, "yellow") if self._output.colour else text
                 self._output.error_line(f">>> {bold}")
         if warning := warning_of(event):

@@ -110,10 +110,8 @@ def compare(found: Sequence[tuple[int, Verdict]], chosen: argparse.Namespace) ->
         again = list(verdicts([seed for seed, _ in lost], chosen, each))
         rows.append(_row(each or "default", again))
         saved = Counter(before[s].ending for s, v in again if v.is_good)
-        say(
-            f"{each or 'default'}: saved "
-            + ", ".join(f"{n} {ending}" for ending, n in saved.most_common())
-        )
+        counts = ", ".join(f"{count} {ending}" for ending, count in saved.most_common())
+        say(f"{each or 'default'}: saved {counts}")
     say()
     table(rows, ("setting", "lost", "saved", "median time to give up", "longest", "faults"))
 
