@@ -1,5 +1,9 @@
 """A CAN bus in memory: exact bit times, arbitration by id, everybody hears everybody.
 
+Senders of one id at the same time are not parted by arbitration: the same frame becomes one, and
+different frames destroy each other until the controllers have counted so many errors that one is
+heard. Without `collides` they take turns, as on a virtual network.
+
 The devices on it are engines (`attach`), the host comes through a `SimulatedLink`. It is driven by
 the link's calls and has no thread: sending and receiving make its time pass, on whichever clock it
 was given. With a `VirtualClock` an upgrade takes no time at all, with a `PacedClock` as long as on
@@ -9,7 +13,8 @@ a real bus, with the same code.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from typing import Final
 
 from flasher.bus.health import (
     ControllerState,
@@ -25,6 +30,13 @@ from flasher.protocol.bittime import frame_bits
 from flasher.protocol.engine import Engine
 from flasher.protocol.frame import Frame
 
+_ERROR_FRAME_BITS: Final = 20
+"""Error flag, delimiter and the pause after it, about."""
+_ID_BITS: Final = 13
+"""Start, id and remote bit: what two senders of one id agree on."""
+_PASSIVE: Final = 128
+_OFF: Final = 256
+"""Transmit errors from which on a controller disturbs nobody any more, or is reset."""
 Disturbance = Callable[[Frame, float], Iterable[Frame]]
 """What becomes of a frame on the wire, given its end time: itself, nothing, two of it, another."""
 
@@ -38,6 +50,8 @@ class _Node:
     def __init__(self) -> None:
         self.outbox: deque[tuple[float, Frame]] = deque()
         """Frames to send, with the time at which each was queued."""
+        self.tx_errors = 0
+        """What its controller counts: 8 for an error, one less for a frame that was sent."""
 
 
 class _Host(_Node):
@@ -63,7 +77,12 @@ class SimulatedBus:
     """The wire, its nodes and its time."""
 
     def __init__(
-        self, bitrate_bps: int, clock: Clock, disturbance: Disturbance | None = None
+        self,
+        bitrate_bps: int,
+        clock: Clock,
+        disturbance: Disturbance | None = None,
+        *,
+        collides: bool = True,
     ) -> None:
         self.clock = clock
         self.frames_carried = 0
@@ -71,11 +90,14 @@ class SimulatedBus:
         """Time that the wire was in use."""
         self._bitrate_bps = bitrate_bps
         self._disturbance = disturbance
+        self._collides = collides
         self._nodes: list[_Node] = []
         """All hosts and devices, in the order in which they came."""
         self._hosts: list[_Host] = []
         self._devices: list[_Device] = []
-        self._sending: tuple[_Node, Frame] | None = None
+        self._sending: tuple[Sequence[_Node], Frame | None] | None = None
+        """Who sends, several the same frame in the same bits; None is a collision of different
+        frames, which nobody receives."""
         self._sending_ends_at = 0.0
         self._delivered_at: float | None = None
         """When a frame was delivered to which nobody has answered yet: devices are as exact as the
@@ -162,7 +184,7 @@ class SimulatedBus:
         """What the hosts had queued, or were sending, is gone."""
         for host in self._hosts:
             host.outbox.clear()
-        if self._sending is not None and self._sending[0] in self._hosts:
+        if self._sending is not None and self._sending[0][0] in self._hosts:
             self._sending = None
 
     def _serve_devices(self, now: float) -> None:
@@ -193,17 +215,46 @@ class SimulatedBus:
             waiting = [device for device in self._devices if device.outbox]
         if not waiting:
             return
-        winner = waiting[0]
+        winners: Sequence[_Node] = waiting
         if len(waiting) > 1:
-            winner = min(waiting, key=lambda node: node.outbox[0][1].can_id)
-        queued_at, frame = winner.outbox.popleft()
-        duration_s = frame_bits(frame) / self._bitrate_bps
+            lowest = min(node.outbox[0][1].can_id for node in waiting)
+            winners = [node for node in waiting if node.outbox[0][1].can_id == lowest]
+            if len(winners) > 1:
+                winners = self._contend(winners) if self._collides else winners[:1]
         # A paced clock wakes a little late, the wire does not: a frame that waited for the one
         # before follows it without a gap.
-        begins_at = max(self._sending_ends_at, queued_at)
-        self._sending = (winner, frame)
-        self._sending_ends_at = begins_at + duration_s
-        self.busy_s += duration_s
+        begins_at = max(self._sending_ends_at, min(node.outbox[0][0] for node in winners))
+        frame = winners[0].outbox[0][1]
+        if any(node.outbox[0][1] != frame for node in winners):
+            self._sending, bits = (winners, None), self._collide(winners)
+        else:
+            self._sending, bits = (winners, frame), frame_bits(frame)
+            for node in winners:
+                node.outbox.popleft()
+                node.tx_errors = max(0, node.tx_errors - 1)
+        self._sending_ends_at = begins_at + bits / self._bitrate_bps
+        self.busy_s += bits / self._bitrate_bps
+
+    def _contend(self, rivals: Sequence[_Node]) -> Sequence[_Node]:
+        """Who sends of several with one id, which arbitration does not part: all that send the
+        frame with the first dominant bit, and whoever still disturbs it.
+        """
+        first = min(_bits_after_id(node.outbox[0][1]) for node in rivals)
+        strongest = [node for node in rivals if _bits_after_id(node.outbox[0][1]) == first]
+        others = [node for node in rivals if node not in strongest]
+        if any(node.tx_errors < _PASSIVE for node in others):
+            return rivals
+        for node in others:
+            _count_error(node)
+        return strongest
+
+    def _collide(self, rivals: Sequence[_Node]) -> int:
+        """Senders of different frames under one id destroy both; returns the bits it takes."""
+        different = {_bits_after_id(node.outbox[0][1]) for node in rivals}
+        same = next(i for i, bits in enumerate(zip(*different, strict=False)) if len(set(bits)) > 1)
+        for node in rivals:
+            _count_error(node)
+        return _ID_BITS + 8 * same + _ERROR_FRAME_BITS
 
     def _try_in_vain(self, hosts: Iterable[_Host]) -> None:
         for host in hosts:
@@ -211,8 +262,10 @@ class SimulatedBus:
             duration_s = frame_bits(frame) / self._bitrate_bps
             self.faults.try_in_vain(queued_at, duration_s, 1 / self._bitrate_bps)
 
-    def _deliver(self, sender: _Node, frame: Frame) -> None:
+    def _deliver(self, senders: Sequence[_Node], frame: Frame | None) -> None:
         self._sending = None
+        if frame is None:
+            return
         self._delivered_at = self._sending_ends_at
         self.frames_carried += 1
         ends_at = self._sending_ends_at
@@ -220,11 +273,24 @@ class SimulatedBus:
         for carried in frames:
             now = ends_at
             for device in self._devices:
-                if device is not sender:
+                if device not in senders:
                     device.engine.receive(carried, now)
             for host in self._hosts:
-                if host is not sender and self.faults.takes_part:
+                if host not in senders and self.faults.takes_part:
                     host.inbox.append(carried)
+
+
+def _bits_after_id(frame: Frame) -> bytes:
+    """What decides between frames of one id, the lower first: a 0 is dominant."""
+    return bytes((frame.is_extended, len(frame.data))) + frame.data
+
+
+def _count_error(node: _Node) -> None:
+    """One that reaches bus-off loses its frame, and comes back at once."""
+    node.tx_errors += 8
+    if node.tx_errors >= _OFF:
+        node.tx_errors = 0
+        node.outbox.popleft()
 
 
 class SimulatedLink:

@@ -219,3 +219,55 @@ def test_the_clocks_only_go_forward_and_do_not_wait_for_the_past() -> None:
         clock.wait_until(before - 100.0)
         clock.wait_until(before + 0.001)
         assert clock.now() >= before + 0.001
+
+
+# -- several senders of one id --------------------------------------------------------------------
+
+
+def test_the_same_frame_of_two_senders_in_the_same_bits_is_one() -> None:
+    bus = SimulatedBus(BITRATE, VirtualClock())
+    frame = Frame(0x725, b"\x55\xaa\x0c")
+    one, two, third = Talker(frame), Talker(frame), Talker()
+    for talker in (one, two, third):
+        bus.attach(talker)
+    link = bus.link()
+    assert link.receive(1.0) == frame
+    assert link.receive(1.0) is None
+    assert len(third.heard) == 1
+    assert not one.heard
+    assert not two.heard
+    assert not one.outbox
+    assert not two.outbox
+
+
+def test_different_frames_of_one_id_collide_until_one_sender_is_error_passive() -> None:
+    clock = VirtualClock()
+    bus = SimulatedBus(BITRATE, clock)
+    low, high = Frame(0x725, b"\x55\x01"), Frame(0x725, b"\x55\x02")
+    bus.attach(Talker(high))
+    bus.attach(Talker(low))
+    link = bus.link()
+    assert link.receive(1.0) == low  # the first bit that differs is dominant
+    assert clock.now() > 16 * 30 / BITRATE  # sixteen tries in vain
+    assert link.receive(1.0) == high
+    assert bus.frames_carried == 2
+
+
+def test_a_controller_that_loses_again_and_again_goes_off_and_comes_back() -> None:
+    bus = SimulatedBus(BITRATE, VirtualClock())
+    loser = Talker(Frame(0x725, b"\xff"), Frame(0x725, b"\xfe\x01"))
+    bus.attach(Talker(*(Frame(0x725, bytes([number])) for number in range(20))))
+    bus.attach(loser)
+    link = bus.link()
+    heard = [link.receive(1.0) for _ in range(21)]
+    assert Frame(0x725, b"\xff") not in heard  # it was lost with the reset of the controller
+    assert Frame(0x725, b"\xfe\x01") in heard
+
+
+def test_on_a_virtual_network_senders_of_one_id_take_turns() -> None:
+    bus = SimulatedBus(BITRATE, VirtualClock(), collides=False)
+    frame, other = Frame(0x725, b"\x55\x02"), Frame(0x725, b"\x55\x01")
+    bus.attach(Talker(frame))
+    bus.attach(Talker(other))
+    link = bus.link()
+    assert [link.receive(1.0), link.receive(1.0)] == [frame, other]

@@ -159,9 +159,7 @@ class Watcher(Protocol):
 
 
 class WorldBus(SimulatedBus):
-    """A simulated bus that knows who sends, and on which equal frames that begin in the same bit
-    are one frame, as on a wire.
-    """
+    """A simulated bus that knows who sends."""
 
     def __init__(self, clock: VirtualClock) -> None:
         super().__init__(WELLING.bitrate_bps, clock, self._carried)
@@ -172,24 +170,12 @@ class WorldBus(SimulatedBus):
         self.host: SimulatedLink | None = None
         """The tool that runs now: what it sends is the host's."""
         self.on_echo: Callable[[Frame, float], None] | None = None
-        self.merged = 0
         self._sender: Any = None
 
-    def _arbitrate(self) -> None:
-        waiting = [node for node in self._nodes if node.outbox]
-        super()._arbitrate()
-        if self._sending is None:
-            return
-        sender, frame = self._sending
-        for node in waiting:
-            if node is not sender and node.outbox and node.outbox[0][1] == frame:
-                node.outbox.popleft()
-                self.merged += 1
-
-    def _deliver(self, sender: Any, frame: Frame) -> None:
-        self._sender = sender
-        super()._deliver(sender, frame)
-        if self.on_echo is not None and self._is_host(sender):
+    def _deliver(self, senders: Sequence[Any], frame: Frame | None) -> None:
+        self._sender = senders[0]
+        super()._deliver(senders, frame)
+        if self.on_echo is not None and frame is not None and self._is_host(senders[0]):
             self.on_echo(frame, self._sending_ends_at)
 
     def _is_host(self, sender: Any) -> bool:
