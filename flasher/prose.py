@@ -53,6 +53,7 @@ _TEXTS: Final[dict[str, dict[str, str]]] = {
         "version_other": "the application runs another version than the image names",
         "no_answer": "the application does not answer",
         "memory_other": "the memory differs from the image",
+        "two_devices": "two devices answer on the same id",
         "second_tool": "a second tool speaks on the bus",
         "interrupted": "interrupted by the user",
     },

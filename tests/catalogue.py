@@ -18,7 +18,14 @@ from babel.messages.pofile import read_po, write_po
 
 from flasher.events import Phase
 from flasher.host.items import meaningful_fields
-from flasher.host.outcome import _EXPLANATIONS, _NO_SESSION_EITHER, AGAIN, DeviceLeft, _late
+from flasher.host.outcome import (
+    _EXPLANATIONS,
+    _NO_SESSION_EITHER,
+    _TWO_TOLD_TO_UPDATE,
+    AGAIN,
+    DeviceLeft,
+    _late,
+)
 from flasher.host.table import Ending
 from flasher.host.verify import Verdict
 from flasher.prose import prose
@@ -48,6 +55,7 @@ def said() -> Iterator[str]:
     explained = [
         *_EXPLANATIONS.values(),
         _NO_SESSION_EITHER,
+        _TWO_TOLD_TO_UPDATE,
         *itertools.starmap(_late, itertools.product(Phase, DeviceLeft)),
     ]
     for each in explained:

@@ -276,7 +276,8 @@ READINGS: Final = {
         "that overlap: two devices of one kind are on the bus",
         "The document has one device of a kind. Nothing is written then, and in a transfer no "
         "success is claimed. Two that answer bit for bit alike in the same slot cannot be told "
-        "apart.",
+        "apart, and one that is silent cannot be found.",
+        host=("timings.boot_watch_s",),
     ),
     "R28": Reading(
         "an announcement that the tool did not cause means another unit, or a lost supply",

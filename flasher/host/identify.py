@@ -4,24 +4,22 @@ Asked are the version information (where the target has a query for it) and, of 
 running information. A device that sits in its bootloader announces itself instead of answering:
 that is heard, and ends the asking at once, so that the announcement can be answered in its window.
 Before the first question it listens for a moment, for another tool may be at work (`guard` hears
-it); after the version was told it listens a moment longer, for another device may tell another one.
+it); after the last one it listens for the answers of a second device (`twins`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from math import inf
 from typing import Any, Final
 
 from flasher.events import Phase, PhaseEntered
 from flasher.host.identity import DeviceAnswers
 from flasher.host.options import UpgradeOptions
-from flasher.host.query import Query, Request, ask_all
+from flasher.host.query import Query, Request, ask_all, count_answers
 from flasher.host.runner import Came, Runner, Signal, Stage, watched
 from flasher.image.plan import Plan
 from flasher.protocol import catalogue
 from flasher.protocol.contents import RunningInformation
-from flasher.protocol.fields import Content
 from flasher.protocol.messages import BootVersion, decode
 from flasher.protocol.spec import Node, Target
 from flasher.protocol.wire import Message
@@ -29,8 +27,6 @@ from flasher.protocol.wire import Message
 LISTEN_FIRST_S: Final = 0.1
 """How long every command that asks listens before it does. A tool that flashes sends more often,
 unless it waits for the device."""
-LISTENS_ON_S: Final = 0.1
-"""How much later than the first device a second one is still heard."""
 
 
 class Identify:
@@ -42,13 +38,12 @@ class Identify:
         version = options.version_request_for(plan.target)
         self._version_item = None if version is None else version.answer_item
         self._queries: list[Query] = []
-        self._listens_until = -inf
         self.phase = Phase.LISTEN
         """Where it stands."""
         self.heard: Message | None = None
         """The boot version that the device announced; None when it did not."""
-        self.answers: list[Content] = []
-        """Every version answer that came, each different one once: two are two devices."""
+        self.two_devices = ""
+        """What speaks for a second device, in words; empty while nothing does."""
         self.cancelled = False
 
     @property
@@ -78,9 +73,10 @@ class Identify:
         if self._requests and self.heard is None:
             run.tell(PhaseEntered(Phase.IDENTIFY, 1))
             asking = ask_all(run, self._while_silent(), self._queries, stop_at_silence=True)
-            yield from watched(asking, lambda came: self._look(run, came))
-        while not self.cancelled and self.heard is None and run.now < self._listens_until:
-            yield from self._listen(run, self._listens_until)
+            yield from watched(asking, self._look)
+            if not self.cancelled and self.heard is None:
+                yield from watched(count_answers(run, self._queries), self._look)
+        self.two_devices = run.twins.evidence
         return self
 
     def _while_silent(self) -> Iterator[Request]:
@@ -90,9 +86,9 @@ class Identify:
 
     def _listen(self, run: Runner[Any], until: float) -> Stage[None]:
         while run.now < until and not self.cancelled:
-            self._look(run, (yield until))
+            self._look((yield until))
 
-    def _look(self, run: Runner[Any], came: Came) -> Came:
+    def _look(self, came: Came) -> Came:
         """Take what came; an announcement ends a question that is being asked."""
         self.cancelled = self.cancelled or came is Signal.CANCEL
         if not isinstance(came, Message):
@@ -100,13 +96,6 @@ class Identify:
         if came.can_id == self._answer_id and isinstance(decode(came), BootVersion):
             self.heard = came
             return Signal.CANCEL
-        item = self._version_item
-        if item is not None and came[:3] == (item.can_id, item.mode, item.command):
-            answer = item.content.from_data(came.data)
-            if not self.answers and self.heard is None:
-                self._listens_until = run.now + LISTENS_ON_S
-            if answer not in self.answers:
-                self.answers.append(answer)
         return came
 
 

@@ -136,6 +136,8 @@ class Outcome:
             explained = _late(self.phase, self.device_left)
         elif self.ending is Ending.NO_BOOT_VERSION and self.sent_into_silence:
             explained = _NO_SESSION_EITHER
+        elif self.ending is Ending.TWO_DEVICES and self.device_left.needs_rescue:
+            explained = _TWO_TOLD_TO_UPDATE
         kind, cause, remedy, code = explained
         node, ending = self.target.node.name, say(prose(self.ending))
         what = say("{node}: {ending}.", node=node, ending=ending)
@@ -203,6 +205,13 @@ class _Explanation(NamedTuple):
 AGAIN: Final = "Run the same command again."
 """What stands for {again} below."""
 
+TWO_DEVICES_CAUSE: Final = (
+    "two devices of the same kind are on the bus, or one whose bootloader answers twice"
+)
+TWO_DEVICES_REMEDY: Final = (
+    "Each of the two may have the new image, half of it, or no application: connect one alone, "
+    "flash it, then the other one alone."
+)
 _EXPLANATIONS: Final = {
     Ending.NO_BOOT_VERSION: _Explanation(
         NoAnswerError,
@@ -276,7 +285,7 @@ _EXPLANATIONS: Final = {
     ),
     Ending.TWO_DEVICES: _Explanation(
         WrongDeviceError,
-        "two devices of the same kind are on the bus",
+        TWO_DEVICES_CAUSE,
         "Disconnect one of them. {again}",
         code=ErrorCode.TWO_DEVICES,
     ),
@@ -328,6 +337,11 @@ _NO_SESSION_EITHER: Final = _EXPLANATIONS[Ending.NO_BOOT_VERSION]._replace(
     "by flasher rescue and a power cycle."
 )
 """For a device that did not answer the update command into its silence (R26) either."""
+
+
+_TWO_TOLD_TO_UPDATE: Final = _Explanation(
+    WrongDeviceError, TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, code=ErrorCode.TWO_DEVICES
+)
 
 
 def _late(phase: Phase, left: DeviceLeft) -> _Explanation:

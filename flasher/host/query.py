@@ -11,7 +11,7 @@ next question: two writes are confirmed by the same words (R10 reads the upgrade
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, islice
 from math import inf
@@ -25,7 +25,7 @@ from flasher.protocol import catalogue
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import MEMORY_PIECE_SIZE, Empty, Memory, ReadMemory
 from flasher.protocol.fields import Content
-from flasher.protocol.spec import BMS, data_size
+from flasher.protocol.spec import BMS, Node, data_size
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from flasher.protocol.wire import Damage, Message, encode, split
 
@@ -128,7 +128,7 @@ def ask(run: Runner[Any], query: Query) -> Stage[Query]:
     """Ask one question; the query says how it went. See the module for the times."""
     title = query.request.item.title
     run.tx.all_left(run.now)
-    run.listen(query.answer_item.can_id)
+    run.hear_too(query.answer_item.can_id, *_others_ask(query))
     query.repeat_at = run.now
     query.ends_at = run.now + run.timings.command_timeout_s
     came: Came = Signal.TIME
@@ -160,8 +160,18 @@ def ask(run: Runner[Any], query: Query) -> Stage[Query]:
     return query
 
 
+def _others_ask(query: Query) -> set[int]:
+    """The ids on which other nodes ask for the same."""
+    return {
+        item.can_id
+        for item in catalogue.ITEMS
+        if item.sender is not Node.CDL and catalogue.answer_of(item) is query.answer_item
+    }
+
+
 def _copy_left(run: Runner[Any], query: Query) -> None:
     timings, left_at = run.timings, run.tx.left_at
+    run.twins.asked(query.answer_item.key, run.now, query.answer_item)
     query.copies_left += 1
     if query.answer is not None:
         query.ends_at = left_at + timings.quiet_after_repeat_s
@@ -207,8 +217,23 @@ def ask_all(
             return
 
 
+def count_answers(run: Runner[Any], queries: Sequence[Query]) -> Stage[None]:
+    """Wait for the answers of a second device to what was asked last, and ask once more what had an
+    answer too many (R27).
+    """
+    if not any(query.answers for query in queries):
+        return
+    if (yield from run.listen_on()):
+        return
+    for query in queries:
+        if query.answer_item in run.twins.doubts:
+            yield from ask(run, Query(query.request, quiet=True))
+            if (yield from run.listen_on()):
+                return
+
+
 class Queries(Runner[None]):
-    """Several questions as an engine; see `ask_all`."""
+    """Several questions as an engine; see `ask_all`, and `count_answers` for `counts`."""
 
     def __init__(
         self,
@@ -217,19 +242,22 @@ class Queries(Runner[None]):
         bitrate_bps: int,
         timings: Timings = DEFAULT_TIMINGS,
         stop_at_silence: bool = False,
+        counts: bool = False,
     ) -> None:
         self.queries: list[Query] = []
         """Those that were begun, in order."""
         iterator = iter(requests)
         first = list(islice(iterator, 1))
-        super().__init__(
-            lambda run: ask_all(
-                run, chain(first, iterator), self.queries, stop_at_silence=stop_at_silence
-            ),
-            bitrate_bps=bitrate_bps,
-            timings=timings,
-        )
+        self._requests = chain(first, iterator)
+        self._stops_at_silence, self._counts = stop_at_silence, counts
+        super().__init__(self._ask, bitrate_bps=bitrate_bps, timings=timings)
         self.done = not first
+
+    def _ask(self, run: Runner[None]) -> Stage[None]:
+        stops = self._stops_at_silence
+        yield from ask_all(run, self._requests, self.queries, stop_at_silence=stops)
+        if self._counts:
+            yield from count_answers(run, self.queries)
 
     @property
     def answers(self) -> list[Content | None]:

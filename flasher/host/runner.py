@@ -20,6 +20,7 @@ from math import inf
 from typing import Any, Generic, TypeVar
 
 from flasher.events import BytesDamaged
+from flasher.host.twins import LISTENS_ON_S, Twins
 from flasher.protocol.engine import Transmitter
 from flasher.protocol.frame import Frame
 from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
@@ -66,6 +67,8 @@ class Runner(Generic[T]):
         """When it is cancelled if it has not ended."""
         self.watch: Callable[[Frame], bool] | None = None
         """Sees every frame; what it returns True for is not heard by the stage."""
+        self.twins = Twins(timings)
+        """What speaks for a second device; the stage says what it has asked."""
         self._make_stage = stage
         self._stage: Stage[T] | None = None
         self._wake_at = 0.0  # at once
@@ -94,9 +97,11 @@ class Runner(Generic[T]):
         self._always = {can_id: self._reassembler(can_id) for can_id in can_ids}
         self._listening = dict(self._always)
 
-    def hear_too(self, can_id: int) -> None:
-        """Hear messages on one more id."""
-        self._always[can_id] = self._listening[can_id] = self._reassembler(can_id)
+    def hear_too(self, *can_ids: int) -> None:
+        """Hear messages on these ids as well."""
+        for can_id in can_ids:
+            if can_id not in self._always:
+                self._always[can_id] = self._listening[can_id] = self._reassembler(can_id)
 
     def _reassembler(self, can_id: int) -> Reassembler:
         return Reassembler(can_id, self.timings.inter_frame_timeout_s)
@@ -120,6 +125,14 @@ class Runner(Generic[T]):
         """Report bytes that made no message."""
         self._events.append(BytesDamaged(damage.can_id, damage.reason.value, damage.data))
 
+    def listen_on(self) -> Stage[bool]:
+        """Hear what a second device sends later; returns True when that was cancelled."""
+        until = self.now + LISTENS_ON_S
+        came: Came = Signal.TIME
+        while self.now < until and came is not Signal.CANCEL:
+            came = yield until
+        return came is Signal.CANCEL
+
     def finish_message(self) -> Stage[None]:
         """Let a message that is half sent go to its end. An adapter that takes nothing any more
         does not hold it up for ever.
@@ -135,12 +148,14 @@ class Runner(Generic[T]):
         if self.done:
             return
         self.now = now
+        self.twins.see(frame, now)
         if self.watch is not None and self.watch(frame):
             return
         reassembler = self._listening.get(frame[0])
         if reassembler is None or not frame.is_payload:
             return
         for found in reassembler.feed(frame[1], now):
+            self.twins.heard(found, now)
             self._resume(found)
 
     def tick(self, now: float) -> None:
@@ -153,6 +168,7 @@ class Runner(Generic[T]):
         for reassembler in tuple(self._listening.values()):
             if now >= reassembler.due_at:
                 for found in reassembler.tick(now):
+                    self.twins.heard(found, now)
                     self._resume(found)
         if now >= self.limit_at:
             self.cancel(now)

@@ -6,6 +6,7 @@ runs the very same code. Beside the stages a guard watches the bus all the time.
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from math import inf
@@ -31,7 +32,7 @@ from flasher.host.identity import (
     judge_device,
     judge_image,
 )
-from flasher.host.options import UpgradeOptions, firmware_version, overall_timeout_s
+from flasher.host.options import UpgradeOptions, overall_timeout_s
 from flasher.host.outcome import DeviceLeft, Outcome, before_the_start
 from flasher.host.runner import Runner, Stage
 from flasher.host.table import Ending
@@ -145,6 +146,8 @@ class Session(Runner[Result]):
     @property
     def standing(self) -> str:
         """How far it has come, in words."""
+        if self._checking is Level.NONE:
+            return "listening for a second device"
         if self._checking is not None:
             return f"verifying by {self._checking.value}"
         if self._identify is not None:
@@ -215,10 +218,9 @@ class Session(Runner[Result]):
         self.limit_at = inf  # the upgrade keeps it itself
         outcome = yield from self._upgrade.stage(self.deadline_at)
         verification = NOT_ASKED
-        if outcome.ok and self._level is not Level.NONE:
+        if outcome.ok:
             self.limit_at = self.deadline_at
-            self.listen_always()
-            verification = yield from self._verified(outcome)
+            verification = yield from self._verified()
         return Result(outcome, verification, self._guard.shutdown_heard, previous)
 
     def _new_identify(self) -> Identify:
@@ -238,10 +240,9 @@ class Session(Runner[Result]):
         if asked.cancelled:
             is_late = self.deadline_at is not None and self.now >= self.deadline_at
             return self._end_early(Ending.OUT_OF_TIME if is_late else Ending.CANCELLED, "")
-        if len(asked.answers) > 1:
-            versions = " and ".join(firmware_version(each) for each in asked.answers)
-            return self._end_early(Ending.TWO_DEVICES, f"they answer {versions}")
-        if asked.answers or asked.seen != DeviceAnswers():
+        if asked.two_devices:
+            return self._end_early(Ending.TWO_DEVICES, asked.two_devices)
+        if asked.seen != DeviceAnswers():
             self._upgrade.in_session = False
         if self._identity is None:
             return None
@@ -284,13 +285,17 @@ class Session(Runner[Result]):
 
     # -- verification ----------------------------------------------------------------------------
 
-    def _verified(self, outcome: Outcome) -> Stage[Verification]:
-        if outcome.ending is Ending.CONFIRMED_BY_VERSION:
-            running = outcome.running_version
-            found = Verification(Level.VERSION, Verdict.VERSION_RIGHT, running)
-        else:
+    def _verified(self) -> Stage[Verification]:
+        level, self._checking = self._level, Level.NONE
+        self.listen_always(self._plan.target.answer_id)
+        with contextlib.suppress(SecondTool):  # the device has the image all the same
+            yield from self.listen_on()
+        if self.twins.evidence:
+            return Verification(level, Verdict.TWO_DEVICES, None, self.twins.evidence)
+        found = NOT_ASKED
+        if level is not Level.NONE:
             found = yield from self._checked(Level.VERSION)
-        if self._level is Level.MEMORY and found.ok:
+        if level is Level.MEMORY and found.ok:
             found = yield from self._checked(Level.MEMORY, found.running_version)
         return found
 

@@ -21,6 +21,7 @@ class State(Enum):
 
     RESETTING = "resetting"
     AWAITING_BOOT = "awaiting boot version"
+    WATCHING = "watching the announcements"
     AWAITING_REQUEST = "awaiting request transfer"
     TRANSFERRING = "transferring"
     SETTLING = "settling"
@@ -47,6 +48,7 @@ class Event(Enum):
 
     RESET_UNANSWERED = "reset not answered"
     BOOT_MISSING = "no boot version in time"
+    WATCHED = "only one bootloader announces itself"
     REQUEST_MISSING = "no request transfer in time"
     PACKET_UNANSWERED = "packet not answered"
     QUIET = "no answer to a copy came any more"
@@ -54,6 +56,7 @@ class Event(Enum):
     VERSION_UNANSWERED = "version not answered"
     TOOL_QUIET = "the other tool is silent"
 
+    TWO_DEVICES = "what one device does not send"
     LINK_BACK = "the adapter was lost and is back"
     SECOND_TOOL = "somebody else speaks as the tool"
     OUT_OF_TIME = "overall deadline"
@@ -152,6 +155,7 @@ _EVERYWHERE: Final[_Row] = {
     # What the wire brings where nobody waits for it.
     **dict.fromkeys(_OF_THE_DEVICE, REPORTED),
     _E.FEEDBACK: IGNORED,
+    _E.TWO_DEVICES: _do("end_for_two_devices", _X.TWO_DEVICES),
     _E.LINK_BACK: _do("begin_again", _S.RESETTING),
     _E.SECOND_TOOL: _do("yield_or_end", _S.YIELDING, _X.SECOND_TOOL),
     _E.OUT_OF_TIME: _do(
@@ -161,40 +165,45 @@ _EVERYWHERE: Final[_Row] = {
     ),
     _E.CANCEL: _do("end_cancelled", _X.CANCELLED),
 }  # fmt: skip
-_ANSWER_BOOT: Final = _do(
-    "answer_boot", _S.AWAITING_REQUEST, _X.WRONG_DEVICE, _X.BOOT_TOO_OLD, _X.UNCHECKED
-)
+_TAKE_BOOT: Final = _do("take_boot", _S.WATCHING, _X.WRONG_DEVICE, _X.BOOT_TOO_OLD, _X.UNCHECKED)
 _ANSWERED: Final = _do(
     "take_answer", _S.TRANSFERRING, _S.SETTLING, _S.ENDING, _S.RESETTING, _X.PACKET_FAILED
 )
 _REQUESTED: Final = _do(
     "take_late_request",
-    _S.TRANSFERRING, _S.SETTLING, _S.AWAITING_REQUEST, _S.RESETTING, _X.RESTARTED, _X.PACKET_FAILED,
+    _S.TRANSFERRING, _S.SETTLING, _S.WATCHING, _S.RESETTING, _X.RESTARTED, _X.PACKET_FAILED,
 )  # fmt: skip
-_ANNOUNCED: Final = _do("take_boot_in_transfer", _S.AWAITING_REQUEST, _X.WRONG_DEVICE, _X.RESTARTED)
+_ANNOUNCED: Final = _do("take_boot_in_transfer", _S.WATCHING, _X.WRONG_DEVICE, _X.RESTARTED)
 _END_REFUSED: Final = _do("take_end_nak", _S.ENDING, _X.REFUSED)
 _COMPLETED: Final = _do("complete", _X.COMPLETED, _X.BROKEN_PROTOCOL)
 
 TABLE: Final[Mapping[State, _Row]] = {
     _S.RESETTING: _EVERYWHERE | {
         _E.FEEDBACK: _do("await_boot", _S.AWAITING_BOOT),
-        _E.BOOT_VERSION: _ANSWER_BOOT,
+        _E.BOOT_VERSION: _TAKE_BOOT,
         # A device that sits in its bootloader does not know the reset (R18): go on.
         _E.RESET_UNANSWERED: _do("repeat_reset", _S.RESETTING, _S.AWAITING_BOOT),
     },
     _S.AWAITING_BOOT: _EVERYWHERE | {
-        _E.BOOT_VERSION: _ANSWER_BOOT,
+        _E.BOOT_VERSION: _TAKE_BOOT,
         _E.BOOT_MISSING: _do(
             "miss_boot", _S.AWAITING_BOOT, _S.RESETTING, _S.AWAITING_REQUEST,
             _X.NO_BOOT_VERSION, _X.NO_ANNOUNCEMENT, _X.PACKET_FAILED,
         ),
         _E.LINK_BACK: _do("wait_or_begin_again", _S.AWAITING_BOOT, _S.RESETTING),
     },
+    # The update command erases: before it, a second bootloader has a moment to show itself (R27).
+    _S.WATCHING: _EVERYWHERE | {
+        _E.BOOT_VERSION: _do("watch_on", _X.WRONG_DEVICE),
+        _E.FEEDBACK: _do("watch_on", _S.AWAITING_BOOT),
+        _E.WATCHED: _do("answer_boot", _S.AWAITING_REQUEST, _S.RESETTING),
+        _E.LINK_BACK: _do("wait_or_begin_again", _S.AWAITING_BOOT, _S.RESETTING),
+    },
     # Silence is not answered (R2): the device may be erasing.
     _S.AWAITING_REQUEST: _EVERYWHERE | {
         _E.BOOT_VERSION: _do(
             "answer_boot_again", _S.AWAITING_REQUEST, _S.RESETTING,
-            _X.WRONG_DEVICE, _X.TWO_DEVICES, _X.UNHEARING, _X.UNCHECKED,
+            _X.WRONG_DEVICE, _X.UNHEARING, _X.UNCHECKED,
         ),
         _E.REQUEST: _do("send_first_packet", _S.TRANSFERRING),
         _E.REQUEST_MISSING: _do(
@@ -234,7 +243,7 @@ TABLE: Final[Mapping[State, _Row]] = {
         _E.NAK: _END_REFUSED,
         _E.COMPLETE: _COMPLETED,
         _E.END_UNANSWERED: _do("miss_end", _S.ENDING, _S.CONFIRMING, _X.UNCONFIRMED),
-        _E.BOOT_VERSION: _do("take_boot_after_end", _S.AWAITING_REQUEST, _X.RESTARTED),
+        _E.BOOT_VERSION: _do("take_boot_after_end", _S.WATCHING, _X.RESTARTED),
         # Every packet is acknowledged: whatever was lost, only the end is missing.
         _E.LINK_BACK: _do("resend_end", _S.ENDING),
     },
@@ -246,7 +255,7 @@ TABLE: Final[Mapping[State, _Row]] = {
             "judge_version", _X.CONFIRMED_BY_VERSION, _X.OTHER_VERSION, _X.UNCONFIRMED
         ),
         _E.VERSION_UNANSWERED: _do("miss_version", _S.CONFIRMING, _X.UNCONFIRMED),
-        _E.BOOT_VERSION: _do("take_boot_after_end", _S.AWAITING_REQUEST, _X.RESTARTED),
+        _E.BOOT_VERSION: _do("take_boot_after_end", _S.WATCHING, _X.RESTARTED),
         _E.LINK_BACK: _do("query_version", _S.CONFIRMING),
     },
     # Nothing is sent, whatever the device answers to the other tool.
@@ -263,6 +272,7 @@ TABLE: Final[Mapping[State, _Row]] = {
 TIMERS: Final[Mapping[State, Event]] = {
     _S.RESETTING: _E.RESET_UNANSWERED,
     _S.AWAITING_BOOT: _E.BOOT_MISSING,
+    _S.WATCHING: _E.WATCHED,
     _S.AWAITING_REQUEST: _E.REQUEST_MISSING,
     _S.TRANSFERRING: _E.PACKET_UNANSWERED,
     _S.SETTLING: _E.QUIET,

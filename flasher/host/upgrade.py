@@ -2,8 +2,8 @@
 
 How to read it: a message, an expired timer or the user's word becomes an event, `table.TABLE` names
 the action, and the actions are the methods below, in the order of the states. An action holds the
-guards and the readings that go with its event (R2, R6, R10, R11, R16, R18, R26), goes to one of the
-states that the table allows it, and sends what follows. A timer starts when a message has left.
+guards and the readings that go with its event (R2, R6, R10, R11, R16, R18, R26, R27), goes to a
+state that the table allows it, and sends what follows. A timer starts when a message has left.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from flasher.host.options import (
 from flasher.host.outcome import DeviceLeft, Outcome, Statistics, standing
 from flasher.host.runner import Came, Runner, Signal, Stage
 from flasher.host.table import TABLE, TIMERS, Ending, Event, Reason, State
+from flasher.host.twins import Twins
 from flasher.image.plan import Plan
 from flasher.protocol import catalogue
 from flasher.protocol.engine import WELL_BEYOND
@@ -62,6 +63,7 @@ _EVENTS: Final[dict[type, Event]] = {
 _PHASES: Final = {
     State.RESETTING: Phase.RESET,
     State.AWAITING_BOOT: Phase.BOOT,
+    State.WATCHING: Phase.BOOT,
     State.AWAITING_REQUEST: Phase.UPDATE,
     State.TRANSFERRING: Phase.TRANSFER,
     State.SETTLING: Phase.TRANSFER,
@@ -103,6 +105,9 @@ class _Attempt:
     """The reset was answered: an application runs."""
     boot: BootVersion | None = None
     """The first boot version."""
+    was_reset_again: bool = False
+    watched_since: float = 0.0
+    watched_until: float = 0.0
     first_update_left_at: float | None = None
     request_at: float = 0.0
 
@@ -197,6 +202,10 @@ class UpgradeStage:
     def standing(self) -> str:
         """Phase, packet and attempt in words."""
         return standing(self._phase, self._packet, self._plan.total_packets, self._attempt)
+
+    @property
+    def _twins(self) -> Twins:
+        return self._run.twins
 
     @property
     def _packet(self) -> int | None:
@@ -303,6 +312,9 @@ class UpgradeStage:
             self._wait_for_boot()
         if self.heard is not None:
             self._take(self.heard)
+        if self.state is State.WATCHING and not self._options.at_power_up:
+            # A bootloader does not know the reset (R18), but another device's application does.
+            self._send_reset()
         while self._outcome is None:
             is_stopping = self._ending is not None
             try:
@@ -343,6 +355,9 @@ class UpgradeStage:
 
     def _message(self, message: Message) -> None:
         self._heard_at = self._run.now
+        if self._twins.evidence and not self.is_yielding:
+            self._dispatch(Event.TWO_DEVICES)
+            return
         item = self._version_item
         if item is not None and message[:3] == (item.can_id, item.mode, item.command):
             self._dispatch(Event.VERSION, item.content.from_data(message.data))
@@ -421,32 +436,45 @@ class UpgradeStage:
         return self._run.now + gap_s if gap_s else 0.0
 
     def _message_left(self) -> None:
-        at, timings, left_at = self._at, self._timings, self._tx.left_at
-        wait_s: float | None = None
-        match self._tx.left_tag, self.state:
-            case Command.PACKET, state:
+        at, tag, left_at = self._at, self._tx.left_tag, self._tx.left_at
+        if tag is Command.READ_VERSION and self._version_item is not None:
+            self._twins.asked(self._version_item.key, self._run.now, self._version_item)
+        elif isinstance(tag, Command):
+            self._twins.left(tag, self._run.now, at.packet)
+        match tag:
+            case Command.PACKET:
                 at.copies_unanswered += 1
-                if state is State.TRANSFERRING:
-                    wait_s = timings.ack_timeout_s
-                elif state is State.SETTLING:
-                    wait_s = timings.quiet_after_repeat_s
-            case Command.UPDATE, state:
+            case Command.UPDATE:
                 self._update_left_at = left_at
                 if at.first_update_left_at is None:
                     at.first_update_left_at = left_at
-                if state is State.AWAITING_REQUEST:
-                    wait_s = timings.request_transfer_timeout_s
-            case Command.END_OF_TRANSFER, state:
+            case Command.END_OF_TRANSFER:
                 self._whole_transfers += not at.end_copies_left
                 at.end_copies_left += 1
-                if state is State.ENDING and at.announced_at is None:
-                    wait_s = timings.complete_timeout_s
-            case (Command.RESET, State.RESETTING) | (Command.READ_VERSION, State.CONFIRMING):
-                wait_s = timings.command_repeat_s
-            case Command.RESET, State.AWAITING_BOOT:
-                wait_s = self._boot_timeout_s
+        wait_s = self._wait_after(tag)
         if wait_s is not None:
             self._timer_at = left_at + wait_s
+
+    def _wait_after(self, tag: object) -> float | None:
+        """How long the answer to a message that has left is waited for in this state."""
+        timings = self._timings
+        match tag, self.state:
+            case _, State.WATCHING:
+                self._at.watched_until = self._tx.left_at + timings.boot_watch_s
+                return timings.boot_watch_s
+            case Command.PACKET, State.TRANSFERRING:
+                return timings.ack_timeout_s
+            case Command.PACKET, State.SETTLING:
+                return timings.quiet_after_repeat_s
+            case Command.UPDATE, State.AWAITING_REQUEST:
+                return timings.request_transfer_timeout_s
+            case Command.END_OF_TRANSFER, State.ENDING if self._at.announced_at is None:
+                return timings.complete_timeout_s
+            case (Command.RESET, State.RESETTING) | (Command.READ_VERSION, State.CONFIRMING):
+                return timings.command_repeat_s
+            case Command.RESET, State.AWAITING_BOOT:
+                return self._boot_timeout_s
+        return None
 
     # -- actions: anywhere -----------------------------------------------------------------------
 
@@ -492,8 +520,11 @@ class UpgradeStage:
         self._next_attempt(reason)
         if isinstance(row, BootVersion):
             self._note_boot(row)
-        self._go(State.AWAITING_REQUEST)
-        self._send_update()
+        if row is None:
+            self._go(State.AWAITING_REQUEST)
+            self._send_update()
+        else:
+            self._watch()
 
     def _next_attempt(self, reason: Reason) -> None:
         if reason is Reason.PACKET_GIVEN_UP:
@@ -540,7 +571,7 @@ class UpgradeStage:
         else:
             self._begin_again(row)
 
-    def _answer_boot(self, boot: BootVersion) -> None:
+    def _take_boot(self, boot: BootVersion) -> None:
         number = boot_version_number(boot.version)
         minimum = self._minimum_boot
         if self._is_foreign(boot):
@@ -551,6 +582,55 @@ class UpgradeStage:
             self._end(Ending.UNCHECKED, None, self.unchecked.detail)
         else:
             self._note_boot(boot)
+            self._watch()
+
+    def _watch(self) -> None:
+        """Give a second device the time to show itself: by its announcement, by its answer to what
+        was sent before (`_message_left`), or, where an application beside the bootloader has
+        answered the reset, by the announcements that follow.
+        """
+        now, timings, at = self._run.now, self._timings, self._at
+        self._go(State.WATCHING)
+        self._tx.drop_unstarted()
+        wait_s = timings.boot_version_timeout_s if self._twins.is_beside else timings.boot_watch_s
+        at.watched_since, at.watched_until = now, now + wait_s
+        if self._tx.idle:
+            self._timer_at = min(at.watched_until, now + self._burst_s)
+
+    def _watch_on(self, row: BootVersion | GeneralFeedback) -> None:
+        now, timings, at = self._run.now, self._timings, self._at
+        if isinstance(row, BootVersion) and self._is_foreign(row):
+            self._end(Ending.WRONG_DEVICE, row)
+            return
+        answer_id = self._plan.target.answer_id
+        if not self._twins.is_beside and not self._twins.has_announced(answer_id):
+            # What was heard before the reset has ended: an application is there, and restarts.
+            self._await_boot(row)
+            return
+        if self._twins.is_beside:
+            wait_s = timings.boot_version_timeout_s
+            at.watched_until = max(at.watched_until, at.watched_since + wait_s)
+        elif self._twins.overlap(answer_id):
+            two_rounds_s = 2 * timings.boot_version_spacing_s
+            at.watched_until = max(at.watched_until, at.watched_since + two_rounds_s)
+        if self._tx.idle:
+            self._timer_at = min(at.watched_until, now + self._burst_s)
+
+    @property
+    def _burst_s(self) -> float:
+        """Silence that ends the announcements of a bootloader."""
+        return BOOT_VERSION_BURST * self._timings.boot_version_spacing_s
+
+    def _answer_boot(self, row: Received) -> None:
+        """Nothing speaks for a second device."""
+        at = self._at
+        has_ended = self._run.now < at.watched_until
+        if self._twins.is_beside and has_ended and not at.was_reset_again:
+            # The announcements have ended, and an application is there: it is reset.
+            at.was_reset_again = True
+            self._go(State.RESETTING)
+            self._send_reset()
+        else:
             self._go(State.AWAITING_REQUEST)
             self._send_update()
 
@@ -607,8 +687,6 @@ class UpgradeStage:
             self._end(Ending.WRONG_DEVICE, boot)
         elif self.unchecked is not None:
             self._end(Ending.UNCHECKED, None, self.unchecked.detail)
-        elif at.boot is not None and boot != at.boot:
-            self._end(Ending.TWO_DEVICES, boot)
         elif not self._tx.idle or now - self._update_left_at < timings.update_spacing_s:
             pass  # too soon to be an answer to the update command
         elif first_at is not None and now - first_at > timings.request_transfer_timeout_s:
@@ -805,12 +883,12 @@ class UpgradeStage:
 
         Judged by time, not by count: a doubled frame must not erase a good image.
         """
-        at, now, spacing_s = self._at, self._run.now, self._timings.boot_version_spacing_s
+        at, now = self._at, self._run.now
         if not at.end_copies_left and not self._tx.begun:
             # It announces itself before it can have heard of the end.
             self._restarted(boot, Reason.RESTARTED)
             return
-        if at.announced_at is None or now - at.announced_last_at > BOOT_VERSION_BURST * spacing_s:
+        if at.announced_at is None or now - at.announced_last_at > self._burst_s:
             at.announced_at = now
         at.announced_last_at = now
         if now - at.announced_at >= self._timings.announcing_on_s:
@@ -818,7 +896,7 @@ class UpgradeStage:
             self._restarted(boot, Reason.RESTARTED)
         elif self.state is State.ENDING:
             self._tx.drop_unstarted()
-            self._timer_at = now + BOOT_VERSION_BURST * spacing_s
+            self._timer_at = now + self._burst_s
             self._report(boot, "boot version after end of transfer")
 
     def _query_version(self, row: Received) -> None:
@@ -867,12 +945,16 @@ class UpgradeStage:
         self._timer_at = self._run.now + OTHER_TOOL_QUIET_S
 
     def _take_turn(self, row: Received) -> None:
+        self._run.twins = Twins(self._timings)  # what came answered the other tool
         self._fail(Ending.SECOND_TOOL, row, Reason.SECOND_TOOL)
 
     # -- the end ---------------------------------------------------------------------------------
 
     def _end_broken(self, row: Received) -> None:
         self._end(Ending.BROKEN_PROTOCOL, row)
+
+    def _end_for_two_devices(self, row: Received) -> None:
+        self._end(Ending.TWO_DEVICES, row, self._twins.evidence)
 
     def _end_out_of_time(self, row: Received) -> None:
         """End as an attempt before would have, where it went on only for nothing to lose."""

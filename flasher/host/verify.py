@@ -18,10 +18,11 @@ from flasher.errors import (
     InterruptedByUserError,
     UsageError,
     VerificationError,
+    WrongDeviceError,
 )
 from flasher.host.options import UpgradeOptions, firmware_version
-from flasher.host.outcome import DeviceLeft
-from flasher.host.query import READ_MEMORY, Query, ask, memory_requests, piece_of
+from flasher.host.outcome import TWO_DEVICES_CAUSE, TWO_DEVICES_REMEDY, DeviceLeft
+from flasher.host.query import READ_MEMORY, Query, ask, count_answers, memory_requests, piece_of
 from flasher.host.runner import Runner, Stage
 from flasher.image.plan import Plan
 from flasher.prose import prose
@@ -47,6 +48,7 @@ class Verdict(Enum):
     VERSION_OTHER = "version_other"
     NO_ANSWER = "no_answer"
     MEMORY_OTHER = "memory_other"
+    TWO_DEVICES = "two_devices"
     SECOND_TOOL = "second_tool"
     INTERRUPTED = "interrupted"
 
@@ -83,6 +85,16 @@ class Verification:
                 where=f"verification by {self.level.value}",
                 remedy=f"See with flasher info what it runs. {_IT_HAS}",
             )
+        if self.verdict is Verdict.TWO_DEVICES:
+            error = WrongDeviceError(
+                what,
+                where=f"verification by {self.level.value}",
+                cause=TWO_DEVICES_CAUSE,
+                remedy=TWO_DEVICES_REMEDY,
+                code=ErrorCode.TWO_DEVICES,
+            )
+            error.needs_rescue = True  # one of them does
+            return error
         if self.verdict is Verdict.SECOND_TOOL:
             return BusError(
                 what,
@@ -186,7 +198,11 @@ def check_version(run: Runner[Any], plan: Plan, options: UpgradeOptions) -> Stag
             return Verification(Level.VERSION, Verdict.INTERRUPTED)
         if run.now >= give_up_at:
             return Verification(Level.VERSION, Verdict.NO_ANSWER)
+    again = yield from ask(run, Query(request, quiet=True))
+    yield from count_answers(run, [again])
     version = firmware_version(query.answer)
+    if run.twins.evidence:
+        return Verification(Level.VERSION, Verdict.TWO_DEVICES, version, run.twins.evidence)
     expected = plan.image.version
     if expected is None:
         return Verification(Level.VERSION, Verdict.VERSION_UNJUDGED, version)

@@ -44,6 +44,9 @@ class Timings:
     """How often a packet is sent at the most (R12)."""
     end_tries: Tries = 3
     """How often end of transfer is sent at the most while nothing answers it (R12)."""
+    boot_watch_s: Pause = 0.025
+    """So long after a boot version a second bootloader may show itself before the update command is
+    sent (R27): half of the time to the next announcement, which one that goes on needs."""
     update_spacing_s: Pause = 0.03
     """An update command follows the one before not sooner than this (R2)."""
     leftover_boot_version_s: Pause = 0.06

@@ -125,9 +125,9 @@ class UnitSteps:
                 target.restart(self._power)
                 found = target.identify()
             self._identified[target.name] = found
-            if found.answers > 1:
+            if found.two_devices:
                 raise StepFailedError(
-                    codes.TWO_DEVICES, f"{found.answers} devices answer as {target.name}."
+                    codes.TWO_DEVICES, f"Two devices answer as {target.name}: {found.two_devices}."
                 )
             if target.is_silent(found) and self._order.kind is not RunKind.RECHECK:
                 raise StepFailedError(

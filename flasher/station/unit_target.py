@@ -49,8 +49,8 @@ class Identified:
 
     seen: DeviceAnswers
     is_in_bootloader: bool
-    answers: int
-    """Different version answers: two are two devices."""
+    two_devices: str
+    """What speaks for a second unit, in words; empty while nothing does."""
 
     @property
     def serial_number(self) -> str:
@@ -118,7 +118,7 @@ class UnitTarget:
         self.run(asking)
         asked = asking.result
         announced = asked.heard is not None or self.watcher.announcements > before
-        return Identified(asked.seen, announced, len(asked.answers))
+        return Identified(asked.seen, announced, asked.two_devices)
 
     def is_silent(self, found: Identified) -> bool:
         """True when it could have answered, and did not."""

@@ -50,7 +50,9 @@ def test_every_case_fails_on_a_variant_of_its_own_clause() -> None:
 
 def test_a_variant_that_takes_no_upgrade_fails_the_bring_up() -> None:
     failing = {name for name, fails in LISTED.items() if BRING_UP in fails}
-    assert failing >= {name for name in LISTED if not VARIANTS[name].upgrade_works}
+    # The suite's tester upgrades one that the host takes for two devices (R27).
+    takes_none = {name for name in LISTED if not VARIANTS[name].upgrade_works} - {"acks-twice"}
+    assert failing >= takes_none
 
 
 def test_a_variant_fails_nothing_but_its_clause_and_what_it_says_that_it_touches() -> None:

@@ -96,10 +96,10 @@ def test_a_doubled_nak_counts_once() -> None:
     assert bench.complete().ok
 
 
-def test_ack_and_general_feedback_after_the_end_are_ignored() -> None:
+def test_general_feedback_after_the_end_is_ignored() -> None:
     bench = Bench(200)
     bench.to_end()
-    bench.say(Ack(2), GeneralFeedback())
+    bench.say(GeneralFeedback())
     bench.wait(1.0)
     assert bench.unread == []
     assert bench.complete().ok

@@ -11,6 +11,7 @@ from flasher.host.outcome import DeviceLeft
 from flasher.host.query import Queries, Request
 from flasher.host.session import Session
 from flasher.host.table import State
+from flasher.host.twins import LISTENS_ON_S
 from flasher.host.verify import Level, memory_check, version_check
 from flasher.image.image import Image
 from flasher.image.plan import plan
@@ -106,10 +107,13 @@ def test_a_session_says_where_it_stands_in_the_upgrade_and_in_the_check() -> Non
     stands.append((session.standing, session.device_left))
     bench.say(Complete())
     stands.append((session.standing, session.device_left))
+    bench.wait(LISTENS_ON_S)
+    stands.append((session.standing, session.device_left))
     assert stands == [
         ("listening for another tool", DeviceLeft.UNTOUCHED),
         ("resetting the application", DeviceLeft.UNTOUCHED),
         ("waiting for the final answer", DeviceLeft.UNKNOWN),
+        ("listening for a second device", DeviceLeft.NEW),
         ("verifying by version", DeviceLeft.NEW),
     ]
     session.cancel(bench.now)

@@ -8,7 +8,13 @@ from flasher.host.upgrade import UpgradeStage
 from tests.loops import each
 
 RUNNING = [state for state in State if state not in {State.STOPPING, State.DONE}]
-FROM_OUTSIDE = {Event.LINK_BACK, Event.SECOND_TOOL, Event.OUT_OF_TIME, Event.CANCEL}
+FROM_OUTSIDE = {
+    Event.TWO_DEVICES,
+    Event.LINK_BACK,
+    Event.SECOND_TOOL,
+    Event.OUT_OF_TIME,
+    Event.CANCEL,
+}
 FROM_THE_WIRE = {
     Event.FEEDBACK,
     Event.BOOT_VERSION,
@@ -77,7 +83,8 @@ def test_after_end_of_transfer_only_a_device_beyond_its_burst_gets_an_update_com
     updating = {
         event
         for state, event, _, leads_to in moves()
-        if state in (State.ENDING, State.CONFIRMING) and State.AWAITING_REQUEST in leads_to
+        if state in (State.ENDING, State.CONFIRMING)
+        and leads_to & {State.WATCHING, State.AWAITING_REQUEST}
     }
     assert updating == {Event.BOOT_VERSION}
     assert {
@@ -89,5 +96,9 @@ def test_an_update_command_answers_something_the_device_said_or_one_long_silence
     """R2, R26."""
     for state, event, action, leads_to in moves():
         if State.AWAITING_REQUEST in leads_to and state is not State.AWAITING_REQUEST:
-            heard = event in {Event.BOOT_VERSION, Event.REQUEST}
-            assert heard or (state, action) == (State.AWAITING_BOOT, "miss_boot")
+            assert (state, action) in {
+                (State.WATCHING, "answer_boot"),
+                (State.AWAITING_BOOT, "miss_boot"),
+            }
+        if State.WATCHING in leads_to and state is not State.WATCHING:
+            assert event in {Event.BOOT_VERSION, Event.REQUEST}

@@ -108,7 +108,7 @@ def test_the_number_of_tries_is_the_users() -> None:
 # -- stale, doubled, future answers (R10, TX-10) ------------------------------------------------
 
 
-@each("stale", [Ack(1), Nak(1), Ack(0), Nak(0)])
+@each("stale", [Nak(1), Ack(0), Nak(0)])
 def test_an_answer_for_an_older_packet_is_ignored(stale: Row) -> None:
     bench = Bench()
     bench.to_packet(2)
@@ -346,7 +346,7 @@ def test_another_device_after_a_restart_is_refused() -> None:
     bench.to_packet(2)
     bench.wait(0.1)
     bench.say(BootVersion("WMC", "V1.2.3"))
-    assert bench.outcome.ending is Ending.WRONG_DEVICE
+    assert bench.outcome.ending is Ending.TWO_DEVICES
 
 
 def test_request_transfer_again_before_ack_1_gets_packet_1_again_and_no_update_command() -> None:
@@ -463,4 +463,5 @@ def test_no_message_is_ever_interleaved_with_another() -> None:
     bench.on_frame = restart
     bench.say(Ack(1))
     assert bench.expect(Packet).number == 2
+    bench.on_frame = None
     bench.expect(UpdateCommand)

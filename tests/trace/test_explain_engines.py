@@ -52,7 +52,7 @@ class Tapped(Traffic):
         (DeviceScript(silent_after=6), Ending.PACKET_FAILED, Cause.PACKET_UNANSWERED),
         (DeviceScript(restart_at=5), Ending.COMPLETED, Cause.COMPLETED),
         (DeviceScript(drop_ack=frozenset({3, 9})), Ending.COMPLETED, Cause.COMPLETED),
-        (DeviceScript(double_ack=frozenset({2, 3, 4, 5})), Ending.COMPLETED, Cause.COMPLETED),
+        (DeviceScript(double_ack=frozenset({2, 3, 4, 5})), Ending.TWO_DEVICES, Cause.TWO_DEVICES),
         (DeviceScript(end_nak=2), Ending.REFUSED, Cause.REFUSED),
         (DeviceScript(lose_complete=9), Ending.UNCONFIRMED, Cause.UNCONFIRMED),
         (DeviceScript(foreign_frames=True), Ending.COMPLETED, Cause.COMPLETED),

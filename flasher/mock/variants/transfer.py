@@ -342,7 +342,7 @@ class AcksDamagedRepetition(MockDevice):
         self._is_damage = False
 
 
-@variant("acks-twice", "TX-07", also="*")
+@variant("acks-twice", "TX-07", also="*", upgrade_works=False)
 class AcksTwice(MockDevice):
     """Sends every ACK of a packet twice."""
 

@@ -1,0 +1,476 @@
+"""Detects a second device of the same kind (R27), by what a single one does not send; pure.
+
+It counts: what was sent once is answered once. `Twins` is told of every message that leaves
+(`asked`, `left`) and of all that comes (`heard`, `see`). What speaks for a second device:
+
+- the reset, a packet or end of transfer has more answers than copies of it have left; a question
+  has, twice in a row: an answer on a broadcast id may be one to a question that was not received;
+- two units name different versions or serial numbers, or announce different boot versions;
+- the announcements of two bootloaders alternate, or one goes on while an application sends;
+- a packet is acknowledged after a bootloader has announced itself, or has asked for the transfer
+  once more, since the last update command;
+- NAK comes beside ACK more often than damaged frames explain.
+
+What a single device may do, or a bad line makes of it, is none: a late answer to what was sent
+again (R10), general feedback beside the bootloader's own answers (R15), request transfer again
+before the first ACK (R16), an answer that the link has doubled.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import pairwise
+from math import inf
+from typing import Final
+
+from flasher.protocol import messages
+from flasher.protocol.catalogue import BY_KEY, Item, answer_of
+from flasher.protocol.fields import Content, label
+from flasher.protocol.frame import Frame
+from flasher.protocol.messages import BootVersion
+from flasher.protocol.spec import COMMAND_SIZE, FRAME_DATA_SIZE, PREFIX_SIZE, Command, Node
+from flasher.protocol.text import printable
+from flasher.protocol.timing import Timings
+from flasher.protocol.wire import Damage, Message
+from flasher.said import say
+
+LISTENS_ON_S: Final = 0.1
+"""How much later than the first device a second one is still heard."""
+_DOUBLED_S: Final = 0.0003
+"""The same message again within less than this was doubled by the link: on the wire, two messages
+take longer."""
+_CLEARLY_APART_S: Final = 0.002
+"""The same answer again after more than this was sent for itself; two frames of one message, or two
+messages one behind the other, are nearer."""
+_APART_S: Final = 0.001
+"""Announcements that are nearer to each other may have waited together in this computer."""
+_TOLERANCE: Final = 0.25
+"""How much two announcements of one bootloader may be nearer or farther than documented."""
+_ODD_ANSWERS: Final = 2.0
+"""So many answers to nothing are another device's: with what is forgotten, three within twenty
+packets. A bad line makes one of a packet whose first frame it doubles: NAK, then ACK."""
+_FORGIVEN: Final = 0.05
+"""Of them are forgotten with every packet."""
+_RUN: Final = 5
+"""So many in a row are no chance, although feedbacks are lost on a bad line."""
+_REMEMBERED: Final = 8
+"""Packets whose copies are counted, and different answers to one question that are kept."""
+_OF_A_TRANSFER: Final = (messages.RequestTransfer, messages.Ack, messages.Nak)
+_SENDER_MASK, _RECEIVER_MASK = 0x7F0, 0x00F
+
+Key = tuple[int, int]
+"""CAN id and command of an answer."""
+
+
+@dataclass
+class _Question:
+    """A question or a write, by what answers it. It is counted in rounds: one is over when every
+    copy is answered, or is not answered any more.
+    """
+
+    key: Key
+    item: Item | None = None
+    copies: int = 0
+    """That have left in this round, whoever asked."""
+    answers: int = 0
+    asked_at: float = -inf
+    answered_at: float = -inf
+    is_odd: bool = False
+    """The round has an answer too many."""
+    odd_rounds: int = 0
+    """So many that have one follow each other, up to this one."""
+    contents: list[Content] = field(default_factory=list)
+    """Every different answer."""
+
+
+@dataclass
+class _Copies:
+    """What has left of one packet, and how often it was acknowledged."""
+
+    left: int = 0
+    acks: int = 0
+    acked_at: float = -inf
+
+
+@dataclass
+class _Announcements:
+    """Those on one id."""
+
+    boot: BootVersion | None = None
+    last_at: float = -inf
+    times: deque[float] = field(default_factory=lambda: deque(maxlen=4))
+    """The last ones since a reset or an update command."""
+    is_documented: bool = False
+    """Two of them came as far apart as documented, with none between."""
+
+
+class _Balance:
+    """Messages that left against answers that came: each answer is one to the oldest that has none.
+
+    One that has been without an answer for long is forgotten when the next message leaves: by then
+    all is heard that waited in this computer.
+    """
+
+    def __init__(self, latest_s: float) -> None:
+        self._latest_s = latest_s
+        self._open: deque[float] = deque(maxlen=_REMEMBERED)
+        self._has_left = False
+
+    def left(self, now: float) -> None:
+        """One left."""
+        while self._open and now - self._open[0] > self._latest_s:
+            self._open.popleft()
+        self._open.append(now)
+        self._has_left = True
+
+    def is_odd(self) -> bool:
+        """An answer came; True when it answers nothing. Before anything has left, it is one to
+        somebody else.
+        """
+        if not self._open:
+            return self._has_left
+        self._open.popleft()
+        return False
+
+
+class _Runs:
+    """ACKs in a row that came with a general feedback, and without: one device confirms all that it
+    receives, or nothing (R15).
+    """
+
+    def __init__(self) -> None:
+        self._has_feedback = False
+        self._length = 0
+        self._is_confirmed = False
+        self._seen: set[bool] = set()
+
+    def note_feedback(self) -> None:
+        self._has_feedback = True
+
+    def note_ack(self) -> bool:
+        """An ACK came; True when there were runs of both kinds."""
+        self._length = self._length + 1 if self._has_feedback is self._is_confirmed else 1
+        self._is_confirmed, self._has_feedback = self._has_feedback, False
+        if self._length >= _RUN:
+            self._seen.add(self._is_confirmed)
+        return len(self._seen) > 1
+
+
+class Twins:
+    """What speaks for a second device on the bus."""
+
+    def __init__(self, timings: Timings) -> None:
+        self._seen = ""
+        """What one device does not send, as it was seen first."""
+        self._timings = timings
+        self._questions: dict[Key, _Question] = {}
+        self._announced: dict[int, _Announcements] = {}
+        self._application_at: dict[int, float] = {}
+        """When an application sent something last, by sender."""
+        self.is_beside = False
+        """The last reset was confirmed while a bootloader announced itself."""
+
+        # The upgrade.
+        self._updates = 0
+        self._requested_at = inf
+        self._left_at = -inf
+        self._lost_by = ""
+        """What came since the last update command after which a device has no transfer any more."""
+        self._copies: dict[int, _Copies] = {}
+        latest_s = timings.packet_tries * timings.ack_timeout_s
+        self._answers = _Balance(latest_s)
+        """Request transfer, ACK, NAK and complete."""
+        self._feedbacks = _Balance(latest_s)
+        """Those of the application, and of a bootloader that sends them as well."""
+        self._confirmed = _Runs()
+        self._last_row: tuple[object, float] = (None, -inf)
+        self._has_ended = self._is_complete = False
+        self._odd_answers = 0.0
+
+    # -- what is sent -----------------------------------------------------------------------------
+
+    def asked(self, key: Key, now: float, item: Item | None = None) -> None:
+        """A copy of what `key` answers has left; `item` is its row, where it has one."""
+        question = self._questions.setdefault(key, _Question(key))
+        is_answered = question.answers >= question.copies
+        timings = self._timings
+        wait_s = timings.quiet_after_repeat_s if is_answered else timings.command_timeout_s
+        if now - max(question.asked_at, question.answered_at) >= wait_s:
+            question.odd_rounds = question.odd_rounds if question.is_odd else 0
+            question.copies, question.answers, question.is_odd = 0, 0, False
+        question.item = item or question.item
+        question.copies += 1
+        question.asked_at = now
+
+    def left(self, command: Command, now: float, packet: int = 0) -> None:
+        """A message of the upgrade has left; `packet` is the number of a packet."""
+        if command is Command.RESET:
+            self._forget_announcements(is_reset=True)
+            self.is_beside = False
+            self._feedbacks.left(now)
+            return
+        if command is Command.UPDATE:
+            self._forget_announcements(is_reset=False)
+            self.is_beside = False
+            self._questions.clear()  # another application will answer
+            self._copies.clear()
+            self._updates += 1
+            self._lost_by, self._requested_at, self._is_complete = "", inf, False
+        elif command is Command.PACKET:
+            if packet not in self._copies:
+                self._odd_answers = max(0.0, self._odd_answers - _FORGIVEN)
+                if len(self._copies) == _REMEMBERED:
+                    del self._copies[min(self._copies)]
+            self._copies.setdefault(packet, _Copies()).left += 1
+        self._left_at = now
+        self._has_ended = command is Command.END_OF_TRANSFER
+        self._answers.left(now)
+        self._feedbacks.left(now)
+
+    def _forget_announcements(self, *, is_reset: bool) -> None:
+        """A bootloader may begin them anew, or end them."""
+        for announced in self._announced.values():
+            announced.times.clear()
+            if is_reset:
+                announced.boot = None
+
+    # -- what comes -------------------------------------------------------------------------------
+
+    def see(self, frame: Frame, now: float) -> None:
+        """A frame came, of anybody: only applications send to others than the tool."""
+        if self._announced and frame.is_payload and frame.can_id & _RECEIVER_MASK != Node.CDL.value:
+            self._application_at[frame.can_id & _SENDER_MASK] = now
+
+    def heard(self, found: Message | Damage, now: float) -> None:
+        """A message came, or bytes that made none."""
+        if isinstance(found, Damage):
+            self._garbled(found, now)
+            return
+        key = found.can_id, found.command
+        item = BY_KEY.get(key)
+        answer = None if item is None or item.mode != found.mode else answer_of(item)
+        if answer is not None:
+            self.asked(answer.key, now, answer)
+            return
+        if key in self._questions:
+            self._answered(self._questions[key], found, now)
+        else:
+            self._upgrade(found, now)
+
+    # -- answers to questions ---------------------------------------------------------------------
+
+    @property
+    def doubts(self) -> list[Item]:
+        """What was asked and had an answer too many once: to be asked again."""
+        return [each.item for each in self._questions.values() if each.item and each.odd_rounds]
+
+    @property
+    def contents(self) -> dict[Key, list[Content]]:
+        """Every different answer to each question."""
+        return {key: each.contents for key, each in self._questions.items()}
+
+    @property
+    def evidence(self) -> str:
+        """What was seen that one device does not send, and in what the two differ by their answers;
+        empty while there is nothing.
+        """
+        differences = "; ".join(
+            f"{name} {' / '.join(values)}"
+            for question in self._questions.values()
+            for name, values in _differences(question.contents)
+        )
+        if not self._seen or not differences:
+            return self._seen
+        return say("{seen}: {differences}", seen=self._seen, differences=differences)
+
+    def _garbled(self, damage: Damage, now: float) -> None:
+        """An answer that was begun counts: two at once spoil each other."""
+        data = damage.data
+        command = int.from_bytes(data[PREFIX_SIZE : PREFIX_SIZE + COMMAND_SIZE], "big")
+        second = data[FRAME_DATA_SIZE : 2 * FRAME_DATA_SIZE]
+        if second and data.startswith(second):
+            return  # its first frame was doubled
+        question = self._questions.get((damage.can_id, command))
+        if question is not None:
+            self._count(question, now)
+        elif command == Command.GENERAL_FEEDBACK:
+            self._take_feedback(damage.can_id, now)
+
+    def _answered(self, question: _Question, message: Message, now: float) -> None:
+        item, contents = question.item, question.contents
+        if item is not None and len(message.data) == item.content.SIZE_BYTES:
+            content = item.content.from_data(message.data)
+            if content not in contents and len(contents) < _REMEMBERED:
+                contents.append(content)
+        self._count(question, now)
+        if len(contents) > 1 and hasattr(contents[0], "firmware_version"):
+            self._see_two(say("two devices answered"))
+        elif question.is_odd and question.key[1] == Command.GENERAL_FEEDBACK:
+            self._see_two(say("one message was confirmed twice"))
+
+    def _count(self, question: _Question, now: float) -> None:
+        if now - question.answered_at < _DOUBLED_S:
+            return
+        if now - question.asked_at > self._timings.command_timeout_s:
+            return
+        question.answers += 1
+        question.answered_at = now
+        if question.answers > question.copies and not question.is_odd:
+            question.is_odd = True
+            question.odd_rounds += 1
+            if question.odd_rounds > 1:
+                self._see_two(say("two devices answered"))
+
+    # -- the upgrade ------------------------------------------------------------------------------
+
+    def announces(self, answer_id: int, now: float) -> bool:
+        """True while a bootloader announces itself one time after the other."""
+        announced = self._announced.get(answer_id)
+        return announced is not None and now - announced.last_at <= self._longest_s
+
+    def _take_feedback(self, answer_id: int, now: float) -> None:
+        is_odd = self._feedbacks.is_odd()
+        if self._updates:
+            self._confirmed.note_feedback()
+        else:
+            self.is_beside = self.is_beside or self.announces(answer_id, now)
+        if is_odd and not self._copies:
+            self._see_two(say("one message was confirmed twice"))
+        elif is_odd:
+            self._note_odd()
+
+    def has_announced(self, answer_id: int) -> bool:
+        """True when a bootloader has announced itself since the last reset or update command."""
+        announced = self._announced.get(answer_id)
+        return announced is not None and bool(announced.times)
+
+    def overlap(self, answer_id: int) -> bool:
+        """True when the last two announcements are too near to each other for one bootloader."""
+        announced = self._announced.get(answer_id)
+        if announced is None or len(announced.times) < 2:
+            return False
+        earlier, later = list(announced.times)[-2:]
+        return later - earlier < self._shortest_s
+
+    @property
+    def _shortest_s(self) -> float:
+        return self._timings.boot_version_spacing_s * (1 - _TOLERANCE)
+
+    @property
+    def _longest_s(self) -> float:
+        return self._timings.boot_version_spacing_s * (1 + _TOLERANCE)
+
+    def _upgrade(self, message: Message, now: float) -> None:
+        row = messages.decode(message)
+        last, at = self._last_row
+        self._last_row = row, now
+        if row == last and now - at < _DOUBLED_S:
+            return
+        if isinstance(row, BootVersion):
+            self._announce(message.can_id, row, now)
+            return
+        if isinstance(row, messages.GeneralFeedback):
+            self._take_feedback(message.can_id, now)
+        if not self._updates:
+            return
+        if self._is_complete and isinstance(row, _OF_A_TRANSFER):
+            self._see_two(say("one device continued a transfer that another one had completed"))
+        match row:
+            case messages.RequestTransfer():
+                self._count_answer()
+                self._requested_at = min(self._requested_at, now)
+                if any(each.acks for each in self._copies.values()):
+                    self._lost_by = say("request transfer came again")
+            case messages.Ack(number):
+                self._acknowledged(number, now)
+                self._count_answer()
+            case messages.Nak():
+                self._count_answer()
+            case messages.Complete():
+                self._count_answer()
+                self._is_complete = self._has_ended
+
+    def _announce(self, can_id: int, boot: BootVersion, now: float) -> None:
+        announced = self._announced.setdefault(can_id, _Announcements())
+        times = announced.times
+        if announced.boot is None:
+            announced.boot = boot
+        elif boot != announced.boot:
+            texts = [printable(f"{each.name} {each.version}") for each in (announced.boot, boot)]
+            self._see_two(
+                say("bootloaders announced {one} and {other}", one=texts[0], other=texts[1])
+            )
+        # What waits in this computer is heard before something leaves: this came after that.
+        after_request_s = self._left_at - self._requested_at
+        if after_request_s > self._timings.leftover_boot_version_s and not self._has_ended:
+            self._lost_by = say("a bootloader announced itself")
+        application_at = self._application_at.get(can_id & _SENDER_MASK, -inf)
+        is_between = bool(times) and times[-1] < application_at < now
+        if is_between and max(application_at - times[-1], now - application_at) <= self._longest_s:
+            self._see_two(say("a bootloader announced itself while an application was running"))
+        gap_s = now - (times[-1] if times else announced.last_at)
+        is_documented = self._shortest_s <= gap_s <= self._longest_s
+        announced.is_documented = announced.is_documented or is_documented
+        if times and self._updates and _APART_S < gap_s < self._shortest_s:
+            self._note_odd()
+        announced.last_at = now
+        times.append(now)
+        if self._alternate(list(times), is_documented=announced.is_documented):
+            self._see_two(say("two bootloaders announced themselves alternately"))
+
+    def _alternate(self, times: list[float], *, is_documented: bool) -> bool:
+        """True when the four are those of two bootloaders; one that is twice as fast as documented
+        has them at equal distances.
+        """
+        if len(times) < 4 or not all(
+            self._shortest_s <= later - earlier <= self._longest_s
+            for earlier, later in zip(times, times[2:], strict=False)
+        ):
+            return False
+        gaps = [later - earlier for earlier, later in pairwise(times)]
+        is_uneven = max(gaps) - min(gaps) > _TOLERANCE * self._timings.boot_version_spacing_s
+        return is_documented or is_uneven
+
+    def _acknowledged(self, number: int, now: float) -> None:
+        copies = self._copies.get(number)
+        if self._confirmed.note_ack():
+            self._see_two(say("some packets were confirmed by general feedback, others were not"))
+        if self._lost_by:
+            self._see_two(
+                say(
+                    "{what}, yet packet {number} was acknowledged",
+                    what=self._lost_by, number=number,
+                )
+            )  # fmt: skip
+        elif copies is not None:
+            copies.acks += 1
+            if copies.acks > copies.left and now - copies.acked_at > _CLEARLY_APART_S:
+                self._see_two(
+                    say(
+                        "packet {number} left {sent} times and was acknowledged {acks} times",
+                        number=number, sent=copies.left, acks=copies.acks,
+                    )
+                )  # fmt: skip
+            copies.acked_at = now
+
+    def _count_answer(self) -> None:
+        if self._answers.is_odd():
+            self._note_odd()
+
+    def _note_odd(self) -> None:
+        self._odd_answers += 1
+        if self._odd_answers >= _ODD_ANSWERS:
+            self._see_two(say("packets were answered more often than they were sent"))
+
+    def _see_two(self, what: str) -> None:
+        self._seen = self._seen or what
+
+
+def _differences(contents: list[Content]) -> Iterator[tuple[str, list[str]]]:
+    """Each field that differs, and its values."""
+    for name, codec in contents[0].LAYOUT if len(contents) > 1 else ():
+        values = [f"{codec.show(getattr(each, name))} {codec.unit}".strip() for each in contents]
+        if len(set(values)) > 1:
+            yield label(name, codec), list(dict.fromkeys(values))
