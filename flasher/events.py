@@ -192,6 +192,13 @@ class QueryUnanswered:
 
 
 @dataclass(frozen=True)
+class TwoDevicesSeen:
+    """Two devices of one kind have answered; `what` was seen, in words."""
+
+    what: str
+
+
+@dataclass(frozen=True)
 class VerificationStarted:
     """The device has confirmed the image; now it is verified by `level` ("version", "memory")."""
 

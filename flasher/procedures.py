@@ -24,12 +24,13 @@ from flasher.errors import (
     NoAnswerError,
     TransmitBlockedError,
     UsageError,
+    WrongDeviceError,
 )
 from flasher.host.identify import LISTEN_FIRST_S
 from flasher.host.identity import Identity
 from flasher.host.items import Readable, find, readable
 from flasher.host.options import BRIEF_ADAPTER_RETURN_S, UpgradeOptions
-from flasher.host.outcome import AGAIN
+from flasher.host.outcome import AGAIN, TWO_DEVICES_CAUSE
 from flasher.host.query import (
     READ_MEMORY,
     Queries,
@@ -199,10 +200,10 @@ class Procedures:
         if not self.is_alone:
             _check_no_other_tool((yield from self._survey((), LISTEN_FIRST_S)))
 
-    def ask(self, request: Request) -> Procedure[Content]:
-        """Ask one question. Raises NoAnswerError."""
+    def ask(self, request: Request, *, for_write: str = "") -> Procedure[Content]:
+        """Ask one question. Raises NoAnswerError, and what `_asked` raises."""
         yield from self.listen_first()
-        query = yield from self._asked(request)
+        query = yield from self._asked(request, for_write=for_write)
         if query.cancelled:
             raise _interrupted()
         if query.answer is None:
@@ -276,7 +277,8 @@ class Procedures:
         if read_back is None:
             return None
         try:
-            return (yield from self.ask(Request(read_back.item)))
+            nothing = "Nothing was written."
+            return (yield from self.ask(Request(read_back.item), for_write=nothing))
         except NoAnswerError as error:
             error.remedy = f"Nothing was written. {error.remedy}"
             raise
@@ -290,7 +292,8 @@ class Procedures:
             assert isinstance(step, Run)  # noqa: S101  it listens
             yield replace(step, may_cancel=False)
         request = Request(plan.writable.item, plan.content)
-        query = yield from self._asked(request, may_cancel=False)
+        both = "Each of them may hold the new value."
+        query = yield from self._asked(request, may_cancel=False, for_write=both)
         written = Written(plan, before, query.answer is not None, None)
         if plan.writable.read_back is None:
             return written
@@ -362,9 +365,16 @@ class Procedures:
             raise _interrupted()
         return survey
 
-    def _asked(self, request: Request, *, may_cancel: bool = True) -> Procedure[Query]:
+    def _asked(
+        self, request: Request, *, may_cancel: bool = True, for_write: str = ""
+    ) -> Procedure[Query]:
+        """The question, asked. Raises WrongDeviceError when two devices answer in a write; its
+        argument says what may be written.
+        """
         queries = self._queries([request])
         yield Run(queries, may_cancel=may_cancel)
+        if for_write and queries.twins.evidence:
+            raise two_devices(self.target, queries.twins.evidence, for_write)
         return queries.queries[0]
 
     def _queries(self, requests: Iterable[Request]) -> Queries:
@@ -373,6 +383,7 @@ class Procedures:
             bitrate_bps=self.profile.dialect.bitrate_bps,
             timings=self.profile.timings,
             stop_at_silence=True,
+            counts=not self.is_alone,
         )
 
     # -- firmware --------------------------------------------------------------------------------
@@ -634,6 +645,16 @@ def _no_answer(asked: Query) -> NoAnswerError:
         where=f"message {item.name}, sent {asked.tries} times",
         cause=cause,
         remedy="See who is on the bus with flasher scan; wake the device with its key.",
+    )
+
+
+def two_devices(target: Target, seen: str, written: str) -> WrongDeviceError:
+    """The error for two devices where one is meant; `written` says what may be written."""
+    return WrongDeviceError(
+        f"{target.node.name}: two devices answer on the same id ({seen}).",
+        cause=TWO_DEVICES_CAUSE,
+        remedy=f"{written} Disconnect one of them.",
+        code=ErrorCode.TWO_DEVICES,
     )
 
 

@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -31,6 +32,8 @@ from flasher.cli.stop import stop_on_signal
 from flasher.cli.values import TRACE_SUFFIXES, FilePath, FolderPath
 from flasher.driver import Tap
 from flasher.errors import ExitCode, FlasherError, InterruptedByUserError, is_secret
+from flasher.events import TwoDevicesSeen
+from flasher.host.told import warning_of
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.trace.figures import LinkMeter, LinkReport
@@ -100,8 +103,16 @@ class Recording:
         self.failure: BaseException | None = None
         self.bundle: Path | None = None
         """Where it was left, if one was."""
+        self.two_devices: str | None = None
+        """What spoke for a second device of the kind."""
         self.is_alone = False
         """The terminal is gone: the verdict is left in a bundle, a good one too."""
+
+    def warn(self, output: Output, event: object) -> None:
+        """Print and keep what a command reports beside its result."""
+        if isinstance(event, TwoDevicesSeen):
+            self.two_devices = event.what
+            output.error_line(f"warning: {warning_of(event)}")
 
     def opened(self, connection: Connection) -> None:
         """The bus is open."""
@@ -187,7 +198,9 @@ def recorded_device(
         recorded_connection(options, bus, output, target) as (connection, record),
         stop_on_signal() as stopped,
     ):
-        watch: Watch = {"taps": record.taps, "cancelled": stopped}
+        watch: Watch = {
+            "taps": record.taps, "cancelled": stopped, "on_event": partial(record.warn, output),
+        }  # fmt: skip
         yield connection.device(target, dialect=bus.dialect, **watch), record
 
 

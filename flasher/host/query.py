@@ -232,6 +232,12 @@ def count_answers(run: Runner[Any], queries: Sequence[Query]) -> Stage[None]:
                 return
 
 
+def tell_two_devices(run: Runner[Any]) -> None:
+    """Report a second device, if one has shown itself."""
+    if run.twins.evidence:
+        run.tell(events.TwoDevicesSeen(run.twins.evidence))
+
+
 class Queries(Runner[None]):
     """Several questions as an engine; see `ask_all`, and `count_answers` for `counts`."""
 
@@ -258,6 +264,7 @@ class Queries(Runner[None]):
         yield from ask_all(run, self._requests, self.queries, stop_at_silence=stops)
         if self._counts:
             yield from count_answers(run, self.queries)
+            tell_two_devices(run)
 
     @property
     def answers(self) -> list[Content | None]:

@@ -12,7 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Final
 
-from flasher.host.query import Query, Request, ask_all
+from flasher.host.query import Query, Request, ask_all, count_answers, tell_two_devices
 from flasher.host.runner import Came, Runner, Signal, Stage, watched
 from flasher.protocol import catalogue, messages
 from flasher.protocol.contents import Fault, Faults
@@ -118,7 +118,9 @@ class Survey(Runner[None]):
         if not self.other_tool_heard:
             asking = ask_all(run, self._while_worth_it(requests), self.queries)
             yield from watched(asking, self._take)
+            yield from watched(count_answers(run, self.queries), self._take)
             self.cancelled = any(query.cancelled for query in self.queries)
+        tell_two_devices(run)
 
     def _while_worth_it(self, requests: Iterable[Request]) -> Iterable[Request]:
         """The questions, until a device is silent to so many that it seems not to be there."""

@@ -33,6 +33,8 @@ def warning_of(event: object) -> str:
                 f"another tool writes to the device ({seen}). It has no application any more: "
                 f"beginning again when the other tool has been silent for {quiet_s:g} s."
             )
+        case events.TwoDevicesSeen(what):
+            return f"two devices of one kind are on the bus: {what}. Disconnect one of them."
         case events.CheckMade(_, "warned" | "waived", text):
             return text
         case _:

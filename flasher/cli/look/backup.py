@@ -26,7 +26,7 @@ from flasher.errors import ExitCode, UsageError
 from flasher.host.query import READ_MEMORY
 from flasher.image.load import load
 from flasher.mock.store import AREA_START
-from flasher.procedures import DeviceInfo
+from flasher.procedures import DeviceInfo, two_devices
 from flasher.protocol.spec import Target
 from flasher.protocol.text import printable
 from flasher.said import say
@@ -116,7 +116,12 @@ class Backup:
 DEVICE_MODEL: Final = Area(AREA_START, AREA_START + _MOCK_AREA_BYTES, say("the device model"))
 
 
-@command(epilog=_EXAMPLES, exit_codes=(ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.INTERRUPTED))
+@command(
+    epilog=_EXAMPLES,
+    exit_codes=(
+        ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.WRONG_DEVICE, ExitCode.INTERRUPTED,
+    ),
+)  # fmt: skip
 @target_option()
 @option(
     "-o", _OUTPUT, "file", metavar="FILE", type=values.FilePath("zip", gives=Path), required=True,
@@ -155,12 +160,14 @@ def backup(
     check_new(file, _OUTPUT, force=force)
     area = None if no_memory else _area(image, profile, target, bus)
     bus = bus.with_profile(profile)
-    with recorded_device(recorded, bus, output, target) as (device, _):
+    with recorded_device(recorded, bus, output, target) as (device, record):
         output.progress(f"asking the {target.node.name} on {device.connection.name} ...")
         found = device.identify()
         data = b""
         if area is not None and found.is_there:
-            data = read_shown(device, area.start, area.end, output)
+            data = read_shown(device, area.start, area.end, output, record)
+        if record.two_devices is not None:
+            raise two_devices(target, record.two_devices, "No file was written.")
         made = backup_of(found, area, data, device.connection.name, file)
     document, memory = made.document, made.document.memory
     write_whole(file, made.archive, _OUTPUT, is_private=True)

@@ -40,6 +40,8 @@ class InfoDocument:
     """Why, for each of those."""
     faults: FieldValue
     heard: HeardDocument | None
+    two_devices: str | None = None
+    """What speaks for a second device, as an answer that came twice."""
 
 
 DOCUMENTS: Final = (InfoDocument,)
@@ -129,4 +131,5 @@ def info_document(found: DeviceInfo) -> InfoDocument:
         },
         faults=content_document(faults)["faults"] if faults else [],
         heard=heard_document(heard) if heard else None,
+        two_devices=found.survey.twins.evidence or None,
     )

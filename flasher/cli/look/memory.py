@@ -7,6 +7,7 @@ import io
 from flasher.api import Device
 from flasher.cli.bar import Bar
 from flasher.cli.output import Output
+from flasher.cli.recording import Recording
 from flasher.errors import NoAnswerError
 from flasher.events import QueryAnswered
 from flasher.host.query import piece_of
@@ -15,13 +16,14 @@ from flasher.protocol.contents import Memory
 MEMORY = "memory"
 
 
-def read_shown(device: Device, start: int, end: int, output: Output) -> bytes:
+def read_shown(device: Device, start: int, end: int, output: Output, record: Recording) -> bytes:
     """Read memory while a bar shows how far it is. Raises as `Device.read_memory`."""
     done = 0
 
     def show(event: object) -> None:
         nonlocal done
         output.event(event)
+        record.warn(output, event)
         if isinstance(event, QueryAnswered) and isinstance(event.content, Memory):
             done += len(piece_of(event.content))
             bar.move_to(done, end - start)

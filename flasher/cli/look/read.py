@@ -47,6 +47,8 @@ class ItemDocument:
     target: str
     item: str
     fields: dict[str, FieldValue]
+    two_devices: str | None = None
+    """What speaks for a second device, as an answer that came twice."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,7 @@ class MemoryDocument:
     data: str | None = None
     file: str | None = None
     format: Literal["hex", "bin"] | None = None
+    two_devices: str | None = None
 
 
 @dataclass(frozen=True)
@@ -126,20 +129,24 @@ def read(
     if file is None and format:
         raise UsageError("--format needs --output FILE.")
     check_writable(file, _OUTPUT)
-    with recorded_device(recorded, bus, output, BMS) as (device, _):
-        data = read_shown(device, first, behind, output)
+    with recorded_device(recorded, bus, output, BMS) as (device, record):
+        data = read_shown(device, first, behind, output, record)
     if file is not None:
         is_hex = format == "hex" or (format is None and file.suffix.lower() in _HEX_SUFFIXES)
         write_whole(file, intel_hex(first, data) if is_hex else data, _OUTPUT, is_private=True)
         output.result(f"{byte_count(len(data))} from 0x{first:08X} in {printable(str(file))}")
         name: Literal["hex", "bin"] = "hex" if is_hex else "bin"
-        document = MemoryDocument(target.name, first, behind, file=str(file), format=name)
+        document = MemoryDocument(
+            target.name, first, behind, file=str(file), format=name, two_devices=record.two_devices
+        )
     else:
         for at in range(0, len(data), _DUMP_WIDTH):
             line = data[at : at + _DUMP_WIDTH]
             text = "".join(chr(byte) if 0x20 <= byte < 0x7F else "." for byte in line)
             output.result(f"{first + at:08X}  {line.hex(' '):<{_DUMP_WIDTH * 3 - 1}}  {text}")
-        document = MemoryDocument(target.name, first, behind, data=data.hex())
+        document = MemoryDocument(
+            target.name, first, behind, data=data.hex(), two_devices=record.two_devices
+        )
     return output.document(document)
 
 
@@ -147,13 +154,15 @@ def _read_item(
     item: str, target: Target, bus: Bus, recorded: RecordingOptions, output: Output
 ) -> int:
     entry = find(item, readable(target, bus.dialect), target, "read")
-    with recorded_device(recorded, bus, output, target) as (device, _):
+    with recorded_device(recorded, bus, output, target) as (device, record):
         answer = device.read(entry.name)
     document = content_document(answer)
     output.results(content_lines(answer, entry.field))
     if entry.field:
         document = {entry.field: document[entry.field]}
-    return output.document(ItemDocument(target=target.name, item=entry.name, fields=document))
+    return output.document(
+        ItemDocument(target.name, entry.name, fields=document, two_devices=record.two_devices)
+    )
 
 
 # -- memory ---------------------------------------------------------------------------------------

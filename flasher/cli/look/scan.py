@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Final, Literal
 
 from flasher.bus.bit_rate import BitRate
@@ -44,6 +45,8 @@ class ScanDocument:
     nodes: dict[str, HeardDocument]
     foreign_frames: int
     """Under ids of no node of the documents."""
+    two_devices: str | None = None
+    """What speaks for a second device of one kind, as an answer that came twice."""
 
 
 DOCUMENTS: Final = (ScanDocument,)
@@ -64,7 +67,9 @@ def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOpt
         stop_on_signal() as stopped,
     ):
         output.progress(f"listening for {SCAN_LISTEN_S:g} s on {connection.name} ...")
-        survey = connection.scan(dialect, taps=record.taps, cancelled=stopped)
+        survey = connection.scan(
+            dialect, taps=record.taps, cancelled=stopped, on_event=partial(record.warn, output),
+        )  # fmt: skip
         error = None if survey.heard else nobody_heard(survey, rate.bps)
         if error is not None:
             record.failed(error)
@@ -77,6 +82,7 @@ def scan(output: Output, target: Target | None, bus: Bus, recorded: RecordingOpt
         dialect_because=why,
         nodes={node.name.lower(): heard_document(h) for node, h in survey.heard.items()},
         foreign_frames=survey.foreign_frames,
+        two_devices=survey.twins.evidence or None,
     )
     if error is not None:
         return output.failure(error, document)

@@ -89,7 +89,8 @@ def _items(ctx: click.Context) -> list[str]:
 @command(
     epilog=_EXAMPLES,
     exit_codes=(
-        ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.VERIFICATION, ExitCode.INTERRUPTED,
+        ExitCode.BUS, ExitCode.NO_ANSWER, ExitCode.WRONG_DEVICE, ExitCode.VERIFICATION,
+        ExitCode.INTERRUPTED,
     ),
 )  # fmt: skip
 @argument(
