@@ -655,8 +655,8 @@ class UpgradeStage:
         if self.in_session or (self._has_begun and not self._is_last_attempt):
             silent_since = max(self._heard_at, self._update_left_at, self._began_at)
             erased_at = silent_since + self._timings.request_transfer_timeout_s
-            was_tried = self._silence_was_answered and not self.goes_on
-            if (self._at.feedback_came or was_tried) and not self.in_session:
+            was_tried = self._at.feedback_came or self._silence_was_answered
+            if was_tried and not self.goes_on and not self.in_session:
                 self._fail(self._silent_ending, row, Reason.BOOT_GIVEN_UP)
             elif self._run.now < erased_at:
                 self._timer_at = erased_at

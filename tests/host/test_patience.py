@@ -145,6 +145,17 @@ def test_an_update_command_goes_into_the_silence_again_after_each_erase_limit() 
     assert bench.on_to_packet(2, first=1)
 
 
+def test_a_bootloader_that_confirms_the_reset_and_stays_in_its_session_is_told_to_update() -> None:
+    """R15: to the letter it confirms every write, the reset too, that it ignores (R18)."""
+    bench = Bench(options=PATIENT)
+    bench.to_transfer()
+    bench.expect(Packet)
+    bench.to_boot()
+    bench.expect(UpdateCommand, within_s=DEFAULT_TIMINGS.request_transfer_timeout_s + 0.1)
+    bench.say(RequestTransfer())
+    assert bench.on_to_packet(2, first=1)
+
+
 def test_the_user_is_asked_for_a_power_cycle_when_the_update_command_went_into_silence() -> None:
     bench = Bench(options=replace(PATIENT, timeout_s=100.0))
     bench.to_transfer()

@@ -250,7 +250,7 @@ class Stranger:
             return
         if mode != WRITE or self.state == "restarting":
             return
-        if self._choices.confirms_writes and command != RESET:
+        if self._choices.confirms_writes:
             self._say(FEEDBACK, b"ACK", now)
         match command:
             case 0x4205:
