@@ -62,6 +62,9 @@ if [ -n "$here" ]; then # from memory: a guest whose time counts instructions ru
         cp -L "$program" "$folder/bin"
         ldd "$program" | awk '$3 ~ "^/" { print $3 }' | xargs -r cp -L -t "$folder/lib" -u
     done
+    loader=$(realpath /lib64/ld-linux-x86-64.so.2)
+    cp "$loader" "$folder/lib" && mount --bind "$folder/lib/${loader##*/}" "$loader"
+    cp -rL /etc/iproute2 "$folder" && mount --bind "$folder/iproute2" /etc/iproute2
     export PATH=$folder/bin:$PATH LD_LIBRARY_PATH=$folder/lib TMPDIR=$folder/tmp
 fi
 if [ -n "$candlelight" ]; then
@@ -71,5 +74,5 @@ if [ -n "$candlelight" ]; then
 fi
 "$PYTHON" -m pytest -n 0 -m socketcan -k "$only" -v -rsP --color=no --tb=short --durations=5 \
     -p no:cacheprovider -p tests.end_to_end.forks -p no:hypothesispytest -p no:anyio \
-    tests/end_to_end/test_socketcan.py tests/end_to_end/test_candlelight.py
+    tests/end_to_end/test_{socketcan,candlelight,sja1000,printed_commands,can_tools}.py
 [ -n "$here" ] || echo "$SECONDS s in all"

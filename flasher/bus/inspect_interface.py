@@ -121,6 +121,13 @@ def start_command(channel: object, bitrate_bps: object) -> str:
     return f"ip link set {channel} up type can bitrate {bitrate_bps}"
 
 
+def find_commands(channel: object) -> tuple[str, str]:
+    """What makes a virtual interface that is missing, or lists those that are there."""
+    if str(channel).startswith("vcan"):
+        return (f"ip link add dev {channel} type vcan", f"ip link set {channel} up")
+    return ("ip -brief link show type can", "dmesg | grep -i can")
+
+
 def restart_commands(channel: object) -> tuple[str, str]:
     """How root starts an interface again after bus-off, with the settings that it has. `type can
     restart` does so only where the driver has it.

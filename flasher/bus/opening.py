@@ -17,6 +17,8 @@ from flasher.bus.health import ControllerState, bus_off_error
 from flasher.bus.inspect_interface import (
     Unseen,
     change_commands,
+    find_commands,
+    look_up,
     read_interface,
     restart_commands,
     start_command,
@@ -232,6 +234,14 @@ def _opening_remedy(interface: str, channel: object, bitrate_bps: object, error:
             "then log in again) or install the adapter's udev rule."
         )
     if interface == "socketcan":
+        if look_up(str(channel)) is Unseen.MISSING:
+            find = find_commands(channel)
+            if str(channel).startswith("vcan"):
+                return f"`{' && '.join(find)}` (as root) makes it."
+            return (
+                f"Plug it in, then start it: `{start_command(channel, bitrate_bps)}` (as root). "
+                f"`{find[0]}` lists the interfaces that are there."
+            )
         return (
             f"`ip -details link show {channel}` shows its state; "
             f"`{start_command(channel, bitrate_bps)}` (as root) starts it."

@@ -284,10 +284,17 @@ def test_an_adapter_that_cannot_be_opened_names_interface_channel_and_fix(
         raise error
 
     monkeypatch.setattr("can.Bus", fail)
-    for interface, fix in (("socketcan", "ip link set can7"), ("pcan", "driver")):
+    there = Interface("can7", is_can=True, is_up=True)
+    for interface, channel, seen, fix in (
+        ("socketcan", "can7", there, "`ip -details link show can7`"),
+        ("socketcan", "can7", Unseen.MISSING, "`ip -brief link show type can`"),
+        ("socketcan", "vcan7", Unseen.MISSING, "`ip link add dev vcan7 type vcan && ip link set"),
+        ("pcan", "can7", there, "driver"),
+    ):
+        monkeypatch.setattr("flasher.bus.opening.look_up", lambda _name, seen=seen: seen)
         with pytest.raises(BusError, match="cannot be opened") as caught:
-            open_adapter(250_000, interface=interface, channel="can7")
-        assert "can7" in caught.value.where
+            open_adapter(250_000, interface=interface, channel=channel)
+        assert channel in caught.value.where
         assert fix in caught.value.remedy
 
 

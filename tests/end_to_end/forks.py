@@ -23,7 +23,14 @@ from tests.end_to_end.processes import SERVING, clean_environment
 
 _ONE_PIECE: Final = 65_536
 _PACKAGES: Final = ("bus", "cli.look", "host", "image", "mock", "protocol", "settings", "trace")
-_MODULES: Final = ("cli.bench.mock", "cli.upgrade.flash", "cli.upgrade.history")
+_MODULES: Final = (
+    "cli.bench.mock",
+    "cli.upgrade.flash",
+    "cli.upgrade.history",
+    "export.convert",
+    "export.dbc",
+    "export.wireshark",
+)
 """Parts of flasher that the commands of these tests load."""
 
 

@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import IO, Final
 
 import pytest
 
@@ -26,6 +26,8 @@ _CONTROL: Final = os.environ.get("FLASHER_CANDLELIGHT", "")
 _SJA1000: Final = os.environ.get("FLASHER_SJA1000", "").split(",")
 _NETWORK: Final = Path("/sys/class/net")
 _APPEARS_WITHIN_S: Final = 20.0
+GUEST_TIMEOUT: Final = pytest.mark.timeout(3600)
+"""Where time counts instructions, it runs ahead while something is read from disk."""
 needs_candlelight = pytest.mark.skipif(not _CONTROL, reason="there are no simulated candleLights")
 needs_sja1000 = pytest.mark.skipif(len(_SJA1000) != 2, reason="there are no SJA1000 controllers")
 
@@ -39,9 +41,9 @@ def on(channel: str) -> tuple[str, ...]:
     return ("-i", "socketcan", "-c", channel)
 
 
-def wait_until(is_so: Callable[[], bool], what: str) -> None:
-    """Wait for the kernel. Fails after `_APPEARS_WITHIN_S`."""
-    until = time.perf_counter() + _APPEARS_WITHIN_S
+def wait_until(is_so: Callable[[], bool], what: str, *, limit_s: float = _APPEARS_WITHIN_S) -> None:
+    """Wait for the kernel, or for a program. Fails after `limit_s`."""
+    until = time.perf_counter() + limit_s
     while not is_so():
         assert time.perf_counter() < until, f"{what} never came"
         time.sleep(0.01)
@@ -61,7 +63,7 @@ def root(command: str) -> str:
 
 def start(channel: str, *options: str, bitrate_bps: int = 250_000) -> None:
     """Start an interface anew, with these options of its controller alone."""
-    modes = ("listen-only off", "loopback off", "one-shot off")
+    modes = ("listen-only off", "loopback off", "one-shot off", "restart-ms 0")
     root(f"ip link set {channel} down")
     root(f"ip link set {channel} type can bitrate {bitrate_bps} {' '.join((*modes, *options))}")
     root(f"ip link set {channel} up")
@@ -74,13 +76,11 @@ def state_of(channel: str) -> str:
 
 
 @contextmanager
-def background(command: str) -> Iterator[subprocess.Popen[str]]:
+def background(command: str, *, output: IO[str] | int = subprocess.DEVNULL) -> Iterator[None]:
     """A program that runs meanwhile."""
-    with subprocess.Popen(
-        shlex.split(command), stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
+    with subprocess.Popen(shlex.split(command), stdout=output, stderr=output) as process:
         try:
-            yield process
+            yield
         finally:
             process.kill()
 

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import random
 import re
-from collections.abc import Iterator
+import shlex
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
 
 from flasher.errors import ExitCode
+from flasher.protocol.frame import Frame
+from flasher.trace.recorder import Recorder
 from tests.end_to_end.forks import Device, Forked, run
 from tests.end_to_end.kernel import (
+    GUEST_TIMEOUT,
     Candlelights,
     background,
     figure,
@@ -22,9 +27,10 @@ from tests.end_to_end.kernel import (
     state_of,
     wait_until,
 )
+from tests.end_to_end.test_foreign_traffic import CANOPEN, NEIGHBOURS, OTHER_KINDS, UDS, XCP
 from tests.firmware import VECTORS
 
-pytestmark = [pytest.mark.socketcan, pytest.mark.timeout(240), needs_candlelight]
+pytestmark = [pytest.mark.socketcan, GUEST_TIMEOUT, needs_candlelight]
 IMAGE = VECTORS + random.Random(25).randbytes(19_984)
 IMPATIENT = ("--set", "pause_in_transfer=announces", "--set", "transfer_timeout_s=2")
 """A device that waits in its transfer for ever would need a power cycle."""
@@ -218,6 +224,75 @@ def test_a_flash_beside_noise(
     noise = f"cangen {bus.device} -I {can_id} -L 8 -D r -g {gap_ms} -p 10"
     with background(noise):
         check_flash(bus, tmp_path, "--trace-file", "noise.log")
-    told = run("explain", "noise.log", folder=tmp_path).stdout
-    figure("\n".join(line for line in told.splitlines() if "load" in line))
-    assert load
+    told = run("explain", "--json", "noise.log", folder=tmp_path)
+    seen = json.loads(told.stdout)["story"]["bus"]["load"]
+    figure(f"bus load: {seen:.0%}")
+    assert seen > load
+
+
+@pytest.mark.usefixtures("device")
+def test_a_flash_beside_another_tools_iso_tp(bus: Candlelights, tmp_path: Path) -> None:
+    """Between two programs on the same two adapters, through the kernel's own sockets."""
+    payload = " ".join(f"{number & 0xFF:02X}" for number in range(200))
+    sending = f"while echo '{payload}' | isotpsend -s 7E0 -d 7E8 {bus.device}; do sleep 0.05; done"
+    with (
+        (tmp_path / "isotp.txt").open("w") as came,
+        background(f"isotprecv -s 7E8 -d 7E0 -l {bus.tool}", output=came),
+        background(f"sh -c {shlex.quote(sending)}"),
+    ):
+        check_flash(bus, tmp_path)
+    lines = (tmp_path / "isotp.txt").read_text().splitlines()[:-1]  # the last one may be half done
+    figure(f"{len(lines)} messages of 200 bytes by ISO-TP meanwhile")
+    assert len(lines) > 3
+    assert {line.strip() for line in lines} == {payload}
+
+
+def played(frames: Iterable[Frame], folder: Path) -> str:
+    """A program that sends these frames over and over, one every 4 ms."""
+    with Recorder(folder / "played.log") as recorder:
+        for number, frame in enumerate(frames):
+            recorder(frame, sent=True, now=number * 0.004)
+    return f"canplayer -I {folder / 'played.log'} -l i"
+
+
+@pytest.mark.usefixtures("device")
+def test_a_flash_beside_other_protocols_and_other_kinds_of_frames(
+    bus: Candlelights, tmp_path: Path
+) -> None:
+    others = (*CANOPEN, *XCP, *UDS, *OTHER_KINDS, *NEIGHBOURS) * 5
+    with background(f"{played(others, tmp_path)} {bus.device}=can0"):
+        check_flash(bus, tmp_path)
+
+
+@pytest.mark.usefixtures("device")
+def test_hostile_frames_on_the_devices_own_id_end_nothing_badly(
+    bus: Candlelights, tmp_path: Path
+) -> None:
+    """Pieces of every answer, and bytes of none: whatever the flash ends as, it says so, and the
+    same command succeeds when they are gone.
+    """
+    chance = random.Random(29)
+    pieces = ["55AA0C04C202", "55AA0C04C302FFFF", "55AA0CFF", "F0", "55", "55AA0C04C502", ""]
+    hostile = [
+        Frame(0x725, bytes.fromhex(chance.choice(pieces)) or chance.randbytes(chance.randrange(9)))
+        for _ in range(500)
+    ]
+    with background(f"{played(hostile, tmp_path)} {bus.device}=can0"):
+        ended = bus.flasher("flash", "image.bin", "-t", "bms", folder=tmp_path).end()
+    figure(f"exit code {ended} beside them")
+    assert ended in set(ExitCode) - {ExitCode.INTERNAL, ExitCode.USAGE, ExitCode.IMAGE}
+    check_flash(bus, tmp_path)
+
+
+@pytest.mark.usefixtures("device")
+@pytest.mark.parametrize("where", ["tool", "device"])
+def test_a_second_tool_is_refused_from_the_wire_and_from_the_same_interface(
+    bus: Candlelights, tmp_path: Path, where: str
+) -> None:
+    """CO-03."""
+    with background(f"cangen {getattr(bus, where)} -I 752 -L 8 -D r -g 5"):
+        done = bus.flasher("flash", "image.bin", "-t", "bms", folder=tmp_path)
+        assert done.end() == ExitCode.BUS, done.said
+    assert "[E407]" in done.stderr
+    assert "erased nothing" in done.stderr
+    check_flash(bus, tmp_path)

@@ -26,7 +26,7 @@ from flasher.errors import ExitCode
 from flasher.protocol.frame import Frame
 from tests.cli.conftest import SAMPLES
 from tests.end_to_end.forks import Device, Forked, run
-from tests.end_to_end.kernel import figure, on, root
+from tests.end_to_end.kernel import GUEST_TIMEOUT, figure, on, root
 from tests.firmware import VECTORS
 
 QUEUE_FRAMES = 64
@@ -40,7 +40,7 @@ def exists(*names: str) -> bool:
         return False
 
 
-pytestmark = [pytest.mark.socketcan, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.socketcan, GUEST_TIMEOUT]
 needs_vcan = pytest.mark.skipif(not exists("vcan0"), reason="there is no interface vcan0")
 needs_pair = pytest.mark.skipif(not exists("vx0", "vx1"), reason="there is no pair vx0/vx1")
 

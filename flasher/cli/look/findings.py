@@ -21,6 +21,7 @@ from flasher.bus.inspect_interface import (
     Interface,
     Unseen,
     change_commands,
+    find_commands,
     restart_commands,
     start_command,
 )
@@ -175,15 +176,9 @@ def interface(seen: Interface | Unseen, channel: str, bitrate_bps: int) -> Itera
     if seen is Unseen.CANNOT_TELL:
         yield _note("interface", f"{name}: this system tells nothing about it")
     elif seen is Unseen.MISSING:
-        yield _problem("interface", f"there is no interface {name}", _make(name))
+        yield _problem("interface", f"there is no interface {name}", find_commands(name))
     elif isinstance(seen, Interface):
         yield from _kind(seen, name, bitrate_bps)
-
-
-def _make(name: str) -> tuple[str, ...]:
-    if name.startswith("vcan"):
-        return (f"ip link add dev {name} type vcan", f"ip link set {name} up")
-    return (_LIST_INTERFACES, "dmesg | grep -i can")
 
 
 def _kind(seen: Interface, name: str, bitrate_bps: int) -> Iterator[Finding]:
