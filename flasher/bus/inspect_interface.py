@@ -8,7 +8,9 @@ interface is there and up.
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
+import socket
 import subprocess
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -119,6 +121,15 @@ def start_command(channel: object, bitrate_bps: object) -> str:
     if str(channel).startswith(tuple(VIRTUAL_KINDS)):
         return f"ip link set {channel} up"
     return f"ip link set {channel} up type can bitrate {bitrate_bps}"
+
+
+def kernel_has_can() -> bool:
+    """False on a kernel that was built without CAN, as many of virtual machines are."""
+    try:
+        socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW).close()
+    except OSError as error:
+        return error.errno != errno.EAFNOSUPPORT
+    return True
 
 
 def find_commands(channel: object) -> tuple[str, str]:

@@ -233,6 +233,11 @@ def _opening_remedy(interface: str, channel: object, bitrate_bps: object, error:
             "On Linux, add the user to the group of the device (`sudo usermod -aG dialout $USER`, "
             "then log in again) or install the adapter's udev rule."
         )
+    if _code(error) == errno.EAFNOSUPPORT:
+        return (
+            "Use a kernel with CAN, or an adapter that python-can drives itself (slcan, gs_usb, "
+            "pcan); `flasher adapters` lists what is there."
+        )
     if interface == "socketcan":
         if look_up(str(channel)) is Unseen.MISSING:
             find = find_commands(channel)

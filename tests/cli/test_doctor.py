@@ -360,17 +360,29 @@ def test_settings_that_are_fine_are_noted_without_a_command(examine: Doctor) -> 
     ],
 )
 def test_an_interface_that_cannot_be_used(
-    examine: Doctor, seen: Interface | Unseen, words: str, fix: str
+    examine: Doctor,
+    monkeypatch: pytest.MonkeyPatch,
+    seen: Interface | Unseen,
+    words: str,
+    fix: str,
 ) -> None:
     examine.interface = seen
-    if seen is Unseen.MISSING:
-        examine.failure = OSError(19, "No such device")
+    monkeypatch.setattr("flasher.cli.look.findings.kernel_has_can", lambda: True)
     run = examine(*ON_CAN0)
     assert run.code == ExitCode.BUS
     problems = [(w, c) for w, (severity, c) in found(run).items() if severity == "problem"]
-    assert bool(examine.opened) == (seen is Unseen.MISSING)
+    assert examine.opened == []
+    assert len(problems) == 1
     assert words in problems[0][0]
     assert problems[0][1][0] == fix
+
+
+def test_a_kernel_without_can_is_named(examine: Doctor, monkeypatch: pytest.MonkeyPatch) -> None:
+    examine.interface = Unseen.MISSING
+    monkeypatch.setattr("flasher.cli.look.findings.kernel_has_can", lambda: False)
+    run = examine("-i", "socketcan", "-c", "vcan0")
+    assert run.code == ExitCode.BUS
+    assert one(run, "this system's kernel has no CAN") == ("problem", ["flasher adapters"])
 
 
 def test_socketcan_without_a_channel_is_not_opened(examine: Doctor) -> None:

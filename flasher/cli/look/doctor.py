@@ -235,7 +235,11 @@ class Examination:
     def _look_at(self, config: dict[str, Any], stopped: Callable[[], bool]) -> None:
         from flasher.bus.adapter import open_adapter  # noqa: PLC0415  loads python-can
         from flasher.bus.bit_rate import named_bit_rate  # noqa: PLC0415
-        from flasher.bus.inspect_interface import Interface, read_interface  # noqa: PLC0415
+        from flasher.bus.inspect_interface import (  # noqa: PLC0415
+            Interface,
+            Unseen,
+            read_interface,
+        )
         from flasher.bus.opening import can_listen_only  # noqa: PLC0415
 
         given = self._bus.config
@@ -254,6 +258,8 @@ class Examination:
             seen = read_interface(channel)
             only_listens = isinstance(seen, Interface) and seen.only_listens
             self._note(*findings.interface(seen, channel, self.bitrate_bps))
+            if seen is Unseen.MISSING:
+                return
             if isinstance(seen, Interface) and (
                 not (seen.is_up and seen.is_can)  # it would open, and carry nothing
                 or seen.bitrate_bps not in (None, self.bitrate_bps)  # it would not be opened

@@ -22,6 +22,7 @@ from flasher.bus.inspect_interface import (
     Unseen,
     change_commands,
     find_commands,
+    kernel_has_can,
     restart_commands,
     start_command,
 )
@@ -175,6 +176,9 @@ def interface(seen: Interface | Unseen, channel: str, bitrate_bps: int) -> Itera
     name = printable(channel)
     if seen is Unseen.CANNOT_TELL:
         yield _note("interface", f"{name}: this system tells nothing about it")
+    elif seen is Unseen.MISSING and not kernel_has_can():
+        what = "this system's kernel has no CAN; an adapter that python-can drives itself (slcan, "
+        yield _problem("interface", f"{what}gs_usb, pcan) works without", ("flasher adapters",))
     elif seen is Unseen.MISSING:
         yield _problem("interface", f"there is no interface {name}", find_commands(name))
     elif isinstance(seen, Interface):
