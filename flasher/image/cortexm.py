@@ -19,9 +19,10 @@ from flasher.image.image import Image
 _VECTORS: Final = Struct("<4I")
 """Initial stack pointer, then reset, NMI and hard fault."""
 _FIRST_TWO_SIZE: Final = 8
-_RAM_AREAS: Final = ((0x1000_0000, 0x2000_0000), (0x2000_0000, 0x4000_0000))
-"""RAM in the code region (core-coupled, or of some makers) and the SRAM region. A stack pointer
-starts at the end of a RAM and grows down, so the start of an area is outside, its end inside."""
+_RAM_START: Final = 0x1000_0000
+_RAM_END: Final = 0x4000_0000
+"""RAM in the code region (core-coupled, or of some makers), then the SRAM region. A stack pointer
+starts at the end of a RAM and grows down: the start of the area is outside, its end inside."""
 _THUMB: Final = 1
 _MEMORY_SIZE: Final = 1 << 24
 """More than the program memory of any device; the handlers of one program lie closer together."""
@@ -102,7 +103,7 @@ def vector_table(image: Image) -> VectorTable | None:
 
 def _too_far_apart(vectors: list[int], image: Image) -> list[str]:
     """What is wrong with the places that vectors point to, as one list or none."""
-    reach = image.size_bytes if image.base is None else max(image.size_bytes, _MEMORY_SIZE)
+    reach = image.size_bytes if image.base is None else _MEMORY_SIZE
     if max(vectors) - min(vectors) < reach:
         return []
     return [
@@ -157,4 +158,4 @@ def _inner_tables(image: Image) -> list[int]:
 
 
 def _is_stack_pointer(word: int) -> bool:
-    return word % 4 == 0 and any(start < word <= end for start, end in _RAM_AREAS)
+    return word % 4 == 0 and _RAM_START < word <= _RAM_END

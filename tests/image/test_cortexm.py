@@ -125,6 +125,20 @@ def test_without_a_base_vectors_further_apart_than_the_image_is_long_are_told() 
     assert "further apart" in far.problems[0]
 
 
+@each("apart, is_near", [((1 << 24) - 2, True), (1 << 24, False)])
+def test_vectors_of_one_program_lie_within_16_mib(apart: int, *, is_near: bool) -> None:
+    """More than the program memory of any device has."""
+    table = known(vector_table(image(STACK, BASE + 1, 0, BASE + 1 + apart)))
+    assert table.plausible is is_near
+    assert table.problems == (
+        ()
+        if is_near
+        else (
+            "its reset, NMI and hard fault vectors lie further apart than the memory reaches",
+        )
+    )
+
+
 def test_a_vector_table_at_an_odd_place_is_told() -> None:
     table = vector_table(image(STACK, BASE + 0x101, base=BASE + 0x10))
     assert table is not None

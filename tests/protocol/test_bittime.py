@@ -214,3 +214,9 @@ def _bits_by_tables(frame: Frame) -> int:
 def test_the_tables_are_all_that_counting_needs(can_id: int, data: bytes) -> None:
     frame = Frame(can_id, data)
     assert _bits_by_tables(frame) == frame_bits(frame)
+
+
+def test_the_tables_have_a_row_for_each_size_of_a_frame() -> None:
+    tables: Any = frame_tables([0x752])
+    assert tables["fixed"] == [fixed_bits(size) for size in range(9)]
+    assert len(tables["heads"][0x752]) == 9
