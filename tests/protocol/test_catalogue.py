@@ -10,7 +10,16 @@ from typing import Any, Final, NamedTuple
 import pytest
 
 from flasher.protocol import contents, wire
-from flasher.protocol.catalogue import BY_KEY, ITEMS, Decoded, Item, answer_of, decode, encode
+from flasher.protocol.catalogue import (
+    BY_KEY,
+    ITEMS,
+    Decoded,
+    Item,
+    answer_of,
+    decode,
+    encode,
+    has_message,
+)
 from flasher.protocol.fields import Content, Text
 from flasher.protocol.spec import (
     DIALECTS,
@@ -227,6 +236,23 @@ def test_the_dialects_differ_in_bit_rate_nodes_and_upgrade() -> None:
     assert (MOTINOVA.version, MOTINOVA.bitrate_bps) == ("V2.7.1", 125_000)
     assert [node.name for node in MOTINOVA.nodes] == ["WMC", "BMS", "OBC", "HMI", "CDL"]
     assert not MOTINOVA.has_upgrade
+
+
+@each(
+    "message, welling, motinova",
+    [
+        (Message(0x710, 0x0C, 0x1808, b""), True, False),
+        (Message(0x740, 0x0C, 0x1305, b"READY"), False, True),
+        (Message(0x720, 0x0C, 0x1308, b"SHUTDOWN"), True, True),
+        (Message(0x725, 0x0C, 0xC109, b"BMSV1.0.0"), True, False),  # of the upgrade
+        (Message(0x752, 0x11, 0x9901, b"?"), True, True),  # not in the documents
+    ],
+)
+def test_a_dialect_has_its_own_messages_and_does_not_judge_unknown_ones(
+    message: Message, *, welling: bool, motinova: bool
+) -> None:
+    assert has_message(WELLING, message) is welling
+    assert has_message(MOTINOVA, message) is motinova
 
 
 @each("dialect", DIALECTS.values())
