@@ -133,9 +133,7 @@ def test_vectors_of_one_program_lie_within_16_mib(apart: int, *, is_near: bool) 
     assert table.problems == (
         ()
         if is_near
-        else (
-            "its reset, NMI and hard fault vectors lie further apart than the memory reaches",
-        )
+        else ("its reset, NMI and hard fault vectors lie further apart than the memory reaches",)
     )
 
 
