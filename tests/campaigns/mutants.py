@@ -4,9 +4,9 @@
 A mutant is one change of one statement. Not changed is what tests of behaviour cannot see: texts,
 annotations, decorators, bases, assertions (`raise RuntimeError` is one), `__all__`, the declaration
 of attributes in `__init__` (their values are changed), the order of the table's moves. The checkout
-stays as it is: mutants live in a copy in a temporary folder. The tests that run a changed line go
-first. A mutant is killed by a failed test, and by far more computing time or memory than its
-package's tests need.
+stays as it is: mutants live in a copy in a temporary folder. The tests that run a changed line are
+tried, the quickest first. A mutant is killed by a failed test, and by far more computing time or
+memory than its package's tests need.
 
 `mutants_excused.txt` lists the mutants that nothing can tell from the original, with reasons.
 """
@@ -58,7 +58,7 @@ OWN_TESTS: Final = {
 """The tests that are a package's own."""
 REQUIRED: Final = 0.95
 QUICKEST_TESTS: Final = 30
-"""Of the tests that run a changed line, as many are tried before all others are collected."""
+"""As many are tried before the others are collected."""
 MEMORY_BYTES: Final = 4 << 30
 WAIT_S: Final = 900
 """A mutant that waits and does not compute is killed after this."""
@@ -339,17 +339,15 @@ class Measured:
         (self._folder / MEASURED).write_text(json.dumps([self._took_s, tests, spent_s]))
 
 
-class Ordered:
-    """A pytest plugin that puts some tests first, or takes them only."""
+class Chosen:
+    """A pytest plugin that runs some tests only, in this order."""
 
-    def __init__(self, first: Sequence[str], *, only: bool) -> None:
-        self._places = {test: place for place, test in enumerate(first)}
-        self._only = only
+    def __init__(self, tests: Sequence[str]) -> None:
+        self._places = {test: place for place, test in enumerate(tests)}
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
-        if self._only:
-            items[:] = [item for item in items if item.nodeid in self._places]
-        items.sort(key=lambda item: self._places.get(item.nodeid, len(self._places)))
+        items[:] = [item for item in items if item.nodeid in self._places]
+        items.sort(key=lambda item: self._places[item.nodeid])
 
 
 class Ground:
@@ -368,26 +366,33 @@ class Ground:
         self._test_s = 10 + int(8 * max(took_s.values()))
 
     def kills(self, mutant: Mutant) -> bool:
-        module = self._folder / mutant.path
         by_line = self._covering.get(mutant.path, {})
-        tests = {test for line in mutant.lines for test in by_line.get(str(line), ()) if test}
-        first = sorted(tests, key=lambda test: self._took_s[test])
+        runs = [by_line[str(line)] for line in mutant.lines if str(line) in by_line]
+        if not runs:
+            return False
+        first = sorted(
+            {test for tests in runs for test in tests if test}, key=self._took_s.__getitem__
+        )
         quick = first[:QUICKEST_TESTS]
-        files = sorted({test.partition("::")[0] for test in quick})
+        module = self._folder / mutant.path
         original, times = module.read_bytes(), module.stat()
         module.write_text(mutant.write())
         try:
-            return bool(files and self._run(files, lambda: Ordered(quick, only=True))) or bool(
-                self._run(self._tests, lambda: Ordered(first, only=False))
-            )
+            # What runs at import may change any test.
+            is_killed = self._fails(quick) if first else bool(self._run(self._tests))
+            return is_killed or (first != quick and self._fails(first))
         finally:
             module.write_bytes(original)
             os.utime(module, ns=(times.st_atime_ns, times.st_mtime_ns))  # for its bytecode
 
+    def _fails(self, tests: Sequence[str]) -> bool:
+        files = sorted({test.partition("::")[0] for test in tests})
+        return bool(self._run(files, lambda: Chosen(tests)))
+
     def _run(
         self,
         tests: Sequence[str],
-        plugin: Callable[[], object],
+        plugin: Callable[[], object] = object,
         *,
         keeps_bytecode: bool = False,
     ) -> int | None:

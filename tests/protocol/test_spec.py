@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+from typing import get_type_hints
+
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from flasher.errors import UsageError
 from flasher.protocol import spec
 from flasher.protocol.spec import Command, Mode, Node, Target, can_id
-from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.protocol.timing import DEFAULT_TIMINGS, Timings
 from tests.loops import each
 
 
@@ -80,6 +86,15 @@ def test_only_the_bms_has_a_version_query() -> None:
 )
 def test_a_target_is_found_by_its_names_in_either_case(name: str, target: Target | None) -> None:
     assert spec.find_target(name) is target
+
+
+def test_what_a_user_names_is_the_target_or_dialect_or_wrong_usage() -> None:
+    assert spec.as_target("PBU") is spec.as_target(spec.OBC) is spec.OBC
+    assert spec.as_dialect("Motinova") is spec.as_dialect(spec.MOTINOVA) is spec.MOTINOVA
+    with pytest.raises(UsageError, match="no target 'hmi'; targets are wmc, bms, obc"):
+        spec.as_target("hmi")
+    with pytest.raises(UsageError, match="no dialect 'can'; dialects are welling, motinova"):
+        spec.as_dialect("can")
 
 
 @each(
@@ -171,3 +186,23 @@ def test_the_default_timings_are_the_documents_and_r12s() -> None:
     assert (timings.complete_timeout_s, timings.end_tries) == (10.0, 3)
     assert (timings.update_spacing_s, timings.leftover_boot_version_s) == (0.03, 0.06)
     assert timings.quiet_after_repeat_s == 0.05
+    assert (timings.announcing_on_s, timings.application_start_timeout_s) == (1.0, 5.0)
+
+
+@each(
+    "name, allowed, refused",
+    [
+        ("ack_timeout_s", (0.001, 3600), (0, -1, 3600.1)),
+        ("update_spacing_s", (0, 3600), (-0.001, 3600.1)),
+        ("packet_tries", (1, 1000), (0, 1001)),
+    ],
+)
+def test_a_profile_may_set_a_timing_within_its_bounds(
+    name: str, allowed: tuple[float, ...], refused: tuple[float, ...]
+) -> None:
+    adapter: TypeAdapter[float] = TypeAdapter(get_type_hints(Timings, include_extras=True)[name])
+    for value in allowed:
+        assert adapter.validate_python(value) == value
+    for value in refused:
+        with pytest.raises(ValidationError):
+            adapter.validate_python(value)

@@ -80,6 +80,24 @@ def test_it_tells_when_the_last_frame_of_a_message_was_accepted() -> None:
     assert [transmitter.frame_sent(0.0) for _ in range(4)] == [False, False, True, True]
 
 
+def test_a_message_is_begun_from_its_first_frame_to_its_last() -> None:
+    transmitter = Transmitter(_BITRATE_BPS)
+    transmitter.queue(_FIRST)
+    begun = [transmitter.begun]
+    for _ in _FIRST:
+        transmitter.frame_sent(0.0)
+        begun.append(transmitter.begun)
+    assert begun == [False, True, True, False]
+
+
+def test_a_frame_that_leaves_after_its_message_was_given_up_ends_no_message() -> None:
+    transmitter = Transmitter(_BITRATE_BPS)
+    transmitter.queue(_THIRD)
+    transmitter.abandon(0.0)
+    assert not transmitter.frame_sent(0.0)
+    assert transmitter.left_at == float("-inf")
+
+
 def test_the_tag_of_the_message_that_has_left_is_known_with_its_last_frame() -> None:
     transmitter = Transmitter(_BITRATE_BPS)
     transmitter.queue(_SECOND, tag="second")
@@ -165,6 +183,35 @@ def test_dropping_lets_a_message_that_was_begun_be_finished() -> None:
     assert transmitter.idle
 
 
+def test_what_follows_a_message_that_was_given_up_waits_until_its_receiver_has_dropped_it() -> None:
+    transmitter = Transmitter(_BITRATE_BPS)
+    transmitter.queue(_FIRST)
+    transmitter.frame_sent(1.0)
+    transmitter.abandon(1.15)
+    assert transmitter.idle
+    assert not transmitter.begun
+    assert transmitter.next_frame(9.0) is None
+    transmitter.queue(_SECOND)
+    assert transmitter.deadline() == 1.15
+    assert _send_all(transmitter, 1.15) == _SECOND
+
+
+def test_the_rest_of_the_last_message_is_hurried_on_without_gaps() -> None:
+    transmitter = Transmitter(_BITRATE_BPS, frame_gap_s=0.01)
+    transmitter.queue(_FIRST)
+    assert _send_all(transmitter, 1.0) == _FIRST[:1]
+    transmitter.hurry()
+    assert transmitter.deadline() == 0.0
+    assert _send_all(transmitter, 1.0) == _FIRST[1:]
+
+
+def test_a_message_that_has_not_begun_is_not_hurried_before_its_time() -> None:
+    transmitter = Transmitter(_BITRATE_BPS)
+    transmitter.queue(_FIRST, not_before=2.0)
+    transmitter.hurry()
+    assert transmitter.deadline() == 2.0
+
+
 def test_dropping_nothing_is_allowed() -> None:
     transmitter = Transmitter(_BITRATE_BPS)
     transmitter.drop_unstarted()
@@ -218,6 +265,17 @@ def test_half_a_message_has_not_left() -> None:
     transmitter.queue(_FIRST)
     transmitter.frame_sent(10.0)
     assert transmitter.left_at == float("-inf")
+
+
+def test_a_message_has_left_at_the_latest_when_its_answer_comes() -> None:
+    """A bus in one computer is faster than the bit rate says."""
+    transmitter = Transmitter(_BITRATE_BPS)
+    transmitter.queue(_FIRST)
+    _send_all(transmitter, 10.0)
+    transmitter.all_left(10.0001)
+    assert transmitter.left_at == 10.0001
+    transmitter.all_left(11.0)
+    assert transmitter.left_at == 10.0001
 
 
 def test_at_half_the_bit_rate_a_message_takes_twice_as_long() -> None:
