@@ -417,8 +417,7 @@ class Device(_OnBus):
         manufacturer: bool = False,
         **watch: Unpack[Watch],
     ) -> Written:
-        """Write an item by name and read it back where it can be read; old and new value are in the
-        result.
+        """Write an item by name and read it back; old and new value are in the result.
 
         `manufacturer` allows what the document leaves to the manufacturer. Raises UsageError for a
         value that does not fit, NoAnswerError when the device is silent before anything was
@@ -426,8 +425,8 @@ class Device(_OnBus):
         """
         return self._run(self._steps.write(name, values, manufacturer=manufacturer), watch)
 
-    def content_before(self, plan: WritePlan, **watch: Unpack[Watch]) -> Content | None:
-        """The first half of a write: what the device holds now; None when there is no query."""
+    def content_before(self, plan: WritePlan, **watch: Unpack[Watch]) -> Content:
+        """The first half of a write: what the device holds now."""
         return self._run(self._steps.content_before(plan), watch)
 
     def carry_out(self, plan: WritePlan, before: Content | None, **watch: Unpack[Watch]) -> Written:

@@ -271,14 +271,11 @@ class Procedures:
 
     # -- writing ---------------------------------------------------------------------------------
 
-    def content_before(self, plan: WritePlan) -> Procedure[Content | None]:
-        """What the device holds before a write; None when there is no query for it."""
-        read_back = plan.writable.read_back
-        if read_back is None:
-            return None
+    def content_before(self, plan: WritePlan) -> Procedure[Content]:
+        """What the device holds before a write."""
+        request = Request(plan.writable.read_back.item)
         try:
-            nothing = "Nothing was written."
-            return (yield from self.ask(Request(read_back.item), for_write=nothing))
+            return (yield from self.ask(request, for_write="Nothing was written."))
         except NoAnswerError as error:
             error.remedy = f"Nothing was written. {error.remedy}"
             raise
@@ -295,8 +292,6 @@ class Procedures:
         both = "Each of them may hold the new value."
         query = yield from self._asked(request, may_cancel=False, for_write=both)
         written = Written(plan, before, query.answer is not None, None)
-        if plan.writable.read_back is None:
-            return written
         for _ in range(2):
             # An answer on a broadcast id may be one to somebody who asked before the write.
             request = Request(plan.writable.read_back.item)

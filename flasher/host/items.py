@@ -51,11 +51,11 @@ class Readable:
 
 @dataclass(frozen=True)
 class Writable:
-    """Something that can be written, and how it is read back (None: it cannot be)."""
+    """Something that can be written, and how it is read back."""
 
     name: str
     item: Item
-    read_back: Readable | None
+    read_back: Readable
 
     @property
     def fields(self) -> tuple[tuple[str, Codec], ...]:
@@ -87,7 +87,7 @@ def writable(target: Target, dialect: Dialect) -> dict[str, Writable]:
     """What the documents let the tool write to the target, by name."""
     reads = readable(target, dialect)
     return {
-        name: Writable(name, item, reads.get(name))
+        name: Writable(name, item, reads[name])
         for name, item in _named(target, dialect, Mode.WRITE)
     }
 

@@ -1,7 +1,6 @@
 """Writing an item: what is to be written, and how it ended.
 
-A write counts when general feedback confirms it and the item reads back as it was written, as far
-as the document gives a query for it.
+A write counts when general feedback confirms it and the item reads back as it was written.
 """
 
 from __future__ import annotations
@@ -66,7 +65,6 @@ class Written:
         """The error that stands for it; None when it was confirmed and reads back right."""
         name, node = self.plan.writable.name, self.plan.target.node.name
         different = self.differences
-        could_read = self.plan.writable.read_back is not None
         if different:
             first = different[0]
             confirmed = "confirmed" if self.is_confirmed else "did not confirm"
@@ -77,7 +75,7 @@ class Written:
                 remedy="Read it again after a power cycle; the old value may be in force.",
                 code=ErrorCode.WRITE_DIFFERS,
             )
-        if self.is_confirmed and (self.read_back is not None or not could_read):
+        if self.is_confirmed and self.read_back is not None:
             return None
         missing = "read it back" if self.is_confirmed else "confirm it"
         known = "; it does read back as written" if self.read_back is not None else ""

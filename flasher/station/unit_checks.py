@@ -162,12 +162,8 @@ class UnitReads:
         """Read every written field once more. Raises StepFailedError for one that differs."""
         for plan in plans:
             key = write_key(plan.target.name, plan.writable.name)
-            read_back = plan.writable.read_back
-            if read_back is None:
-                measured.append(Measurement(key, text="written, cannot be read back"))
-                continue
             try:
-                fields = self._targets[plan.target.name].read(read_back)
+                fields = self._targets[plan.target.name].read(plan.writable.read_back)
             except NoAnswerError as error:
                 raise StepFailedError(codes.NOT_RUNNING, error.what) from error
             wanted = [name for name, _ in type(plan.content).LAYOUT if name in fields]

