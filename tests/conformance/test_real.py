@@ -81,7 +81,7 @@ def test_own_frames_that_come_back_are_not_taken_for_others() -> None:
 
 def test_one_echo_that_is_lost_does_not_hide_those_behind_it() -> None:
     clock = VirtualClock()
-    bus = SimulatedBus(WELLING.bitrate_bps, clock)
+    bus = SimulatedBus(WELLING.bitrate_bps, clock, collides=False)
     port = RealPort(bus.link(), clock, WELLING.bitrate_bps, echoes=True)
     others = bus.link()
     frames = [RawFrame(0x752, bytes((number,))) for number in range(3)]
