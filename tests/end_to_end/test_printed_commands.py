@@ -261,6 +261,7 @@ def test_what_doctor_prints_on_a_full_bus_succeeds(reader: Reader, tmp_path: Pat
 # -- no interface, or too many ---------------------------------------------------------------------
 
 
+@needs_candlelight  # commands of root are run: in a guest only
 @pytest.mark.parametrize("channel", ["can77", "vcan77"])
 def test_what_is_printed_of_a_missing_interface_succeeds(
     reader: Reader, tmp_path: Path, channel: str
@@ -276,6 +277,7 @@ def test_what_is_printed_of_a_missing_interface_succeeds(
         root(f"ip link delete {channel}")
 
 
+@needs_candlelight  # commands of root are run: in a guest only
 @pytest.mark.usefixtures("bus")
 def test_what_is_printed_where_nothing_is_named_succeeds(reader: Reader, tmp_path: Path) -> None:
     for arguments in (("doctor",), ("adapters",), ("info", "-t", "bms")):
