@@ -9,7 +9,7 @@ It counts: what was sent once is answered once. `Twins` is told of every message
 - the announcements of two bootloaders alternate, or one goes on while an application sends;
 - a packet is acknowledged after a bootloader has announced itself, or has asked for the transfer
   once more, since the last update command;
-- NAK comes beside ACK more often than damaged frames explain.
+- packets have ACK and NAK, though every copy has its ACK, more often than damaged frames explain.
 
 What a single device may do, or a bad line makes of it, is none: a late answer to what was sent
 again (R10), general feedback beside the bootloader's own answers (R15), request transfer again
@@ -44,19 +44,17 @@ take longer."""
 _CLEARLY_APART_S: Final = 0.002
 """The same answer again after more than this was sent for itself; two frames of one message, or two
 messages one behind the other, are nearer."""
-_APART_S: Final = 0.001
-"""Announcements that are nearer to each other may have waited together in this computer."""
 _TOLERANCE: Final = 0.25
 """How much two announcements of one bootloader may be nearer or farther than documented."""
 _ODD_ANSWERS: Final = 2.0
-"""So many answers to nothing are another device's: with what is forgotten, three within twenty
-packets. A bad line makes one of a packet whose first frame it doubles: NAK, then ACK."""
+"""So many packets with two answers are two devices': with what is forgotten, three of twenty. A bad
+line makes one where it doubles the first frame of a packet: NAK, then ACK."""
 _FORGIVEN: Final = 0.05
 """Of them are forgotten with every packet."""
 _RUN: Final = 5
 """So many in a row are no chance, although feedbacks are lost on a bad line."""
 _REMEMBERED: Final = 8
-"""Packets whose copies are counted, and different answers to one question that are kept."""
+"""Packets, and different answers to one question, that are kept."""
 _OF_A_TRANSFER: Final = (messages.RequestTransfer, messages.Ack, messages.Nak)
 _SENDER_MASK, _RECEIVER_MASK = 0x7F0, 0x00F
 
@@ -86,12 +84,28 @@ class _Question:
 
 
 @dataclass
-class _Copies:
-    """What has left of one packet, and how often it was acknowledged."""
+class _Packet:
+    """Copies of one packet against its answers."""
 
-    left: int = 0
+    unacknowledged: int = 0
+    """Copies that have left without an ACK; it outlives an attempt, as an ACK may come late."""
     acks: int = 0
+    naks: int = 0
     acked_at: float = -inf
+    is_odd: bool = False
+
+    def begin(self) -> None:
+        """A new attempt."""
+        self.acks = self.naks = 0
+        self.is_odd = False
+
+    @property
+    def has_two_answers(self) -> bool:
+        """True when each copy has its ACK, and there were more answers. A line that spoils many
+        frames makes several NAKs of a copy, but no ACK.
+        """
+        all_acked = self.acks > 0 and self.unacknowledged <= 0
+        return all_acked and (self.naks > 0 or self.unacknowledged < 0)
 
 
 @dataclass
@@ -107,22 +121,17 @@ class _Announcements:
 
 
 class _Balance:
-    """Messages that left against answers that came: each answer is one to the oldest that has none.
-
-    One that has been without an answer for long is forgotten when the next message leaves: by then
-    all is heard that waited in this computer.
+    """Messages that left against answers that came. A device that has hung answers what came
+    meanwhile, however late: what has no answer keeps waiting for one.
     """
 
-    def __init__(self, latest_s: float) -> None:
-        self._latest_s = latest_s
-        self._open: deque[float] = deque(maxlen=_REMEMBERED)
+    def __init__(self) -> None:
+        self._open = 0
         self._has_left = False
 
-    def left(self, now: float) -> None:
+    def left(self) -> None:
         """One left."""
-        while self._open and now - self._open[0] > self._latest_s:
-            self._open.popleft()
-        self._open.append(now)
+        self._open += 1
         self._has_left = True
 
     def is_odd(self) -> bool:
@@ -131,7 +140,7 @@ class _Balance:
         """
         if not self._open:
             return self._has_left
-        self._open.popleft()
+        self._open -= 1
         return False
 
 
@@ -178,11 +187,12 @@ class Twins:
         self._left_at = -inf
         self._lost_by = ""
         """What came since the last update command after which a device has no transfer any more."""
-        self._copies: dict[int, _Copies] = {}
-        latest_s = timings.packet_tries * timings.ack_timeout_s
-        self._answers = _Balance(latest_s)
-        """Request transfer, ACK, NAK and complete."""
-        self._feedbacks = _Balance(latest_s)
+        self._packets: dict[int, _Packet] = {}
+        self._packet = _Packet()
+        """The one in work."""
+        self._has_ack = False
+        """Since the last update command."""
+        self._feedbacks = _Balance()
         """Those of the application, and of a bootloader that sends them as well."""
         self._confirmed = _Runs()
         self._last_row: tuple[object, float] = (None, -inf)
@@ -209,25 +219,34 @@ class Twins:
         if command is Command.RESET:
             self._forget_announcements(is_reset=True)
             self.is_beside = False
-            self._feedbacks.left(now)
+            self._feedbacks.left()
             return
         if command is Command.UPDATE:
             self._forget_announcements(is_reset=False)
             self.is_beside = False
             self._questions.clear()  # another application will answer
-            self._copies.clear()
+            for each in self._packets.values():
+                each.begin()
+            self._packet = _Packet()
             self._updates += 1
-            self._lost_by, self._requested_at, self._is_complete = "", inf, False
+            self._lost_by, self._requested_at = "", inf
+            self._is_complete = self._has_ack = False
         elif command is Command.PACKET:
-            if packet not in self._copies:
-                self._odd_answers = max(0.0, self._odd_answers - _FORGIVEN)
-                if len(self._copies) == _REMEMBERED:
-                    del self._copies[min(self._copies)]
-            self._copies.setdefault(packet, _Copies()).left += 1
+            self._packet = self._packet_of(packet)
+            self._packet.unacknowledged += 1
         self._left_at = now
         self._has_ended = command is Command.END_OF_TRANSFER
-        self._answers.left(now)
-        self._feedbacks.left(now)
+        self._feedbacks.left()
+
+    def _packet_of(self, number: int) -> _Packet:
+        """A packet that is sent: those that had all their answers long ago are forgotten."""
+        if number in self._packets:
+            return self._packets[number]
+        self._odd_answers = max(0.0, self._odd_answers - _FORGIVEN)
+        if len(self._packets) >= _REMEMBERED:
+            answered = (key for key, each in self._packets.items() if each.unacknowledged <= 0)
+            del self._packets[next(answered, min(self._packets))]
+        return self._packets.setdefault(number, _Packet())
 
     def _forget_announcements(self, *, is_reset: bool) -> None:
         """A bootloader may begin them anew, or end them."""
@@ -336,7 +355,7 @@ class Twins:
             self._confirmed.note_feedback()
         else:
             self.is_beside = self.is_beside or self.announces(answer_id, now)
-        if is_odd and not self._copies:
+        if is_odd and not self._packets:
             self._see_two(say("one message was confirmed twice"))
         elif is_odd:
             self._note_odd()
@@ -379,17 +398,15 @@ class Twins:
             self._see_two(say("one device continued a transfer that another one had completed"))
         match row:
             case messages.RequestTransfer():
-                self._count_answer()
                 self._requested_at = min(self._requested_at, now)
-                if any(each.acks for each in self._copies.values()):
+                if self._has_ack:
                     self._lost_by = say("request transfer came again")
             case messages.Ack(number):
                 self._acknowledged(number, now)
-                self._count_answer()
             case messages.Nak():
-                self._count_answer()
+                self._packet.naks += 1
+                self._weigh(self._packet)
             case messages.Complete():
-                self._count_answer()
                 self._is_complete = self._has_ended
 
     def _announce(self, can_id: int, boot: BootVersion, now: float) -> None:
@@ -413,8 +430,6 @@ class Twins:
         gap_s = now - (times[-1] if times else announced.last_at)
         is_documented = self._shortest_s <= gap_s <= self._longest_s
         announced.is_documented = announced.is_documented or is_documented
-        if times and self._updates and _APART_S < gap_s < self._shortest_s:
-            self._note_odd()
         announced.last_at = now
         times.append(now)
         if self._alternate(list(times), is_documented=announced.is_documented):
@@ -434,29 +449,31 @@ class Twins:
         return is_documented or is_uneven
 
     def _acknowledged(self, number: int, now: float) -> None:
-        copies = self._copies.get(number)
+        self._has_ack = True
         if self._confirmed.note_ack():
             self._see_two(say("some packets were confirmed by general feedback, others were not"))
         if self._lost_by:
+            what = self._lost_by
             self._see_two(
-                say(
-                    "{what}, yet packet {number} was acknowledged",
-                    what=self._lost_by, number=number,
-                )
-            )  # fmt: skip
-        elif copies is not None:
-            copies.acks += 1
-            if copies.acks > copies.left and now - copies.acked_at > _CLEARLY_APART_S:
-                self._see_two(
-                    say(
-                        "packet {number} left {sent} times and was acknowledged {acks} times",
-                        number=number, sent=copies.left, acks=copies.acks,
-                    )
-                )  # fmt: skip
-            copies.acked_at = now
+                say("{what}, yet packet {number} was acknowledged", what=what, number=number)
+            )
+        packet = self._packets.get(number)
+        if packet is None:  # never sent, or long ago
+            self._packet.naks += 1
+            self._weigh(self._packet)
+            return
+        packet.acks += 1
+        packet.unacknowledged -= 1
+        if packet.unacknowledged < 0 and now - packet.acked_at > _CLEARLY_APART_S:
+            self._see_two(
+                say("packet {number} was acknowledged more often than it was sent", number=number)
+            )
+        packet.acked_at = now
+        self._weigh(packet)
 
-    def _count_answer(self) -> None:
-        if self._answers.is_odd():
+    def _weigh(self, packet: _Packet) -> None:
+        if packet.has_two_answers and not packet.is_odd:
+            packet.is_odd = True
             self._note_odd()
 
     def _note_odd(self) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from flasher.host.outcome import Outcome
+from flasher.host.twins import Twins
 from tests.campaigns.world import plans
 from tests.campaigns.world.draw import drawn
 from tests.campaigns.world.plans import Plan
@@ -79,12 +80,24 @@ def test_the_oracle_finds_a_success_that_is_none(monkeypatch: pytest.MonkeyPatch
     assert verdict.is_false
 
 
-def test_the_oracle_finds_a_twin_that_was_left_behind() -> None:
-    """The twin comes when all is transferred, and keeps what it had."""
-    joins = "@end+0.001 stranger begins=off"
-    verdict = play(Plan.parse(f"{SHORT} ; {joins}"))
+def test_the_oracle_finds_a_twin_that_was_left_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Twins, "_see_two", lambda _twins, _what: None)
+    twin = "stranger erase=0.05 late=0.003 ; @packet3+0.02 power device=1 seconds=9"
+    verdict = play(Plan.parse(f"world target=wmc packets=3 ; stranger erase=0.05 ; {twin}"))
+    assert verdict.left == "new / none"
+    assert verdict.faults == ("FALSE: success, and its twin has none",)
+
+
+def test_a_twin_that_sent_nothing_in_the_transfer_is_counted_by_itself() -> None:
+    verdict = play(Plan.parse(f"{SHORT} ; stranger begins=off"))
     assert verdict.left == "new / old"
-    assert verdict.is_false
+    assert verdict.faults == ("UNSEEN: success, and its twin has old",)
+
+
+def test_a_second_device_that_comes_after_the_transfer_is_no_fault_of_the_host() -> None:
+    verdict = play(Plan.parse(f"{SHORT} ; @end+0.001 stranger begins=off"))
+    assert verdict.left == "new / old"
+    assert verdict.faults == ()
 
 
 def test_each_clause_of_a_plan_is_drawn_by_some_seed() -> None:

@@ -28,6 +28,8 @@ _COMMANDS: Final = {b"\x42\x05": "reset", b"\xa1\x0b": "update", b"\xa3\x85": "p
     b"\xa4\x01": "end"
 }
 
+_BEGINS, _GENERAL_FEEDBACK = b"\x55\xaa", b"\x55\x03"
+
 
 class Killed(BaseException):
     """The host's process is gone."""
@@ -170,13 +172,22 @@ class WorldBus(SimulatedBus):
         self.host: SimulatedLink | None = None
         """The tool that runs now: what it sends is the host's."""
         self.on_echo: Callable[[Frame, float], None] | None = None
+        self.heard: set[Any] = set()
+        """Who has begun a message alone that reached the tool; the player empties it. General
+        feedback is none: an application sends it to all that is not for it.
+        """
         self._sender: Any = None
 
     def _deliver(self, senders: Sequence[Any], frame: Frame | None) -> None:
         self._sender = senders[0]
         super()._deliver(senders, frame)
-        if self.on_echo is not None and frame is not None and self._is_host(senders[0]):
+        if frame is None:
+            return
+        if self.on_echo is not None and self._is_host(senders[0]):
             self.on_echo(frame, self._sending_ends_at)
+        is_alone = len(senders) == 1 and self.faults.takes_part
+        if is_alone and frame.data[:2] == _BEGINS and frame.data[4:6] != _GENERAL_FEEDBACK:
+            self.heard.add(getattr(senders[0], "engine", None))
 
     def _is_host(self, sender: Any) -> bool:
         return self.host is not None and sender is self.host._host

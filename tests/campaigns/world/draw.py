@@ -67,6 +67,9 @@ class _Draw:
         self._target = draw.choice(("bms", "bms", "bms", "wmc", "obc"))
         self._packets = draw.choice((3, 5, 8, 12, 20, 20, 30, 45))
         self._has_twin = self._is(self._twin_share)
+        if self._has_twin:
+            # As long as firmware is: of a shorter transfer little shows that two devices take part.
+            self._packets = draw.choice((120, 200, 300, 600))
         happenings = [self._happening() for _ in range(draw.choice(_HOW_MANY))]
         needs_others = any(isinstance(each, plans.Tool | plans.Load) for each in happenings)
         clauses: list[plans.Clause] = [

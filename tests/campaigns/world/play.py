@@ -7,7 +7,7 @@ result against it.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from math import inf
 from typing import Any, Final
@@ -146,6 +146,8 @@ class Player:
         self._is_interrupted = False
         self._kill: plans.Kill | None = None
         self._may_have_erased = False
+        self._at_update: list[Unit] = []
+        """Who was on the bus when the last update command began."""
         for number, device in enumerate(self.plan.devices):
             unit = Unit(self._engine(device))
             self.units.append(unit)
@@ -204,7 +206,10 @@ class Player:
         if sender == "host":
             begun = message_begun(frame)
             if begun is not None:
-                self._may_have_erased |= begun[0] == "update"
+                if begun[0] == "update":
+                    self._may_have_erased = True
+                    self._at_update = self._present
+                    self.bus.heard.clear()
                 self._begins(*begun, now)
 
     def _begins(self, what: str, number: int, now: float) -> None:
@@ -331,9 +336,15 @@ class Player:
                 continue
             lateness = max(lateness, took_s / limit_s)
             break
+        heard = frozenset(self.bus.heard)
+        then = [self._word_for(unit) for unit in self.units]
         self._stop()
         self._wait(self.clock.now() + SETTLE_S)
-        faults += self._judge(claim, had)
+        words = [self._word_for(unit) for unit in self.units]
+        if any(isinstance(each, plans.Tool) for each in self.plan.clauses):
+            # What another tool did after the end is none of the host's.
+            words = [was if was == "new" else now for was, now in zip(then, words, strict=True)]
+        faults += self._judge(claim, had, words, heard)
         if lateness > LATEST:
             faults.append(f"LATE: ended at {lateness:.4f} of the announced deadline")
         has_it = self.units[0].application == self.image.data
@@ -428,8 +439,13 @@ class Player:
             return "new"
         return "old" if application == unit.before else "other"
 
-    def _judge(self, claim: _Claim, had: str) -> Iterator[str]:
-        word, *twins = map(self._word_for, self.units)
+    def _judge(
+        self, claim: _Claim, had: str, words: Sequence[str], heard: frozenset[object]
+    ) -> Iterator[str]:
+        word, *twins = words
+        # Of two devices, one that sends nothing of its own in the transfer cannot be seen.
+        is_unseen = len(self._at_update) > 1 and not heard.issuperset(self._at_update)
+        false = "UNSEEN" if is_unseen else "FALSE"
         if claim.ending == "HANG":
             yield "HANG: it did not end"
             return
@@ -438,10 +454,11 @@ class Player:
         if claim.is_ok != (claim.exit_code == ExitCode.OK):
             yield "UNDOCUMENTED: success and exit code differ"
         if claim.is_ok and word != "new":
-            yield f"FALSE: success, and the device has {word}"
+            yield f"{false}: success, and the device has {word}"
         for twin, unit in zip(twins, self.units[1:], strict=True):
-            if claim.is_ok and twin != "new" and unit in self._present:
-                yield f"FALSE: success, and its twin has {twin}"
+            took_part = unit in self._at_update or unit.application != unit.before
+            if claim.is_ok and twin != "new" and took_part:
+                yield f"{false}: success, and its twin has {twin}"
         if not self._may_have_erased:
             return  # whoever erased it, it was not the host
         # Another tool may erase a device that was complete, while its version is asked.
