@@ -407,6 +407,8 @@ class Twins:
                 self._packet.naks += 1
                 self._weigh(self._packet)
             case messages.Complete():
+                if self._lost_by:
+                    self._see_two(say("{what}, yet the transfer was completed", what=self._lost_by))
                 self._is_complete = self._has_ended
 
     def _announce(self, can_id: int, boot: BootVersion, now: float) -> None:

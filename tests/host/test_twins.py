@@ -178,6 +178,19 @@ def test_a_packet_that_was_sent_once_and_acknowledged_twice_is_two_devices() -> 
     assert check_two(bench) == "packet 2 was acknowledged more often than it was sent"
 
 
+def test_a_transfer_that_is_complete_after_a_late_request_is_two_devices() -> None:
+    """The second device took until then to erase."""
+    bench = in_transfer(1)
+    for number in range(1, 6):
+        bench.say(Ack(number))
+        bench.expect(Packet)
+    bench.say(Ack(6))
+    bench.expect(EndOfTransfer)
+    bench.say(RequestTransfer())
+    bench.say(Complete())
+    assert "yet the transfer was completed" in check_two(bench, DeviceLeft.UNKNOWN)
+
+
 def test_an_answer_that_the_link_has_doubled_is_one() -> None:
     bench = in_transfer(1)
     for number in range(1, 6):
