@@ -148,13 +148,43 @@ def test_the_echo_of_an_own_frame_is_no_other_tool_but_a_second_one_is() -> None
     engine = survey(listen_s=0.0)
     engine.tick(0.0)
     engine.tick(0.0)
-    frame = engine.next_frame(0.0)
-    assert frame is not None
-    engine.frame_sent(0.0)
-    engine.receive(frame._replace(is_echo=True), 0.001)
+    question = []
+    while (frame := engine.next_frame(0.0)) is not None:
+        question.append(frame)
+        engine.frame_sent(0.0)
+    assert len(question) == 2
+    for frame in question:
+        engine.receive(frame._replace(is_echo=True), 0.001)
     assert engine.heard == {}
-    engine.receive(frame, 0.002)
+    for frame in question:
+        engine.receive(frame, 0.002)
     assert set(engine.heard) == {Node.CDL}
+    for frame in question:
+        engine.receive(frame._replace(is_echo=True), 0.003)
+    assert engine.heard[Node.CDL].messages.total() == 1
+
+
+def test_cancelled_in_a_question_it_is_done_and_says_so() -> None:
+    engine = survey(listen_s=0.0)
+    engine.tick(0.0)
+    engine.tick(0.0)
+    assert engine.queries
+    assert not engine.cancelled
+    engine.cancel(0.1)
+    assert engine.done
+    assert engine.cancelled
+
+
+def test_frames_that_the_documents_do_not_give_are_counted() -> None:
+    engine = survey()
+    engine.tick(0.0)
+    engine.receive(Frame(0x720, b"\x55"), 0.1)
+    assert engine.foreign_frames == 0
+    engine.receive(Frame(0x1FF, b"\x55"), 0.1)
+    engine.receive(Frame(0x720, b"", is_remote=True), 0.1)
+    assert engine.foreign_frames == 2
+    assert engine.heard[Node.BMS].frames == 1
+    assert not engine.other_tool_heard
 
 
 FRAMES = st.lists(
