@@ -15,6 +15,7 @@ from flasher.errors import (
     VerificationError,
 )
 from flasher.host.identify import LISTEN_FIRST_S
+from flasher.host.query import check_range
 from flasher.host.write import plan_write
 from flasher.protocol import contents
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC, Dialect, Node, Target
@@ -196,7 +197,11 @@ def test_repeated_answers_do_not_shift_the_pieces() -> None:
     assert wire_to(battery).device().read_memory(0x1000, 0x1400) == battery.memory
 
 
-@each("start, end", [(8, 8), (9, 8), (0, 0x1_0000_0000)])
+def test_all_but_the_last_byte_of_the_memory_can_be_named() -> None:
+    check_range(0, 0xFFFF_FFFF)
+
+
+@each("start, end", [(8, 8), (9, 8), (-1, 8), (0, 0x1_0000_0000)])
 def test_an_impossible_range_is_refused(start: int, end: int) -> None:
     with pytest.raises(UsageError, match="no range of memory"):
         wire_to().device().read_memory(start, end)

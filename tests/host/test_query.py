@@ -4,15 +4,21 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any, Generic, TypeVar
 
 import pytest
 
 from flasher import events
 from flasher.host.query import Queries, Query, Request
+from flasher.host.query import ask as ask_one
+from flasher.host.runner import Runner
 from flasher.protocol import contents
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
+from flasher.protocol.wire import Message
 from tests.loops import each
 from tests.peers.wording import build, payloads
 
@@ -29,10 +35,13 @@ def frames(can_id: int, mode: int, command: int, data: bytes) -> list[Frame]:
     return [Frame(can_id, part) for part in payloads(build(can_id, mode, command, data))]
 
 
-class Bench:
+EngineT = TypeVar("EngineT", bound=Runner[Any])
+
+
+class Bench(Generic[EngineT]):
     """Drives an engine on virtual time and keeps what it sent, frame by frame with its time."""
 
-    def __init__(self, engine: Queries, *, accepts: bool = True) -> None:
+    def __init__(self, engine: EngineT, *, accepts: bool = True) -> None:
         self.engine = engine
         self.accepts = accepts
         self.now = 0.0
@@ -40,7 +49,7 @@ class Bench:
         self.events: list[object] = []
 
     @property
-    def query(self) -> Query:
+    def query(self: Bench[Queries]) -> Query:
         """The question that is asked."""
         return self.engine.queries[-1]
 
@@ -77,7 +86,7 @@ class Bench:
         return [at for at, frame in self.sent if frame.data.startswith(b"\x55\xaa")]
 
 
-def ask(item: Item = READ_VERSION, content: Content | None = None) -> Bench:
+def ask(item: Item = READ_VERSION, content: Content | None = None) -> Bench[Queries]:
     request = Request(item) if content is None else Request(item, content)
     return Bench(Queries([request], bitrate_bps=RATE))
 
@@ -103,7 +112,29 @@ def test_an_unanswered_question_is_repeated_every_200_ms_and_given_up_after_one_
     assert all(0.2 < gap < 0.202 for gap in gaps)  # it is timed from where the copy has left
     assert bench.over()
     assert bench.query.answer is None
-    assert bench.events[-1] == events.QueryUnanswered("read version information", 5)
+    title = "read version information"
+    assert bench.events == [
+        *(events.MessageRepeated(title, "query_unanswered", tries) for tries in (2, 3, 4, 5)),
+        events.QueryUnanswered(title, 5),
+    ]
+
+
+def test_of_a_quiet_question_nothing_is_told() -> None:
+    for is_quiet in (True, False):
+        query = Query(Request(READ_VERSION), quiet=is_quiet)
+        bench: Bench[Runner[Query]] = Bench(Runner(partial(ask_one, query=query), bitrate_bps=RATE))
+        bench.run(0.25)
+        for frame in frames(0x720, 0x0C, 0x1540, VERSION)[:5]:
+            bench.engine.receive(frame, bench.now)
+        bench.run(0.5)
+        bench.say(0x720, 0x0C, 0x1540, VERSION)
+        told = [type(event) for event in bench.events]
+        assert query.answer is not None
+        repeated = events.MessageRepeated
+        expected = [repeated, events.BytesDamaged, repeated, events.QueryAnswered]
+        assert told == ([] if is_quiet else expected)
+        bench.run(2.0)
+        assert bench.over()
 
 
 def test_it_is_over_one_second_after_the_first_copy_has_left() -> None:
@@ -239,6 +270,30 @@ def test_the_caller_may_refuse_an_answer() -> None:
     bench.run(0.05)
     bench.say(0x720, 0x0C, 0x1010, RUNNING)
     assert bench.query.answer is None
+    bench.say(0x720, 0x0C, 0x1010, b"\0" + RUNNING[1:])
+    assert bench.query.answer is not None
+
+
+def test_a_message_of_another_size_than_the_content_of_the_answer_is_none() -> None:
+    """A product's own query, whose command gives another size than its content has."""
+    answer = replace(BY_KEY[0x720, 0x1540], command=0x1539)
+    query = Query(Request(READ_VERSION, answer=answer))
+    assert not query.is_answer(Message(0x720, 0x0C, 0x1539, bytes(0x39)))
+    assert query.answer is None
+
+
+def test_answers_that_came_faster_than_the_bit_rate_do_not_defer_the_end_of_a_silent_question() -> (
+    None
+):
+    """A bus in one computer."""
+    engine = Queries([Request(READ_RUNNING)] * 60 + [Request(READ_VERSION)], bitrate_bps=RATE)
+    bench = Bench(engine)
+    for _ in range(60):
+        bench.run(0.0)
+        bench.say(0x720, 0x0C, 0x1010, RUNNING)
+    assert bench.query.request.item is READ_VERSION
+    bench.run(1.005)
+    assert bench.over()
 
 
 def test_a_message_that_nothing_answers_cannot_be_asked() -> None:

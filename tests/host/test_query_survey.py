@@ -10,9 +10,10 @@ from flasher.errors import UsageError
 from flasher.host.items import check_date, readable, writable
 from flasher.host.query import Request
 from flasher.host.survey import Survey
-from flasher.protocol.catalogue import BY_KEY
+from flasher.protocol.catalogue import BY_KEY, decode
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC, Dialect, Node, Target
+from flasher.protocol.wire import Message
 from tests.loops import each
 from tests.peers.wording import build, payloads
 
@@ -110,6 +111,30 @@ def test_what_is_heard_while_listening_belongs_to_its_sender() -> None:
         engine.receive(Frame(0x732, part), 0.1)
     assert engine.heard[Node.OBC].messages == {"732 5000 read running information": 1}
     assert engine.heard[Node.OBC].frames == 2
+
+
+@each(
+    "message, title, is_in_dialect",
+    [
+        ((0x720, 0x0C, 0x1204, bytes((4, 0, 1, 0))), "720 1204 faults", True),
+        ((0x740, 0x0C, 0x1305, b"READY"), "740 1305 ready for shutdown", False),
+        ((0x725, 0x0C, 0xC109, b"BMSV1.2.3"), "725 C109 boot version", True),
+        ((0x720, 0x0C, 0x9901, b"?"), "720 9901 (not in the documents)", True),
+    ],
+)
+def test_a_message_is_named_and_its_last_content_kept(
+    message: tuple[int, int, int, bytes], title: str, *, is_in_dialect: bool
+) -> None:
+    engine = survey()
+    engine.tick(0.0)
+    for data in (message[3], message[3]):
+        for part in payloads(build(*message[:3], data)):
+            engine.receive(Frame(message[0], part), 0.1)
+    (heard,) = engine.heard.values()
+    assert heard.messages == {title: 2}
+    assert heard.not_in_dialect == (set() if is_in_dialect else {title})
+    decoded = decode(Message(*message))
+    assert heard.last == ({} if decoded is None else {title: decoded.content})
 
 
 def test_a_tool_that_is_heard_while_listening_is_not_disturbed_by_questions() -> None:
