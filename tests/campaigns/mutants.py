@@ -50,6 +50,7 @@ OWN_TESTS: Final = {
         "tests/api/test_requests.py",
         "tests/cli/test_progress.py",
         "tests/cli/test_read_write.py",
+        "tests/cli/test_two_devices.py",
         "tests/test_prose.py",
     ),
     "flasher/image": ("tests/image",),

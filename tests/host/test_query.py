@@ -317,6 +317,44 @@ def test_after_a_repetition_it_waits_for_the_answers_to_both_copies() -> None:
     assert not bench.over()
     bench.say(0x725, 0x0C, 0x5503, b"ACK")
     assert bench.over()
+    assert [type(event) for event in bench.events] == [events.MessageRepeated, events.QueryAnswered]
+
+
+def test_no_further_copy_is_sent_while_it_waits_for_a_second_answer() -> None:
+    bench = Bench(Queries([write(b"ONE.")], bitrate_bps=RATE))
+    bench.run(0.38)
+    bench.say(0x725, 0x0C, 0x5503, b"ACK")
+    bench.run(0.425)
+    assert not bench.over()
+    bench.run(0.431)
+    assert bench.over()
+    assert len(bench.starts()) == 2
+
+
+def test_a_copy_that_has_not_begun_to_leave_when_the_answer_comes_is_dropped() -> None:
+    bench = Bench(Queries([write(b"ONE.")], bitrate_bps=RATE))
+    bench.run(0.1)
+    bench.accepts = False
+    bench.run(0.25)
+    assert bench.query.tries == 2
+    bench.say(0x725, 0x0C, 0x5503, b"ACK")
+    assert bench.over()
+
+
+def test_the_answer_to_a_copy_that_leaves_last_is_waited_for_from_its_end_on() -> None:
+    """The first copy is answered while the second one is half sent."""
+    bench = Bench(Queries([write(b"ONE.")], bitrate_bps=RATE))
+    bench.run(0.1)
+    bench.accepts = False
+    bench.run(0.21)
+    bench.engine.frame_sent(0.21)
+    bench.say(0x725, 0x0C, 0x5503, b"ACK")
+    bench.run(0.25)
+    bench.accepts = True
+    bench.run(0.295)
+    assert not bench.over()
+    bench.run(0.302)
+    assert bench.over()
 
 
 def test_it_waits_for_a_second_answer_50_ms_only() -> None:
@@ -370,6 +408,62 @@ def test_no_further_question_is_made_after_a_silence_if_so_wished() -> None:
     Bench(engine).run(3.0)
     assert engine.done
     assert taken == [READ_VERSION]
+
+
+def counting(*items: Item) -> Bench[Queries]:
+    return Bench(Queries([Request(item) for item in items], bitrate_bps=RATE, counts=True))
+
+
+def test_a_question_that_is_answered_twice_is_asked_again_and_then_two_devices_are_told() -> None:
+    bench = counting(READ_RUNNING, READ_VERSION)
+    bench.run(1.05)
+    bench.say(0x720, 0x0C, 0x1540, VERSION)
+    bench.run(1.08)
+    bench.say(0x720, 0x0C, 0x1540, VERSION)
+    bench.run(1.16)
+    assert not bench.over()
+    assert len(bench.starts()) == 5 + 2
+    bench.say(0x720, 0x0C, 0x1540, VERSION)
+    bench.run(1.18)
+    bench.say(0x720, 0x0C, 0x1540, VERSION)
+    bench.run(1.4)
+    assert bench.over()
+    answered = [each for each in bench.events if isinstance(each, events.QueryAnswered)]
+    assert len(answered) == 1
+    assert bench.events[-1] == events.TwoDevicesSeen("two devices answered")
+
+
+def test_an_answer_to_another_node_that_asks_the_same_is_no_second_device() -> None:
+    bench = counting(READ_VERSION)
+    bench.run(0.01)
+    bench.say(0x732, 0x11, 0x5100, b"")
+    bench.say(0x720, 0x0C, 0x1540, VERSION)
+    bench.run(0.02)
+    bench.say(0x720, 0x0C, 0x1540, VERSION)
+    bench.run(1.0)
+    assert bench.over()
+    assert len(bench.starts()) == 1
+    assert not [each for each in bench.events if isinstance(each, events.TwoDevicesSeen)]
+
+
+def test_the_echo_of_a_question_is_not_taken_for_the_question_of_another() -> None:
+    bench = counting(READ_VERSION)
+    for again in (0, 1):
+        bench.run(0.01 + 0.12 * again)
+        for _, frame in bench.sent[2 * again :]:
+            bench.engine.receive(frame._replace(is_echo=True), bench.now)
+        bench.say(0x720, 0x0C, 0x1540, VERSION)
+        bench.run(0.02 + 0.12 * again)
+        bench.say(0x720, 0x0C, 0x1540, VERSION)
+    bench.run(1.0)
+    assert bench.events[-1] == events.TwoDevicesSeen("two devices answered")
+
+
+def test_where_nothing_was_answered_no_second_device_is_waited_for() -> None:
+    bench = counting(READ_VERSION)
+    bench.run(1.01)
+    assert bench.over()
+    assert events.QueryUnanswered("read version information", 5) == bench.events[-1]
 
 
 def test_cancelled_it_ends_and_asks_nothing_more() -> None:
