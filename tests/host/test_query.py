@@ -341,22 +341,6 @@ def test_a_copy_that_has_not_begun_to_leave_when_the_answer_comes_is_dropped() -
     assert bench.over()
 
 
-def test_the_answer_to_a_copy_that_leaves_last_is_waited_for_from_its_end_on() -> None:
-    """The first copy is answered while the second one is half sent."""
-    bench = Bench(Queries([write(b"ONE.")], bitrate_bps=RATE))
-    bench.run(0.1)
-    bench.accepts = False
-    bench.run(0.21)
-    bench.engine.frame_sent(0.21)
-    bench.say(0x725, 0x0C, 0x5503, b"ACK")
-    bench.run(0.25)
-    bench.accepts = True
-    bench.run(0.295)
-    assert not bench.over()
-    bench.run(0.302)
-    assert bench.over()
-
-
 def test_it_waits_for_a_second_answer_50_ms_only() -> None:
     bench = Bench(Queries([write(b"ONE.")], bitrate_bps=RATE))
     bench.run(0.25)
