@@ -18,7 +18,7 @@ from flasher.protocol.text import printable
 from flasher.report.base import Status, render_page
 from flasher.said import say
 from flasher.station.records.errors import UnprovenError
-from flasher.station.records.keys import Head, fingerprint
+from flasher.station.records.heads import Head
 from flasher.station.records.model import (
     Examination,
     Measurement,
@@ -28,6 +28,7 @@ from flasher.station.records.model import (
     UnitLife,
     UnitState,
 )
+from flasher.station.records.signatures import fingerprint
 from flasher.station.records.store import Store
 
 EARLIER_SHOWN: Final = 50

@@ -16,7 +16,6 @@ import segno
 from flasher.cli.documents import as_json
 from flasher.errors import UsageError
 from flasher.station.certificate import Proof, proven, render_certificate
-from flasher.station.records.keys import is_signed
 from flasher.station.records.model import (
     Measurement,
     RunFilter,
@@ -26,6 +25,7 @@ from flasher.station.records.model import (
     UnitState,
     Verified,
 )
+from flasher.station.records.signatures import is_signed
 from flasher.station.reports import Report, make_report
 from tests.station.factory import SERIAL, USUAL, Bench
 

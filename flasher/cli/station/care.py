@@ -23,10 +23,10 @@ from flasher.cli.station.place import open_to_read, operator_of, records_of, the
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.text import printable
 from flasher.station.records.database import locate, open_database
-from flasher.station.records.keys import fingerprint
 from flasher.station.records.migration import migrate as migrate_records
 from flasher.station.records.model import Examination, Problem
 from flasher.station.records.roles import check_roles, grant_roles
+from flasher.station.records.signatures import fingerprint
 from flasher.station.records.store import Store
 
 ELSEWHERE: Final = "a head kept elsewhere"

@@ -16,10 +16,11 @@ from typing import Any, Final
 from sqlalchemy import Connection, Table, func, select, true
 
 from flasher.station.records import schema
-from flasher.station.records.keys import Head, SigningKey
+from flasher.station.records.heads import Head
 from flasher.station.records.model import AuditEvent, utc_text
 from flasher.station.records.rows import grouped, named
 from flasher.station.records.schema import audit, station
+from flasher.station.records.signatures import SigningKey
 from flasher.station.records.triggers import fingerprint_of
 
 GENESIS: Final = "0" * 64

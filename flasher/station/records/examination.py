@@ -16,7 +16,8 @@ from flasher.station.records.chain import NAMED, OWN, digests_of
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
 from flasher.station.records.files import FileStore
-from flasher.station.records.keys import Head, Keeping, is_signed
+from flasher.station.records.heads import Fault, Head, HeadsFile
+from flasher.station.records.keys import Keeping
 from flasher.station.records.model import (
     TRACE,
     AttachmentFile,
@@ -30,6 +31,7 @@ from flasher.station.records.model import (
 from flasher.station.records.proof import contradictions, traces_of_targets
 from flasher.station.records.queries import details_of
 from flasher.station.records.rows import batches
+from flasher.station.records.signatures import is_signed
 from flasher.station.records.triggers import differences, fingerprint_of
 from flasher.trace.reader import read_trace
 
@@ -114,8 +116,9 @@ class Examiner:
             )
             hashes: dict[int, str] = {}
             restored: dict[int, range] = {}
-            yield from self._chain(name, rows.mappings(), records_id, found, hashes, restored)
-            yield from self._heads(name, kept_of.get(name), hashes, restored)
+            keys: set[str] = set()
+            yield from self._chain(name, rows.mappings(), records_id, found, hashes, restored, keys)
+            yield from self._heads(name, kept_of.get(name), hashes, restored, keys)
         for thing, what in self._schema:
             yield Problem(f"schema, {printable(thing)}", what)
 
@@ -127,6 +130,7 @@ class Examiner:
         found: Mapping[str, str],
         hashes: dict[int, str],
         restored: dict[int, range],
+        keys: set[str],
     ) -> Iterator[Problem]:
         """Go along one chain; fills the hashes of its rows, and which heads were given up."""
         before, key = chain.GENESIS, None
@@ -146,6 +150,7 @@ class Examiner:
             if key is None or not is_signed(row["hash"], row["signature"], key):
                 yield Problem(where, "it is not signed with the key of the station")
             key = following or key
+            keys |= {following} if following else set()
             before, hashes[expected] = row["hash"], row["hash"]
             if not is_whole:
                 continue  # what it says counts for nothing
@@ -181,22 +186,29 @@ class Examiner:
     def _heads(
         self,
         name: str,
-        kept: tuple[Head | int, ...] | None,
+        kept: HeadsFile | None,
         hashes: Mapping[int, str],
         restored: Mapping[int, range],
+        keys: set[str],
     ) -> Iterator[Problem]:
         """Compare a chain with its kept heads."""
         shown = printable(name)
         place = printable(str(self._keeping.heads_folder))
-        if not kept:
+        if kept is None:
             if hashes:
                 self._unkept.append(name)
                 if self._keeping.heads is not None:
                     yield Problem(f"heads of {shown}", f"none of these records is kept in {place}")
             return
-        heads = [each for each in kept if isinstance(each, Head)]
-        for line in (each for each in kept[:-1] if not isinstance(each, Head)):
-            yield Problem(f"heads of {shown}", f"line {line} in {place} is no head")
+        heads = []
+        for entry in kept.entries():
+            if isinstance(entry, Head):
+                heads.append(entry)
+            elif isinstance(entry, Fault):
+                yield Problem(f"heads of {shown}, {entry.where}", entry.what)
+            elif entry.key not in keys:
+                where = f"heads of {shown}, segment {entry.segment} in {place}"
+                yield Problem(where, "it is not signed with a key of the station")
         held = _counting(heads, hashes, restored)
         missing = [head for head in held if head.number not in hashes]
         other = [head for head in held if hashes.get(head.number, head.hash) != head.hash]

@@ -22,8 +22,9 @@ from flasher.station.records import chain, schema
 from flasher.station.records.chain import CLAIM_PARTS, Trail, digests_of
 from flasher.station.records.database import Database, StationLock, copy_sqlite, locate
 from flasher.station.records.files import whole_file
-from flasher.station.records.keys import Keeping, SigningKey
+from flasher.station.records.keys import Keeping
 from flasher.station.records.rows import batches
+from flasher.station.records.signatures import SigningKey
 from flasher.station.records.triggers import final_table, trigger_statements
 
 _OLD: Final = Table(
@@ -86,7 +87,7 @@ def migrate(
         except BaseException:
             path.unlink(missing_ok=True)
             raise
-        keeping.heads_file(station, records_id).append(trail.heads)
+        keeping.heads_file(station, records_id).append(trail.heads, key)
     return Migrated(station, runs, backup, problems)
 
 

@@ -14,7 +14,7 @@ from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.database import Database
 from flasher.station.records.errors import NotFoundError
-from flasher.station.records.keys import Head
+from flasher.station.records.heads import Head
 from flasher.station.records.model import (
     Figures,
     RunDetails,

@@ -21,8 +21,10 @@ from flasher.station.records.errors import (
     RecordError,
     RecordsCutError,
 )
-from flasher.station.records.keys import Head, HeadsFile, Keeping, SigningKey, fingerprint
+from flasher.station.records.heads import Head, HeadsFile
+from flasher.station.records.keys import Keeping
 from flasher.station.records.schema import schema_info
+from flasher.station.records.signatures import SigningKey, fingerprint
 
 
 class Signer:
@@ -71,13 +73,13 @@ class Signer:
         Raises KeyMissingError; RecordsCutError for records that lack rows of which the heads are
         kept; RecordError.
         """
-        kept = self._kept()
-        if kept and not self._is_there(kept[-1]):
+        last = self.heads_file.last()
+        if last is not None and not self._is_there(last):
             raise RecordsCutError(
-                f"These records lack what {self._station} wrote up to {kept[-1].at}: they are an"
+                f"These records lack what {self._station} wrote up to {last.at}: they are an"
                 " older copy, or their end was cut off.",
                 where=self._database.location.shown,
-                cause=f"audit row {kept[-1].number} is kept in {self.heads_file.path}",
+                cause=f"audit row {last.number} is kept in {self.heads_file.path}",
                 remedy="Put the right records back (flasher station verify names what is missing);"
                 " if they are lost: flasher station accept restored.",
             )
@@ -100,7 +102,7 @@ class Signer:
         with self._heads_lock:
             some = list(self._unkept)  # those of earlier commits too that could not be kept
             if some:
-                self.heads_file.append(some)
+                self.heads_file.append(some, trail.key)
                 del self._unkept[: len(some)]
 
     def rotate(self, operator: str) -> None:
@@ -138,16 +140,21 @@ class Signer:
 
         Raises UsageError when nothing is missing.
         """
-        heads = self._kept()
-        if not heads or self._is_there(heads[-1]):
+        last = self.heads_file.last()
+        if last is None or self._is_there(last):
             raise UsageError(
                 "Nothing is missing: the records hold the last row of which a head is kept.",
                 remedy="Start the station.",
             )
-        kept = [head for head in heads if not self._is_there(head)]
+        heads = (each for each in self.heads_file.entries() if isinstance(each, Head))
+        with self._database.reading() as connection:
+            numbers = [
+                head.number
+                for head in heads
+                if chain.hash_at(connection, self._station, head.number) != head.hash
+            ]
         self._load()
         with self.writing() as trail:
-            numbers = [head.number for head in kept]
             lost = {"lost_from": min(numbers), "lost_to": max(numbers)}
             trail.append(self._now(), chain.RESTORED, {**lost, "by": operator, "reason": reason})
         return lost["lost_to"] - lost["lost_from"] + 1
@@ -178,15 +185,12 @@ class Signer:
             following.replace(path)
         self._key = loaded
 
-    @property
+    @cached_property
     def heads_file(self) -> HeadsFile:
         return self.keeping.heads_file(self._station, self.records_id)
 
     def _following(self) -> Path:
         return self.key_file.with_suffix(".new")
-
-    def _kept(self) -> list[Head]:
-        return [each for each in self.heads_file.read() if isinstance(each, Head)]
 
     def _is_there(self, head: Head) -> bool:
         with self._database.reading() as connection:

@@ -21,9 +21,11 @@ from flasher.station.records.errors import (
     Refusal,
     SchemaVersionError,
 )
-from flasher.station.records.keys import HeadsFile, Keeping, SigningKey
+from flasher.station.records.heads import Fault, HeadsFile
+from flasher.station.records.keys import Keeping
 from flasher.station.records.migration import migrate
 from flasher.station.records.model import TORN_TRACE, TRACE, RunId, RunState
+from flasher.station.records.signatures import SigningKey
 from flasher.station.records.store import Store
 from tests.station.factory import SERIAL, Bench
 
@@ -326,11 +328,15 @@ def test_what_was_wrong_with_records_of_version_1_is_said_and_stays_said(old: Pa
 def test_what_is_no_file_in_place_of_key_or_heads_is_never_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe", 0o600)
     with pytest.raises(UsageError, match="no regular file"):
-        HeadsFile(tmp_path / "pipe").read()
+        HeadsFile(tmp_path / "pipe").last()
     with pytest.raises(UsageError, match="no regular file"):
         SigningKey.load(tmp_path / "pipe")
 
 
 def test_a_line_without_end_in_the_heads_is_told_by_its_number(tmp_path: Path) -> None:
     (tmp_path / "heads").write_bytes(b"[" * 100_000 + b"\n{}\n")
-    assert HeadsFile(tmp_path / "heads").read() == (1, 2)
+    found = HeadsFile(tmp_path / "heads").entries()
+    assert [each.what for each in found if isinstance(each, Fault)] == [
+        "line 1 is no head",
+        "line 2 is no head",
+    ]

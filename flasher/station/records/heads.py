@@ -1,0 +1,345 @@
+"""The kept heads of a station's audit chain: files that only grow.
+
+A file that has become large is closed by a signed checkpoint, and another one begins with a copy of
+it: `NAME.heads`, `NAME.heads.000002`, and so on. Whoever starts a station or adds a head reads the
+end of the last one only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+from flasher.files import opened, parse_json
+from flasher.protocol.text import printable
+from flasher.station.records.errors import RecordError, mapped
+from flasher.station.records.files import sync_folder
+from flasher.station.records.signatures import SEGMENT, SigningKey, is_signed
+
+SEGMENT_MAX_BYTES: Final = 4 * 1024 * 1024
+"""A larger segment is closed before the next head is added: some 12,000 audit rows."""
+_TAIL_BYTES: Final = 64 * 1024
+_NO_SEGMENT: Final = "0" * 64
+"""In place of the hash of the checkpoint before the first one."""
+_NUMBER: Final = re.compile(r"[0-9]{6,}")
+
+
+@dataclass(frozen=True)
+class Head:
+    """The end of a station's chain at some moment, signed."""
+
+    station: str
+    number: int
+    """Of the audit row in the station's chain, from 1."""
+    at: str
+    hash: str
+    signature: str
+    key: str
+    """The public key, in hexadecimal digits."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The signed end of a closed segment."""
+
+    segment: int
+    """From 1."""
+    head: Head
+    """The last one in it."""
+    sha256: str
+    """Of all bytes of the segment before the checkpoint."""
+    previous: str
+    """SHA-256 of the checkpoint before it, so that no segment can be left out."""
+    key: str
+    signature: str
+
+
+@dataclass(frozen=True)
+class Fault:
+    """What is wrong with kept heads, and where."""
+
+    where: str
+    what: str
+
+
+@dataclass(frozen=True)
+class Position:
+    """Where reading goes on."""
+
+    segment: int = 1
+    offset: int = 0
+
+
+class HeadsFile:
+    """The kept heads of one station; `append` is the only change that is ever made. `path` is the
+    first segment, which may be a file of any size that an older flasher wrote.
+    """
+
+    def __init__(self, path: Path, segment_max_bytes: int = SEGMENT_MAX_BYTES) -> None:
+        self.path = path
+        self._max_bytes = segment_max_bytes
+        self._last = 0
+        """The last segment that was seen."""
+
+    def append(self, heads: Iterable[Head], key: SigningKey) -> None:
+        """Add a line for each; on disk when this returns. The key signs the checkpoint of a segment
+        that is full. Raises RecordError.
+        """
+        lines = [json.dumps(asdict(head), sort_keys=True) for head in heads]
+        with mapped(printable(str(self.path)), writes=True):
+            is_known = bool(self._last)
+            number = self._last_segment()
+            path = self._segment(number)
+            checkpoint = None
+            if path.exists() and path.stat().st_size >= self._max_bytes:
+                checkpoint = self._closed(number, key)
+                number += checkpoint is not None
+            elif number > 1 and not is_known and self._last_entry(number) is None:
+                checkpoint = self._closed(number - 1, key)  # a crash left it without its beginning
+            if checkpoint is not None:
+                lines.insert(0, checkpoint)
+            _write(self._segment(number), lines)
+            self._last = number
+
+    def last(self) -> Head | None:
+        """The head that was kept last; None without any. Raises RecordError, UsageError for what is
+        no file.
+        """
+        for number in range(self._last_segment(), 0, -1):
+            found = self._last_entry(number)
+            if found is not None:
+                return found.head if isinstance(found, Checkpoint) else found
+        return None
+
+    def first(self) -> Head | None:
+        """The head that was kept first. Raises as `last`."""
+        return next((each for each in self.entries() if isinstance(each, Head)), None)
+
+    def entries(self, after: int = 0) -> Iterator[Head | Checkpoint | Fault]:
+        """What is kept, in the order in which it was; closed segments up to the audit row `after`
+        are left out. Half a line at the end, which a station may be writing, is left out too.
+        Raises as `last`.
+        """
+        previous = _NO_SEGMENT
+        last = self._last_segment()
+        for number in range(1, last + 1):
+            is_closed = number < last
+            if not self._segment(number).exists():
+                if is_closed or number > 1:
+                    yield Fault(self._shown(number), "it is missing")
+                continue
+            if is_closed and after:
+                end = self._last_entry(number)
+                if isinstance(end, Checkpoint) and end.head.number <= after:
+                    previous = _hash_of(_checkpoint_line(end))
+                    continue
+            for entry in self._checked(number, previous, is_closed=is_closed):
+                if isinstance(entry, Checkpoint):
+                    previous = _hash_of(_checkpoint_line(entry))
+                yield entry
+
+    def of_row(self, number: int) -> tuple[Head, ...]:
+        """The heads of one audit row: several where older records were put back. Reads one segment,
+        found by the checkpoints with which they begin. Raises as `last`.
+        """
+        count = self._last_segment()
+        at = bisect_left(range(1, count + 1), number, key=self._begins_after)
+        lines = self._lines(Position(max(at, 1)), is_one=True)
+        heads = (entry for _, line in lines if isinstance(entry := _parsed(line), Head))
+        return tuple(head for head in heads if head.number == number)
+
+    def since(self, position: Position) -> Iterator[tuple[Head, Position]]:
+        """The heads from a position on, each with the position after it. Raises as `last`."""
+        for after, line in self._lines(position):
+            entry = _parsed(line)
+            if isinstance(entry, Head):
+                yield entry, after
+
+    def position_after(self, head: Head) -> Position | None:
+        """The position after a head, looked for from the end on; None where it is not kept. Raises
+        as `last`.
+        """
+        for number in range(self._last_segment(), 0, -1):
+            for after, line in self._lines(Position(number), is_one=True):
+                if _parsed(line) == head:
+                    return after
+        return None
+
+    # -- segments ---------------------------------------------------------------------------------
+
+    def _segment(self, number: int) -> Path:
+        return self.path if number == 1 else self.path.with_name(f"{self.path.name}.{number:06}")
+
+    def _shown(self, number: int) -> str:
+        return printable(str(self._segment(number)))
+
+    def _last_segment(self) -> int:
+        if not self._last or self._segment(self._last + 1).exists():
+            name = f"{self.path.name}."
+            found = self.path.parent.glob(f"{name}*") if self.path.parent.is_dir() else ()
+            ends = (path.name.removeprefix(name) for path in found)
+            self._last = max([1, *(int(end) for end in ends if _NUMBER.fullmatch(end))])
+        return self._last
+
+    def _closed(self, number: int, key: SigningKey) -> str | None:
+        """Close a segment, unless it is; its checkpoint. None where it holds no head."""
+        end = self._last_entry(number)
+        if isinstance(end, Checkpoint):
+            return _checkpoint_line(end)
+        if end is None:
+            return None
+        path = self._segment(number)
+        with opened(path, None, error=RecordError, may_grow=True) as (file, size):
+            file.seek(size - 1)
+            is_whole_line = file.read(1) == b"\n"
+            file.seek(0)
+            digest = hashlib.file_digest(file, "sha256")
+        if not is_whole_line:  # half a line, which a crash has left
+            digest.update(b"\n")
+        before = _NO_SEGMENT
+        if number > 1:
+            lines = self._lines(Position(number), is_one=True)
+            before = _hash_of(next((line for _, line in lines), b"").decode("ascii", "replace"))
+        body = _body(number, end, digest.hexdigest(), before, key.public)
+        signature = key.sign(json.dumps(body, sort_keys=True), SEGMENT)
+        line = json.dumps({"checkpoint": body, "signature": signature}, sort_keys=True)
+        _write(path, [line])
+        return line
+
+    def _begins_after(self, number: int) -> int:
+        """The last audit row before a segment."""
+        line = next((line for _, line in self._lines(Position(number), is_one=True)), b"")
+        entry = _parsed(line)
+        return entry.head.number if isinstance(entry, Checkpoint) else 0
+
+    def _last_entry(self, number: int) -> Head | Checkpoint | None:
+        path = self._segment(number)
+        if not path.exists():
+            return None
+        with opened(path, None, error=RecordError, may_grow=True) as (file, size):
+            length = min(size, _TAIL_BYTES)
+            while True:
+                file.seek(size - length)
+                for line in reversed(file.read(length).splitlines()):
+                    entry = _parsed(line)
+                    if entry is not None:
+                        return entry
+                if length == size:
+                    return None
+                length = min(size, length * 8)
+
+    def _checked(
+        self, number: int, previous: str, *, is_closed: bool
+    ) -> Iterator[Head | Checkpoint | Fault]:
+        """What a segment holds, and what is wrong with it."""
+        digest, last, entry, is_first = hashlib.sha256(), None, None, True
+        where = self._shown(number)
+        for count, (_, line) in enumerate(self._lines(Position(number), is_one=True), 1):
+            entry = _parsed(line)
+            if entry is None:
+                yield Fault(where, f"line {count} is no head")
+            elif is_first and number > 1:
+                is_first = False
+                if _hash_of(line.decode("ascii", "replace")) != previous:
+                    yield Fault(where, "it does not begin with the checkpoint of the one before it")
+                if isinstance(entry, Head):
+                    yield entry
+            elif isinstance(entry, Head):
+                last = entry
+                yield entry
+            else:
+                stated = (entry.segment, entry.head, entry.sha256, entry.previous)
+                found = (number, last, digest.hexdigest(), previous)
+                if stated != found or not _is_whole(entry):
+                    yield Fault(where, "it was changed after it was closed")
+                yield entry
+            digest.update(line + b"\n")
+        if is_closed and not isinstance(entry, Checkpoint):
+            yield Fault(where, "its end is missing")
+
+    def _lines(
+        self, position: Position, *, is_one: bool = False
+    ) -> Iterator[tuple[Position, bytes]]:
+        """Whole lines, each with the position after it; of this segment, or of all from it on."""
+        for number in range(position.segment, self._last_segment() + 1):
+            path = self._segment(number)
+            if path.exists():
+                at = position.offset if number == position.segment else 0
+                # A station may add to it meanwhile.
+                with opened(path, None, error=RecordError, may_grow=True) as (file, size):
+                    file.seek(at)
+                    while at < size and (line := file.readline(size - at)).endswith(b"\n"):
+                        at += len(line)
+                        yield Position(number, at), line[:-1]
+            if is_one:
+                return
+
+
+def _write(path: Path, lines: list[str]) -> None:
+    data = "".join(f"{line}\n" for line in lines).encode("ascii")
+    is_new = not path.exists()
+    if is_new:
+        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    handle = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600)
+    with os.fdopen(handle, "rb+", buffering=0) as file:
+        size = file.seek(0, os.SEEK_END)
+        if size:
+            file.seek(size - 1)
+            if file.read(1) != b"\n":
+                data = b"\n" + data  # after half a line, which a crash has left
+        file.write(data)
+        os.fsync(file.fileno())
+    if is_new:
+        sync_folder(path.parent)
+
+
+def _parsed(line: bytes) -> Head | Checkpoint | None:
+    """What a line holds; None for anything else."""
+    try:
+        found = parse_json(line)
+        if "checkpoint" in found:
+            body = found["checkpoint"]
+            return Checkpoint(**body | {"head": _head(body["head"])}, signature=found["signature"])
+        return _head(found)
+    except (ValueError, TypeError, KeyError):
+        return None
+
+
+def _head(found: Any) -> Head:
+    """Raises TypeError, ValueError."""
+    head = Head(**found)
+    if type(head.number) is not int:
+        raise ValueError("the number of a head is no number")
+    return head
+
+
+def _body(number: int, head: Head, sha256: str, previous: str, public: str) -> dict[str, Any]:
+    found = asdict(Checkpoint(number, head, sha256, previous, public, ""))
+    del found["signature"]
+    return found
+
+
+def _body_of(checkpoint: Checkpoint) -> dict[str, Any]:
+    each = checkpoint
+    return _body(each.segment, each.head, each.sha256, each.previous, each.key)
+
+
+def _checkpoint_line(checkpoint: Checkpoint) -> str:
+    found = {"checkpoint": _body_of(checkpoint), "signature": checkpoint.signature}
+    return json.dumps(found, sort_keys=True)
+
+
+def _hash_of(line: str) -> str:
+    return hashlib.sha256(line.encode("ascii", "replace")).hexdigest()
+
+
+def _is_whole(checkpoint: Checkpoint) -> bool:
+    text = json.dumps(_body_of(checkpoint), sort_keys=True)
+    return is_signed(text, checkpoint.signature, checkpoint.key, SEGMENT)

@@ -1,0 +1,106 @@
+"""Ed25519 signatures of a station: its private key in a file, and how a signature is checked."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+from pathlib import Path
+from typing import Final
+
+from cryptography.exceptions import InvalidSignature, UnsupportedAlgorithm
+from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from cryptography.hazmat.primitives.serialization import (
+    Encoding,
+    NoEncryption,
+    PrivateFormat,
+    load_pem_private_key,
+)
+
+from flasher.files import read
+from flasher.protocol.text import printable
+from flasher.station.records.errors import KeyMissingError, RecordError, mapped
+from flasher.station.records.files import sync_folder
+
+KEY_MAX_SIZE: Final = 64 * 1024
+"""In bytes."""
+_MODE: Final = 0o600
+AUDIT_ROW: Final = "audit row"
+"""What is signed says what it is, so that no signature can be used for something else."""
+SEGMENT: Final = "heads"
+
+
+def fingerprint(public: str) -> str:
+    """What a person compares: the first 16 digits of the hash of a public key, in groups."""
+    digits = hashlib.sha256(bytes.fromhex(public)).hexdigest()[:16]
+    return "-".join(digits[at : at + 4] for at in range(0, 16, 4))
+
+
+def is_signed(text: str, signature: str, public: str, what: str = AUDIT_ROW) -> bool:
+    """True when the holder of the key signed this text as `what`."""
+    try:
+        key = Ed25519PublicKey.from_public_bytes(bytes.fromhex(public))
+        key.verify(base64.b64decode(signature, validate=True), _signed_bytes(what, text))
+    except (InvalidSignature, ValueError):
+        return False
+    return True
+
+
+class SigningKey:
+    """A private key. `public` is the public one, 64 hexadecimal digits."""
+
+    def __init__(self, key: Ed25519PrivateKey) -> None:
+        self._key = key
+        self.public = key.public_key().public_bytes_raw().hex()
+
+    @classmethod
+    def make(cls, path: Path) -> SigningKey:
+        """A new key, on disk when this returns, for this user alone. Raises RecordError."""
+        key = Ed25519PrivateKey.generate()
+        text = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
+        with mapped(printable(str(path)), writes=True):
+            path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _MODE)
+            with os.fdopen(handle, "wb") as file:
+                file.write(text)
+                file.flush()
+                os.fsync(file.fileno())
+            sync_folder(path.parent)
+        return cls(key)
+
+    @classmethod
+    def load(cls, path: Path) -> SigningKey | None:
+        """The key in a file; None when there is no file. Raises KeyMissingError for a file that is
+        no key or that others may read, RecordError for one that cannot be read, UsageError for what
+        is no file.
+        """
+        shown = printable(str(path))
+        if not path.exists():
+            return None
+        try:
+            with mapped(shown, writes=False):
+                if os.name != "nt" and path.stat().st_mode & 0o077:
+                    raise KeyMissingError(
+                        "Others may read the signing key of the station.",
+                        where=shown,
+                        remedy=f"chmod 600 {shown}",
+                    )
+            data = read(path, KEY_MAX_SIZE, error=RecordError)
+            key = load_pem_private_key(data, password=None)
+        except (ValueError, TypeError, UnsupportedAlgorithm):
+            key = None
+        if not isinstance(key, Ed25519PrivateKey):
+            raise KeyMissingError(
+                "The signing key of the station cannot be used: the file holds no Ed25519 key.",
+                where=shown,
+                remedy="Put the right file back; if it is lost: flasher station key --lost.",
+            )
+        return cls(key)
+
+    def sign(self, text: str, what: str = AUDIT_ROW) -> str:
+        """The signature in base64."""
+        return base64.b64encode(self._key.sign(_signed_bytes(what, text))).decode("ascii")
+
+
+def _signed_bytes(what: str, text: str) -> bytes:
+    return f"flasher station {what} {text}".encode()
