@@ -146,7 +146,7 @@ class AbortRun:
 
 @dataclass(frozen=True)
 class CheckPin:
-    """Hold a PIN against its hash; then call `Line.pin_checked`."""
+    """Compare a PIN with its hash; then call `Line.pin_checked`, and give no scan before."""
 
     pin: Pin
     pin_hash: str
@@ -205,6 +205,8 @@ class Line:
         self.lot = lot
         self.stopped: LineStopped | None = None
         """Why the line is stopped; None while it runs."""
+        self.is_checking_pin = False
+        """A PIN is being checked: no scan may be given meanwhile."""
         self.is_closing = False
         """No further run is begun."""
         self._check_serial = check_serial
@@ -372,7 +374,7 @@ class Line:
                 printable(scanned)[:80], lambda: ("label", self._take_mounted(socket, scanned, now))
             )
         elif crew.asked is not None:
-            self._take_pin(crew.asked, scanned)
+            self._take_pin(crew.asked, scanned, now)
         elif person is not None:
             crew.person = person
             before, self.operator = self.operator, person.name
@@ -425,11 +427,13 @@ class Line:
 
     # -- badges and PINs --------------------------------------------------------------------------
 
-    def _take_pin(self, asked: Asked, scanned: str) -> None:
+    def _take_pin(self, asked: Asked, scanned: str, now: float) -> None:
         """What was scanned while a PIN is awaited: it is never shown."""
         if scanned.upper() == Word.CANCEL.value:
             self._end_pin(asked, "CANCELLED", say("It was cancelled."), _NOTHING)
         elif is_form(scanned):
+            self._crew.count_try(asked.person.name, now)
+            self.is_checking_pin = True
             self._effects.append(CheckPin(Pin(scanned), asked.person.pin))
         else:
             self._refuse(
@@ -442,24 +446,24 @@ class Line:
     def pin_checked(self, now: float, *, is_right: bool) -> None:
         """Result of `CheckPin`."""
         crew = self._crew
+        self.is_checking_pin = False
         asked = crew.asked
         if asked is None:
             return
-        has_tries = crew.take_answer(asked.person.name, is_right=is_right, now=now)
         if is_right:
             crew.asked = None
+            crew.was_right(asked.person.name)
             word, argument = asked.word, asked.argument
             self._tell(PinEnded(asked.person.name, is_right=True))
             self._answer(
                 printable(asked.text)[:80],
                 lambda: (word.value.lower(), self._COMMANDS[word](self, argument, now)),
             )
-        elif has_tries:
+        elif remedy := crew.lock_words(asked.person.name, now):
+            self._end_pin(asked, "PIN_LOCKED", say("Too many wrong PINs."), remedy)
+        else:
             remedy = say("Type it again, or scan CANCEL.")
             self._refuse(HIDDEN, "WRONG_PIN", say("The PIN is wrong."), remedy)
-        else:
-            remedy = say("Wait a minute, then scan it again.")
-            self._end_pin(asked, "PIN_LOCKED", say("Too many wrong PINs."), remedy)
         self._go_on(now)
 
     def _end_pin(self, asked: Asked, code: str, reason: str, remedy: str) -> None:
@@ -689,7 +693,7 @@ class Line:
                 self._refuse(text, _FORGOTTEN, reason, _AGAIN)
             self._forget_scans()
         asked = self._crew.asked
-        if asked is not None and now >= asked.until_s:
+        if asked is not None and not self.is_checking_pin and now >= asked.until_s:
             self._end_pin(asked, "NO_PIN", say("No PIN came."), _AGAIN)
         for socket in self.sockets.values():
             waits = socket.label and socket.begin_at_s is None and socket.phase is Phase.REST

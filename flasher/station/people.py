@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from math import ceil
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,6 +26,7 @@ from flasher.protocol.text import printable
 from flasher.said import say
 from flasher.settings.reading import Reader, Table
 from flasher.station import pins
+from flasher.station.attempts import BackOff
 from flasher.station.config import no_two
 from flasher.station.pattern import pattern_of
 from flasher.station.recipe import SerialNumber, ShortText
@@ -32,9 +34,6 @@ from flasher.station.scans import Command, Label, Refused, Word, understand
 
 PIN_LIMIT_S: Final = 30.0
 """The PIN has to follow what it is for within this time."""
-TRIES_MAX: Final = 3
-LOCKED_S: Final = 60.0
-"""After so many wrong PINs nothing that needs one is accepted from that person for this time."""
 HIDDEN: Final = "****"
 """Stands for what was scanned or typed and may be a PIN."""
 
@@ -161,9 +160,8 @@ class Crew:
         self.person: Person | None = None
         """Who works here; None before the first badge."""
         self.asked: Asked | None = None
-        self._wrong: dict[str, int] = {}
-        """Wrong PINs by the person's name, since the last right one or the last lock."""
-        self._locked_until_s: dict[str, float] = {}
+        self._tries = {each.name: BackOff() for each in self._people.values()}
+        """PINs that were given here, by the person's name."""
 
     @property
     def codes(self) -> frozenset[str]:
@@ -207,20 +205,22 @@ class Crew:
 
     def ask(self, person: Person, word: Word, argument: str, now: float) -> Asked:
         """Wait for the PIN. Raises Refused for a person with too many wrong ones."""
-        if now < self._locked_until_s.get(person.name, now):
-            raise Refused(
-                "PIN_LOCKED",
-                say("Too many wrong PINs of {name}.", name=printable(person.name)),
-                say("Wait a minute, then scan it again."),
-            )
+        if remedy := self.lock_words(person.name, now):
+            name = printable(person.name)
+            raise Refused("PIN_LOCKED", say("Too many wrong PINs of {name}.", name=name), remedy)
         self.asked = Asked(person, word, argument, now + PIN_LIMIT_S)
         return self.asked
 
-    def take_answer(self, name: str, *, is_right: bool, now: float) -> bool:
-        """A PIN of this person was right or wrong. False when no other try is left."""
-        wrong = 0 if is_right else self._wrong.get(name, 0) + 1
-        is_locked = wrong >= TRIES_MAX
-        if is_locked:
-            self._locked_until_s[name] = now + LOCKED_S
-        self._wrong[name] = 0 if is_locked else wrong
-        return not is_locked
+    def lock_words(self, name: str, now: float) -> str:
+        """How long this person has to wait after too many wrong PINs; "" where one is taken."""
+        wait_s = self._tries[name].wait_s(now)
+        if wait_s == 0.0:
+            return ""
+        return say("Wait {seconds} s, then scan it again.", seconds=ceil(wait_s))
+
+    def count_try(self, name: str, now: float) -> None:
+        """A PIN of this person is going to be checked."""
+        self._tries[name].count(now)
+
+    def was_right(self, name: str) -> None:
+        self._tries[name].reset()

@@ -15,6 +15,7 @@ from __future__ import annotations
 import multiprocessing
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor, Future
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final
@@ -122,6 +123,7 @@ class Station:
         options: StationOptions | None = None,
         clock: Clock | None = None,
         launch: Launch = ProcessPort,
+        checker: Executor | None = None,
     ) -> None:
         self.store = store
         self.recipe = recipe
@@ -146,6 +148,10 @@ class Station:
         """Runs that are claimed and not saved yet, by their sockets."""
         self._scans: deque[tuple[str, str]] = deque()
         self._published: deque[StationEvent] = deque()
+        self._checked: deque[bool] = deque()
+        """PINs that were right or wrong, and of which the line is not told yet."""
+        self.checker = checker or pins.checker()
+        """Checks PINs, beside the loop of the station."""
         self._wake_receiver, self._wake_sender = multiprocessing.Pipe(duplex=False)
         self._started_at = self.clock.utc()
         self._is_stopping = False
@@ -238,16 +244,23 @@ class Station:
             self._hear(socket, message)
         while self._published:
             self.tell(self._published.popleft())
-        while self._scans:
-            text, mounted = self._scans.popleft()
-            self.line.scan(text, self._now, mounted)
-            self._carry_out()
+        self._take_scans()
         if self._is_aborting:
             self._abort_running()
         self.line.tick(self._now)
         self._carry_out()
         self._tell_labels()
         self._on_turn()
+
+    def _take_scans(self) -> None:
+        """What was scanned, and the PINs that were checked; scans wait while one is."""
+        while self._checked or (self._scans and not self.line.is_checking_pin):
+            if self._checked:
+                self.line.pin_checked(self._now, is_right=self._checked.popleft())
+            else:
+                text, mounted = self._scans.popleft()
+                self.line.scan(text, self._now, mounted)
+            self._carry_out()
 
     def close(self) -> None:
         """End all processes. Runs that go on are stopped, and saved if they say their end in time;
@@ -313,8 +326,8 @@ class Station:
                         all_saved = self._end_unknown() and all(saved)
                         self.line.resumed(self._now, all_saved=all_saved)
                     case line.CheckPin(pin, pin_hash):
-                        is_right = pins.is_right(pin, pin_hash)
-                        self.line.pin_checked(self._now, is_right=is_right)
+                        checked = self.checker.submit(pins.is_right, pin, pin_hash)
+                        checked.add_done_callback(self._pin_checked)
                     case line.Reprint(serial, data):
                         self.line.reprinted(serial, self._reprint(serial, data))
                     case line.Audit(what, data):
@@ -346,6 +359,11 @@ class Station:
         for socket in self.line.sockets.values():
             if socket.phase is Phase.RUN:
                 self.supervisor.send(socket.name, Abort())
+
+    def _pin_checked(self, checked: Future[bool]) -> None:
+        """Called in the thread that checks PINs."""
+        self._checked.append(checked.exception() is None and checked.result())
+        self._wake()
 
     def _wake(self) -> None:
         self._wake_sender.send_bytes(b"x")

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -67,6 +69,28 @@ class ScriptedPort:
         return True
 
 
+class AtOnce(Executor):
+    """Does what it is given at once, in the same thread; while `holds`, when `go_on` is called."""
+
+    def __init__(self) -> None:
+        self.holds = False
+        self.waiting: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
+        self.done = 0
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        self.waiting.append((future, lambda: fn(*args, **kwargs)))
+        if not self.holds:
+            self.go_on()
+        return future
+
+    def go_on(self) -> None:
+        """Do the first of what waits."""
+        future, do = self.waiting.popleft()
+        self.done += 1
+        future.set_result(do())
+
+
 class LineBench:
     """A station with sockets A, B, ...; at the start the processes say that they are empty."""
 
@@ -86,6 +110,7 @@ class LineBench:
         self.sees_units = sees_units
         self.events: list[StationEvent] = []
         self.ports: dict[str, ScriptedPort] = {}
+        self.checker = AtOnce()
         setups = [WorkerSetup(name, bench.recipe.path, {}, None) for name in sockets]
         self.station = Station(
             bench.store,
@@ -103,6 +128,7 @@ class LineBench:
             ),
             clock=bench.clock,
             launch=self._launch,
+            checker=self.checker,
         )
         self.station.start()
         for name in sockets:

@@ -12,6 +12,7 @@ from argon2 import PasswordHasher
 
 from flasher.errors import UsageError
 from flasher.station import pins
+from flasher.station.attempts import PAUSE_S, TRIES_MAX
 from flasher.station.board import Board
 from flasher.station.events import (
     LineResumed,
@@ -27,9 +28,7 @@ from flasher.station.line import CheckPin
 from flasher.station.messages import Abort
 from flasher.station.people import (
     HIDDEN,
-    LOCKED_S,
     PIN_LIMIT_S,
-    TRIES_MAX,
     Crew,
     Person,
     Role,
@@ -221,7 +220,8 @@ def test_wrong_pins_are_limited_and_the_limit_ends(line: LineBench, bench: Bench
         line.scan(WRONG)
     assert refusal(line) == "PIN_LOCKED"
     assert line.last(PinEnded) == PinEnded("Rea", is_right=False)
-    bench.clock.go_on(LOCKED_S - 0.1)
+    assert line.last(ScanRefused).remedy == "Wait 60 s, then scan it again."
+    bench.clock.go_on(PAUSE_S - 0.1)
     line.scan("REASON x")
     assert refusal(line) == "PIN_LOCKED", "no PIN is asked for"
     line.scan(PIN)
@@ -231,6 +231,57 @@ def test_wrong_pins_are_limited_and_the_limit_ends(line: LineBench, bench: Bench
     line.scan("REASON x")
     line.scan(PIN)
     assert line.last(ScanAccepted).meaning == "reason"
+
+
+def test_each_pause_is_longer_until_a_pin_is_right(line: LineBench, bench: Bench) -> None:
+    line.scan(REWORK)
+    for pause_s in (PAUSE_S, 2 * PAUSE_S):
+        line.scan("REASON x")
+        for _ in range(TRIES_MAX):
+            line.scan(WRONG)
+        assert line.last(ScanRefused).remedy == f"Wait {pause_s:g} s, then scan it again."
+        bench.clock.go_on(pause_s)
+    for _ in range(3 * TRIES_MAX):
+        line.scan("REASON x")
+        line.scan(PIN)
+        assert line.last(ScanAccepted).text == "REASON x"
+
+
+def test_a_pin_is_checked_beside_the_line_and_what_follows_waits(
+    line: LineBench, bench: Bench
+) -> None:
+    line.scan(REWORK)
+    line.scan("REASON new cell")
+    line.checker.holds = True
+    for text in (WRONG, PIN, "LOT L9"):
+        line.station.submit(text)
+    line.turn()
+    assert len(line.checker.waiting) == 1, "one at a time"
+    line.arrive("A")  # the line goes on
+    assert line.of(ScanRefused) == []
+    line.checker.go_on()
+    line.turn()
+    assert refusal(line) == "WRONG_PIN"
+    assert len(line.checker.waiting) == 1
+    bench.clock.go_on(PIN_LIMIT_S)
+    line.turn()
+    assert line.of(PinEnded) == [], "it came in time"
+    line.checker.go_on()
+    line.turn()
+    assert line.of(PinEnded) == [PinEnded("Rea", is_right=True)]
+    assert line.last(ScanAccepted).text == "LOT L9"
+    assert line.checker.done == 2
+
+
+def test_a_check_that_fails_is_no_right_pin(line: LineBench) -> None:
+    line.scan(REWORK)
+    line.scan("REASON x")
+    line.checker.holds = True
+    line.scan(PIN)
+    checked, _ = line.checker.waiting.popleft()
+    checked.set_exception(MemoryError())
+    line.turn()
+    assert refusal(line) == "WRONG_PIN"
 
 
 def test_the_lock_is_of_one_person_and_survives_another_badge(line: LineBench) -> None:
