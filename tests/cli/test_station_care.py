@@ -1,4 +1,4 @@
-"""`flasher station verify`, `key`, `accept` and `migrate`, as a person meets them."""
+"""`flasher station verify`, `key`, `accept` and `upgrade`, as a person meets them."""
 
 from __future__ import annotations
 
@@ -13,9 +13,11 @@ import pytest
 
 from flasher.errors import ExitCode
 from flasher.station.records.model import RunState
+from flasher.station.records.schema import SCHEMA_VERSION
 from tests.cli.conftest import Flasher
 from tests.cli.test_schema import hold_output
 from tests.station.factory import SERIAL, Bench
+from tests.station.records import old_records
 
 
 @pytest.fixture
@@ -130,23 +132,39 @@ def test_which_station_is_meant_has_to_be_clear(
     assert named.out.startswith("line-3: key ")
 
 
-def test_records_of_version_1_are_read_after_migration(
-    flasher: Flasher, tmp_path: Path, schema: dict[str, Any]
+@pytest.mark.parametrize("back_end", ["sqlite", "postgresql"])
+def test_records_of_an_older_schema_are_upgraded_once(
+    flasher: Flasher,
+    tmp_path: Path,
+    schema: dict[str, Any],
+    back_end: str,
+    request: pytest.FixtureRequest,
 ) -> None:
-    old = tmp_path / "records.sqlite"
-    sample = Path(__file__).parents[1] / "station" / "records" / "version_1.sql"
-    with closing(sqlite3.connect(old)) as db:
-        db.executescript(sample.read_text("utf-8"))
-    place = ("--database", old, "--keys", tmp_path / "keys")
-    refused = flasher("station", "unit", SERIAL, *place)
+    old_records.unpack(back_end, tmp_path)
+    database, files = str(tmp_path / "records.sqlite"), tmp_path / "records.sqlite.files"
+    if back_end == "postgresql":
+        server = request.getfixturevalue("postgres")
+        database, files = old_records.restore(server, tmp_path / "dump.sql"), tmp_path / "files"
+    place = ("--database", database, "--files", files, "--keys", tmp_path / "keys")
+    refused = flasher("station", "unit", "W2605100", *place)
     assert refused.code == ExitCode.USAGE
-    assert "flasher station migrate" in refused.err
-    done = flasher("station", "migrate", *place, "--json")
+    assert "flasher station upgrade" in refused.err
+    unclear = flasher("station", "upgrade", *place)
+    assert unclear.code == ExitCode.USAGE
+    assert "line-2, line-3" in unclear.err
+    sockets = tmp_path / "sockets.toml"
+    sockets.write_text(
+        f'name = "line-2"\nrecords = "{database}"\nfiles = "{files}"\n'
+        f'keys = "{tmp_path / "keys"}"\n[[socket]]\nname = "A"\nmock = {{}}\n',
+        encoding="utf-8",
+    )
+    done = flasher("station", "upgrade", "--sockets", sockets, "--json")
     hold_output(schema, done.out, 0)
-    assert done.document["runs"] == 3
-    assert Path(done.document["backup"]).is_file()
-    assert "PASS" in flasher("station", "unit", SERIAL, *place).out
-    assert flasher("station", "migrate", *place).code == ExitCode.USAGE
+    assert (done.document["before"], done.document["after"]) == ("2", str(SCHEMA_VERSION))
+    assert (done.document["backup"] is None) == (back_end == "postgresql")
+    assert "PASS" in flasher("station", "unit", "W2605100", *place).out
+    assert "nothing to do" in flasher("station", "upgrade", "--sockets", sockets).out
+    assert flasher("station", "verify", *place).code == ExitCode.OK
 
 
 def test_rules_that_were_taken_away_hide_nothing_else(

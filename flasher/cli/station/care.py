@@ -1,4 +1,4 @@
-"""The care for records: `flasher station backup`, `verify`, `key`, `accept`, `migrate`, `roles`."""
+"""The care for records: `flasher station backup`, `verify`, `key`, `accept`, `upgrade`, `roles`."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from flasher.cli.station.documents import (
 from flasher.cli.station.place import open_to_read, operator_of, records_of, the_station
 from flasher.errors import ExitCode, UsageError
 from flasher.protocol.text import printable
-from flasher.station.records.database import locate, open_database
-from flasher.station.records.migration import migrate as migrate_records
+from flasher.station.records.database import locate, no_records, open_database
 from flasher.station.records.model import Examination, Problem
 from flasher.station.records.roles import check_roles, grant_roles
 from flasher.station.records.signatures import fingerprint
-from flasher.station.records.store import Store
+from flasher.station.records.store import Store, SystemClock
+from flasher.station.records.upgrade import upgrade as upgrade_records
 
 ELSEWHERE: Final = "a head kept elsewhere"
 
@@ -157,17 +157,24 @@ def accept(
     return output.document(AcceptedDocument(station=store.station, what=what))
 
 
-def migrate(output: Output, records: RecordsOptions) -> int:
+def upgrade(output: Output, records: RecordsOptions) -> int:
     place = records_of(records)
-    done = migrate_records(
-        place.url,
-        folder=place.files,
-        keeping=place.keeping,
+    location = locate(place.url, place.files or Path())
+    if location.file is not None and not location.file.exists():
+        raise no_records(location)
+    done = upgrade_records(
+        location,
         choose=lambda names: place.station or the_station(names),
+        keeping=place.keeping,
+        now=SystemClock().utc,
         lock_timeout_s=place.lock_timeout_s,
     )
-    output.result(f"{counted(done.runs, 'run')} brought up to date as {printable(done.station)}")
-    output.result(f"  backup: {printable(str(done.backup))}")
+    if done.before == done.after:
+        output.result(f"schema {done.after}: nothing to do")
+    else:
+        output.result(f"brought from schema {done.before} to schema {done.after}")
+    if done.backup is not None:
+        output.result(f"  backup: {printable(str(done.backup))}")
     for each in done.problems:
         output.result(f"  {printable(each)}")
     code = ExitCode.VERIFICATION if done.problems else ExitCode.OK

@@ -441,8 +441,10 @@ def accept(
     return _call("care.accept", output, records, what, operator, reason)
 
 
-@station.action("migrate")
+@station.action("upgrade")
 @_records_options
-def migrate(output: Output, records: RecordsOptions) -> int:
-    """Bring records of an older flasher up to date; a backup is made first."""
-    return _call("care.migrate", output, records)
+def upgrade(output: Output, records: RecordsOptions) -> int:
+    """Bring records of an older flasher up to date. Of a file, a backup is made first; a server
+    has to be backed up before (pg_dump), and its owner does it.
+    """
+    return _call("care.upgrade", output, records)

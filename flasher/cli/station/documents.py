@@ -8,7 +8,6 @@ from typing import Any, Final, get_args
 
 from flasher.cli.documents import document_of
 from flasher.station.events import RunEnded, ScanRefused, StationEvent
-from flasher.station.records.migration import Migrated
 from flasher.station.records.model import (
     Backup,
     Figures,
@@ -18,6 +17,7 @@ from flasher.station.records.model import (
     RunState,
     UnitLife,
 )
+from flasher.station.records.upgrade import Upgraded
 from flasher.trace.story import Cause, Story
 
 
@@ -239,7 +239,7 @@ DOCUMENTS: Final = (
     SigningKeyDocument,
     AcceptedDocument,
     PinDocument,
-    Migrated,
+    Upgraded,
 )
 LINES: Final[tuple[type, ...]] = get_args(StationEvent)
 """Every event of a station, as it happens."""

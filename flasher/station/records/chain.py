@@ -31,7 +31,7 @@ CLAIMED: Final = "claimed"
 FINISHED: Final = "finished"
 INTERRUPTED: Final = "interrupted"
 MIGRATED: Final = "migrated"
-MIGRATED_RUN: Final = "migrated run"
+"""The schema was changed: what was wrong with it before, and what it is now."""
 KEY_ROTATED: Final = "key rotated"
 """Signed with the key before; the rows that follow with the one that it names."""
 KEY_LOST: Final = "key lost"
@@ -42,12 +42,12 @@ RESTORED: Final = "restored"
 """An operator accepted an older copy of the records; the missing rows are lost."""
 RECIPE: Final = "recipe"
 """A recipe was used for the first time."""
-ENDINGS: Final = (FINISHED, INTERRUPTED, MIGRATED_RUN)
+ENDINGS: Final = (FINISHED, INTERRUPTED)
 """Rows that vouch for a run as it ended."""
 _KEYS: Final = (BEGUN, KEY_ROTATED, KEY_LOST)
 EVENTS: Final = (
     BEGUN, CLAIMED, FINISHED, INTERRUPTED, RECIPE, *(event.value for event in AuditEvent), CLOCK,
-    RESTORED, KEY_ROTATED, KEY_LOST, MIGRATED, MIGRATED_RUN,
+    RESTORED, KEY_ROTATED, KEY_LOST, MIGRATED,
 )  # fmt: skip
 """All that a row may be about."""
 

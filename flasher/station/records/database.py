@@ -32,6 +32,7 @@ from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.text import printable
 from flasher.station.records.errors import (
     NOT_SAVED,
+    OldSchemaError,
     RecordError,
     RecordsDamagedError,
     RecordsMovedError,
@@ -41,7 +42,12 @@ from flasher.station.records.errors import (
 )
 from flasher.station.records.files import FileStore, sync_folder, whole_file
 from flasher.station.records.model import Backup, utc_text
-from flasher.station.records.schema import SCHEMA_VERSION, metadata, schema_info
+from flasher.station.records.schema import (
+    SCHEMA_VERSION,
+    alembic_version,
+    metadata,
+    schema_info,
+)
 from flasher.station.records.triggers import trigger_statements
 
 if TYPE_CHECKING:
@@ -52,6 +58,10 @@ _IMMEDIATE: Final = "flasher_immediate"
 _POSTGRESQL: Final = "postgresql+psycopg"
 _OPENED: Final = "flasher_file"
 """Which file a connection has open."""
+_CHANGE_LIMIT_S: Final = 3600.0
+"""How long a server may work on one statement that changes the schema."""
+_BEFORE_ALEMBIC: Final = 2
+"""The schema of records that have no revision; there are older ones, which nobody has."""
 
 
 @dataclass(frozen=True)
@@ -117,9 +127,17 @@ def _no_database(url: str) -> UsageError:
 class Database:
     """A database that holds what is committed. Open it with `open_database`."""
 
-    def __init__(self, location: Location, lock_timeout_s: float, *, read_only: bool) -> None:
+    def __init__(
+        self,
+        location: Location,
+        lock_timeout_s: float,
+        *,
+        read_only: bool = False,
+        changes_schema: bool = False,
+    ) -> None:
         self.location = location
         self._read_only = read_only
+        self._changes_schema = changes_schema
         self._lock_timeout_ms = max(1, round(lock_timeout_s * 1000))
         self.engine = self._engine()
         self._check_station: Callable[[], None] = lambda: None
@@ -197,7 +215,10 @@ class Database:
 
     def _engine(self) -> Engine:
         if self.location.url.get_backend_name() != "sqlite":
-            made: Engine = _server().make_engine(self.location.url, self._lock_timeout_ms / 1000)
+            limit_s = _CHANGE_LIMIT_S if self._changes_schema else None
+            made: Engine = _server().make_engine(
+                self.location.url, self._lock_timeout_ms / 1000, limit_s
+            )
             return made
         options: dict[str, Any] = {"connect_args": {"timeout": self._lock_timeout_ms / 1000}}
         if self.location.file is None:
@@ -226,7 +247,8 @@ class Database:
             "busy_timeout": self._lock_timeout_ms,
             "journal_mode": "memory" if self.location.file is None else "wal",
             "synchronous": _SYNCHRONOUS_FULL,
-            "foreign_keys": 1,
+            # Alembic changes a table by making it anew: others name rows of it meanwhile.
+            "foreign_keys": 0 if self._changes_schema else 1,
             # Or REPLACE would delete without the triggers.
             "recursive_triggers": 1,
         }
@@ -308,6 +330,14 @@ def _begin_sqlite(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
 
 
+def no_records(location: Location) -> UsageError:
+    return UsageError(
+        f"There are no records at {location.shown}.",
+        remedy="Correct the name of the file.",
+        code=ErrorCode.FILE_NOT_READ,
+    )
+
+
 def open_database(
     location: Location,
     now: datetime,
@@ -322,11 +352,7 @@ def open_database(
     Raises RecordError, SchemaVersionError for records of another version.
     """
     if location.file is not None and not location.file.exists() and not create:
-        raise UsageError(
-            f"There are no records at {location.shown}.",
-            remedy="Correct the name of the file.",
-            code=ErrorCode.FILE_NOT_READ,
-        )
+        raise no_records(location)
     database = Database(location, lock_timeout_s, read_only=read_only)
     try:
         _check_version(database, now, create=create)
@@ -337,29 +363,62 @@ def open_database(
 
 
 def _check_version(database: Database, now: datetime, *, create: bool) -> None:
+    where = database.location.shown
     with database.reading() as connection:
         has_tables = inspect(connection).get_table_names()
     if not has_tables and create:
         _create(database, now)
-    where = database.location.shown
-    if has_tables and schema_info.name not in has_tables:
+    elif schema_info.name not in has_tables:
         raise SchemaVersionError(
             "The database holds something else than records of flasher.",
             where=where,
             remedy="Name another file, or an empty database.",
         )
     with database.reading() as connection:
-        version = connection.execute(select(schema_info.c.version)).scalar_one_or_none()
-    if version == SCHEMA_VERSION:
+        found = revision_of(connection)
+    if found == str(SCHEMA_VERSION):
         return
-    newer = version is not None and version > SCHEMA_VERSION
-    raise SchemaVersionError(
-        f"The records have version {version}; this flasher has version {SCHEMA_VERSION}.",
-        where=where,
-        cause="they were made by a newer flasher" if newer else "they were made by an older one",
-        remedy="Use that newer flasher."
-        if newer
-        else "Bring them up to date, with a backup made first: flasher station migrate.",
+    if not found:
+        raise RecordsDamagedError(
+            "The records do not name their schema.",
+            where=where,
+            remedy="Stop. Keep the database, and go on with the last backup.",
+        )
+    what = f"The records have schema {printable(found)}; this flasher has schema {SCHEMA_VERSION}."
+    number = int(found) if found.isdecimal() else SCHEMA_VERSION
+    if number >= SCHEMA_VERSION:
+        raise SchemaVersionError(
+            what,
+            where=where,
+            cause="they were made by a newer flasher",
+            remedy="Use that newer flasher.",
+        )
+    cause = "they were made by an older flasher"
+    if number < _BEFORE_ALEMBIC:
+        raise SchemaVersionError(what, where=where, cause=cause, remedy="Use that older flasher.")
+    backup = (
+        "Back them up (pg_dump), then, as their owner"
+        if database.location.file is None
+        else ("Start the station, which backs them up and brings them up to date, or")
+    )
+    raise OldSchemaError(
+        what, where=where, cause=cause, remedy=f"{backup}: flasher station upgrade."
+    )
+
+
+def revision_of(connection: Connection) -> str:
+    """The schema that the records have; empty where they do not name one."""
+    if inspect(connection).has_table(alembic_version.name):
+        query = select(alembic_version.c.version_num)
+        return str(connection.execute(query).scalar_one_or_none() or "")
+    version = connection.execute(select(schema_info.c.version)).scalar_one_or_none()
+    return "" if version is None else str(version)
+
+
+def pin_search_path(connection: Connection) -> None:
+    """On a server: the functions of triggers look into temporary tables after the records."""
+    connection.execute(
+        text("SELECT set_config('search_path', quote_ident(current_schema()) || ', pg_temp', true)")
     )
 
 
@@ -367,13 +426,7 @@ def _create(database: Database, now: datetime) -> None:
     """All tables and triggers in one transaction, unless another process was faster."""
     with database.writing("creation") as connection:
         if database.backend == "postgresql":
-            # Of the functions of the triggers: temporary tables stand behind the records.
-            connection.execute(
-                text(
-                    "SELECT set_config('search_path',"
-                    " quote_ident(current_schema()) || ', pg_temp', true)"
-                )
-            )
+            pin_search_path(connection)
         if inspect(connection).has_table(schema_info.name):
             return
         metadata.create_all(connection)
@@ -384,6 +437,7 @@ def _create(database: Database, now: datetime) -> None:
                 version=SCHEMA_VERSION, created_at=utc_text(now), records_id=uuid4().hex
             )
         )
+        connection.execute(alembic_version.insert().values(version_num=str(SCHEMA_VERSION)))
     if database.location.file is not None:
         sync_folder(database.location.file.parent)
 
@@ -405,26 +459,22 @@ def make_backup(database: Database, files: FileStore, path: Path) -> Backup:
         raise UsageError("A backup cannot replace the database itself.", remedy="Name another.")
     with mapped(printable(str(path)), writes=True):
         with whole_file(path) as part:
-            copy_sqlite(source, part)
+            copy_checked(source, part)
             with contextlib.closing(sqlite3.connect(part)) as copy:
-                (found,) = copy.execute("PRAGMA integrity_check").fetchone()
-                if found != "ok":
-                    raise RecordsDamagedError(
-                        "The database is damaged: the copy does not hold together.",
-                        where=printable(str(found)),
-                        remedy="Keep the last good backup.",
-                    )
                 named = copy.execute("SELECT DISTINCT sha256 FROM attachment").fetchall()
             target = FileStore(path.with_name(path.name + ".files"))
             for (sha256,) in named:
                 if not target.path(sha256).exists():
                     target.add("backup", files.path(sha256))
-        data = path.read_bytes()
-    return Backup(path, hashlib.sha256(data).hexdigest(), len(data))
+        with path.open("rb") as data:
+            sha256 = hashlib.file_digest(data, "sha256").hexdigest()
+    return Backup(path, sha256, path.stat().st_size)
 
 
-def copy_sqlite(source: Path, part: Path) -> None:
-    """A consistent copy of a database that others may be using."""
+def copy_checked(source: Path, part: Path) -> None:
+    """A consistent copy of a database that others may be using. Raises RecordsDamagedError for one
+    that does not hold together.
+    """
     with (
         contextlib.closing(read_only_sqlite(source)) as original,
         contextlib.closing(sqlite3.connect(part)) as copy,
@@ -432,3 +482,10 @@ def copy_sqlite(source: Path, part: Path) -> None:
         original.backup(copy)
         # One file, without a log beside it that would be lost in copying it on.
         copy.execute("PRAGMA journal_mode = DELETE")
+        (found,) = copy.execute("PRAGMA integrity_check").fetchone()
+    if found != "ok":
+        raise RecordsDamagedError(
+            "The database is damaged: the copy does not hold together.",
+            where=printable(str(found)),
+            remedy="Keep the last good backup.",
+        )

@@ -57,6 +57,10 @@ class SchemaVersionError(RecordError):
     default_code = ErrorCode.RECORDS_VERSION
 
 
+class OldSchemaError(SchemaVersionError):
+    """The records have an older schema, which this flasher can bring up to date."""
+
+
 class RuleBrokenError(RecordError):
     """The database refused what would have made the records untrue."""
 

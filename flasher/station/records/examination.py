@@ -32,7 +32,7 @@ from flasher.station.records.proof import contradictions, traces_of_targets
 from flasher.station.records.queries import details_of
 from flasher.station.records.rows import batches
 from flasher.station.records.signatures import is_signed
-from flasher.station.records.triggers import differences, fingerprint_of
+from flasher.station.records.triggers import fingerprint_of, stated_differences
 from flasher.trace.reader import read_trace
 
 _RUNS_NAMED: Final = 5
@@ -48,8 +48,8 @@ class Examiner:
         self._remarks: list[str] = []
         self._kept: list[KeptHeads] = []
         self._unkept: list[str] = []
-        self._schema: dict[tuple[str, str], None] = {}
-        """How the schema differs from what any chain states of it, each difference once."""
+        self._stated: list[tuple[object, Mapping[str, str]]] = []
+        """The last statement of each chain about the schema, with its version."""
         self._claims: dict[int, Mapping[str, str]] = {}
         """The digests that the chains state for each run, at its claim."""
         self._endings: dict[int, Mapping[str, str]] = {}
@@ -117,9 +117,9 @@ class Examiner:
             hashes: dict[int, str] = {}
             restored: dict[int, range] = {}
             keys: set[str] = set()
-            yield from self._chain(name, rows.mappings(), records_id, found, hashes, restored, keys)
+            yield from self._chain(name, rows.mappings(), records_id, hashes, restored, keys)
             yield from self._heads(name, kept_of.get(name), hashes, restored, keys)
-        for thing, what in self._schema:
+        for thing, what in stated_differences(self._stated, found):
             yield Problem(f"schema, {printable(thing)}", what)
 
     def _chain(
@@ -127,14 +127,13 @@ class Examiner:
         name: str,
         rows: Iterable[Mapping[Any, Any]],
         records_id: str,
-        found: Mapping[str, str],
         hashes: dict[int, str],
         restored: dict[int, range],
         keys: set[str],
     ) -> Iterator[Problem]:
         """Go along one chain; fills the hashes of its rows, and which heads were given up."""
         before, key = chain.GENESIS, None
-        stated: Mapping[str, str] = {}
+        stated: tuple[object, Mapping[str, str]] = (None, {})
         shown = printable(name)
         for expected, row in enumerate(rows, 1):
             where = f"audit row {expected} of {shown}"
@@ -154,14 +153,15 @@ class Examiner:
             before, hashes[expected] = row["hash"], row["hash"]
             if not is_whole:
                 continue  # what it says counts for nothing
-            stated = _table(data.get("schema")) or stated
+            if _table(data.get("schema")):
+                stated = data.get("version"), _table(data.get("schema"))
             if row["event"] == chain.RESTORED:
                 restored[expected] = _lost(data)
             self._take_row(shown, row, data)
             for what in _contradictions(name, records_id, row["event"], data):
                 yield Problem(where, what)
         if hashes:
-            self._schema |= dict.fromkeys(differences(stated, found))
+            self._stated.append(stated)
 
     def _take_row(self, shown: str, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
         """Note what an intact row vouches for, and what a person should know of it."""

@@ -6,7 +6,7 @@ can, so no station is to be the owner.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import Final
 
 from sqlalchemy import Connection, text
@@ -14,7 +14,14 @@ from sqlalchemy import Connection, text
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.station.records.database import Database, Location
-from flasher.station.records.schema import device_write, metadata, run, run_target, schema_info
+from flasher.station.records.schema import (
+    alembic_version,
+    device_write,
+    metadata,
+    run,
+    run_target,
+    schema_info,
+)
 
 _ENDED_LATER: Final = (run, run_target, device_write)
 """Their rows are completed while a run goes on; triggers hold what may change in them."""
@@ -48,7 +55,6 @@ def grant_roles(database: Database, station: str, reader: str) -> tuple[str, ...
         schema = quoted(connection.execute(text("SELECT current_schema()")).scalar_one())
         name = quoted(connection.execute(text("SELECT current_database()")).scalar_one())
         both = f"{quoted(station)}, {quoted(reader)}"
-        adds = _names(set(metadata.sorted_tables) - {schema_info})
         for statement in (
             f"REVOKE CREATE ON SCHEMA {schema} FROM PUBLIC, {both}",
             f"REVOKE TEMPORARY ON DATABASE {name} FROM PUBLIC, {both}",
@@ -56,15 +62,42 @@ def grant_roles(database: Database, station: str, reader: str) -> tuple[str, ...
             f"REVOKE ALL ON ALL SEQUENCES IN SCHEMA {schema} FROM PUBLIC, {both}",
             f"GRANT CONNECT ON DATABASE {name} TO {both}",
             f"GRANT USAGE ON SCHEMA {schema} TO {both}",
-            f"GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {both}",
-            f"GRANT INSERT ON {adds} TO {quoted(station)}",
-            f"GRANT UPDATE ON {_names(_ENDED_LATER)} TO {quoted(station)}",
-            f"GRANT USAGE ON ALL SEQUENCES IN SCHEMA {schema} TO {quoted(station)}",
+            *_grants(schema, readers=both, stations=quoted(station)),
         ):
             connection.exec_driver_sql(statement)
         for role in (station, reader):
             _check(connection, role)
     return made
+
+
+def grant_again(connection: Connection) -> None:
+    """Give the roles of stations and readers their rights on tables that were added since."""
+    quoted = connection.dialect.identifier_preparer.quote
+    schema = quoted(connection.execute(text("SELECT current_schema()")).scalar_one())
+
+    def roles(right: str) -> str:
+        query = text(
+            "SELECT DISTINCT rolname FROM pg_class, aclexplode(relacl) AS given"
+            " JOIN pg_roles AS role ON role.oid = given.grantee"
+            " WHERE relnamespace = current_schema()::regnamespace AND relname = 'run'"
+            " AND privilege_type = :right AND given.grantee <> relowner"
+        )
+        return ", ".join(map(quoted, connection.execute(query, {"right": right}).scalars()))
+
+    readers, stations = roles("SELECT"), roles("INSERT")
+    for statement in _grants(schema, readers=readers, stations=stations):
+        connection.exec_driver_sql(statement)
+
+
+def _grants(schema: str, *, readers: str, stations: str) -> Iterator[str]:
+    """What those who read (stations too) and `stations` may do; both may be empty."""
+    if readers:
+        yield f"GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {readers}"
+    if stations:
+        added = set(metadata.sorted_tables) - {schema_info, alembic_version}
+        yield f"GRANT INSERT ON {_names(added)} TO {stations}"
+        yield f"GRANT UPDATE ON {_names(_ENDED_LATER)} TO {stations}"
+        yield f"GRANT USAGE ON ALL SEQUENCES IN SCHEMA {schema} TO {stations}"
 
 
 def _names(tables: Iterable[object]) -> str:

@@ -1,6 +1,7 @@
 """The tables of the records, with the rules that hold inside one row or one index.
 
-Rules over several rows are triggers (`triggers`). A change here is a new `SCHEMA_VERSION`.
+Rules over several rows are triggers (`triggers`). A change here is a new `SCHEMA_VERSION` and a
+module in `migrations.versions`, which brings older records to it.
 Times are texts in UTC of one length (`model.utc_text`); durations come from the monotonic clock.
 """
 
@@ -18,6 +19,7 @@ from sqlalchemy import (
     Index,
     Integer,
     MetaData,
+    PrimaryKeyConstraint,
     SmallInteger,
     String,
     Table,
@@ -28,7 +30,7 @@ from sqlalchemy import (
 
 from flasher.station.records.model import RunKind, RunState, StepState, Verified
 
-SCHEMA_VERSION: Final = 2
+SCHEMA_VERSION: Final = 3
 
 metadata: Final = MetaData()
 
@@ -82,7 +84,17 @@ schema_info: Final = Table(
     _utc("created_at"),
     _text("records_id", 32),
 )
-"""`records_id` tells these records, and every copy of them, from all others."""
+"""`records_id` tells these records, and every copy of them, from all others. `version` is there for
+a flasher before Alembic, which refuses these records by it.
+"""
+
+alembic_version: Final = Table(
+    "alembic_version",
+    metadata,
+    Column("version_num", String(32), nullable=False),
+    PrimaryKeyConstraint("version_num", name="alembic_version_pkc"),
+)
+"""The schema of these records: the last change of `migrations.versions`, as Alembic keeps it."""
 
 station: Final = _table("station", _text("name"), UniqueConstraint("name"))
 
@@ -151,6 +163,7 @@ run: Final = _table(
     Column("verification_reached", SmallInteger, nullable=True),
     _sha256("log_sha256", nullable=True),
     Index("run_of_unit", "unit_id", "id"),
+    Index("run_of_socket", "socket_id", "id"),
     Index("run_by_begin", "begun_at"),
     Index("run_of_recipe", "recipe_id", "begun_at"),
     _one_of("state", RunState),

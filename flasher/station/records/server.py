@@ -45,11 +45,13 @@ class _Connection(psycopg.Connection[Any]):
             raise psycopg.OperationalError(f"the server said nothing for {limit_s:g} s") from None
 
 
-def make_engine(url: URL, lock_timeout_s: float) -> Engine:
+def make_engine(url: URL, lock_timeout_s: float, statement_limit_s: float | None = None) -> Engine:
     """The engine of a server. Who sets a limit in the URL gets that one."""
+    work_s = STATEMENT_LIMIT_S if statement_limit_s is None else statement_limit_s
+    silence_s = SILENCE_LIMIT_S if statement_limit_s is None else statement_limit_s + 5.0
     limits = {
         "lock_timeout": round(lock_timeout_s * 1000),
-        "statement_timeout": round((lock_timeout_s + STATEMENT_LIMIT_S) * 1000),
+        "statement_timeout": round((lock_timeout_s + work_s) * 1000),
         **{f"tcp_{name}": value for name, value in _PROBES.items()},
     }
     usual: dict[str, Any] = {
@@ -66,7 +68,7 @@ def make_engine(url: URL, lock_timeout_s: float) -> Engine:
         options = " ".join(f"-c {name}={value}" for name, value in limits.items())
         options = f"{options} {wanted.get('options', '')}".rstrip()
         made = _Connection.connect(**(usual | wanted | {"options": options}))
-        made.silence_limit_s = lock_timeout_s + SILENCE_LIMIT_S
+        made.silence_limit_s = lock_timeout_s + silence_s
         return made
 
     return engine

@@ -22,6 +22,7 @@ import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import UTC, datetime, timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Self
 
@@ -36,7 +37,11 @@ from flasher.station.records.database import (
     make_backup,
     open_database,
 )
-from flasher.station.records.errors import NotFoundError, RuleBrokenError
+from flasher.station.records.errors import (
+    NotFoundError,
+    OldSchemaError,
+    RuleBrokenError,
+)
 from flasher.station.records.examination import Examiner
 from flasher.station.records.files import FileStore
 from flasher.station.records.keys import Keeping
@@ -60,6 +65,7 @@ from flasher.station.records.model import (
 from flasher.station.records.queries import Records
 from flasher.station.records.rows import insert
 from flasher.station.records.signing import Signer
+from flasher.station.records.upgrade import upgrade
 
 _USUAL: Final = Keeping()
 _ONLY_FINITE = "a number that is no number cannot be recorded"
@@ -103,20 +109,36 @@ class Store:
         keeping: Keeping = _USUAL,
     ) -> Self:
         """The records at an SQLAlchemy URL, or in an SQLite file; made when they are not there and
-        `create` is true. `folder` holds the attachments (beside an SQLite file by default).
+        `create` is true. `folder` holds the attachments (beside an SQLite file by default). A file
+        of an older schema is brought up to date, after a backup beside it (`upgrade`).
         `read_only` changes nothing, not even the journal.
 
         Raises UsageError for a place that cannot be, SchemaVersionError, or another RecordError.
         """
         clock = clock or SystemClock()
         location = locate(url, folder)
-        database = open_database(
+        opened = partial(
+            open_database,
             location,
             clock.utc(),
             lock_timeout_s=lock_timeout_s,
             create=create and not read_only,
             read_only=read_only,
         )
+        try:
+            database = opened()
+        except OldSchemaError:
+            # What is on a server is for its owner to change, after a backup of the server's own.
+            if read_only or location.file is None:
+                raise
+            upgrade(
+                location,
+                choose=lambda _: station,
+                keeping=keeping,
+                now=clock.utc,
+                lock_timeout_s=lock_timeout_s,
+            )
+            database = opened()
         return cls(database, station, clock, keeping)
 
     def close(self) -> None:

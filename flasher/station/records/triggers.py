@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import Final, NamedTuple
 
 from sqlalchemy import Connection, text
@@ -217,13 +217,23 @@ def trigger_statements(dialect: str) -> list[str]:
     return statements
 
 
-def final_table(dialect: str, table: str) -> list[str]:
-    """The SQL that makes triggers which keep a table as it is."""
-    said = f"{table} is final"
-    events = ("INSERT", "UPDATE", "DELETE")
-    return _statements(
-        dialect, (Rule(f"{table}_{e.lower()}", table, e, _ALWAYS, said) for e in events)
-    )
+def drop_triggers(connection: Connection) -> None:
+    """Take all triggers away, and on a server their functions."""
+    if connection.dialect.name == "sqlite":
+        query, drop = "SELECT name FROM sqlite_master WHERE type = 'trigger'", "DROP TRIGGER {}"
+    else:
+        query, drop = _FUNCTIONS, "DROP FUNCTION {}() CASCADE"
+    for name in connection.execute(text(query)).scalars().all():
+        quoted = connection.dialect.identifier_preparer.quote(name)
+        connection.exec_driver_sql(drop.format(quoted))
+
+
+_FUNCTIONS: Final = """
+SELECT DISTINCT p.proname
+FROM pg_trigger t JOIN pg_class c ON c.oid = t.tgrelid JOIN pg_proc p ON p.oid = t.tgfoid
+WHERE NOT t.tgisinternal AND c.relnamespace = current_schema()::regnamespace
+    AND p.pronamespace = c.relnamespace
+"""
 
 
 def _statements(dialect: str, rules: Iterable[Rule]) -> list[str]:
@@ -245,8 +255,8 @@ def _statements(dialect: str, rules: Iterable[Rule]) -> list[str]:
 def _function(name: str, body: str) -> str:
     # The path of who makes it: tables of a session's own must not stand before the records.
     return (
-        f"CREATE FUNCTION {name}() RETURNS trigger LANGUAGE plpgsql SET search_path FROM CURRENT"
-        f" AS $$ BEGIN {body}; END $$"
+        f"CREATE OR REPLACE FUNCTION {name}() RETURNS trigger LANGUAGE plpgsql"
+        f" SET search_path FROM CURRENT AS $$ BEGIN {body}; END $$"
     )
 
 
@@ -311,3 +321,19 @@ def differences(stated: Mapping[str, str], found: Mapping[str, str]) -> Iterator
             yield name, "it was added"
         elif stated[name] != found[name]:
             yield name, "it was changed"
+
+
+def stated_differences(
+    stated: Collection[tuple[object, Mapping[str, str]]], found: Mapping[str, str]
+) -> dict[tuple[str, str], None]:
+    """How the schema differs from what the chains state of it, each difference once. A statement of
+    an older version counts no more once another chain states the newer one.
+    """
+    numbers = [version if isinstance(version, int) else 0 for version, _ in stated]
+    newest = max(numbers, default=0)
+    return {
+        difference: None
+        for number, (_, fingerprint) in zip(numbers, stated, strict=True)
+        if number == newest
+        for difference in differences(fingerprint, found)
+    }

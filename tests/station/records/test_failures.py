@@ -122,9 +122,9 @@ def test_records_of_another_version_are_refused_with_what_to_do(
 ) -> None:
     bench.store.close()
     with contextlib.closing(sqlite3.connect(bench.path)) as other:
-        other.execute("UPDATE schema_info SET version = ?", (version,))
+        other.execute("UPDATE alembic_version SET version_num = ?", (str(version),))
         other.commit()
-    with pytest.raises(SchemaVersionError, match=f"version {version}") as caught:
+    with pytest.raises(SchemaVersionError, match=f"schema {version}") as caught:
         bench.opened()
     assert cause in caught.value.cause
     assert "flasher" in caught.value.remedy

@@ -43,7 +43,7 @@ def test_records_that_another_session_holds_are_waited_for_and_then_an_error(ben
             holder.execute("LOCK TABLE audit")
             with pytest.raises(RecordsLockedError, match="RECORD NOT SAVED: another program holds"):
                 store.note(AuditEvent.RESUME, {})
-            holder.execute("LOCK TABLE schema_info")
+            holder.execute("LOCK TABLE alembic_version")
             with pytest.raises(RecordsLockedError, match="cannot be read: another program holds"):
                 bench.opened("line-9", lock_timeout_s=0.05)
         store.note(AuditEvent.RESUME, {})

@@ -5,8 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import shutil
-import sqlite3
-from contextlib import closing
 from datetime import timedelta
 from pathlib import Path
 
@@ -19,12 +17,10 @@ from flasher.station.records.errors import (
     KeyMissingError,
     RecordsCutError,
     Refusal,
-    SchemaVersionError,
 )
 from flasher.station.records.heads import Fault, HeadsFile
 from flasher.station.records.keys import Keeping
-from flasher.station.records.migration import migrate
-from flasher.station.records.model import TORN_TRACE, TRACE, RunId, RunState
+from flasher.station.records.model import TORN_TRACE, TRACE, RunId
 from flasher.station.records.signatures import SigningKey
 from flasher.station.records.store import Store
 from tests.station.factory import SERIAL, Bench
@@ -267,62 +263,6 @@ def test_records_on_media_that_nobody_can_write_are_read(
     ) as store:
         assert not store.examine().problems
     assert not bench.path.with_name(bench.path.name + "-wal").exists()
-
-
-# -- records of version 1 -------------------------------------------------------------------------
-
-
-@pytest.fixture
-def old(tmp_path: Path) -> Path:
-    """Records of version 1: a good unit, a bad one, and one that runs."""
-    path = tmp_path / "records.sqlite"
-    with closing(sqlite3.connect(path)) as db:
-        db.executescript(Path(__file__).with_name("version_1.sql").read_text("utf-8"))
-    return path
-
-
-def migrated(path: Path) -> tuple[str, ...]:
-    done = migrate(
-        str(path),
-        folder=None,
-        keeping=Keeping(path.parent / "keys"),
-        choose=lambda names: names[0],
-        lock_timeout_s=1.0,
-    )
-    assert done.station == "line-2"
-    assert done.runs == 3
-    with closing(sqlite3.connect(done.backup)) as db:
-        assert db.execute("SELECT version FROM schema_info").fetchone() == (1,)
-    return done.problems
-
-
-def test_records_of_version_1_are_brought_up_to_date_with_a_backup(old: Path) -> None:
-    with pytest.raises(SchemaVersionError, match="version 1") as caught:
-        Store.open(str(old), station="line-2")
-    assert "flasher station migrate" in caught.value.remedy
-    assert migrated(old) == ()
-    with Store.open(str(old), station="line-2", keeping=Keeping(old.parent / "keys")) as store:
-        assert len(store.recover()) == 1
-        assert store.read.unit(SERIAL).state.value == "PASS"  # so it is not made twice
-        found = store.examine()
-        # Only the traces are not there: they are no part of the sample.
-        assert {each.what for each in found.problems} == {"An attachment is missing."}
-        assert found.is_checked_elsewhere
-    with pytest.raises(UsageError, match="no records of version 1"):
-        migrated(old)
-
-
-def test_what_was_wrong_with_records_of_version_1_is_said_and_stays_said(old: Path) -> None:
-    with closing(sqlite3.connect(old)) as db:
-        db.execute("DROP TRIGGER run_update")
-        db.execute("UPDATE run SET text = 'all was well' WHERE id = 2")
-        db.commit()
-    (problem,) = migrated(old)
-    assert problem.startswith("run 2: it was changed after it was finished")
-    keeping = Keeping(old.parent / "keys")
-    with Store.open(str(old), station="x", read_only=True, keeping=keeping) as store:
-        assert any(problem in each.what for each in store.examine().problems)
-        assert store.read.units("W2605003")[0].runs[0].run.state is RunState.FAIL
 
 
 def test_what_is_no_file_in_place_of_key_or_heads_is_never_waited_for(tmp_path: Path) -> None:

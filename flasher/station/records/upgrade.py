@@ -1,0 +1,201 @@
+"""Brings records of an older schema up to date: after a backup, in one transaction.
+
+Alembic runs the changes (`migrations`). What the database's own rules were before is compared with
+what the audit trail states of them, and the differences stay recorded in it with the new ones.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import Any, Final
+
+from sqlalchemy import Connection, inspect, select, update
+
+from flasher.errors import UsageError
+from flasher.protocol.text import printable
+from flasher.station.records import chain, schema
+from flasher.station.records.chain import Trail
+from flasher.station.records.database import (
+    Database,
+    Location,
+    copy_checked,
+    pin_search_path,
+    revision_of,
+)
+from flasher.station.records.errors import NOT_SAVED, RecordError, RecordsDamagedError, mapped
+from flasher.station.records.files import whole_file
+from flasher.station.records.keys import Keeping
+from flasher.station.records.roles import grant_again
+from flasher.station.records.signing import Signer
+from flasher.station.records.triggers import (
+    drop_triggers,
+    fingerprint_of,
+    stated_differences,
+    trigger_statements,
+)
+
+CHANGES: Final = "flasher.station.records:migrations"
+"""Where Alembic finds the changes."""
+NEWEST: Final = str(schema.SCHEMA_VERSION)
+
+
+@dataclass(frozen=True)
+class Upgraded:
+    """What was done."""
+
+    before: str
+    """The schema that the records had."""
+    after: str
+    backup: Path | None
+    """The copy made before; None where nothing was changed, or on a server."""
+    problems: tuple[str, ...]
+    """How the old schema differed from what the audit trail states of it."""
+
+
+def upgrade(
+    location: Location,
+    *,
+    choose: Callable[[tuple[str, ...]], str],
+    keeping: Keeping,
+    now: Callable[[], datetime],
+    lock_timeout_s: float,
+) -> Upgraded:
+    """Bring the records up to date. `choose` gets the names of their stations, and returns the one
+    whose key signs the change in its audit trail.
+
+    Raises StationBusyError while a station runs; UsageError, RecordError: nothing was changed then.
+    """
+    database = Database(location, lock_timeout_s, changes_schema=True)
+    with closing(database), ExitStack() as held:
+        with database.reading() as connection:
+            before, begun = revision_of(connection), _stations(connection)
+        if before == NEWEST:
+            return Upgraded(before, before, None, ())
+        station = choose(begun) if begun else None
+        if station is not None and station not in begun:
+            raise UsageError(
+                f"Records of schema {before} have to be brought to schema {NEWEST} by a station"
+                f" that they know, and {printable(station)} is none.",
+                remedy="flasher station upgrade, with --sockets FILE of one of:"
+                f" {', '.join(map(printable, begun))}.",
+            )
+        for name in begun:
+            lock = database.station_lock(name)
+            held.callback(lock.release)
+            lock.acquire()
+        with database.reading() as connection:
+            if revision_of(connection) == NEWEST:  # another process was faster
+                return Upgraded(NEWEST, NEWEST, None, ())
+        with _unchanged_on_error(before), _backup(location.file, before) as backup:
+            if station is None:
+                with database.writing("schema") as connection:
+                    _change(connection)
+                return Upgraded(before, NEWEST, backup, ())
+            signer = Signer(database, station, now, keeping)
+            signer.begin()
+            with signer.writing("schema") as trail:
+                problems = _change_signed(trail, now())
+            return Upgraded(before, NEWEST, backup, problems)
+
+
+def _stations(connection: Connection) -> tuple[str, ...]:
+    """The stations that have signed something."""
+    station = schema.station.c
+    signed = select(schema.audit.c.id).where(schema.audit.c.station_id == station.id).exists()
+    return tuple(
+        connection.execute(select(station.name).where(signed).order_by(station.id)).scalars()
+    )
+
+
+@contextmanager
+def _unchanged_on_error(before: str) -> Iterator[None]:
+    try:
+        yield
+    except RecordError as error:
+        error.what = error.what.replace(
+            NOT_SAVED, f"The records were not brought to schema {NEWEST}, they keep schema {before}"
+        )
+        raise
+
+
+@contextmanager
+def _backup(file: Path | None, before: str) -> Iterator[Path | None]:
+    """A copy of an SQLite file, taken away again when nothing comes of the change."""
+    if file is None:
+        yield None
+        return
+    backup = file.with_name(f"{file.name}.schema-{before}")
+    while backup.exists():
+        backup = backup.with_name(backup.name + "-again")
+    with mapped(printable(str(backup)), writes=True), whole_file(backup) as part:
+        copy_checked(file, part)
+    try:
+        yield backup
+    except BaseException:
+        with contextlib.suppress(OSError):
+            backup.unlink()
+        raise
+
+
+def _change_signed(trail: Trail, now: datetime) -> tuple[str, ...]:
+    connection = trail.connection
+    wrong = stated_differences(_stated(connection), fingerprint_of(connection))
+    problems = tuple(f"schema, {printable(name)}: {what}" for name, what in wrong)
+    _change(connection)
+    data = {
+        "version": schema.SCHEMA_VERSION,
+        "problems": problems,
+        "schema": fingerprint_of(connection),
+    }
+    trail.append(now, chain.MIGRATED, data)
+    return problems
+
+
+def _stated(connection: Connection) -> list[tuple[object, Mapping[str, str]]]:
+    """What the chains state of the schema: of each its last statement, with the version."""
+    audit = schema.audit.c
+    query = select(audit.station_id, audit.data).where(
+        audit.event.in_((chain.BEGUN, chain.MIGRATED))
+    )
+    last = {
+        row.station_id: chain.data_of(row.data)
+        for row in connection.execute(query.order_by(audit.number))
+    }
+    return [(data.get("version"), data.get("schema") or {}) for data in last.values()]
+
+
+def _change(connection: Connection) -> None:
+    # Only here: a start that changes nothing does not wait for it.
+    from alembic import command  # noqa: PLC0415
+    from alembic.config import Config  # noqa: PLC0415
+
+    is_file = connection.dialect.name == "sqlite"
+    missing = _missing_rows(connection) if is_file else []
+    if not is_file:
+        pin_search_path(connection)
+    drop_triggers(connection)
+    before = revision_of(connection)
+    if not inspect(connection).has_table(schema.alembic_version.name):
+        schema.alembic_version.create(connection)
+        connection.execute(schema.alembic_version.insert().values(version_num=before))
+    config = Config()
+    config.set_main_option("script_location", CHANGES)
+    config.attributes["connection"] = connection
+    command.upgrade(config, NEWEST)
+    for statement in trigger_statements(connection.dialect.name):
+        connection.exec_driver_sql(statement)
+    connection.execute(update(schema.schema_info).values(version=schema.SCHEMA_VERSION))
+    if is_file and _missing_rows(connection) != missing:
+        raise RecordsDamagedError(f"{NOT_SAVED}: rows would name rows that are missing.")
+    if not is_file:
+        grant_again(connection)
+
+
+def _missing_rows(connection: Connection) -> list[Any]:
+    """Rows that name a row that is not there: SQLite does not look for them during the change."""
+    return [tuple(row) for row in connection.exec_driver_sql("PRAGMA foreign_key_check").all()]
