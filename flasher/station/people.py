@@ -122,17 +122,6 @@ def load_badges(path: Path, serial_number: SerialNumber) -> tuple[Person, ...]:
     return table.person
 
 
-def role_of(people: Iterable[Person], code: str, pin: str, *, needs_pin: bool) -> Role | None:
-    """The role of who shows this badge and knows its PIN; None for everybody else. A badge without
-    PIN is enough, unless `needs_pin`. It takes some 50 ms.
-    """
-    person = next((each for each in people if each.code == code), None)
-    if person is None:
-        return None
-    is_known = pins.is_right(pins.Pin(pin), person.pin) if person.pin else not needs_pin
-    return person.role if is_known else None
-
-
 @dataclass(frozen=True)
 class Asked:
     """An override that waits for the PIN of its person."""

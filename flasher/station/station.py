@@ -105,7 +105,8 @@ class StationOptions:
 class Station:
     """A station with one recipe. Methods raise nothing for what happens on the line: events tell.
 
-    `submit`, `publish`, `stop` and `abort_all` may be called from any thread, the others from one.
+    `submit`, `publish`, `note`, `stop` and `abort_all` may be called from any thread, the others
+    from one.
     """
 
     def __init__(  # noqa: PLR0913  what a station is made of
@@ -148,6 +149,7 @@ class Station:
         """Runs that are claimed and not saved yet, by their sockets."""
         self._scans: deque[tuple[str, str]] = deque()
         self._published: deque[StationEvent] = deque()
+        self._notes: deque[tuple[AuditEvent, Mapping[str, str]]] = deque()
         self._checked: deque[bool] = deque()
         """PINs that were right or wrong, and of which the line is not told yet."""
         self.checker = checker or pins.checker()
@@ -208,6 +210,11 @@ class Station:
         self._published.append(event)
         self._wake()
 
+    def note(self, what: AuditEvent, data: Mapping[str, str]) -> None:
+        """A person did something beside the line; it is in the audit trail after the next turn."""
+        self._notes.append((what, data))
+        self._wake()
+
     def stop(self) -> None:
         """Begin no further unit; `run` returns when the runs that go on have ended."""
         self._is_stopping = True
@@ -244,6 +251,8 @@ class Station:
             self._hear(socket, message)
         while self._published:
             self.tell(self._published.popleft())
+        while self._notes:
+            self._audit(*self._notes.popleft())
         self._take_scans()
         if self._is_aborting:
             self._abort_running()

@@ -22,6 +22,7 @@ from starlette.routing import BaseRoute, Route
 from flasher.errors import FlasherError
 from flasher.station.children import deaf_from_birth
 from flasher.web.pages import Pages
+from flasher.web.sign_ins import SignIn
 
 PROCESSES: Final = 2
 ANSWER_LIMIT_S: Final = 120.0
@@ -43,6 +44,8 @@ class Question:
     """Of a page about one run."""
     language: str = "en"
     token: str = ""
+    sign_in: SignIn | None = None
+    """Of who asks."""
 
 
 @dataclass(frozen=True)
@@ -131,19 +134,29 @@ def _answer(question: Question) -> Answer:
         return Answer(str(error).encode("utf-8", "replace"), "text/plain; charset=utf-8", 503)
 
 
+def question_of(path: str, request: Request, pages: Pages) -> Question:
+    """What a request asks for; `path` as its route is written."""
+    fields = {
+        name: value.strip()[:FIELD_MAX]
+        for name, value in request.query_params.items()
+        if value.strip()
+    }
+    return Question(
+        path,
+        fields,
+        int(request.path_params.get("run", 0)),
+        pages.translator_of(request).code,
+        request.session.get("token", ""),
+        request.scope.get("sign_in"),
+    )
+
+
 def answer_routes(pages: Pages, ask: Ask, paths: Iterable[str]) -> list[BaseRoute]:
     """The routes of pages that are answered by `ask`."""
 
     async def page(path: str, request: Request) -> Response:
-        fields = {
-            name: value.strip()[:FIELD_MAX]
-            for name, value in request.query_params.items()
-            if value.strip()
-        }
-        run = int(request.path_params.get("run", 0))
-        language, token = pages.translator_of(request).code, request.session.get("token", "")
         try:
-            answer = await ask(Question(path, fields, run, language, token))
+            answer = await ask(question_of(path, request, pages))
         except TimeoutError:
             return PlainTextResponse("That took too long: narrow it down.", 503)
         if answer.location:

@@ -2,23 +2,19 @@
 
 Every request names this server as its host, so that no foreign name leads here (DNS rebinding).
 What changes something is a POST from a page of this server that knows the token of its session.
-Answers forbid scripts, styles and connections from anywhere else. Where a password is set, or a
-badge asked for, nothing but the page that asks is shown before. Where there are badges, the pages
-of supervisors are for theirs.
+Answers forbid scripts, styles and connections from anywhere else. Where people sign in
+(`flasher.web.login`), nothing but the page that asks is shown before.
 """
 
 from __future__ import annotations
 
 import hmac
 import secrets
-from collections import deque
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
-from functools import partial
 from typing import Any, Final
-from urllib.parse import parse_qs
 
-from anyio.to_thread import run_sync
+from anyio import CancelScope
+from anyio.lowlevel import checkpoint
 from starlette.applications import Starlette
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware import Middleware
@@ -30,9 +26,9 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from flasher.report.base import PAGE_STYLE
-from flasher.said import say
-from flasher.station.people import Role
+from flasher.web.login import FORMS, LOGIN, SIGN_OUT, Login
 from flasher.web.pages import Pages
+from flasher.web.sign_ins import SignIn
 
 TOKEN_HEADER: Final = "x-flasher-token"  # noqa: S105  its name
 BODY_MAX: Final = 64 * 1024
@@ -51,69 +47,12 @@ _HEADERS: Final = {
     "permissions-policy": "camera=(), microphone=(), geolocation=(), payment=(), usb=()",
     "cache-control": "no-store",
 }
-_TRIES_MAX: Final = 5
-_TRIES_WITHIN_S: Final = 60.0
 _ENTER: Final = "/enter"
 _CLOSED: Final = "/closed"
-_LOGIN: Final = "/login"
-_OPEN: Final = ("/static/", _LOGIN, _ENTER, _CLOSED)
-"""Paths that need no password."""
-_SUPERVISES_S: Final = 900.0
-"""A supervisor who looked at no page for so long has left the screen."""
-_QUERY_MAX: Final = 1000
-"""Characters of what a page was asked for that are kept while somebody signs in."""
-_BADGE_MAX: Final = 300
-"""Characters of a badge or a PIN."""
-
-
-@dataclass(frozen=True)
-class Badges:
-    """The people who may open pages."""
-
-    role_of: Callable[[str, str], Role | None]
-    """The role of a badge with a PIN; None when one of them is wrong. It is slow on purpose."""
-    is_supervised: Callable[[str], bool]
-    """True for the path of a page that is for supervisors."""
-    are_for_all: bool
-    """True where the other pages need a badge too: any."""
-
-
-@dataclass(frozen=True)
-class _Rights:
-    """What who signs in has to say, and how a session shows that it was said."""
-
-    password: str
-    badges: Badges | None
-    signed: str
-    now: Callable[[], float]
-
-    def has_signed(self, session: Mapping[str, Any]) -> bool:
-        return bool(session.get("is_in") == self.signed)
-
-    def is_supervised(self, path: str) -> bool:
-        return self.badges is not None and self.badges.is_supervised(path)
-
-
-_IN: Final = "in"
-"""Kept in the session of who may see the pages, where nobody signs in."""
-
-
-class Tries:
-    """Limits how often somebody may guess: `_TRIES_MAX` wrong ones in `_TRIES_WITHIN_S`."""
-
-    def __init__(self, now: Callable[[], float]) -> None:
-        self._now = now
-        self._wrong: deque[float] = deque()
-
-    @property
-    def are_used_up(self) -> bool:
-        """True while no other try is allowed."""
-        while self._wrong and self._now() - self._wrong[0] > _TRIES_WITHIN_S:
-            self._wrong.popleft()
-        return len(self._wrong) >= _TRIES_MAX
-
-    def was_wrong(self) -> None:
-        self._wrong.append(self._now())
+_OPEN: Final = ("/static/", LOGIN, SIGN_OUT, _ENTER, _CLOSED)
+"""Paths that need no sign-in."""
+_IS_IN: Final = "is_in"
+"""What the session of the browser has that an address let in."""
 
 
 class Entry:
@@ -126,50 +65,43 @@ class Entry:
         self.cookie = f"flasher-{secrets.token_hex(4)}"
         """Cookies hold for all ports of a computer, and several servers may run on it."""
 
-    async def take(self, request: Request) -> Response:
+    @property
+    def routes(self) -> list[BaseRoute]:
+        return [Route(_ENTER, self._take), Route(_CLOSED, self._refuse)]
+
+    async def _take(self, request: Request) -> Response:
         said = request.query_params.get("key", "")
         if not self._key or not hmac.compare_digest(said.encode(), self._key.encode()):
-            return RedirectResponse("/" if request.session.get("is_in") else _CLOSED, 303)
+            return RedirectResponse("/" if request.session.get(_IS_IN) else _CLOSED, 303)
         self._key = ""
-        request.session["is_in"] = _IN
+        request.session[_IS_IN] = True
         # From a page of this server on, so that the cookie goes with it wherever the address was
         # clicked.
         return self._pages.show(request, "enter.html")
 
-    async def refuse(self, request: Request) -> Response:
+    async def _refuse(self, request: Request) -> Response:
         return self._pages.show(request, "closed.html", status=403)
 
 
-def application(  # noqa: PLR0913  the name and the rights of a server
+def application(
     routes: Collection[BaseRoute],
     *,
-    pages: Pages,
     hosts: Collection[str],
     secret: str,
-    now: Callable[[], float],
-    password: str = "",
-    badges: Badges | None = None,
-    signed: str = _IN,
+    login: Login | None = None,
     entry: Entry | None = None,
     is_tls: bool = False,
     uploads: Callable[[str], int] = lambda _path: BODY_MAX,
 ) -> ASGIApp:
     """The pages behind the guard. `hosts`: names by which this server is addressed, without port;
-    `secret` signs the cookies; `signed` is kept in the session of who signed in, and is another one
-    where password or badges are others, so that people sign in again;
-    `uploads` gives the limit of a path's body in bytes.
+    `secret` signs the cookies; `login` knows who signed in, and `entry` lets one browser in:
+    without either everybody sees the pages; `uploads` gives the limit of a path's body in bytes.
     """
-    rights = _Rights(password, badges, signed, now)
-    login = _Login(pages, rights)
-    entries = [] if entry is None else [Route(_ENTER, entry.take), Route(_CLOSED, entry.refuse)]
-    asks = bool(password) or (badges is not None and badges.are_for_all)
-    refused_to = _LOGIN if asks else "" if entry is None else _CLOSED
     own: list[BaseRoute] = [
-        *entries,
+        *([] if entry is None else entry.routes),
+        *([] if login is None else login.routes),
         Route("/static/page.css", FileResponse(PAGE_STYLE)),
         Mount("/static", StaticFiles(packages=[("flasher.web", "static")])),
-        Route(_LOGIN, login.show, methods=["GET"]),
-        Route(_LOGIN, login.take, methods=["POST"]),
     ]
     session = Middleware(
         SessionMiddleware,
@@ -182,7 +114,7 @@ def application(  # noqa: PLR0913  the name and the rights of a server
         routes=[*own, *routes],
         middleware=[
             session,
-            Middleware(_Sessions, rights=rights, refused_to=refused_to),
+            Middleware(_Sessions, login=login, entry=entry),
         ],
     )
     return _Guard(inner, hosts, uploads)
@@ -254,109 +186,61 @@ def _limited(receive: Receive, limit: int) -> Receive:
 
 
 class _Sessions:
-    """Every session has a token, which a POST has to say; and has said the password, shown a badge
-    or used the entry, where there is one: others are sent to `refused_to`.
+    """Every session has a token, which a POST has to give. Who may not see a page is sent to where
+    people sign in, or told that another browser has the pages.
     """
 
-    def __init__(self, app: ASGIApp, *, rights: _Rights, refused_to: str) -> None:
+    def __init__(self, app: ASGIApp, *, login: Login | None, entry: Entry | None) -> None:
         self._app = app
-        self._rights = rights
-        self._refused_to = refused_to
+        self._login = login
+        self._entry = entry
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         session: dict[str, Any] = scope["session"]
         session.setdefault("token", secrets.token_urlsafe(24))
         path: str = scope["path"]
-        if to := "" if path.startswith(_OPEN) else self._refused(path, session):
-            if to == _LOGIN and scope["method"] == "GET":
-                # One slash alone: two would begin the name of another computer.
-                query = scope["query_string"].decode("latin-1")[:_QUERY_MAX]
-                session["wanted"] = "/" + path.lstrip("/\\") + (f"?{query}" if query else "")
-            is_stream = path.endswith("/events")
+        is_stream = path.endswith("/events")
+        sign_in = None
+        if self._login is not None:
+            # A page that stays open looks for its stream by HEAD: nobody is there for that.
+            is_use = not is_stream and scope["method"] in ("GET", "POST")
+            sign_in = self._login.find(session, is_use=is_use)
+        scope["sign_in"] = sign_in
+        if to := "" if path.startswith(_OPEN) else self._refused(path, session, sign_in):
+            if to == LOGIN and self._login is not None and scope["method"] == "GET":
+                self._login.want(session, scope)
             refusal = Response(status_code=401) if is_stream else RedirectResponse(to, 303)
             await refusal(scope, receive, send)
             return
-        if scope["method"] == "POST" and path != _LOGIN:
+        if scope["method"] == "POST" and path not in FORMS:
             said = Headers(scope=scope).get(TOKEN_HEADER, "")
             if not hmac.compare_digest(said.encode(), session["token"].encode()):
                 await PlainTextResponse("Load the page again.", 403)(scope, receive, send)
                 return
-        await self._app(scope, receive, send)
+        if is_stream:
+            await self._stream(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
 
-    def _refused(self, path: str, session: dict[str, Any]) -> str:
+    def _refused(self, path: str, session: Mapping[str, Any], sign_in: SignIn | None) -> str:
         """Where who may not see this page is sent to; "" for who may."""
-        rights = self._rights
-        if self._refused_to and not rights.has_signed(session):
-            return self._refused_to
-        if not rights.is_supervised(path):
-            return ""
-        if not rights.has_signed(session):
-            return _LOGIN
-        now = rights.now()
-        # A clock that began anew, after a restart of the computer, says nothing of before.
-        if not 0.0 <= now - session.get("supervised_at", -_SUPERVISES_S) < _SUPERVISES_S:
-            return _LOGIN
-        session["supervised_at"] = now
+        if self._entry is not None and not session.get(_IS_IN):
+            return _CLOSED
+        if self._login is not None and self._login.is_refused(path, sign_in):
+            return LOGIN
         return ""
 
+    async def _stream(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """A stream, which ends with the sign-in that it needs."""
+        session, path = scope["session"], scope["path"]
+        with CancelScope() as streaming:
 
-class _Login:
-    """The page that asks for the password, or for a badge."""
+            async def send_to_who_may(message: Message) -> None:
+                login = self._login
+                if login is not None and login.is_refused(path, login.find(session)):
+                    await send({"type": "http.response.body", "body": b"", "more_body": False})
+                    streaming.cancel()
+                    await checkpoint()
+                await send(message)
 
-    def __init__(self, pages: Pages, rights: _Rights) -> None:
-        self._pages = pages
-        self._rights = rights
-        self._tries = Tries(rights.now)
-
-    async def show(self, request: Request) -> Response:
-        return self._show(request)
-
-    def _show(
-        self, request: Request, trouble: str = "", status: int = 200, *, badge: str = ""
-    ) -> Response:
-        """The page; with a `badge` that was scanned it asks for its PIN alone."""
-        return self._pages.show(
-            request,
-            "login.html",
-            status=status,
-            trouble=trouble,
-            badge=badge,
-            asks_password=bool(self._rights.password)
-            and not self._rights.has_signed(request.session),
-            asks_badge=self._rights.badges is not None,
-            is_for_supervisors=self._is_supervised(request),
-        )
-
-    async def take(self, request: Request) -> Response:
-        fields = parse_qs((await request.body()).decode("utf-8", "replace"))
-        token, password, badge, pin = (
-            fields.get(name, [""])[0] for name in ("token", "password", "badge", "pin")
-        )
-        if not hmac.compare_digest(token.encode(), request.session["token"].encode()):
-            return RedirectResponse(_LOGIN, 303)
-        if self._tries.are_used_up:
-            return self._show(request, say("Too many wrong tries: wait a minute."), 429)
-        role, rights = None, self._rights
-        badges = rights.badges if badge else None
-        if badges is not None:
-            # Beside the loop that serves all pages: it takes its time.
-            find = partial(badges.role_of, badge.strip()[:_BADGE_MAX], pin[:_BADGE_MAX])
-            role = await run_sync(find)
-        is_password = hmac.compare_digest(password.encode(), rights.password.encode())
-        # Beside the right password too, a wrong badge is a wrong try: else PINs could be guessed.
-        if role is None and (badges is not None or not (rights.password and is_password)):
-            self._tries.was_wrong()
-            if badge and not pin:  # a scanner ends what it types by Enter
-                return self._show(request, say("Type the PIN of the badge."), 403, badge=badge)
-            return self._show(request, say("That is not it."), 403)
-        if role is not None and role is not Role.SUPERVISOR and self._is_supervised(request):
-            return self._show(request, say("That badge is no supervisor's."), 403)
-        if not rights.has_signed(request.session):
-            request.session.pop("supervised_at", None)  # by badges that may be others now
-        request.session["is_in"] = rights.signed
-        if role is Role.SUPERVISOR:
-            request.session["supervised_at"] = rights.now()
-        return RedirectResponse(request.session.get("wanted", "/"), 303)
-
-    def _is_supervised(self, request: Request) -> bool:
-        return self._rights.is_supervised(str(request.session.get("wanted", "/")).partition("?")[0])
+            await self._app(scope, receive, send_to_who_may)

@@ -72,6 +72,7 @@ class Pages:
     ) -> Response:
         """A page, in the language of its request."""
         token = request.session.get("token", "")
+        context.setdefault("sign_in", request.scope.get("sign_in"))
         return HTMLResponse(
             self.text(template, self.translator_of(request), token, **context), status
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import socket
 import threading
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import uvicorn
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.text import printable
@@ -19,6 +21,28 @@ LOOPBACK: Final = frozenset({"127.0.0.1", "::1", "localhost"})
 logging.getLogger("uvicorn").addHandler(logging.NullHandler())
 _END_LIMIT_S: Final = 1.0
 """Streams that are still open are cut after this time."""
+
+
+_CONNECTIONS_MAX: Final = 200
+_OF_ONE_ADDRESS_MAX: Final = 100
+"""Open connections from one address, so that one client does not take those of all."""
+
+
+class _Protocol(H11Protocol):
+    """Ends connections from an address that has too many."""
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        super().connection_made(transport)
+        address = _client_of(self)
+        if sum(_client_of(each) == address for each in self.connections) > _OF_ONE_ADDRESS_MAX:
+            # At once, and not when the loop has ended it: many may come together.
+            self.connections.discard(self)
+            transport.abort()
+
+
+def _client_of(connection: Any) -> str | None:
+    client: tuple[str, int] | None = connection.client
+    return client and client[0]
 
 
 class Tls(NamedTuple):
@@ -45,7 +69,10 @@ class Server:
             server_header=False,
             timeout_graceful_shutdown=1,
             h11_max_incomplete_event_size=16 * 1024,
-            limit_concurrency=200,
+            limit_concurrency=_CONNECTIONS_MAX,
+            http=_Protocol,
+            # A header that names another address is believed from nobody: tries are counted by it.
+            proxy_headers=False,
             ssl_certfile=None if tls is None else str(tls.certificate),
             ssl_keyfile=None if tls is None else str(tls.key),
         )

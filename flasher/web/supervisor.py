@@ -71,6 +71,8 @@ _NAMES: Final = {
     "/audit": say("Audit trail"),
 }
 """The menu."""
+_SIGN_INS: Final = {"/sign-ins": say("Sign-ins")}
+"""What it has besides where people sign in."""
 BY_WORDS: Final = {
     By.SOCKET: say("socket"),
     By.RECIPE: say("recipe"),
@@ -128,21 +130,8 @@ class Supervisor:
         self, question: Question, template: str, *, http: int = 200, **context: Any
     ) -> Answer:
         said = translator(question.language)
-        now = self.now()
-        context.setdefault("path", question.path)
-        text = self._pages.text(
-            template,
-            said,
-            question.token,
-            layout="supervise.html",
-            menu=_NAMES,
-            fields=question.fields,
-            here=_Addresses(question),
-            zone=_zone(now),
-            at=lambda moment: "" if moment is None else f"{moment.astimezone():%Y-%m-%d %H:%M:%S}",
-            outcomes=RUN_WORDS,
-            **context,
-        )
+        shown = frame(question, self.now()) | context
+        text = self._pages.text(template, said, question.token, outcomes=RUN_WORDS, **shown)
         return Answer(text.encode("utf-8", "backslashreplace"), status=http)
 
     # -- runs -------------------------------------------------------------------------------------
@@ -372,6 +361,20 @@ class Supervisor:
             events=chain.EVENTS,
             told=lambda row: ", ".join(_facts(row.data)),
         )
+
+
+def frame(question: Question, now: datetime) -> dict[str, Any]:
+    """What all pages of the supervisor show around what they are about."""
+    return {
+        "layout": "supervise.html",
+        "menu": _NAMES if question.sign_in is None else _NAMES | _SIGN_INS,
+        "path": question.path,
+        "fields": question.fields,
+        "here": _Addresses(question),
+        "zone": _zone(now),
+        "at": lambda moment: "" if moment is None else f"{moment.astimezone():%Y-%m-%d %H:%M:%S}",
+        "sign_in": question.sign_in,
+    }
 
 
 Place = tuple[str, Path, Keeping]

@@ -33,10 +33,8 @@ def app_with(supervisor: Supervisor) -> ASGIApp:
     pages = Pages()
     return application(
         answer_routes(pages, ask, PAGES),
-        pages=pages,
         hosts={"127.0.0.1"},
         secret=_KEY,
-        now=lambda: 0.0,
     )
 
 

@@ -97,8 +97,8 @@ class BenchPlace:
         entry = Entry(pages)
         page = BenchPage(pages, self.bench, self.shelf, is_mock=True)
         app = application(
-            [*page.routes, *answer_routes(pages, ask, KEPT)], pages=pages, hosts={"127.0.0.1"},
-            secret=_KEY, now=lambda: 0.0, entry=entry, uploads=upload_limit(BODY_MAX),
+            [*page.routes, *answer_routes(pages, ask, KEPT)], hosts={"127.0.0.1"},
+            secret=_KEY, entry=entry, uploads=upload_limit(BODY_MAX),
         )  # fmt: skip
         worker = threading.Thread(target=self.bench.run, daemon=True)
         with Server(app, "127.0.0.1", 0) as server:

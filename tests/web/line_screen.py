@@ -96,7 +96,7 @@ def served(line: LineScreen, port: int = 0, *, closes_feed: bool = True) -> Iter
     pages = Pages()
     app = application(
         OperatorPage(pages, line.screen.feed, line.scans.append, sound_volume=0.3).routes,
-        pages=pages, hosts={"127.0.0.1"}, secret=_KEY, now=lambda: 0.0,
+        hosts={"127.0.0.1"}, secret=_KEY,
     )  # fmt: skip
     with Server(app, "127.0.0.1", port) as server:
         line.url = server.url

@@ -4,12 +4,13 @@ beside it, the supervisor's alone of `flasher station pages`, and who may see th
 
 from __future__ import annotations
 
-import hmac
+import logging
 import os
 import secrets
 import socket
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
+from concurrent.futures import Executor
 from contextlib import closing, contextmanager
 from datetime import datetime
 from functools import partial
@@ -26,21 +27,26 @@ from flasher.cli.station.place import open_to_read
 from flasher.cli.stop import stop_on_signal
 from flasher.errors import ErrorCode, ExitCode, UsageError
 from flasher.files import read
+from flasher.protocol.text import printable
 from flasher.said import say
 from flasher.station.board import Board
 from flasher.station.config import StationConfig, load_config
 from flasher.station.events import RunEnded, StationEvent
 from flasher.station.health import Watch
-from flasher.station.people import BADGES, Person, role_of
+from flasher.station.people import BADGES, Person
+from flasher.station.pins import checker
 from flasher.station.records.keys import Keeping
-from flasher.station.records.model import RunFilter, RunState, utc_moment
+from flasher.station.records.model import Clock, RunFilter, RunState, utc_moment
+from flasher.station.records.store import SystemClock
 from flasher.station.station import Station
 from flasher.station.tally import DEFAULT_SHIFTS, EndedRun, Tally
 from flasher.web.answers import AnswerProcesses, answer_routes
-from flasher.web.guard import Badges, application
+from flasher.web.guard import application
+from flasher.web.login import Badges, Login
 from flasher.web.operator import LINE, Lot, OperatorPage, Screen
 from flasher.web.pages import Pages
 from flasher.web.server import LOOPBACK, Server, Tls
+from flasher.web.sign_ins import Note
 from flasher.web.supervisor import PAGES, open_supervisor, place_of
 
 _TURN_S: Final = 0.1
@@ -49,6 +55,7 @@ _PASSWORD_FILE_MAX_SIZE: Final = 4096
 """In bytes."""
 _ANY: Final = frozenset({"0.0.0.0", "::"})  # noqa: S104  compared, not bound
 _SECRET_MAX_SIZE: Final = 200
+_LOG: Final = logging.getLogger("flasher.web")
 
 
 # -- the operator's -------------------------------------------------------------------------------
@@ -98,8 +105,7 @@ def operator_page(
     people: Sequence[Person],
 ) -> Iterator[tuple[OperatorView, str]]:
     """Serve the page, and those of the supervisor beside it, while the block runs; gives its view
-    and its address. `keeping`: where the secret of the sessions is kept, so that pages go on after
-    a restart; None for no place. `people`: those with a badge.
+    and its address. `keeping` and `people`: as `served` has them.
 
     Raises UsageError.
     """
@@ -127,6 +133,9 @@ def operator_page(
         keeping=keeping,
         people=people,
         is_supervised=lambda path: path != "/" and not path.startswith(LINE),
+        clock=station.clock,
+        note=station.note,
+        checker=station.checker,
     )
     with closing(answering), server as url:
         try:
@@ -159,6 +168,10 @@ def serve(output: Output, address: Address, options: PagesOptions, records: Reco
             keeping=None,
             people=people,
             is_supervised=lambda _path: True,
+            clock=SystemClock(),
+            # The trail is written by the station alone.
+            note=lambda event, data: _LOG.info("%s: %s", event.value, printable(str(data))),
+            checker=checker(),
         ) as url,
     ):
         answering.begin()
@@ -185,35 +198,36 @@ def served(
     keeping: Keeping | None,
     people: Sequence[Person] = (),
     is_supervised: Callable[[str], bool],
+    clock: Clock,
+    note: Note,
+    checker: Executor,
 ) -> Iterator[str]:
     """Serve pages while the block runs; gives their address. `keeping`: where the secret of the
-    sessions is kept; None: they end with the server. `people`: those with a badge, of whom
-    supervisors alone see the pages that `is_supervised` tells by their path; without people
-    everybody sees them. Raises UsageError.
+    cookies is kept, so that a page that is open works after a restart; None for no place. `people`:
+    those with a badge, of whom supervisors alone see the pages that `is_supervised` tells by their
+    path; without people everybody sees them. `note` takes who signs in and out; `checker` checks
+    PINs. Raises UsageError.
     """
     password, tls = _password(options), _tls(options)
     _check_open(options, address, has_password=bool(password or people), has_tls=tls is not None)
+    is_far = address.host not in LOOPBACK
     badges = None
     if people:
-        is_far = address.host not in LOOPBACK
         badges = Badges(
-            # A badge alone is no more than paper: it does not stand for a password.
-            partial(role_of, people, needs_pin=is_far or bool(password)),
-            is_supervised,
+            people,
+            # A badge alone is no more than paper: it is not enough in place of a password.
+            needs_pin=is_far or bool(password),
+            is_supervised=is_supervised,
             are_for_all=is_far and not password,
         )
-    secret = secrets.token_urlsafe(32) if keeping is None else kept_secret(keeping)
-    # Who signed in goes on after a restart, unless the password or a badge is another one now.
-    known = repr((password, [(each.code, each.role.value, each.pin) for each in people]))
+    login = None
+    if people or password:
+        login = Login(pages, clock, note, checker=checker, password=password, badges=badges)
     app = application(
         routes,
-        pages=pages,
         hosts=_hosts(address),
-        secret=secret,
-        signed=hmac.digest(secret.encode(), known.encode(), "sha256").hex(),
-        now=time.perf_counter,
-        password=password,
-        badges=badges,
+        secret=secrets.token_urlsafe(32) if keeping is None else kept_secret(keeping),
+        login=login,
         is_tls=tls is not None,
     )
     with Server(app, address.host, address.port, tls) as server:
@@ -278,7 +292,7 @@ def _password(options: PagesOptions) -> str:
 
 
 def kept_secret(keeping: Keeping) -> str:
-    """What signs the sessions of the pages, for this user alone; made where there is none."""
+    """What signs the cookies of the pages, for this user alone; made where there is none."""
     path: Path = keeping.keys_folder / "pages.secret"
     try:
         path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)

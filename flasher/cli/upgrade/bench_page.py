@@ -330,10 +330,8 @@ def serve(
         page = BenchPage(pages, machine, shelf, is_mock=bus.mock)
         app = application(
             [*page.routes, *answer_routes(pages, answering.ask, KEPT)],
-            pages=pages,
             hosts=LOOPBACK,
             secret=secrets.token_urlsafe(32),
-            now=time.perf_counter,
             entry=entry,
             uploads=upload_limit(BODY_MAX),
         )

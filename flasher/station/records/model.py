@@ -90,6 +90,13 @@ class AuditEvent(StrEnum):
     REPRINT = "reprint"
     """The label of a unit is printed once more."""
     REFUSED_SCAN = "refused scan"
+    SIGN_IN = "sign-in"
+    """Somebody signed in at a page."""
+    SIGN_IN_REFUSED = "refused sign-in"
+    """A wrong badge, PIN or password was given at a page."""
+    SIGN_OUT = "sign-out"
+    SIGN_IN_ENDED = "ended sign-in"
+    """By a supervisor, by its own person at another browser, or by its limits."""
 
 
 class UnitState(LowerInJson, StrEnum):

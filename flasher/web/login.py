@@ -1,0 +1,323 @@
+"""The pages by which people sign in and out, and the list of who is signed in.
+
+A PIN is checked in a thread of its own, one at a time. A try is counted before it is checked, few
+requests wait, and the others are refused at once: guesses cost neither memory nor the time of those
+who work.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import hmac
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from ipaddress import IPv6Address, ip_address, ip_network
+from math import ceil
+from typing import Any, Final
+from urllib.parse import parse_qs
+
+from starlette.requests import Request
+from starlette.responses import RedirectResponse, Response
+from starlette.routing import BaseRoute, Route
+from starlette.types import Scope
+
+from flasher.said import say
+from flasher.station import pins
+from flasher.station.attempts import Attempts
+from flasher.station.people import Person, Role
+from flasher.station.records.model import AuditEvent, Clock
+from flasher.web.answers import question_of
+from flasher.web.pages import Pages
+from flasher.web.sign_ins import IDLE_S, SHIFT_S, Note, SignIn, SignIns
+from flasher.web.supervisor import frame
+
+LOGIN: Final = "/login"
+SIGN_OUT: Final = "/sign-out"
+SIGN_INS: Final = "/sign-ins"
+_END: Final = f"{SIGN_INS}/end"
+_KEYS: Final = "sign_ins"
+"""What the session has: the keys of the sign-ins of its browser."""
+FORMS: Final = (LOGIN, SIGN_OUT, _END)
+"""Their fields have the token of the session."""
+_WAITING_MAX: Final = 4
+"""PINs that are checked or wait for it."""
+_WAITING_OF_ONE_MAX: Final = 2
+"""Those of one address, so that one client does not take all places."""
+_QUERY_MAX: Final = 1000
+"""Characters of what a page was asked for that are kept while somebody signs in."""
+_BADGE_MAX: Final = 300
+"""Characters of a badge or a PIN."""
+
+
+ROLE_WORDS: Final = {
+    Role.OPERATOR: say("operator"),
+    Role.REWORK: say("rework"),
+    Role.SUPERVISOR: say("supervisor"),
+}
+
+
+@dataclass(frozen=True)
+class Badges:
+    """The people who may open pages."""
+
+    people: Sequence[Person]
+    needs_pin: bool
+    """True where a badge without a PIN opens nothing."""
+    is_supervised: Callable[[str], bool]
+    """True for the path of a page that is for supervisors."""
+    are_for_all: bool
+    """True where the other pages need a badge too: any."""
+
+    def find(self, code: str) -> Person | None:
+        return next((each for each in self.people if each.code == code), None)
+
+    @property
+    def any_hash(self) -> str:
+        """A hash to be compared where there is none, so that the time tells of no badge."""
+        return next((each.pin for each in self.people if each.pin), "")
+
+
+class _RefusedError(Exception):
+    """Somebody is not let in."""
+
+    def __init__(
+        self, trouble: str, status: int = 403, *, wait_s: int = 0, badge: str = ""
+    ) -> None:
+        super().__init__(trouble)
+        self.trouble = trouble
+        self.status = status
+        self.wait_s = wait_s
+        self.badge = badge
+        """A badge that was scanned, and whose PIN is to be typed."""
+
+
+class _Places:
+    """Places for requests that wait; who finds none is refused at once."""
+
+    def __init__(self) -> None:
+        self._taken: Counter[str] = Counter()
+
+    @contextmanager
+    def of(self, address: str) -> Iterator[None]:
+        if self._taken.total() >= _WAITING_MAX or self._taken[address] >= _WAITING_OF_ONE_MAX:
+            trouble = say("Others are signing in at this moment. Try it again.")
+            raise _RefusedError(trouble, 503, wait_s=1)
+        self._taken[address] += 1
+        try:
+            yield
+        finally:
+            self._taken[address] -= 1
+            self._taken += Counter()  # without those that are zero
+
+
+class Login:
+    """Asks who is there, by the password of all or by a badge."""
+
+    def __init__(
+        self,
+        pages: Pages,
+        clock: Clock,
+        note: Note,
+        *,
+        checker: Executor,
+        password: str = "",
+        badges: Badges | None = None,
+    ) -> None:
+        self._pages = pages
+        self._clock = clock
+        self._note = note
+        self._checker = checker
+        self._password = password
+        self._badges = badges
+        self._attempts = Attempts()
+        self._places = _Places()
+        self.sign_ins = SignIns(clock, note)
+
+    @property
+    def routes(self) -> list[BaseRoute]:
+        return [
+            Route(LOGIN, self._page, methods=["GET"]),
+            Route(LOGIN, self._take, methods=["POST"]),
+            Route(SIGN_OUT, self._sign_out, methods=["POST"]),
+            Route(SIGN_INS, self._list, methods=["GET"]),
+            Route(_END, self._end, methods=["POST"]),
+        ]
+
+    # -- for the guard ----------------------------------------------------------------------------
+
+    def find(self, session: dict[str, Any], *, is_use: bool = False) -> SignIn | None:
+        """Who is signed in; `is_use`: and looks at a page."""
+        return self.sign_ins.find(_keys(session), is_use=is_use)
+
+    def is_refused(self, path: str, sign_in: SignIn | None) -> bool:
+        """True for a page that who is signed in, or nobody, may not see."""
+        badges = self._badges
+        if badges is not None and (path.startswith(SIGN_INS) or badges.is_supervised(path)):
+            return sign_in is None or not sign_in.is_supervisor
+        if path.startswith(SIGN_INS):
+            return sign_in is None
+        asks_all = bool(self._password) or (badges is not None and badges.are_for_all)
+        return asks_all and sign_in is None
+
+    def want(self, session: dict[str, Any], scope: Scope) -> None:
+        """Keep what page somebody asked for who has to sign in first."""
+        query = scope["query_string"].decode("latin-1")[:_QUERY_MAX]
+        # One slash alone: two would begin the name of another computer.
+        session["wanted"] = "/" + scope["path"].lstrip("/\\") + (f"?{query}" if query else "")
+
+    # -- in ---------------------------------------------------------------------------------------
+
+    async def _page(self, request: Request) -> Response:
+        return self._show(request)
+
+    def _show(self, request: Request, refused: _RefusedError | None = None) -> Response:
+        badge = "" if refused is None else refused.badge
+        answer = self._pages.show(
+            request,
+            "login.html",
+            status=200 if refused is None else refused.status,
+            trouble="" if refused is None else refused.trouble,
+            badge=badge,
+            asks_password=bool(self._password) and self.find(request.session) is None,
+            asks_badge=self._badges is not None,
+            is_for_supervisors=self._is_for_supervisors(request),
+        )
+        if refused is not None and refused.wait_s:
+            answer.headers["retry-after"] = str(refused.wait_s)
+        return answer
+
+    async def _take(self, request: Request) -> Response:
+        fields = await _form(request)
+        if fields is None:
+            return RedirectResponse(LOGIN, 303)
+        address = _address(request)
+        try:
+            person = await self._checked(address, fields)
+            if self._is_for_supervisors(request) and person is not None:
+                _check_supervisor(person)
+        except _RefusedError as refused:
+            return self._show(request, refused)
+        keys = self.sign_ins.begin(person, address, _keys(request.session))
+        request.session[_KEYS] = keys
+        return RedirectResponse(request.session.pop("wanted", "/"), 303)
+
+    async def _checked(self, address: str, fields: dict[str, str]) -> Person | None:
+        """Who that is; None for who knows the password. Raises _RefusedError."""
+        code, pin = (fields.get(name, "").strip()[:_BADGE_MAX] for name in ("badge", "pin"))
+        # Beside the right password too, a wrong badge is a wrong try.
+        if self._badges is not None and code:
+            return await self._person(self._badges, address, code, pin)
+        self._count(address, "")
+        password = fields.get("password", "").encode()
+        if not (self._password and hmac.compare_digest(password, self._password.encode())):
+            raise self._wrong(address, "wrong password")
+        self._attempts.was_right(address, "")
+        return None
+
+    async def _person(self, badges: Badges, address: str, code: str, pin: str) -> Person:
+        """The person of a badge, who knows its PIN. Raises _RefusedError."""
+        person = badges.find(code)
+        if person is not None and not (person.pin or badges.needs_pin):
+            self._count(address, code)
+            return person
+        if not pin:  # a scanner ends what it types by Enter
+            self._count(address, None)
+            raise _RefusedError(say("Type the PIN of the badge."), badge=code)
+        # Of a badge that opens nothing too, so that the time tells nothing of it.
+        pin_hash = person.pin if person is not None and person.pin else badges.any_hash
+        with self._places.of(address):
+            self._count(address, code)
+            is_right = pin_hash != "" and await asyncio.wrap_future(
+                self._checker.submit(pins.is_right, pins.Pin(pin), pin_hash)
+            )
+        if person is None:
+            raise self._wrong(address, "unknown badge")
+        if not (is_right and person.pin):
+            raise self._wrong(address, "wrong PIN", person.name)
+        self._attempts.was_right(address, code)
+        return person
+
+    def _count(self, address: str, badge: str | None) -> None:
+        """Count a try, before it is checked. Raises _RefusedError for one too many."""
+        wait_s = ceil(self._attempts.begin(address, badge, self._clock.monotonic_s()))
+        if wait_s:
+            trouble = say("Too many tries: wait {seconds} s.", seconds=wait_s)
+            raise _RefusedError(trouble, 429, wait_s=wait_s)
+
+    def _wrong(self, address: str, why: str, name: str = "") -> _RefusedError:
+        # Without the text: somebody may have typed a PIN where the badge belongs.
+        self._note(AuditEvent.SIGN_IN_REFUSED, {"name": name, "address": address, "why": why})
+        return _RefusedError(say("That is not it."))
+
+    def _is_for_supervisors(self, request: Request) -> bool:
+        wanted = str(request.session.get("wanted", "/")).partition("?")[0]
+        return self._badges is not None and self._badges.is_supervised(wanted)
+
+    # -- out --------------------------------------------------------------------------------------
+
+    async def _sign_out(self, request: Request) -> Response:
+        fields, sign_in = await _form(request), self.find(request.session)
+        if fields is not None and sign_in is not None:
+            self.sign_ins.sign_out(sign_in, everywhere="everywhere" in fields)
+        return RedirectResponse("/", 303)
+
+    # -- who is there -----------------------------------------------------------------------------
+
+    async def _list(self, request: Request) -> Response:
+        question = question_of(SIGN_INS, request, self._pages)
+        now = self._clock.utc().astimezone()
+        listed = self.sign_ins.listed()
+        return self._pages.show(
+            request,
+            "sign_ins.html",
+            sign_ins=reversed(listed),
+            roles=ROLE_WORDS,
+            hours=f"{SHIFT_S / 3600:g}",
+            minutes=f"{IDLE_S / 60:g}",
+            **frame(question, now),
+        )
+
+    async def _end(self, request: Request) -> Response:
+        fields, by = await _form(request), self.find(request.session)
+        if fields is not None and by is not None:
+            if "all" in fields:
+                self.sign_ins.end_all(by)
+            elif fields.get("number", "").isdecimal():
+                self.sign_ins.end(int(fields["number"]), by)
+        return RedirectResponse(SIGN_INS, 303)
+
+
+def _check_supervisor(person: Person) -> None:
+    """Raises _RefusedError for another role."""
+    if person.role is not Role.SUPERVISOR:
+        raise _RefusedError(say("That badge is no supervisor's."))
+
+
+def _keys(session: Mapping[str, Any]) -> list[str]:
+    return list(session.get(_KEYS, ()))
+
+
+async def _form(request: Request) -> dict[str, str] | None:
+    """The fields of a form; None of one that is not of a page of this session."""
+    found = parse_qs((await request.body()).decode("utf-8", "replace"), keep_blank_values=True)
+    fields = {name: values[0] for name, values in found.items()}
+    token: str = request.session["token"]
+    is_own = hmac.compare_digest(fields.get("token", "").encode(), token.encode())
+    return fields if is_own else None
+
+
+def _address(request: Request) -> str:
+    """The client of a request. Of IPv6 the network: one client has all addresses of one."""
+    host = "" if request.client is None else request.client.host
+    try:
+        found = ip_address(host.partition("%")[0])
+    except ValueError:
+        return host
+    if not isinstance(found, IPv6Address):
+        return str(found)
+    if found.ipv4_mapped is not None:
+        return str(found.ipv4_mapped)
+    return str(found) if found.is_loopback else f"{ip_network((found, 64), strict=False)}"
