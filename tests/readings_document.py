@@ -138,6 +138,7 @@ HOLDERS: Final = {
             "tests/host/test_transfer.py::"
             "test_a_later_boot_version_starts_the_transfer_over_as_a_new_attempt"
         ),
+        "tests/station/test_exchanges.py::test_a_unit_that_is_exchanged_while_it_is_flashed",
     ),
 }
 """Tests of the host, the reader and the device model that hold a reading."""

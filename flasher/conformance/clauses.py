@@ -282,7 +282,7 @@ READINGS: Final = {
     "R28": Reading(
         "an announcement that the tool did not cause means another unit, or a lost supply",
         "The announcement after power-up is that after a reset, and names no unit. An upgrade "
-        "takes it for a restart of the device that it has reset (R11).",
+        "takes it for a restart of the device that it has reset (R11); a run of the station ends.",
     ),
 }
 CLAUSES: Final = {

@@ -47,6 +47,9 @@ class UpgradeOptions:
     """How often the upgrade may begin: after a restart of the device, an adapter that was lost and
     came back, or a packet whose tries are exhausted. None: `DEFAULT_ATTEMPTS` times, and as often
     as the overall deadline allows once the device has no application."""
+    single_session: bool = False
+    """Never begin again: a device that has restarted may be another one. A lost adapter may come
+    back, up to `attempts` times, as long as the device goes on where it stood."""
     waits_for_other_tool: bool = True
     """Upgrade an erased device again when another tool that wrote to it is silent, as long as an
     attempt is left. False: end at once."""

@@ -271,6 +271,8 @@ class UpgradeStage:
 
     @property
     def _is_last_attempt(self) -> bool:
+        if self._options.single_session:
+            return True
         return self._attempt >= self._attempts and not self.goes_on
 
     @property

@@ -104,6 +104,11 @@ WRONG_UNIT: Final = _error(
     say("the unit's own serial number is not the one on the label"),
     say("Compare label and unit: scan the label of the unit that is in the socket."),
 )
+UNIT_CHANGED: Final = _error(
+    "UNIT_CHANGED",
+    say("the unit in the socket may be another one than at the beginning of the run"),
+    say("Put the unit of this label into the socket, and scan the label again."),
+)
 TWO_DEVICES: Final = _error(
     "TWO_DEVICES",
     say("two devices of one kind answer"),
@@ -169,3 +174,5 @@ OF_ENDING: Final[Mapping[Ending, Code]] = {
 """What a bad end of an upgrade is in the records."""
 NEED_POWER_CYCLE: Final = frozenset({NO_BOOTLOADER, ERASE_FAILED, TRANSFER_FAILED})
 """After these a power cycle may reach the bootloader again."""
+OF_SILENCE: Final = frozenset({NO_ANSWER, NOT_RUNNING, WRITE_FAILED})
+"""What a unit fails with that is not there any more."""

@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from typing import Final
 
 from flasher.protocol import catalogue
+from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
-from flasher.protocol.messages import BootVersion, decode
+from flasher.protocol.messages import BootVersion, RequestTransfer, decode
 from flasher.protocol.spec import data_size
 from flasher.protocol.text import printable
 from flasher.protocol.wire import Message, Reassembler, encode, split
@@ -47,6 +48,12 @@ class TargetWatcher:
         self.heard_at: float | None = None
         """When the device last said anything."""
         self.announced_at: float | None = None
+        self.transfer_requests = 0
+        """Of its bootloader."""
+        self.answers = 0
+        """To a question for its version, whoever asked."""
+        self.answer: Content | None = None
+        """The last one."""
         self.serial: str | None = None
         """The serial number in its last answer, empty without one; None: it has not answered."""
 
@@ -62,6 +69,8 @@ class TargetWatcher:
                     self.announcements += 1
                     self.announced_at = now
                     self.version = printable(row.version)
+                elif isinstance(row, RequestTransfer):
+                    self.transfer_requests += 1
         if self._answers is not None and frame.can_id == self._answers.can_id:
             for found in self._answers.feed(frame.data, now):
                 if isinstance(found, Message):
@@ -73,8 +82,9 @@ class TargetWatcher:
         if item is None or (message.mode, message.command) != (item.mode, item.command):
             return
         if data_size(message.command) == item.content.SIZE_BYTES:
-            version = item.content.from_data(message.data)
-            self.serial = str(getattr(version, "serial_number", ""))
+            self.answer = item.content.from_data(message.data)
+            self.answers += 1
+            self.serial = str(getattr(self.answer, "serial_number", ""))
 
 
 class Presence:

@@ -236,6 +236,13 @@ class Duplicate(StrEnum):
     REFLASH_WITH_REASON = "reflash-with-reason"
 
 
+class AfterRestart(StrEnum):
+    """What a run does when the unit has restarted, and the run has not caused it."""
+
+    END = "end"
+    CONTINUE = "continue"
+
+
 class Golden(Table):
     """Known good units that test a socket before it may go on. Their runs count in no figure."""
 
@@ -277,6 +284,9 @@ class Recipe(Table):
     step: dict[StepName, StepRule] = Field(default_factory=dict)
     duplicate: Duplicate = Duplicate.BLOCK
     """What is done with a unit that has passed already."""
+    after_restart: AfterRestart = AfterRestart.END
+    """A unit that restarts by itself in a run may be another one. "continue" is for sockets that
+    hold the unit until the run has ended; the record says so."""
     golden: Golden | None = None
     allow_completed_not_read_back: bool = True
     """A target that cannot be asked for its version may pass; the record says so."""

@@ -132,19 +132,21 @@ def with_history(
     order: RunOrder, life: UnitLife | None, recipe: LoadedRecipe, *, is_reworked: bool = False
 ) -> RunOrder:
     """The order with what the unit's runs before mean for it. A verdict ends a story: what came
-    before the last PASS or FAIL is not the state in which this run finds the unit. But what must
+    before the last PASS or FAIL is not the state in which this run finds the unit; nor is a flash
+    before a run in which the unit may have become another one. But what must
     not change is held until a PASS: a run that failed after its first write may be what changed it.
     Only for a unit that `is_reworked` it is read anew.
     """
     runs = [] if life is None else list(life.runs)
     still_open = _after(runs, lambda run: run.run.state not in _OPEN)
     unfinished = _after(runs, lambda run: run.run.state is RunState.PASS)
+    of_this_unit = _after(still_open, lambda run: run.run.code == codes.UNIT_CHANGED.name)
     passed = next((run for run in reversed(runs) if run.run.state is RunState.PASS), None)
     written = passed.writes if passed is not None else ()
     return replace(
         order,
         known_before=_known(still_open if is_reworked else unfinished),
-        flashed_before=_flashed(still_open, recipe),
+        flashed_before=_flashed(of_this_unit, recipe),
         written_before={
             write_key(write.target, write.what): write.value
             for write in written

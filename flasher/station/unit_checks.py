@@ -20,6 +20,7 @@ from flasher.station.recipe_file import LoadedRecipe, codec_of, readable_of
 from flasher.station.records.model import Measurement, RunKind, StepName
 from flasher.station.unit_target import Identified, StepFailedError, UnitTarget
 
+NOT_IDENTIFIED: Final = "not identified before flashing"
 BEFORE: Final = "before "
 """Begins the names of measurements of what must not change."""
 OF_CHECK: Final = {
@@ -59,9 +60,11 @@ def wanted_text(plan: WritePlan) -> str:
     return ", ".join(change.new for change in field_changes(plan, None))
 
 
-def said_of(name: str, found: Identified) -> list[Measurement]:
+def said_of(target: UnitTarget, found: Identified) -> list[Measurement]:
     """What a device reported of itself, as measurements without limits."""
-    version = found.seen.version
+    name, version = target.name, found.seen.version
+    if version is None:
+        return [Measurement(f"{name} identity", text=NOT_IDENTIFIED)]
     words = ("model", "serial_number", "hardware_version", "firmware_version")
     texts = {word: getattr(version, word, None) for word in words}
     return [
@@ -73,7 +76,7 @@ def said_of(name: str, found: Identified) -> list[Measurement]:
 
 def state_words(target: UnitTarget, found: Identified) -> str:
     if found.is_in_bootloader:
-        return f"in its bootloader {target.watcher.version}".strip()
+        return f"in its bootloader {target.watcher.version}, {NOT_IDENTIFIED}".replace(" ,", ",")
     if found.seen.version is None:
         return "cannot be asked" if target.version_request is None else "silent"
     return found.seen.firmware_version or "answers"

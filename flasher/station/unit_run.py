@@ -7,12 +7,12 @@ begun, tried again, timed, recorded and judged.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Final
 
 from flasher.api import Connection
-from flasher.driver import Tap
+from flasher.driver import STALL_S, Tap
 from flasher.errors import (
     BusError,
     FlasherError,
@@ -22,6 +22,7 @@ from flasher.errors import (
     WrongDeviceError,
 )
 from flasher.station import codes
+from flasher.station.continuity import Continuity
 from flasher.station.events import OperatorPrompted, Progressed, StepStarted
 from flasher.station.messages import (
     Journal,
@@ -32,7 +33,7 @@ from flasher.station.messages import (
     StepReport,
 )
 from flasher.station.power import PowerControl
-from flasher.station.recipe import StepRule
+from flasher.station.recipe import AfterRestart, StepRule
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import Measurement, RunState, StepName, StepState
 from flasher.station.unit_steps import Act, UnitSteps
@@ -52,6 +53,20 @@ _BY_ERROR: Final = (
     (VerificationError, codes.WRITE_DIFFERS),
     (FlasherError, codes.RECIPE),
 )
+
+
+class _NotedPower:
+    """The power of a socket: a unit that restarts then does so for a cause."""
+
+    def __init__(self, power: PowerControl, units: Iterable[Continuity]) -> None:
+        self._power = power
+        self._units = units
+        self.check = power.check
+
+    def begin_cycle(self) -> None:
+        for each in self._units:
+            each.cycle_power()
+        self._power.begin_cycle()
 
 
 class UnitRun:
@@ -77,7 +92,13 @@ class UnitRun:
         self._taps = taps
         self._tell = tell
         self._cancelled = cancelled
-        self._power = power
+        goes_on = recipe.recipe.after_restart is AfterRestart.CONTINUE
+        stall_s = STALL_S * connection.clock.speed
+        self._continuity = {
+            each.name: Continuity(each, stall_s=stall_s, goes_on=goes_on) for each in recipe.targets
+        }
+        self._goes_on = goes_on
+        self._power = None if power is None else _NotedPower(power, self._continuity.values())
         self._step: tuple[StepName, str] = (StepName.CONNECT, "")
         self._step_began_at = 0.0
         self._step_ends_at: float | None = None
@@ -104,8 +125,16 @@ class UnitRun:
             self._tell(OperatorPrompted("", text, limit_s))
 
         try:
+            taps = (*self._taps, *self._continuity.values())
             targets = [
-                UnitTarget(each, self._connection, self._taps, self._is_over)
+                UnitTarget(
+                    each,
+                    self._connection,
+                    self._continuity[each.name],
+                    taps,
+                    self._is_over,
+                    goes_on=self._goes_on,
+                )
                 for each in self._recipe.targets
             ]
             return UnitSteps(
@@ -133,9 +162,13 @@ class UnitRun:
             failed = self._try(steps, act, try_number, rule.time_limit_s)
             if failed is None:
                 return
-            if not failed.code.may_retry or try_number == rule.tries:
+            is_final = not failed.code.may_retry or steps.has_lost_its_session
+            if is_final or try_number == rule.tries:
                 raise failed
-            self._before_next_try(steps, failed, rule)
+            try:
+                self._before_next_try(steps, failed, rule)
+            except StepFailedError as changed:
+                raise self._changed(steps) or changed from failed
 
     def _try(
         self, steps: UnitSteps, act: Act, try_number: int, limit_s: float | None
@@ -148,6 +181,8 @@ class UnitRun:
         measured: list[Measurement] = []
         failed, text = None, ""
         try:
+            if step is not StepName.CONNECT:
+                steps.targets[0].hear_waiting()
             steps.targets[0].check_cancelled()
             text = act(measured)
         except StepFailedError as error:
@@ -165,6 +200,9 @@ class UnitRun:
             failed = StepFailedError(code, words)
         finally:
             self._step_ends_at = None
+        if failed is not None and failed.code in codes.OF_SILENCE:
+            failed = self._of_silence(steps, failed)
+        failed = self._changed(steps) or failed
         duration_s = self._clock.now() - began_at
         if limit_s is not None:
             measured.append(Measurement("duration", duration_s, "s", high=limit_s))
@@ -182,6 +220,26 @@ class UnitRun:
         )
         return failed
 
+    def _changed(self, steps: UnitSteps) -> StepFailedError | None:
+        """What ends the run where the unit may be another one: that goes before all else."""
+        lost = next((each.lost for each in self._continuity.values() if each.lost), "")
+        if not lost:
+            return None
+        return StepFailedError(codes.UNIT_CHANGED, f"{lost} {steps.left_behind}".strip())
+
+    def _of_silence(self, steps: UnitSteps, failed: StepFailedError) -> StepFailedError:
+        """Something has no answer: an application that had answered, and does not any more, means
+        that the unit is gone.
+        """
+        try:
+            for target in steps.targets:
+                target.confirm()
+        except StepFailedError as silent:
+            return silent
+        except (InterruptedByUserError, BusError):
+            pass  # what ends the run is noticed by whoever goes on
+        return failed
+
     def _before_next_try(self, steps: UnitSteps, failed: StepFailedError, rule: StepRule) -> None:
         if failed.code is codes.BUS:
             # It may be back; when it is not, the next try says so.
@@ -189,18 +247,24 @@ class UnitRun:
                 self._connection.link.reopen()
         try:
             if rule.power_cycle and self._power is not None:
-                self._power.begin_cycle()
-            if rule.pause_s:
-                steps.targets[0].listen(rule.pause_s)
+                steps.targets[0].restart(self._power)
+            steps.wait(rule.pause_s)
         except InterruptedByUserError:
             return
         except BusError as error:
             raise StepFailedError(codes.BUS, error.what) from error
 
     def _is_over(self) -> bool:
-        """Asked between frames: a person stopped it, or the step's time is over."""
+        """Asked between frames: a person stopped it, the step's time is over, or the unit may be
+        another one.
+        """
+        now = self._clock.now()
+        for each in self._continuity.values():
+            each.listened(now)
+            if each.lost:
+                return True
         ends_at = self._step_ends_at
-        return self._cancelled() or (ends_at is not None and self._clock.now() >= ends_at)
+        return self._cancelled() or (ends_at is not None and now >= ends_at)
 
     def _progress(self, share: float) -> None:
         now = self._clock.now()

@@ -6,13 +6,14 @@ StepFailedError with the code of what is wrong.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from typing import Final
 
 from flasher import events
-from flasher.errors import NoAnswerError, VerificationError
+from flasher.errors import BusError, InterruptedByUserError, NoAnswerError, VerificationError
 from flasher.host.identity import CheckResult, judge_device
 from flasher.host.options import firmware_version
 from flasher.host.outcome import DeviceLeft
@@ -25,9 +26,12 @@ from flasher.said import say
 from flasher.station import codes
 from flasher.station.messages import Journal, RunOrder, flash_value, write_key
 from flasher.station.power import PowerControl
+from flasher.station.presence import PROBE_S
+from flasher.station.recipe import AfterRestart
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import (
     FLASH,
+    POWER_CYCLES,
     SERIAL_NUMBER,
     Measurement,
     RunKind,
@@ -107,6 +111,24 @@ class UnitSteps:
             (StepName.VERIFY, "", self._verify),
         ]
 
+    @property
+    def has_lost_its_session(self) -> bool:
+        """True when a device was told to update and runs no application since: it cannot say any
+        more who it is, so nothing is begun anew with it.
+        """
+        return any(each.continuity.is_told_to_update and not each.goes_on for each in self.targets)
+
+    def wait(self, limit_s: float) -> None:
+        """Let time pass between two tries; an application that runs is asked meanwhile who it is.
+        Raises StepFailedError when it falls silent.
+        """
+        clock = self.targets[0].clock
+        ends_at = clock.now() + limit_s
+        while (left_s := ends_at - clock.now()) > 0:
+            for target in self.targets:
+                target.confirm()
+            self.targets[0].listen(min(left_s, PROBE_S))
+
     # -- before anything is written ---------------------------------------------------------------
 
     def _connect(self, measured: list[Measurement]) -> str:
@@ -129,11 +151,15 @@ class UnitSteps:
                 raise StepFailedError(
                     codes.TWO_DEVICES, f"Two devices answer as {target.name}: {found.two_devices}."
                 )
-            if target.is_silent(found) and self._order.kind is not RunKind.RECHECK:
+            may_await_power = self._power is not None or target.goes_on
+            is_rescue = self._order.kind is RunKind.RECHECK and may_await_power
+            if target.is_silent(found) and not is_rescue:
                 raise StepFailedError(
                     codes.NO_ANSWER, f"The {target.name} neither answers nor announces itself."
                 )
-            measured += said_of(target.name, found)
+            target.continuity.begin(found.seen.version)
+            target.check_cancelled()
+            measured += said_of(target, found)
             said.append(f"{target.name}: {state_words(target, found)}")
         self._check_label()
         measured += self._reads.limits(StepName.IDENTIFY)
@@ -208,13 +234,26 @@ class UnitSteps:
         value = flash_value(target.loaded.version, target.image.sha256)
         write = self._journal.intent(name, FLASH, value)
         self._progress(0.0)
+        target.confirm()
         try:
             result = self._upgrade(target, at_power_up=target.is_silent(found))
         except StepFailedError as failed:
             may_rescue = self._power is not None or failed.needs_rescue
-            if failed.code not in codes.NEED_POWER_CYCLE or not may_rescue:
+            if failed.code not in codes.NEED_POWER_CYCLE:
                 raise
+            if self.has_lost_its_session:
+                # One that lost its supply, or another one, announces itself when it has it again.
+                with suppress(BusError, InterruptedByUserError):
+                    target.listen(target.loaded.profile.timings.boot_version_timeout_s)
+                raise
+            if not may_rescue:
+                raise
+            target.confirm()
             result = self._upgrade(target, at_power_up=True)
+        if target.version_request is None:
+            target.continuity.end_transfer()
+        else:
+            target.continuity.settle()
         statistics = result.outcome.statistics
         measured.append(Measurement(f"{name} repetitions", float(statistics.repetitions)))
         measured.append(Measurement(f"{name} transfer", statistics.transfer_s or 0.0, "s"))
@@ -225,9 +264,13 @@ class UnitSteps:
     def _upgrade(self, target: UnitTarget, *, at_power_up: bool) -> Result:
         """One upgrade to a good end. Raises StepFailedError."""
         limit_s = self._recipe.recipe.rule(StepName.FLASH).time_limit_s
+        was_away = False
 
         def hear(event: object) -> None:
+            nonlocal was_away
             match event:
+                case events.AdapterLost():
+                    was_away = True
                 case events.PacketAcknowledged(number, total):
                     self._progress(number / total)
                 case events.PowerCycleAwaited(wait_s):
@@ -247,9 +290,14 @@ class UnitSteps:
         )
         left = result.outcome.device_left
         self.left_behind = f"State of the device: {prose(left)}." if left.needs_rescue else ""
-        if result.ok:
-            return result
         target.check_cancelled()
+        if result.ok:
+            if was_away and not result.outcome.is_completed and not target.goes_on:
+                raise StepFailedError(
+                    codes.UNIT_CHANGED,
+                    f"The adapter was away, and the {target.name} did not go on where it stood.",
+                )
+            return result
         code = _OF_VERDICT.get(result.verification.verdict)
         error = result.error()
         words = "" if error is None else error.what
@@ -277,7 +325,10 @@ class UnitSteps:
 
     def _await(self, target: UnitTarget) -> Content:
         """Its version answer, once it runs; noted as what it says. Raises StepFailedError."""
+        was_running = target.continuity.is_running and not target.goes_on
         answer = target.await_application()
+        if answer is None and was_running:
+            raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} fell silent.")
         if answer is None:
             raise StepFailedError(codes.NOT_RUNNING, f"The {target.name} does not answer.")
         own = self._identified[target.name]
@@ -288,11 +339,14 @@ class UnitSteps:
         target.check_cancelled()
         old = target.device.content_before(plan)
         write = self._journal.intent(target.name, plan.writable.name, wanted_text(plan))
+        target.confirm()
+        target.continuity.allow(plan.content)
         written = target.device.carry_out(plan, old)
         error = written.error()
         if isinstance(error, VerificationError):
             code = codes.WRITE_DIFFERS if written.differences else codes.WRITE_FAILED
             raise StepFailedError(code, error.what)
+        target.continuity.wrote(plan.content)
         read = [change.read_back for change in written.changes if change.read_back is not None]
         self._journal.verified(write, ", ".join(read) if read else None)
 
@@ -305,6 +359,8 @@ class UnitSteps:
 
     def _restart(self, measured: list[Measurement]) -> str:
         restarting = list(filter(self._restarts, self.targets))
+        for target in self.targets:
+            target.confirm()
         for target in restarting[:1] if self._power is not None else restarting:
             try:
                 if not target.restart(self._power):
@@ -329,8 +385,23 @@ class UnitSteps:
         self._reads.written(self._plans, measured)
         self._reads.unchanged(measured)
         measured += self._reads.limits(StepName.VERIFY)
+        for target in self.targets:
+            target.confirm()
+        measured += self._continuity()
         check_measured(measured)
         return "; ".join(said)
+
+    def _continuity(self) -> Iterator[Measurement]:
+        """What the record says of the time in which the unit was watched."""
+        for target in self.targets:
+            is_watched = target.continuity.is_running and not target.goes_on
+            words = "observed" if is_watched else "not observed"
+            yield Measurement(f"{target.name} continuity", text=words)
+        cycles = self.targets[0].continuity.power_cycles
+        if cycles:
+            yield Measurement(POWER_CYCLES, float(cycles))
+        if self.targets[0].goes_on:
+            yield Measurement("after restart", text=AfterRestart.CONTINUE.value)
 
     def _verify_image(self, target: UnitTarget, measured: list[Measurement]) -> Verified:
         """How far the image is proven now. Raises StepFailedError where something is against it."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from flasher.api import Connection, release_checked, release_options
+from flasher.bus.link import AT_ONCE
 from flasher.driver import Tap
 from flasher.errors import ErrorCode, InterruptedByUserError, NoAnswerError
 from flasher.host.identify import identify
@@ -23,14 +24,15 @@ from flasher.protocol.contents import Reset
 from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Command
+from flasher.station import codes
 from flasher.station.codes import Code
+from flasher.station.continuity import Continuity
 from flasher.station.power import PowerControl
-from flasher.station.presence import TargetWatcher
 from flasher.station.recipe_file import LoadedTarget
 
 _LOOK_EVERY_S: Final = 0.05
-BURST_QUIET_S: Final = 0.3
-"""No further announcement for so long: the burst (4 of them, 50 ms apart) is over."""
+_WAITING_MAX: Final = 10_000
+"""Frames that are taken at once: a babbling bus must not hold up a run."""
 
 
 class StepFailedError(Exception):
@@ -67,18 +69,25 @@ class UnitTarget:
         self,
         loaded: LoadedTarget,
         connection: Connection,
+        continuity: Continuity,
         taps: Sequence[Tap],
         cancelled: Callable[[], bool],
+        *,
+        goes_on: bool = False,
     ) -> None:
         self.loaded = loaded
         self.name = loaded.name
         self.clock = connection.clock
-        self.watcher = TargetWatcher(loaded)
+        self.continuity = continuity
+        self.watcher = continuity.watcher
+        self.goes_on = goes_on
+        """The recipe lets it restart by itself (`AfterRestart.CONTINUE`)."""
+        self._taps = taps
         # Nobody else has this adapter, and each flash listens itself.
         self.device = connection.device(
             profile=loaded.profile,
             is_alone=True,
-            taps=(*taps, self.watcher),
+            taps=taps,
             cancelled=cancelled,
         )
         self.image = release_checked(loaded.image, loaded.release)
@@ -91,10 +100,15 @@ class UnitTarget:
 
     def options(self, **overrides: object) -> UpgradeOptions:
         """The options of an upgrade, those of the product. A unit that does not take its image in
-        some attempts is a failed one, and another tool a fault of the station.
+        one session, or where it may go on in some attempts, is a failed one, and another tool a
+        fault of the station.
         """
         profile = self.loaded.profile
-        limited = {"attempts": profile.attempts, "waits_for_other_tool": False}
+        limited = {
+            "attempts": profile.attempts,
+            "waits_for_other_tool": False,
+            "single_session": not self.goes_on,
+        }
         chosen = profile.upgrade_options(**(limited | overrides))
         return release_options(chosen, self.loaded.release)
 
@@ -130,10 +144,36 @@ class UnitTarget:
         give_up_at = self.clock.now() + self.loaded.profile.timings.application_start_timeout_s
         while True:
             try:
-                return self.device.version()
+                answer = self.device.version()
             except NoAnswerError:
                 if self.clock.now() >= give_up_at:
                     return None
+            else:
+                self.check_cancelled()
+                self.continuity.settle()
+                return answer
+
+    def confirm(self) -> None:
+        """Ask it once more who it is: `continuity` compares the answer. Raises StepFailedError when
+        an application that had answered does not any more; one that has restarted since is not
+        asked.
+        """
+        self.hear_waiting()
+        self.check_cancelled()
+        if not self.continuity.is_running or self.await_application() is not None:
+            return
+        if not self.goes_on:
+            raise StepFailedError(codes.UNIT_CHANGED, f"The {self.name} fell silent.")
+
+    def hear_waiting(self) -> None:
+        """Take what came while nobody listened."""
+        link = self.device.connection.link
+        for _ in range(_WAITING_MAX):
+            frame = link.receive(AT_ONCE)
+            if frame is None:
+                return
+            for tap in self._taps:
+                tap(frame, sent=False, now=self.clock.now())
 
     def read(self, what: Readable) -> Mapping[str, tuple[object, str]]:
         """The fields of something readable: value, and as it is shown. Raises NoAnswerError."""
@@ -172,7 +212,7 @@ class UnitTarget:
 
     def _is_quiet(self, now: float) -> bool:
         announced_at = self.watcher.announced_at
-        return announced_at is None or now - announced_at >= BURST_QUIET_S
+        return announced_at is None or now - announced_at >= self.continuity.quiet_s
 
     # -- running ----------------------------------------------------------------------------------
 

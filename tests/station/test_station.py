@@ -727,6 +727,22 @@ def test_what_an_interrupted_run_flashed_and_read_back_is_told_to_the_next(bench
     assert line.order("A").order.flashed_before == {"bms"}
 
 
+def test_a_flash_before_the_unit_may_have_changed_is_not_relied_on(bench: Bench) -> None:
+    line = LineBench(bench)
+    line.scan(SERIAL)
+    line.arrive("A")
+    run_id = line.order("A").order.run_id
+    target = bench.recipe.targets[0]
+    value = flash_value(target.version, target.image.sha256)
+    bench.store.verified(bench.store.intent(run_id, "bms", "flash", value), target.version)
+    line.end("A", RunState.ERROR, "UNIT_CHANGED")
+    line.scan(SERIAL)
+    line.scan("SOCKET A")
+    again = line.order("A").order
+    assert again.run_id != run_id
+    assert (again.kind, again.flashed_before) == (RunKind.RECHECK, frozenset())
+
+
 def test_a_station_that_ends_stops_its_runs_and_saves_them(line: LineBench) -> None:
     line.scan(SERIAL)
     line.arrive("A")

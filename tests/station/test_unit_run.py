@@ -14,7 +14,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WMC
 from flasher.settings.manifest import release_of, to_toml
 from flasher.station.codes import CODES, OF_ENDING
-from flasher.station.events import OperatorPrompted, Progressed
+from flasher.station.events import Progressed
 from flasher.station.records.model import RunKind, RunState, StepName, StepState, Verified
 from flasher.station.records.proof import traces_of_targets
 from flasher.trace.reader import read_trace
@@ -398,23 +398,6 @@ def test_a_silent_unit_is_reached_by_its_power(tmp_path: Path) -> None:
     assert result.outcome is RunState.PASS, result.text
     assert power.cycles == 2  # to reach it, and as its restart
     assert bench.step(StepName.RESTART).text == "by power"
-
-
-def test_without_power_control_a_person_is_asked_for_a_half_flashed_unit(tmp_path: Path) -> None:
-    bench = UnitBench(tmp_path)
-    bench.device.power_cut(0.0)
-
-    def switch_on() -> bool:
-        if (
-            any(isinstance(note, OperatorPrompted) for note in bench.notes)
-            and not bench.device.has_power
-        ):
-            bench.device.power_on(bench.clock.now())
-        return False
-
-    bench.is_cancelled = switch_on
-    result = bench.run(RunKind.RECHECK)
-    assert result.outcome is RunState.PASS, result.text
 
 
 # -- codes ----------------------------------------------------------------------------------------

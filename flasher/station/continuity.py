@@ -1,0 +1,211 @@
+"""Detects that the unit in a socket may no longer be the one that was identified; pure.
+
+A `Continuity` is a driver's tap for one target of a run. `lost` says what speaks against the same,
+uninterrupted unit:
+
+- its bootloader announces itself, although the run has neither reset it, nor ended a transfer, nor
+  switched its power (R28);
+- it announces itself in the middle of a transfer;
+- a version answer, whoever asked for it, or an announced boot version, differs from the first one
+  in something that the run has not written.
+
+That an application fell silent is not seen here: whoever asks it knows.
+
+What a single unit may do is no evidence: announcements of one burst, however many; another burst
+after every reset that was sent, as the first one may have come too late; a burst after the end of a
+transfer, or none; a restart of what the battery supplies while the battery restarts. Nor is a pause
+of this computer: time in which nobody listened does not count.
+"""
+
+from __future__ import annotations
+
+from math import inf
+from typing import Final
+
+from flasher.protocol.fields import Content
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import BMS, Command, Mode
+from flasher.protocol.wire import Message, Reassembler
+from flasher.station.presence import TargetWatcher
+from flasher.station.recipe_file import LoadedTarget
+
+IDENTITY: Final = ("model", "serial_number", "hardware_version")
+"""The fields of a version answer that stay as they are; the firmware version does not."""
+_SPACINGS_OF_QUIET: Final = 6
+_QUIET_MIN_S: Final = 0.3
+
+
+class Continuity:
+    """What was sent to one target and what came from it, since it was identified.
+
+    `stall_s` is the longest time between two calls in which somebody has listened.
+    """
+
+    def __init__(self, loaded: LoadedTarget, *, stall_s: float, goes_on: bool = False) -> None:
+        timings = loaded.profile.timings
+        self.watcher = TargetWatcher(loaded)
+        self.lost = ""
+        """What speaks against the same unit; empty while nothing does."""
+        self.is_running = False
+        """Its application has answered since the last restart."""
+        self.is_told_to_update = False
+        """An update command has left, and no application has answered since."""
+        self.power_cycles = 0
+        self._goes_on = goes_on
+        """A restart is no evidence."""
+        self._name = loaded.name
+        self._reset_command = loaded.profile.reset_command
+        self._sent = Reassembler(loaded.target.request_id, timings.inter_frame_timeout_s)
+        # The battery supplies the others: when it restarts, they may.
+        self._supply_id = None if loaded.target is BMS else BMS.request_id
+        self._supplied_until = -inf
+        self._start_s = timings.application_start_timeout_s
+        self._leftover_s = timings.leftover_boot_version_s
+        self.quiet_s = max(_QUIET_MIN_S, _SPACINGS_OF_QUIET * timings.boot_version_spacing_s)
+        """No further announcement for so long: the burst (4 of them, 50 ms apart) is over."""
+        self._stall_s = stall_s
+        self._now = -inf
+        self._listened_s = 0.0
+        """How long somebody has listened so far."""
+        self._announced_s: float | None = None
+        """The same when the last announcement of the burst came that goes on; None: none does."""
+        self._burst_until = -inf
+        """Up to when a burst may begin that the run has caused."""
+        self._requested_at: float | None = None
+        """When the transfer that goes on was requested."""
+        self._is_identified = False
+        self._is_asked = self.watcher.request is not None
+        self._boot_version = ""
+        self._known: dict[str, frozenset[str]] = {}
+        """What each field of its identity may be; empty before it has answered."""
+
+    # -- what the run knows -----------------------------------------------------------------------
+
+    def begin(self, content: Content | None) -> None:
+        """The unit was identified by its version answer; None: it has given none. From now on it
+        has to stay. One that cannot be asked is identified by nothing: it has to stay from the
+        first update command on.
+        """
+        if self._is_identified or not self._is_asked:
+            return
+        self._is_identified = True
+        self._boot_version = self.watcher.version
+        if content is not None:
+            self._compare(content)
+            self.settle()
+
+    def settle(self) -> None:
+        """Its application has answered a question of the run: what was restarted has started."""
+        self.is_running, self.is_told_to_update = True, False
+        self._burst_until, self._announced_s = -inf, None
+
+    def end_transfer(self) -> None:
+        """The new image is complete."""
+        self.is_told_to_update = False
+
+    def cycle_power(self) -> None:
+        """The run switches its power off and on."""
+        self.power_cycles += 1
+        self._restart()
+
+    def allow(self, content: Content) -> None:
+        """This is going to be written to it: the old value is as good as the new one."""
+        for name, text in _identity(content).items():
+            if name in self._known:
+                self._known[name] |= {text}
+
+    def wrote(self, content: Content) -> None:
+        """It was written and read back: only the new value is good."""
+        for name, text in _identity(content).items():
+            if name in self._known:
+                self._known[name] = frozenset({text})
+
+    # -- what is sent and received ----------------------------------------------------------------
+
+    def listened(self, now: float) -> None:
+        """Somebody has listened up to now; called again and again while the run uses the bus."""
+        passed_s = now - self._now
+        if passed_s <= self._stall_s:
+            self._listened_s += passed_s
+        self._now = now
+
+    def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
+        self.listened(now)
+        if sent:
+            self._note_sent(frame, now)
+            return
+        watcher = self.watcher
+        requests, announcements = watcher.transfer_requests, watcher.announcements
+        answers = watcher.answers
+        watcher(frame, sent=False, now=now)
+        if watcher.transfer_requests > requests and self.is_told_to_update:
+            self._requested_at = now
+        if watcher.announcements > announcements:
+            self._take_announcement(now)
+        if watcher.answers > answers and watcher.answer is not None and self._is_identified:
+            self._compare(watcher.answer)
+
+    def _note_sent(self, frame: Frame, now: float) -> None:
+        if frame.can_id == self._supply_id:
+            self._supplied_until = now + self._start_s
+        if frame.can_id != self._sent.can_id:
+            return
+        for found in self._sent.feed(frame.data, now):
+            if not isinstance(found, Message) or found.mode != Mode.WRITE:
+                continue
+            if found.command in (self._reset_command, Command.RESET):
+                self._restart()
+            elif found.command == Command.UPDATE:
+                self._is_identified = True
+                self.is_running, self.is_told_to_update = False, True
+                self._burst_until, self._requested_at = -inf, None
+            elif found.command == Command.END_OF_TRANSFER:
+                self._requested_at = None
+                self._burst_until = inf if self._is_asked else now + self._start_s
+
+    def _restart(self) -> None:
+        self.is_running = False
+        self._requested_at = None
+        # However late: only an answer of the application shows that no burst will follow.
+        self._burst_until = inf
+
+    def _take_announcement(self, now: float) -> None:
+        since_s = inf if self._announced_s is None else self._listened_s - self._announced_s
+        goes_on, self._announced_s = since_s < self.quiet_s, self._listened_s
+        if not self._is_identified:
+            return
+        if self._requested_at is not None:
+            if now - self._requested_at > self._leftover_s:
+                self._lose_by_restart("in the middle of the transfer")
+            return
+        if goes_on:
+            return
+        if now <= self._burst_until:
+            self._burst_until = -inf
+        elif now > self._supplied_until:
+            self._lose_by_restart("although this run had not restarted it")
+        version, self._boot_version = self._boot_version, self.watcher.version
+        if version and version != self._boot_version:
+            self._lose(f"announced boot version {version} before, and {self._boot_version} now")
+
+    def _lose_by_restart(self, when: str) -> None:
+        self.is_running = False
+        if not self._goes_on:
+            self._lose(f"announced its bootloader {when}")
+
+    def _compare(self, content: Content) -> None:
+        found = _identity(content)
+        if not self._known:
+            self._known = {name: frozenset({text}) for name, text in found.items()}
+        for name, text in found.items():
+            known = self._known.get(name, frozenset({text}))
+            if text not in known:
+                first = " or ".join(f"{each!a:.40}" for each in sorted(known))
+                self._lose(f"had the {name.replace('_', ' ')} {first}, and has {text!a:.40} now")
+
+    def _lose(self, what: str) -> None:
+        self.lost = self.lost or f"The {self._name} {what}."
+
+
+def _identity(content: Content) -> dict[str, str]:
+    return {name: str(getattr(content, name)) for name in IDENTITY if hasattr(content, name)}
