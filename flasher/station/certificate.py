@@ -67,7 +67,9 @@ class Proof:
     record_sha256: str = ""
     """Over the run and all that belongs to it."""
     is_kept: bool = False
-    """The chain was held against heads that are kept elsewhere."""
+    """The chain was compared with heads in another place than beside the key."""
+    is_beside: bool = False
+    """It was compared with those beside the key."""
 
 
 def proven(store: Store, life: UnitLife, examined: Examination | None = None) -> Proof:
@@ -84,7 +86,7 @@ def proven(store: Store, life: UnitLife, examined: Examination | None = None) ->
             remedy="Look at all of it with flasher station verify.",
         )
     head, record_sha256 = store.read.head_of(last.run_id), store.read.record_sha256(last.run_id)
-    return Proof(head, record_sha256, examined.is_checked_elsewhere)
+    return Proof(head, record_sha256, examined.is_checked_elsewhere, bool(examined.kept))
 
 
 def render_certificate(life: UnitLife, made_at: datetime, proof: Proof) -> str:
@@ -111,6 +113,7 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof) -> dict[str, Any]:
         "head": proof.head,
         "key": fingerprint(proof.head.key) if proof.head else "",
         "is_kept": proof.is_kept,
+        "is_beside": proof.is_beside,
         "record_sha256": proof.record_sha256,
         "code": "" if proof.head is None else _code(last, proof.record_sha256, proof.head),
         "writes": last.writes[:_WRITES_ON_SHEET],

@@ -169,9 +169,9 @@ class StationConfig(Table):
     """The folder of the traces; needed for a server, else beside the file of the records."""
     keys: str = ""
     """The folder of the signing key; empty: a place of this user."""
-    heads: str = ""
-    """The folder in which the signed heads of the audit trail are kept, best on another computer;
-    empty: beside the key.
+    heads: tuple[str, ...] = Field(default=(), max_length=8)
+    """Other places than beside the key in which the signed heads of the audit trail are kept: a
+    folder, best on another computer, or the URL of a PostgreSQL server; or a list of them.
     """
     lock_timeout_s: float = Field(default=DEFAULT_LOCK_TIMEOUT_S, gt=0, le=60)
     """How long a record waits for another program that holds the database."""
@@ -184,6 +184,18 @@ class StationConfig(Table):
     label: LabelConfig | None = None
     scanner: tuple[ScannerConfig, ...] = Field(default=(), max_length=SOCKETS_MAX)
     socket: tuple[SocketConfig, ...] = Field(min_length=1, max_length=SOCKETS_MAX)
+
+    @field_validator("heads", mode="before")
+    @classmethod
+    def _one_is_a_list(cls, value: Any) -> Any:
+        return [value] if isinstance(value, str) else value
+
+    @field_validator("heads")
+    @classmethod
+    def _check_heads(cls, value: tuple[str, ...]) -> tuple[str, ...]:
+        if not all(value):
+            raise ValueError("a place of the heads is empty")
+        return value
 
     @model_validator(mode="after")
     def _check_sockets(self) -> StationConfig:
@@ -223,16 +235,17 @@ def load_config(path: Path) -> StationConfig:
     changes: dict[str, str] = {}
     if "://" not in config.records:
         changes["records"] = str(here / config.records)
-    for key in ("files", "keys", "heads", "badges"):
+    for key in ("files", "keys", "badges"):
         if getattr(config, key):
             changes[key] = str(here / getattr(config, key))
+    heads = tuple(each if "://" in each else str(here / each) for each in config.heads)
     label = config.label
     if label is not None:
         places = {"template": str(here / label.template)}
         if label.printer.startswith("file:"):
             places["printer"] = f"file:{here / label.printer.removeprefix('file:')}"
         label = label.model_copy(update=places)
-    return config.model_copy(update={**changes, "label": label})
+    return config.model_copy(update={**changes, "heads": heads, "label": label})
 
 
 def mock_config(

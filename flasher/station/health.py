@@ -33,12 +33,17 @@ class Check:
 
 class Watch:
     """Looks at the disk and the clock every few seconds. `folder`: where the records' files are;
-    `utc` and `monotonic_s`: the two clocks.
+    `utc` and `monotonic_s`: the two clocks; `unkept`: the places that have not the last heads.
     """
 
     def __init__(
-        self, folder: Path, utc: Callable[[], datetime], monotonic_s: Callable[[], float]
+        self,
+        folder: Path,
+        utc: Callable[[], datetime],
+        monotonic_s: Callable[[], float],
+        unkept: Callable[[], Collection[str]] = tuple,
     ) -> None:
+        self._unkept = unkept
         self._folder = folder
         self._utc = utc
         self._monotonic_s = monotonic_s
@@ -59,6 +64,9 @@ class Watch:
         if board.lost_scanners:
             text = say("cannot be read: {names}", names=_few(board.lost_scanners))
             checks.append(Check(say("scanners"), is_good=False, text=text))
+        if unkept := self._unkept():
+            text = say("not kept yet in: {names}", names=_few(unkept))
+            checks.append(Check(say("heads"), is_good=False, text=text))
         return (*checks, *self._seen)
 
     def _disk(self) -> Check:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing
@@ -18,6 +19,11 @@ from tests.cli.conftest import Flasher
 from tests.cli.test_schema import hold_output
 from tests.station.factory import SERIAL, Bench
 from tests.station.records import old_records
+
+BESIDE = (
+    "NOT CHECKED as a whole against a head kept elsewhere: whoever can write beside the key could"
+    " have made records and heads anew"
+)
 
 
 @pytest.fixture
@@ -42,13 +48,24 @@ def test_verify_says_what_the_records_were_held_against(
     run = flasher("station", "verify", *place)
     assert run.code == ExitCode.OK
     assert run.out.splitlines() == [
-        "records, traces and audit trails are as they were written",
-        f"  line-2: rows 1 to 6 held against the heads in {bench.keys}",
+        f"nothing in the records differs; {BESIDE}",
+        f"  line-2: rows 1 to 6 match the heads beside the key, in {bench.keys}",
+        "  line-2: no heads are kept elsewhere than beside the key",
         "  1 trace of runs that passed agree with the records",
     ]
     told = flasher("station", "verify", *place, "--json")
     hold_output(schema, told.out, 0)
-    assert told.document["is_checked_elsewhere"]
+    assert not told.document["is_checked_elsewhere"]
+    shutil.copytree(bench.keys, bench.folder / "share", ignore=shutil.ignore_patterns("*.key"))
+    two = flasher("station", "verify", *place, "--heads", bench.folder / "share")
+    assert two.out.splitlines()[:3] == [
+        "records, traces and audit trails are as they were written",
+        f"  line-2: rows 1 to 6 match the heads beside the key, in {bench.keys}",
+        f"  line-2: rows 1 to 6 match the heads in {bench.folder / 'share'}",
+    ]
+    gone = flasher("station", "verify", *place, "--heads", bench.folder / "gone")
+    assert gone.code == ExitCode.OK
+    assert f"heads NOT REACHED: {bench.folder / 'gone'}: there is no such folder" in gone.out
     without = flasher("station", "verify", "--database", bench.path, "--keys", bench.folder)
     assert without.code == ExitCode.OK
     assert "NOT CHECKED against a head kept elsewhere" in without.out
@@ -65,7 +82,7 @@ def test_a_unit_whose_records_were_changed_gets_no_page(
     assert good.code == ExitCode.OK
     page = (tmp_path / "good.html").read_text("utf-8")
     assert "Signed audit row" in page
-    assert "Held against heads that are kept outside of the records." in page
+    assert "Compared only with heads beside the key of the station" in page
     with closing(sqlite3.connect(bench.path)) as db:
         rule = db.execute("SELECT sql FROM sqlite_master WHERE name = 'run_update'").fetchone()[0]
         db.execute("DROP TRIGGER run_update")

@@ -119,7 +119,8 @@ class Bench:
     lock_timeout_s: float = 0.02
     url: str | None = None
     """Records on a server that are ready; None: in a file."""
-    heads: Path | None = None
+    heads: tuple[str | Path, ...] = ()
+    """Other places than beside the key."""
     _traces: int = 0
 
     def __post_init__(self) -> None:
@@ -132,9 +133,6 @@ class Bench:
             self.keys.mkdir()
             for name, data in _begun_records().items():
                 file = self.folder / name
-                if self.heads is not None and file.suffix == ".heads":
-                    self.heads.mkdir()
-                    file = self.heads / file.name
                 file.touch(0o600)
                 file.write_bytes(data)
         self.store = self.opened()
@@ -146,7 +144,7 @@ class Bench:
             station=station,
             clock=self.clock,
             folder=None if self.url is None else self.folder / "files",
-            keeping=Keeping(self.keys, self.heads),
+            keeping=self.keeping,
             lock_timeout_s=lock_timeout_s or self.lock_timeout_s,
         )
         if self.url is None:
@@ -154,6 +152,10 @@ class Bench:
             event.listen(store.database.engine, "connect", _do_not_wait_for_the_disk)
             store.database.close()
         return store
+
+    @property
+    def keeping(self) -> Keeping:
+        return Keeping(self.keys, tuple(map(str, self.heads)))
 
     @contextmanager
     def outsider(self) -> Iterator[Any]:

@@ -60,6 +60,8 @@ def verify(output: Output, records: RecordsOptions) -> int:
         found = store.examine()
     for line in _problem_lines(found.problems):
         output.result(printable(line))
+    for line in found.unreached:
+        output.result(printable(f"heads NOT REACHED: {line}"))
     for line in found.remarks:
         output.progress(f"note: {printable(line)}")
     if found.problems:
@@ -90,18 +92,28 @@ def _problem_lines(problems: Sequence[Problem]) -> Iterator[str]:
 def _say_what_was_checked(found: Examination, output: Output) -> None:
     if found.is_checked_elsewhere:
         output.result("records, traces and audit trails are as they were written")
+    elif found.kept:
+        output.result(
+            f"nothing in the records differs; NOT CHECKED as a whole against {ELSEWHERE}: whoever"
+            " can write beside the key could have made records and heads anew"
+        )
     else:
         output.result(f"nothing in the records differs; NOT CHECKED against {ELSEWHERE}")
-    for name in found.unkept:
-        output.result(f"  {printable(name)}: no heads are kept; an older copy would look the same")
     for each in found.kept:
+        where = "the heads in" if each.is_elsewhere else "the heads beside the key, in"
         rows = f"{each.station}: rows {each.first:,} to {each.last:,}"
-        output.result(printable(f"  {rows} held against the heads in {each.path}"))
+        output.result(printable(f"  {rows} match {where} {each.place}"))
         if each.first > 1:
-            output.result(f"    the rows before row {each.first:,} are held against no kept head")
+            output.result(f"    the rows before row {each.first:,} are compared with no head there")
+        if each.last < each.rows:
+            output.result(f"    the rows after row {each.last:,} are not kept there yet")
+    for name in found.unkept:
+        output.result(f"  {printable(name)}: no heads are kept elsewhere than beside the key")
     output.result(f"  {counted(found.traces, 'trace')} of runs that passed agree with the records")
     if found.unkept:
-        output.progress("Name the folder of the kept heads with --heads.")
+        output.progress(
+            "Name a second place of the heads: heads in the station's file, or --heads."
+        )
 
 
 # -- the key and what a person answers for --------------------------------------------------------
@@ -124,12 +136,14 @@ def key(
         elif rotate:
             store.rotate_key(operator_of(operator))
         signer = store.signer
-        public, file, heads = signer.public, signer.key_file, signer.heads_file.path
+        public, file = signer.public, signer.key_file
+        places = (signer.keeping.beside_key, *signer.keeping.elsewhere)
+        heads = tuple(each.shown for each in places)
     is_there = file.exists()
     output.result(f"{printable(store.station)}: key {fingerprint(public)}")
     output.result(f"  public: {public}")
     output.result(f"  file:   {printable(str(file))}" + ("" if is_there else " (NOT THERE)"))
-    output.result(f"  heads:  {printable(str(heads))}")
+    output.result(f"  heads:  {', '.join(heads)}")
     return output.document(
         SigningKeyDocument(
             station=store.station,
@@ -137,7 +151,7 @@ def key(
             public=public,
             file=str(file),
             is_there=is_there,
-            heads=str(heads),
+            heads=heads,
         )
     )
 

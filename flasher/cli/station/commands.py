@@ -98,7 +98,7 @@ class RecordsOptions:
     database: str | None
     files: Path | None
     keys: Path | None
-    heads: Path | None
+    heads: tuple[str, ...]
     sockets: Path | None
 
 
@@ -118,10 +118,11 @@ _records_options: Final = option_set(
         "--keys", metavar="DIR", panel="records",
         help="the folder of the signing key (default: of --sockets, else a place of this user)",
     ),
-    _path_option(
-        "--heads", metavar="DIR", panel="records",
-        help="the folder where the signed heads of the audit trails are kept, best on another "
-        "computer (default: of --sockets, else beside the key)",
+    option(
+        "--heads", metavar="DIR|URL", multiple=True, panel="records",
+        help="another place than beside the key where the signed heads of the audit trails are "
+        "kept: a folder, best on another computer, or postgresql://USER@HOST/NAME; may be repeated "
+        "(default: of --sockets)",
     ),
     _path_option("--sockets", panel="records", brief=True, help="the station's file (TOML)"),
 )  # fmt: skip

@@ -184,17 +184,21 @@ class StationRolesDocument:
 
 @dataclass(frozen=True)
 class VerifiedRecordsDocument:
-    """What was found in the records, and what they could be held against."""
+    """What was found in the records, and what they could be compared with."""
 
     problems: tuple[Problem, ...]
     remarks: tuple[str, ...]
     kept: tuple[KeptHeads, ...]
     unkept: tuple[str, ...]
-    """Stations of which no heads are kept: older records would look the same."""
+    """Stations of which no heads are kept elsewhere than beside their key: records made anew with
+    key and heads would look the same."""
+    unreached: tuple[str, ...]
+    """Places of heads that could not be reached, each with why."""
     traces: int
-    """Runs that passed and were held against their own traces."""
+    """Runs that passed and were compared with their own traces."""
     is_checked_elsewhere: bool
-    """Every audit trail was held, from its first row, against heads that are kept elsewhere."""
+    """Every audit trail was compared, from its first row to its last, with heads that are kept in
+    another place than beside the key."""
 
 
 @dataclass(frozen=True)
@@ -208,8 +212,9 @@ class SigningKeyDocument:
     file: str
     is_there: bool
     """The file is where it has to be."""
-    heads: str
-    """Where the signed heads of the audit trail are kept."""
+    heads: tuple[str, ...]
+    """The places where the signed heads of the audit trail are kept, the one beside the key
+    first."""
 
 
 @dataclass(frozen=True)

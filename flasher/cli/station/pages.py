@@ -117,7 +117,8 @@ def operator_page(
         if row["station"] == store.station and state is not RunState.RUNNING:
             at = utc_moment(str(row["begun_at"]))
             tally.add(EndedRun(at, str(row["serial"]), state, str(row["code"])))
-    watch = Watch(store.files.folder, station.clock.utc, station.clock.monotonic_s)
+    clock = station.clock
+    watch = Watch(store.files.folder, clock.utc, clock.monotonic_s, store.signer.unkept)
     screen = Screen(tally, watch)
     pages = Pages(options.language)
     operator = OperatorPage(pages, screen.feed, station.submit, sound_volume=config.sound_volume)

@@ -54,7 +54,7 @@ def records_of(options: RecordsOptions) -> RecordsPlace:
         )
     if database is None:
         database, files = config.records, files or _path(config.files)
-    keeping = Keeping(keys or _path(config.keys), heads or _path(config.heads))
+    keeping = Keeping(keys or _path(config.keys), heads or config.heads)
     return RecordsPlace(database, files, config.lock_timeout_s, keeping, config.name)
 
 

@@ -165,6 +165,22 @@ def head_of(connection: Connection, run_id: int) -> Head | None:
     return Head(row.name, row.number, row.at, row.hash, row.signature, key or "")
 
 
+def given_up(connection: Connection, station_name: str) -> list[range]:
+    """The rows that a person gave up as lost, when older records were put back."""
+    query = _rows_of(station_name, audit.c.data).where(
+        audit.c.run_id.is_(None), audit.c.event == RESTORED
+    )
+    return [lost_of(data_of(text)) for text in connection.execute(query).scalars()]
+
+
+def lost_of(data: Mapping[str, Any]) -> range:
+    """The rows that a RESTORED row gives up; none where it does not say."""
+    first, last = data.get("lost_from"), data.get("lost_to")
+    if isinstance(first, int) and isinstance(last, int):
+        return range(first, last + 1)
+    return range(0)
+
+
 def hash_at(connection: Connection, station_name: str, number: int) -> str | None:
     """The hash of a row; None where the chain has no such row."""
     query = _rows_of(station_name, audit.c.hash).where(audit.c.number == number)

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 from pydantic import ValidationError
 from sqlalchemy import Connection, func, select
 
-from flasher.errors import UsageError
+from flasher.errors import FlasherError, UsageError
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import NAMED, OWN, digests_of
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
 from flasher.station.records.files import FileStore
-from flasher.station.records.heads import Fault, Head, HeadsFile
+from flasher.station.records.heads import Fault, Head
 from flasher.station.records.keys import Keeping
 from flasher.station.records.model import (
     TRACE,
@@ -28,69 +29,147 @@ from flasher.station.records.model import (
     RunId,
     RunState,
 )
+from flasher.station.records.places import PATIENCE_S, Place, patiently
 from flasher.station.records.proof import contradictions, traces_of_targets
 from flasher.station.records.queries import details_of
-from flasher.station.records.rows import batches
+from flasher.station.records.rows import batches, grouped
 from flasher.station.records.signatures import is_signed
 from flasher.station.records.triggers import fingerprint_of, stated_differences
 from flasher.trace.reader import read_trace
 
 _RUNS_NAMED: Final = 5
+_HASH_BYTES: Final = 32
+_USED: Final = {
+    schema.unit: schema.run.c.unit_id,
+    schema.lot: schema.run.c.lot_id,
+    schema.operator: schema.run.c.operator_id,
+    schema.recipe: schema.run.c.recipe_id,
+    schema.socket: schema.run.c.socket_id,
+    schema.artifact: schema.run_target.c.artifact_id,
+}
+"""Rows that are made for a run only, and where it names them."""
+Progress = Callable[[int, int], None]
+"""Is called with how much is done, and how much there is to do."""
+
+
+@dataclass
+class _Trail:
+    """What was found along the chain of one station."""
+
+    station: str
+    hashes: bytearray = field(default_factory=bytearray)
+    """Of the rows from the first on; as bytes, since a plant has millions."""
+    restored: dict[int, range] = field(default_factory=dict)
+    """Rows that give up others, and which."""
+    keys: set[str] = field(default_factory=set)
+
+    @property
+    def end(self) -> int:
+        """The number of the last row."""
+        return len(self.hashes) // _HASH_BYTES
+
+    def add(self, row_hash: str) -> None:
+        try:
+            found = bytes.fromhex(row_hash)
+        except ValueError:
+            found = b""
+        self.hashes += found if len(found) == _HASH_BYTES else bytes(_HASH_BYTES)
+
+    def hash_of(self, number: int) -> str | None:
+        """The hash of a row; None where there is no such row."""
+        if not 1 <= number <= self.end:
+            return None
+        return self.hashes[(number - 1) * _HASH_BYTES : number * _HASH_BYTES].hex()
+
+
+@dataclass(frozen=True)
+class _Kept:
+    """A place of heads, as it was before the records were read."""
+
+    place: Place
+    is_elsewhere: bool
+    lasts: Mapping[str, Head]
+    """The last head of each station."""
 
 
 class Examiner:
     """One examination of the records."""
 
-    def __init__(self, database: Database, files: FileStore, keeping: Keeping) -> None:
+    def __init__(
+        self,
+        database: Database,
+        files: FileStore,
+        keeping: Keeping,
+        progress: Progress = lambda _done, _total: None,
+    ) -> None:
         self._database = database
         self._files = files
         self._keeping = keeping
+        self._progress = progress
+        self._done = self._total = 0
         self._remarks: list[str] = []
         self._kept: list[KeptHeads] = []
         self._unkept: list[str] = []
+        self._unreached: list[str] = []
         self._stated: list[tuple[object, Mapping[str, str]]] = []
         """The last statement of each chain about the schema, with its version."""
-        self._claims: dict[int, Mapping[str, str]] = {}
-        """The digests that the chains state for each run, at its claim."""
-        self._endings: dict[int, Mapping[str, str]] = {}
-        """And at its end."""
         self._traces = 0
         self._nameless = 0
 
     def examine(self, runs: Collection[RunId] | None = None) -> Examination:
         """Examine everything; of the runs these, or all."""
         with self._database.reading() as connection:
-            problems = tuple(self._problems(connection, runs))
+            records_id = connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
+            names = list(connection.execute(select(schema.station.c.name)).scalars())
+        # Before the records are read: a station may add rows, and their heads, meanwhile.
+        kept = list(self._reach(records_id, names))
+        with self._database.reading() as connection:
+            problems = tuple(self._problems(connection, records_id, kept, runs))
         if self._nameless:
             self._remarks.append(
                 f"{self._nameless} PASS of devices that name no serial number: their traces do not"
                 " tell which unit it was"
             )
         return Examination(
-            problems, tuple(self._remarks), tuple(self._kept), tuple(self._unkept), self._traces
+            problems,
+            tuple(self._remarks),
+            tuple(self._kept),
+            tuple(self._unkept),
+            self._traces,
+            tuple(self._unreached),
         )
 
     def _problems(
-        self, connection: Connection, runs: Collection[RunId] | None
+        self,
+        connection: Connection,
+        records_id: str,
+        kept: list[_Kept],
+        runs: Collection[RunId] | None,
     ) -> Iterator[Problem]:
         if self._database.backend == "sqlite":
             yield from _sqlite_problems(connection)
-        yield from self._trails(connection)
-        run = schema.run.c
+        run, audit = schema.run.c, schema.audit.c
         there = list(connection.execute(select(run.id).order_by(run.id)).scalars())
-        for run_id in sorted((self._claims.keys() | self._endings.keys()) - set(there)):
-            yield Problem(f"run {run_id}", "it is missing: the audit trail knows it", (run_id,))
         chosen = there if runs is None else sorted(set(there) & set(runs))
+        rows = connection.execute(select(func.count()).select_from(schema.audit)).scalar_one()
+        self._total = rows + len(chosen)
+        yield from self._trails(connection, records_id, kept)
+        gone = select(audit.run_id).outerjoin(schema.run, run.id == audit.run_id).distinct()
+        gone = gone.where(audit.run_id.is_not(None), run.id.is_(None)).order_by(audit.run_id)
+        for run_id in connection.execute(gone).scalars():
+            yield Problem(f"run {run_id}", "it is missing: the audit trail knows it", (run_id,))
         changed: dict[tuple[str, str], list[int]] = defaultdict(list)
         for some in batches(chosen):
+            stated = _stated(connection, some)
             for run_id, digests in digests_of(connection, some).items():
-                yield from self._digests(run_id, digests, changed)
-            yield from self._runs(connection, some)
+                yield from self._digests(run_id, digests, stated[run_id], changed)
+            yield from self._runs(connection, some, stated)
         for (part, _), run_ids in changed.items():
             shown = ", ".join(map(str, run_ids[:_RUNS_NAMED]))
             more = f" and {len(run_ids) - _RUNS_NAMED} more" if len(run_ids) > _RUNS_NAMED else ""
             what = f"changed after it was recorded: {NAMED[part]}"
             yield Problem(f"{part} of run {shown}{more}", what, tuple(run_ids))
+        yield from _unused(connection)
         of_pass = select(run.log_sha256).where(run.state == RunState.PASS.value)
         twice = of_pass.group_by(run.log_sha256).having(func.count() > 1)
         for sha256 in connection.execute(twice).scalars().all():
@@ -99,42 +178,123 @@ class Examiner:
             shown = ", ".join(map(str, same[:_RUNS_NAMED]))
             yield Problem(f"runs {shown}", "they have one and the same trace", same)
 
+    def _did(self, count: int) -> None:
+        self._done += count
+        self._progress(self._done, self._total)
+
+    # -- kept heads -------------------------------------------------------------------------------
+
+    def _reach(
+        self, records_id: str, names: list[str], limit_s: float = PATIENCE_S
+    ) -> Iterator[_Kept]:
+        """The places of heads that can be reached. Raises RecordError, UsageError for the one
+        beside the key.
+        """
+
+        def lasts(place: Place) -> dict[str, Head]:
+            every = dict.fromkeys([*names, *place.stations(records_id)])
+            found = {name: place.of(name, records_id).last() for name in every}
+            return {name: head for name, head in found.items() if head is not None}
+
+        beside = self._keeping.beside_key
+        if beside.folder.is_dir():
+            yield _Kept(beside, is_elsewhere=False, lasts=lasts(beside))
+        places = self._keeping.elsewhere
+        asked = [lambda place=place: lasts(place) for place in places]
+        for place, found in zip(places, patiently(asked, limit_s), strict=True):
+            if isinstance(found, FlasherError):
+                self._unreached.append(f"{place.shown}: {found.cause or found.what}")
+            else:
+                yield _Kept(place, is_elsewhere=True, lasts=found)
+
+    def _compare(self, trail: _Trail, each: _Kept, records_id: str) -> Iterator[Problem]:
+        """Compare a chain with the heads that a place keeps of it."""
+        shown, place = printable(trail.station), each.place.shown
+        last = each.lasts.get(trail.station)
+        if last is None:
+            if each.is_elsewhere and trail.end:
+                yield Problem(f"heads of {shown}", f"none of these records is kept in {place}")
+            return
+        first = end = 0
+        is_younger = False
+        """True after the last head that was there before the records were read."""
+        wrong: list[tuple[int, Head]] = []
+        given_up_at: dict[int, int] = {}
+        for index, entry in enumerate(each.place.of(trail.station, records_id).entries()):
+            if isinstance(entry, Fault):
+                yield Problem(f"heads of {shown}, {entry.where}", entry.what)
+            elif isinstance(entry, Head):
+                if trail.hash_of(entry.number) == entry.hash:
+                    first, end = first or entry.number, max(end, entry.number)
+                    if entry.number in trail.restored:
+                        given_up_at[entry.number] = index
+                elif not is_younger:
+                    wrong.append((index, entry))
+                is_younger = is_younger or entry == last
+            elif entry.key not in trail.keys:
+                where = f"heads of {shown}, segment {entry.segment} in {place}"
+                yield Problem(where, "it is not signed with a key of the station")
+        held = [
+            head
+            for index, head in wrong
+            if not any(
+                head.number in lost and index < given_up_at.get(number, index + 1)
+                for number, lost in trail.restored.items()
+            )
+        ]
+        yield from _differences(trail, place, held)
+        if first or held:
+            numbers = [each.number for each in held]
+            self._kept.append(
+                KeptHeads(
+                    trail.station,
+                    place,
+                    min([*numbers, *([first] if first else [])]),
+                    max([end, *numbers]),
+                    trail.end,
+                    each.is_elsewhere,
+                )
+            )
+
     # -- audit trails -----------------------------------------------------------------------------
 
-    def _trails(self, connection: Connection) -> Iterator[Problem]:
-        """Go through all audit trails, and hold them against the heads that are kept of them."""
-        records_id = connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
+    def _trails(
+        self, connection: Connection, records_id: str, kept: list[_Kept]
+    ) -> Iterator[Problem]:
+        """Go through all audit trails, and compare them with the heads that are kept of them."""
         found = fingerprint_of(connection)
         names = list(connection.execute(select(schema.station.c.name)).scalars())
-        kept_of = self._keeping.kept_heads(records_id, names)
-        for name in dict.fromkeys([*names, *kept_of]):
-            rows = connection.execute(
+        others = [name for each in kept for name in each.lasts]
+        for name in dict.fromkeys([*names, *others]):
+            query = (
                 select(schema.audit)
                 .join_from(schema.audit, schema.station)
                 .where(schema.station.c.name == name)
                 .order_by(schema.audit.c.number)
+                .execution_options(yield_per=1000)
             )
-            hashes: dict[int, str] = {}
-            restored: dict[int, range] = {}
-            keys: set[str] = set()
-            yield from self._chain(name, rows.mappings(), records_id, hashes, restored, keys)
-            yield from self._heads(name, kept_of.get(name), hashes, restored, keys)
+            trail = _Trail(name)
+            with connection.execute(query) as rows:
+                yield from self._chain(trail, rows.mappings(), records_id)
+            for each in kept:
+                yield from self._compare(trail, each, records_id)
+            if trail.end and not any(
+                kept.is_elsewhere and kept.station == name for kept in self._kept
+            ):
+                self._unkept.append(name)
         for thing, what in stated_differences(self._stated, found):
             yield Problem(f"schema, {printable(thing)}", what)
 
     def _chain(
         self,
-        name: str,
+        trail: _Trail,
         rows: Iterable[Mapping[Any, Any]],
         records_id: str,
-        hashes: dict[int, str],
-        restored: dict[int, range],
-        keys: set[str],
     ) -> Iterator[Problem]:
-        """Go along one chain; fills the hashes of its rows, and which heads were given up."""
+        """Go along one chain; fills what was found of it."""
         before, key = chain.GENESIS, None
         stated: tuple[object, Mapping[str, str]] = (None, {})
-        shown = printable(name)
+        shown = printable(trail.station)
         for expected, row in enumerate(rows, 1):
             where = f"audit row {expected} of {shown}"
             data = chain.data_of(row["data"])
@@ -148,102 +308,55 @@ class Examiner:
                 key = following  # which signs itself
             if key is None or not is_signed(row["hash"], row["signature"], key):
                 yield Problem(where, "it is not signed with the key of the station")
-            key = following or key
-            keys |= {following} if following else set()
-            before, hashes[expected] = row["hash"], row["hash"]
+            if following is not None:
+                key = following
+                trail.keys.add(key)
+            before = row["hash"]
+            trail.add(before)
+            self._did(1)
             if not is_whole:
                 continue  # what it says counts for nothing
             if _table(data.get("schema")):
                 stated = data.get("version"), _table(data.get("schema"))
             if row["event"] == chain.RESTORED:
-                restored[expected] = _lost(data)
+                trail.restored[expected] = chain.lost_of(data)
             self._take_row(shown, row, data)
-            for what in _contradictions(name, records_id, row["event"], data):
+            for what in _contradictions(trail.station, records_id, row["event"], data):
                 yield Problem(where, what)
-        if hashes:
+        if trail.end:
             self._stated.append(stated)
 
     def _take_row(self, shown: str, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
-        """Note what an intact row vouches for, and what a person should know of it."""
+        """Note what a person should know of an intact row."""
         said = f"{row['at'][:10]} by {printable(str(data.get('by')))}"
-        digests = _table(data.get("digests")) if row["run_id"] is not None else {}
         match row["event"]:
             case chain.KEY_LOST:
                 self._remarks.append(f"{shown}: the key was declared lost on {said}")
             case chain.RESTORED:
-                lost = _lost(data)
+                lost = chain.lost_of(data)
                 self._remarks.append(
                     f"{shown}: rows {lost.start} to {lost.stop - 1} of an earlier chain were given"
                     f" up as lost on {said}"
                 )
             case chain.CLOCK:
                 self._remarks.append(f"{shown}: the clock was released on {said}")
-            case chain.CLAIMED if digests:
-                self._claims[row["run_id"]] = digests
-            case ending if ending in chain.ENDINGS and digests:
-                self._endings[row["run_id"]] = digests
-
-    def _heads(
-        self,
-        name: str,
-        kept: HeadsFile | None,
-        hashes: Mapping[int, str],
-        restored: Mapping[int, range],
-        keys: set[str],
-    ) -> Iterator[Problem]:
-        """Compare a chain with its kept heads."""
-        shown = printable(name)
-        place = printable(str(self._keeping.heads_folder))
-        if kept is None:
-            if hashes:
-                self._unkept.append(name)
-                if self._keeping.heads is not None:
-                    yield Problem(f"heads of {shown}", f"none of these records is kept in {place}")
-            return
-        heads = []
-        for entry in kept.entries():
-            if isinstance(entry, Head):
-                heads.append(entry)
-            elif isinstance(entry, Fault):
-                yield Problem(f"heads of {shown}, {entry.where}", entry.what)
-            elif entry.key not in keys:
-                where = f"heads of {shown}, segment {entry.segment} in {place}"
-                yield Problem(where, "it is not signed with a key of the station")
-        held = _counting(heads, hashes, restored)
-        missing = [head for head in held if head.number not in hashes]
-        other = [head for head in held if hashes.get(head.number, head.hash) != head.hash]
-        if missing:
-            last = max(missing, key=lambda head: head.number)
-            yield Problem(
-                f"audit trail of {shown}",
-                f"it ends at row {max(hashes, default=0)}, but row {last.number} of {last.at} is"
-                f" kept in {place}: its end was cut off, or this is an older copy",
-            )
-        if other:
-            first = min(other, key=lambda head: head.number)
-            yield Problem(
-                f"audit trail of {shown}",
-                f"row {first.number} of {first.at} is not the one that is kept in {place}: the"
-                " chain was made anew",
-            )
-        if held:
-            numbers = [head.number for head in held]
-            path = self._keeping.heads_folder
-            self._kept.append(KeptHeads(name, path, min(numbers), max(numbers)))
 
     # -- runs -------------------------------------------------------------------------------------
 
     def _digests(
-        self, run_id: int, digests: Mapping[str, str], changed: dict[tuple[str, str], list[int]]
+        self,
+        run_id: int,
+        digests: Mapping[str, str],
+        stated: _Stated,
+        changed: dict[tuple[str, str], list[int]],
     ) -> Iterator[Problem]:
-        """Hold a run against what the trails vouch for; `changed` collects what several share."""
+        """Compare a run with what the trails vouch for; `changed` collects what several share."""
         where = f"run {run_id}"
-        stated = (self._claims.get(run_id, {}), self._endings.get(run_id, {}))
-        if not any(stated):
+        if not stated.is_known:
             yield Problem(where, "the audit trail does not know it", (run_id,))
         wrong = {
             part: digests.get(part, "")
-            for each in stated
+            for each in (stated.claim, stated.ending)
             for part in each
             if each[part] != digests.get(part)
         }
@@ -254,14 +367,16 @@ class Examiner:
             what = f"changed after it was recorded: {', '.join(own)}"
             yield Problem(where, what, (run_id,))
 
-    def _runs(self, connection: Connection, run_ids: list[int]) -> Iterator[Problem]:
+    def _runs(
+        self, connection: Connection, run_ids: list[int], stated: Mapping[int, _Stated]
+    ) -> Iterator[Problem]:
         """Check that the runs can be read, and their attachments."""
         try:
             found = tuple(details_of(connection, schema.run.c.id.in_(run_ids)))
         except ValidationError as error:
             if len(run_ids) > 1:
                 for run_id in run_ids:
-                    yield from self._runs(connection, [run_id])
+                    yield from self._runs(connection, [run_id], stated)
             else:
                 (first, *_) = error.errors()
                 said = printable(f"{first['input']!r:.80} as {first['loc'][-1]}")
@@ -270,8 +385,8 @@ class Examiner:
         for details in found:
             run_id = details.run.run_id
             is_over = details.run.state is not RunState.RUNNING
-            is_known = run_id in self._claims or run_id in self._endings
-            if is_known and is_over != (run_id in self._endings):
+            self._did(1)
+            if stated[run_id].is_known and is_over != bool(stated[run_id].ending):
                 what = "it is finished" if is_over else "it goes on"
                 what += ", but the audit trail says otherwise"
                 yield Problem(f"run {run_id}", what, (run_id,))
@@ -316,19 +431,64 @@ class Examiner:
             yield Problem(where, f"its trace says otherwise: {what}", (run.run_id,))
 
 
-def _counting(
-    heads: list[Head], hashes: Mapping[int, str], restored: Mapping[int, range]
-) -> list[Head]:
-    """The heads without those that a person gave up, when older records were put back."""
-    given_up: set[int] = set()
-    for number, lost in restored.items():
-        given_up_at = len(heads)
-        for index, head in enumerate(heads):
-            if (head.number, head.hash) == (number, hashes[number]):
-                given_up_at = index
-        earlier = enumerate(heads[:given_up_at])
-        given_up |= {index for index, head in earlier if head.number in lost}
-    return [head for index, head in enumerate(heads) if index not in given_up]
+@dataclass
+class _Stated:
+    """The digests that the audit trails state for a run."""
+
+    claim: Mapping[str, str] = field(default_factory=dict)
+    """At its claim."""
+    ending: Mapping[str, str] = field(default_factory=dict)
+    """And at its end."""
+
+    @property
+    def is_known(self) -> bool:
+        return bool(self.claim or self.ending)
+
+
+def _stated(connection: Connection, run_ids: list[int]) -> dict[int, _Stated]:
+    """What intact audit rows state for these runs."""
+    found: dict[int, _Stated] = defaultdict(_Stated)
+    query = select(schema.audit).order_by(schema.audit.c.id)
+    for run_id, rows in grouped(connection, query, schema.audit.c.run_id, run_ids).items():
+        for row in rows:
+            digests = _table(chain.data_of(row["data"]).get("digests"))
+            if not digests or row["hash"] != chain.row_hash(row):
+                continue
+            if row["event"] == chain.CLAIMED:
+                found[run_id].claim = digests
+            elif row["event"] in chain.ENDINGS:
+                found[run_id].ending = digests
+    return found
+
+
+def _differences(trail: _Trail, place: str, held: list[Head]) -> Iterator[Problem]:
+    """What heads tell that are not those of the chain."""
+    where = f"audit trail of {printable(trail.station)}"
+    missing = [head for head in held if head.number > trail.end]
+    other = [head for head in held if head.number <= trail.end]
+    if missing:
+        last = max(missing, key=lambda head: head.number)
+        yield Problem(
+            where,
+            f"it ends at row {trail.end}, but row {last.number} of {last.at} is"
+            f" kept in {place}: its end was cut off, or this is an older copy",
+        )
+    if other:
+        first = min(other, key=lambda head: head.number)
+        yield Problem(
+            where,
+            f"row {first.number} of {first.at} is not the one that is kept in {place}: the"
+            " chain was made anew",
+        )
+
+
+def _unused(connection: Connection) -> Iterator[Problem]:
+    """Rows that no station adds without a run."""
+    for table, naming in _USED.items():
+        query = select(table).where(table.c.id.not_in(select(naming).where(naming.is_not(None))))
+        for row in connection.execute(query.order_by(table.c.id).limit(_RUNS_NAMED)).mappings():
+            name = row.get("serial") or row.get("name")
+            yield Problem(f"{table.name} {printable(str(name))}", "it was added: no run names it")
 
 
 def _contradictions(
@@ -347,14 +507,6 @@ def _contradictions(
 
 def _table(value: Any) -> Mapping[str, str]:
     return value if isinstance(value, dict) else {}
-
-
-def _lost(data: Mapping[str, Any]) -> range:
-    """The rows that a person gave up; none where it is not said."""
-    first, last = data.get("lost_from"), data.get("lost_to")
-    if isinstance(first, int) and isinstance(last, int):
-        return range(first, last + 1)
-    return range(0)
 
 
 def _sqlite_problems(connection: Connection) -> Iterator[Problem]:

@@ -2,61 +2,70 @@
 chain.
 
 Whoever can write the database but has no key cannot make a chain that verifies. The chain alone
-cannot tell that its end was cut off, or that it is an older copy of itself; a file in another place
-that only grows can.
+cannot tell that its end was cut off, or that it is an older copy of itself; heads in another place,
+where they only grow, can. Heads beside the key tell it only as long as nobody has written there.
 """
 
 from __future__ import annotations
 
-import hashlib
-import re
-from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from platformdirs import user_data_path
 
+from flasher.errors import ErrorCode, UsageError
+from flasher.station.records.database import Location
 from flasher.station.records.heads import HeadsFile
+from flasher.station.records.places import FolderPlace, Place, file_name, place_of
 
 
 @dataclass(frozen=True)
 class Keeping:
-    """Where the signing key of a station is kept, and the heads of its chain; None: the place of
-    this user, and beside the key.
+    """Where the signing key of a station is kept (None: the place of this user), and in which other
+    places than beside it the heads of its chain: folders, and URLs of PostgreSQL servers.
     """
 
     keys: Path | None = None
-    heads: Path | None = None
+    heads: tuple[str, ...] = ()
+
+    def __reduce__(self) -> tuple[type[Keeping], tuple[Path | None, tuple[str, ...]]]:
+        """Sent to another process without the connections of this one."""
+        return Keeping, (self.keys, self.heads)
 
     @property
     def keys_folder(self) -> Path:
         return self.keys or user_data_path("flasher", appauthor=False) / "station"
 
-    @property
-    def heads_folder(self) -> Path:
-        return self.heads or self.keys_folder
+    @cached_property
+    def beside_key(self) -> FolderPlace:
+        return FolderPlace(self.keys_folder)
+
+    @cached_property
+    def elsewhere(self) -> tuple[Place, ...]:
+        """The other places. Raises UsageError for a URL that cannot be."""
+        here = self.keys_folder.resolve()
+        places = (place_of(text) for text in dict.fromkeys(self.heads))
+        return tuple(
+            each
+            for each in places
+            if not (isinstance(each, FolderPlace) and each.folder.resolve() == here)
+        )
 
     def key_file(self, station: str, records_id: str) -> Path:
-        return self.keys_folder / _file_name(station, records_id, ".key")
+        return self.keys_folder / file_name(station, records_id, ".key")
 
     def heads_file(self, station: str, records_id: str) -> HeadsFile:
-        return HeadsFile(self.heads_folder / _file_name(station, records_id, ".heads"))
+        """The heads beside the key."""
+        return self.beside_key.of(station, records_id)
 
-    def kept_heads(self, records_id: str, stations: Iterable[str]) -> dict[str, HeadsFile]:
-        """The heads that are kept of these records, by station; also of stations that the records
-        do not name. Raises RecordError.
-        """
-        found = {name: self.heads_file(name, records_id) for name in stations}
-        if self.heads_folder.is_dir():
-            for path in sorted(self.heads_folder.glob("*.heads")):
-                first = HeadsFile(path).first()
-                if first is not None and path == self.heads_file(first.station, records_id).path:
-                    found[first.station] = HeadsFile(path)
-        return {name: file for name, file in found.items() if file.last() is not None}
-
-
-def _file_name(station: str, records_id: str, suffix: str) -> str:
-    """The name of a station's file for these records: unlike for unlike stations."""
-    plain = re.sub(r"[^A-Za-z0-9_-]", "_", station)[:40]
-    mark = hashlib.sha256(f"{records_id} {station}".encode()).hexdigest()[:12]
-    return f"{plain}-{mark}{suffix}"
+    def check(self, location: Location) -> None:
+        """Raises UsageError for heads in the database of the records themselves."""
+        for each in self.elsewhere:
+            if each.holds(location):
+                raise UsageError(
+                    f"The heads cannot be kept in {each.shown}: the records are there.",
+                    cause="whoever can change the records could change their heads as well",
+                    remedy="Name a database of its own, best on another server.",
+                    code=ErrorCode.RECORDS,
+                )

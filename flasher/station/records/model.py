@@ -391,13 +391,23 @@ class Problem:
 
 @dataclass(frozen=True)
 class KeptHeads:
-    """What a station's chain was held against."""
+    """The heads that a station's chain was compared with."""
 
     station: str
-    path: Path
+    place: str
+    """A folder, or a database server."""
     first: int
     """Number of the first audit row whose head is kept there: from 1 where all of them are."""
     last: int
+    rows: int
+    """Of the chain; the last of them may not be kept there yet."""
+    is_elsewhere: bool
+    """False beside the key of the station: whoever can write there can make all of it anew."""
+
+    @property
+    def is_whole(self) -> bool:
+        """True when it vouches for every row."""
+        return self.first == 1 and self.last >= self.rows
 
 
 @dataclass(frozen=True)
@@ -409,15 +419,30 @@ class Examination:
     """What a person should know, though nothing is wrong with it."""
     kept: tuple[KeptHeads, ...]
     unkept: tuple[str, ...]
-    """Stations whose chains could not be held against heads that are kept elsewhere."""
+    """Stations whose chains could not be compared with heads that are kept elsewhere."""
     traces: int
-    """PASS runs that were held against their own traces."""
+    """PASS runs that were compared with their own traces."""
+    unreached: tuple[str, ...] = ()
+    """Places of heads that could not be reached, each with why."""
 
     @property
     def is_checked_elsewhere(self) -> bool:
-        """True when every chain was held, from its first row, against heads kept elsewhere."""
-        are_whole = all(each.first == 1 for each in self.kept)
-        return bool(self.kept) and not self.unkept and are_whole
+        """True when every chain was compared, from its first row to its last, with heads that are
+        kept in another place than beside the key of its station.
+        """
+        stations = {each.station for each in self.kept}
+        return (
+            not self.unkept
+            and all(
+                any(
+                    each.is_whole and each.is_elsewhere
+                    for each in self.kept
+                    if each.station == name
+                )
+                for name in stations
+            )
+            and bool(stations)
+        )
 
     def of_run(self, run_id: RunId) -> tuple[Problem, ...]:
         """What speaks against one run."""

@@ -23,6 +23,7 @@ from flasher.station.records.errors import (
 )
 from flasher.station.records.heads import Head, HeadsFile
 from flasher.station.records.keys import Keeping
+from flasher.station.records.places import Copying, Place, lasts
 from flasher.station.records.schema import schema_info
 from flasher.station.records.signatures import SigningKey, fingerprint
 
@@ -44,6 +45,8 @@ class Signer:
         self._key: SigningKey | None = None
         self._unkept: list[Head] = []
         self._heads_lock = Lock()
+        self.copies: list[Copying] = []
+        """To the other places, while this process is the station."""
 
     @cached_property
     def records_id(self) -> str:
@@ -73,17 +76,36 @@ class Signer:
         Raises KeyMissingError; RecordsCutError for records that lack rows of which the heads are
         kept; RecordError.
         """
-        last = self.heads_file.last()
-        if last is not None and not self._is_there(last):
-            raise RecordsCutError(
-                f"These records lack what {self._station} wrote up to {last.at}: they are an"
-                " older copy, or their end was cut off.",
-                where=self._database.location.shown,
-                cause=f"audit row {last.number} is kept in {self.heads_file.path}",
-                remedy="Put the right records back (flasher station verify names what is missing);"
-                " if they are lost: flasher station accept restored.",
-            )
+        for place, last in self._lasts():
+            if self._is_missing(last):
+                raise RecordsCutError(
+                    f"These records lack what {self._station} wrote up to {last.at}: they are an"
+                    " older copy, or their end was cut off.",
+                    where=self._database.location.shown,
+                    cause=f"audit row {last.number} is kept in {place.shown}",
+                    remedy="Put the right records back (flasher station verify names what is"
+                    " missing); if they are lost: flasher station accept restored.",
+                )
         self._load()
+        if not self.copies:
+            self.copies = [self._copying(place) for place in self.keeping.elsewhere]
+            for each in self.copies:
+                each.begin()
+
+    def wait_for_copies(self) -> None:
+        """Wait a moment until the other places have all heads."""
+        for each in self.copies:
+            each.wait()
+
+    def unkept(self) -> list[str]:
+        """The other places that have not the last heads, since they cannot be reached."""
+        return [each.shown for each in self.copies if each.fault]
+
+    def close(self) -> None:
+        """End the copying of heads; what is not copied is copied after the next start."""
+        for each in self.copies:
+            each.end()
+        self.copies = []
 
     @contextmanager
     def writing(self, *locks: str) -> Iterator[chain.Trail]:
@@ -104,6 +126,8 @@ class Signer:
             if some:
                 self.heads_file.append(some, trail.key)
                 del self._unkept[: len(some)]
+        for each in self.copies:
+            each.wake()
 
     def rotate(self, operator: str) -> None:
         """Sign with a new key from now on. The one before is deleted."""
@@ -140,18 +164,19 @@ class Signer:
 
         Raises UsageError when nothing is missing.
         """
-        last = self.heads_file.last()
-        if last is None or self._is_there(last):
+        kept = [place for place, last in self._lasts() if self._is_missing(last)]
+        if not kept:
             raise UsageError(
                 "Nothing is missing: the records hold the last row of which a head is kept.",
                 remedy="Start the station.",
             )
-        heads = (each for each in self.heads_file.entries() if isinstance(each, Head))
         with self._database.reading() as connection:
             numbers = [
                 head.number
-                for head in heads
-                if chain.hash_at(connection, self._station, head.number) != head.hash
+                for place in kept
+                for head in place.of(self._station, self.records_id).entries()
+                if isinstance(head, Head)
+                and chain.hash_at(connection, self._station, head.number) != head.hash
             ]
         self._load()
         with self.writing() as trail:
@@ -189,9 +214,33 @@ class Signer:
     def heads_file(self) -> HeadsFile:
         return self.keeping.heads_file(self._station, self.records_id)
 
+    def _lasts(self) -> Iterator[tuple[Place, Head]]:
+        """The head that each place has last, where it can be reached and has any. Raises
+        RecordError, UsageError for the one beside the key.
+        """
+        here = self.heads_file.last()
+        if here is not None:
+            yield self.keeping.beside_key, here
+        for place, last in lasts(self.keeping.elsewhere, self._station, self.records_id):
+            if isinstance(last, Head):
+                yield place, last
+
+    def _copying(self, place: Place) -> Copying:
+        source = self.keeping.heads_file(self._station, self.records_id)
+        target = place.of(self._station, self.records_id)
+        return Copying(source, place, target, self._key_now)
+
+    def _key_now(self) -> SigningKey:
+        assert self._key is not None  # noqa: S101  copying begins after it was loaded
+        return self._key
+
     def _following(self) -> Path:
         return self.key_file.with_suffix(".new")
 
-    def _is_there(self, head: Head) -> bool:
+    def _is_missing(self, head: Head) -> bool:
+        """True for a head whose row is not in the records, and was not given up."""
         with self._database.reading() as connection:
-            return chain.hash_at(connection, self._station, head.number) == head.hash
+            if chain.hash_at(connection, self._station, head.number) == head.hash:
+                return False
+            lost = chain.given_up(connection, self._station)
+            return not any(head.number in each for each in lost)

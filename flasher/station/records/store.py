@@ -117,6 +117,7 @@ class Store:
         """
         clock = clock or SystemClock()
         location = locate(url, folder)
+        keeping.check(location)
         opened = partial(
             open_database,
             location,
@@ -143,6 +144,7 @@ class Store:
 
     def close(self) -> None:
         """Close the database and let another process be the station."""
+        self.signer.close()
         self._lock.release()
         self.database.close()
 
@@ -359,6 +361,7 @@ class Store:
 
         Raises RecordError when they cannot be read.
         """
+        self.signer.wait_for_copies()
         return Examiner(self.database, self.files, self.signer.keeping).examine(runs)
 
     def release_clock(self, operator: str, reason: str) -> None:

@@ -123,17 +123,6 @@ def test_a_head_that_cannot_be_kept_shows_no_pass_and_is_kept_later(
     assert found.kept[0].last == bench.store.read.head_of(run_id).number  # type: ignore[union-attr]
 
 
-def test_heads_may_be_kept_in_a_place_of_their_own(tmp_path: Path) -> None:
-    bench = Bench(tmp_path, heads=tmp_path / "server")
-    bench.make()
-    bench.store.close()
-    only(tmp_path / "server", "*.heads")
-    assert not list(bench.keys.glob("*.heads"))
-    keeping = Keeping(heads=tmp_path / "server")
-    with Store.open(str(bench.path), station="x", read_only=True, keeping=keeping) as store:
-        assert store.examine().is_checked_elsewhere
-
-
 def test_half_a_line_that_a_crash_left_spoils_nothing(bench: Bench) -> None:
     kept = only(bench.keys, "*.heads")
     with kept.open("a") as file:
@@ -150,8 +139,8 @@ def test_heads_that_begin_late_leave_the_rows_before_unchecked(bench: Bench) -> 
     bench.make(serial=OTHER)
     found = bench.store.examine()
     assert not found.problems
-    assert not found.is_checked_elsewhere
     assert found.kept[0].first > 1
+    assert not found.kept[0].is_whole
 
 
 def test_an_older_copy_does_not_become_the_station_before_a_person_says_so(bench: Bench) -> None:

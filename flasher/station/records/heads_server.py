@@ -1,0 +1,138 @@
+"""A PostgreSQL server as a place of kept heads: a table that only grows.
+
+It needs the extra `postgres`; the rest of the records does not import it without a need.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final
+
+from sqlalchemy import (
+    BigInteger,
+    Column,
+    Connection,
+    Index,
+    MetaData,
+    Select,
+    Table,
+    Text,
+    inspect,
+    select,
+    text,
+)
+
+from flasher.station.records.database import Location, locate
+from flasher.station.records.errors import mapped
+from flasher.station.records.heads import Head
+from flasher.station.records.server import make_engine
+from flasher.station.records.signatures import SigningKey
+
+_PATIENCE_S: Final = 5.0
+_metadata: Final = MetaData()
+kept_head: Final = Table(
+    "kept_head",
+    _metadata,
+    Column("id", BigInteger, primary_key=True, autoincrement=True),
+    Column("records_id", Text, nullable=False),
+    Column("station", Text, nullable=False),
+    Column("number", BigInteger, nullable=False),
+    Column("at", Text, nullable=False),
+    Column("hash", Text, nullable=False),
+    Column("signature", Text, nullable=False),
+    Column("key", Text, nullable=False),
+    Index("kept_head_of_row", "records_id", "station", "number"),
+    Index("kept_head_last", "records_id", "station", "id"),
+)
+_HEAD: Final = [kept_head.c[name] for name in Head.__dataclass_fields__]
+_RULES: Final = """\
+CREATE FUNCTION kept_head_stays() RETURNS trigger LANGUAGE plpgsql AS $$
+BEGIN RAISE EXCEPTION 'kept heads are neither changed nor deleted'; END $$;
+CREATE TRIGGER kept_head_stays BEFORE UPDATE OR DELETE OR TRUNCATE ON kept_head
+FOR EACH STATEMENT EXECUTE FUNCTION kept_head_stays();
+"""
+
+
+class ServerPlace:
+    """A database of a server."""
+
+    def __init__(self, url: str) -> None:
+        """Raises UsageError for a URL that cannot be."""
+        self.location = locate(url, Path())
+        self.shown = self.location.shown
+        self._engine = make_engine(self.location.url, _PATIENCE_S)
+
+    def of(self, station: str, records_id: str) -> ServerHeads:
+        return ServerHeads(self, station, records_id)
+
+    def stations(self, records_id: str) -> list[str]:
+        query = select(kept_head.c.station).where(kept_head.c.records_id == records_id).distinct()
+        with self.connected() as connection:
+            return list(connection.execute(query).scalars()) if _is_there(connection) else []
+
+    def holds(self, location: Location) -> bool:
+        mine, other = self.location.url, location.url
+        return (mine.host, mine.port or 5432, mine.database) == (
+            other.host, other.port or 5432, other.database,
+        )  # fmt: skip
+
+    @contextmanager
+    def connected(self, *, writes: bool = False) -> Iterator[Connection]:
+        """A transaction in a connection of its own: between two of them hours may pass. Raises
+        RecordError.
+        """
+        try:
+            with mapped(self.shown, writes=writes), self._engine.begin() as connection:
+                yield connection
+        finally:
+            self._engine.dispose()
+
+
+class ServerHeads:
+    """The heads of one station on a server; rows are only added."""
+
+    def __init__(self, place: ServerPlace, station: str, records_id: str) -> None:
+        self._place = place
+        self._own = {"station": station, "records_id": records_id}
+
+    def append(self, heads: Iterable[Head], _key: SigningKey) -> None:
+        """Add heads; the table is made when it is not there. Raises RecordError."""
+        with self._place.connected(writes=True) as connection:
+            if not _is_there(connection):
+                # Two stations may find that at once.
+                connection.execute(text("SELECT pg_advisory_xact_lock(7052, 7052)"))
+                if not _is_there(connection):
+                    _metadata.create_all(connection)
+                    connection.exec_driver_sql(_RULES)
+            connection.execute(kept_head.insert(), [asdict(head) | self._own for head in heads])
+
+    def last(self) -> Head | None:
+        query = self._query().order_by(kept_head.c.id.desc()).limit(1)
+        return next(iter(self._heads(query)), None)
+
+    def entries(self, after: int = 0) -> Iterator[Head]:
+        query = self._query().where(kept_head.c.number > after).order_by(kept_head.c.id)
+        with self._place.connected() as connection:
+            if _is_there(connection):
+                with connection.execute(query.execution_options(yield_per=1000)) as result:
+                    for row in result.mappings():
+                        yield Head(**row)
+
+    def of_row(self, number: int) -> tuple[Head, ...]:
+        return tuple(self._heads(self._query().where(kept_head.c.number == number)))
+
+    def _query(self) -> Select[Any]:
+        return select(*_HEAD).filter_by(**self._own)
+
+    def _heads(self, query: Select[Any]) -> list[Head]:
+        with self._place.connected() as connection:
+            if not _is_there(connection):
+                return []
+            return [Head(**row) for row in connection.execute(query).mappings()]
+
+
+def _is_there(connection: Connection) -> bool:
+    return inspect(connection).has_table(kept_head.name)

@@ -1,0 +1,248 @@
+"""The places in which heads are kept: beside the station's key, in other folders, on PostgreSQL
+servers; and the copying from the first to the others, which no commit waits for.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import threading
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final, Protocol, TypeVar
+
+from flasher.errors import FlasherError
+from flasher.protocol.text import printable
+from flasher.station.records.database import Location
+from flasher.station.records.errors import RecordError
+from flasher.station.records.heads import Checkpoint, Fault, Head, HeadsFile, Position
+from flasher.station.records.signatures import SigningKey
+
+RETRY_S: Final = 10.0
+"""After this time a place that could not be reached is tried again, or with the next audit row."""
+PATIENCE_S: Final = 5.0
+"""So long a place may take to say which head it has; a share that is gone may hang for ever."""
+_END_S: Final = 2.0
+_SOME: Final = 500
+_RECENT: Final = 100_000
+"""In so many rows before the last one, the row is looked for up to which two places agree."""
+_Found = TypeVar("_Found")
+
+
+class Heads(Protocol):
+    """The heads of one station that a place keeps."""
+
+    def append(self, heads: Iterable[Head], key: SigningKey) -> None: ...
+
+    def last(self) -> Head | None: ...
+
+    def entries(self, after: int = 0) -> Iterator[Head | Checkpoint | Fault]: ...
+
+    def of_row(self, number: int) -> tuple[Head, ...]: ...
+
+
+class Place(Protocol):
+    """Where heads are kept. All methods raise FlasherError when it cannot be reached."""
+
+    @property
+    def shown(self) -> str:
+        """For messages; without a password."""
+
+    def of(self, station: str, records_id: str) -> Heads: ...
+
+    def stations(self, records_id: str) -> Iterable[str]:
+        """The stations of which heads of these records are kept."""
+
+    def holds(self, location: Location) -> bool:
+        """True when these records themselves are there."""
+
+
+class FolderPlace:
+    """A folder of this computer, or a share of another one."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.shown = printable(str(folder))
+
+    def of(self, station: str, records_id: str) -> HeadsFile:
+        return HeadsFile(self.folder / file_name(station, records_id, ".heads"))
+
+    def stations(self, records_id: str) -> Iterator[str]:
+        if not self.folder.is_dir():
+            cause = "there is no such folder"
+            raise RecordError(f"{self.shown} cannot be read: {cause}.", cause=cause)
+        for path in sorted(self.folder.glob("*.heads")):
+            first = HeadsFile(path).first()
+            if first and path.name == file_name(first.station, records_id, ".heads"):
+                yield first.station
+
+    def holds(self, location: Location) -> bool:
+        return False
+
+
+def place_of(text: str) -> Place:
+    """The place that a setting names: a folder, or the URL of a PostgreSQL server. Raises
+    UsageError.
+    """
+    if "://" not in text:
+        return FolderPlace(Path(text))
+    # The driver is an extra.
+    from flasher.station.records.heads_server import ServerPlace  # noqa: PLC0415
+
+    return ServerPlace(text)
+
+
+def file_name(station: str, records_id: str, suffix: str) -> str:
+    """The name of a station's file for these records: unlike for unlike stations."""
+    plain = re.sub(r"[^A-Za-z0-9_-]", "_", station)[:40]
+    mark = hashlib.sha256(f"{records_id} {station}".encode()).hexdigest()[:12]
+    return f"{plain}-{mark}{suffix}"
+
+
+def patiently(
+    works: Sequence[Callable[[], _Found]], limit_s: float = PATIENCE_S
+) -> list[_Found | FlasherError]:
+    """What each returns, or why it does not: they run side by side, for `limit_s` at most."""
+    found: dict[int, _Found | FlasherError] = {}
+
+    def run(at: int, work: Callable[[], _Found]) -> None:
+        try:
+            found[at] = work()
+        except FlasherError as error:
+            found[at] = error
+        except OSError as error:
+            found[at] = RecordError(f"It cannot be read: {error.strerror or error}.")
+
+    threads = [
+        threading.Thread(target=run, args=(at, work), daemon=True) for at, work in enumerate(works)
+    ]
+    for thread in threads:
+        thread.start()
+    silent = RecordError(f"It did not answer within {limit_s:g} s.")
+    for thread in threads:
+        thread.join(limit_s)
+        limit_s = limit_s if not thread.is_alive() else 0.0
+    return [found.get(at, silent) for at in range(len(works))]
+
+
+class Copying:
+    """Copies the heads beside the key to one other place, in a thread of its own. What could not be
+    copied stays in the source, from which it is copied when the place can be reached again.
+    """
+
+    def __init__(
+        self,
+        source: HeadsFile,
+        place: Place,
+        target: Heads,
+        key: Callable[[], SigningKey],
+        *,
+        retry_s: float = RETRY_S,
+    ) -> None:
+        self._source = source
+        self._place = place
+        self._target = target
+        self._key = key
+        self._retry_s = retry_s
+        self._position: Position | None = None
+        self._known = source.path.with_name(f"{source.path.name}.places")
+        self._wake, self._is_ending = threading.Event(), False
+        self._idle = threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True, name="heads")
+        self.fault = ""
+        """Why the place has not the last heads; empty while it has."""
+
+    @property
+    def shown(self) -> str:
+        return self._place.shown
+
+    def begin(self) -> None:
+        self._thread.start()
+        self.wake()
+
+    def wake(self) -> None:
+        """There are more heads."""
+        self._idle.clear()
+        self._wake.set()
+
+    def wait(self, limit_s: float = _END_S) -> bool:
+        """Wait until the place has all heads, or cannot be reached; False when it takes longer."""
+        return self._idle.wait(limit_s)
+
+    def end(self) -> None:
+        """Copy what there is, unless it takes long."""
+        self._is_ending = True
+        self.wake()
+        self._thread.join(_END_S)
+
+    def _run(self) -> None:
+        while True:
+            self._wake.wait(self._retry_s if self.fault else None)
+            self._wake.clear()
+            is_ending = self._is_ending
+            try:
+                self._copy()
+            except FlasherError as error:
+                self._position, self.fault = None, error.cause or error.what
+            except OSError as error:
+                self._position, self.fault = None, error.strerror or str(error)
+            else:
+                self.fault = ""
+            if not self._wake.is_set():
+                self._idle.set()
+            if is_ending:
+                return
+
+    def _copy(self) -> None:
+        if self._position is None:
+            self._position = self._find()
+        some: list[Head] = []
+        for head, position in self._source.since(self._position):
+            some.append(head)
+            if len(some) == _SOME:
+                self._put(some, position)
+                some = []
+        if some:
+            self._put(some, position)
+
+    def _put(self, some: list[Head], position: Position) -> None:
+        self._target.append(some, self._key())
+        self._position = position
+
+    def _find(self) -> Position:
+        """Where to go on. Raises RecordError for a place that lost what it had."""
+        last = self._target.last()
+        known = self._known.read_text("utf-8").splitlines() if self._known.exists() else []
+        if last is None and self.shown in known:
+            raise RecordError(
+                f"The heads that were kept in {self.shown} are gone.",
+                cause="the heads that were kept there are gone: is it the right share?",
+                remedy=f"Mount the share. To begin anew there, delete {self._known}.",
+            )
+        if self.shown not in known:
+            self._known.write_text("".join(f"{each}\n" for each in [*known, self.shown]), "utf-8")
+        if last is None:
+            return Position()
+        found = self._source.position_after(last)
+        if found is not None:
+            return found
+        # After another head than the last one here: older records were put back, or the file
+        # beside the key began later than this place.
+        old = last.number - _RECENT
+        recent = {each.hash for each in self._target.entries(max(old, 0)) if isinstance(each, Head)}
+        found = Position()
+        for head, position in self._source.since(found):
+            if head.hash in recent or head.number <= old:
+                found = position
+        return found
+
+
+def lasts(
+    places: Sequence[Place], station: str, records_id: str
+) -> list[tuple[Place, Head | FlasherError | None]]:
+    """The head that each place has last, or why it does not say."""
+
+    def asked(place: Place) -> Callable[[], Any]:
+        return lambda: place.of(station, records_id).last()
+
+    return list(zip(places, patiently([asked(each) for each in places]), strict=True))

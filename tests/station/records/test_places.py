@@ -1,0 +1,296 @@
+"""Heads in several places: what a forger cannot reach is compared with what he left; a place that
+cannot be reached stops no line.
+"""
+
+from __future__ import annotations
+
+import pickle
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+import pytest
+from sqlalchemy import Connection, create_engine, select, text
+
+from flasher.errors import UsageError
+from flasher.station.board import Board
+from flasher.station.health import Watch
+from flasher.station.records import schema
+from flasher.station.records.chain import canonical, data_of, digests_of, row_hash
+from flasher.station.records.errors import RecordsCutError
+from flasher.station.records.heads import Head, HeadsFile
+from flasher.station.records.keys import Keeping
+from flasher.station.records.model import Examination, Problem
+from flasher.station.records.places import patiently, place_of
+from flasher.station.records.schema import audit, run
+from flasher.station.records.signatures import SigningKey
+from flasher.station.records.store import Store
+from tests.station.factory import Bench
+from tests.station.postgres import Server
+from tests.station.records.conftest import BACK_ENDS
+
+OTHER = "W2605003"
+
+
+@pytest.fixture(params=BACK_ENDS)
+def line(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Bench]:
+    """A line with three units, whose heads are kept beside the key and on a share."""
+    url = None
+    if request.param == "postgresql":
+        url = request.getfixturevalue("postgres").records()
+    made = Bench(tmp_path, url=url, heads=(tmp_path / "share",))
+    for serial in ("W2605002", OTHER, "W2605004"):
+        made.make(serial=serial)
+    yield made
+    made.store.close()
+
+
+@contextmanager
+def forging(bench: Bench) -> Iterator[Connection]:
+    """The records without their rules, by somebody who owns the database."""
+    engine = create_engine(bench.url or f"sqlite:///{bench.path}")
+    with engine.begin() as connection:
+        rules: dict[str, str] = {}
+        if bench.url is None:
+            query = "SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"
+            rules = dict(connection.execute(text(query)).all())
+            for name in rules:
+                connection.exec_driver_sql(f"DROP TRIGGER {name}")
+        else:
+            connection.exec_driver_sql("SET session_replication_role = replica")
+        yield connection
+        for statement in rules.values():
+            connection.exec_driver_sql(statement)
+    engine.dispose()
+
+
+def verified(bench: Bench, keeping: Keeping | None = None) -> Examination:
+    bench.store.close()
+    files = bench.store.files.folder
+    with Store.open(
+        bench.url or str(bench.path), station="x", folder=files, read_only=True,
+        keeping=keeping or bench.keeping,
+    ) as store:  # fmt: skip
+        return store.examine()
+
+
+def told(problems: tuple[Problem, ...], where: str, what: str) -> bool:
+    return any(where in each.where and what in each.what for each in problems)
+
+
+def beside(bench: Bench) -> Path:
+    (found,) = bench.keys.glob("*.heads")
+    return found
+
+
+def cut_tail(bench: Bench) -> None:
+    """The last unit was never made: neither in the database nor in the heads beside the key."""
+    bench.store.close()
+    with forging(bench) as connection:
+        last = connection.execute(select(run.c.id).order_by(run.c.id.desc()).limit(1)).scalar_one()
+        for table in (
+            schema.step,
+            schema.device_write,
+            schema.attachment,
+            schema.run_target,
+            audit,
+        ):
+            connection.execute(table.delete().where(table.c.run_id == last))
+        connection.execute(run.delete().where(run.c.id == last))
+        connection.exec_driver_sql("DELETE FROM unit WHERE serial = 'W2605004'")
+    kept = beside(bench)
+    kept.write_text("".join(kept.read_text().splitlines(keepends=True)[:-2]))
+
+
+def make_anew(bench: Bench) -> None:
+    """A unit has another history, in a chain that was signed anew, with new heads beside it."""
+    bench.store.close()
+    (path,) = bench.keys.glob("*.key")
+    path.unlink()
+    key, heads = SigningKey.make(path), []
+    with forging(bench) as connection:
+        connection.exec_driver_sql("UPDATE run SET text = 'all was well' WHERE state = 'PASS'")
+        before = "0" * 64
+        for row in connection.execute(select(audit).order_by(audit.c.number)).mappings().all():
+            data: dict[str, Any] = data_of(row["data"])
+            if row["number"] == 1:
+                data["key"] = key.public
+            if "digests" in data and row["event"] == "finished":
+                data["digests"] = digests_of(connection, [row["run_id"]])[row["run_id"]]
+            new = dict(row) | {"previous_hash": before, "data": canonical(data)}
+            before = row_hash(new)
+            changes = {name: new[name] for name in ("previous_hash", "data")}
+            signature = key.sign(before)
+            connection.execute(
+                audit.update()
+                .where(audit.c.id == row["id"])
+                .values(**changes, hash=before, signature=signature)
+            )
+            heads.append(Head("line-2", row["number"], row["at"], before, signature, key.public))
+    kept = beside(bench)
+    kept.unlink()
+    HeadsFile(kept).append(heads, key)
+
+
+FORGERIES: dict[Callable[[Bench], None], str] = {
+    cut_tail: "its end was cut off",
+    make_anew: "the chain was made anew",
+}
+
+
+@pytest.mark.parametrize("forge", FORGERIES)
+def test_what_was_forged_with_the_heads_beside_the_key_is_reported_by_another_place(
+    line: Bench, tmp_path: Path, forge: Callable[[Bench], None]
+) -> None:
+    honest = verified(line)
+    assert not honest.problems
+    assert honest.is_checked_elsewhere
+    assert {(each.place, each.first, each.last) for each in honest.kept} == {
+        (str(line.keys), 1, 8), (str(tmp_path / "share"), 1, 8),
+    }  # fmt: skip
+    forge(line)
+    found = verified(line)
+    assert told(found.problems, "audit trail of line-2", FORGERIES[forge])
+    assert all(str(tmp_path / "share") in each.what for each in found.problems)
+    alone = verified(line, Keeping(line.keys))
+    assert not alone.problems  # nothing tells it there, and it does not claim to
+    assert not alone.is_checked_elsewhere
+    assert alone.unkept == ("line-2",)
+
+
+@pytest.mark.parametrize("forge", FORGERIES)
+def test_no_station_goes_on_with_what_another_place_contradicts(
+    line: Bench, forge: Callable[[Bench], None]
+) -> None:
+    forge(line)
+    line.store = line.opened()
+    with pytest.raises(RecordsCutError) as caught:
+        line.store.recover()
+    assert "share" in caught.value.cause
+
+
+def test_rows_that_are_given_up_are_so_in_every_place(line: Bench) -> None:
+    cut_tail(line)
+    line.store = line.opened()
+    assert line.store.accept_restored("jo", "the disk died") == 2
+    line.store.recover()
+    line.make(serial="W2605005")
+    found = verified(line)
+    assert not found.problems
+    assert found.is_checked_elsewhere
+
+
+def test_heads_on_a_server_report_a_forgery_and_only_grow(postgres: Server, tmp_path: Path) -> None:
+    url = postgres.url(postgres.database())
+    bench = Bench(tmp_path, heads=(url,))
+    for serial in ("W2605002", OTHER, "W2605004"):
+        bench.make(serial=serial)
+    assert verified(bench).is_checked_elsewhere
+    place = place_of(url)
+    assert list(place.stations(bench.store.signer.records_id)) == ["line-2"]
+    kept = place.of("line-2", bench.store.signer.records_id)
+    assert kept.of_row(3) == HeadsFile(beside(bench)).of_row(3)
+    cut_tail(bench)
+    assert told(verified(bench).problems, "audit trail of line-2", "row 8")
+    engine = create_engine(url)
+    for statement in (
+        "DELETE FROM kept_head",
+        "UPDATE kept_head SET number = 1",
+        "TRUNCATE kept_head",
+    ):
+        with pytest.raises(Exception, match="neither changed nor deleted"), engine.begin() as other:
+            other.exec_driver_sql(statement)
+    engine.dispose()
+
+
+def test_the_records_own_database_is_no_other_place(postgres: Server, tmp_path: Path) -> None:
+    url = postgres.records()
+    with pytest.raises(UsageError, match="the records are there"):
+        Bench(tmp_path, url=url, heads=(url,))
+
+
+def test_a_place_that_is_gone_stops_no_line_and_is_caught_up(tmp_path: Path) -> None:
+    share, gone = tmp_path / "share", tmp_path / "gone"
+    bench = Bench(tmp_path, heads=(share,))
+    bench.make()
+    bench.store.signer.wait_for_copies()
+    share.rename(gone)
+    share.write_text("no folder")
+    bench.make(serial=OTHER)
+    (copying,) = bench.store.signer.copies
+    assert copying.wait()
+    assert copying.fault
+    watch = Watch(tmp_path, bench.clock.utc, bench.clock.monotonic_s, bench.store.signer.unkept)
+    (check,) = (each for each in watch.look(Board()) if each.name == "heads")
+    assert str(share) in check.text
+    found = verified(bench)
+    assert not found.problems
+    assert found.unreached == (f"{share}: there is no such folder",)
+    assert found.unkept == ("line-2",)
+    assert not found.is_checked_elsewhere
+    share.unlink()
+    gone.rename(share)
+    bench.store = bench.opened()
+    bench.store.recover()
+    bench.store.signer.wait_for_copies()
+    assert verified(bench).is_checked_elsewhere
+
+
+def test_a_share_that_is_not_mounted_is_not_begun_anew(tmp_path: Path) -> None:
+    share = tmp_path / "share"
+    bench = Bench(tmp_path, heads=(share,))
+    bench.make()
+    bench.store.close()
+    shutil.move(share, tmp_path / "away")
+    share.mkdir()
+    bench.store = bench.opened()
+    bench.store.recover()
+    bench.make(serial=OTHER)
+    (copying,) = bench.store.signer.copies
+    assert copying.wait()
+    assert "is it the right share?" in copying.fault
+    assert not list(share.iterdir())
+
+
+def test_a_new_place_gets_the_heads_from_the_first_on(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.make()
+    bench.store.close()
+    bench.heads = (tmp_path / "new",)
+    bench.store = bench.opened()
+    bench.store.recover()
+    bench.store.signer.wait_for_copies()
+    assert verified(bench).is_checked_elsewhere
+
+
+def test_a_folder_in_which_an_older_flasher_kept_all_heads_goes_on(tmp_path: Path) -> None:
+    bench = Bench(tmp_path)
+    bench.make()
+    bench.store.close()
+    (tmp_path / "old").mkdir()
+    shutil.move(beside(bench), tmp_path / "old")
+    bench.heads = (tmp_path / "old",)
+    bench.store = bench.opened()
+    bench.store.recover()
+    bench.make(serial=OTHER)
+    bench.store.signer.wait_for_copies()
+    found = verified(bench)
+    assert found.is_checked_elsewhere
+    assert not found.problems
+
+
+def test_a_place_that_does_not_answer_is_not_waited_for() -> None:
+    ended = Event()
+    silent, good = patiently([ended.wait, lambda: True], 0.01)
+    ended.set()
+    assert "did not answer" in str(silent)
+    assert good is True
+
+
+def test_a_keeping_is_sent_to_another_process_without_its_connections(postgres: Server) -> None:
+    keeping = Keeping(heads=(postgres.url("postgres"),))
+    assert keeping.elsewhere
+    assert pickle.loads(pickle.dumps(keeping)) == keeping  # noqa: S301
