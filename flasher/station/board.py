@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from flasher.protocol.text import printable
@@ -34,6 +35,7 @@ from flasher.station.events import (
 )
 from flasher.station.records.model import Figures, RunState, StepName
 from flasher.station.scans import Word
+from flasher.station.socket import PAGE
 
 STEPS: Final = {
     StepName.CONNECT: say("connect"),
@@ -46,6 +48,8 @@ STEPS: Final = {
     StepName.SAVE: say("save"),
 }
 """What a socket does."""
+_PAGES_MAX: Final = 100
+"""Pages whose last answers are kept."""
 NO_BADGES: Final = say("No badge table: people are taken at their word.")
 
 
@@ -79,6 +83,34 @@ class Row:
     """The label that the virtual unit in it bears: what a trainee has to type."""
 
 
+@dataclass(frozen=True)
+class Answer:
+    """What was said last: to a scan, or of what somebody has to do."""
+
+    text: str = ""
+    is_refusal: bool = False
+    number: int = 0
+    """Later ones have higher numbers."""
+
+
+@dataclass(frozen=True)
+class Spoken:
+    """The last answers: to each page, and to everybody else."""
+
+    to_all: Answer = Answer()
+    to_pages: Mapping[str, Answer] = field(default_factory=dict)
+
+    def to(self, source: str) -> Answer:
+        """The last one that this source is shown: what another page scanned is not its business."""
+        return max(self.to_all, self.to_pages.get(source, Answer()), key=lambda each: each.number)
+
+    def with_answer(self, answer: Answer, source: str) -> Spoken:
+        if not source.startswith(PAGE):
+            return replace(self, to_all=answer)
+        others = {name: each for name, each in self.to_pages.items() if name != source}
+        return replace(self, to_pages=dict([*others.items(), (source, answer)][-_PAGES_MAX:]))
+
+
 @dataclass
 class Board:
     """The whole station."""
@@ -95,12 +127,11 @@ class Board:
     """Address of the operator page, where there is one."""
     records_fault: str = ""
     """Why the last record was not saved; empty when the last one was."""
-    said: str = ""
-    """The answer to the last scan, or what somebody has to do."""
+    answer: Answer = Answer()
+    """The last one to anybody."""
+    spoken: Spoken = Spoken()
     prompt: str = ""
     """What somebody has to do about the label that was scanned last."""
-    is_refusal: bool = False
-    """True when `said` is a refusal."""
     pin_of: str = ""
     """Whose PIN is typed next: what is typed must not be shown. Empty: no PIN is awaited."""
     has_badges: bool = True
@@ -110,8 +141,8 @@ class Board:
     ended: dict[str, RunEnded] = field(default_factory=dict)
     """The last run of each unit, by its serial number."""
     refused: list[ScanRefused] = field(default_factory=list)
-    waiting: set[str] = field(default_factory=set)
-    """Labels that were accepted, and have no socket yet."""
+    waiting: dict[str, str] = field(default_factory=dict)
+    """Labels that were accepted and have no socket yet, and where they were scanned."""
     lost_scanners: dict[str, ScannerChanged] = field(default_factory=dict)
     """Scanners that cannot be read, by their names."""
     unprinted: dict[str, LabelFailed] = field(default_factory=dict)
@@ -120,6 +151,16 @@ class Board:
     virtual_sockets: tuple[str, ...] = ()
     broken: dict[str, str] = field(default_factory=dict)
     """Sockets that will not work any more, with the reason."""
+
+    @property
+    def said(self) -> str:
+        """The answer to the last scan, or what somebody has to do."""
+        return self.answer.text
+
+    @property
+    def is_refusal(self) -> bool:
+        """True when `said` is a refusal."""
+        return self.answer.is_refusal
 
     def apply(self, event: StationEvent) -> None:
         match event:
@@ -135,10 +176,10 @@ class Board:
                 self._scanned(event)
             case PinAwaited() | PinEnded() | LabelPrinted() | LabelFailed() | ScannerChanged():
                 self._beside(event)
-            case OperatorPrompted("", text, _):
+            case OperatorPrompted("", text, _, source):
                 # It comes just before the scan that it belongs to is accepted.
-                self.said = self.prompt = shown(text)
-                self.is_refusal = False
+                self.prompt = shown(text)
+                self.speak(self.prompt, source=source)
             case UnitArrived(socket, _, label):
                 self.labels[socket] = label
                 self.rows[socket].borne = printable(label)
@@ -161,7 +202,7 @@ class Board:
         self.rows = {n: Row(printable(n), is_virtual=n in virtual) for n in event.sockets}
         self.has_badges = event.has_badges
         if not self.has_badges:
-            self.said = NO_BADGES
+            self.speak(NO_BADGES)
         if virtual:
             self.title = f"{self.virtual_words} {self.title}"
 
@@ -177,16 +218,15 @@ class Board:
             return
         self.pin_of = printable(event.person) if isinstance(event, PinAwaited) else ""
         if isinstance(event, PinAwaited):
-            self.is_refusal = False
             text = printable(event.text)
-            self.said = say(
-                "{text}: type the PIN of {name}, or scan CANCEL.", text=text, name=self.pin_of
+            self.speak(
+                say("{text}: type the PIN of {name}, or scan CANCEL.", text=text, name=self.pin_of)
             )
 
     def _scanner(self, event: ScannerChanged) -> None:
         name = printable(event.scanner)
         self.lost_scanners.pop(name, None)
-        self.said, self.is_refusal = beside_words(event), not event.is_ready
+        self.speak(beside_words(event), is_refusal=not event.is_ready)
         if not event.is_ready:
             self.lost_scanners[name] = event
 
@@ -195,7 +235,7 @@ class Board:
             self.unprinted.pop(event.serial, None)
             return
         self.unprinted[event.serial] = event
-        self.said, self.is_refusal = beside_words(event), True
+        self.speak(beside_words(event), is_refusal=True)
         row = self.rows.get(event.socket)
         if row is not None and row.serial == printable(event.serial):
             row.note = self.said
@@ -204,27 +244,34 @@ class Board:
         text = printable(event.text)
         if isinstance(event, ScanRefused):
             self.refused.append(event)
-            self.waiting.discard(event.text)
+            if self.waiting.get(event.text) == event.source:
+                del self.waiting[event.text]
             reason, remedy = shown(event.reason), shown(event.remedy)
-            self.is_refusal = True
-            self.said = say("{text}: {reason} {remedy}", text=text, reason=reason, remedy=remedy)
+            said = say("{text}: {reason} {remedy}", text=text, reason=reason, remedy=remedy)
+            self.speak(said, event.source, is_refusal=True)
         else:
-            self.is_refusal = False
             meaning = say(event.meaning)
             if event.socket and event.meaning != Word.SOCKET.value.lower():
                 socket = printable(event.socket)
-                self.said = say(
+                said = say(
                     "{text}: {meaning} for socket {socket}",
                     text=text, meaning=meaning, socket=socket,
                 )  # fmt: skip
             else:
-                self.said = say("{text}: {meaning}", text=text, meaning=meaning)
+                said = say("{text}: {meaning}", text=text, meaning=meaning)
             if event.meaning == "label" and not event.socket:
-                self.waiting.add(event.text)
-                self.said = say("{said}. {prompt}", said=self.said, prompt=self.prompt)
+                self.waiting[event.text] = event.source
+                said = say("{said}. {prompt}", said=said, prompt=self.prompt)
             elif event.meaning == Word.CANCEL.value.lower():
-                self.waiting.clear()
+                kept = {n: source for n, source in self.waiting.items() if source != event.source}
+                self.waiting = kept
+            self.speak(said, event.source)
         self.prompt = ""
+
+    def speak(self, text: str, source: str = "", *, is_refusal: bool = False) -> None:
+        """Show an answer where its scan came from."""
+        self.answer = Answer(text, is_refusal, self.answer.number + 1)
+        self.spoken = self.spoken.with_answer(self.answer, source)
 
     def _socket(self, event: StationEvent) -> None:
         if isinstance(event, RecordNotSaved):
@@ -240,7 +287,7 @@ class Board:
                 if not state.is_verdict:
                     row.code = ""
             case RunStarted(_, serial):
-                self.waiting.discard(serial)
+                self.waiting.pop(serial, None)
                 row.code = ""
             case StepStarted(_, _, step, try_number, target):
                 row.step = _doing(step, target, try_number)

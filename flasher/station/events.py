@@ -111,17 +111,23 @@ class ScanAccepted(Timed):
     meaning: str
     socket: str = ""
     """The socket that it is for; empty while none is chosen."""
+    source: str = ""
+    """Where it was scanned, as "scanner left"."""
 
 
 @dataclass(frozen=True)
 class ScanRefused(Timed):
-    """A scan was refused and changed nothing. `code` is a stable word, `remedy` one action."""
+    """A scan was refused and changed nothing, or what waited of it was dropped. `code` is a stable
+    word, `remedy` one action.
+    """
 
     text: str
     code: str
     reason: str
     remedy: str
     socket: str = ""
+    source: str = ""
+    """Where it was scanned."""
 
 
 @dataclass(frozen=True)
@@ -159,6 +165,8 @@ class OperatorPrompted(Timed):
     socket: str
     text: str
     limit_s: float | None = None
+    source: str = ""
+    """Where the label was scanned that it is about; empty: it is not about a scan."""
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,9 @@ from flasher.station.scans import (
     Label,
     NotUnderstood,
     Refused,
+    Waiting,
     Word,
+    card_waits,
     check_first,
     check_fits,
     check_free,
@@ -54,7 +56,15 @@ from flasher.station.scans import (
     understand,
     was_in,
 )
-from flasher.station.socket import Binding, LastRun, Occupancy, Phase, Socket
+from flasher.station.socket import (
+    UNNAMED,
+    Binding,
+    LastRun,
+    Occupancy,
+    Phase,
+    Socket,
+    Source,
+)
 
 ARRIVAL_LIMIT_S: Final = 20.0
 SCAN_LIMIT_S: Final = 120.0
@@ -67,10 +77,13 @@ REACH_S: Final = 2.0
 """A unit that is heard sooner after the prompt was in the socket before."""
 IDENTIFY_S: Final = 3.0
 """A unit with an application reports its serial number within this time after power-on."""
+NOTE_S: Final = 15.0
+"""A socket shows for this time that a card or label was dropped."""
 _RESUME: Final = Word.RESUME.value.lower()
 _REPRINT: Final = Word.REPRINT.value.lower()
 _PIN: Final = "pin"
 _FORGOTTEN: Final = "FORGOTTEN"
+_UNIT_CHANGED: Final = "UNIT_CHANGED"
 _AGAIN: Final = say("Scan it again.")
 _NOTHING: Final = say("Nothing to do.")
 
@@ -214,13 +227,8 @@ class Line:
         self._scans_labels = scans_labels
         self._crew = crew or Crew(())
         self._effects: list[Effect] = []
-        self._label = ""
-        """The label that waits for the card of its socket."""
-        self._chosen: Socket | None = None
-        """The socket whose card was scanned, and that waits for its label."""
-        self._is_choice_refused = False
-        """The last card was refused: the label that follows must not go to another socket."""
-        self._forget_at_s: float | None = None
+        self._waiting: dict[str, Waiting] = {}
+        """What was scanned and waits for another scan of the same source, by its name."""
         self._reason = ""
         """Given by REASON, for the next label."""
         self._reasons: dict[str, str] = {}
@@ -253,7 +261,7 @@ class Line:
             socket.out_since_s = now
         socket.out_of_service = what.reason or say("It cannot work.")
         reason = say("Socket {socket} is out of service.", socket=socket.name)
-        self._drop_label(socket, reason, say("Scan it again when it works again."))
+        self._drop_scans(socket, _FORGOTTEN, reason, say("Scan it again when it works again."))
         # What happens in it cannot be seen now. What was silent before stays doubtful.
         socket.own, socket.is_own_known = None, False
         if socket.occupancy is not Occupancy.SILENT:
@@ -262,11 +270,20 @@ class Line:
     def _unit(self, socket: Socket, what: PresenceChanged, now: float) -> None:
         """A unit is heard, reports its serial number, or is not heard any more."""
         if not what.is_there:
-            self._silent(socket, is_certain=what.is_certain)
+            reason = say("Its unit is not heard any more.")
+            remedy = say("Scan it again when it is connected.")
+            self._silent(socket, now, _FORGOTTEN, reason, remedy, is_certain=what.is_certain)
             return
+        if socket.is_exchange(what):
+            reason = say(
+                "The unit in socket {socket} was changed or switched on.", socket=socket.name
+            )
+            remedy = say("Look which unit is in it, then scan it again.")
+            self._silent(socket, now, _UNIT_CHANGED, reason, remedy, is_certain=False)
         was_silent = socket.occupancy in (Occupancy.SILENT, Occupancy.EMPTY)
         is_new = socket.hear(what, is_serial=self._is_serial(what.serial or ""))
         if is_new:
+            socket.arrived_at_s = now
             self._tell(UnitArrived(socket.name, what.how, what.label))
         if socket.phase is not Phase.REST:
             return
@@ -274,28 +291,43 @@ class Line:
             self._scan_borne(socket, what.label, now)
         elif (is_new or was_silent) and socket.label and socket.binding is Binding.NAMED:
             self._arrived_where_named(socket, what.label, now)
-        elif self._label and socket.own == self._label and socket.awaits_label:
-            serial = self._label
-            self._forget_scans()
-            self._bind(socket, serial, Binding.SAID, now)
+        elif (
+            socket.awaits_label
+            and not socket.is_chosen
+            and (waiting := self._label_of(socket.own)) is not None
+        ):
+            serial = waiting.label
+            waiting.forget()
+            self._bind(socket, serial, Binding.SAID, now, waiting.source)
         elif is_new:
             self._arrived_elsewhere(socket)
 
-    def _silent(self, socket: Socket, *, is_certain: bool) -> None:
+    def _silent(
+        self,
+        socket: Socket,
+        now: float,
+        code: str,
+        reason: str,
+        remedy: str,
+        *,
+        is_certain: bool,
+    ) -> None:
+        """The unit that was heard may be out: what was scanned for it is dropped."""
         if not socket.fall_silent(is_certain=is_certain):
             return
         self._tell(UnitRemoved(socket.name))
-        if socket.binding is Binding.NAMED:
+        was_named = bool(socket.label) and socket.binding is Binding.NAMED
+        if was_named:
             socket.begin_at_s = None  # the one that arrived was not the one
-        else:
-            # It was meant for the unit that was there.
-            reason = say("Its unit is not heard any more.")
-            self._drop_label(socket, reason, say("Scan it again when it is connected."))
+        if self._drop_scans(socket, code, reason, remedy, keeps_label=was_named):
+            socket.note = say("{reason} {remedy}", reason=reason, remedy=remedy)
+            socket.note_until_s = now + NOTE_S
 
     def _arrived_where_named(self, socket: Socket, borne: str, now: float) -> None:
         if not borne and now < socket.bound_at_s + REACH_S:
             self._drop_label(
                 socket,
+                _FORGOTTEN,
                 say("A unit was in socket {socket} already.", socket=socket.name),
                 say("Scan it again with the card of its socket."),
             )
@@ -304,7 +336,7 @@ class Line:
                 "The unit in socket {socket} bears {label}.", socket=socket.name, label=borne
             )
             remedy = say("Scan {label}.", label=borne)
-            self._refuse(socket.let_go(), "OTHER_UNIT", reason, remedy, socket)
+            self._refuse(socket.let_go(), "OTHER_UNIT", reason, remedy, socket, socket.source)
         else:
             # It may be one that woke up: it is asked who it is before anything begins.
             socket.begin_at_s = now if borne else now + IDENTIFY_S
@@ -321,7 +353,7 @@ class Line:
                 socket=named.name,
                 here=socket.name,
             )
-            self._tell(OperatorPrompted(socket.name, text))
+            self._tell(OperatorPrompted(socket.name, text, source=named.source.name))
 
     def _claimed(self, socket: Socket, _what: Claimed, _now: float) -> None:
         socket.phase = Phase.RUN
@@ -333,7 +365,7 @@ class Line:
 
     def _not_claimed(self, socket: Socket, what: NotClaimed, _now: float) -> None:
         serial, socket.phase, socket.serial = socket.serial, Phase.REST, ""
-        self._refuse(serial, what.code, what.reason, what.remedy, socket)
+        self._refuse(serial, what.code, what.reason, what.remedy, socket, socket.source)
         socket.note = say("{reason} {remedy}", reason=what.reason, remedy=what.remedy)
         if what.stops_line:
             self.stop(what.code, what.reason, what.remedy)
@@ -363,71 +395,94 @@ class Line:
 
     # -- scans ------------------------------------------------------------------------------------
 
-    def scan(self, text: str, now: float, mounted: str = "") -> None:
-        """Something was scanned; `mounted`: by the scanner of this socket."""
+    def scan(self, text: str, now: float, source: Source = UNNAMED) -> None:
+        """Something was scanned at a source."""
         scanned = text.strip()
         crew = self._crew
         person = crew.find(scanned)
-        if mounted and self._is_serial(scanned):  # not the PIN that a person may be typing
-            socket = self.sockets[mounted]
+        waiting = self._waiting.setdefault(source.name, Waiting(source))
+        is_mounted_label = bool(source.socket) and self._is_serial(scanned)
+        if is_mounted_label and waiting.card is None and not waiting.is_in_doubt:
+            socket = self.sockets[source.socket]
             self._answer(
-                printable(scanned)[:80], lambda: ("label", self._take_mounted(socket, scanned, now))
+                printable(scanned)[:80],
+                source,
+                lambda: ("label", self._take_mounted(socket, scanned, now, source)),
             )
-        elif crew.asked is not None:
-            self._take_pin(crew.asked, scanned, now)
+        elif crew.asked is not None and not is_mounted_label:  # no PIN that somebody types
+            self._take_pin(crew.asked, scanned, source, now)
         elif person is not None:
             crew.person = person
             before, self.operator = self.operator, person.name
             role = person.role.value
             self._audit(AuditEvent.OPERATOR, before=before, now=person.name, role=role)
-            self._tell(ScanAccepted(printable(person.name), "badge"))
+            self._tell(ScanAccepted(printable(person.name), "badge", source=source.name))
         elif crew.may_be_pin(scanned) and not self._is_serial(scanned):
             # Typed too late, or too often: it must not be shown in what is said of it.
             reason = say("No PIN is awaited, and it is no serial number of this recipe.")
-            self._refuse(HIDDEN, "NO_PIN_AWAITED", reason, say("Scan first what needs the PIN."))
+            remedy = say("Scan first what needs the PIN.")
+            self._refuse(HIDDEN, "NO_PIN_AWAITED", reason, remedy, source=source)
         else:
-            self._answer(printable(scanned)[:80], lambda: self._understand(text, now))
+            self._answer(
+                printable(scanned)[:80], source, lambda: self._understand(text, waiting, now)
+            )
         self._go_on(now)
 
-    def _answer(self, shown: str, understand: Callable[[], tuple[str, Socket | None]]) -> None:
+    def _answer(
+        self, shown: str, source: Source, understand: Callable[[], tuple[str, Socket | None]]
+    ) -> None:
         """Tell what came of a scan that is `shown` so."""
         try:
             meaning, socket = understand()
         except Refused as refused:
-            self._refuse(shown, refused.code, refused.reason, refused.remedy)
+            self._refuse(shown, refused.code, refused.reason, refused.remedy, source=source)
         else:
             if meaning not in (_RESUME, _REPRINT, _PIN):  # what came of it is said by other events
                 name = "" if socket is None else socket.name
-                self._tell(ScanAccepted(shown, meaning, name))
+                self._tell(ScanAccepted(shown, meaning, name, source.name))
 
-    def _understand(self, text: str, now: float) -> tuple[str, Socket | None]:
+    def _understand(self, text: str, waiting: Waiting, now: float) -> tuple[str, Socket | None]:
         """What a scan means, and for which socket. Raises Refused."""
         understood = understand(text)
         if isinstance(understood, Label):
             self._crew.check_somebody()
-        was_refused, self._is_choice_refused = self._is_choice_refused, False
+        was_in_doubt = waiting.is_in_doubt
+        # A refused card is for the scan that follows; two of a kind, until it is said which counts.
+        waiting.is_in_doubt = was_in_doubt and bool(waiting.text)
         match understood:
             case Label(serial):
-                if was_refused:
-                    raise Refused(
-                        "NO_SOCKET",
-                        say("The socket that was scanned before it cannot take it."),
-                        say("Scan the card of a socket that can, then the label again."),
-                    )
-                return "label", self._take_label(serial, now)
+                if was_in_doubt and not waiting.label:
+                    raise self._in_doubt(waiting)
+                return "label", self._take_label(serial, waiting, now)
             case Command(word, argument):
                 person = self._crew.check_role(word)
                 if person is not None and person.pin:
-                    asked = self._crew.ask(person, word, argument, now)
+                    asked = self._crew.ask(person, word, argument, now, waiting.source)
                     self._tell(PinAwaited(person.name, asked.text, asked.until_s - now))
                     return _PIN, None
-                return word.value.lower(), self._COMMANDS[word](self, argument, now)
+                return word.value.lower(), self._COMMANDS[word](self, argument, now, waiting)
             case NotUnderstood(why):
+                waiting.is_in_doubt = bool(waiting.text)  # it may have been a second card or label
                 raise Refused("NOT_UNDERSTOOD", why, say("Scan the label again."))
+
+    @staticmethod
+    def _in_doubt(waiting: Waiting) -> Refused:
+        """For a scan that may belong to something that was refused before it."""
+        if not waiting.text:
+            return Refused(
+                "NO_SOCKET",
+                say("The socket that was scanned before it cannot take it."),
+                say("Scan the card of a socket that can, then the label again."),
+            )
+        return Refused(
+            "CARD_WAITS" if waiting.card is not None else "LABEL_WAITS",
+            say("{text} was scanned before and waits, and then something else.", text=waiting.text),
+            say("Scan {text} again, then what belongs to it; or scan CANCEL.", text=waiting.text),
+        )
 
     # -- badges and PINs --------------------------------------------------------------------------
 
-    def _take_pin(self, asked: Asked, scanned: str, now: float) -> None:
+    def _take_pin(self, asked: Asked, scanned: str, source: Source, now: float) -> None:
         """What was scanned while a PIN is awaited: it is never shown."""
         if scanned.upper() == Word.CANCEL.value:
             self._end_pin(asked, "CANCELLED", say("It was cancelled."), _NOTHING)
@@ -441,6 +496,7 @@ class Line:
                 "NO_PIN",
                 say("That is no PIN: it has {form}.", form=FORM_WORDS),
                 say("Type the PIN of {name}, or scan CANCEL.", name=printable(asked.person.name)),
+                source=source,
             )
 
     def pin_checked(self, now: float, *, is_right: bool) -> None:
@@ -454,10 +510,12 @@ class Line:
             crew.asked = None
             crew.was_right(asked.person.name)
             word, argument = asked.word, asked.argument
+            waiting = self._waiting.setdefault(asked.source.name, Waiting(asked.source))
             self._tell(PinEnded(asked.person.name, is_right=True))
             self._answer(
                 printable(asked.text)[:80],
-                lambda: (word.value.lower(), self._COMMANDS[word](self, argument, now)),
+                asked.source,
+                lambda: (word.value.lower(), self._COMMANDS[word](self, argument, now, waiting)),
             )
         elif remedy := crew.lock_words(asked.person.name, now):
             self._end_pin(asked, "PIN_LOCKED", say("Too many wrong PINs."), remedy)
@@ -474,62 +532,81 @@ class Line:
 
     # -- labels and commands ----------------------------------------------------------------------
 
-    def _take_label(self, serial: str, now: float) -> Socket | None:
+    def _take_label(self, serial: str, waiting: Waiting, now: float) -> Socket | None:
         """The socket that a label is for; None while it waits for one. Raises Refused."""
-        chosen = self._chosen
-        if chosen is not None:
-            self._take_for_chosen(chosen, serial, now)
-            return chosen
+        card = waiting.card
+        if card is not None:
+            self._take_for_card(card, serial, waiting, now)
+            return card
+        # The card that follows another label may belong to either.
+        waiting.is_in_doubt = waiting.label not in ("", serial)
         self._check_label(serial)
-        check_first(self.sockets, serial, self._label)
-        placed = place(self.sockets, serial)
+        check_first(self.sockets, serial, waiting)
+        placed = place(self.sockets, serial, waiting.source)
+        for other in self._waiting.values():
+            if other.label == serial and other is not waiting:  # it is where it was scanned last
+                reason = say("It was scanned elsewhere.")
+                self._drop_waiting(other, _FORGOTTEN, reason, _NOTHING)
         if placed is None:
-            self._keep_waiting(serial, now)
+            self._keep_waiting(serial, waiting, now)
             return None
         socket, why = placed
-        self._bind(socket, serial, why, now)
+        self._bind(socket, serial, why, now, waiting.source)
         if why is not Binding.SAID and not socket.is_due(now):
-            self._tell(OperatorPrompted(socket.name, socket.wanted))
+            source = waiting.source.name
+            self._tell(OperatorPrompted(socket.name, socket.wanted, source=source))
         return socket
 
-    def _take_mounted(self, socket: Socket, serial: str, now: float) -> Socket:
-        """A label of the scanner at a socket: as its card and the label. Raises Refused. What waits
-        of another scanner goes on waiting.
-        """
+    def _take_mounted(self, socket: Socket, serial: str, now: float, source: Source) -> Socket:
+        """A label of the scanner at a socket: as its card and the label. Raises Refused."""
         self._crew.check_somebody()
         self._check_label(serial)
         self._check_takes(socket)
-        self._check_for(socket, serial)
+        self._check_for(socket, serial, source)
         if socket.label == serial:  # it scans by itself: nobody says that the unit is there
             raise Refused("DOUBLE_SCAN", say("It was scanned already."), socket.wanted)
-        self._take_for(socket, serial, now)
+        self._take_for(socket, serial, self._waiting[source.name], now)
         return socket
 
-    def _take_for_chosen(self, chosen: Socket, serial: str, now: float) -> None:
-        """A label behind the card of its socket. Raises Refused: the card was for this label."""
+    def _take_for_card(self, card: Socket, serial: str, waiting: Waiting, now: float) -> None:
+        """A label after the card of its socket. Raises Refused: the card was for this label."""
         try:
             self._check_label(serial)
-            self._check_for(chosen, serial)
+            self._check_for(card, serial, waiting.source)
         except Refused:
-            self._forget_scans()
+            self._forget_card(waiting)
             raise
-        self._take_for(chosen, serial, now)
+        self._take_for(card, serial, waiting, now)
 
-    def _check_for(self, socket: Socket, serial: str) -> None:
+    def _check_for(self, socket: Socket, serial: str, source: Source) -> None:
         check_free(socket)
         check_fits(self.sockets, socket, serial)
-        check_one_socket(self.sockets, socket, serial)
+        check_one_socket(self.sockets, socket, serial, source)
 
-    def _take_for(self, socket: Socket, serial: str, now: float) -> None:
+    def _take_for(self, socket: Socket, serial: str, waiting: Waiting, now: float) -> None:
         was_here = socket.label == serial
         for each in self.sockets.values():
-            if each is socket or each.label == serial:
-                each.let_go()  # what was scanned for it before, or it was put elsewhere
-        if socket is self._chosen or serial == self._label:
-            self._forget_scans()
-        self._bind(socket, serial, Binding.SAID, now)
+            if each.label == serial:
+                each.let_go()  # it was put elsewhere
+        for other in self._waiting.values():
+            if other.label == serial:
+                other.forget()
+        reason = say(
+            "Socket {socket} is for {label} now.", socket=socket.name, label=printable(serial)
+        )
+        for other in self._waiting.values():
+            if other.card is socket and other is not waiting:
+                self._drop_waiting(other, _FORGOTTEN, reason, _AGAIN)
+        self._drop_label(socket, _FORGOTTEN, reason, _AGAIN)  # was scanned for it before
+        waiting.forget()
+        self._bind(socket, serial, Binding.SAID, now, waiting.source)
         if was_here:
             socket.begin_at_s = now  # said twice: do not wait until it is heard
+
+    def _label_of(self, own: str | None) -> Waiting | None:
+        """The waiting label of the unit that reports this serial number."""
+        found = (each for each in self._waiting.values() if each.label and each.label == own)
+        return next(found, None)
 
     def _check_line(self) -> None:
         if self.stopped is not None:
@@ -550,14 +627,14 @@ class Line:
             ) from error
         check_known(self.sockets, serial)
 
-    def _keep_waiting(self, serial: str, now: float) -> None:
+    def _keep_waiting(self, serial: str, waiting: Waiting, now: float) -> None:
         if not any(each.can_work for each in self.sockets.values()):
             raise Refused(
                 "SOCKET_BROKEN",
                 say("No socket works."),
                 say("Mend one of them, then scan it again."),
             )
-        self._label, self._forget_at_s = serial, now + SCAN_LIMIT_S
+        waiting.label, waiting.forget_at_s = serial, now + SCAN_LIMIT_S
         shown, before = printable(serial), was_in(self.sockets, serial)
         words = say("Scan the card of the socket that {label} is in, or goes into.", label=shown)
         if before is not None:
@@ -567,24 +644,33 @@ class Line:
                 label=shown,
                 socket=before.name,
             )
-        self._tell(OperatorPrompted("", words))
+        self._tell(OperatorPrompted("", words, source=waiting.source.name))
 
-    def _take_socket(self, argument: str, now: float) -> Socket:
-        self._is_choice_refused = True  # until nothing speaks against it
+    def _take_socket(self, argument: str, now: float, waiting: Waiting) -> Socket:
+        is_again = waiting.card is not None and waiting.card.name.lower() == argument.lower()
+        if waiting.label and waiting.is_in_doubt:
+            raise self._in_doubt(waiting)
+        if not waiting.label:
+            # Until nothing speaks against it: the label that follows must not go elsewhere.
+            waiting.is_in_doubt = True
+            waiting.forget_at_s = None if waiting.card is None else now + CARD_LIMIT_S
         socket = self._named(argument)
         self._check_line()
+        if waiting.card is not None and not is_again:
+            raise self._in_doubt(waiting)
+        if socket.is_chosen and not is_again:
+            raise card_waits(socket)
         self._check_takes(socket)
-        if self._label:
-            check_fits(self.sockets, socket, self._label)
-            serial = self._label
-            self._forget_scans()
-            self._bind(socket, serial, Binding.SAID, now)
+        if waiting.label:
+            serial = waiting.label
+            check_fits(self.sockets, socket, serial)
+            waiting.forget()
+            self._bind(socket, serial, Binding.SAID, now, waiting.source)
         else:
-            self._forget_scans()
-            # Its label waits until it is said whether it is another one.
-            self._chosen, self._forget_at_s = socket, now + CARD_LIMIT_S
-            socket.is_chosen = True
-        self._is_choice_refused = False
+            # Its label waits until it is known whether it is another one.
+            waiting.card, waiting.is_in_doubt, socket.is_chosen = socket, False, True
+            waiting.forget_at_s = now + CARD_LIMIT_S
+            self._clear_drop_note(socket)
         return socket
 
     @staticmethod
@@ -603,7 +689,7 @@ class Line:
             raise Refused("NO_SUCH_SOCKET", say("There is no such socket."), remedy)
         return found
 
-    def _abort(self, argument: str, _now: float) -> Socket:
+    def _abort(self, argument: str, _now: float, _waiting: Waiting) -> Socket:
         socket = self._named(argument)
         if socket.phase is not Phase.RUN:
             reason = say("Nothing runs in socket {socket}.", socket=socket.name)
@@ -612,37 +698,63 @@ class Line:
         self._effects.append(AbortRun(socket.name))
         return socket
 
-    def _free(self, argument: str, _now: float) -> Socket:
+    def _free(self, argument: str, _now: float, _waiting: Waiting) -> Socket:
         socket = self._named(argument)
         check_free(socket)
         reason = say("Socket {socket} is free.", socket=socket.name)
-        self._drop_label(socket, reason, say("Scan it again when it is connected."))
+        remedy = say("Scan it again when it is connected.")
+        self._drop_scans(socket, _FORGOTTEN, reason, remedy)
         socket.last, socket.is_last_there, socket.interrupted, socket.note = None, False, "", ""
         if socket.can_work and not (socket.is_there and socket.sees_units):
             socket.occupancy = Occupancy.EMPTY
         return socket
 
-    def _cancel(self, _argument: str, _now: float) -> None:
-        self._forget_scans()
+    def _cancel(self, _argument: str, _now: float, waiting: Waiting) -> None:
+        """End the wait of what was scanned at this source."""
+        bound = [each for each in self.sockets.values() if each.label]
+        own = [each for each in bound if each.source == waiting.source]
+        if not (own or waiting.text or self._reason):
+            self._check_waits_nowhere(bound)
+        self._forget_card(waiting)
         self._reason = ""
-        self._reasons.clear()
-        for socket in self.sockets.values():
-            socket.let_go()
+        for socket in own:
+            self._reasons.pop(socket.let_go(), None)
 
-    def _set_lot(self, argument: str, _now: float) -> None:
+    def _check_waits_nowhere(self, bound: list[Socket]) -> None:
+        """Raises Refused for a CANCEL that means what was scanned at another source."""
+        waits: list[tuple[str, Source, str]] = [
+            (
+                each.label,
+                each.source,
+                say("Scan CANCEL there, or FREE {socket}.", socket=each.name),
+            )
+            for each in bound
+        ]
+        there = say("Scan CANCEL there.")
+        waits += [(e.text, e.source, there) for e in self._waiting.values() if e.text]
+        if waits:
+            text, source, remedy = waits[0]
+            reason = say(
+                "{text} waits, and was not scanned here ({source}).",
+                text=printable(text),
+                source=source.name or say("a program"),
+            )
+            raise Refused("NOTHING_WAITS", reason, remedy)
+
+    def _set_lot(self, argument: str, _now: float, _waiting: Waiting) -> None:
         self.lot = argument
 
-    def _set_operator(self, argument: str, _now: float) -> None:
+    def _set_operator(self, argument: str, _now: float, _waiting: Waiting) -> None:
         if self._crew.has_badges:
             raise Refused("BADGES", say("Here a badge says who works."), say("Scan your badge."))
         self._audit(AuditEvent.OPERATOR, before=self.operator, now=argument)
         self.operator = argument
 
-    def _give_reason(self, argument: str, _now: float) -> None:
+    def _give_reason(self, argument: str, _now: float, _waiting: Waiting) -> None:
         self._audit(AuditEvent.REASON, text=argument)
         self._reason = argument
 
-    def _reprint(self, argument: str, _now: float) -> None:
+    def _reprint(self, argument: str, _now: float, _waiting: Waiting) -> None:
         self._crew.check_somebody()
         self._effects.append(Reprint(argument, self._with_author({"serial": argument})))
 
@@ -654,7 +766,7 @@ class Line:
         else:
             self._refuse(text, refused.code, refused.reason, refused.remedy)
 
-    def _resume(self, _argument: str, _now: float) -> None:
+    def _resume(self, _argument: str, _now: float, _waiting: Waiting) -> None:
         if self.stopped is None:
             raise Refused("NOT_STOPPED", say("The line is not stopped."), _NOTHING)
         self._audit(AuditEvent.RESUME, code=self.stopped.code)
@@ -683,15 +795,19 @@ class Line:
     # -- the time, and what is due ----------------------------------------------------------------
 
     def tick(self, now: float) -> None:
-        if self._forget_at_s is not None and now >= self._forget_at_s:
-            if self._label:
-                reason = say("No card of a socket was scanned for it.")
-                self._refuse(self._label, _FORGOTTEN, reason, _AGAIN)
-            elif self._chosen is not None:
-                text = f"SOCKET {self._chosen.name}"
-                reason = say("No label was scanned for it.")
-                self._refuse(text, _FORGOTTEN, reason, _AGAIN)
-            self._forget_scans()
+        for waiting in tuple(self._waiting.values()):
+            if waiting.forget_at_s is not None and now >= waiting.forget_at_s:
+                self._drop_waiting(
+                    waiting,
+                    _FORGOTTEN,
+                    say("No card of a socket was scanned for it.")
+                    if waiting.label
+                    else say("No label was scanned for it."),
+                    _AGAIN,
+                )
+                waiting.is_in_doubt = False
+            if not (waiting.text or waiting.is_in_doubt):
+                del self._waiting[waiting.source.name]
         asked = self._crew.asked
         if asked is not None and not self.is_checking_pin and now >= asked.until_s:
             self._end_pin(asked, "NO_PIN", say("No PIN came."), _AGAIN)
@@ -699,12 +815,17 @@ class Line:
             waits = socket.label and socket.begin_at_s is None and socket.phase is Phase.REST
             if waits and now >= socket.bound_at_s + SCAN_LIMIT_S:
                 reason = say("Its unit did not come.")
-                self._drop_label(socket, reason, say("Scan it again with its unit."))
+                self._drop_label(socket, _FORGOTTEN, reason, say("Scan it again with its unit."))
+            if socket.note_until_s is not None and now >= socket.note_until_s:
+                self._clear_drop_note(socket)
         self._go_on(now)
 
     def _go_on(self, now: float) -> None:
         """Start the runs that are due, then report the sockets that changed."""
         for socket in self.sockets.values():
+            came_at_s = max(socket.bound_at_s, socket.arrived_at_s)
+            if socket.label and socket.is_unidentified and now >= came_at_s + IDENTIFY_S:
+                self._drop_unidentified(socket)
             if self.stopped is None and not self.is_closing and socket.is_due(now):
                 serial, socket.label, socket.begin_at_s = socket.label, "", None
                 socket.phase, socket.serial = Phase.CLAIM, serial
@@ -717,12 +838,13 @@ class Line:
                 state, serial, text = shown
                 self._tell(SocketChanged(socket.name, state, serial, text))
 
-    def _bind(self, socket: Socket, serial: str, why: Binding, now: float) -> None:
+    def _bind(self, socket: Socket, serial: str, why: Binding, now: float, source: Source) -> None:
         """Assign the label to the unit in this socket, or to the one that will arrive."""
         if self._reason:
             self._reasons[serial], self._reason = self._reason, ""
         was_here = serial in (socket.interrupted, socket.last.serial if socket.last else "")
-        socket.label, socket.binding, socket.note = serial, why, ""
+        socket.label, socket.binding, socket.source = serial, why, source
+        socket.note, socket.note_until_s = "", None
         socket.begin_at_s, socket.bound_at_s = None, now
         if why is Binding.NAMED:
             return  # the unit that has passed is shown until it has left
@@ -732,17 +854,65 @@ class Line:
         elif why is Binding.SAID or (why is Binding.ONLY and was_here):
             socket.begin_at_s = now + self._arrival_limit_s
 
-    def _drop_label(self, socket: Socket, reason: str, remedy: str) -> None:
+    def _drop_scans(
+        self, socket: Socket, code: str, reason: str, remedy: str, *, keeps_label: bool = False
+    ) -> bool:
+        """Drop the card and the label that wait at a socket; False when none did."""
+        cards = [each for each in self._waiting.values() if each.card is socket]
+        for waiting in cards:
+            self._drop_waiting(waiting, code, reason, remedy)
+        is_label = not keeps_label and self._drop_label(socket, code, reason, remedy)
+        return bool(cards) or is_label
+
+    def _drop_label(self, socket: Socket, code: str, reason: str, remedy: str) -> bool:
         label = socket.let_go()
         if label:
-            self._refuse(label, _FORGOTTEN, reason, remedy, socket)
+            self._refuse(label, code, reason, remedy, socket, socket.source)
+        return bool(label)
 
-    def _forget_scans(self) -> None:
-        if self._chosen is not None:
-            self._chosen.is_chosen = False
-            why = say("SOCKET {socket} was scanned, and not its label.", socket=self._chosen.name)
-            self._drop_label(self._chosen, why, say("Scan it again with the card."))
-        self._label, self._chosen, self._forget_at_s = "", None, None
+    def _drop_waiting(self, waiting: Waiting, code: str, reason: str, remedy: str) -> None:
+        """What waits of a source is dropped, and told to it. A label that follows a dropped card
+        must not go elsewhere.
+        """
+        text, card = waiting.text, waiting.card
+        if text:
+            self._refuse(text, code, reason, remedy, card, waiting.source)
+        self._forget_card(waiting)
+        if card is not None:
+            waiting.is_in_doubt, waiting.forget_at_s = True, None
+
+    def _drop_unidentified(self, socket: Socket) -> None:
+        reason = (
+            say(
+                "The unit in socket {socket} is in its bootloader and cannot say who it is.",
+                socket=socket.name,
+            )
+            if socket.is_in_bootloader
+            else say("The unit in socket {socket} does not say who it is.", socket=socket.name)
+        )
+        remedy = say("Scan SOCKET {socket}, then the label.", socket=socket.name)
+        self._drop_label(socket, "NOT_IDENTIFIED", reason, remedy)
+
+    def _forget_card(self, waiting: Waiting) -> None:
+        """Forget what waits; the label that waited at the chosen socket gave way to the card."""
+        card = waiting.card
+        waiting.forget()
+        if card is not None:
+            why = say("SOCKET {socket} was scanned, and not its label.", socket=card.name)
+            self._drop_label(card, _FORGOTTEN, why, say("Scan it again with the card."))
+
+    @staticmethod
+    def _clear_drop_note(socket: Socket) -> None:
+        if socket.note_until_s is not None:
+            socket.note, socket.note_until_s = "", None
+
+    def drop_all(self, code: str, reason: str, remedy: str) -> None:
+        """Drop every card and label that waits."""
+        for waiting in self._waiting.values():
+            self._drop_waiting(waiting, code, reason, remedy)
+            waiting.is_in_doubt = False
+        for socket in self.sockets.values():
+            self._drop_label(socket, code, reason, remedy)
 
     def stop(self, code: str, reason: str, remedy: str) -> None:
         """Start no run until RESUME. Labels are dropped, since units may be swapped meanwhile."""
@@ -750,12 +920,8 @@ class Line:
             return
         self.stopped = LineStopped(code, reason, remedy)
         self._tell(self.stopped)
-        if self._label:
-            self._refuse(self._label, _FORGOTTEN, say("The line was stopped."), _AGAIN)
-        self._forget_scans()
-        for socket in self.sockets.values():
-            remedy = say("Scan it again when it goes on.")
-            self._drop_label(socket, say("The line was stopped."), remedy)
+        reason = say("The line was stopped.")
+        self.drop_all(_FORGOTTEN, reason, say("Scan it again when it goes on."))
 
     def _is_serial(self, text: str) -> bool:
         try:
@@ -770,10 +936,16 @@ class Line:
         self._effects.append(event)
 
     def _refuse(
-        self, text: str, code: str, reason: str, remedy: str, socket: Socket | None = None
+        self,
+        text: str,
+        code: str,
+        reason: str,
+        remedy: str,
+        socket: Socket | None = None,
+        source: Source = UNNAMED,
     ) -> None:
         name = "" if socket is None else socket.name
-        self._tell(ScanRefused(text, code, reason, remedy, name))
+        self._tell(ScanRefused(text, code, reason, remedy, name, source.name))
         self._audit(AuditEvent.REFUSED_SCAN, text=text, code=code, socket=name)
 
     def _audit(self, what: AuditEvent, **data: str) -> None:
@@ -793,7 +965,7 @@ class Line:
             self._refuse(label, refused.code, refused.reason, refused.remedy, socket)
         else:
             self._tell(ScanAccepted(label, "label", socket.name))
-            self._bind(socket, label, Binding.SAID, now)
+            self._bind(socket, label, Binding.SAID, now, UNNAMED)
 
     # -- the tables -------------------------------------------------------------------------------
 
@@ -816,7 +988,7 @@ class Line:
         },
     }
     """Handlers by phase of the socket and type of the input."""
-    _COMMANDS: ClassVar[Mapping[Word, Callable[[Line, str, float], Socket | None]]] = {
+    _COMMANDS: ClassVar[Mapping[Word, Callable[[Line, str, float, Waiting], Socket | None]]] = {
         Word.SOCKET: _take_socket,
         Word.CANCEL: _cancel,
         Word.ABORT: _abort,

@@ -202,6 +202,12 @@ class PresenceChanged:
     """The serial number that the unit itself says; empty: it has none; None: not said yet."""
     is_certain: bool = False
     """Nothing is in the socket; else nothing is heard, which may be a unit that sleeps."""
+    is_power_up: bool = False
+    """A bootloader announced that its power came: of a unit that was put in, which may be another
+    one than was heard before.
+    """
+    is_in_bootloader: bool = False
+    """Only announcements of a bootloader are heard, and no application."""
 
 
 @dataclass(frozen=True)

@@ -31,6 +31,7 @@ from flasher.station.config import no_two
 from flasher.station.pattern import pattern_of
 from flasher.station.recipe import SerialNumber, ShortText
 from flasher.station.scans import Command, Label, Refused, Word, understand
+from flasher.station.socket import Source
 
 PIN_LIMIT_S: Final = 30.0
 """The PIN has to follow what it is for within this time."""
@@ -130,6 +131,7 @@ class Asked:
     word: Word
     argument: str
     until_s: float
+    source: Source
 
     @property
     def text(self) -> str:
@@ -192,12 +194,12 @@ class Crew:
             )
         return person
 
-    def ask(self, person: Person, word: Word, argument: str, now: float) -> Asked:
+    def ask(self, person: Person, word: Word, argument: str, now: float, source: Source) -> Asked:
         """Wait for the PIN. Raises Refused for a person with too many wrong ones."""
         if remedy := self.lock_words(person.name, now):
             name = printable(person.name)
             raise Refused("PIN_LOCKED", say("Too many wrong PINs of {name}.", name=name), remedy)
-        self.asked = Asked(person, word, argument, now + PIN_LIMIT_S)
+        self.asked = Asked(person, word, argument, now + PIN_LIMIT_S, source)
         return self.asked
 
     def lock_words(self, name: str, now: float) -> str:

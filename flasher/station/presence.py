@@ -25,6 +25,12 @@ SILENCE_S: Final = 2.0
 """A unit of which nothing was heard for so long is out."""
 PROBE_S: Final = 0.5
 """How often a unit is asked whether it is there."""
+PAUSE_S: Final = 0.25
+"""Announcements of one power-up follow each other sooner."""
+_RHYTHM_S: Final = 1.0
+"""Pauses of a bootloader that goes on announcing come again within this time."""
+_ALIKE: Final = 1.5
+"""Two pauses that differ by less than this factor are alike."""
 
 
 class TargetWatcher:
@@ -54,6 +60,13 @@ class TargetWatcher:
         """To a question for its version, whoever asked."""
         self.answer: Content | None = None
         """The last one."""
+        self.power_ups = 0
+        """Announcements that began after a pause, or after the application was heard."""
+        self.is_in_bootloader = False
+        """Nothing but announcements was heard since it announced itself."""
+        self._paused_s = 0.0
+        """The last pause between announcements, and when it ended."""
+        self._paused_at = float("-inf")
         self.serial: str | None = None
         """The serial number in its last answer, empty without one; None: it has not answered."""
 
@@ -62,12 +75,13 @@ class TargetWatcher:
             return
         if frame.can_id in self._own_ids:
             self.heard_at = now
+            if frame.can_id != self._boot.can_id:
+                self.is_in_bootloader = False
         if frame.can_id == self._boot.can_id:
             for found in self._boot.feed(frame.data, now):
                 row = decode(found) if isinstance(found, Message) else None
                 if isinstance(row, BootVersion):
-                    self.announcements += 1
-                    self.announced_at = now
+                    self._announced(now)
                     self.version = printable(row.version)
                 elif isinstance(row, RequestTransfer):
                     self.transfer_requests += 1
@@ -75,6 +89,19 @@ class TargetWatcher:
             for found in self._answers.feed(frame.data, now):
                 if isinstance(found, Message):
                     self._take(found)
+
+    def _announced(self, now: float) -> None:
+        pause_s = float("inf") if self.announced_at is None else now - self.announced_at
+        is_rhythm = (
+            self._paused_s / _ALIKE < pause_s < self._paused_s * _ALIKE
+            and now - pause_s - self._paused_at < _RHYTHM_S
+        )
+        if not self.is_in_bootloader or (pause_s > PAUSE_S and not is_rhythm):
+            self.power_ups += 1
+        if pause_s > PAUSE_S:
+            self._paused_s, self._paused_at = pause_s, now
+        self.announcements += 1
+        self.announced_at, self.is_in_bootloader = now, True
 
     def _take(self, message: Message) -> None:
         """A message that may be the answer."""
@@ -102,8 +129,16 @@ class Presence:
         return bool(self._requests)
 
     @property
-    def _announced(self) -> int:
-        return sum(watcher.announcements for watcher in self._watchers)
+    def _power_ups(self) -> int:
+        return sum(watcher.power_ups for watcher in self._watchers)
+
+    def _is_in_bootloader(self, now: float) -> bool:
+        """True when nothing is heard but announcements."""
+        return all(
+            watcher.is_in_bootloader
+            for watcher in self._watchers
+            if watcher.heard_at is not None and now - watcher.heard_at < SILENCE_S
+        )
 
     def begin(self) -> None:
         """Forget what was heard: after a run, or while nothing could be heard, all may differ."""
@@ -113,7 +148,8 @@ class Presence:
         self._began_at: float | None = None
         self._forget_serials()
         self._told_serial: str | None = None
-        self._announcements = self._announced
+        self._told_in_bootloader = False
+        self._told_power_ups = self._power_ups
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         """One frame of an idle bus."""
@@ -145,16 +181,27 @@ class Presence:
         is_soon = self.is_there is None and now - self._began_at < SILENCE_S
         if is_soon and not heard:
             return None
+        is_power_up = heard and self._power_ups > self._told_power_ups
+        if is_power_up and self.is_there:
+            self._forget_serials()  # what answered before may be out
+        in_bootloader = heard and self._is_in_bootloader(now)
         # What the unit says that it is; None before it has said anything.
         said = [each.serial for each in self._watchers if each.serial is not None]
         serial = next(filter(None, said), "") if said else None
-        if heard == self.is_there and serial == self._told_serial:
+        told = (self.is_there, self._told_serial, self._told_in_bootloader)
+        if (heard, serial, in_bootloader) == told and not is_power_up:
             return None
-        self.is_there = heard
+        self.is_there, self._told_in_bootloader = heard, in_bootloader
+        self._told_power_ups = self._power_ups
         if not heard:
             self._forget_serials()
             self._told_serial = None
             return PresenceChanged(is_there=False)
-        how = "boot version" if self._announced > self._announcements else "traffic"
-        self._told_serial, self._announcements = serial, self._announced
-        return PresenceChanged(is_there=True, how=how, serial=serial)
+        self._told_serial = serial
+        return PresenceChanged(
+            is_there=True,
+            how="boot version" if is_power_up or in_bootloader else "traffic",
+            serial=serial,
+            is_power_up=is_power_up,
+            is_in_bootloader=in_bootloader,
+        )

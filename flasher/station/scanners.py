@@ -18,6 +18,7 @@ from flasher.said import say
 from flasher.station.config import ScannerConfig
 from flasher.station.events import ScannerChanged, ScanRefused, StationEvent
 from flasher.station.keys import KeyDecoder, ScanBuilder
+from flasher.station.socket import Source
 
 REOPEN_S: Final = 1.0
 READ_S: Final = 0.2
@@ -51,14 +52,15 @@ class Scanner:
     def __init__(
         self,
         config: ScannerConfig,
-        submit: Callable[[str, str], None],
+        submit: Callable[[str, Source], None],
         publish: Callable[[StationEvent], None],
         open_scanner: Open | None = None,
     ) -> None:
-        """`submit` gets each scan, and the socket that the scanner belongs to."""
+        """`submit` gets each scan, and the scanner as its source."""
         self.config = config
+        self._source = Source(f"scanner {printable(config.name)}", config.socket)
         self._publish = publish
-        self._builder = ScanBuilder(lambda text: submit(text, config.socket), self._damaged)
+        self._builder = ScanBuilder(lambda text: submit(text, self._source), self._damaged)
         self._open = open_scanner or _opener(config)
         self._device: Reads | None = None
         self._why: str | None = None
@@ -124,6 +126,7 @@ class Scanner:
                 say("A part of a scan of {scanner} is lost.", scanner=printable(self.config.name)),
                 say("Scan it again."),
                 self.config.socket,
+                self._source.name,
             )
         )
 

@@ -1,7 +1,7 @@
 """Scans of the operator: labels of units, and commands, which are barcodes on a card.
 
 SOCKET A      the unit is, or will be, in socket A; for the label before or after it
-CANCEL        forget the label and the socket that wait
+CANCEL        forget the label and the socket that wait, of the scanner that reads it
 ABORT A       stop the run in socket A
 FREE A        the unit is out of socket A, where the station cannot see it
 LOT 4711      the lot of the units that follow
@@ -19,6 +19,9 @@ scanned alone belongs to
   which it knows that nothing is in it.
 
 In all other cases the operator scans the card of the socket.
+
+Each scanner, page and terminal is a `Source` with a card or a label of its own that waits for the
+other (`Waiting`): what two people scan at once does not mix.
 """
 
 from __future__ import annotations
@@ -34,7 +37,7 @@ from flasher.station import codes
 from flasher.station.pattern import TEXT_MAX
 from flasher.station.records.errors import Refusal
 from flasher.station.records.model import RunState
-from flasher.station.socket import Binding, LastRun, Occupancy, Phase, Socket
+from flasher.station.socket import Binding, LastRun, Occupancy, Phase, Socket, Source
 
 _COMMAND_MAX: Final = 200
 
@@ -51,6 +54,32 @@ class Word(StrEnum):
     REASON = "REASON"
     REPRINT = "REPRINT"
     RESUME = "RESUME"
+
+
+@dataclass
+class Waiting:
+    """What was scanned at one source and waits for the scan that belongs to it."""
+
+    source: Source
+    label: str = ""
+    """It waits for the card of its socket."""
+    card: Socket | None = None
+    """The socket whose card waits for its label."""
+    is_in_doubt: bool = False
+    """Something was refused that belongs to what is scanned next, which must not be taken for
+    another unit or socket: a card, or a second card or label beside the one that waits.
+    """
+    forget_at_s: float | None = None
+
+    @property
+    def text(self) -> str:
+        """As it was scanned; empty: nothing waits."""
+        return self.label or ("" if self.card is None else f"{Word.SOCKET.value} {self.card.name}")
+
+    def forget(self) -> None:
+        if self.card is not None:
+            self.card.is_chosen = False
+        self.label, self.card, self.is_in_doubt, self.forget_at_s = "", None, False, None
 
 
 ALONE: Final = frozenset({Word.CANCEL, Word.RESUME})
@@ -115,15 +144,15 @@ class Refused(Exception):  # noqa: N818  a scan that changes nothing
         self.remedy = remedy
 
 
-def place(sockets: Sockets, serial: str) -> tuple[Socket, Binding] | None:
+def place(sockets: Sockets, serial: str, source: Source) -> tuple[Socket, Binding] | None:
     """The socket of a label that was scanned alone; None when the operator has to scan its card.
 
     Raises Refused.
     """
     if len(sockets) == 1:
         (only,) = sockets.values()
-        return only, _why_only(only, serial)
-    idle = [e for e in sockets.values() if e.can_work and e.phase is Phase.REST]
+        return only, _why_only(only, serial, source)
+    idle = [e for e in sockets.values() if e.can_work and e.phase is Phase.REST and not e.is_chosen]
     said = [each for each in idle if each.is_there and each.own == serial]
     if len(said) == 1:
         return said[0], Binding.SAID
@@ -141,7 +170,7 @@ def place(sockets: Sockets, serial: str) -> tuple[Socket, Binding] | None:
     if was_in(sockets, serial) is not None or any(may_be_in):
         return None
     empty = (e for e in sockets.values() if e.occupancy is Occupancy.EMPTY and e.can_work)
-    named = next((e for e in empty if e.phase is Phase.REST and not e.label), None)
+    named = next((e for e in empty if e in idle and not e.label), None)
     return None if named is None else (named, Binding.NAMED)
 
 
@@ -154,11 +183,13 @@ def was_in(sockets: Sockets, serial: str) -> Socket | None:
     return None
 
 
-def _why_only(only: Socket, serial: str) -> Binding:
+def _why_only(only: Socket, serial: str, source: Source) -> Binding:
     check_service(only)
     check_free(only)
+    if only.is_chosen:
+        raise card_waits(only)
     if only.label:
-        raise one_at_a_time(only.label, only.wanted)
+        raise one_at_a_time(only.label, only.wanted, _way_out(only, source))
     last = only.verdict
     if last is None or last.serial == serial:
         return Binding.ONLY
@@ -209,8 +240,10 @@ def check_known(sockets: Sockets, serial: str) -> None:
             raise Refused("JUST_PASSED", reason, say("Take it out, and scan the next unit."))
 
 
-def check_first(sockets: Sockets, serial: str, waiting: str) -> None:
-    """Raises Refused for a label that was scanned already, or behind one that still waits."""
+def check_first(sockets: Sockets, serial: str, waiting: Waiting) -> None:
+    """Raises Refused for a label that was scanned already, or while another one waits: `waiting`
+    is that of the same source.
+    """
     for each in sockets.values():
         if each.label == serial:
             remedy = say(
@@ -220,12 +253,13 @@ def check_first(sockets: Sockets, serial: str, waiting: str) -> None:
             )
             raise Refused("DOUBLE_SCAN", say("It was scanned already."), remedy)
         if each.label and each.binding is Binding.NAMED:
-            raise one_at_a_time(each.label, each.wanted)
-    if waiting:
-        remedy = say("Scan the card of the socket that {label} is in.", label=printable(waiting))
-        if waiting == serial:
+            raise one_at_a_time(each.label, each.wanted, _way_out(each, waiting.source))
+    label = waiting.label
+    if label:
+        remedy = say("Scan the card of the socket that {label} is in.", label=printable(label))
+        if label == serial:
             raise Refused("DOUBLE_SCAN", say("It was scanned already."), remedy)
-        raise one_at_a_time(waiting, remedy)
+        raise one_at_a_time(label, remedy)
 
 
 def check_fits(sockets: Sockets, socket: Socket, serial: str) -> None:
@@ -253,19 +287,34 @@ def _said_by(socket: Socket) -> str:
     return say("The unit in socket {socket} says that it is {own}.", socket=socket.name, own=own)
 
 
-def check_one_socket(sockets: Sockets, socket: Socket, serial: str) -> None:
+def check_one_socket(sockets: Sockets, socket: Socket, serial: str, source: Source) -> None:
     """Raises Refused for a label that a person gave to another socket."""
     for each in sockets.values():
         if each is not socket and each.label == serial and each.binding is not Binding.NAMED:
             reason = say("It was scanned for socket {socket}.", socket=each.name)
-            remedy = say("{wanted} Or scan CANCEL.", wanted=each.wanted)
+            way = _way_out(each, source)
+            remedy = say("{wanted} Or scan {way}.", wanted=each.wanted, way=way)
             raise Refused("DOUBLE_SCAN", reason, remedy)
 
 
-def one_at_a_time(label: str, remedy: str) -> Refused:
+def _way_out(socket: Socket, source: Source) -> str:
+    """What to scan so that a label does not wait for its unit any more."""
+    return Word.CANCEL.value if socket.source == source else f"{Word.FREE.value} {socket.name}"
+
+
+def card_waits(socket: Socket) -> Refused:
+    """For a scan at one source that means a socket whose card was scanned at another one."""
+    return Refused(
+        "CARD_WAITS",
+        say("The card of socket {socket} was scanned elsewhere.", socket=socket.name),
+        say("Its label has to be scanned there, or CANCEL; then scan it here."),
+    )
+
+
+def one_at_a_time(label: str, wanted: str, way: str = Word.CANCEL.value) -> Refused:
     """For a label that is scanned while another one waits."""
     reason = say("{label} was scanned before and waits for its unit.", label=printable(label))
-    return Refused("LABEL_WAITS", reason, say("{wanted} Or scan CANCEL.", wanted=remedy))
+    return Refused("LABEL_WAITS", reason, say("{wanted} Or scan {way}.", wanted=wanted, way=way))
 
 
 def still_there(socket: Socket, last: LastRun) -> Refused:

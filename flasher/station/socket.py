@@ -1,13 +1,15 @@
 """State of one socket: its process, the unit in it, its label and its last run.
 
 A unit is known by what is heard of it. One that falls silent may sleep, and is not taken for one
-that was removed, unless it would tell its serial number when it is heard again.
+that was removed, unless it would tell its serial number when it is heard again. One that announces
+a power-up, or reports another serial number, may be another one that was put in its place.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Final
 
 from flasher.protocol.text import printable
 from flasher.said import say
@@ -17,6 +19,22 @@ from flasher.station.records.model import RunState, UnitState
 
 Shown = tuple[SocketState, str, str]
 """State, serial number and text of a socket."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where scans come from. Two with the same name are one."""
+
+    name: str = ""
+    """As events and messages have it: "scanner left"."""
+    socket: str = field(default="", compare=False)
+    """The socket that it is mounted at."""
+
+
+PAGE: Final = "page "
+"""How the names of browsers' sessions begin."""
+UNNAMED: Final = Source()
+"""Of a program that has one."""
 
 
 class Phase(Enum):
@@ -83,10 +101,16 @@ class Socket:
     label: str = ""
     """The label of the next run."""
     binding: Binding = Binding.SAID
+    source: Source = UNNAMED
+    """Where the label was scanned."""
     begin_at_s: float | None = None
     """When the run begins although no unit is heard, or although it does not say who it is."""
     bound_at_s: float = 0.0
     """When it got its label."""
+    arrived_at_s: float = 0.0
+    """When the unit in it was heard first."""
+    is_in_bootloader: bool = False
+    """Nothing but its bootloader's announcements is heard: it cannot say who it is."""
     serial: str = ""
     """The unit of the run that goes on."""
     last: LastRun | None = None
@@ -98,6 +122,8 @@ class Socket:
     """The unit of a run that a dead station left in this socket."""
     note: str = ""
     """What is wrong with the last label, or with saving."""
+    note_until_s: float | None = None
+    """The note is about what was dropped, and is shown until then."""
     out_since_s: float = 0.0
     """Since when it is out of service."""
     shown: Shown | None = None
@@ -157,11 +183,17 @@ class Socket:
 
     # -- the unit in it ---------------------------------------------------------------------------
 
+    def is_exchange(self, what: PresenceChanged) -> bool:
+        """True when the unit that is heard may be another one than was there a moment ago."""
+        is_other = None not in (self.own, what.serial) and self.own != what.serial
+        return self.is_there and what.is_there and (what.is_power_up or is_other)
+
     def hear(self, what: PresenceChanged, *, is_serial: bool) -> bool:
         """A unit is heard, or says who it is; `is_serial`: by a number of the recipe. True when it
         is another one than before.
         """
         before, self.occupancy = self.occupancy, Occupancy.THERE
+        self.is_in_bootloader = what.is_in_bootloader
         if what.serial is not None:
             self.own, self.is_own_known = what.serial, is_serial
         is_new = self._is_new(before) or bool(what.label)
@@ -188,7 +220,7 @@ class Socket:
 
     def _forget_note(self) -> None:
         """Clear the note: it was about the unit that was there before."""
-        if self.phase is Phase.REST:
+        if self.phase is Phase.REST and self.note_until_s is None:
             self.note = ""
 
     def fall_silent(self, *, is_certain: bool) -> bool:
@@ -196,7 +228,7 @@ class Socket:
         before = self.occupancy
         is_out = is_certain or self.is_own_known or before is Occupancy.EMPTY
         self.occupancy = Occupancy.EMPTY if is_out else Occupancy.SILENT
-        self.own, self.is_own_known, self.borne = None, False, ""
+        self.own, self.is_own_known, self.borne, self.is_in_bootloader = None, False, "", False
         self._forget_note()
         if is_certain:
             self.last = None
@@ -213,10 +245,22 @@ class Socket:
         """True when the unit reports another serial number than the label."""
         return self.is_there and self.is_own_known and self.own != label
 
+    @property
+    def is_unidentified(self) -> bool:
+        """True when its label was not scanned with its card, and the unit in it does not say who it
+        is: it does not answer, or is in its bootloader.
+        """
+        could_say = self.sees_units and self.binding is Binding.NAMED and not self.borne
+        return (
+            self.binding is not Binding.SAID
+            and self.is_there
+            and (self.is_in_bootloader or (could_say and self.own is None))
+        )
+
     def is_due(self, now: float) -> bool:
         """True when the unit of its label is there, as far as known."""
         is_free = self.can_work and self.phase is Phase.REST and not self.is_chosen
-        if not (self.label and is_free):
+        if not (self.label and is_free) or self.is_unidentified:
             return False
         is_time = self.begin_at_s is not None and now >= self.begin_at_s
         if self.binding is Binding.NAMED:
@@ -251,7 +295,8 @@ class Socket:
             return SocketState.SCAN, self.label, words
         last = self.verdict
         if last is not None and last.outcome is not None:
-            return _state_after(last.outcome), last.serial, last.action
+            told = last.action if self.note_until_s is None else self.note
+            return _state_after(last.outcome), last.serial, told
         if self.out_of_service is not None:
             state = SocketState.ERROR if self.out_of_service else SocketState.STARTING
             return state, self.label, self.out_of_service or (self.wanted if self.label else "")
@@ -267,7 +312,8 @@ class Socket:
             return SocketState.SCAN, self.label, wanted
         if self.is_starting:
             return SocketState.STARTING, "", say("Listening for a unit.")
-        card = "" if is_only else say(" and SOCKET {socket}", socket=self.name)
+        needs_card = not is_only or self.is_in_bootloader
+        card = say(" and SOCKET {socket}", socket=self.name) if needs_card else ""
         return self._view_free(card)
 
     def _view_free(self, card: str) -> Shown:
@@ -298,8 +344,8 @@ class Socket:
         if last is None or last.outcome is None:
             return say("Scan the label of the unit{card}.", card=card)
         return say(
-            "After {state} of {serial} nothing was heard. If this is another unit, scan its"
-            " label{card}.",
+            "After {state} of {serial} it was silent or without power. If this is another unit,"
+            " scan its label{card}.",
             state=_state_after(last.outcome).value,
             serial=printable(last.serial),
             card=card,

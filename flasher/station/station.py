@@ -80,11 +80,13 @@ from flasher.station.records.model import (
 from flasher.station.records.store import Store, SystemClock
 from flasher.station.runs import ActiveRun, save, verified_words, with_history
 from flasher.station.scans import Refused
-from flasher.station.socket import Phase, Socket
+from flasher.station.socket import UNNAMED, Phase, Socket, Source
 from flasher.station.supervisor import Launch, ProcessPort, Supervisor, WorkerLost
 
 TURN_S: Final = 0.1
 """How long a turn of the loop waits at the most."""
+SCANS_ENDED: Final = "SCANS_ENDED"
+"""The code of a label that waited when the last scan was done."""
 EventHandler = Callable[[StationEvent], None]
 
 
@@ -147,7 +149,7 @@ class Station:
         self.supervisor = Supervisor(setups, self.clock.monotonic_s, launch)
         self._runs: dict[str, ActiveRun] = {}
         """Runs that are claimed and not saved yet, by their sockets."""
-        self._scans: deque[tuple[str, str]] = deque()
+        self._scans: deque[tuple[str, Source]] = deque()
         self._published: deque[StationEvent] = deque()
         self._notes: deque[tuple[AuditEvent, Mapping[str, str]]] = deque()
         self._checked: deque[bool] = deque()
@@ -200,9 +202,11 @@ class Station:
             )
         self.turn(0.0)
 
-    def submit(self, text: str, socket: str = "") -> None:
-        """Something was scanned; `socket`: by the scanner that is mounted at that one."""
-        self._scans.append((text, socket))
+    def submit(self, text: str, source: Source = UNNAMED) -> None:
+        """Something was scanned. A card waits for a label of the same source, and a label for a
+        card.
+        """
+        self._scans.append((text, source))
         self._wake()
 
     def publish(self, event: StationEvent) -> None:
@@ -214,6 +218,12 @@ class Station:
         """A person did something beside the line; it is in the audit trail after the next turn."""
         self._notes.append((what, data))
         self._wake()
+
+    def drop_waiting(self) -> None:
+        """Drop the cards and labels that wait: no scan follows. Called in the station's thread."""
+        remedy = say("Scan it again when the station runs.")
+        self.line.drop_all(SCANS_ENDED, say("The scans have ended."), remedy)
+        self._carry_out()
 
     def stop(self) -> None:
         """Begin no further unit; `run` returns when the runs that go on have ended."""
@@ -267,8 +277,8 @@ class Station:
             if self._checked:
                 self.line.pin_checked(self._now, is_right=self._checked.popleft())
             else:
-                text, mounted = self._scans.popleft()
-                self.line.scan(text, self._now, mounted)
+                text, source = self._scans.popleft()
+                self.line.scan(text, self._now, source)
             self._carry_out()
 
     def close(self) -> None:

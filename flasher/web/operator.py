@@ -7,6 +7,7 @@ stopped or the station says nothing.
 from __future__ import annotations
 
 import asyncio
+import hashlib
 import json
 import time
 from collections.abc import AsyncIterator, Callable
@@ -19,9 +20,10 @@ from starlette.responses import JSONResponse, RedirectResponse, Response
 from starlette.routing import BaseRoute, Route
 
 from flasher.said import say
-from flasher.station.board import Board, Row
+from flasher.station.board import Board, Row, Spoken
 from flasher.station.events import LineStopped, RunEnded, SocketState, StationEvent
 from flasher.station.health import Check, Watch
+from flasher.station.socket import PAGE, Source
 from flasher.station.tally import EndedRun, Output, Tally
 from flasher.web.feed import Feed
 from flasher.web.pages import Pages, streamed
@@ -29,6 +31,8 @@ from flasher.web.translation import Translator
 
 TAIL_DIGITS: Final = 6
 """Of a serial number, shown large: enough to tell the units on a bench apart."""
+_PAGE_DIGITS: Final = 8
+"""Of the number by which a page is told from others."""
 SCAN_MAX: Final = 300
 """Characters of a scan from a page."""
 HEAD_EVERY_S: Final = 0.1
@@ -76,14 +80,13 @@ class Head:
     output: Output
     health: tuple[Check, ...]
     stopped: LineStopped | None
-    spoken: str
-    is_refusal: bool
+    spoken: Spoken
     is_secret: bool
     """What is typed now must not be shown."""
 
-    def said(self, translate: Translator) -> dict[str, Any]:
-        """The head in a language, for the page's script."""
-        stopped, lot = self.stopped, self.lot
+    def said(self, translate: Translator, source: Source) -> dict[str, Any]:
+        """The head in a language, for the page's script in the session that is this source."""
+        stopped, lot, spoken = self.stopped, self.lot, self.spoken.to(source.name)
         name = lot.name or translate(say("no lot"))
         left = max(lot.size - lot.good, 0)
         return {
@@ -95,8 +98,8 @@ class Head:
             if lot.size
             else name,
             "virtual": translate(self.virtual),
-            "spoken": translate(self.spoken),
-            "is_refusal": self.is_refusal,
+            "spoken": translate(spoken.text),
+            "is_refusal": spoken.is_refusal,
             "is_secret": self.is_secret,
             "stopped": None
             if stopped is None
@@ -199,18 +202,24 @@ class Screen:
             self._tally.output(datetime.now().astimezone()),
             self._watch.look(board),
             board.stopped,
-            board.said,
-            board.is_refusal,
+            board.spoken,
             bool(board.pin_of),
         )
         self.feed.put(_HEAD, head, word=(head.stopped, head.spoken, head.is_secret))
 
 
 class OperatorPage:
-    """The routes of the page. `submit` hands a scan to the station."""
+    """The routes of the page. `submit` hands a scan to the station, with the browser's session as
+    its source.
+    """
 
     def __init__(
-        self, pages: Pages, feed: Feed, submit: Callable[[str], None], *, sound_volume: float
+        self,
+        pages: Pages,
+        feed: Feed,
+        submit: Callable[[str, Source], None],
+        *,
+        sound_volume: float,
     ) -> None:
         self._pages = pages
         self._sound_volume = sound_volume
@@ -234,7 +243,8 @@ class OperatorPage:
         return self._pages.show(request, "line.html", sound_volume=self._sound_volume)
 
     async def _events(self, request: Request) -> Response:
-        return streamed(_messages(self._feed, self._pages.translator_of(request)))
+        translate = self._pages.translator_of(request)
+        return streamed(_messages(self._feed, translate, _source_of(request)))
 
     async def _scan(self, request: Request) -> Response:
         try:
@@ -245,11 +255,19 @@ class OperatorPage:
         if not isinstance(text, str) or not text.strip() or len(text) > SCAN_MAX:
             return JSONResponse({"error": "no scan"}, 400)
         # The station answers it by an event, which every page shows.
-        await asyncio.to_thread(self._submit, text)
+        await asyncio.to_thread(self._submit, text, _source_of(request))
         return JSONResponse({})
 
 
-async def _messages(feed: Feed, translate: Translator) -> AsyncIterator[dict[str, Any]]:
+def _source_of(request: Request) -> Source:
+    """The session of a browser; its token stays secret."""
+    token = str(request.session["token"]).encode()
+    return Source(PAGE + hashlib.sha256(token).hexdigest()[:_PAGE_DIGITS])
+
+
+async def _messages(
+    feed: Feed, translate: Translator, source: Source
+) -> AsyncIterator[dict[str, Any]]:
     async for batch in feed.follow():
         message: dict[str, Any] = {}
         if batch.is_all:
@@ -259,5 +277,5 @@ async def _messages(feed: Feed, translate: Translator) -> AsyncIterator[dict[str
         if tiles:
             message["tiles"] = tiles
         if heads:
-            message["head"] = heads[-1].said(translate)
+            message["head"] = heads[-1].said(translate, source)
         yield message

@@ -146,7 +146,9 @@ class World:
 
     def scan(self, text: str) -> None:
         self.note(f"scan {text}")
-        is_card = text.startswith("SOCKET") or self.line._chosen is not None
+        is_card = text.startswith("SOCKET") or any(
+            each.card for each in self.line._waiting.values()
+        )
         holder = next((s for s in self.line.sockets.values() if s.own == text), None)
         self.way = "card" if is_card or holder is None else "said by the unit"
         self.line.scan(text, self.now)
@@ -345,7 +347,7 @@ class Operator:
         """What the screen still wants is not what comes next."""
         world = self.world
         wants = any("in this socket" in shown.text for shown in world.shown.values())
-        if world.line._label or wants:
+        if any(each.label for each in world.line._waiting.values()) or wants:
             world.scan("CANCEL")
 
     def runs(self, unit: Unit) -> bool:
@@ -385,7 +387,7 @@ class Operator:
             case "WRONG_UNIT" | "DUPLICATE":
                 self.clear()
                 return ""
-            case "STARTING" | "FORGOTTEN" | "NO_SOCKET":
+            case "STARTING" | "FORGOTTEN" | "UNIT_CHANGED" | "NO_SOCKET":
                 self.wait()
                 return ""
         return None

@@ -15,7 +15,7 @@ from flasher.station.events import SocketChanged
 from flasher.station.line import Line
 from flasher.station.messages import PresenceChanged
 from flasher.station.records.model import RunState
-from flasher.station.socket import Binding, Occupancy, Phase, Socket
+from flasher.station.socket import Binding, Occupancy, Phase, Socket, Source
 from tests.loops import each
 from tests.station.line_world import Walk, World
 
@@ -58,9 +58,10 @@ def handle(
 
 def bind_to_the_first_arrival(patch: pytest.MonkeyPatch) -> None:
     def arrived(self: Line, socket: Socket) -> None:
-        if self._label:
-            serial, self._label = self._label, ""
-            self._bind(socket, serial, Binding.SAID, 0.0)
+        for waiting in self._waiting.values():
+            if waiting.label:
+                self._bind(socket, waiting.label, Binding.SAID, 0.0, waiting.source)
+                waiting.forget()
 
     patch.setattr(Line, "_arrived_elsewhere", arrived)
 
@@ -96,9 +97,9 @@ def take_silence_for_an_empty_socket(patch: pytest.MonkeyPatch) -> None:
 
 
 def name_a_socket_of_which_nothing_is_known(patch: pytest.MonkeyPatch) -> None:
-    def place(sockets: scans.Sockets, serial: str) -> tuple[Socket, Binding] | None:
+    def place(sockets: scans.Sockets, serial: str, source: Source) -> tuple[Socket, Binding] | None:
         try:
-            found = scans.place(sockets, serial)
+            found = scans.place(sockets, serial, source)
         except scans.Refused:
             found = None
         free = (e for e in sockets.values() if e.can_work and e.phase is Phase.REST)

@@ -25,6 +25,7 @@ from flasher.station.events import (
 from flasher.station.keys import LENGTH_MAX, PAUSE_S, KeyDecoder, ScanBuilder
 from flasher.station.people import Crew, Person, Role
 from flasher.station.scanners import InputScanner, NoScanner, Reads, Scanner, input_device
+from flasher.station.socket import Source
 from tests.loops import each
 from tests.station.factory import SERIAL, Bench
 from tests.station.line_bench import LineBench
@@ -192,9 +193,11 @@ class Desk:
         self.said: list[StationEvent] = []
         self.scans: list[tuple[str, str]] = []
         config = ScannerConfig(name=name, input="/dev/input/event7", socket=socket)
-        self.scanner = Scanner(
-            config, lambda text, at: self.scans.append((text, at)), self.said.append, self._open
-        )
+        self.scanner = Scanner(config, self._take, self.said.append, self._open)
+
+    def _take(self, text: str, source: Source) -> None:
+        assert source.name == f"scanner {self.scanner.config.name}"
+        self.scans.append((text, source.socket))
 
     def _open(self, builder: ScanBuilder) -> Reads:
         if self.plugged is None or self.plugged.is_gone:
@@ -324,7 +327,7 @@ def test_a_serial_scanner_in_pieces_and_unplugged() -> None:
     said: list[StationEvent] = []
     scans: list[tuple[str, str]] = []
     config = ScannerConfig(name="right", port=os.ttyname(slave), socket="B")
-    scanner = Scanner(config, lambda text, at: scans.append((text, at)), said.append)
+    scanner = Scanner(config, lambda text, at: scans.append((text, at.socket)), said.append)
     assert scanner.step(0.0)
     for piece in (b"W26", b"05002\r", b"\nW2605003\r\nW26", b"05004\t"):
         os.write(master, piece)
@@ -373,8 +376,12 @@ def line(bench: Bench) -> LineBench:
     return LineBench(bench)
 
 
+def scanner_at(socket: str) -> Source:
+    return Source(f"scanner {socket}", socket)
+
+
 def mounted(line: LineBench, text: str, socket: str) -> None:
-    line.station.submit(text, socket)
+    line.station.submit(text, scanner_at(socket))
     line.turn()
 
 
@@ -382,8 +389,8 @@ def test_its_labels_are_for_its_socket(line: LineBench) -> None:
     mounted(line, SERIAL, "B")
     mounted(line, OTHER, "A")
     assert line.of(ScanAccepted) == [
-        ScanAccepted(SERIAL, "label", "B"),
-        ScanAccepted(OTHER, "label", "A"),
+        ScanAccepted(SERIAL, "label", "B", "scanner B"),
+        ScanAccepted(OTHER, "label", "A", "scanner A"),
     ]
     assert line.of(OperatorPrompted) == [], "no socket is named"
     line.arrive("A")
@@ -435,7 +442,7 @@ def test_a_unit_that_has_passed_has_to_leave_first(line: LineBench) -> None:
 
 def test_cards_and_nonsense_mean_the_same_at_every_scanner(line: LineBench) -> None:
     mounted(line, "SOCKET B", "A")
-    line.scan(SERIAL)
+    mounted(line, SERIAL, "A")
     line.arrive("B")
     assert line.last(RunStarted).socket == "B"
     mounted(line, "NONSENSE", "A")
@@ -462,7 +469,8 @@ def test_500_labels_at_the_speed_of_a_scanner_go_where_they_belong(bench: Bench)
     chance, wanted = random.Random(7), []
     for at in range(500):
         wanted.append((f"W2605{at:03}", chance.choice("ABCD")))
-        line.station.submit(*wanted[-1])
+        label, socket = wanted[-1]
+        line.station.submit(label, scanner_at(socket))
     line.turn()
     said = [
         (event.text, event.socket) for event in line.of(ScanAccepted) if event.meaning == "label"

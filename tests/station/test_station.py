@@ -232,13 +232,21 @@ def test_a_unit_that_was_there_before_its_socket_was_named_is_not_begun(line: Li
     assert line.of(RunStarted) == []
 
 
-def test_who_announces_itself_is_asked_who_it_is_before_it_is_begun(line: LineBench) -> None:
+def test_who_does_not_say_who_it_is_needs_the_card_of_its_socket(line: LineBench) -> None:
     line.scan(SERIAL)
     line.arrive("A", None)
-    assert line.of(RunStarted) == []
-    line.bench.clock.go_on(3.0)
+    line.bench.clock.go_on(2.9)
     line.turn()
-    assert line.last(RunStarted).serial == SERIAL, "it has no application that could say it"
+    assert line.of(ScanRefused) == []
+    line.bench.clock.go_on(0.1)
+    line.turn()
+    refused = line.last(ScanRefused)
+    assert (refused.text, refused.code, refused.socket) == (SERIAL, "NOT_IDENTIFIED", "A")
+    assert refused.remedy == "Scan SOCKET A, then the label."
+    assert line.of(RunStarted) == []
+    line.scan("SOCKET A")
+    line.scan(SERIAL)
+    assert line.last(RunStarted).serial == SERIAL
 
 
 def test_a_label_without_its_unit_is_forgotten(line: LineBench) -> None:
@@ -296,7 +304,7 @@ def test_green_goes_when_it_may_be_another_unit(line: LineBench) -> None:
     assert line.state("A") is SocketState.PASS, "it may sleep"
     line.arrive("A", "")
     assert line.state("A") is SocketState.SCAN
-    assert line.text("A").startswith(f"After PASS of {SERIAL} nothing was heard.")
+    assert line.text("A").startswith(f"After PASS of {SERIAL} it was silent")
 
 
 def test_a_socket_out_of_service_is_that(line: LineBench) -> None:

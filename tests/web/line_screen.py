@@ -20,6 +20,7 @@ from flasher.station.events import (
 )
 from flasher.station.health import Watch
 from flasher.station.records.model import RunId, RunKind, RunState
+from flasher.station.socket import Source
 from flasher.station.tally import Tally
 from flasher.web.guard import application
 from flasher.web.operator import Lot, OperatorPage, Screen
@@ -36,6 +37,8 @@ class LineScreen:
     def __init__(self, *sockets: str) -> None:
         self.board = Board()
         self.scans: list[str] = []
+        self.sources: list[Source] = []
+        """Where each was scanned."""
         self.screen = Screen(Tally(), Watch(Path("/"), lambda: datetime.now(UTC), lambda: 0.0))
         self.operator = "Jo"
         self.lot = Lot("L17", 500, 12)
@@ -54,10 +57,15 @@ class LineScreen:
             self.board = Board()
             self.screen._passed.clear()
         self.scans.clear()
+        self.sources.clear()
         sockets = self._sockets
         self.say(StationStarted("line-2", "Battery 36 V", "7", "BAT-36-10", sockets, (), at=AT))
         for name in sockets:
             self.state(name, SocketState.EMPTY)
+
+    def take(self, text: str, source: Source) -> None:
+        self.scans.append(text)
+        self.sources.append(source)
 
     def say(self, event: StationEvent) -> None:
         with self._lock:
@@ -95,7 +103,7 @@ def served(line: LineScreen, port: int = 0, *, closes_feed: bool = True) -> Iter
     """The page of a line while the block runs; gives its address."""
     pages = Pages()
     app = application(
-        OperatorPage(pages, line.screen.feed, line.scans.append, sound_volume=0.3).routes,
+        OperatorPage(pages, line.screen.feed, line.take, sound_volume=0.3).routes,
         hosts={"127.0.0.1"}, secret=_KEY,
     )  # fmt: skip
     with Server(app, "127.0.0.1", port) as server:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -16,7 +17,14 @@ from flasher.cli.output import Output
 from flasher.cli.station.commands import PagesOptions, RecordsOptions, RunOptions
 from flasher.cli.station.documents import StationRunDocument, figures_document
 from flasher.cli.station.place import operator_of, records_of
-from flasher.cli.station.scans import LineReader, ScanFile, Typing, keyboard, read_scans
+from flasher.cli.station.scans import (
+    LineReader,
+    ScanFile,
+    Submit,
+    Typing,
+    keyboard,
+    read_scans,
+)
 from flasher.cli.station.setup import crew_of, labels_of, scanners_of
 from flasher.cli.station.views import JsonLines, Lines, Table, View, figures_line
 from flasher.cli.stop import stop_on_signal
@@ -38,7 +46,8 @@ from flasher.station.recipe_file import load_checked
 from flasher.station.records.errors import RecordError
 from flasher.station.records.keys import Keeping
 from flasher.station.records.store import Store
-from flasher.station.station import Station, StationOptions
+from flasher.station.socket import Source
+from flasher.station.station import SCANS_ENDED, Station, StationOptions
 from flasher.station.supervisor import Launch, ProcessPort
 from flasher.station.virtual_units import next_number
 
@@ -49,6 +58,8 @@ LAUNCH: Launch = ProcessPort
 """How a socket's process is made."""
 END_LIMIT_S: Final = 10.0
 """How long stopped runs have to say their end; what does not is INTERRUPTED at the next start."""
+WAIT_LEFT_S: Final = 4.0
+"""How long a label waits for its unit after the last scan."""
 _LEAVE_S: Final = 2.0
 """A verdict on a virtual unit can be read so long."""
 
@@ -106,7 +117,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
             session.file = ScanFile(
                 scans,
                 list(session.station.line.sockets),
-                session.station.submit,
+                session.submit_from("file of scans"),
                 badges=frozenset() if crew is None else crew.codes,
             )
         session.work()
@@ -191,6 +202,8 @@ class _Session:
     _typing: Typing | None = None
     _was_submitted: bool = False
     _is_used_up: bool = False
+    _used_up_at: float = 0.0
+    """When the last scan was submitted."""
     _failure: FlasherError | None = None
     _page: OperatorView | None = None
     _is_begun: bool = False
@@ -267,13 +280,17 @@ class _Session:
         if sys.stdin.isatty():
             has_pins = self.crew is not None and self.crew.has_pins
             if isinstance(self.view, Table) or has_pins:  # what is typed is not echoed
-                self._typing = Typing(self.station.submit)
+                self._typing = Typing(self.submit_from("terminal"))
                 stack.enter_context(keyboard(self._typing))
             else:
-                LineReader(sys.stdin, self.station.submit).start()
+                LineReader(sys.stdin, self.submit_from("terminal")).start()
         elif not (self.file or self.scans_itself or self._page or self.config.scanner):
-            self._pipe = LineReader(sys.stdin, self.station.submit)
+            self._pipe = LineReader(sys.stdin, self.submit_from("standard input"))
             self._pipe.start()
+
+    def submit_from(self, name: str) -> Submit:
+        """Hands scans of one source to the station."""
+        return partial(self.station.submit, source=Source(name))
 
     def _second_stop(self) -> None:
         """A second Ctrl-C; called in the handler of the signal."""
@@ -283,7 +300,7 @@ class _Session:
 
     def _first_stop(self) -> None:
         text = "No further unit is begun; those that run are finished. Ctrl-C again stops them."
-        self.view.board.said, self.view.board.is_refusal = text, False
+        self.view.board.speak(text)
         self.output.progress(text)
         self.view.refresh()
 
@@ -299,15 +316,27 @@ class _Session:
         except FlasherError as error:
             self._failure = error
             return True
-        is_alone = (self.file or self.scans_itself) and not (self._typing or self._page)
+        is_at_end = self._pipe is not None and self._pipe.is_at_end
+        is_alone = is_at_end or (
+            (self.file or self.scans_itself) and not (self._typing or self._page)
+        )
         if self.station.line.stopped is not None and is_alone:
             return not self.station.is_running  # nobody is there who could scan RESUME
         # What was submitted last is understood only in the station's next turn.
         was_submitted, self._was_submitted = self._was_submitted, self._scans_used_up()
+        self._drop_what_waits()
         is_busy = any(socket.is_busy for socket in self.station.line.sockets.values())
         is_quiet = not (is_busy or self.view.board.waiting)
         self._is_used_up = was_submitted and self._was_submitted and is_quiet
         return self._is_used_up
+
+    def _drop_what_waits(self) -> None:
+        """When no scan follows: a card or label that still waits for its unit is not done."""
+        now = self.station.clock.monotonic_s()
+        if self.scans_itself or not self._was_submitted:
+            self._used_up_at = now
+        elif now - self._used_up_at >= WAIT_LEFT_S:
+            self.station.drop_waiting()
 
     def _check_sockets(self) -> None:
         """Raises BusError when no socket will ever work again."""
@@ -354,12 +383,15 @@ class _Session:
         return code
 
     def _not_done(self) -> list[str]:
-        """Labels of the file that were refused, and have no run."""
-        if self.file is None:
-            return []
-        ended = self.view.board.ended
-        refused = {each.text for each in self.view.board.refused}
-        return sorted(label for label in self.file.labels if label in refused - ended.keys())
+        """Labels that have no run: of the file those that were refused, of standard input those
+        that still waited at its end.
+        """
+        refused = {
+            each.text
+            for each in self.view.board.refused
+            if each.code == SCANS_ENDED or (self.file and each.text in self.file.labels)
+        }
+        return sorted(refused - self.view.board.ended.keys())
 
     def _summary(self) -> Iterator[str]:
         board = self.view.board

@@ -1,0 +1,488 @@
+"""Scans of several sources, and units that change places between the scans: no run is begun on a
+unit with another paper label, and from every state a way of scans leads on.
+"""
+
+from __future__ import annotations
+
+import itertools
+import random
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Final
+
+import pytest
+
+from flasher.protocol.contents import VersionInformation
+from flasher.protocol.fields import Text
+from flasher.protocol.messages import BootVersion
+from flasher.protocol.spec import BMS, Mode
+from flasher.protocol.text import encode_text
+from flasher.protocol.wire import Message, encode, split
+from flasher.station import line
+from flasher.station.events import ScanRefused, SocketState, StationEvent
+from flasher.station.line import Line
+from flasher.station.messages import Ready
+from flasher.station.presence import Presence
+from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.records.model import RunState
+from flasher.station.socket import Socket, Source
+from tests.loops import each
+from tests.station.unit_bench import UnitBench
+
+STEP_S: Final = 0.05
+ONE, TWO = Source("scanner left"), Source("page 2")
+GAPS_S: Final = (0.3, 0.5, 1.0, 3.5)
+STARTS_AFTER_S: Final = 0.5
+"""From power to the application."""
+
+
+def check_serial(text: str) -> None:
+    if not text.startswith("W"):
+        raise ValueError("not of this recipe")
+
+
+@dataclass
+class Unit:
+    """A battery with a paper label: it answers with `own`, and has an application or none."""
+
+    label: str
+    own: str = ""
+    has_application: bool = True
+    power_at: float = 0.0
+    said: int = 0
+    """Announcements since its power came."""
+
+    def put_in(self, now: float) -> None:
+        self.power_at, self.said = now, 0
+
+    def frames(self, now: float) -> list[Message]:
+        """What it sends in this step."""
+        age = now - self.power_at
+        if age < STARTS_AFTER_S or not self.has_application:
+            due = int(age / 0.05)
+            self.said, announces = due, due > self.said and (due <= 4 or not self.has_application)
+            return [BootVersion("BMS", "V1.0.0").to_message(BMS.answer_id)] if announces else []
+        if round(age / STEP_S) % 5:
+            return []
+        texts = ("BM36", self.own, "V1r2r0", "V1r0r0")
+        content = VersionInformation(*(Text(encode_text(text, 16)) for text in texts))
+        return [Message(0x720, Mode.REPORT, 0x1540, content.data())]
+
+
+@dataclass
+class Floor:
+    """A line whose sockets watch units, on virtual time."""
+
+    recipe: LoadedRecipe
+    names: str = "AB"
+    now: float = 100.0
+    events: list[StationEvent] = field(default_factory=list)
+    runs: list[tuple[str, str]] = field(default_factory=list)
+    """Label and socket of each."""
+
+    def __post_init__(self) -> None:
+        self.units: dict[str, Unit] = {}
+        self.presences = {name: Presence(self.recipe.targets) for name in self.names}
+        self.line = Line([Socket(name) for name in self.names], check_serial, operator="jo")
+        self.busy: dict[str, str] = {}
+        for name in self.names:
+            self.line.feed(name, Ready("a bus", sees_units=True), self.now)
+        self.go_on(2.5)
+
+    def go_on(self, seconds: float) -> None:
+        for _ in range(round(seconds / STEP_S)):
+            self.now += STEP_S
+            for name, presence in self.presences.items():
+                unit = self.units.get(name)
+                for message in unit.frames(self.now) if unit else ():
+                    for frame in split(message.can_id, encode(message)):
+                        presence(frame, sent=False, now=self.now)
+                if name in self.busy:
+                    continue
+                change = presence.change(self.now)
+                if change is not None:
+                    self.line.feed(name, change, self.now)
+            self.line.tick(self.now)
+            self.carry_out()
+
+    def carry_out(self) -> None:
+        while effects := self.line.take():
+            for effect in effects:
+                if isinstance(effect, line.ClaimRun):
+                    unit = self.units.get(effect.socket)
+                    assert unit is None or unit.label == effect.serial, (
+                        f"{effect.serial} runs on the unit of {unit.label}"
+                    )
+                    self.runs.append((effect.serial, effect.socket))
+                    self.busy[effect.socket] = effect.serial
+                    self.line.feed(effect.socket, line.Claimed(), self.now)
+                elif isinstance(effect, StationEvent):
+                    self.events.append(effect)
+
+    def end_run(self, name: str, outcome: RunState = RunState.PASS) -> None:
+        del self.busy[name]
+        self.presences[name].begin()
+        self.line.feed(name, line.Ended(), self.now)
+        self.line.feed(name, line.Saved(outcome, "Take it out."), self.now)
+        self.carry_out()
+
+    def scan(self, text: str, source: Source = ONE) -> None:
+        self.line.scan(text, self.now, source)
+        self.carry_out()
+        self.go_on(0.2)
+
+    def put(self, unit: Unit, name: str) -> None:
+        self.units[name] = unit
+        unit.put_in(self.now)
+
+    def put_all(self, *units: Unit) -> None:
+        for name, unit in zip(self.names, units, strict=False):
+            self.put(unit, name)
+        self.go_on(3.0)
+
+    def change_places(self, gap_s: float) -> None:
+        """The units of A and B; both sockets are empty for a while."""
+        a, b = self.units.pop("A"), self.units.pop("B")
+        self.go_on(gap_s)
+        self.put(b, "A")
+        self.put(a, "B")
+        self.go_on(2.5)
+
+    def refused(self) -> list[ScanRefused]:
+        return [event for event in self.events if isinstance(event, ScanRefused)]
+
+    def state(self, name: str) -> SocketState:
+        return self.line.sockets[name].state
+
+    def text(self, name: str) -> str:
+        shown = self.line.sockets[name].shown
+        return "" if shown is None else shown[2]
+
+
+@pytest.fixture(scope="module")
+def recipe(tmp_path_factory: pytest.TempPathFactory) -> LoadedRecipe:
+    return UnitBench(tmp_path_factory.mktemp("recipe")).recipe
+
+
+def pair(own: tuple[str, str] = ("", "")) -> tuple[Unit, Unit]:
+    return Unit("W1", own[0]), Unit("W2", own[1])
+
+
+# -- two people at once ---------------------------------------------------------------------------
+
+CARDS, LABELS = ("SOCKET A", "SOCKET B"), ("W1", "W2")
+
+
+def test_two_people_at_one_source_never_get_each_others_unit(recipe: LoadedRecipe) -> None:
+    """Both cards before both labels, and the other way round, in all orders."""
+    for first, second in ((CARDS, LABELS), (LABELS, CARDS)):
+        for one, two in itertools.product(
+            itertools.permutations(first), itertools.permutations(second)
+        ):
+            floor = Floor(recipe)
+            floor.put_all(*pair())
+            for text in (*one, *two):
+                floor.scan(text)
+            floor.scan("CANCEL")
+            left = {"A": "W1", "B": "W2"}
+            for label, socket in floor.runs:
+                assert left.pop(socket) == label
+            for name, label in left.items():
+                floor.scan(f"SOCKET {name}")
+                floor.scan(label)
+            assert sorted(floor.runs) == [("W1", "A"), ("W2", "B")], (one, two)
+
+
+def test_two_people_at_two_sources_disturb_each_other_in_no_order(recipe: LoadedRecipe) -> None:
+    scans = [("SOCKET A", ONE), ("W1", ONE), ("SOCKET B", TWO), ("W2", TWO)]
+    for order in itertools.permutations(scans):
+        floor = Floor(recipe)
+        floor.put_all(*pair())
+        for text, source in order:
+            floor.scan(text, source)
+        assert sorted(floor.runs) == [("W1", "A"), ("W2", "B")], order
+        assert floor.refused() == []
+
+
+def test_two_units_that_are_put_in_after_their_scans(recipe: LoadedRecipe) -> None:
+    scans = [("SOCKET A", ONE), ("W1", ONE), ("SOCKET B", TWO), ("W2", TWO)]
+    for order in itertools.permutations(scans):
+        if order.index(scans[0]) > order.index(scans[1]):
+            continue  # a label alone goes where the station says
+        if order.index(scans[2]) > order.index(scans[3]):
+            continue
+        floor = Floor(recipe)
+        for text, source in order:
+            floor.scan(text, source)
+        floor.put_all(*pair())
+        assert sorted(floor.runs) == [("W1", "A"), ("W2", "B")], order
+
+
+def test_a_second_card_is_refused_and_says_what_waits(recipe: LoadedRecipe) -> None:
+    floor = Floor(recipe)
+    floor.put_all(*pair())
+    floor.scan("SOCKET A")
+    floor.scan("SOCKET B")
+    refused = floor.refused()[-1]
+    assert (refused.text, refused.code, refused.source) == ("SOCKET B", "CARD_WAITS", ONE.name)
+    assert "SOCKET A was scanned before and waits" in refused.reason
+    floor.scan("W2")
+    assert floor.refused()[-1].text == "W2"
+    assert floor.runs == [], "it is not known for which of the two it was meant"
+    floor.scan("SOCKET A")
+    floor.scan("W1")
+    assert floor.runs == [("W1", "A")], "the same card again says which counts"
+
+
+def test_cancel_ends_the_wait_of_its_own_source_alone(recipe: LoadedRecipe) -> None:
+    floor = Floor(recipe)
+    floor.put_all(*pair())
+    floor.scan("SOCKET A", ONE)
+    floor.scan("SOCKET B", TWO)
+    floor.scan("CANCEL", ONE)
+    floor.scan("W2", TWO)
+    assert floor.runs == [("W2", "B")]
+    floor.scan("SOCKET A", ONE)
+    floor.scan("CANCEL", TWO)
+    refused = floor.refused()[-1]
+    assert (refused.code, refused.source) == ("NOTHING_WAITS", TWO.name)
+    assert "SOCKET A waits" in refused.reason
+    assert ONE.name in refused.reason
+    floor.scan("W1", ONE)
+    assert floor.runs[1:] == [("W1", "A")]
+
+
+def test_a_socket_whose_card_waits_elsewhere_is_not_taken(recipe: LoadedRecipe) -> None:
+    floor = Floor(recipe)
+    floor.put_all(*pair())
+    floor.scan("SOCKET A", ONE)
+    floor.scan("SOCKET A", TWO)
+    assert floor.refused()[-1].code == "CARD_WAITS"
+    floor.scan("W2", TWO)
+    assert floor.refused()[-1].code == "NO_SOCKET"
+    floor.scan("W1", ONE)
+    assert floor.runs == [("W1", "A")]
+
+
+def test_a_label_is_where_it_was_scanned_last(recipe: LoadedRecipe) -> None:
+    floor = Floor(recipe)
+    floor.put_all(*pair())
+    floor.scan("W1", ONE)
+    floor.scan("W1", TWO)
+    dropped = floor.refused()[-1]
+    assert (dropped.text, dropped.source, dropped.reason) == (
+        "W1", ONE.name, "It was scanned elsewhere.",
+    )  # fmt: skip
+    floor.scan("SOCKET A", TWO)
+    assert floor.runs == [("W1", "A")]
+
+
+def test_a_label_of_another_source_can_be_freed_everywhere(recipe: LoadedRecipe) -> None:
+    """Its page is closed, and nobody can scan CANCEL there."""
+    floor = Floor(recipe)
+    floor.scan("FREE A")
+    floor.scan("W1", TWO)
+    floor.scan("W2", ONE)
+    refused = floor.refused()[-1]
+    assert refused.code == "LABEL_WAITS"
+    assert refused.remedy.endswith("Or scan FREE A.")
+    floor.scan("FREE A", ONE)
+    assert (floor.refused()[-1].text, floor.refused()[-1].source) == ("W1", TWO.name)
+    floor.scan("W2", ONE)
+    floor.go_on(3.0)
+    floor.put(Unit("W2"), "A")
+    floor.go_on(4.0)
+    assert floor.runs == [("W2", "A")]
+
+
+# -- a card dies with its unit --------------------------------------------------------------------
+
+
+@each("own", [("", ""), ("M1", "M2"), ("W1", "W2")])
+def test_a_card_does_not_live_longer_than_its_unit(
+    recipe: LoadedRecipe, own: tuple[str, str]
+) -> None:
+    for gap_s, name, label in itertools.product(GAPS_S, "AB", LABELS):
+        floor = Floor(recipe)
+        floor.put_all(*pair(own))
+        floor.scan(f"SOCKET {name}")
+        floor.change_places(gap_s)
+        dropped = floor.refused()[-1]
+        assert (dropped.text, dropped.socket, dropped.source) == (f"SOCKET {name}", name, ONE.name)
+        assert dropped.code == ("UNIT_CHANGED" if gap_s < 2.0 else "FORGOTTEN")
+        if gap_s < 2.0:
+            assert floor.text(name).startswith(f"The unit in socket {name} was changed")
+        floor.scan(label)
+        assert floor.runs == []
+        assert floor.refused()[-1].code == "NO_SOCKET"
+        where = "B" if label == "W1" else "A"
+        floor.scan(f"SOCKET {where}")
+        floor.scan(label)
+        assert floor.runs == [(label, where)], (gap_s, name, label)
+
+
+def test_what_was_dropped_is_shown_for_a_while(recipe: LoadedRecipe) -> None:
+    floor = Floor(recipe)
+    floor.put_all(*pair())
+    floor.scan("SOCKET A")
+    floor.change_places(0.5)
+    said = "The unit in socket A was changed or switched on. Look which unit is in it, then scan"
+    assert floor.text("A").startswith(said)
+    floor.go_on(15.0)
+    assert floor.text("A") == "Scan the label of the unit and SOCKET A."
+    floor.scan("SOCKET A")
+    floor.units.pop("A")
+    floor.go_on(2.5)
+    assert floor.text("A").startswith("Its unit is not heard any more.")
+    floor.go_on(15.0)
+    assert floor.state("A") is SocketState.SILENT
+
+
+def test_a_label_for_an_empty_socket_goes_on_waiting(recipe: LoadedRecipe) -> None:
+    floor = Floor(recipe)
+    floor.scan("SOCKET A")
+    floor.go_on(5.0)
+    floor.scan("W1")
+    floor.go_on(10.0)
+    assert floor.refused() == []
+    floor.put(Unit("W1"), "A")
+    floor.go_on(3.0)
+    assert floor.runs == [("W1", "A")]
+
+
+def test_green_goes_with_its_unit_however_fast_the_next_one_is(recipe: LoadedRecipe) -> None:
+    floor = Floor(recipe)
+    floor.put_all(*pair())
+    floor.scan("SOCKET A")
+    floor.scan("W1")
+    floor.end_run("A")
+    floor.go_on(2.0)
+    assert floor.state("A") is SocketState.PASS
+    floor.change_places(0.3)
+    assert floor.state("A") is SocketState.SCAN
+    assert floor.text("A").startswith("After PASS of W1 it was silent or without power.")
+
+
+def test_a_unit_that_is_switched_off_and_on_is_known_by_its_number(recipe: LoadedRecipe) -> None:
+    floor = Floor(recipe)
+    floor.put_all(*pair(("W1", "W2")))
+    floor.scan("W1")
+    floor.end_run("A")
+    floor.go_on(2.0)
+    floor.units["A"].put_in(floor.now)
+    floor.go_on(2.0)
+    assert floor.state("A") is SocketState.PASS
+
+
+# -- units without an application -----------------------------------------------------------------
+
+
+@each("sockets", ["A", "AB"])
+def test_a_unit_in_its_bootloader_needs_the_card(recipe: LoadedRecipe, sockets: str) -> None:
+    for is_first in (True, False):
+        floor = Floor(recipe, sockets)
+        if is_first:
+            floor.put_all(Unit("W1", has_application=False))
+            assert floor.text("A").endswith("SOCKET A.")
+        floor.scan("W1")
+        floor.go_on(3.0)  # a person needs a moment
+        if not is_first:
+            floor.put_all(Unit("W1", has_application=False))
+        floor.go_on(4.0)
+        assert floor.runs == []
+        if floor.refused():
+            assert floor.refused()[-1].code == "NOT_IDENTIFIED"
+            assert floor.refused()[-1].remedy == "Scan SOCKET A, then the label."
+            floor.scan("SOCKET A")
+            floor.scan("W1")
+        else:
+            floor.scan("SOCKET A")
+        assert floor.runs == [("W1", "A")]
+
+
+def test_a_bootloader_that_goes_on_announcing_is_no_arrival(recipe: LoadedRecipe) -> None:
+    floor = Floor(recipe)
+    floor.put_all(Unit("W1", has_application=False), Unit("W2", has_application=False))
+    floor.scan("SOCKET A")
+    floor.go_on(10.0)
+    assert floor.refused() == []
+    floor.scan("SOCKET A")
+    floor.change_places(0.3)
+    assert floor.refused()[-1].code == "UNIT_CHANGED"
+    floor.scan("W1")
+    floor.scan("SOCKET B")
+    floor.scan("W1")
+    assert floor.runs == [("W1", "B")]
+
+
+# -- anything in any order ------------------------------------------------------------------------
+
+
+def steps(floor: Floor, chance: random.Random, count: int) -> Iterable[str]:
+    """People at two sources, each with a socket and its unit, who are interrupted by each other,
+    and change units at any time. What each of them does is told.
+    """
+    units = {name: Unit(f"W{at + 1}") for at, name in enumerate(floor.names)}
+    table: deque[Unit] = deque(Unit(f"W{at}") for at in range(5, 9))
+    floor.put_all(*units.values())
+    for _ in range(count):
+        source, name = chance.choice((ONE, TWO)), chance.choice(floor.names)
+        match chance.randrange(7):
+            case 0 | 1 if name in floor.units and name not in floor.busy:
+                # Who scans card and label does so for the unit that is in the socket.
+                label = floor.units[name].label
+                yield f"{source.name}: SOCKET {name}, {label}"
+                floor.scan(f"SOCKET {name}", source)
+                floor.go_on(chance.choice((0.0, 0.5)))
+                if chance.random() < 0.4:
+                    yield from exchange(floor, chance, table, name)
+                    label = chance.choice((label, floor.units[name].label))
+                floor.scan(label, source)
+            case 2 if name not in floor.busy:
+                yield from exchange(floor, chance, table, name)
+            case 3 if name in floor.busy:
+                yield f"the run in {name} ends"
+                floor.end_run(name, chance.choice((RunState.PASS, RunState.FAIL)))
+                floor.go_on(3.0)
+                yield from exchange(floor, chance, table, name)
+            case 4:
+                yield f"{source.name}: SOCKET {name}"
+                floor.scan(f"SOCKET {name}", source)
+            case 5:
+                yield f"{source.name}: CANCEL"
+                floor.scan("CANCEL", source)
+            case _:
+                floor.go_on(chance.choice((0.5, 4.0, 16.0)))
+
+
+def exchange(floor: Floor, chance: random.Random, table: deque[Unit], name: str) -> Iterable[str]:
+    gap_s = chance.choice(GAPS_S)
+    table.append(floor.units.pop(name))
+    floor.go_on(gap_s)
+    floor.put(table.popleft(), name)
+    yield f"{floor.units[name].label} into {name} after {gap_s} s"
+    floor.go_on(chance.choice((1.0, 3.0)))
+
+
+def test_no_run_is_begun_on_another_unit_and_nobody_is_stuck(recipe: LoadedRecipe) -> None:
+    runs = 0
+    for seed in range(30):
+        floor, chance = Floor(recipe), random.Random(seed)
+        story: list[str] = []
+        try:
+            story.extend(steps(floor, chance, 40))
+            for name in tuple(floor.busy):
+                floor.end_run(name, RunState.FAIL)
+            floor.go_on(3.0)
+            for source in (ONE, TWO):
+                floor.scan("CANCEL", source)
+            for name in floor.names:
+                before = len(floor.runs)
+                for text in (f"FREE {name}", f"SOCKET {name}", floor.units[name].label):
+                    floor.scan(text)
+                assert len(floor.runs) == before + 1, f"nothing works for {name}"
+        except AssertionError as error:
+            raise AssertionError(f"seed {seed}: {error}\n" + "\n".join(story[-20:])) from error
+        runs += len(floor.runs)
+    assert runs > 100
