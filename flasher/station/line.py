@@ -83,7 +83,6 @@ _RESUME: Final = Word.RESUME.value.lower()
 _REPRINT: Final = Word.REPRINT.value.lower()
 _PIN: Final = "pin"
 _FORGOTTEN: Final = "FORGOTTEN"
-_UNIT_CHANGED: Final = "UNIT_CHANGED"
 _AGAIN: Final = say("Scan it again.")
 _NOTHING: Final = say("Nothing to do.")
 
@@ -276,10 +275,10 @@ class Line:
             return
         if socket.is_exchange(what):
             reason = say(
-                "The unit in socket {socket} was changed or switched on.", socket=socket.name
+                "The unit in socket {socket} was exchanged, or had no power.", socket=socket.name
             )
-            remedy = say("Look which unit is in it, then scan it again.")
-            self._silent(socket, now, _UNIT_CHANGED, reason, remedy, is_certain=False)
+            remedy = say("See which unit is in it, then scan again.")
+            self._silent(socket, now, codes.UNIT_CHANGED.name, reason, remedy, is_certain=False)
         was_silent = socket.occupancy in (Occupancy.SILENT, Occupancy.EMPTY)
         is_new = socket.hear(what, is_serial=self._is_serial(what.serial or ""))
         if is_new:
@@ -476,7 +475,7 @@ class Line:
             )
         return Refused(
             "CARD_WAITS" if waiting.card is not None else "LABEL_WAITS",
-            say("{text} was scanned before and waits, and then something else.", text=waiting.text),
+            say("{text} waits, and something else was scanned after it.", text=waiting.text),
             say("Scan {text} again, then what belongs to it; or scan CANCEL.", text=waiting.text),
         )
 

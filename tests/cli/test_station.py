@@ -8,6 +8,7 @@ import io
 import json
 import signal
 import sys
+import time
 from pathlib import Path
 from typing import Any, get_args
 from xml.etree import ElementTree as Xml
@@ -16,6 +17,7 @@ import pytest
 from argon2 import PasswordHasher
 
 from flasher.cli.main import main
+from flasher.cli.station.run import WAIT_LEFT_S
 from flasher.cli.station.views import JsonLines
 from flasher.errors import ExitCode
 from flasher.settings.reading import Table
@@ -220,6 +222,26 @@ def test_scans_come_from_a_pipe_and_lines_are_for_people(
     assert f"socket 1  {passed}" in run.out
     assert "refused NO_SUCH_SOCKET" in run.out
     assert "1 unit: 1 passed, 0 failed; yield 100 %" in run.out
+
+
+def test_a_label_that_waits_when_the_pipe_has_ended_is_dropped(
+    flasher: Flasher, recipe: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert WAIT_LEFT_S < 5.0
+    monkeypatch.setattr("flasher.cli.station.run.WAIT_LEFT_S", 0.2)
+    monkeypatch.setattr("flasher.station.presence.SILENCE_S", 0.1)
+    monkeypatch.setattr(sys, "stdin", io.StringIO("SOCKET A\nW2605002\n"))
+    sockets = tmp_path / "sockets.toml"
+    bus = 'interface = "virtual"\nchannel = "nobody connects a unit"\n'
+    sockets.write_text(f'[[socket]]\nname = "A"\n{bus}', "utf-8")
+    words = ("--recipe", recipe, "--sockets", sockets, "--database", tmp_path / "r.sqlite")
+    began = time.perf_counter()
+    run = flasher("station", "run", *words, "--lines")
+    assert time.perf_counter() - began < 20.0, "it would be forgotten after two minutes"
+    assert run.code == ExitCode.PARTIAL
+    told = "SCANS_ENDED: W2605002: The scans have ended. Scan it again when the station runs."
+    assert f"refused {told}" in run.out
+    assert "refused  W2605002: SCANS_ENDED" in run.out
 
 
 def test_records_that_cannot_be_written_stop_the_line_and_nothing_passes(

@@ -38,7 +38,7 @@ def test_a_sentence_is_said_by_its_template() -> None:
     wanted = say("Put {label} into socket {socket}.", label="W1", socket="A")
     assert wanted == "Put W1 into socket A."
     assert translator("de")(wanted) == "W1 auf Platz A setzen."
-    both = say("{wanted} Or scan CANCEL.", wanted=wanted)
+    both = say("{wanted} Or scan {way}.", wanted=wanted, way="CANCEL")
     assert translator("de")(both) == "W1 auf Platz A setzen. Oder CANCEL scannen."
     assert translator("en")(both) == both == "Put W1 into socket A. Or scan CANCEL."
 

@@ -333,7 +333,8 @@ class _Session:
     def _drop_what_waits(self) -> None:
         """When no scan follows: a card or label that still waits for its unit is not done."""
         now = self.station.clock.monotonic_s()
-        if self.scans_itself or not self._was_submitted:
+        is_starting = any(socket.is_starting for socket in self.station.line.sockets.values())
+        if self.scans_itself or is_starting or not self._was_submitted:
             self._used_up_at = now
         elif now - self._used_up_at >= WAIT_LEFT_S:
             self.station.drop_waiting()
