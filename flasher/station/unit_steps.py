@@ -30,6 +30,8 @@ from flasher.station.presence import PROBE_S
 from flasher.station.recipe import AfterRestart
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import (
+    AFTER_RESTART,
+    BY_POWER,
     FLASH,
     POWER_CYCLES,
     SERIAL_NUMBER,
@@ -371,7 +373,7 @@ class UnitSteps:
                 raise StepFailedError(codes.NO_RESTART, error.what) from error
         for target in restarting:
             self._await(target)
-        return "by power" if self._power is not None else "by reset"
+        return BY_POWER if self._power is not None else "by reset"
 
     def _verify(self, measured: list[Measurement]) -> str:
         said = []
@@ -401,7 +403,7 @@ class UnitSteps:
         if cycles:
             yield Measurement(POWER_CYCLES, float(cycles))
         if self.targets[0].goes_on:
-            yield Measurement("after restart", text=AfterRestart.CONTINUE.value)
+            yield Measurement(AFTER_RESTART, text=AfterRestart.CONTINUE.value)
 
     def _verify_image(self, target: UnitTarget, measured: list[Measurement]) -> Verified:
         """How far the image is proven now. Raises StepFailedError where something is against it."""

@@ -1,4 +1,5 @@
-"""Checks a PASS against its own bus trace: what was sent, what was answered, and by which unit.
+"""Checks a PASS against its own bus trace: what was sent, what was answered, and by which unit; and
+that it was one unit from its first answer to the last.
 
 The trace is written by another process than the records, frame by frame; here it is read again from
 its bytes alone, by nothing that took part in the run.
@@ -9,17 +10,95 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from math import inf
+from typing import Final
 
 from flasher.host.options import firmware_version
 from flasher.protocol import catalogue, messages
-from flasher.protocol.contents import SerialNumber
+from flasher.protocol.contents import Reset, SerialNumber
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import TARGETS, Node, Target, can_id, packet_count
+from flasher.protocol.spec import BMS, TARGETS, Mode, Node, Target, can_id, packet_count
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Message, Reassembler
-from flasher.station.records.model import FLASH, SERIAL_NUMBER, RunDetails, TargetRecord, Verified
+from flasher.station.records.model import (
+    AFTER_RESTART,
+    BY_POWER,
+    FLASH,
+    POWER_CYCLES,
+    SERIAL_NUMBER,
+    RunDetails,
+    StepName,
+    TargetRecord,
+    Verified,
+)
+
+_BURST_QUIET_S: Final = 0.3
+"""An announcement after so much silence begins another burst."""
+_LEFTOVER_S: Final = 0.25
+"""Announcements up to here after request transfer may have been on their way."""
+_ERASING_QUIET_S: Final = 1.0
+"""The same for a device that was told to update, and has not answered yet."""
+_IDENTITY: Final = ("model", "serial_number", "hardware_version")
+
+
+@dataclass
+class Restarts:
+    """When the bootloader of one target announced itself, and nothing in the trace had caused it.
+    Times are seconds on the trace's clock.
+    """
+
+    uncaused: list[float] = field(default_factory=list)
+    _is_identified: bool = False
+    """It has answered, or was told to update: it has to stay."""
+    _is_due: bool = False
+    """A burst follows what was sent, at any time."""
+    _is_told: bool = False
+    """An update command was sent, and no application has answered since."""
+    _requested_at: float | None = None
+    _announced_at: float | None = None
+    _is_noted: bool = False
+    """The burst that goes on is among them."""
+
+    def sent(self, message: Message, row: object) -> None:
+        """The tool sent something to it."""
+        if isinstance(row, messages.UpdateCommand):
+            self._is_identified = self._is_told = True
+            self._is_due, self._requested_at = False, None
+        elif isinstance(row, Reset | messages.EndOfTransfer | messages.Unknown):
+            # Products may have a reset of their own.
+            self._is_due = self._is_due or message.mode == Mode.WRITE
+            self._requested_at = None
+
+    def answered(self) -> None:
+        """Its application named its version."""
+        self._is_identified = True
+        self._is_due = self._is_told = False
+
+    def take(self, row: object, at_s: float) -> None:
+        """Its bootloader sent something."""
+        if isinstance(row, messages.RequestTransfer) and self._is_told:
+            self._requested_at = at_s
+        if not isinstance(row, messages.BootVersion):
+            return
+        since_s = inf if self._announced_at is None else at_s - self._announced_at
+        self._announced_at = at_s
+        is_new = since_s >= _BURST_QUIET_S
+        self._is_noted = self._is_noted and not is_new
+        if self._requested_at is not None:
+            is_uncaused = at_s - self._requested_at > _LEFTOVER_S
+        elif not is_new:
+            is_uncaused = False
+        elif self._is_due:
+            is_uncaused = self._is_due = False
+        elif self._is_told:
+            is_uncaused = since_s > _ERASING_QUIET_S
+        else:
+            is_uncaused = self._is_identified
+        if is_uncaused and not self._is_noted:
+            self._is_noted = True
+            self.uncaused.append(at_s)
 
 
 @dataclass
@@ -40,14 +119,24 @@ class TraceOfTarget:
     written_serial: str | None = None
     answers: list[bytes] = field(default_factory=list)
     """The data of all other answers: products may have queries of their own."""
+    restarts: Restarts = field(default_factory=Restarts)
+    changes: list[str] = field(default_factory=list)
+    """Fields that name the unit, and became what the tool had not written."""
+    _identity: dict[str, str] = field(default_factory=dict)
+    """As answered last."""
+    _written: dict[str, set[str]] = field(default_factory=dict)
+    """What the tool has written to these fields."""
 
-    def take(self, message: Message) -> None:
+    def take(self, message: Message, at_s: float) -> None:
         """One intact message, of the tool or of the device."""
         decoded = catalogue.decode(message)
+        row = messages.decode(message)
+        if message.can_id == self.target.request_id:
+            self.restarts.sent(message, row if decoded is None else decoded.content)
         if decoded is not None:
             self._take_content(message, decoded.content)
             return
-        row = messages.decode(message)
+        self.restarts.take(row, at_s)
         match row:
             case messages.UpdateCommand():
                 self.packets, self.size_bytes, self.is_complete = {}, row.size_bytes, False
@@ -66,10 +155,20 @@ class TraceOfTarget:
         if message.can_id == self.target.request_id:
             if isinstance(content, SerialNumber):
                 self.written_serial = str(content.serial_number)
+            for name in _IDENTITY:
+                if hasattr(content, name):
+                    self._written.setdefault(name, set()).add(str(getattr(content, name)))
             return
         self.serial = str(getattr(content, "serial_number", "")) or self.serial
         if hasattr(content, "firmware_version"):
             self.version = firmware_version(content)
+            self.restarts.answered()
+            for name in _IDENTITY:
+                value = str(getattr(content, name, ""))
+                is_new = value != self._identity.setdefault(name, value)
+                if is_new and value not in self._written.get(name, ()):
+                    self.changes.append(name.replace("_", " "))
+                self._identity[name] = value
 
     def _end(self) -> None:
         total = packet_count(self.size_bytes)
@@ -104,14 +203,17 @@ def traces_of_targets(
         for each in traces.values()
         for of_id in (each.target.request_id, *ids_of[each.target.node])
     }
-    for at_s, frame in frames:
+    began_s: float | None = None
+    for moment_s, frame in frames:
+        began_s = moment_s if began_s is None else began_s
+        at_s = moment_s - began_s
         if not frame.is_payload or frame.can_id not in streams:
             continue
         stream, each = streams[frame.can_id]
         found = [*stream.tick(at_s), *stream.feed(frame.data, at_s)]
         for message in found:
             if isinstance(message, Message):
-                each.take(message)
+                each.take(message, at_s)
     return traces
 
 
@@ -132,6 +234,9 @@ def contradictions(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Ite
             yield f"the {target.target} answers version {answered}, not {target.version}"
         if said.serial and said.serial != run.serial:
             yield f"it is of the unit {printable(said.serial)}, not of {printable(run.serial)}"
+        for name in dict.fromkeys(said.changes):
+            yield f"the {name} of the {target.target} changed: it is of two units"
+    yield from _restarts(details, traces)
     for write in details.writes:
         said = traces.get(write.target)
         if write.what == SERIAL_NUMBER and said is not None:
@@ -139,6 +244,27 @@ def contradictions(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Ite
                 yield f"the serial number {printable(run.serial)} is not written in it"
             if not said.serial:
                 yield f"the serial number {printable(run.serial)} is not read back in it"
+
+
+def _restarts(details: RunDetails, traces: dict[str, TraceOfTarget]) -> Iterator[str]:
+    """Where a bootloader announced itself without a cause that trace or records hold."""
+    measured = {each.name: each for step in details.steps for each in step.measurements}
+    is_switched = any(
+        step.name == StepName.RESTART.value and step.text == BY_POWER for step in details.steps
+    )
+    known = measured.get(POWER_CYCLES)
+    if AFTER_RESTART in measured or (is_switched and known is None):
+        return  # it was allowed to; records of before this was counted
+    cycles = 0 if known is None else int(known.value or 0)
+    for name, said in traces.items():
+        # The battery supplies the others, and restarts for causes of its own.
+        is_supplied = BMS.name in traces and said.target is not BMS
+        uncaused = [] if is_supplied else said.restarts.uncaused[cycles:]
+        for at_s in uncaused[:1]:
+            yield (
+                f"the {name} announced its bootloader {at_s:.1f} s after the beginning, and nothing"
+                " had restarted it: it lost its supply, or it is another unit"
+            )
 
 
 def _image(target: TargetRecord, said: TraceOfTarget) -> Iterator[str]:
