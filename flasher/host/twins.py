@@ -89,23 +89,22 @@ class _Packet:
 
     unacknowledged: int = 0
     """Copies that have left without an ACK; it outlives an attempt, as an ACK may come late."""
-    acks: int = 0
-    naks: int = 0
+    has_ack: bool = False
+    has_nak: bool = False
     acked_at: float = -inf
     is_odd: bool = False
 
     def begin(self) -> None:
         """A new attempt."""
-        self.acks = self.naks = 0
-        self.is_odd = False
+        self.has_ack = self.has_nak = self.is_odd = False
 
     @property
     def has_two_answers(self) -> bool:
         """True when each copy has its ACK, and there were more answers. A line that spoils many
         frames makes several NAKs of a copy, but no ACK.
         """
-        all_acked = self.acks > 0 and self.unacknowledged <= 0
-        return all_acked and (self.naks > 0 or self.unacknowledged < 0)
+        all_acked = self.has_ack and self.unacknowledged <= 0
+        return all_acked and (self.has_nak or self.unacknowledged < 0)
 
 
 @dataclass
@@ -182,7 +181,7 @@ class Twins:
         """The last reset was confirmed while a bootloader announced itself."""
 
         # The upgrade.
-        self._updates = 0
+        self._was_told_to_update = False
         self._requested_at = inf
         self._left_at = -inf
         self._lost_by = ""
@@ -228,7 +227,7 @@ class Twins:
             for each in self._packets.values():
                 each.begin()
             self._packet = _Packet()
-            self._updates += 1
+            self._was_told_to_update = True
             self._lost_by, self._requested_at = "", inf
             self._is_complete = self._has_ack = False
         elif command is Command.PACKET:
@@ -351,7 +350,7 @@ class Twins:
 
     def _take_feedback(self, answer_id: int, now: float) -> None:
         is_odd = self._feedbacks.is_odd()
-        if self._updates:
+        if self._was_told_to_update:
             self._confirmed.note_feedback()
         else:
             self.is_beside = self.is_beside or self.announces(answer_id, now)
@@ -392,7 +391,7 @@ class Twins:
             return
         if isinstance(row, messages.GeneralFeedback):
             self._take_feedback(message.can_id, now)
-        if not self._updates:
+        if not self._was_told_to_update:
             return
         if self._is_complete and isinstance(row, _OF_A_TRANSFER):
             self._see_two(say("one device continued a transfer that another one had completed"))
@@ -404,7 +403,7 @@ class Twins:
             case messages.Ack(number):
                 self._acknowledged(number, now)
             case messages.Nak():
-                self._packet.naks += 1
+                self._packet.has_nak = True
                 self._weigh(self._packet)
             case messages.Complete():
                 if self._lost_by:
@@ -461,10 +460,10 @@ class Twins:
             )
         packet = self._packets.get(number)
         if packet is None:  # never sent, or long ago
-            self._packet.naks += 1
+            self._packet.has_nak = True
             self._weigh(self._packet)
             return
-        packet.acks += 1
+        packet.has_ack = True
         packet.unacknowledged -= 1
         if packet.unacknowledged < 0 and now - packet.acked_at > _CLEARLY_APART_S:
             self._see_two(
@@ -489,7 +488,7 @@ class Twins:
 
 def _differences(contents: list[Content]) -> Iterator[tuple[str, list[str]]]:
     """Each field that differs, and its values."""
-    for name, codec in contents[0].LAYOUT if len(contents) > 1 else ():
+    for name, codec in contents[0].LAYOUT if contents else ():
         values = [f"{codec.show(getattr(each, name))} {codec.unit}".strip() for each in contents]
         if len(set(values)) > 1:
             yield label(name, codec), list(dict.fromkeys(values))
