@@ -261,8 +261,7 @@ class Station:
             self._hear(socket, message)
         while self._published:
             self.tell(self._published.popleft())
-        while self._notes:
-            self._audit(*self._notes.popleft())
+        self._write_notes()
         self._take_scans()
         if self._is_aborting:
             self._abort_running()
@@ -297,6 +296,7 @@ class Station:
         if self._labels is not None:
             self._labels.close()
             self._tell_labels()
+        self._write_notes()
         self.tell(StationStopped(self.store.station))
 
     @property
@@ -404,6 +404,10 @@ class Station:
             self._not_saved("", "", None, error)
             return False
         return True
+
+    def _write_notes(self) -> None:
+        while self._notes:
+            self._audit(*self._notes.popleft())
 
     def _audit(self, what: AuditEvent, data: Mapping[str, str]) -> None:
         try:

@@ -6,7 +6,9 @@ import errno
 import io
 import json
 import re
+import signal
 import socket
+import sqlite3
 import stat
 import sys
 import threading
@@ -201,6 +203,55 @@ def test_a_password_is_asked_for(flasher: Flasher, asked: list[Any], password: P
     page, refused = asked
     assert "asks for its password" in page
     assert refused == httpx2.codes.UNAUTHORIZED
+
+
+def test_who_signs_in_at_a_page_is_in_the_audit_trail(
+    flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    badges = tmp_path / "badges.toml"
+    badges.write_text('[[person]]\nname = "Sue"\ncode = "BADGE-2"\nrole = "supervisor"\n')
+    threads: list[threading.Thread] = []
+    answers: list[tuple[int, str]] = []
+
+    class Used(Server):
+        def __enter__(self) -> Any:
+            entered = super().__enter__()
+            threads.append(threading.Thread(target=use, args=(self.url,)))
+            threads[0].start()
+            return entered
+
+    def use(url: str) -> None:
+        with httpx2.Client(timeout=30, base_url=url, headers={"origin": url.rstrip("/")}) as client:
+
+            def post(path: str, **fields: str) -> None:
+                found = re.search(r'name="token" value="(.*?)"', client.get("/login").text)
+                assert found is not None
+                answer = client.post(path, data={"token": found[1], **fields})
+                answers.append((answer.status_code, answer.headers.get("location", "")))
+
+            client.get("/runs")
+            post("/login", badge="BADGE-9", pin="0000")
+            post("/login", badge="BADGE-2")
+            page = client.get("/runs").text
+            answers.append((page.count('action="/sign-out"'), ""))
+            post("/sign-out")
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(pages, "Server", Used)
+    records = ("--database", tmp_path / "records.sqlite", "--keys", tmp_path / "keys")
+    flasher(*RUN, "--web", "0", "--badges", badges, *records)
+    threads[0].join(10)
+    assert answers == [(403, ""), (303, "/runs"), (1, ""), (303, "/")]
+    with closing(sqlite3.connect(tmp_path / "records.sqlite")) as connection:
+        rows = connection.execute("SELECT event, data FROM audit ORDER BY id").fetchall()
+    told = [(event, json.loads(data)) for event, data in rows if "sign" in event]
+    address = {"address": "127.0.0.1"}
+    sue = {"number": "1", "name": "Sue", **address}
+    assert told == [
+        ("refused sign-in", {"name": "", "why": "unknown badge", **address}),
+        ("sign-in", {**sue, "role": "supervisor"}),
+        ("sign-out", sue),
+    ]
 
 
 def test_the_secret_of_the_sessions_is_kept_for_this_user_alone(tmp_path: Path) -> None:

@@ -35,6 +35,7 @@ from flasher.station.people import (
     load_badges,
 )
 from flasher.station.pins import Pin
+from flasher.station.records.model import AuditEvent
 from tests.loops import each
 from tests.station.factory import SERIAL, Bench
 from tests.station.line_bench import LineBench
@@ -271,6 +272,14 @@ def test_a_pin_is_checked_beside_the_line_and_what_follows_waits(
     assert line.of(PinEnded) == [PinEnded("Rea", is_right=True)]
     assert line.last(ScanAccepted).text == "LOT L9"
     assert line.checker.done == 2
+
+
+def test_what_a_person_does_at_a_page_is_in_the_trail_after_a_turn(line: LineBench) -> None:
+    line.station.note(AuditEvent.SIGN_IN, {"name": "Sue"})
+    line.turn()
+    line.station.note(AuditEvent.SIGN_OUT, {"name": "Sue"})
+    line.station.close()
+    assert audit(line)[-2:] == [("sign-in", {"name": "Sue"}), ("sign-out", {"name": "Sue"})]
 
 
 def test_a_check_that_fails_is_no_right_pin(line: LineBench) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
+from starlette.routing import BaseRoute
 from starlette.testclient import TestClient
 from starlette.types import ASGIApp
 
@@ -12,6 +13,7 @@ from flasher.station.records.keys import Keeping
 from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.web.answers import Answer, Question, answer_routes
 from flasher.web.guard import application
+from flasher.web.login import Login
 from flasher.web.pages import Pages
 from flasher.web.supervisor import PAGES, Supervisor, open_supervisor
 
@@ -24,17 +26,18 @@ def app_of(database: Path, keys: Path) -> ASGIApp:
     return app_with(open_supervisor(str(database), folder, Keeping(keys), DEFAULT_SHIFTS))
 
 
-def app_with(supervisor: Supervisor) -> ASGIApp:
-    """The pages that it answers."""
+def app_with(supervisor: Supervisor, login: Login | None = None, *more: BaseRoute) -> ASGIApp:
+    """The pages that it answers, and more; with `login` for who signed in."""
 
     async def ask(question: Question) -> Answer:
         return await asyncio.to_thread(supervisor.answer, question)
 
     pages = Pages()
     return application(
-        answer_routes(pages, ask, PAGES),
+        [*more, *answer_routes(pages, ask, PAGES)],
         hosts={"127.0.0.1"},
         secret=_KEY,
+        login=login,
     )
 
 
