@@ -217,8 +217,8 @@ class Line:
         self.lot = lot
         self.stopped: LineStopped | None = None
         """Why the line is stopped; None while it runs."""
-        self.is_checking_pin = False
-        """A PIN is being checked: no scan may be given meanwhile."""
+        self._pin_from: Source | None = None
+        """Where the PIN came from that is being checked."""
         self.is_closing = False
         """No further run is begun."""
         self._check_serial = check_serial
@@ -232,6 +232,11 @@ class Line:
         """Given by REASON, for the next label."""
         self._reasons: dict[str, str] = {}
         """Reasons by label, so that a run that starts in between does not take another one's."""
+
+    @property
+    def is_checking_pin(self) -> bool:
+        """True while a PIN is being checked: no scan may be given meanwhile."""
+        return self._pin_from is not None
 
     def take(self) -> list[Effect]:
         """The effects since the last call; call again after feeding back a result."""
@@ -486,8 +491,13 @@ class Line:
         if scanned.upper() == Word.CANCEL.value:
             self._end_pin(asked, "CANCELLED", say("It was cancelled."), _NOTHING)
         elif is_form(scanned):
-            self._crew.count_try(asked.person.name, now)
-            self.is_checking_pin = True
+            name = asked.person.name
+            if remedy := self._crew.lock_words(name, source, now):
+                reason = say("Too many wrong PINs of {name}.", name=printable(name))
+                self._refuse(HIDDEN, "PIN_LOCKED", reason, remedy, source=source)
+                return
+            self._crew.count_try(name, source, now)
+            self._pin_from = source
             self._effects.append(CheckPin(Pin(scanned), asked.person.pin))
         else:
             self._refuse(
@@ -501,13 +511,12 @@ class Line:
     def pin_checked(self, now: float, *, is_right: bool) -> None:
         """Result of `CheckPin`."""
         crew = self._crew
-        self.is_checking_pin = False
-        asked = crew.asked
-        if asked is None:
+        asked, source, self._pin_from = crew.asked, self._pin_from, None
+        if asked is None or source is None:
             return
         if is_right:
             crew.asked = None
-            crew.was_right(asked.person.name)
+            crew.was_right(asked.person.name, source)
             word, argument = asked.word, asked.argument
             waiting = self._waiting.setdefault(asked.source.name, Waiting(asked.source))
             self._tell(PinEnded(asked.person.name, is_right=True))
@@ -516,11 +525,11 @@ class Line:
                 asked.source,
                 lambda: (word.value.lower(), self._COMMANDS[word](self, argument, now, waiting)),
             )
-        elif remedy := crew.lock_words(asked.person.name, now):
+        elif remedy := crew.lock_words(asked.person.name, source, now):
             self._end_pin(asked, "PIN_LOCKED", say("Too many wrong PINs."), remedy)
         else:
             remedy = say("Type it again, or scan CANCEL.")
-            self._refuse(HIDDEN, "WRONG_PIN", say("The PIN is wrong."), remedy)
+            self._refuse(HIDDEN, "WRONG_PIN", say("The PIN is wrong."), remedy, source=source)
         self._go_on(now)
 
     def _end_pin(self, asked: Asked, code: str, reason: str, remedy: str) -> None:

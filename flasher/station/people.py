@@ -31,7 +31,7 @@ from flasher.station.config import no_two
 from flasher.station.pattern import pattern_of
 from flasher.station.recipe import SerialNumber, ShortText
 from flasher.station.scans import Command, Label, Refused, Word, understand
-from flasher.station.socket import Source
+from flasher.station.socket import PAGE, Source
 
 PIN_LIMIT_S: Final = 30.0
 """The PIN has to follow what it is for within this time."""
@@ -151,8 +151,10 @@ class Crew:
         self.person: Person | None = None
         """Who works here; None before the first badge."""
         self.asked: Asked | None = None
-        self._tries = {each.name: BackOff() for each in self._people.values()}
-        """PINs that were given here, by the person's name."""
+        self._tries: dict[tuple[str, str], BackOff] = {}
+        """PINs that were given, by the person's name and where: who guesses at a page does not stop
+        that person at the scanner.
+        """
 
     @property
     def codes(self) -> frozenset[str]:
@@ -196,22 +198,27 @@ class Crew:
 
     def ask(self, person: Person, word: Word, argument: str, now: float, source: Source) -> Asked:
         """Wait for the PIN. Raises Refused for a person with too many wrong ones."""
-        if remedy := self.lock_words(person.name, now):
+        if remedy := self.lock_words(person.name, source, now):
             name = printable(person.name)
             raise Refused("PIN_LOCKED", say("Too many wrong PINs of {name}.", name=name), remedy)
         self.asked = Asked(person, word, argument, now + PIN_LIMIT_S, source)
         return self.asked
 
-    def lock_words(self, name: str, now: float) -> str:
+    def lock_words(self, name: str, source: Source, now: float) -> str:
         """How long this person has to wait after too many wrong PINs; "" where one is taken."""
-        wait_s = self._tries[name].wait_s(now)
+        wait_s = self._tries_of(name, source).wait_s(now)
         if wait_s == 0.0:
             return ""
         return say("Wait {seconds} s, then scan it again.", seconds=ceil(wait_s))
 
-    def count_try(self, name: str, now: float) -> None:
+    def count_try(self, name: str, source: Source, now: float) -> None:
         """A PIN of this person is going to be checked."""
-        self._tries[name].count(now)
+        self._tries_of(name, source).count(now)
 
-    def was_right(self, name: str) -> None:
-        self._tries[name].reset()
+    def was_right(self, name: str, source: Source) -> None:
+        self._tries_of(name, source).reset()
+
+    def _tries_of(self, name: str, source: Source) -> BackOff:
+        # Of all pages together: a browser can begin any number of sessions.
+        place = PAGE if source.name.startswith(PAGE) else source.name
+        return self._tries.setdefault((name, place), BackOff())

@@ -36,6 +36,7 @@ from flasher.station.people import (
 )
 from flasher.station.pins import Pin
 from flasher.station.records.model import AuditEvent
+from flasher.station.socket import PAGE, Source
 from tests.loops import each
 from tests.station.factory import SERIAL, Bench
 from tests.station.line_bench import LineBench
@@ -246,6 +247,38 @@ def test_each_pause_is_longer_until_a_pin_is_right(line: LineBench, bench: Bench
         line.scan("REASON x")
         line.scan(PIN)
         assert line.last(ScanAccepted).text == "REASON x"
+
+
+def test_who_guesses_at_a_page_does_not_stop_that_person_at_a_scanner(
+    line: LineBench, bench: Bench
+) -> None:
+    pages = [Source(f"{PAGE}{number}") for number in range(3)]
+    scanner = Source("scanner left")
+
+    def scan(text: str, source: Source) -> None:
+        line.station.submit(text, source)
+        line.turn()
+
+    line.scan(REWORK)
+    scan("REASON x", pages[0])
+    for number in range(TRIES_MAX):
+        scan(WRONG, pages[number % 3])  # a browser can begin any number of sessions
+    assert refusal(line) == "PIN_LOCKED"
+    for page in pages:
+        scan("REASON x", page)
+        assert refusal(line) == "PIN_LOCKED"
+    scan("REASON x", scanner)
+    checked = line.checker.done
+    for page in pages:
+        scan(PIN, page)
+        assert (refusal(line), line.last(ScanRefused).text) == ("PIN_LOCKED", HIDDEN)
+    assert line.checker.done == checked == TRIES_MAX
+    scan(PIN, scanner)
+    assert line.last(ScanAccepted).text == "REASON x"
+    bench.clock.go_on(PAUSE_S)
+    scan("REASON y", scanner)
+    scan(PIN, pages[0])
+    assert line.last(ScanAccepted).text == "REASON y"
 
 
 def test_a_pin_is_checked_beside_the_line_and_what_follows_waits(

@@ -42,7 +42,7 @@ def url() -> Iterator[str]:
         are_for_all=False,
     )
     pages, line = Pages(), LineScreen("1", "2")
-    operator = OperatorPage(pages, line.screen.feed, line.scans.append, sound_volume=0.3)
+    operator = OperatorPage(pages, line.screen.feed, line.take, sound_volume=0.3)
     login = Login(
         pages, SystemClock(), lambda _event, _data: None, checker=checker(), badges=badges
     )
