@@ -33,6 +33,7 @@ IDENTITY: Final = ("model", "serial_number", "hardware_version")
 """The fields of a version answer that stay as they are; the firmware version does not."""
 _SPACINGS_OF_QUIET: Final = 6
 _QUIET_MIN_S: Final = 0.3
+_PACE_TOLERANCE: Final = 1.5
 
 
 class Continuity:
@@ -63,6 +64,9 @@ class Continuity:
         self._leftover_s = timings.leftover_boot_version_s
         self.quiet_s = max(_QUIET_MIN_S, _SPACINGS_OF_QUIET * timings.boot_version_spacing_s)
         """No further announcement for so long: the burst (4 of them, 50 ms apart) is over."""
+        self._gap_s = self.quiet_s
+        self._longest_pause_s = 0.0
+        """Between two announcements before it was identified."""
         self._stall_s = stall_s
         self._now = -inf
         self._listened_s = 0.0
@@ -88,20 +92,26 @@ class Continuity:
         """
         if self._is_identified or not self._is_asked:
             return
-        self._is_identified = True
-        self._boot_version = self.watcher.version
+        self._stay()
         if content is not None:
             self._compare(content)
             self.settle()
+
+    def _stay(self) -> None:
+        self._is_identified = True
+        self._boot_version = self.watcher.version
+        # A bootloader without an application may announce itself at a pace of its own.
+        self._gap_s = max(self.quiet_s, _PACE_TOLERANCE * self._longest_pause_s)
 
     def settle(self) -> None:
         """Its application has answered a question of the run: what was restarted has started."""
         self.is_running, self.is_told_to_update = True, False
         self._burst_until, self._announced_s = -inf, None
 
-    def end_transfer(self) -> None:
-        """The new image is complete."""
+    def complete(self) -> None:
+        """A target that cannot be asked has the complete image: it may start by its bootloader."""
         self.is_told_to_update = False
+        self._burst_until = self._now + self._start_s
 
     def cycle_power(self) -> None:
         """The run switches its power off and on."""
@@ -139,7 +149,7 @@ class Continuity:
         answers = watcher.answers
         watcher(frame, sent=False, now=now)
         if watcher.transfer_requests > requests and self.is_told_to_update:
-            self._requested_at = now
+            self._requested_at, self._burst_until = now, -inf
         if watcher.announcements > announcements:
             self._take_announcement(now)
         if watcher.answers > answers and watcher.answer is not None and self._is_identified:
@@ -156,12 +166,14 @@ class Continuity:
             if found.command in (self._reset_command, Command.RESET):
                 self._restart()
             elif found.command == Command.UPDATE:
-                self._is_identified = True
+                if not self._is_identified:
+                    self._stay()
                 self.is_running, self.is_told_to_update = False, True
-                self._burst_until, self._requested_at = -inf, None
+                # A burst that the reset before it has caused may still come: it was lost then.
+                self._requested_at = None
             elif found.command == Command.END_OF_TRANSFER:
                 self._requested_at = None
-                self._burst_until = inf if self._is_asked else now + self._start_s
+                self._burst_until = inf
 
     def _restart(self) -> None:
         self.is_running = False
@@ -171,8 +183,10 @@ class Continuity:
 
     def _take_announcement(self, now: float) -> None:
         since_s = inf if self._announced_s is None else self._listened_s - self._announced_s
-        goes_on, self._announced_s = since_s < self.quiet_s, self._listened_s
+        goes_on, self._announced_s = since_s < self._gap_s, self._listened_s
         if not self._is_identified:
+            if since_s < inf:
+                self._longest_pause_s = max(self._longest_pause_s, since_s)
             return
         if self._requested_at is not None:
             if now - self._requested_at > self._leftover_s:

@@ -244,16 +244,17 @@ class UnitSteps:
             if failed.code not in codes.NEED_POWER_CYCLE:
                 raise
             if self.has_lost_its_session:
-                # One that lost its supply, or another one, announces itself when it has it again.
-                with suppress(BusError, InterruptedByUserError):
-                    target.listen(target.loaded.profile.timings.boot_version_timeout_s)
+                if target.is_unheard:
+                    # Whoever lost its supply, or is put in now, announces itself.
+                    with suppress(BusError, InterruptedByUserError):
+                        target.listen(target.loaded.profile.timings.boot_version_timeout_s)
                 raise
             if not may_rescue:
                 raise
             target.confirm()
             result = self._upgrade(target, at_power_up=True)
         if target.version_request is None:
-            target.continuity.end_transfer()
+            target.continuity.complete()
         else:
             target.continuity.settle()
         statistics = result.outcome.statistics

@@ -28,6 +28,7 @@ from flasher.station import codes
 from flasher.station.codes import Code
 from flasher.station.continuity import Continuity
 from flasher.station.power import PowerControl
+from flasher.station.presence import SILENCE_S
 from flasher.station.recipe_file import LoadedTarget
 
 _LOOK_EVERY_S: Final = 0.05
@@ -164,6 +165,12 @@ class UnitTarget:
             return
         if not self.goes_on:
             raise StepFailedError(codes.UNIT_CHANGED, f"The {self.name} fell silent.")
+
+    @property
+    def is_unheard(self) -> bool:
+        """True when it has sent nothing for a while, not even something damaged."""
+        heard_at = self.watcher.heard_at
+        return heard_at is None or self.clock.now() - heard_at >= SILENCE_S
 
     def hear_waiting(self) -> None:
         """Take what came while nobody listened."""

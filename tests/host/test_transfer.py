@@ -324,6 +324,24 @@ def test_a_later_boot_version_starts_the_transfer_over_as_a_new_attempt() -> Non
     assert outcome.statistics.attempts == 2
 
 
+@pytest.mark.parametrize("attempts", [None, 3])
+def test_a_single_session_ends_with_the_first_restart(attempts: int | None) -> None:
+    bench = Bench(options=UpgradeOptions(single_session=True, attempts=attempts))
+    bench.to_packet(2)
+    bench.wait(0.1)
+    bench.say(BOOT)
+    assert bench.outcome.ending is Ending.RESTARTED
+    assert bench.seen(events.AttemptStarted) == []
+
+
+def test_a_single_session_ends_with_a_packet_that_is_not_answered() -> None:
+    bench = Bench(options=UpgradeOptions(single_session=True, attempts=3))
+    bench.to_packet(2)
+    bench.wait(DEFAULT_TIMINGS.ack_timeout_s * DEFAULT_TIMINGS.packet_tries + 0.1)
+    assert bench.outcome.ending is Ending.PACKET_FAILED
+    assert bench.seen(events.AttemptStarted) == []
+
+
 def test_a_device_that_restarts_again_and_again_ends_the_upgrade() -> None:
     bench = Bench(options=UpgradeOptions(attempts=3))
     bench.to_packet(1)

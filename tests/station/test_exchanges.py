@@ -14,6 +14,7 @@ from flasher.mock.faults import AtTime, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, WELLING, WMC, Target
+from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.settings.manifest import release_of
 from flasher.station.events import OperatorPrompted
 from flasher.station.messages import RunResult
@@ -172,7 +173,7 @@ BETWEEN = [
 
 
 @BOTH_KINDS
-@pytest.mark.parametrize("gap_s", [0.3, 0.5, 3.5, 60.0])
+@pytest.mark.parametrize("gap_s", [0.5, 3.5])
 @pytest.mark.parametrize("note", BETWEEN, ids=" ".join)
 def test_a_unit_that_is_exchanged_between_two_steps(
     tmp_path: Path, numbers: tuple[str, str], gap_s: float, note: tuple[str, ...]
@@ -181,6 +182,13 @@ def test_a_unit_that_is_exchanged_between_two_steps(
     second = replace(NEW_UNIT, factory_version=BMS_VERSION)
     world = Exchange(tmp_path, numbers, gap_s=gap_s, second=second)
     world.at_note(*note)
+    world.check_caught()
+
+
+@pytest.mark.parametrize("gap_s", [0.3, 60.0])
+def test_a_unit_that_is_exchanged_at_once_or_much_later(tmp_path: Path, gap_s: float) -> None:
+    world = Exchange(tmp_path, gap_s=gap_s, second=replace(NEW_UNIT, factory_version=BMS_VERSION))
+    world.at_note("step", "flash bms", "PASS", "")
     world.check_caught()
 
 
@@ -229,6 +237,22 @@ def test_the_power_of_one_unit_that_fails_is_no_different(tmp_path: Path) -> Non
     lose_power_once(bench, 1.0)
     result = bench.run()
     assert (result.outcome, result.code) == (RunState.ERROR, "UNIT_CHANGED"), result
+
+
+@pytest.mark.parametrize("has_application", [True, False])
+def test_units_in_their_bootloaders_that_change_places(
+    tmp_path: Path, *, has_application: bool
+) -> None:
+    """The first one cannot be identified; that another one came is noticed all the same."""
+    world = Exchange(tmp_path)
+    first = MockDevice(BMS, bitrate_bps=250_000, profile=NEW_UNIT, has_application=False)
+    world.bench.put(first)
+    if not has_application:
+        second = MockDevice(BMS, bitrate_bps=250_000, profile=NEW_UNIT, has_application=False)
+        second.power_cut(0.0)
+        world.second = second
+    world.when = lambda: first.program_count > PACKETS // 2
+    world.check_caught()
 
 
 # -- at the moment of the run's own restart -------------------------------------------------------
@@ -433,5 +457,43 @@ def test_a_unit_that_stays_passes(tmp_path: Path, text: str, change: dict[str, o
     targets = (BMS, WMC) if text is TWO_TARGETS else (BMS,)
     bench = UnitBench(tmp_path, text, profile, targets=targets)
     bench.recipe = with_larger_image(bench.recipe)
+    result = bench.run()
+    assert result.outcome is RunState.PASS, result
+
+
+@pytest.mark.parametrize("reset_delay_s", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("reset", ["ignored", "restarts"])
+@pytest.mark.parametrize("has_application", [True, False])
+def test_a_unit_that_stays_passes_however_long_the_records_take(
+    tmp_path: Path, *, has_application: bool, reset: str, reset_delay_s: float
+) -> None:
+    """One without an application announces itself all the time, also while nobody listens."""
+    profile = replace(NEW_UNIT, reset_in_bootloader=reset, reset_delay_s=reset_delay_s)  # type: ignore[arg-type]
+    bench = UnitBench(tmp_path)
+    bench.put(
+        MockDevice(BMS, bitrate_bps=250_000, profile=profile, has_application=has_application)
+    )
+
+    def save_slowly() -> None:
+        until = bench.clock.now() + 2.0
+        while bench.clock.now() < until:
+            bench.bus.advance(until)
+
+    bench.journal.on_note = save_slowly
+    result = bench.run()
+    assert result.outcome is RunState.PASS, result
+
+
+@pytest.mark.parametrize("spacing_s", [0.2, 0.4, 0.9])
+def test_a_bootloader_may_announce_itself_at_a_pace_of_its_own(
+    tmp_path: Path, spacing_s: float
+) -> None:
+    bench = UnitBench(tmp_path)
+    timings = replace(DEFAULT_TIMINGS, boot_version_spacing_s=spacing_s)
+    bench.put(
+        MockDevice(
+            BMS, bitrate_bps=250_000, profile=NEW_UNIT, timings=timings, has_application=False
+        )
+    )
     result = bench.run()
     assert result.outcome is RunState.PASS, result
