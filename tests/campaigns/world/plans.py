@@ -18,7 +18,7 @@ much later. The first device is the one that is meant, a second one its twin.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, field, fields
 from typing import Any, ClassVar, Final, Literal, get_args, get_origin, get_type_hints
 
@@ -350,16 +350,23 @@ class Plan:
 
     @classmethod
     def parse(cls, text: str) -> Plan:
-        lines = (part.strip() for line in text.splitlines() for part in line.split(";"))
-        return cls(tuple(_clause(line) for line in lines if line))
+        return cls(tuple(parse_clauses(text, CLAUSES)))
 
 
-def _clause(line: str) -> Clause:
+def parse_clauses(text: str, kinds: Mapping[str, type[Clause]]) -> Iterator[Clause]:
+    """The clauses of a text. Raises ValueError for one that is none of `kinds`."""
+    lines = (part.strip() for line in text.splitlines() for part in line.split(";"))
+    for line in lines:
+        if line:
+            yield _clause(line, kinds)
+
+
+def _clause(line: str, kinds: Mapping[str, type[Clause]]) -> Clause:
     words = line.split()
     when = When.parse(words.pop(0)) if words and words[0].startswith("@") else None
-    if not words or words[0] not in CLAUSES:
-        raise ValueError(f"{line!r} begins with no name of a clause: {', '.join(CLAUSES)}")
-    kind = CLAUSES[words[0]]
+    if not words or words[0] not in kinds:
+        raise ValueError(f"{line!r} begins with no name of a clause: {', '.join(kinds)}")
+    kind = kinds[words[0]]
     own = {known.name for known in fields(kind)} - {"choices", "when"}
     given = [word for word in words[1:] if word.partition("=")[0] in own]
     others = [word for word in words[1:] if word not in given]

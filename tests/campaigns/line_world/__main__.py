@@ -1,0 +1,95 @@
+"""Stories of a line on virtual time: `python -m tests.campaigns.line_world --steps 100000`.
+
+Each story is drawn from a seed: units with paper labels and numbers of their own or none, two or
+three sockets, people with scanners of their own or shared, who put, pull, exchange and scan at any
+instant; processes, the station and the supply fail. The whole station runs (`Station`, its records,
+the processes of its sockets, the production upgrade on simulated buses); an oracle looks into each
+unit. A step is an act of a story. A violation is shrunk to a story of one line, which
+`--replay LINE` plays with all that was shown; - reads it from standard input.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections import Counter
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+
+from tests.campaigns.line_world.play import Played, draw, play, shrink
+from tests.campaigns.line_world.stories import Story
+
+ACTS: int = 60
+"""Of one story."""
+
+
+def say(line: str = "") -> None:
+    sys.stdout.write(line + "\n")
+    sys.stdout.flush()
+
+
+def played(seed: int, *, acts: int, shrinks: bool) -> tuple[int, Played, int]:
+    """The seed, the story as it is to be shown, and the steps that were played."""
+    found = draw(seed, acts)
+    steps = len(found.story.acts)
+    return seed, shrink(found) if found.kind and shrinks else found, steps
+
+
+def replay(line: str) -> int:
+    found = play(Story.parse(line), say)
+    say()
+    say(found.text or "no violation")
+    return int(bool(found.kind))
+
+
+def results(chosen: argparse.Namespace) -> Iterator[tuple[int, Played, int]]:
+    work = partial(played, acts=chosen.acts, shrinks=not chosen.no_shrink)
+    seeds = range(chosen.seed, chosen.seed + -(-chosen.steps // chosen.acts))
+    if chosen.jobs == 1:
+        yield from map(work, seeds)
+        return
+    with ProcessPoolExecutor(chosen.jobs, initializer=partial(os.nice, 10)) as pool:
+        yield from pool.map(work, seeds, chunksize=4)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", type=int, default=10_000)
+    parser.add_argument("--acts", type=int, default=ACTS, help="steps of one story")
+    parser.add_argument("--seed", type=int, default=0, help="of the first story")
+    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--most", type=int, default=5, help="end after so many violations")
+    parser.add_argument("--no-shrink", action="store_true")
+    parser.add_argument("--replay", metavar="LINE", help="play this story; - reads it from stdin")
+    chosen = parser.parse_args()
+    if chosen.replay is not None:
+        return replay(sys.stdin.read() if chosen.replay == "-" else chosen.replay)
+    began = time.perf_counter()
+    steps = bad = stories = 0
+    seen: Counter[str] = Counter()
+    kinds: Counter[str] = Counter()
+    for seed, found, count in results(chosen):
+        steps, stories = steps + count, stories + 1
+        seen += found.seen or Counter()
+        if found.kind:
+            bad += 1
+            kinds[found.kind] += 1
+            say(f"{found.text}\n  seed {seed}, {len(found.story.acts)} acts\n  {found.story}\n")
+            if bad >= chosen.most:
+                break
+        if stories % 100 == 0:
+            say(f"{steps} steps, {60 * steps / (time.perf_counter() - began):,.0f} a minute")
+    took_s = time.perf_counter() - began
+    say(f"{steps} steps in {stories} stories, {60 * steps / took_s:,.0f} a minute; {bad} violations")
+    for kind, count in kinds.most_common():
+        say(f"  {count} {kind}")
+    for what, count in seen.most_common():
+        say(f"{count:8} {what}")
+    return int(bad > 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,216 @@
+"""Time of a whole line: each socket has a bus and a clock of its own, and all of them reach the
+same moment before anything happens that is not on a bus.
+
+The process of a socket runs in a greenlet, up to the `horizon` that it is given; it stops sooner
+where it waits for the station. Nothing here reads a real clock, so that the same story takes the
+same course each time.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from greenlet import getcurrent, greenlet  # type: ignore[import-untyped]
+
+from flasher.api import Connection
+from flasher.bus.link import VirtualClock
+from flasher.bus.simulated import SimulatedBus
+from flasher.protocol.engine import Engine
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import WELLING
+from flasher.station.messages import Ask, Finished, FromWorker, ToWorker, WorkerSetup
+from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.worker import StationGoneError, StationPipe, Worker
+
+
+class SocketBus(SimulatedBus):
+    """The bus of a socket: nothing on it passes the horizon."""
+
+    def __init__(self) -> None:
+        self.horizon = 0.0
+        self.wire_clock = VirtualClock()
+        super().__init__(WELLING.bitrate_bps, self.wire_clock)
+        self.stop: Callable[[], None] = lambda: None
+        """Called at the horizon; it returns when there is a later one."""
+
+    def advance(self, limit: float) -> None:
+        while self.clock.now() >= self.horizon:
+            if limit <= self.clock.now():
+                super().advance(limit)
+                return
+            self.stop()
+        super().advance(min(limit, self.horizon))
+
+    def idle(self, until: float) -> None:
+        """Let time pass without an adapter."""
+        while self.clock.now() < until:
+            super().advance(until)
+
+    def pull(self, engine: Engine) -> None:
+        """Take a device off, in the middle of a frame if it sends one."""
+        if self._sending is not None:
+            senders, _ = self._sending
+            if any(getattr(sender, "engine", None) is engine for sender in senders):
+                self._sending = None
+        self.detach(engine)
+
+    def close_adapter(self) -> None:
+        """What the process of the socket had still to send is gone with it."""
+        self._silence_hosts()
+        for host in self._hosts:
+            self._nodes.remove(host)
+        self._hosts.clear()
+
+
+class Pipe:
+    """Both ends of the pipe between the station and the process of a socket."""
+
+    def __init__(self, bus: SocketBus, on_sent: Callable[[FromWorker], None]) -> None:
+        self._bus = bus
+        self._on_sent = on_sent
+        self.to_worker: deque[ToWorker] = deque()
+        self.to_station: deque[FromWorker] = deque()
+        self.is_broken = False
+
+    # -- the end of the process -------------------------------------------------------------------
+
+    def send(self, message: Any) -> None:
+        if self.is_broken:
+            raise OSError("the station is gone")
+        self.to_station.append(message)
+        self._on_sent(message)
+        if isinstance(message, Ask | Finished):
+            self._bus.stop()  # the station answers at once
+
+    def recv(self) -> Any:
+        if not self.to_worker:
+            raise EOFError
+        return self.to_worker.popleft()
+
+    def poll(self, timeout: float = 0.0) -> bool:
+        until = self._bus.clock.now() + timeout
+        while not self.to_worker and not self.is_broken:
+            if self._bus.clock.now() >= until:
+                return False
+            self._bus.advance(until)
+        return True
+
+
+class Process:
+    """The process of a socket, as the supervisor has it (a `Port`)."""
+
+    waitable = None
+
+    def __init__(
+        self,
+        setup: WorkerSetup,
+        recipe: LoadedRecipe,
+        bus: SocketBus,
+        on_sent: Callable[[FromWorker], None],
+    ) -> None:
+        self._bus = bus
+        self._pipe = Pipe(bus, on_sent)
+        bus.close_adapter()
+        self.connection = Connection(bus.link(), bus.clock, f"bus {setup.socket}")
+        self.has_asked = False
+        """It waits for the station."""
+
+        def main() -> None:
+            pipe = StationPipe(self._pipe, bus.clock.now)
+            with suppress(StationGoneError):
+                Worker(setup, recipe, pipe, self.connection).work()
+
+        self._greenlet = greenlet(main)
+        bus.stop = self._stop
+
+    def _stop(self) -> None:
+        self.has_asked = self._bus.clock.now() < self._bus.horizon
+        self._greenlet.parent.switch()
+
+    @property
+    def is_over(self) -> bool:
+        return bool(self._greenlet.dead)
+
+    def go_on(self, horizon: float) -> None:
+        """Run until this time, or until it waits for the station."""
+        self._bus.horizon, self.has_asked = horizon, False
+        if not self.is_over and self._bus.clock.now() < horizon:
+            self._greenlet.parent = getcurrent()
+            self._greenlet.switch()
+        if self.is_over:
+            self._bus.idle(horizon)
+
+    # -- the station's end ------------------------------------------------------------------------
+
+    def send(self, message: ToWorker) -> bool:
+        if not (self.is_over or self._pipe.is_broken):
+            self._pipe.to_worker.append(message)
+        return not self.is_over
+
+    def receive(self) -> FromWorker | None:
+        if self._pipe.to_station:
+            return self._pipe.to_station.popleft()
+        if self.is_over:
+            raise EOFError
+        return None
+
+    def kill(self) -> None:
+        """End it where it stands."""
+        if not self.is_over:
+            self._greenlet.throw()
+        self._bus.close_adapter()
+
+    def join(self, limit_s: float) -> bool:
+        return self.is_over
+
+    def lose_station(self) -> None:
+        """The station is dead: it finds the pipe broken."""
+        self._pipe.is_broken = True
+
+
+class PaperUnit:
+    """A unit as it lies on the table: a device with a paper label, on whichever bus it is put."""
+
+    done = False
+
+    def __init__(self, engine: Any, label: str) -> None:
+        self.engine = engine
+        self.label = label
+        self.sleeps_until = float("-inf")
+        self.on_sent: Callable[[float], None] = lambda _now: None
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if now >= self.sleeps_until:
+            self.engine.receive(frame, now)
+
+    def tick(self, now: float) -> None:
+        if now >= self.sleeps_until:
+            self.engine.tick(now)
+
+    def deadline(self) -> float | None:
+        due_at: float | None = self.engine.deadline()
+        return None if due_at is None else max(due_at, self.sleeps_until)
+
+    def next_frame(self, now: float) -> Frame | None:
+        found: Frame | None = self.engine.next_frame(now) if now >= self.sleeps_until else None
+        return found
+
+    def frame_sent(self, now: float) -> None:
+        self.engine.frame_sent(now)
+        self.on_sent(now)
+
+    def cancel(self, now: float) -> None:
+        pass
+
+    def take_events(self) -> Any:
+        return self.engine.take_events()
+
+
+def scratch() -> Path | None:
+    """Where files of a story go: memory, where there is such a place."""
+    shared = Path("/dev/shm")  # noqa: S108
+    return shared if shared.is_dir() else None

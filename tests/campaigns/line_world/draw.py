@@ -1,0 +1,219 @@
+"""Draws stories: people who work as the screen says, are in a hurry, exchange units, and are
+interrupted. What somebody does next is drawn when the time has come, from what is there then; what
+was done is the story.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Final
+
+from flasher.station.events import SocketState
+from tests.campaigns.line_world import stories
+from tests.campaigns.line_world.stories import Story
+from tests.campaigns.line_world.world import Bay, World
+
+Step = tuple[float, stories.Clause | None]
+"""Seconds to wait, and what is done then; None: nothing, only look again."""
+_GAPS_S: Final = (0.0005, 0.05, 0.3, 0.5, 1.0, 3.5)
+"""From pulling a unit to putting another one in."""
+_IN_HAND: Final = (SocketState.PASS, SocketState.FAIL, SocketState.RECHECK)
+
+
+def setup_of(chance: random.Random) -> Story:
+    """What there is."""
+    sockets = chance.choice((1, 2, 2, 2, 3))
+    units = []
+    for label in range(1, sockets + chance.choice((1, 2)) + 1):
+        number = chance.choices(("none", "maker", "own", "other"), (6, 4, 2, 0.5))[0]
+        units.append(
+            stories.UnitSetup(
+                label=label,
+                number=number,  # type: ignore[arg-type]
+                application="none" if chance.random() < 0.12 else "old",
+                pace="slow" if chance.random() < 0.6 else "fast",
+                answers=chance.random() > 0.04,
+            )
+        )
+    people = []
+    for name in ("jo", "al", "mo")[: chance.choice((1, 1, 2, 2, 3))]:
+        source = chance.choices(("page", name, "mounted"), (4, 4, 1))[0]
+        people.append(stories.Person(name=name, source=source))
+    recipe = chance.choices(("writes", "plain"), (4, 1))[0]
+    line = stories.LineSetup(sockets=sockets, recipe=recipe)  # type: ignore[arg-type]
+    return Story(line, units, people, [])
+
+
+class Teller:
+    """Draws what happens in a world."""
+
+    def __init__(self, chance: random.Random, world: World) -> None:
+        self.chance = chance
+        self.world = world
+
+    def acts(self) -> Iterator[stories.Clause]:
+        """Acts with their times, each drawn when the one before it is done."""
+        actors = [self._person(each.name) for each in self.world.people.values()]
+        actors.append(self._fate())
+        now = self.world.now
+        upcoming = [(now + gap, act, actor) for actor in actors for gap, act in (next(actor),)]
+        while True:
+            index = min(range(len(upcoming)), key=lambda each: upcoming[each][0])
+            moment, act, actor = upcoming[index]
+            if act is not None:
+                yield replace(act, when=stories.at(moment))
+            else:
+                self.world.go_to(moment)
+            gap, following = next(actor)
+            upcoming[index] = (max(moment, self.world.now) + gap, following, actor)
+
+    # -- what is there ----------------------------------------------------------------------------
+
+    def _pause(self) -> float:
+        chance = self.chance
+        return chance.choice(
+            (
+                chance.uniform(0.0, 0.01),
+                chance.uniform(0.1, 0.6),
+                chance.uniform(0.3, 1.5),
+                chance.uniform(1.0, 4.0),
+            )
+        )
+
+    def _on_table(self) -> list[int]:
+        return [each for each in self.world.units if self.world.where(each) is None]
+
+    def _number(self, bay: Bay) -> int:
+        return next(n for n, unit in self.world.units.items() if unit is bay.unit)
+
+    def _bays(self, *, full: bool, working: bool | None = None) -> list[Bay]:
+        return [
+            bay
+            for bay in self.world.bays.values()
+            if (bay.unit is not None) == full and working in (None, bool(bay.run))
+        ]
+
+    # -- people -----------------------------------------------------------------------------------
+
+    def _person(self, name: str) -> Iterator[Step]:
+        scenes = {
+            self._serve: 8.0,
+            self._exchange: 4.0,
+            self._swap: 2.0,
+            self._clear: 5.0,
+            self._cancel: 0.6,
+            self._free: 0.4,
+        }
+        while True:
+            yield self._pause(), None
+            yield from self.chance.choices(list(scenes), list(scenes.values()))[0](name)
+
+    def _serve(self, name: str) -> Iterator[Step]:
+        """Bring a unit into a socket, and scan it."""
+        chance, empty = self.chance, self._bays(full=False)
+        waiting = [self._number(bay) for bay in self._bays(full=True, working=False)]
+        units = self._on_table() if empty else []
+        if waiting and (not units or chance.random() < 0.4):
+            yield from self._scan(name, chance.choice(waiting))
+        elif units:
+            unit, socket = chance.choice(units), chance.choice(empty).name
+            puts_first = chance.random() < 0.75
+            if puts_first:
+                yield self._pause(), stories.Put(unit=unit, socket=socket)
+            yield from self._scan(name, unit, socket)
+            if not puts_first:
+                named = [
+                    bay.name
+                    for bay in self.world.bays.values()
+                    if bay.shown is not None and bay.shown.serial == self.world.units[unit].label
+                ]
+                yield self._pause(), stories.Put(unit=unit, socket=(named or [socket])[0])
+
+    def _scan(self, name: str, unit: int, socket: str = "") -> Iterator[Step]:
+        card = stories.Card(by=name, unit=unit, socket=socket)
+        label = stories.Label(by=name, unit=unit)
+        way = self.chance.random()
+        if way < 0.65:
+            yield self._pause(), card
+            if self.chance.random() < 0.12:
+                yield from self._swap(name)
+            if self.chance.random() < 0.04:
+                yield 15.0, None
+            yield self._pause(), label
+        elif way < 0.8:
+            yield self._pause(), label
+            yield self._pause(), card
+        else:
+            yield self._pause(), label
+
+    def _exchange(self, _name: str) -> Iterator[Step]:
+        """Another unit into a socket that works."""
+        working = self._bays(full=True, working=True)
+        if not working:
+            return
+        bay = self.chance.choice(working)
+        yield self.chance.choice((self.chance.uniform(0, 0.6), self.chance.uniform(0, 4.0))), None
+        if bay.unit is None:
+            return
+        before = self._number(bay)
+        yield 0.0, stories.Pull(unit=before)
+        others = [each for each in self._on_table() if each != before] or [before]
+        unit = before if self.chance.random() < 0.1 else self.chance.choice(others)
+        yield self.chance.choice(_GAPS_S), stories.Put(unit=unit, socket=bay.name)
+
+    def _swap(self, _name: str) -> Iterator[Step]:
+        """Two units change places, or one with a unit from the table."""
+        full = self._bays(full=True)
+        if not full:
+            return
+        one = self.chance.choice(full)
+        unit = self._number(one)
+        others = [bay for bay in full if bay is not one]
+        gap = self.chance.choice(_GAPS_S)
+        if others and self.chance.random() < 0.7:
+            other = self.chance.choice(others)
+            second = self._number(other)
+            yield self._pause(), stories.Pull(unit=unit)
+            yield 0.1, stories.Pull(unit=second)
+            yield gap, stories.Put(unit=unit, socket=other.name)
+            yield 0.1, stories.Put(unit=second, socket=one.name)
+        else:
+            table = self._on_table() or [unit]
+            yield self._pause(), stories.Pull(unit=unit)
+            yield gap, stories.Put(unit=self.chance.choice(table), socket=one.name)
+
+    def _clear(self, _name: str) -> Iterator[Step]:
+        """Take out what is done."""
+        for bay in self._bays(full=True, working=False):
+            if bay.shown is not None and bay.shown.state in _IN_HAND:
+                yield self._pause(), stories.Pull(unit=self._number(bay))
+                return
+
+    def _cancel(self, name: str) -> Iterator[Step]:
+        yield self._pause(), stories.Cancel(by=name)
+
+    def _free(self, name: str) -> Iterator[Step]:
+        empty = self._bays(full=False)
+        if empty:
+            yield self._pause(), stories.Free(by=name, socket=self.chance.choice(empty).name)
+
+    # -- what befalls them ------------------------------------------------------------------------
+
+    def _fate(self) -> Iterator[Step]:
+        chance = self.chance
+        while True:
+            wait = chance.expovariate(1 / 25.0)
+            socket = chance.choice(list(self.world.bays))
+            seconds = round(chance.choice((0.05, 0.5, 2.0, 4.0)), 3)
+            way = chance.random()
+            if way < 0.4:
+                unit = chance.choice(list(self.world.units))
+                yield wait, stories.Sleep(unit=unit, seconds=seconds)
+            elif way < 0.65:
+                yield wait, stories.Dip(socket=socket, seconds=seconds)
+            elif way < 0.85:
+                yield wait, stories.KillWorker(socket=socket)
+            else:
+                yield wait, stories.KillStation(seconds=1.0 + seconds)

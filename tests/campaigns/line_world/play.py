@@ -1,0 +1,158 @@
+"""Plays stories, draws them, and shrinks those that end in a violation."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+from tests.campaigns.line_world import stories
+from tests.campaigns.line_world.draw import Teller, setup_of
+from tests.campaigns.line_world.stories import Story, time_of
+from tests.campaigns.line_world.world import Violation, World
+
+_GRID_S: Final = (1.0, 0.5, 0.1, 0.01, 0.001)
+
+
+@dataclass(frozen=True)
+class Played:
+    """A story that was played, and what came of it."""
+
+    story: Story
+    kind: str = ""
+    """Of the violation; empty without one."""
+    text: str = ""
+    seen: Counter[str] | None = None
+
+
+def _silent(_line: str) -> None:
+    pass
+
+
+def play(story: Story, log: Callable[[str], None] = _silent) -> Played:
+    """Play a story as it is written, then bring every unit home."""
+    done: list[stories.Clause] = []
+    with World(story, log) as world:
+        try:
+            for act in story.acts:
+                if world.do(act):
+                    done.append(act)
+            world.go_home()
+        except Violation as violation:
+            kept = [each for each in story.acts if each in done or time_of(each) >= world.now]
+            return Played(replace(story, acts=kept), violation.kind, str(violation), world.seen)
+        return Played(replace(story, acts=done), seen=world.seen)
+
+
+def draw(seed: int, steps: int) -> Played:
+    """Draw a story of so many acts, and play it at once."""
+    chance = random.Random(seed)
+    setup = setup_of(chance)
+    acts: list[stories.Clause] = []
+    with World(setup) as world:
+        kind = text = ""
+        try:
+            for act in Teller(chance, world).acts():
+                acts.append(act)
+                if not world.do(act):
+                    acts.pop()
+                if len(acts) >= steps or world.now > 20.0 * steps:
+                    break
+            world.go_home()
+        except Violation as violation:
+            kind, text = violation.kind, str(violation)
+        return Played(replace(setup, acts=acts), kind, text, world.seen)
+
+
+# -- shrinking -------------------------------------------------------------------------------------
+
+
+def shrink(found: Played, most: int = 400) -> Played:
+    """A shorter story with a violation of the same kind."""
+    tries = 0
+
+    def is_bad(story: Story) -> Played | None:
+        nonlocal tries
+        tries += 1
+        if tries > most:
+            return None
+        played = play(story)
+        return played if played.kind == found.kind else None
+
+    best = is_bad(found.story)
+    if best is None:
+        return found  # it would not be the same when it is played again
+    best = _without_acts(best, is_bad)
+    best = _simpler_setup(best, is_bad)
+    best = _rounder(best, is_bad)
+    return _without_acts(best, is_bad)
+
+
+def _without_acts(best: Played, is_bad: Callable[[Story], Played | None]) -> Played:
+    size = max(1, len(best.story.acts) // 2)
+    while True:
+        start = max(0, len(best.story.acts) - size)
+        while start >= 0 and best.story.acts:
+            acts = best.story.acts
+            shorter = [*acts[:start], *acts[start + size :]]
+            found = is_bad(replace(best.story, acts=shorter)) if len(shorter) < len(acts) else None
+            best = found or best
+            start = start - size if start >= size or start == 0 else 0
+        if size == 1:
+            return best
+        size //= 2
+
+
+def _simpler_setup(best: Played, is_bad: Callable[[Story], Played | None]) -> Played:
+    used = {getattr(act, "unit", None) for act in best.story.acts}
+    people = {getattr(act, "by", None) for act in best.story.acts}
+    units = [each for each in best.story.units if each.label in used]
+    best = is_bad(replace(best.story, units=units)) or best
+    left = [each for each in best.story.people if each.name in people]
+    best = is_bad(replace(best.story, people=left)) or best
+    for number in range(len(best.story.units)):
+        for change in (
+            {"number": "none"}, {"application": "old"}, {"pace": "fast"}, {"answers": True},
+        ):  # fmt: skip
+            simpler = list(best.story.units)
+            simpler[number] = replace(simpler[number], **change)  # type: ignore[arg-type]
+            if simpler != list(best.story.units):
+                best = is_bad(replace(best.story, units=simpler)) or best
+    for sockets in range(1, best.story.line.sockets):
+        line = replace(best.story.line, sockets=sockets)
+        found = is_bad(replace(best.story, line=line))
+        if found is not None:
+            return found
+    return best
+
+
+def _rounder(best: Played, is_bad: Callable[[Story], Played | None]) -> Played:
+    """Times that a person can read: first all at once, then one by one."""
+    for grid in _GRID_S:
+        found = is_bad(replace(best.story, acts=_on_grid(best.story.acts, grid)))
+        if found is not None:
+            best = found
+            break
+    shift = time_of(best.story.acts[0]) - 3.0 if best.story.acts else 0.0
+    if shift > 0:
+        moved = [replace(each, when=stories.at(time_of(each) - shift)) for each in best.story.acts]
+        best = is_bad(replace(best.story, acts=moved)) or best
+    for number in range(len(best.story.acts)):
+        for grid in _GRID_S:
+            acts = list(best.story.acts)
+            acts[number] = _on_grid([acts[number]], grid)[0]
+            if acts == list(best.story.acts):
+                break
+            found = is_bad(replace(best.story, acts=sorted(acts, key=time_of)))
+            if found is not None and len(found.story.acts) == len(acts):
+                best = found
+                break
+    return best
+
+
+def _on_grid(acts: Sequence[stories.Clause], grid_s: float) -> list[stories.Clause]:
+    return [
+        replace(each, when=stories.at(round(time_of(each) / grid_s) * grid_s)) for each in acts
+    ]

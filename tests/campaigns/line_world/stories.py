@@ -1,0 +1,196 @@
+"""Stories of a line, as text that replays exactly: what there is, and who does what when.
+
+A story is a list of clauses, one a line (or all in one line, parted by " ; "), as plans of an
+upgrade are (`tests.campaigns.world.plans`):
+
+    line sockets=2 recipe=writes
+    unit label=1 number=none
+    unit label=2 number=maker pace=slow
+    person name=jo source=page
+    @0.5 put unit=1 socket=A
+    @3.2 card unit=1 by=jo
+    @3.9 label unit=1 by=jo
+    @4.61 pull unit=1
+    @4.91 put unit=2 socket=A
+
+Units and times are concrete; where a card belongs follows from where the unit is. People are
+honest: an act that an honest person would not do at that moment (scan a label for a socket in
+which another unit is; put a unit into a socket that waits for another label) is skipped, so that
+any part of a story is a story again, which is what shrinking needs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
+
+from tests.campaigns.world.plans import Clause, When, parse_clauses
+
+Number = Literal["none", "own", "maker", "other"]
+SOCKETS: Final = "ABC"
+
+
+@dataclass(frozen=True, kw_only=True)
+class LineSetup(Clause):
+    """The station. `recipe=writes` gives each unit its number, `plain` writes none."""
+
+    NAME = "line"
+    sockets: int
+    recipe: Literal["writes", "plain"] = "writes"
+
+
+@dataclass(frozen=True, kw_only=True)
+class UnitSetup(Clause):
+    """A unit with its paper label. Its number: none, that of its label, one of its maker, or that
+    of a label which is not its own.
+    """
+
+    NAME = "unit"
+    label: int
+    number: Number = "none"
+    application: Literal["old", "none"] = "old"
+    pace: Literal["fast", "slow"] = "fast"
+    """Slow: half a second to erase, a quarter of a second a packet."""
+    answers: bool = True
+    """False: its application does not answer the question for its version."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Person(Clause):
+    """Somebody who works at the line; people with one source share a scanner or a page.
+    `mounted`: the scanners at the sockets.
+    """
+
+    NAME = "person"
+    name: str
+    source: str = "page"
+
+
+# -- what people do --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Put(Clause):
+    NAME = "put"
+    unit: int
+    socket: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Pull(Clause):
+    """Take the unit out of the socket that it is in."""
+
+    NAME = "pull"
+    unit: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scan(Clause):
+    by: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Card(Scan):
+    """Scan the card of the socket that the unit is in; of `socket`, while it is in the hand."""
+
+    NAME = "card"
+    unit: int
+    socket: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Label(Scan):
+    NAME = "label"
+    unit: int = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cancel(Scan):
+    NAME = "cancel"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Free(Scan):
+    """Scan FREE of a socket that is empty."""
+
+    NAME = "free"
+    socket: str
+
+
+# -- what befalls them -----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True)
+class Sleep(Clause):
+    """A unit neither hears nor speaks for a time; its supply stays on."""
+
+    NAME = "sleep"
+    unit: int
+    seconds: float = 3.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Dip(Clause):
+    """The supply of a socket fails for a time."""
+
+    NAME = "dip"
+    socket: str
+    seconds: float = 0.5
+
+
+@dataclass(frozen=True, kw_only=True)
+class KillWorker(Clause):
+    NAME = "worker"
+    socket: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class KillStation(Clause):
+    """The station dies, and is started again after some seconds."""
+
+    NAME = "station"
+    seconds: float = 2.0
+
+
+CLAUSES: Final[dict[str, type[Clause]]] = {
+    kind.NAME: kind
+    for kind in (
+        LineSetup, UnitSetup, Person, Put, Pull, Card, Label, Cancel, Free, Sleep, Dip, KillWorker,
+        KillStation,
+    )
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Story:
+    """What there is, and what happens."""
+
+    line: LineSetup
+    units: Sequence[UnitSetup]
+    people: Sequence[Person]
+    acts: Sequence[Clause]
+    """In the order of their times."""
+
+    def __str__(self) -> str:
+        return " ; ".join(map(str, (self.line, *self.units, *self.people, *self.acts)))
+
+    @classmethod
+    def parse(cls, text: str) -> Story:
+        clauses = list(parse_clauses(text, CLAUSES))
+        acts = [each for each in clauses if each.when is not None]
+        return cls(
+            next((each for each in clauses if isinstance(each, LineSetup)), LineSetup(sockets=2)),
+            [each for each in clauses if isinstance(each, UnitSetup)],
+            [each for each in clauses if isinstance(each, Person)] or [Person(name="jo")],
+            sorted(acts, key=time_of),
+        )
+
+
+def time_of(act: Clause) -> float:
+    return act.when.plus_s if act.when is not None else 0.0
+
+
+def at(moment: float) -> When:
+    """A time of a story: with microseconds, so that its text is exact."""
+    return When(plus_s=round(moment, 6))

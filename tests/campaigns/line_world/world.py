@@ -1,0 +1,648 @@
+"""The world of a story: sockets with their processes, the station, units, people, and an oracle
+that looks into each unit.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, NoReturn
+
+from flasher.mock.bms import BmsApplication
+from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
+from flasher.protocol.spec import BMS, WELLING
+from flasher.station.events import (
+    OperatorPrompted,
+    RunEnded,
+    RunStarted,
+    ScanAccepted,
+    ScanRefused,
+    SocketChanged,
+    SocketState,
+    StationEvent,
+    StepStarted,
+    WorkerFailed,
+)
+from flasher.station.messages import Finished, FromWorker, WorkerSetup
+from flasher.station.records.model import RunState, StepName
+from flasher.station.station import Station
+from tests.campaigns.line_world import stories
+from tests.campaigns.line_world.clockwork import PaperUnit, Process, SocketBus, scratch
+from tests.station.factory import IMAGES, USUAL, Bench
+from tests.station.unit_bench import WRITES
+
+WINDOW_S: Final = 0.1
+"""The station looks at its processes at least so often."""
+GREEN_S: Final = 5.0
+"""A tile that is green for a unit which is not in its socket has to change within this time."""
+NONE: Final = "NONE"
+"""What a new unit has for a serial number, where the recipe writes one."""
+_RECIPES: Final = {"writes": USUAL + WRITES, "plain": USUAL}
+_SLOW: Final = {"erase_time_s": 0.5, "program_time_s": 0.25}
+_READY_S: Final = 4.0
+_RUN_LIMIT_S: Final = 150.0
+_TRIES: Final = 4
+_FINAL: Final = ("DUPLICATE", "JUST_PASSED", "WRONG_UNIT")
+"""Refusals after which a unit is not for this line: it has passed, or says that it is another."""
+
+
+def label_of(number: int) -> str:
+    return f"W2605{number:03}"
+
+
+class Violation(Exception):  # noqa: N818
+    """What must never be: its kind, and what happened."""
+
+    def __init__(self, kind: str, text: str) -> None:
+        super().__init__(f"{kind}: {text}")
+        self.kind = kind
+
+
+@dataclass
+class Bay:
+    """A socket as it is, and what is known of its run."""
+
+    name: str
+    bus: SocketBus
+    process: Process | None = None
+    unit: PaperUnit | None = None
+    changed_at: float = 0.0
+    """Since when the same unit is in it, and the station can see it."""
+    has_spoken: bool = False
+    """The unit sent something since then."""
+    run: str = ""
+    """The label of the run that the station works on."""
+    is_working: bool = False
+    """The process works on a run."""
+    heard: dict[str, None] = field(default_factory=dict)
+    """Labels of the units that sent something in the run."""
+    shown: SocketChanged | None = None
+
+
+@dataclass
+class PersonAtWork:
+    """What somebody believes."""
+
+    name: str
+    source: str
+    card: tuple[str, int, bool] | None = None
+    """The socket whose card was accepted, for which unit, and whether it was in it."""
+    label: int | None = None
+    """The unit whose label was accepted, and waits for a card."""
+
+
+@dataclass(frozen=True)
+class _Stored:
+    """What a unit holds that lasts."""
+
+    number: str
+    operations: int
+
+
+class World:
+    """One line. `do` carries out an act at its time; everything raises Violation."""
+
+    def __init__(self, setup: stories.Story, log: Callable[[str], None] = lambda _line: None) -> None:
+        self.now = 0.0
+        self.log = log
+        self.seen: Counter[str] = Counter()
+        self.setup = setup
+        self._closing = ExitStack()
+        folder = self._closing.enter_context(tempfile.TemporaryDirectory(dir=scratch()))
+        self.bench = Bench(Path(folder))
+        self._began_at = self.bench.clock.seconds
+        if setup.line.recipe != "plain":
+            self.bench.use(_RECIPES[setup.line.recipe])
+        self.bays = {
+            name: Bay(name, SocketBus()) for name in stories.SOCKETS[: setup.line.sockets]
+        }
+        none = NONE if setup.line.recipe == "writes" else ""
+        self.units = {each.label: _make(each, none) for each in setup.units}
+        self._allowed = {
+            number: {unit.label, _stored(unit).number} for number, unit in self.units.items()
+        }
+        self._stored = {number: _stored(unit) for number, unit in self.units.items()}
+        self.passed: set[str] = set()
+        """Labels whose PASS was shown."""
+        self.people = {each.name: PersonAtWork(each.name, each.source) for each in setup.people}
+        self.station: Station | None = None
+        self._station_at: float | None = None
+        """When a station that died is started again."""
+        self._answers: list[StationEvent] = []
+        self._power_at: dict[str, float] = {}
+        self._begin_station()
+
+    def close(self) -> None:
+        for bay in self.bays.values():
+            if bay.process is not None:
+                bay.process.kill()
+        self.station = None
+        self.bench.store.close()
+        self._closing.close()
+
+    def __enter__(self) -> World:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # -- time -------------------------------------------------------------------------------------
+
+    def go_to(self, moment: float) -> None:
+        """Let time pass up to this moment."""
+        while self.now < moment:
+            due = [each for each in (self._station_at, *self._power_at.values()) if each is not None]
+            horizon = min(moment, self.now + WINDOW_S, *due)
+            for bay in self.bays.values():
+                if bay.process is None:
+                    bay.bus.idle(horizon)
+                    continue
+                bay.process.go_on(horizon)
+                if bay.process.has_asked:
+                    horizon = max(self.now, min(horizon, bay.bus.clock.now()))
+            self.bench.clock.go_on(horizon - self.now)
+            self.now = horizon
+            self._come_back()
+            self.turn()
+
+    def _come_back(self) -> None:
+        for name, moment in list(self._power_at.items()):
+            if moment <= self.now and self._are_level():
+                del self._power_at[name]
+                self._switch_on(self.bays[name])
+        if self._station_at is not None and self._station_at <= self.now and self._are_level():
+            self._station_at = None
+            self._begin_station()
+
+    def _are_level(self) -> bool:
+        """True when no bus is behind the others."""
+        return all(bay.bus.clock.now() >= self.now for bay in self.bays.values())
+
+    def turn(self) -> None:
+        """A turn of the station, and a look at all units."""
+        if self.station is not None:
+            self.station.turn(0.0)
+        self._look()
+
+    # -- the station ------------------------------------------------------------------------------
+
+    def _begin_station(self) -> None:
+        for bay in self.bays.values():
+            if bay.process is not None:
+                bay.process.kill()
+            bay.process, bay.run, bay.is_working, bay.shown = None, "", False, None
+            bay.changed_at = self.now
+        setups = [WorkerSetup(name, self.bench.recipe.path, {}, {}) for name in self.bays]
+        self.station = Station(
+            self.bench.store,
+            self.bench.recipe,
+            setups,
+            operator="jo",
+            on_event=self._take,
+            clock=self.bench.clock,
+            launch=self._launch,
+        )
+        self.station.start()
+
+    def _launch(self, setup: WorkerSetup) -> Process:
+        bay = self.bays[setup.socket]
+        bay.is_working = False
+        bay.changed_at = self.now
+        bay.process = Process(
+            setup, self.bench.recipe, bay.bus, lambda message: self._sent(bay, message)
+        )
+        return bay.process
+
+    def _sent(self, bay: Bay, message: FromWorker) -> None:
+        """What the process of a socket tells, at its own time."""
+        match message:
+            case StepStarted(step=StepName.CONNECT, try_number=1):
+                bay.is_working, bay.heard = True, {}
+            case Finished():
+                bay.is_working = False
+
+    def _take(self, event: StationEvent) -> None:
+        """An event of the station. `Station.tell` swallows what is raised here."""
+        try:
+            self._judge(event)
+        except Violation as violation:
+            self._found = self._found or violation
+
+    _found: Violation | None = None
+
+    def _judge(self, event: StationEvent) -> None:
+        self.log(f"{self.now:9.4f}      {_shown(event)}")
+        match event:
+            case ScanAccepted() | ScanRefused() | OperatorPrompted():
+                self._answers.append(event)
+                if isinstance(event, ScanRefused):
+                    self._forget(event.text)
+            case SocketChanged():
+                self.bays[event.socket].shown = event
+            case RunStarted():
+                self.bays[event.socket].run = event.serial
+                self.seen["runs"] += 1
+                for person in self.people.values():
+                    if person.label is not None and label_of(person.label) == event.serial:
+                        person.label = None
+            case RunEnded():
+                self._end(self.bays[event.socket], event)
+            case WorkerFailed() if "said nothing" in event.reason:
+                raise Violation("CRASH", f"the process of {event.socket} hangs: {event.reason}")
+
+    def _forget(self, text: str) -> None:
+        """Somebody is told that a scan does not wait any more."""
+        for person in self.people.values():
+            if person.card is not None and text == f"SOCKET {person.card[0]}":
+                person.card = None
+            if person.label is not None and text == label_of(person.label):
+                person.label = None
+
+    # -- acts -------------------------------------------------------------------------------------
+
+    def do(self, act: stories.Clause) -> bool:
+        """Carry out an act at its time; False where nobody honest would, or nothing is there."""
+        self.go_to(stories.time_of(act))
+        is_done = self._ACTS[type(act)](self, act)
+        if is_done:
+            self.seen["acts"] += 1
+            self.log(f"{self.now:9.4f}  {' '.join(str(act).split()[1:])}".rstrip())
+        self.turn()
+        return is_done
+
+    def _put(self, act: stories.Put) -> bool:
+        bay, unit = self.bays.get(act.socket), self.units.get(act.unit)
+        if bay is None or unit is None or bay.unit is not None or self.where(act.unit) is not None:
+            return False
+        if self.awaits_another(bay, act.unit):
+            return False
+        bay.unit, bay.changed_at, bay.has_spoken = unit, self.now, False
+
+        def sent(_now: float) -> None:
+            bay.has_spoken = True
+            if bay.is_working:
+                bay.heard[unit.label] = None
+
+        unit.on_sent = sent
+        bay.bus.attach(unit)
+        if act.socket not in self._power_at:
+            unit.engine.power_on(self.now)
+        return True
+
+    @staticmethod
+    def awaits_another(bay: Bay, unit: int) -> bool:
+        """The tile says that another unit has to come here."""
+        shown = bay.shown
+        return (
+            shown is not None
+            and shown.state is SocketState.SCAN
+            and shown.serial not in ("", label_of(unit))
+        )
+
+    def _pull(self, act: stories.Pull) -> bool:
+        bay = self.where(act.unit)
+        if bay is None or bay.unit is None:
+            return False
+        unit, bay.unit, bay.changed_at = bay.unit, None, self.now
+        bay.bus.pull(unit)
+        unit.on_sent = lambda _now: None
+        unit.sleeps_until = float("-inf")
+        if unit.engine.has_power:
+            unit.engine.power_cut(self.now)
+        return True
+
+    def where(self, unit: int) -> Bay | None:
+        """The socket that a unit is in."""
+        found = self.units.get(unit)
+        return next((bay for bay in self.bays.values() if found and bay.unit is found), None)
+
+    def _card(self, act: stories.Card) -> bool:
+        person, unit = self.people.get(act.by), self.units.get(act.unit)
+        bay = self.where(act.unit)
+        is_in = bay is not None
+        if bay is None:
+            bay = self.bays.get(act.socket)
+        if self.station is None or person is None or unit is None or bay is None:
+            return False
+        if person.source == "mounted" or (not is_in and bay.unit is not None):
+            return False
+        if person.label not in (None, act.unit):
+            return False
+        if any(each.label is not None for each in self._sharing(person)):
+            return False  # the screen says whose card is awaited
+        label, person.label = person.label, None
+        if self._scan(f"SOCKET {bay.name}", person):
+            person.card = None if label is not None else (bay.name, act.unit, is_in)
+        else:
+            person.label = label if self._is_waiting_for_card(person) else None
+        return True
+
+    @staticmethod
+    def _is_waiting_for_card(person: PersonAtWork) -> bool:
+        return False  # refused: begin anew
+
+    def _sharing(self, person: PersonAtWork) -> list[PersonAtWork]:
+        """Others at the same source."""
+        return [
+            each
+            for each in self.people.values()
+            if each is not person and each.source == person.source
+        ]
+
+    def _label(self, act: stories.Label) -> bool:
+        person, unit = self.people.get(act.by), self.units.get(act.unit)
+        if self.station is None or person is None or unit is None:
+            return False
+        bay = self.where(act.unit)
+        if person.source == "mounted":
+            return bay is not None and self._scan(unit.label, person, bay.name) is not None
+        if person.card is not None:
+            socket, meant, was_in = person.card
+            there = self.bays[socket].unit
+            if meant != act.unit or (not was_in and there not in (None, unit)):
+                return False
+            if not was_in and bay is not None and bay.name != socket:
+                return False  # it was put elsewhere
+            person.card = None
+            self._scan(unit.label, person)
+            return True
+        if any(each.card is not None or each.label is not None for each in self._sharing(person)):
+            return False  # the screen says that something else is awaited
+        if len(self.bays) == 1:
+            there = self.bays["A"].unit
+            if there not in (None, unit):
+                return False
+        before = len(self._answers)
+        if self._scan(unit.label, person):
+            accepted = [e for e in self._answers[before:] if isinstance(e, ScanAccepted)]
+            if accepted and not accepted[-1].socket:
+                person.label = act.unit
+        return True
+
+    def _cancel(self, act: stories.Cancel) -> bool:
+        person = self.people.get(act.by)
+        if self.station is None or person is None:
+            return False
+        person.card = person.label = None
+        self._scan("CANCEL", person)
+        return True
+
+    def _free(self, act: stories.Free) -> bool:
+        person, bay = self.people.get(act.by), self.bays.get(act.socket)
+        if self.station is None or person is None or bay is None or bay.unit is not None:
+            return False
+        self._scan(f"FREE {bay.name}", person)
+        return True
+
+    def _scan(self, text: str, person: PersonAtWork, mounted: str = "") -> bool:
+        """Scan, and read the answer: True when it was accepted."""
+        if self.station is None:
+            return False
+        self.seen["scans"] += 1
+        self.log(f"{self.now:9.4f}    scan {text} by {person.name}")
+        before = len(self._answers)
+        self._submit(text, person, mounted)
+        self.turn()
+        said = self._answers[before:]
+        if text == "CANCEL":
+            for each in self._sharing(person):
+                each.card = each.label = None
+        return any(isinstance(each, ScanAccepted) and each.text == text for each in said)
+
+    def _submit(self, text: str, person: PersonAtWork, mounted: str) -> None:
+        assert self.station is not None
+        self.station.submit(text, mounted)
+
+    def _sleep(self, act: stories.Sleep) -> bool:
+        unit, bay = self.units.get(act.unit), self.where(act.unit)
+        if unit is None or bay is None:
+            return False
+        unit.sleeps_until = self.now + act.seconds
+        return True
+
+    def _dip(self, act: stories.Dip) -> bool:
+        bay = self.bays.get(act.socket)
+        if bay is None or act.socket in self._power_at:
+            return False
+        if bay.unit is not None and bay.unit.engine.has_power:
+            bay.bus.pull(bay.unit)
+            bay.unit.engine.power_cut(self.now)
+            bay.bus.attach(bay.unit)
+        self._power_at[act.socket] = self.now + act.seconds
+        return True
+
+    def _switch_on(self, bay: Bay) -> None:
+        if bay.unit is not None and not bay.unit.engine.has_power:
+            bay.unit.engine.power_on(self.now)
+
+    def _kill_worker(self, act: stories.KillWorker) -> bool:
+        bay = self.bays.get(act.socket)
+        if self.station is None or bay is None or bay.process is None or bay.process.is_over:
+            return False
+        bay.process.kill()
+        bay.is_working = False
+        return True
+
+    def _kill_station(self, act: stories.KillStation) -> bool:
+        if self.station is None:
+            return False
+        self.station = None
+        for bay in self.bays.values():
+            if bay.process is not None:
+                bay.process.lose_station()
+            bay.shown = None
+        for person in self.people.values():
+            person.card = person.label = None
+        self._station_at = self.now + act.seconds
+        return True
+
+    _ACTS: Final[dict[type, Callable[[World, Any], bool]]] = {
+        stories.Put: _put,
+        stories.Pull: _pull,
+        stories.Card: _card,
+        stories.Label: _label,
+        stories.Cancel: _cancel,
+        stories.Free: _free,
+        stories.Sleep: _sleep,
+        stories.Dip: _dip,
+        stories.KillWorker: _kill_worker,
+        stories.KillStation: _kill_station,
+    }
+
+    # -- the oracle -------------------------------------------------------------------------------
+
+    def _end(self, bay: Bay, event: RunEnded) -> None:
+        bay.run = ""
+        self.seen[f"{event.outcome.value} {event.code}"] += 1
+        if event.code == "INTERNAL":
+            raise Violation("CRASH", f"the run of {event.serial} ended with a bug: {event.text}")
+        if event.outcome is not RunState.PASS:
+            return
+        self.passed.add(event.serial)
+        heard = list(bay.heard)
+        if heard != [event.serial]:
+            raise Violation(
+                "FALSE PASS",
+                f"PASS of {event.serial} in {bay.name}, and in its run {_words(heard)} was heard",
+            )
+        unit = next(each for each in self.units.values() if each.label == event.serial)
+        stored = _stored(unit)
+        if unit.engine.stored_image != IMAGES[BMS].data:
+            raise Violation("FALSE PASS", f"PASS of {event.serial}, which has another image")
+        if self.setup.line.recipe == "writes" and stored.number != event.serial:
+            raise Violation(
+                "FALSE PASS", f"PASS of {event.serial}, which says that it is {stored.number}"
+            )
+
+    def _look(self) -> None:
+        """Look at every unit and every tile."""
+        if self._found is not None:
+            raise self._found
+        for number, unit in self.units.items():
+            before, after = self._stored[number], _stored(unit)
+            if after == before:
+                continue
+            self._stored[number] = after
+            bay = self.where(number)
+            label = "" if bay is None else bay.run
+            if after.number not in self._allowed[number]:
+                raise Violation(
+                    "NUMBER",
+                    f"the unit with the label {unit.label} now says that it is {after.number}",
+                )
+            is_own = before.number.startswith("W")
+            if is_own and label not in ("", before.number, unit.label):
+                raise Violation(
+                    "TOUCHED",
+                    f"unit {unit.label}, which says that it is {before.number}, was flashed or"
+                    f" written under the label {label}",
+                )
+        for bay in self.bays.values():
+            self._look_at_green(bay)
+
+    def _look_at_green(self, bay: Bay) -> None:
+        shown = bay.shown
+        if shown is None or shown.state is not SocketState.PASS or self.station is None:
+            return
+        if self.now - bay.changed_at < GREEN_S:
+            return
+        unit = bay.unit
+        if unit is not None and unit.label != shown.serial and bay.has_spoken:
+            raise Violation(
+                "GREEN",
+                f"{bay.name} shows PASS of {shown.serial} over unit {unit.label}, for"
+                f" {self.now - bay.changed_at:.1f} s",
+            )
+
+    # -- nobody is stuck --------------------------------------------------------------------------
+
+    def go_home(self) -> None:
+        """Nothing happens any more, and a careful person brings each unit to a finished run."""
+        self.go_to(self.now + 0.5)
+        while self.station is None or self._power_at:
+            self.go_to(self.now + 1.0)
+        for unit in self.units.values():
+            unit.sleeps_until = float("-inf")
+        for number in self.units:
+            if label_of(number) not in self.passed:
+                self._bring_home(number)
+
+    def _bring_home(self, number: int) -> None:
+        label, said = label_of(number), ""
+        for attempt in range(_TRIES):
+            self._await_ends()
+            for person in self.people.values():
+                person.card = person.label = None
+                if person.source != "mounted":
+                    self._scan("CANCEL", person)
+            for each in self.units:
+                self._pull(stories.Pull(unit=each))
+            self.go_to(self.now + _READY_S)
+            if attempt:
+                for name in self.bays:
+                    self._scan(f"FREE {name}", self._careful)
+            bay = self.bays[list(self.bays)[attempt % len(self.bays)]]
+            if not self._put(stories.Put(unit=number, socket=bay.name)):
+                self._stuck(number, f"{bay.name} waits for another unit")
+            self.go_to(self.now + _READY_S)
+            before, runs = len(self._answers), self.seen["runs"]
+            self._scan(f"SOCKET {bay.name}", self._careful)
+            self.go_to(self.now + 1.0)
+            self._scan(label, self._careful)
+            give_up_at = self.now + 30.0
+            while self.seen["runs"] == runs and self.now < give_up_at:
+                self.go_to(self.now + 0.5)
+            refusals = [e for e in self._answers[before:] if isinstance(e, ScanRefused)]
+            if any(each.code in _FINAL for each in refusals):
+                return
+            said = "; ".join(f"{e.code} {e.reason} {e.remedy}" for e in refusals)
+            if self.seen["runs"] > runs:
+                self._await_ends()
+                return
+        self._stuck(number, said)
+
+    def _stuck(self, number: int, said: str) -> NoReturn:
+        raise Violation("STUCK", f"no way of scans leads to a run of {label_of(number)}: {said}")
+
+    @property
+    def _careful(self) -> PersonAtWork:
+        return PersonAtWork("careful", "careful")
+
+    def _await_ends(self) -> None:
+        give_up_at = self.now + _RUN_LIMIT_S
+        while any(bay.run or bay.is_working for bay in self.bays.values()):
+            if self.now >= give_up_at:
+                running = [f"{bay.run} in {bay.name}" for bay in self.bays.values() if bay.run]
+                raise Violation("STUCK", f"no end of the run of {_words(running)}")
+            self.go_to(self.now + 0.5)
+
+
+def _make(setup: stories.UnitSetup, none: str) -> PaperUnit:
+    """A unit that lies on the table, without power; `none` is what a new one has for a number."""
+    numbers = {
+        "none": none,
+        "own": label_of(setup.label),
+        "maker": f"MK{setup.label:05}",
+        "other": label_of(900 + setup.label),
+    }
+    profile = DeviceProfile(
+        serial_number=numbers[setup.number],
+        application_area_bytes=8192,
+        silent_queries="none" if setup.answers else "752:3300",
+        **(_SLOW if setup.pace == "slow" else {}),  # type: ignore[arg-type]
+    )
+    device = MockDevice(
+        BMS,
+        bitrate_bps=WELLING.bitrate_bps,
+        profile=profile,
+        has_application=setup.application == "old",
+    )
+    device.power_cut(0.0)
+    return PaperUnit(device, label_of(setup.label))
+
+
+def _stored(unit: PaperUnit) -> _Stored:
+    application = unit.engine.application
+    assert isinstance(application, BmsApplication)
+    number = application.kept["serial number"]
+    return _Stored(
+        str(getattr(number, "serial_number", "")), unit.engine.operations_done
+    )
+
+
+def _words(labels: list[str]) -> str:
+    return " and ".join(labels) or "nobody"
+
+
+def _shown(event: StationEvent) -> str:
+    words = {
+        name: value
+        for name, value in vars(event).items()
+        if value not in ("", (), None) and name not in ("at", "run_id", "audit")
+    }
+    return f"{type(event).__name__} " + " ".join(f"{name}={value}" for name, value in words.items())
