@@ -83,7 +83,9 @@ def main() -> int:
         if stories % 100 == 0:
             say(f"{steps} steps, {60 * steps / (time.perf_counter() - began):,.0f} a minute")
     took_s = time.perf_counter() - began
-    say(f"{steps} steps in {stories} stories, {60 * steps / took_s:,.0f} a minute; {bad} violations")
+    say(
+        f"{steps} steps in {stories} stories, {60 * steps / took_s:,.0f} a minute; {bad} violations"
+    )
     for kind, count in kinds.most_common():
         say(f"  {count} {kind}")
     for what, count in seen.most_common():

@@ -15,9 +15,9 @@ from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.stories import Story
 from tests.campaigns.line_world.world import Bay, World
 
-Step = tuple[float, stories.Clause | None]
+Step = tuple[float, stories.Act | None]
 """Seconds to wait, and what is done then; None: nothing, only look again."""
-_GAPS_S: Final = (0.0005, 0.05, 0.3, 0.5, 1.0, 3.5)
+_GAPS_S: Final = (0.1, 0.3, 0.3, 0.5, 1.0, 3.5)
 """From pulling a unit to putting another one in."""
 _IN_HAND: Final = (SocketState.PASS, SocketState.FAIL, SocketState.RECHECK)
 
@@ -53,7 +53,7 @@ class Teller:
         self.chance = chance
         self.world = world
 
-    def acts(self) -> Iterator[stories.Clause]:
+    def acts(self) -> Iterator[stories.Act]:
         """Acts with their times, each drawn when the one before it is done."""
         actors = [self._person(each.name) for each in self.world.people.values()]
         actors.append(self._fate())

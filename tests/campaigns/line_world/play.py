@@ -6,6 +6,7 @@ import random
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Final
 
 from tests.campaigns.line_world import stories
@@ -33,12 +34,11 @@ def _silent(_line: str) -> None:
 
 def play(story: Story, log: Callable[[str], None] = _silent) -> Played:
     """Play a story as it is written, then bring every unit home."""
-    done: list[stories.Clause] = []
+    done: list[stories.Act] = []
     with World(story, log) as world:
         try:
             for act in story.acts:
-                if world.do(act):
-                    done.append(act)
+                done += [act] if world.do(act) else []
             world.go_home()
         except Violation as violation:
             kept = [each for each in story.acts if each in done or time_of(each) >= world.now]
@@ -50,7 +50,7 @@ def draw(seed: int, steps: int) -> Played:
     """Draw a story of so many acts, and play it at once."""
     chance = random.Random(seed)
     setup = setup_of(chance)
-    acts: list[stories.Clause] = []
+    acts: list[stories.Act] = []
     with World(setup) as world:
         kind = text = ""
         try:
@@ -117,7 +117,7 @@ def _simpler_setup(best: Played, is_bad: Callable[[Story], Played | None]) -> Pl
             {"number": "none"}, {"application": "old"}, {"pace": "fast"}, {"answers": True},
         ):  # fmt: skip
             simpler = list(best.story.units)
-            simpler[number] = replace(simpler[number], **change)  # type: ignore[arg-type]
+            simpler[number] = replace(simpler[number], **change)  
             if simpler != list(best.story.units):
                 best = is_bad(replace(best.story, units=simpler)) or best
     for sockets in range(1, best.story.line.sockets):
@@ -131,7 +131,8 @@ def _simpler_setup(best: Played, is_bad: Callable[[Story], Played | None]) -> Pl
 def _rounder(best: Played, is_bad: Callable[[Story], Played | None]) -> Played:
     """Times that a person can read: first all at once, then one by one."""
     for grid in _GRID_S:
-        found = is_bad(replace(best.story, acts=_on_grid(best.story.acts, grid)))
+        acts = _on_grid(best.story.acts, grid)
+        found = is_bad(replace(best.story, acts=acts)) if _are_apart(acts) else None
         if found is not None:
             best = found
             break
@@ -145,14 +146,17 @@ def _rounder(best: Played, is_bad: Callable[[Story], Played | None]) -> Played:
             acts[number] = _on_grid([acts[number]], grid)[0]
             if acts == list(best.story.acts):
                 break
-            found = is_bad(replace(best.story, acts=sorted(acts, key=time_of)))
+            found = is_bad(replace(best.story, acts=acts)) if _are_apart(acts) else None
             if found is not None and len(found.story.acts) == len(acts):
                 best = found
                 break
     return best
 
 
-def _on_grid(acts: Sequence[stories.Clause], grid_s: float) -> list[stories.Clause]:
-    return [
-        replace(each, when=stories.at(round(time_of(each) / grid_s) * grid_s)) for each in acts
-    ]
+def _are_apart(acts: Sequence[stories.Act]) -> bool:
+    """True when each act has a later time than the one before."""
+    return all(time_of(one) < time_of(other) for one, other in pairwise(acts))
+
+
+def _on_grid(acts: Sequence[stories.Act], grid_s: float) -> list[stories.Act]:
+    return [replace(each, when=stories.at(round(time_of(each) / grid_s) * grid_s)) for each in acts]

@@ -71,22 +71,29 @@ class Person(Clause):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Put(Clause):
+class Act(Clause):
+    """Has a time."""
+
+    NAME = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Put(Act):
     NAME = "put"
     unit: int
     socket: str
 
 
 @dataclass(frozen=True, kw_only=True)
-class Pull(Clause):
+class Pull(Act):
     """Take the unit out of the socket that it is in."""
 
     NAME = "pull"
-    unit: int = 1
+    unit: int
 
 
 @dataclass(frozen=True, kw_only=True)
-class Scan(Clause):
+class Scan(Act):
     by: str
 
 
@@ -102,7 +109,7 @@ class Card(Scan):
 @dataclass(frozen=True, kw_only=True)
 class Label(Scan):
     NAME = "label"
-    unit: int = 1
+    unit: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -122,7 +129,7 @@ class Free(Scan):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Sleep(Clause):
+class Sleep(Act):
     """A unit neither hears nor speaks for a time; its supply stays on."""
 
     NAME = "sleep"
@@ -131,7 +138,7 @@ class Sleep(Clause):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Dip(Clause):
+class Dip(Act):
     """The supply of a socket fails for a time."""
 
     NAME = "dip"
@@ -140,13 +147,13 @@ class Dip(Clause):
 
 
 @dataclass(frozen=True, kw_only=True)
-class KillWorker(Clause):
+class KillWorker(Act):
     NAME = "worker"
     socket: str
 
 
 @dataclass(frozen=True, kw_only=True)
-class KillStation(Clause):
+class KillStation(Act):
     """The station dies, and is started again after some seconds."""
 
     NAME = "station"
@@ -169,7 +176,7 @@ class Story:
     line: LineSetup
     units: Sequence[UnitSetup]
     people: Sequence[Person]
-    acts: Sequence[Clause]
+    acts: Sequence[Act]
     """In the order of their times."""
 
     def __str__(self) -> str:
@@ -178,7 +185,7 @@ class Story:
     @classmethod
     def parse(cls, text: str) -> Story:
         clauses = list(parse_clauses(text, CLAUSES))
-        acts = [each for each in clauses if each.when is not None]
+        acts = [each for each in clauses if isinstance(each, Act)]
         return cls(
             next((each for each in clauses if isinstance(each, LineSetup)), LineSetup(sockets=2)),
             [each for each in clauses if isinstance(each, UnitSetup)],
@@ -187,7 +194,7 @@ class Story:
         )
 
 
-def time_of(act: Clause) -> float:
+def time_of(act: Act) -> float:
     return act.when.plus_s if act.when is not None else 0.0
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NoReturn
@@ -38,6 +38,8 @@ from tests.station.unit_bench import WRITES
 
 WINDOW_S: Final = 0.1
 """The station looks at its processes at least so often."""
+HAND_S: Final = 0.1
+"""The fastest hand takes so long from pulling a unit to putting another one in."""
 GREEN_S: Final = 5.0
 """A tile that is green for a unit which is not in its socket has to change within this time."""
 NONE: Final = "NONE"
@@ -73,6 +75,7 @@ class Bay:
     unit: PaperUnit | None = None
     changed_at: float = 0.0
     """Since when the same unit is in it, and the station can see it."""
+    emptied_at: float = float("-inf")
     has_spoken: bool = False
     """The unit sent something since then."""
     run: str = ""
@@ -107,7 +110,9 @@ class _Stored:
 class World:
     """One line. `do` carries out an act at its time; everything raises Violation."""
 
-    def __init__(self, setup: stories.Story, log: Callable[[str], None] = lambda _line: None) -> None:
+    def __init__(
+        self, setup: stories.Story, log: Callable[[str], None] = lambda _line: None
+    ) -> None:
         self.now = 0.0
         self.log = log
         self.seen: Counter[str] = Counter()
@@ -118,9 +123,7 @@ class World:
         self._began_at = self.bench.clock.seconds
         if setup.line.recipe != "plain":
             self.bench.use(_RECIPES[setup.line.recipe])
-        self.bays = {
-            name: Bay(name, SocketBus()) for name in stories.SOCKETS[: setup.line.sockets]
-        }
+        self.bays = {name: Bay(name, SocketBus()) for name in stories.SOCKETS[: setup.line.sockets]}
         none = NONE if setup.line.recipe == "writes" else ""
         self.units = {each.label: _make(each, none) for each in setup.units}
         self._allowed = {
@@ -135,6 +138,7 @@ class World:
         """When a station that died is started again."""
         self._answers: list[StationEvent] = []
         self._power_at: dict[str, float] = {}
+        self._pulled_at: dict[int, float] = {}
         self._begin_station()
 
     def close(self) -> None:
@@ -156,7 +160,9 @@ class World:
     def go_to(self, moment: float) -> None:
         """Let time pass up to this moment."""
         while self.now < moment:
-            due = [each for each in (self._station_at, *self._power_at.values()) if each is not None]
+            due = [
+                each for each in (self._station_at, *self._power_at.values()) if each is not None
+            ]
             horizon = min(moment, self.now + WINDOW_S, *due)
             for bay in self.bays.values():
                 if bay.process is None:
@@ -265,7 +271,7 @@ class World:
 
     # -- acts -------------------------------------------------------------------------------------
 
-    def do(self, act: stories.Clause) -> bool:
+    def do(self, act: stories.Act) -> bool:
         """Carry out an act at its time; False where nobody honest would, or nothing is there."""
         self.go_to(stories.time_of(act))
         is_done = self._ACTS[type(act)](self, act)
@@ -279,7 +285,8 @@ class World:
         bay, unit = self.bays.get(act.socket), self.units.get(act.unit)
         if bay is None or unit is None or bay.unit is not None or self.where(act.unit) is not None:
             return False
-        if self.awaits_another(bay, act.unit):
+        moved_s = self.now - max(bay.emptied_at, self._pulled_at.get(act.unit, -HAND_S))
+        if self.awaits_another(bay, act.unit) or round(moved_s, 6) < HAND_S:
             return False
         bay.unit, bay.changed_at, bay.has_spoken = unit, self.now, False
 
@@ -309,6 +316,7 @@ class World:
         if bay is None or bay.unit is None:
             return False
         unit, bay.unit, bay.changed_at = bay.unit, None, self.now
+        bay.emptied_at = self._pulled_at[act.unit] = self.now
         bay.bus.pull(unit)
         unit.on_sent = lambda _now: None
         unit.sleeps_until = float("-inf")
@@ -630,9 +638,7 @@ def _stored(unit: PaperUnit) -> _Stored:
     application = unit.engine.application
     assert isinstance(application, BmsApplication)
     number = application.kept["serial number"]
-    return _Stored(
-        str(getattr(number, "serial_number", "")), unit.engine.operations_done
-    )
+    return _Stored(str(getattr(number, "serial_number", "")), unit.engine.operations_done)
 
 
 def _words(labels: list[str]) -> str:
