@@ -117,7 +117,7 @@ def _simpler_setup(best: Played, is_bad: Callable[[Story], Played | None]) -> Pl
             {"number": "none"}, {"application": "old"}, {"pace": "fast"}, {"answers": True},
         ):  # fmt: skip
             simpler = list(best.story.units)
-            simpler[number] = replace(simpler[number], **change)  
+            simpler[number] = replace(simpler[number], **change)
             if simpler != list(best.story.units):
                 best = is_bad(replace(best.story, units=simpler)) or best
     for sockets in range(1, best.story.line.sockets):

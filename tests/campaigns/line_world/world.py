@@ -30,6 +30,7 @@ from flasher.station.events import (
 )
 from flasher.station.messages import Finished, FromWorker, WorkerSetup
 from flasher.station.records.model import RunState, StepName
+from flasher.station.socket import Source
 from flasher.station.station import Station
 from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.clockwork import PaperUnit, Process, SocketBus, scratch
@@ -49,6 +50,8 @@ _SLOW: Final = {"erase_time_s": 0.5, "program_time_s": 0.25}
 _READY_S: Final = 4.0
 _RUN_LIMIT_S: Final = 150.0
 _TRIES: Final = 4
+_SCAN_LABEL: Final = "Scan the label of the unit that is in this socket"
+"""A tile says so while its card waits for a label."""
 _FINAL: Final = ("DUPLICATE", "JUST_PASSED", "WRONG_UNIT")
 """Refusals after which a unit is not for this line: it has passed, or says that it is another."""
 
@@ -139,6 +142,7 @@ class World:
         self._answers: list[StationEvent] = []
         self._power_at: dict[str, float] = {}
         self._pulled_at: dict[int, float] = {}
+        self._scanning: tuple[str, str] | None = None
         self._begin_station()
 
     def close(self) -> None:
@@ -246,8 +250,8 @@ class World:
         match event:
             case ScanAccepted() | ScanRefused() | OperatorPrompted():
                 self._answers.append(event)
-                if isinstance(event, ScanRefused):
-                    self._forget(event.text)
+                if isinstance(event, ScanRefused) and (event.text, event.source) != self._scanning:
+                    self._forget(event.text, event.source)
             case SocketChanged():
                 self.bays[event.socket].shown = event
             case RunStarted():
@@ -261,9 +265,11 @@ class World:
             case WorkerFailed() if "said nothing" in event.reason:
                 raise Violation("CRASH", f"the process of {event.socket} hangs: {event.reason}")
 
-    def _forget(self, text: str) -> None:
-        """Somebody is told that a scan does not wait any more."""
+    def _forget(self, text: str, source: str) -> None:
+        """It is reported at a source that a scan does not wait any more."""
         for person in self.people.values():
+            if person.source != source:
+                continue
             if person.card is not None and text == f"SOCKET {person.card[0]}":
                 person.card = None
             if person.label is not None and text == label_of(person.label):
@@ -343,16 +349,12 @@ class World:
             return False
         if any(each.label is not None for each in self._sharing(person)):
             return False  # the screen says whose card is awaited
-        label, person.label = person.label, None
         if self._scan(f"SOCKET {bay.name}", person):
-            person.card = None if label is not None else (bay.name, act.unit, is_in)
-        else:
-            person.label = label if self._is_waiting_for_card(person) else None
+            text = "" if bay.shown is None else bay.shown.text
+            is_awaited = text.startswith(_SCAN_LABEL)
+            person.card = (bay.name, act.unit, is_in) if is_awaited else None
+            person.label = None
         return True
-
-    @staticmethod
-    def _is_waiting_for_card(person: PersonAtWork) -> bool:
-        return False  # refused: begin anew
 
     def _sharing(self, person: PersonAtWork) -> list[PersonAtWork]:
         """Others at the same source."""
@@ -368,29 +370,43 @@ class World:
             return False
         bay = self.where(act.unit)
         if person.source == "mounted":
-            return bay is not None and self._scan(unit.label, person, bay.name) is not None
+            if bay is not None:
+                self._scan(unit.label, person, bay.name)
+            return bay is not None
         if person.card is not None:
-            socket, meant, was_in = person.card
-            there = self.bays[socket].unit
-            if meant != act.unit or (not was_in and there not in (None, unit)):
-                return False
-            if not was_in and bay is not None and bay.name != socket:
-                return False  # it was put elsewhere
-            person.card = None
-            self._scan(unit.label, person)
-            return True
+            return self._label_after_card(person, act.unit, person.card)
         if any(each.card is not None or each.label is not None for each in self._sharing(person)):
             return False  # the screen says that something else is awaited
-        if len(self.bays) == 1:
-            there = self.bays["A"].unit
-            if there not in (None, unit):
-                return False
+        if len(self.bays) == 1 and self.bays["A"].unit not in (None, unit):
+            return False
         before = len(self._answers)
         if self._scan(unit.label, person):
             accepted = [e for e in self._answers[before:] if isinstance(e, ScanAccepted)]
             if accepted and not accepted[-1].socket:
                 person.label = act.unit
         return True
+
+    def _label_after_card(
+        self, person: PersonAtWork, number: int, card: tuple[str, int, bool]
+    ) -> bool:
+        """Who has scanned the card of a unit scans its label, and does not look again whether it is
+        still there.
+        """
+        socket, meant, was_in = card
+        unit, bay = self.units[number], self.where(number)
+        is_elsewhere = bay is not None and bay.name != socket
+        is_taken = self.bays[socket].unit not in (None, unit)
+        if meant != number or (not was_in and (is_elsewhere or is_taken)):
+            return False
+        person.card = None
+        before = len(self._answers)
+        if not self._scan(unit.label, person) and self._says_card_waits(before):
+            person.card = card
+        return True
+
+    def _says_card_waits(self, before: int) -> bool:
+        refused = [each for each in self._answers[before:] if isinstance(each, ScanRefused)]
+        return any(each.code in ("CARD_WAITS", "LABEL_WAITS") for each in refused)
 
     def _cancel(self, act: stories.Cancel) -> bool:
         person = self.people.get(act.by)
@@ -414,17 +430,16 @@ class World:
         self.seen["scans"] += 1
         self.log(f"{self.now:9.4f}    scan {text} by {person.name}")
         before = len(self._answers)
-        self._submit(text, person, mounted)
+        name = f"scanner {mounted}" if mounted else person.source
+        self._scanning = text, name
+        self.station.submit(text, Source(name, mounted))
         self.turn()
+        self._scanning = None
         said = self._answers[before:]
         if text == "CANCEL":
             for each in self._sharing(person):
                 each.card = each.label = None
         return any(isinstance(each, ScanAccepted) and each.text == text for each in said)
-
-    def _submit(self, text: str, person: PersonAtWork, mounted: str) -> None:
-        assert self.station is not None
-        self.station.submit(text, mounted)
 
     def _sleep(self, act: stories.Sleep) -> bool:
         unit, bay = self.units.get(act.unit), self.where(act.unit)
