@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import replace
 
+from flasher.events import CheckMade
 from flasher.host.identity import (
     WAIVABLE,
     Check,
@@ -14,9 +15,11 @@ from flasher.host.identity import (
     Identity,
     judge_device,
     judge_image,
+    new_version,
 )
 from flasher.host.table import Ending
 from flasher.image.image import Image
+from flasher.image.plausible import Cpu
 from flasher.image.release import Release
 from flasher.protocol.contents import RunningInformation, Status, VersionInformation
 from flasher.protocol.fields import Text
@@ -164,3 +167,190 @@ def test_what_a_device_tells_is_shown_escaped() -> None:
     ]
     assert said
     assert not any("\x1b" in text or "\x07" in text for text in said)
+
+
+# -- every sentence, and what becomes of it -------------------------------------------------------
+
+
+def judged(
+    image: Image = IMAGE, identity: Identity | None = None, device: DeviceAnswers | None = None
+) -> dict[Check, CheckResult]:
+    identity = identity or Identity()
+    found = list(judge_image(image, BMS, identity))
+    found += judge_device(image, BMS, identity, device or DeviceAnswers())
+    assert len({each.check for each in found}) == len(found)
+    return {each.check: each for each in found}
+
+
+@each(
+    "image, identity, verdict, text, detail",
+    [
+        (Image.from_bytes(b"PK\3\4" + bytes(60)), Identity(), REFUSED, "the image is a zip archive",
+         "the image is a zip archive; --allow-implausible waives this"),
+        (Image.from_bytes(bytes(4) + VECTORS), Identity(), REFUSED, "no Cortex-M vector table",
+         "--allow-implausible waives this, as does"),
+        (Image.from_bytes(bytes(4) + VECTORS), Identity(cpu=Cpu.OTHER), UNKNOWN,
+         "the profile says that the processor is another", ""),
+        (Image.from_bytes(b"PK\3\4" + bytes(60)), Identity(cpu=Cpu.OTHER), REFUSED, "zip", ""),
+        (Image.from_bytes(bytes(4) + VECTORS), Identity(waived=frozenset({Check.PLAUSIBLE})),
+         CheckVerdict.WAIVED, "no Cortex-M vector table", ""),
+    ],
+)  # fmt: skip
+def test_an_image_that_is_no_program_is_refused_and_why(
+    image: Image, identity: Identity, verdict: CheckVerdict, text: str, detail: str
+) -> None:
+    found = judged(image, identity)[Check.PLAUSIBLE]
+    assert found.verdict is verdict
+    assert text in found.text
+    assert detail in found.detail
+    assert (found.ending is Ending.IMPLAUSIBLE) is (verdict is REFUSED)
+    assert Check.TARGET in judged(image, identity), "the other checks are made all the same"
+
+
+def test_a_manifest_vouches_for_its_very_bytes_only() -> None:
+    odd = Image.from_bytes(bytes(4) + VECTORS)
+    assert Identity(release_of(odd, BMS)).vouches_for(odd)
+    assert not Identity().vouches_for(odd)
+    assert not Identity(release()).vouches_for(odd)
+    found = judged(odd, Identity(release_of(odd, BMS)))[Check.PLAUSIBLE]
+    assert found.verdict is UNKNOWN
+    assert found.text.endswith("the manifest was made for these very bytes")
+    archive = Image.from_bytes(b"PK\3\4" + bytes(60))
+    assert judged(archive, Identity(release_of(archive, BMS)))[Check.PLAUSIBLE].verdict is REFUSED
+
+
+def test_what_says_that_the_image_is_for_the_target() -> None:
+    assert judged()[Check.TARGET].text.startswith("no manifest, and the image names no device")
+    by_manifest = judged(IMAGE, Identity(release()))[Check.TARGET]
+    assert by_manifest.text == "by the manifest the image is for the BMS"
+    named = Image.from_bytes(VECTORS + b"\0BMS_UPD\0")
+    assert judged(named)[Check.TARGET].text == "by a name inside the image the image is for the BMS"
+    other = judged(IMAGE, Identity(release(target=WMC)))[Check.TARGET]
+    assert "is for the WMC, not the BMS" in other.detail
+    assert other.ending is Ending.NOT_FOR_DEVICE
+    assert other.waiver == "other-target"
+
+
+@each(
+    "stated, rules",
+    [
+        ({"hardware_versions": ("V1*",)}, "hardware"),
+        ({"previous_from": OLD}, "the version that is replaced"),
+        ({"hardware_versions": ("V1*",), "previous_except": (OLD,)},
+         "hardware and the version that is replaced"),
+    ],
+)  # fmt: skip
+def test_a_rule_that_a_silent_device_cannot_be_asked_for_refuses_it(
+    stated: dict[str, object], rules: str
+) -> None:
+    found = judged(IMAGE, Identity(release(**stated)))[Check.HARDWARE]
+    assert found.text == (
+        "the BMS's application does not tell its versions: "
+        f"the manifest's rule on {rules} cannot be checked"
+    )
+    assert found.verdict is REFUSED
+    assert found.is_unchecked
+    assert found.ending is Ending.UNCHECKED
+    assert found.detail == f"{found.text}; --allow-hardware waives this"
+    rescued = judged(IMAGE, Identity(release(**stated), goes_on_unchecked=True))[Check.HARDWARE]
+    assert rescued.verdict is UNKNOWN
+    assert rescued.text == f"{found.text}: goes on unchecked"
+    assert rescued.ending is None
+
+
+@each("waived", [Check.HARDWARE, Check.PREVIOUS])
+def test_a_rule_is_waived_by_its_own_option_and_by_that_for_hardware(waived: Check) -> None:
+    both = release(hardware_versions=("V1*",), previous_from=OLD)
+    for ruled in (replace(both, hardware_versions=()), replace(both, previous_from=None)):
+        found = list(
+            judge_device(IMAGE, BMS, Identity(ruled, frozenset({waived})), DeviceAnswers())
+        )
+        other_rule = waived is Check.PREVIOUS and bool(ruled.hardware_versions)
+        assert found[0].verdict is (REFUSED if other_rule else CheckVerdict.WAIVED)
+
+
+def test_hardware_that_is_not_listed_is_named_with_the_list() -> None:
+    fits = ("V1r3*", "V2*")
+    found = judged(IMAGE, Identity(release(hardware_versions=fits)), seen())[Check.HARDWARE]
+    assert found.text == (
+        "the device's hardware V1r2r0_20220512 is not in the manifest, which lists V1r3*, V2*"
+    )
+    assert found.ending is Ending.NOT_FOR_DEVICE
+    assert not found.is_unchecked
+    good = judged(IMAGE, Identity(release(hardware_versions=("V1*",))), seen())[Check.HARDWARE]
+    assert good.text == "the manifest lists hardware V1r2r0_20220512"
+    assert judged(device=seen())[Check.HARDWARE].text == (
+        "no manifest says which hardware the image fits"
+    )
+
+
+@each(
+    "firmware, check, verdict, text",
+    [
+        (NEW, SAME, WARNED, f"the device already runs {NEW}"),
+        (OLD, DOWNGRADE, PASSED, f"{NEW} is newer than {OLD}, which runs now"),
+        ("V3r0r0_20260301", DOWNGRADE, REFUSED,
+         f"{NEW} is older than V3r0r0_20260301, which runs now"),
+        ("by hand", DOWNGRADE, UNKNOWN, f"by hand and {NEW} cannot be compared"),
+    ],
+)  # fmt: skip
+def test_the_running_version_is_compared_with_the_new_one(
+    firmware: str, check: Check, verdict: CheckVerdict, text: str
+) -> None:
+    found = judged(device=seen(firmware))[check]
+    assert found.verdict is verdict
+    assert found.text.startswith(text)
+
+
+def test_the_images_own_version_counts_before_the_manifests() -> None:
+    named = replace(release_of(NAMELESS, BMS), firmware_version=NEW)
+    assert new_version(NAMELESS, named) == NEW
+    assert new_version(replace(IMAGE, version=OLD), named) == OLD
+    assert new_version(NAMELESS, None) is None
+    found = judged(NAMELESS, Identity(), seen())[DOWNGRADE]
+    assert found.verdict is UNKNOWN
+    assert found.text == f"the image names no version to compare with the running {OLD}"
+    assert judged(NAMELESS, Identity(named), seen())[DOWNGRADE].verdict is PASSED
+
+
+@each(
+    "stated, text",
+    [
+        ({"previous_from": OLD}, f"the manifest lets {OLD} be replaced"),
+        ({"previous_except": (OLD,)}, f"the device runs {OLD}: the manifest excludes it"),
+        ({"previous_except": (OLD,), "previous_from": NEW},
+         f"the device runs {OLD}: the manifest excludes it"),
+        ({"previous_except": ("V1r0r9_20220901",), "previous_from": NEW},
+         f"the device runs {OLD}: the manifest replaces {NEW} and newer"),
+    ],
+)  # fmt: skip
+def test_the_rule_on_the_version_that_is_replaced(stated: dict[str, object], text: str) -> None:
+    assert judged(IMAGE, Identity(release(**stated)), seen())[PREVIOUS].text == text
+
+
+def test_a_battery_in_use_or_low_is_named_with_its_figures() -> None:
+    device = replace(
+        seen(), running=replace(BATTERY, mean_current_ma=-1500, state_of_charge_percent=7)
+    )
+    found = judged(device=device)
+    assert found[Check.IN_USE].text == "the battery gives 1500 mA, more than 1000 mA"
+    assert found[Check.IN_USE].ending is Ending.IN_USE
+    assert found[Check.CHARGE].text == "the battery is at 7 %: charge it first, if it can wait"
+    assert found[Check.CHARGE].ending is None
+    assert found[Check.CHARGE].waiver == ""
+    assert found[Check.CHARGE].detail == found[Check.CHARGE].text
+    limits = Identity(in_use_ma=1500, low_charge_percent=7)
+    assert {Check.IN_USE, Check.CHARGE}.isdisjoint(judged(identity=limits, device=device))
+
+
+def test_the_same_version_ends_the_session_where_it_is_skipped() -> None:
+    found = judged(identity=Identity(skip_same_version=True), device=seen(NEW))[SAME]
+    assert found.ending is Ending.UP_TO_DATE
+    assert found.event == CheckMade("same-version", "skipped", f"the device already runs {NEW}")
+
+
+def test_only_the_battery_tells_its_state_even_without_a_version() -> None:
+    device = DeviceAnswers(running=replace(BATTERY, mean_current_ma=-1500))
+    assert judged(device=device)[Check.IN_USE].verdict is REFUSED
+    assert device.hardware_version is None
+    assert device.firmware_version is None
