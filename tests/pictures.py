@@ -56,7 +56,8 @@ def _every_state(line: LineScreen) -> None:
 def _refused(line: LineScreen) -> None:
     _at_work(line)
     reason = say("It was scanned already.")
-    remedy = say("{wanted} Or scan CANCEL.", wanted=say("Connect {label}.", label="BAT2620-0014"))
+    wanted = say("Connect {label}.", label="BAT2620-0014")
+    remedy = say("{wanted} Or scan {way}.", wanted=wanted, way="CANCEL")
     line.say(ScanRefused("BAT2620-0014", "DOUBLE_SCAN", reason, remedy, at=AT))
 
 

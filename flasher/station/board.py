@@ -35,7 +35,7 @@ from flasher.station.events import (
 )
 from flasher.station.records.model import Figures, RunState, StepName
 from flasher.station.scans import Word
-from flasher.station.socket import PAGE
+from flasher.station.socket import PAGE, source_words
 
 STEPS: Final = {
     StepName.CONNECT: say("connect"),
@@ -85,7 +85,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Answer:
-    """What was said last: to a scan, or of what somebody has to do."""
+    """The answer to a scan, or what somebody has to do."""
 
     text: str = ""
     is_refusal: bool = False
@@ -95,16 +95,18 @@ class Answer:
 
 @dataclass(frozen=True)
 class Spoken:
-    """The last answers: to each page, and to everybody else."""
+    """The last answers: to what each page scanned, and all others."""
 
     to_all: Answer = Answer()
     to_pages: Mapping[str, Answer] = field(default_factory=dict)
 
     def to(self, source: str) -> Answer:
-        """The last one that this source is shown: what another page scanned is not its business."""
+        """The last one that is shown there: what another page scanned is not its business."""
         return max(self.to_all, self.to_pages.get(source, Answer()), key=lambda each: each.number)
 
-    def with_answer(self, answer: Answer, source: str) -> Spoken:
+    def with_answer(self, text: str, source: str, *, is_refusal: bool) -> Spoken:
+        before = max((each.number for each in self.to_pages.values()), default=0)
+        answer = Answer(text, is_refusal, max(before, self.to_all.number) + 1)
         if not source.startswith(PAGE):
             return replace(self, to_all=answer)
         others = {name: each for name, each in self.to_pages.items() if name != source}
@@ -127,9 +129,9 @@ class Board:
     """Address of the operator page, where there is one."""
     records_fault: str = ""
     """Why the last record was not saved; empty when the last one was."""
-    answer: Answer = Answer()
-    """The last one to anybody."""
     spoken: Spoken = Spoken()
+    scanners: set[str] = field(default_factory=set)
+    """Where something was scanned, beside pages."""
     prompt: str = ""
     """What somebody has to do about the label that was scanned last."""
     pin_of: str = ""
@@ -154,13 +156,13 @@ class Board:
 
     @property
     def said(self) -> str:
-        """The answer to the last scan, or what somebody has to do."""
-        return self.answer.text
+        """The answer to the last scan that was not made on a page, or what somebody has to do."""
+        return self.spoken.to_all.text
 
     @property
     def is_refusal(self) -> bool:
         """True when `said` is a refusal."""
-        return self.answer.is_refusal
+        return self.spoken.to_all.is_refusal
 
     def apply(self, event: StationEvent) -> None:
         match event:
@@ -269,9 +271,12 @@ class Board:
         self.prompt = ""
 
     def speak(self, text: str, source: str = "", *, is_refusal: bool = False) -> None:
-        """Show an answer where its scan came from."""
-        self.answer = Answer(text, is_refusal, self.answer.number + 1)
-        self.spoken = self.spoken.with_answer(self.answer, source)
+        """Show an answer where its scan came from; of several scanners, named."""
+        if source and not source.startswith(PAGE):
+            self.scanners.add(source)
+            if len(self.scanners) > 1:
+                text = say("{source}: {said}", source=source_words(source), said=text)
+        self.spoken = self.spoken.with_answer(text, source, is_refusal=is_refusal)
 
     def _socket(self, event: StationEvent) -> None:
         if isinstance(event, RecordNotSaved):

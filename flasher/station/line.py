@@ -64,6 +64,7 @@ from flasher.station.socket import (
     Phase,
     Socket,
     Source,
+    source_words,
 )
 
 ARRIVAL_LIMIT_S: Final = 20.0
@@ -279,10 +280,8 @@ class Line:
             self._silent(socket, now, _FORGOTTEN, reason, remedy, is_certain=what.is_certain)
             return
         if socket.is_exchange(what):
-            reason = say(
-                "The unit in socket {socket} was exchanged, or had no power.", socket=socket.name
-            )
-            remedy = say("See which unit is in it, then scan again.")
+            reason = say("The unit was exchanged, or had no power.")
+            remedy = say("See which unit it is, then scan again.")
             self._silent(socket, now, codes.UNIT_CHANGED.name, reason, remedy, is_certain=False)
         was_silent = socket.occupancy in (Occupancy.SILENT, Occupancy.EMPTY)
         is_new = socket.hear(what, is_serial=self._is_serial(what.serial or ""))
@@ -745,7 +744,7 @@ class Line:
             reason = say(
                 "{text} waits, and was not scanned here ({source}).",
                 text=printable(text),
-                source=source.name or say("a program"),
+                source=source_words(source.name),
             )
             raise Refused("NOTHING_WAITS", reason, remedy)
 

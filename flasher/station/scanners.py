@@ -18,7 +18,7 @@ from flasher.said import say
 from flasher.station.config import ScannerConfig
 from flasher.station.events import ScannerChanged, ScanRefused, StationEvent
 from flasher.station.keys import KeyDecoder, ScanBuilder
-from flasher.station.socket import Source
+from flasher.station.socket import SCANNER, Source
 
 REOPEN_S: Final = 1.0
 READ_S: Final = 0.2
@@ -58,7 +58,7 @@ class Scanner:
     ) -> None:
         """`submit` gets each scan, and the scanner as its source."""
         self.config = config
-        self._source = Source(f"scanner {printable(config.name)}", config.socket)
+        self._source = Source(SCANNER + printable(config.name), config.socket)
         self._publish = publish
         self._builder = ScanBuilder(lambda text: submit(text, self._source), self._damaged)
         self._open = open_scanner or _opener(config)

@@ -31,10 +31,29 @@ class Source:
     """The socket that it is mounted at."""
 
 
+SCANNER: Final = "scanner "
 PAGE: Final = "page "
 """How the names of browsers' sessions begin."""
+TERMINAL: Final = Source("terminal")
+PIPE: Final = Source("standard input")
+FILE: Final = Source("file of scans")
 UNNAMED: Final = Source()
 """Of a program that has one."""
+_SHOWN: Final = {
+    TERMINAL.name: say("terminal"),
+    PIPE.name: say("standard input"),
+    FILE.name: say("file of scans"),
+    UNNAMED.name: say("a program"),
+}
+
+
+def source_words(name: str) -> str:
+    """The name of a source for people."""
+    if name.startswith(SCANNER):
+        return say("scanner {name}", name=printable(name.removeprefix(SCANNER)))
+    if name.startswith(PAGE):
+        return say("page {number}", number=printable(name.removeprefix(PAGE)))
+    return _SHOWN.get(name, printable(name))
 
 
 class Phase(Enum):

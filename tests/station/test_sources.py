@@ -312,7 +312,7 @@ def test_a_card_does_not_live_longer_than_its_unit(
         assert (dropped.text, dropped.socket, dropped.source) == (f"SOCKET {name}", name, ONE.name)
         assert dropped.code == ("UNIT_CHANGED" if gap_s < 2.0 else "FORGOTTEN")
         if gap_s < 2.0:
-            assert floor.text(name).startswith(f"The unit in socket {name} was exchanged")
+            assert floor.text(name).startswith("The unit was exchanged")
         floor.scan(label)
         assert floor.runs == []
         assert floor.refused()[-1].code == "NO_SOCKET"
@@ -327,7 +327,7 @@ def test_what_was_dropped_is_shown_for_a_while(recipe: LoadedRecipe) -> None:
     floor.put_all(*pair())
     floor.scan("SOCKET A")
     floor.change_places(0.5)
-    said = "The unit in socket A was exchanged, or had no power. See which unit is in it, then"
+    said = "The unit was exchanged, or had no power. See which unit it is, then scan again."
     assert floor.text("A").startswith(said)
     floor.go_on(15.0)
     assert floor.text("A") == "Scan the label of the unit and SOCKET A."

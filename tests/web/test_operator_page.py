@@ -13,11 +13,13 @@ import pytest
 from PIL import Image, ImageChops, ImageStat
 from playwright.sync_api import Browser, Page, expect
 
+from flasher.said import say
 from flasher.station.events import (
     LineResumed,
     LineStopped,
     PinAwaited,
     PinEnded,
+    ScanAccepted,
     ScanRefused,
     SocketChanged,
     SocketState,
@@ -211,6 +213,33 @@ def test_a_scan_that_did_not_reach_the_station_is_said_and_forgotten(
 def test_a_refused_scan_is_said(page: Page, line: LineScreen) -> None:
     line.say(ScanRefused("X1", "WRONG_SERIAL", "No serial number.", "Scan the label.", at=AT))
     expect(page.locator("#spoken")).to_have_text("X1: No serial number. Scan the label.")
+
+
+def test_a_page_shows_what_came_of_its_own_scans_and_of_scanners(
+    browser: Browser, page: Page, line: LineScreen
+) -> None:
+    """A second browser is another source, and its operator is not disturbed."""
+    other = browser.new_page()
+    other.goto(f"{line.url}line")
+    for each, text in ((page, "SOCKET A"), (other, "SOCKET B"), (page, "W1")):
+        each.keyboard.type(text)
+        each.keyboard.press("Enter")
+        each.wait_for_function("() => waiting.length === 0 && !isSending")
+    one, two, again = line.sources
+    assert one == again != two
+    reason = say("The unit was exchanged, or had no power.")
+    remedy = say("See which unit it is, then scan again.")
+    line.say(ScanRefused("SOCKET A", "UNIT_CHANGED", reason, remedy, "A", one.name, at=AT))
+    line.say(ScanAccepted("SOCKET B", "socket", "B", two.name, at=AT))
+    expect(page.locator("#spoken")).to_have_text(f"SOCKET A: {reason} {remedy}")
+    expect(other.locator("#spoken")).to_have_text("SOCKET B: socket")
+    other.reload()
+    expect(other.locator("#spoken")).to_have_text("SOCKET B: socket")
+    for name in ("left", "right"):
+        line.say(ScanAccepted("W1", "label", "A", f"scanner {name}", at=AT))
+    for each in (page, other):
+        expect(each.locator("#spoken")).to_have_text("scanner right: W1: label for socket A")
+    other.close()
 
 
 def test_a_pin_is_hidden_while_it_is_typed(page: Page, line: LineScreen) -> None:

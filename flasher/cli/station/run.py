@@ -20,7 +20,6 @@ from flasher.cli.station.place import operator_of, records_of
 from flasher.cli.station.scans import (
     LineReader,
     ScanFile,
-    Submit,
     Typing,
     keyboard,
     read_scans,
@@ -46,7 +45,7 @@ from flasher.station.recipe_file import load_checked
 from flasher.station.records.errors import RecordError
 from flasher.station.records.keys import Keeping
 from flasher.station.records.store import Store
-from flasher.station.socket import Source
+from flasher.station.socket import FILE, PIPE, TERMINAL
 from flasher.station.station import SCANS_ENDED, Station, StationOptions
 from flasher.station.supervisor import Launch, ProcessPort
 from flasher.station.virtual_units import next_number
@@ -117,7 +116,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
             session.file = ScanFile(
                 scans,
                 list(session.station.line.sockets),
-                session.submit_from("file of scans"),
+                partial(session.station.submit, source=FILE),
                 badges=frozenset() if crew is None else crew.codes,
             )
         session.work()
@@ -278,19 +277,16 @@ class _Session:
         if sys.stdin is None:
             return
         if sys.stdin.isatty():
+            submit = partial(self.station.submit, source=TERMINAL)
             has_pins = self.crew is not None and self.crew.has_pins
             if isinstance(self.view, Table) or has_pins:  # what is typed is not echoed
-                self._typing = Typing(self.submit_from("terminal"))
+                self._typing = Typing(submit)
                 stack.enter_context(keyboard(self._typing))
             else:
-                LineReader(sys.stdin, self.submit_from("terminal")).start()
+                LineReader(sys.stdin, submit).start()
         elif not (self.file or self.scans_itself or self._page or self.config.scanner):
-            self._pipe = LineReader(sys.stdin, self.submit_from("standard input"))
+            self._pipe = LineReader(sys.stdin, partial(self.station.submit, source=PIPE))
             self._pipe.start()
-
-    def submit_from(self, name: str) -> Submit:
-        """Hands scans of one source to the station."""
-        return partial(self.station.submit, source=Source(name))
 
     def _second_stop(self) -> None:
         """A second Ctrl-C; called in the handler of the signal."""

@@ -274,8 +274,9 @@ def _words(event: StationEvent) -> Iterator[str]:
                 yield NO_BADGES
             for run_id in event.recovered:
                 yield f"run {run_id} was interrupted: its unit has to be checked"
-        case events.ScanRefused(text, code, reason, remedy):
-            yield f"refused {code}: {text}: {reason} {remedy}"
+        case events.ScanRefused(text, code, reason, remedy, _, source):
+            where = f" ({source})" if source else ""
+            yield f"refused {code}: {text}: {reason} {remedy}{where}"
         case events.PinAwaited(person, text, limit_s):
             yield f">>> {text}: type the PIN of {person} within {limit_s:.0f} s, or scan CANCEL"
         case events.OperatorPrompted(socket, text):
