@@ -15,6 +15,7 @@ from flasher.protocol.spec import BMS, WMC, Mode
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message, encode, split
 from flasher.station.presence import Presence
+from tests.loops import each
 from tests.station.unit_bench import UnitBench
 
 TRAFFIC = Frame(0x720, b"\x55\xaa\x0c\x12\x10\x10\x00\x00")
@@ -112,3 +113,62 @@ def test_a_unit_that_cannot_be_asked_is_said_to_be_unseen(tmp_path: Path) -> Non
     firmware = loaded.firmware.model_copy(update={"target": "wmc"})
     target = replace(loaded, firmware=firmware, profile=profile)
     assert not Presence([target]).sees_units
+
+
+# -- power-ups ------------------------------------------------------------------------------------
+
+
+def announce(presence: Presence, *times: float) -> list[tuple[bool, bool]]:
+    """Announcements at these times: of each change whether it is a power-up, and whether the unit
+    is in its bootloader.
+    """
+    changes = []
+    for now in times:
+        message = BootVersion("BMS", "V1.0.0").to_message(BMS.answer_id)
+        for frame in split(BMS.answer_id, encode(message)):
+            presence(frame, sent=False, now=now)
+        change = presence.change(now)
+        if change is not None:
+            changes.append((change.is_power_up, change.is_in_bootloader))
+    return changes
+
+
+def test_an_announcement_of_a_unit_that_is_there_is_an_arrival(presence: Presence) -> None:
+    for frame in version_answer("W2605002"):
+        presence(frame, sent=False, now=1.0)
+    presence.change(1.0)
+    assert announce(presence, 1.5, 1.55, 1.6, 1.65) == [(True, True)], "once for the burst"
+    for frame in version_answer("W2605002"):
+        presence(frame, sent=False, now=2.0)
+    change = presence.change(2.0)
+    assert change is not None
+    assert (change.serial, change.is_power_up, change.is_in_bootloader) == (
+        "W2605002", False, False,
+    )  # fmt: skip
+
+
+def test_what_was_said_before_a_power_up_is_not_of_this_unit(presence: Presence) -> None:
+    for frame in version_answer("W2605002"):
+        presence(frame, sent=False, now=1.0)
+    presence.change(1.0)
+    announce(presence, 1.4)
+    presence(TRAFFIC, sent=False, now=1.9)
+    change = presence.change(1.9)
+    assert change is not None
+    assert (change.serial, change.is_in_bootloader) == (None, False)
+
+
+@each(
+    "cadence_s",
+    [0.05, 0.24, 0.4, 1.0],
+)
+def test_a_bootloader_that_goes_on_announcing_powers_up_once(
+    tmp_path: Path, cadence_s: float
+) -> None:
+    presence = Presence(UnitBench(tmp_path).recipe.targets)
+    times = [1.0 + cadence_s * at for at in range(20)]
+    changes = announce(presence, *times)
+    assert changes[0] == (True, True)
+    # Of a slow one the first pause may be an exchange.
+    assert len(changes) <= (1 if cadence_s < 0.25 else 2)
+    assert announce(presence, times[-1] + cadence_s + 0.65) == [(True, True)], "another one"
