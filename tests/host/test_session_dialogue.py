@@ -287,9 +287,9 @@ def test_an_adapter_may_be_lost_once_for_each_attempt_but_the_last(
 
 def test_an_adapter_may_be_lost_as_often_as_it_likes_where_nothing_can_be_lost() -> None:
     dialogue = Dialogue()
-    assert not dialogue.session.goes_on
+    assert Dialogue().session.goes_on is False
     dialogue.to_packet(1)
-    assert dialogue.session.goes_on
+    assert dialogue.session.goes_on is True
     for _ in range(9):
         assert dialogue.may_begin_again()
         dialogue.session.link_back(dialogue.now)
