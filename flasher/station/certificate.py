@@ -20,7 +20,6 @@ from flasher.said import say
 from flasher.station.records.errors import UnprovenError
 from flasher.station.records.heads import Head
 from flasher.station.records.model import (
-    Examination,
     Measurement,
     RunDetails,
     RunKind,
@@ -67,26 +66,29 @@ class Proof:
     record_sha256: str = ""
     """Over the run and all that belongs to it."""
     is_kept: bool = False
-    """The chain was compared with heads in another place than beside the key."""
+    """The head of its row is kept in another place than beside the key."""
     is_beside: bool = False
     """It was compared with those beside the key."""
+    examined_at: str = ""
+    """When all records up to its row were examined; empty where they were not since."""
 
 
-def proven(store: Store, life: UnitLife, examined: Examination | None = None) -> Proof:
-    """What vouches for the last run. Raises UnprovenError where the records were changed."""
+def proven(store: Store, life: UnitLife) -> Proof:
+    """What vouches for the last run. Raises UnprovenError where its records were changed."""
     last = life.runs[-1].run if life.runs else None
     if last is None or last.state is RunState.RUNNING:
         return Proof()
-    examined = examined or store.examine({last.run_id})
-    problems = examined.of_run(last.run_id)
-    if problems:
+    found = store.examine_run(last.run_id)
+    if found.problems:
         raise UnprovenError(
             f"No certificate for {printable(life.serial)}: its records were changed.",
-            cause=f"{problems[0].where}: {problems[0].what}",
+            cause=f"{found.problems[0].where}: {found.problems[0].what}",
             remedy="Look at all of it with flasher station verify.",
         )
     head, record_sha256 = store.read.head_of(last.run_id), store.read.record_sha256(last.run_id)
-    return Proof(head, record_sha256, examined.is_checked_elsewhere, bool(examined.kept))
+    return Proof(
+        head, record_sha256, bool(found.elsewhere), found.is_beside, found.examined_at or ""
+    )
 
 
 def render_certificate(life: UnitLife, made_at: datetime, proof: Proof) -> str:
@@ -114,6 +116,7 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof) -> dict[str, Any]:
         "key": fingerprint(proof.head.key) if proof.head else "",
         "is_kept": proof.is_kept,
         "is_beside": proof.is_beside,
+        "examined_at": proof.examined_at[:10],
         "record_sha256": proof.record_sha256,
         "code": "" if proof.head is None else _code(last, proof.record_sha256, proof.head),
         "writes": last.writes[:_WRITES_ON_SHEET],

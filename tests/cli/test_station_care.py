@@ -57,7 +57,9 @@ def test_verify_says_what_the_records_were_held_against(
     hold_output(schema, told.out, 0)
     assert not told.document["is_checked_elsewhere"]
     shutil.copytree(bench.keys, bench.folder / "share", ignore=shutil.ignore_patterns("*.key"))
-    two = flasher("station", "verify", *place, "--heads", bench.folder / "share")
+    again = flasher("station", "verify", *place)
+    assert "only what came after the examination of" in again.out
+    two = flasher("station", "verify", *place, "--all", "--heads", bench.folder / "share")
     assert two.out.splitlines()[:3] == [
         "records, traces and audit trails are as they were written",
         f"  line-2: rows 1 to 6 match the heads beside the key, in {bench.keys}",

@@ -8,6 +8,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
+from flasher.cli.bar import Bar
 from flasher.cli.documents import document_of
 from flasher.cli.files import check_writable
 from flasher.cli.output import Output, byte_count, counted
@@ -55,9 +56,10 @@ def backup(output: Output, records: RecordsOptions, file: Path) -> int:
 # -- what was changed -----------------------------------------------------------------------------
 
 
-def verify(output: Output, records: RecordsOptions) -> int:
-    with closing(open_to_read(records)) as store:
-        found = store.examine()
+def verify(output: Output, records: RecordsOptions, *, is_all: bool) -> int:
+    look = {"unit": " rows", "desc": "examined", "unit_scale": True}
+    with closing(open_to_read(records)) as store, Bar(output, **look) as bar:
+        found = store.examine(goes_on=not is_all, progress=bar.move_to)
     for line in _problem_lines(found.problems):
         output.result(printable(line))
     for line in found.unreached:
@@ -99,6 +101,9 @@ def _say_what_was_checked(found: Examination, output: Output) -> None:
         )
     else:
         output.result(f"nothing in the records differs; NOT CHECKED against {ELSEWHERE}")
+    if found.since is not None:
+        since = f"{found.since[:16].replace('T', ' ')} UTC"
+        output.result(f"  only what came after the examination of {since}; --all: everything")
     for each in found.kept:
         where = "the heads in" if each.is_elsewhere else "the heads beside the key, in"
         rows = f"{each.station}: rows {each.first:,} to {each.last:,}"

@@ -398,10 +398,14 @@ def roles(output: Output, station_role: str, reader_role: str, records: RecordsO
 
 
 @station.action("verify")
+@option(
+    "--all", "is_all", is_flag=True, brief=True,
+    help="examine everything again; else what came after the last examination without a problem",
+)  # fmt: skip
 @_records_options
-def verify(output: Output, records: RecordsOptions) -> int:
+def verify(output: Output, records: RecordsOptions, *, is_all: bool) -> int:
     """Tell whether the records were changed."""
-    return _call("care.verify", output, records)
+    return _call("care.verify", output, records, is_all=is_all)
 
 
 @station.action("key")

@@ -194,6 +194,9 @@ class VerifiedRecordsDocument:
     key and heads would look the same."""
     unreached: tuple[str, ...]
     """Places of heads that could not be reached, each with why."""
+    since: str | None
+    """When everything before was examined, where only what came after that was now; null:
+    everything was."""
     traces: int
     """Runs that passed and were compared with their own traces."""
     is_checked_elsewhere: bool

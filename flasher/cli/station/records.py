@@ -30,7 +30,6 @@ from flasher.station.records.model import (
     TORN_TRACE,
     TRACE,
     AttachmentFile,
-    Examination,
     Figures,
     RunDetails,
     RunFilter,
@@ -115,14 +114,13 @@ def _certificates(folder: Path, report: Report, store: Store, output: Output) ->
     units = sorted({(str(row["serial"]), str(row["part"])) for row in report.runs})
     serials = [serial for serial, _ in units]
     lives = [store.read.unit(serial, part) for serial, part in units]
-    examined = store.examine({life.runs[-1].run.run_id for life in lives})
     refused = 0
     for life in lives:
         # Two parts may have one serial number; no name leads out of the folder.
         name = life.serial if serials.count(life.serial) == 1 else f"{life.part} {life.serial}"
         page = folder / f"{quote(name, safe=' ').replace('.', '%2E')}.html"
         try:
-            write_whole(page, certificate(store, life, examined), option)
+            write_whole(page, certificate(store, life), option)
         except UnprovenError as error:
             refused += 1
             output.result(printable(f"no page for {life.serial}: {error.cause}"))
@@ -131,11 +129,11 @@ def _certificates(folder: Path, report: Report, store: Store, output: Output) ->
     return refused
 
 
-def certificate(store: Store, life: UnitLife, examined: Examination | None = None) -> bytes:
+def certificate(store: Store, life: UnitLife) -> bytes:
     """The page of a unit. Raises UnprovenError where its records were changed."""
     from flasher.station.certificate import proven, render_certificate  # noqa: PLC0415  loads jinja2
 
-    proof = proven(store, life, examined)
+    proof = proven(store, life)
     return render_certificate(life, datetime.now(UTC), proof).encode("utf-8")
 
 

@@ -13,7 +13,7 @@ from collections.abc import Iterable, Mapping
 from datetime import datetime
 from typing import Any, Final
 
-from sqlalchemy import Connection, Table, func, select, true
+from sqlalchemy import Connection, Row, Table, select
 
 from flasher.station.records import schema
 from flasher.station.records.heads import Head
@@ -139,15 +139,23 @@ def key_in_force(
     """The public key that signs the row of number `before`, or the next one; None before the first
     row.
     """
-    query = (
-        _rows_of(station_name, audit.c.event, audit.c.data)
-        .where(audit.c.event.in_(_KEYS))
-        .where(true() if before is None else audit.c.number < before)
-        .order_by(audit.c.number.desc())
-        .limit(1)
-    )
-    row = connection.execute(query).one_or_none()
-    return None if row is None else key_of(row.event, data_of(row.data))
+    rows = [
+        row
+        for row in without_run(connection, station_name, _KEYS)
+        if before is None or row.number < before
+    ]
+    return key_of(rows[-1].event, data_of(rows[-1].data)) if rows else None
+
+
+def without_run(connection: Connection, station_name: str, events: Iterable[str]) -> list[Row[Any]]:
+    """The rows of these events, which are about no run, in their order. They are few among
+    millions, and found by the index of the runs.
+    """
+    station_id = select(station.c.id).where(station.c.name == station_name)
+    wanted = connection.execute(station_id).scalar_one_or_none()
+    query = select(audit).where(audit.c.run_id.is_(None), audit.c.event.in_(events))
+    found = (row for row in connection.execute(query) if row.station_id == wanted)
+    return sorted(found, key=lambda row: row.number)
 
 
 def head_of(connection: Connection, run_id: int) -> Head | None:
@@ -167,10 +175,8 @@ def head_of(connection: Connection, run_id: int) -> Head | None:
 
 def given_up(connection: Connection, station_name: str) -> list[range]:
     """The rows that a person gave up as lost, when older records were put back."""
-    query = _rows_of(station_name, audit.c.data).where(
-        audit.c.run_id.is_(None), audit.c.event == RESTORED
-    )
-    return [lost_of(data_of(text)) for text in connection.execute(query).scalars()]
+    rows = without_run(connection, station_name, [RESTORED])
+    return [lost_of(data_of(row.data)) for row in rows]
 
 
 def lost_of(data: Mapping[str, Any]) -> range:
@@ -189,14 +195,10 @@ def hash_at(connection: Connection, station_name: str, number: int) -> str | Non
 
 def latest(connection: Connection, station_name: str) -> str | None:
     """The latest time in the chain since a person last released the clock; None without rows."""
-    released = (
-        _rows_of(station_name, func.coalesce(func.max(audit.c.number), 0))
-        .where(audit.c.event == CLOCK)
-        .scalar_subquery()
-    )
+    released = without_run(connection, station_name, [CLOCK])
     query = (
         _rows_of(station_name, audit.c.at)
-        .where(audit.c.number >= released)
+        .where(audit.c.number >= (released[-1].number if released else 0))
         .order_by(audit.c.at.desc())
         .limit(1)
     )

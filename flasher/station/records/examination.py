@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from datetime import datetime
 from typing import Any, Final
 
 from pydantic import ValidationError
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, func, or_, select
 
 from flasher.errors import FlasherError, UsageError
 from flasher.protocol.text import printable
@@ -16,8 +17,9 @@ from flasher.station.records import chain, schema
 from flasher.station.records.chain import NAMED, OWN, digests_of
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
+from flasher.station.records.examined import Examined, ExaminedChain
 from flasher.station.records.files import FileStore
-from flasher.station.records.heads import Fault, Head
+from flasher.station.records.heads import Checkpoint, Fault, Head
 from flasher.station.records.keys import Keeping
 from flasher.station.records.model import (
     TRACE,
@@ -26,8 +28,10 @@ from flasher.station.records.model import (
     KeptHeads,
     Problem,
     RunDetails,
+    RunExamination,
     RunId,
     RunState,
+    utc_text,
 )
 from flasher.station.records.places import PATIENCE_S, Place, patiently
 from flasher.station.records.proof import contradictions, traces_of_targets
@@ -39,6 +43,8 @@ from flasher.trace.reader import read_trace
 
 _RUNS_NAMED: Final = 5
 _HASH_BYTES: Final = 32
+_BRIEFLY_S: Final = 0.5
+"""A page waits no longer for a place of heads."""
 _USED: Final = {
     schema.unit: schema.run.c.unit_id,
     schema.lot: schema.run.c.lot_id,
@@ -57,16 +63,23 @@ class _Trail:
     """What was found along the chain of one station."""
 
     station: str
+    begin: int = 0
+    """The rows up to this one were examined before."""
     hashes: bytearray = field(default_factory=bytearray)
-    """Of the rows from the first on; as bytes, since a plant has millions."""
+    """Of the rows after that; as bytes, since a plant has millions."""
     restored: dict[int, range] = field(default_factory=dict)
     """Rows that give up others, and which."""
-    keys: set[str] = field(default_factory=set)
+    keys: list[str] = field(default_factory=list)
+    """The last one signs the next row."""
+    stated: tuple[int | None, Mapping[str, str]] = (None, {})
+    """What the chain states last of the schema, with its version."""
+    first: dict[str, int] = field(default_factory=dict)
+    """The first row of which a place keeps the head."""
 
     @property
     def end(self) -> int:
         """The number of the last row."""
-        return len(self.hashes) // _HASH_BYTES
+        return self.begin + len(self.hashes) // _HASH_BYTES
 
     def add(self, row_hash: str) -> None:
         try:
@@ -76,10 +89,11 @@ class _Trail:
         self.hashes += found if len(found) == _HASH_BYTES else bytes(_HASH_BYTES)
 
     def hash_of(self, number: int) -> str | None:
-        """The hash of a row; None where there is no such row."""
-        if not 1 <= number <= self.end:
+        """The hash of a row; None where it was not examined now."""
+        at = number - self.begin
+        if not 1 <= at <= self.end - self.begin:
             return None
-        return self.hashes[(number - 1) * _HASH_BYTES : number * _HASH_BYTES].hex()
+        return self.hashes[(at - 1) * _HASH_BYTES : at * _HASH_BYTES].hex()
 
 
 @dataclass(frozen=True)
@@ -101,7 +115,9 @@ class Examiner:
         files: FileStore,
         keeping: Keeping,
         progress: Progress = lambda _done, _total: None,
+        since: Examined | None = None,
     ) -> None:
+        """`since`: examine only what came after that, as long as that is still there."""
         self._database = database
         self._files = files
         self._keeping = keeping
@@ -111,20 +127,30 @@ class Examiner:
         self._kept: list[KeptHeads] = []
         self._unkept: list[str] = []
         self._unreached: list[str] = []
-        self._stated: list[tuple[object, Mapping[str, str]]] = []
-        """The last statement of each chain about the schema, with its version."""
+        self._since = since
+        self._trails_found: list[_Trail] = []
+        self.examined: Examined | None = None
+        """What was found good; None before, and where something was not."""
         self._traces = 0
         self._nameless = 0
 
-    def examine(self, runs: Collection[RunId] | None = None) -> Examination:
-        """Examine everything; of the runs these, or all."""
+    def examine(self, now: datetime) -> Examination:
+        """Examine everything, or what came after the last time. Raises RecordError."""
         with self._database.reading() as connection:
-            records_id = connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
+            records_id = _records_id(connection)
             names = list(connection.execute(select(schema.station.c.name)).scalars())
         # Before the records are read: a station may add rows, and their heads, meanwhile.
         kept = list(self._reach(records_id, names))
         with self._database.reading() as connection:
-            problems = tuple(self._problems(connection, records_id, kept, runs))
+            if self._since is not None and not _is_as_examined(connection, self._since):
+                self._remarks.append(
+                    f"what was examined on {self._since.at[:10]} is not there as it was: everything"
+                    " is examined again"
+                )
+                self._since = None
+            problems = tuple(self._problems(connection, records_id, kept))
+            if not problems:
+                self.examined = self._found_good(connection, records_id, now)
         if self._nameless:
             self._remarks.append(
                 f"{self._nameless} PASS of devices that name no serial number: their traces do not"
@@ -137,6 +163,7 @@ class Examiner:
             tuple(self._unkept),
             self._traces,
             tuple(self._unreached),
+            None if self._since is None else self._since.at,
         )
 
     def _problems(
@@ -144,18 +171,23 @@ class Examiner:
         connection: Connection,
         records_id: str,
         kept: list[_Kept],
-        runs: Collection[RunId] | None,
     ) -> Iterator[Problem]:
-        if self._database.backend == "sqlite":
+        since = self._since
+        if self._database.backend == "sqlite" and since is None:
             yield from _sqlite_problems(connection)
         run, audit = schema.run.c, schema.audit.c
-        there = list(connection.execute(select(run.id).order_by(run.id)).scalars())
-        chosen = there if runs is None else sorted(set(there) & set(runs))
+        some_runs = select(run.id).order_by(run.id)
+        if since is not None:
+            some_runs = some_runs.where(or_(run.id > since.run, run.id.in_(since.unfinished)))
+        chosen = list(connection.execute(some_runs).scalars())
         rows = connection.execute(select(func.count()).select_from(schema.audit)).scalar_one()
-        self._total = rows + len(chosen)
+        before = 0 if since is None else sum(each.rows for each in since.chains.values())
+        self._total = rows - before + len(chosen)
         yield from self._trails(connection, records_id, kept)
         gone = select(audit.run_id).outerjoin(schema.run, run.id == audit.run_id).distinct()
         gone = gone.where(audit.run_id.is_not(None), run.id.is_(None)).order_by(audit.run_id)
+        if since is not None:
+            gone = gone.where(audit.run_id > since.run)
         for run_id in connection.execute(gone).scalars():
             yield Problem(f"run {run_id}", "it is missing: the audit trail knows it", (run_id,))
         changed: dict[tuple[str, str], list[int]] = defaultdict(list)
@@ -164,19 +196,37 @@ class Examiner:
             for run_id, digests in digests_of(connection, some).items():
                 yield from self._digests(run_id, digests, stated[run_id], changed)
             yield from self._runs(connection, some, stated)
-        for (part, _), run_ids in changed.items():
-            shown = ", ".join(map(str, run_ids[:_RUNS_NAMED]))
-            more = f" and {len(run_ids) - _RUNS_NAMED} more" if len(run_ids) > _RUNS_NAMED else ""
-            what = f"changed after it was recorded: {NAMED[part]}"
-            yield Problem(f"{part} of run {shown}{more}", what, tuple(run_ids))
+        yield from _shared(changed)
         yield from _unused(connection)
-        of_pass = select(run.log_sha256).where(run.state == RunState.PASS.value)
-        twice = of_pass.group_by(run.log_sha256).having(func.count() > 1)
-        for sha256 in connection.execute(twice).scalars().all():
-            with_it = select(run.id).where(run.log_sha256 == sha256).order_by(run.id)
-            same = tuple(connection.execute(with_it).scalars())
-            shown = ", ".join(map(str, same[:_RUNS_NAMED]))
-            yield Problem(f"runs {shown}", "they have one and the same trace", same)
+        yield from _same_traces(connection)
+
+    def _found_good(self, connection: Connection, records_id: str, now: datetime) -> Examined:
+        run = schema.run.c
+        last, count = connection.execute(select(func.max(run.id), func.count(run.id))).one()
+        running = select(run.id).where(run.state == RunState.RUNNING.value)
+        chains = {
+            each.station: ExaminedChain(
+                each.end,
+                chain.hash_at(connection, each.station, each.end) or "",
+                each.keys[-1],
+                tuple(each.keys),
+                {number: (lost.start, lost.stop - 1) for number, lost in each.restored.items()},
+                each.stated[0],
+                dict(each.stated[1]),
+                each.first,
+            )
+            for each in self._trails_found
+            if each.end
+        }
+        return Examined(
+            utc_text(now),
+            records_id,
+            chains,
+            last or 0,
+            count,
+            tuple(connection.execute(running).scalars()),
+            tuple(self._remarks),
+        )
 
     def _did(self, count: int) -> None:
         self._done += count
@@ -185,14 +235,20 @@ class Examiner:
     # -- kept heads -------------------------------------------------------------------------------
 
     def _reach(
-        self, records_id: str, names: list[str], limit_s: float = PATIENCE_S
+        self,
+        records_id: str,
+        names: list[str],
+        limit_s: float = PATIENCE_S,
+        *,
+        is_all: bool = True,
     ) -> Iterator[_Kept]:
-        """The places of heads that can be reached. Raises RecordError, UsageError for the one
-        beside the key.
+        """The places of heads that can be reached; with the heads of other stations too where
+        `is_all`. Raises RecordError, UsageError for the one beside the key.
         """
 
         def lasts(place: Place) -> dict[str, Head]:
-            every = dict.fromkeys([*names, *place.stations(records_id)])
+            others = place.stations(records_id) if is_all else ()
+            every = dict.fromkeys([*names, *others])
             found = {name: place.of(name, records_id).last() for name in every}
             return {name: head for name, head in found.items() if head is not None}
 
@@ -207,7 +263,9 @@ class Examiner:
             else:
                 yield _Kept(place, is_elsewhere=True, lasts=found)
 
-    def _compare(self, trail: _Trail, each: _Kept, records_id: str) -> Iterator[Problem]:
+    def _compare(
+        self, connection: Connection, trail: _Trail, each: _Kept, records_id: str
+    ) -> Iterator[Problem]:
         """Compare a chain with the heads that a place keeps of it."""
         shown, place = printable(trail.station), each.place.shown
         last = each.lasts.get(trail.station)
@@ -215,45 +273,38 @@ class Examiner:
             if each.is_elsewhere and trail.end:
                 yield Problem(f"heads of {shown}", f"none of these records is kept in {place}")
             return
-        first = end = 0
+        first, end = trail.first.get(place, 0), 0
+        wrong: list[tuple[int, Head]] = []
+        heads = each.place.of(trail.station, records_id)
+        # Of the rows that were examined before, the last one vouches for all before it.
+        begin = last if first else next(e for e in heads.entries() if isinstance(e, Head))
+        for head in (begin, last):
+            if head.number <= trail.begin:
+                if chain.hash_at(connection, trail.station, head.number) == head.hash:
+                    first, end = first or head.number, max(end, head.number)
+                else:
+                    wrong.append((0, head))
+        given_up_at: dict[int, int] = {}
         is_younger = False
         """True after the last head that was there before the records were read."""
-        wrong: list[tuple[int, Head]] = []
-        given_up_at: dict[int, int] = {}
-        for index, entry in enumerate(each.place.of(trail.station, records_id).entries()):
-            if isinstance(entry, Fault):
-                yield Problem(f"heads of {shown}, {entry.where}", entry.what)
-            elif isinstance(entry, Head):
-                if trail.hash_of(entry.number) == entry.hash:
-                    first, end = first or entry.number, max(end, entry.number)
-                    if entry.number in trail.restored:
-                        given_up_at[entry.number] = index
-                elif not is_younger:
-                    wrong.append((index, entry))
-                is_younger = is_younger or entry == last
-            elif entry.key not in trail.keys:
-                where = f"heads of {shown}, segment {entry.segment} in {place}"
-                yield Problem(where, "it is not signed with a key of the station")
-        held = [
-            head
-            for index, head in wrong
-            if not any(
-                head.number in lost and index < given_up_at.get(number, index + 1)
-                for number, lost in trail.restored.items()
-            )
-        ]
+        for index, entry in enumerate(heads.entries(after=trail.begin)):
+            if not isinstance(entry, Head):
+                yield from _segment_wrong(trail, place, entry)
+            elif trail.hash_of(entry.number) == entry.hash:
+                first, end = first or entry.number, max(end, entry.number)
+                if entry.number in trail.restored:
+                    given_up_at[entry.number] = index
+            elif entry.number > trail.begin and not is_younger:
+                wrong.append((index, entry))
+            is_younger = is_younger or entry == last
+        held = _not_given_up(trail, wrong, given_up_at)
         yield from _differences(trail, place, held)
-        if first or held:
-            numbers = [each.number for each in held]
+        numbers = [*([first] if first else []), *(head.number for head in held)]
+        if numbers:
+            trail.first[place] = min(numbers)
+            end = max(end, *numbers)
             self._kept.append(
-                KeptHeads(
-                    trail.station,
-                    place,
-                    min([*numbers, *([first] if first else [])]),
-                    max([end, *numbers]),
-                    trail.end,
-                    each.is_elsewhere,
-                )
+                KeptHeads(trail.station, place, min(numbers), end, trail.end, each.is_elsewhere)
             )
 
     # -- audit trails -----------------------------------------------------------------------------
@@ -266,23 +317,25 @@ class Examiner:
         names = list(connection.execute(select(schema.station.c.name)).scalars())
         others = [name for each in kept for name in each.lasts]
         for name in dict.fromkeys([*names, *others]):
+            trail = _begun(name, self._since)
             query = (
                 select(schema.audit)
                 .join_from(schema.audit, schema.station)
-                .where(schema.station.c.name == name)
+                .where(schema.station.c.name == name, schema.audit.c.number > trail.begin)
                 .order_by(schema.audit.c.number)
                 .execution_options(yield_per=1000)
             )
-            trail = _Trail(name)
+            self._trails_found.append(trail)
             with connection.execute(query) as rows:
                 yield from self._chain(trail, rows.mappings(), records_id)
             for each in kept:
-                yield from self._compare(trail, each, records_id)
+                yield from self._compare(connection, trail, each, records_id)
             if trail.end and not any(
                 kept.is_elsewhere and kept.station == name for kept in self._kept
             ):
                 self._unkept.append(name)
-        for thing, what in stated_differences(self._stated, found):
+        stated = [each.stated for each in self._trails_found if each.end]
+        for thing, what in stated_differences(stated, found):
             yield Problem(f"schema, {printable(thing)}", what)
 
     def _chain(
@@ -292,10 +345,12 @@ class Examiner:
         records_id: str,
     ) -> Iterator[Problem]:
         """Go along one chain; fills what was found of it."""
-        before, key = chain.GENESIS, None
-        stated: tuple[object, Mapping[str, str]] = (None, {})
+        before = chain.GENESIS
+        if self._since is not None and trail.begin:
+            before = self._since.chains[trail.station].hash
+        key = trail.keys[-1] if trail.keys else None
         shown = printable(trail.station)
-        for expected, row in enumerate(rows, 1):
+        for expected, row in enumerate(rows, trail.begin + 1):
             where = f"audit row {expected} of {shown}"
             data = chain.data_of(row["data"])
             if row["previous_hash"] != before or row["number"] != expected:
@@ -310,21 +365,76 @@ class Examiner:
                 yield Problem(where, "it is not signed with the key of the station")
             if following is not None:
                 key = following
-                trail.keys.add(key)
+                trail.keys.append(key)
             before = row["hash"]
             trail.add(before)
             self._did(1)
             if not is_whole:
                 continue  # what it says counts for nothing
             if _table(data.get("schema")):
-                stated = data.get("version"), _table(data.get("schema"))
+                trail.stated = data.get("version"), _table(data.get("schema"))
             if row["event"] == chain.RESTORED:
                 trail.restored[expected] = chain.lost_of(data)
             self._take_row(shown, row, data)
             for what in _contradictions(trail.station, records_id, row["event"], data):
                 yield Problem(where, what)
-        if trail.end:
-            self._stated.append(stated)
+
+    # -- one run ----------------------------------------------------------------------------------
+
+    def examine_run(self, run_id: RunId) -> RunExamination:
+        """Examine one run with its audit rows and what is kept of them, without going through all
+        records. Raises RecordError.
+        """
+        with self._database.reading() as connection:
+            records_id = _records_id(connection)
+            names = connection.execute(
+                select(schema.station.c.name)
+                .join_from(schema.audit, schema.station)
+                .where(schema.audit.c.run_id == run_id)
+                .distinct()
+            )
+            kept = list(self._reach(records_id, list(names.scalars()), _BRIEFLY_S, is_all=False))
+        with self._database.reading() as connection:
+            rows = connection.execute(
+                select(schema.audit, schema.station.c.name)
+                .join_from(schema.audit, schema.station)
+                .where(schema.audit.c.run_id == run_id)
+                .order_by(schema.audit.c.id)
+            )
+            ending: Mapping[Any, Any] | None = None
+            problems: list[Problem] = []
+            for row in rows.mappings().all():
+                where = f"audit row {row['number']} of {printable(row['name'])}"
+                problems += (Problem(where, what) for what in _wrong_with(connection, row))
+                if row["event"] in chain.ENDINGS:
+                    ending = row
+            stated = _stated(connection, [run_id])
+            changed: dict[tuple[str, str], list[int]] = defaultdict(list)
+            for digests in digests_of(connection, [run_id]).values():
+                problems += self._digests(run_id, digests, stated[run_id], changed)
+            problems += _shared(changed)
+            problems += self._runs(connection, [run_id], stated)
+            places = []
+            if ending is not None:
+                problems += _schema_of(connection, ending["name"])
+                for each in kept:
+                    found = list(_kept_wrong(connection, each, ending, records_id))
+                    problems += (Problem(*what) for what in found if what)
+                    if not found:
+                        places.append(each)
+        since = self._since
+        is_examined = (
+            since is not None
+            and ending is not None
+            and ending["name"] in since.chains
+            and ending["number"] <= since.chains[ending["name"]].rows
+        )
+        return RunExamination(
+            tuple(problems),
+            tuple(each.place.shown for each in places if each.is_elsewhere),
+            any(not each.is_elsewhere for each in places),
+            since.at if since is not None and is_examined else None,
+        )
 
     def _take_row(self, shown: str, row: Mapping[Any, Any], data: Mapping[str, Any]) -> None:
         """Note what a person should know of an intact row."""
@@ -431,6 +541,109 @@ class Examiner:
             yield Problem(where, f"its trace says otherwise: {what}", (run.run_id,))
 
 
+def _records_id(connection: Connection) -> str:
+    return str(connection.execute(select(schema.schema_info.c.records_id)).scalar_one())
+
+
+def _is_as_examined(connection: Connection, since: Examined) -> bool:
+    """True when what was examined is still there, as far as its ends and numbers tell."""
+    if _records_id(connection) != since.records:
+        return False
+    audit, run = schema.audit.c, schema.run.c
+    for name, each in since.chains.items():
+        count = (
+            select(func.count())
+            .select_from(schema.audit.join(schema.station))
+            .where(schema.station.c.name == name, audit.number <= each.rows)
+        )
+        if chain.hash_at(connection, name, each.rows) != each.hash:
+            return False
+        if connection.execute(count).scalar_one() != each.rows:
+            return False
+    runs = select(func.count()).where(run.id <= since.run)
+    return bool(connection.execute(runs).scalar_one() == since.runs)
+
+
+def _begun(name: str, since: Examined | None) -> _Trail:
+    """The chain of a station, from where the last examination ended."""
+    each = None if since is None else since.chains.get(name)
+    if each is None:
+        return _Trail(name)
+    restored = {number: range(first, last + 1) for number, (first, last) in each.restored.items()}
+    stated = (each.version, each.schema)
+    return _Trail(
+        name, each.rows, restored=restored, keys=list(each.keys), stated=stated,
+        first=dict(each.first),
+    )  # fmt: skip
+
+
+def _wrong_with(connection: Connection, row: Mapping[Any, Any]) -> Iterator[str]:
+    """What is wrong with one audit row."""
+    number, name = row["number"], row["name"]
+    before = chain.GENESIS if number == 1 else chain.hash_at(connection, name, number - 1)
+    if row["previous_hash"] != before:
+        yield "the chain is broken: the row before it is missing or changed"
+    if row["hash"] != chain.row_hash(row):
+        yield "it was changed after it was written"
+    key = chain.key_in_force(connection, name, number)
+    if key is None or not is_signed(row["hash"], row["signature"], key):
+        yield "it is not signed with the key of the station"
+
+
+def _schema_of(connection: Connection, name: str) -> Iterator[Problem]:
+    """How the schema differs from what the chain of a station states last."""
+    rows = chain.without_run(connection, name, (chain.BEGUN, chain.MIGRATED))
+    data = chain.data_of(rows[-1].data) if rows else {}
+    if data.get("version") == schema.SCHEMA_VERSION:
+        stated = [(data.get("version"), _table(data.get("schema")))]
+        for thing, what in stated_differences(stated, fingerprint_of(connection)):
+            yield Problem(f"schema, {printable(thing)}", what)
+
+
+def _kept_wrong(
+    connection: Connection, each: _Kept, row: Mapping[Any, Any], records_id: str
+) -> Iterator[tuple[str, str] | None]:
+    """What a place tells against an audit row and the end of its chain; nothing where it keeps the
+    head of that row; None where it does not.
+    """
+    name, number, place = row["name"], row["number"], each.place.shown
+    last = each.lasts.get(name)
+    if last is None:
+        yield None
+        return
+    where = f"audit trail of {printable(name)}"
+    if chain.hash_at(connection, name, last.number) != last.hash:
+        lost = chain.given_up(connection, name)
+        if not any(last.number in some for some in lost):
+            yield where, f"row {last.number} of {last.at} is kept in {place}, but is not there"
+    heads = each.place.of(name, records_id).of_row(number)
+    if any(head.hash == row["hash"] for head in heads):
+        return
+    yield None
+    if heads and not any(number in some for some in chain.given_up(connection, name)):
+        yield where, f"row {number} is not the one that is kept in {place}"
+
+
+def _shared(changed: Mapping[tuple[str, str], list[int]]) -> Iterator[Problem]:
+    """What several runs name, and was changed."""
+    for (part, _), run_ids in changed.items():
+        shown = ", ".join(map(str, run_ids[:_RUNS_NAMED]))
+        more = f" and {len(run_ids) - _RUNS_NAMED} more" if len(run_ids) > _RUNS_NAMED else ""
+        what = f"changed after it was recorded: {NAMED[part]}"
+        yield Problem(f"{part} of run {shown}{more}", what, tuple(run_ids))
+
+
+def _same_traces(connection: Connection) -> Iterator[Problem]:
+    run = schema.run.c
+    of_pass = select(run.log_sha256).where(run.state == RunState.PASS.value)
+    twice = of_pass.group_by(run.log_sha256).having(func.count() > 1)
+    for sha256 in connection.execute(twice).scalars().all():
+        with_it = select(run.id).where(run.log_sha256 == sha256).order_by(run.id)
+        same = tuple(connection.execute(with_it).scalars())
+        shown = ", ".join(map(str, same[:_RUNS_NAMED]))
+        yield Problem(f"runs {shown}", "they have one and the same trace", same)
+
+
 @dataclass
 class _Stated:
     """The digests that the audit trails state for a run."""
@@ -459,6 +672,29 @@ def _stated(connection: Connection, run_ids: list[int]) -> dict[int, _Stated]:
             elif row["event"] in chain.ENDINGS:
                 found[run_id].ending = digests
     return found
+
+
+def _segment_wrong(trail: _Trail, place: str, entry: Checkpoint | Fault) -> Iterator[Problem]:
+    shown = printable(trail.station)
+    if isinstance(entry, Fault):
+        yield Problem(f"heads of {shown}, {entry.where}", entry.what)
+    elif entry.key not in trail.keys:
+        where = f"heads of {shown}, segment {entry.segment} in {place}"
+        yield Problem(where, "it is not signed with a key of the station")
+
+
+def _not_given_up(
+    trail: _Trail, wrong: list[tuple[int, Head]], given_up_at: Mapping[int, int]
+) -> list[Head]:
+    """The heads without those that a person gave up, when older records were put back."""
+    return [
+        head
+        for index, head in wrong
+        if not any(
+            head.number in lost and index < given_up_at.get(number, index + 1)
+            for number, lost in trail.restored.items()
+        )
+    ]
 
 
 def _differences(trail: _Trail, place: str, held: list[Head]) -> Iterator[Problem]:

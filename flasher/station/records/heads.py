@@ -152,7 +152,9 @@ class HeadsFile:
         count = self._last_segment()
         at = bisect_left(range(1, count + 1), number, key=self._begins_after)
         lines = self._lines(Position(max(at, 1)), is_one=True)
-        heads = (entry for _, line in lines if isinstance(entry := _parsed(line), Head))
+        named = f'"number": {number},'.encode("ascii")  # thousands of others are not parsed
+        some = (_parsed(line) for _, line in lines if named in line)
+        heads = (entry for entry in some if isinstance(entry, Head))
         return tuple(head for head in heads if head.number == number)
 
     def since(self, position: Position) -> Iterator[tuple[Head, Position]]:

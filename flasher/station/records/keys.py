@@ -59,6 +59,11 @@ class Keeping:
         """The heads beside the key."""
         return self.beside_key.of(station, records_id)
 
+    def examined_files(self, records_id: str) -> tuple[Path, Path]:
+        """Where whoever examines these records keeps what he found good, and his key."""
+        note = self.keys_folder / file_name("examined", records_id, ".examined")
+        return note, note.with_suffix(".verifier")
+
     def check(self, location: Location) -> None:
         """Raises UsageError for heads in the database of the records themselves."""
         for each in self.elsewhere:

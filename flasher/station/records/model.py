@@ -428,6 +428,8 @@ class Examination:
     """PASS runs that were compared with their own traces."""
     unreached: tuple[str, ...] = ()
     """Places of heads that could not be reached, each with why."""
+    since: str | None = None
+    """When all before was examined, where only what came after that was; None: everything was."""
 
     @property
     def is_checked_elsewhere(self) -> bool:
@@ -448,9 +450,18 @@ class Examination:
             and bool(stations)
         )
 
-    def of_run(self, run_id: RunId) -> tuple[Problem, ...]:
-        """What speaks against one run."""
-        return tuple(each for each in self.problems if not each.runs or run_id in each.runs)
+
+@dataclass(frozen=True)
+class RunExamination:
+    """What was found about one run, its audit rows, and the heads of them that are kept."""
+
+    problems: tuple[Problem, ...]
+    elsewhere: tuple[str, ...]
+    """Places in which the head of its last row is kept; not the one beside the key."""
+    is_beside: bool
+    """It is kept beside the key."""
+    examined_at: str | None
+    """When all records up to its last row were examined; None where they were not since."""
 
 
 @dataclass(frozen=True)

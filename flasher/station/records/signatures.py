@@ -28,6 +28,7 @@ _MODE: Final = 0o600
 AUDIT_ROW: Final = "audit row"
 """What is signed says what it is, so that no signature can be used for something else."""
 SEGMENT: Final = "heads"
+EXAMINED: Final = "examined records"
 
 
 def fingerprint(public: str) -> str:

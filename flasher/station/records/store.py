@@ -20,7 +20,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,7 @@ from typing import Any, Final, Self
 
 from sqlalchemy import func, select, update
 
+from flasher.errors import FlasherError
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import Trail, digests_of
 from flasher.station.records.claims import Claiming, Order
@@ -40,9 +41,11 @@ from flasher.station.records.database import (
 from flasher.station.records.errors import (
     NotFoundError,
     OldSchemaError,
+    RecordError,
     RuleBrokenError,
 )
-from flasher.station.records.examination import Examiner
+from flasher.station.records.examination import Examiner, Progress
+from flasher.station.records.examined import Examined, load_examined, save_examined
 from flasher.station.records.files import FileStore
 from flasher.station.records.keys import Keeping
 from flasher.station.records.model import (
@@ -56,6 +59,7 @@ from flasher.station.records.model import (
     Ending,
     Examination,
     Measurement,
+    RunExamination,
     RunId,
     RunState,
     StepState,
@@ -356,13 +360,42 @@ class Store:
         """
         return make_backup(self.database, self.files, path)
 
-    def examine(self, runs: Collection[RunId] | None = None) -> Examination:
-        """Examine the records; of the runs these, or all.
+    def examine(
+        self, *, goes_on: bool = False, progress: Progress = lambda _done, _total: None
+    ) -> Examination:
+        """Examine the records: all of them, or what came after the last time where it `goes_on`.
+        What is found good is noted for the next time, beside the keys of this user.
 
         Raises RecordError when they cannot be read.
         """
         self.signer.wait_for_copies()
-        return Examiner(self.database, self.files, self.signer.keeping).examine(runs)
+        note, remarks = self._examined()
+        since = note if goes_on else None
+        examiner = Examiner(self.database, self.files, self.signer.keeping, progress, since)
+        found = examiner.examine(self._clock.utc())
+        if examiner.examined is not None:
+            try:
+                save_examined(*self._examined_files, examiner.examined)
+            except RecordError as error:
+                remarks += (f"the next examination begins anew: {error.what}",)
+        return replace(found, remarks=(*remarks, *found.remarks))
+
+    def examine_run(self, run_id: RunId) -> RunExamination:
+        """Examine one run, without going through all records. Raises RecordError."""
+        note, _ = self._examined()
+        keeping = self.signer.keeping
+        return Examiner(self.database, self.files, keeping, since=note).examine_run(run_id)
+
+    @property
+    def _examined_files(self) -> tuple[Path, Path]:
+        return self.signer.keeping.examined_files(self.signer.records_id)
+
+    def _examined(self) -> tuple[Examined | None, tuple[str, ...]]:
+        """What was examined before, and what a person should know of it."""
+        try:
+            return load_examined(*self._examined_files), ()
+        except FlasherError as error:
+            return None, (f"{error.what} Everything is examined.",)
 
     def release_clock(self, operator: str, reason: str) -> None:
         """Note that the clock is right, though records of a later time are there."""
