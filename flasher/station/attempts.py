@@ -113,6 +113,11 @@ class Attempts:
                 each.count(now)
         return wait_s
 
+    def pause_s(self, address: str, badge: str, now: float) -> float:
+        """The pause that the tries of a badge have brought; 0 before it."""
+        of_badge = self._badges.get((badge, address), _OfBadge())
+        return of_badge.back_off.wait_s(now)
+
     def was_right(self, address: str, badge: str) -> None:
         """The last try of this badge was right: its next pause is the first one again."""
         self._badges[badge, address].back_off.reset()

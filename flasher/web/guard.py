@@ -51,6 +51,7 @@ _ENTER: Final = "/enter"
 _CLOSED: Final = "/closed"
 _OPEN: Final = ("/static/", LOGIN, SIGN_OUT, _ENTER, _CLOSED)
 """Paths that need no sign-in."""
+_ENTERED_S: Final = 14 * 24 * 3600
 _IS_IN: Final = "is_in"
 """What the session of the browser has that an address let in."""
 
@@ -107,6 +108,8 @@ def application(
         SessionMiddleware,
         secret_key=secret,
         session_cookie="flasher" if entry is None else entry.cookie,
+        # The browser that an address let in could not come back; who signs in can.
+        max_age=_ENTERED_S if entry is not None else None,
         same_site="strict",
         https_only=is_tls,
     )

@@ -197,7 +197,7 @@ class Login:
         try:
             person = await self._checked(address, fields)
             if self._is_for_supervisors(request) and person is not None:
-                _check_supervisor(person)
+                self._check_supervisor(address, person)
         except _RefusedError as refused:
             return self._show(request, refused)
         keys = self.sign_ins.begin(person, address, _keys(request.session))
@@ -213,7 +213,7 @@ class Login:
         self._count(address, "")
         password = fields.get("password", "").encode()
         if not (self._password and hmac.compare_digest(password, self._password.encode())):
-            raise self._wrong(address, "wrong password")
+            raise self._wrong(address, "", "wrong password")
         self._attempts.was_right(address, "")
         return None
 
@@ -234,9 +234,9 @@ class Login:
                 self._checker.submit(pins.is_right, pins.Pin(pin), pin_hash)
             )
         if person is None:
-            raise self._wrong(address, "unknown badge")
+            raise self._wrong(address, code, "unknown badge")
         if not (is_right and person.pin):
-            raise self._wrong(address, "wrong PIN", person.name)
+            raise self._wrong(address, code, "wrong PIN", person.name)
         self._attempts.was_right(address, code)
         return person
 
@@ -247,10 +247,21 @@ class Login:
             trouble = say("Too many tries: wait {seconds} s.", seconds=wait_s)
             raise _RefusedError(trouble, 429, wait_s=wait_s)
 
-    def _wrong(self, address: str, why: str, name: str = "") -> _RefusedError:
+    def _wrong(self, address: str, badge: str, why: str, name: str = "") -> _RefusedError:
         # Without the text: somebody may have typed a PIN where the badge belongs.
-        self._note(AuditEvent.SIGN_IN_REFUSED, {"name": name, "address": address, "why": why})
+        data = {"name": name, "address": address, "why": why}
+        pause_s = self._attempts.pause_s(address, badge, self._clock.monotonic_s())
+        if pause_s:
+            data["pause"] = f"{pause_s:g} s"
+        self._note(AuditEvent.SIGN_IN_REFUSED, data)
         return _RefusedError(say("That is not it."))
+
+    def _check_supervisor(self, address: str, person: Person) -> None:
+        """Raises _RefusedError for another role."""
+        if person.role is not Role.SUPERVISOR:
+            data = {"name": person.name, "address": address, "why": "no supervisor"}
+            self._note(AuditEvent.SIGN_IN_REFUSED, data)
+            raise _RefusedError(say("That badge is no supervisor's."))
 
     def _is_for_supervisors(self, request: Request) -> bool:
         wanted = str(request.session.get("wanted", "/")).partition("?")[0]
@@ -288,12 +299,6 @@ class Login:
             elif fields.get("number", "").isdecimal():
                 self.sign_ins.end(int(fields["number"]), by)
         return RedirectResponse(SIGN_INS, 303)
-
-
-def _check_supervisor(person: Person) -> None:
-    """Raises _RefusedError for another role."""
-    if person.role is not Role.SUPERVISOR:
-        raise _RefusedError(say("That badge is no supervisor's."))
 
 
 def _keys(session: Mapping[str, Any]) -> list[str]:
