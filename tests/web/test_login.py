@@ -25,6 +25,7 @@ from flasher.web.sign_ins import IDLE_S, SHIFT_S, SignIns
 from tests.loops import each
 from tests.station.factory import FakeClock
 from tests.station.line_bench import AtOnce
+from tests.web.own_loop import in_own_loop
 
 URL = "http://127.0.0.1:8740"
 ALL = "of all of us"
@@ -239,7 +240,7 @@ def test_the_password_of_all_is_not_the_badge_of_a_supervisor() -> None:
 
 def at_once(place: Place, *tries: tuple[str, str, str]) -> list[int]:
     """Statuses of sign-ins at the same time: address, badge and PIN of each."""
-    return [answer.status_code for answer in asyncio.run(_at_once(place, tries))]
+    return [answer.status_code for answer in in_own_loop(_at_once(place, tries))]
 
 
 async def _at_once(place: Place, tries: tuple[tuple[str, str, str], ...]) -> list[httpx2.Response]:
@@ -577,7 +578,7 @@ def test_a_stream_ends_with_its_sign_in() -> None:
         place.said.put_nowait("after")
         await looking
 
-    asyncio.run(look())
+    in_own_loop(look())
     assert not any(b"after" in each.get("body", b"") for each in sent)
     assert sent[-1] == {"type": "http.response.body", "body": b"", "more_body": False}
 
