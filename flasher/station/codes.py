@@ -174,5 +174,5 @@ OF_ENDING: Final[Mapping[Ending, Code]] = {
 """What a bad end of an upgrade is in the records."""
 NEED_POWER_CYCLE: Final = frozenset({NO_BOOTLOADER, ERASE_FAILED, TRANSFER_FAILED})
 """After these a power cycle may reach the bootloader again."""
-OF_SILENCE: Final = frozenset({NO_ANSWER, NOT_RUNNING, WRITE_FAILED})
+OF_SILENCE: Final = frozenset({NO_ANSWER, NOT_RUNNING, WRITE_FAILED, NO_BOOTLOADER, NO_RESTART})
 """What a unit fails with that is not there any more."""

@@ -4,7 +4,7 @@ A `Continuity` is a driver's tap for one target of a run. `lost` says what speak
 uninterrupted unit:
 
 - its bootloader announces itself, although the run has neither reset it, nor ended a transfer, nor
-  switched its power (R28);
+  switched its power (R28); or after a silence in which it has not confirmed the reset;
 - it announces itself in the middle of a transfer;
 - a version answer, whoever asked for it, or an announced boot version, differs from the first one
   in something that the run has not written.
@@ -12,9 +12,10 @@ uninterrupted unit:
 That an application fell silent is not seen here: whoever asks it knows.
 
 What a single unit may do is no evidence: announcements of one burst, however many; another burst
-after every reset that was sent, as the first one may have come too late; a burst after the end of a
-transfer, or none; a restart of what the battery supplies while the battery restarts. Nor is a pause
-of this computer: time in which nobody listened does not count.
+after every reset that was sent, as the first one may have come too late; a burst that follows a
+reset so soon that nobody can have put another unit in, although the confirmation was lost; a burst
+after the end of a transfer, or none; a restart of what the battery supplies while the battery
+restarts. Nor is a pause of this computer: time in which nobody listened does not count.
 """
 
 from __future__ import annotations
@@ -34,6 +35,10 @@ IDENTITY: Final = ("model", "serial_number", "hardware_version")
 _SPACINGS_OF_QUIET: Final = 6
 _QUIET_MIN_S: Final = 0.3
 _PACE_TOLERANCE: Final = 1.5
+_EXCHANGE_S: Final = 0.25
+"""Nobody puts another unit in within so short a silence."""
+_MESSAGE_S: Final = 0.1
+"""The frames of one announcement come within this time."""
 
 
 class Continuity:
@@ -75,6 +80,12 @@ class Continuity:
         """The same when the last announcement of the burst came that goes on; None: none does."""
         self._burst_until = -inf
         """Up to when a burst may begin that the run has caused."""
+        self._heard_s = 0.0
+        """How long somebody had listened when the unit was heard last."""
+        self._returned_s = -inf
+        """The same for when it was heard again after a silence that allows an exchange."""
+        self._awaits_confirmation = False
+        """A reset was sent to an application that runs, and is not confirmed."""
         self._requested_at: float | None = None
         """When the transfer that goes on was requested."""
         self._is_identified = False
@@ -106,6 +117,7 @@ class Continuity:
     def settle(self) -> None:
         """Its application has answered a question of the run: what was restarted has started."""
         self.is_running, self.is_told_to_update = True, False
+        self._awaits_confirmation = False
         self._burst_until, self._announced_s = -inf, None
 
     def complete(self) -> None:
@@ -146,8 +158,14 @@ class Continuity:
             return
         watcher = self.watcher
         requests, announcements = watcher.transfer_requests, watcher.announcements
-        answers = watcher.answers
+        answers, confirmations = watcher.answers, watcher.confirmations
         watcher(frame, sent=False, now=now)
+        if watcher.heard_at == now:
+            if self._listened_s - self._heard_s > _EXCHANGE_S:
+                self._returned_s = self._listened_s
+            self._heard_s = self._listened_s
+        if watcher.confirmations > confirmations and self._awaits_confirmation:
+            self.is_running = self._awaits_confirmation = False
         if watcher.transfer_requests > requests and self.is_told_to_update:
             self._requested_at, self._burst_until = now, -inf
         if watcher.announcements > announcements:
@@ -163,12 +181,17 @@ class Continuity:
         for found in self._sent.feed(frame.data, now):
             if not isinstance(found, Message) or found.mode != Mode.WRITE:
                 continue
-            if found.command in (self._reset_command, Command.RESET):
+            if found.command == Command.RESET and self.is_running:
+                # As long as it has not confirmed that, it goes on running.
+                self._awaits_confirmation = True
+                self._burst_until, self._requested_at = inf, None
+            elif found.command in (self._reset_command, Command.RESET):
                 self._restart()
             elif found.command == Command.UPDATE:
                 if not self._is_identified:
                     self._stay()
-                self.is_running, self.is_told_to_update = False, True
+                self.is_running = self._awaits_confirmation = False
+                self.is_told_to_update = True
                 # A burst that the reset before it has caused may still come: it was lost then.
                 self._requested_at = None
             elif found.command == Command.END_OF_TRANSFER:
@@ -176,7 +199,7 @@ class Continuity:
                 self._burst_until = inf
 
     def _restart(self) -> None:
-        self.is_running = False
+        self.is_running = self._awaits_confirmation = False
         self._requested_at = None
         # However late: only an answer of the application shows that no burst will follow.
         self._burst_until = inf
@@ -196,6 +219,10 @@ class Continuity:
             return
         if now <= self._burst_until:
             self._burst_until = -inf
+            has_returned = self._listened_s - self._returned_s < _MESSAGE_S
+            if self._awaits_confirmation and has_returned:
+                self._lose_by_restart("and had not confirmed the reset before")
+            self.is_running = self._awaits_confirmation = False
         elif now > self._supplied_until:
             self._lose_by_restart("although this run had not restarted it")
         version, self._boot_version = self._boot_version, self.watcher.version

@@ -13,7 +13,7 @@ from typing import Final
 from flasher.protocol import catalogue
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
-from flasher.protocol.messages import BootVersion, RequestTransfer, decode
+from flasher.protocol.messages import BootVersion, GeneralFeedback, RequestTransfer, decode
 from flasher.protocol.spec import data_size
 from flasher.protocol.text import printable
 from flasher.protocol.wire import Message, Reassembler, encode, split
@@ -56,6 +56,8 @@ class TargetWatcher:
         self.announced_at: float | None = None
         self.transfer_requests = 0
         """Of its bootloader."""
+        self.confirmations = 0
+        """Of writes and resets."""
         self.answers = 0
         """To a question for its version, whoever asked."""
         self.answer: Content | None = None
@@ -85,6 +87,8 @@ class TargetWatcher:
                     self.version = printable(row.version)
                 elif isinstance(row, RequestTransfer):
                     self.transfer_requests += 1
+                elif isinstance(row, GeneralFeedback):
+                    self.confirmations += 1
         if self._answers is not None and frame.can_id == self._answers.can_id:
             for found in self._answers.feed(frame.data, now):
                 if isinstance(found, Message):

@@ -13,6 +13,7 @@ from flasher.mock.bms import BmsApplication
 from flasher.mock.faults import AtTime, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
+from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, WELLING, WMC, Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.settings.manifest import release_of
@@ -276,6 +277,45 @@ def test_a_burst_too_many_around_an_own_restart(tmp_path: Path, gap_s: float, st
 
     world.when = announces
     world.check_caught()
+
+
+@BOTH_KINDS
+@pytest.mark.parametrize("gap_s", [0.3, 1.0, 3.5, 8.0])
+@pytest.mark.parametrize("resets", [0, 1], ids=["before the flash", "after the writes"])
+def test_a_reset_that_the_first_unit_did_not_receive(
+    tmp_path: Path, numbers: tuple[str, str], gap_s: float, resets: int
+) -> None:
+    """It is pulled just then, and what follows is the announcement of the second one."""
+    second = replace(NEW_UNIT, factory_version=BMS_VERSION)
+    world = Exchange(tmp_path, numbers, gap_s=gap_s, second=second)
+    seen = 0
+
+    def see(frame: Frame, *, sent: bool, now: float) -> None:  # noqa: ARG001  a tap
+        nonlocal seen
+        seen += sent and frame.can_id == BMS.request_id and frame.data[4:6] == b"\x42\x05"
+
+    world.bench.taps = (see,)
+    world.when = lambda: seen > resets
+    world.check_caught()
+
+
+@pytest.mark.parametrize("reset_delay_s", [0.0, 0.1])
+def test_a_confirmation_of_the_reset_may_be_lost(tmp_path: Path, reset_delay_s: float) -> None:
+    """A restart that follows so soon is that of the same unit."""
+    lost = 0
+
+    def lose(frame: Frame, _now: float) -> tuple[Frame, ...]:
+        nonlocal lost
+        is_feedback = frame.can_id == BMS.answer_id and frame.data[4:6] == b"\x55\x03"
+        is_lost = is_feedback and lost < 1
+        lost += is_lost
+        return () if is_lost else (frame,)
+
+    profile = replace(NEW_UNIT, reset_delay_s=reset_delay_s)
+    bench = UnitBench(tmp_path, profile=profile, disturbance=lose)
+    result = bench.run()
+    assert lost
+    assert result.outcome is RunState.PASS, result
 
 
 @pytest.mark.parametrize(

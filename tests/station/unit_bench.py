@@ -8,7 +8,7 @@ from pathlib import Path
 
 from flasher.api import Connection
 from flasher.bus.link import VirtualClock
-from flasher.bus.simulated import SimulatedBus
+from flasher.bus.simulated import Disturbance, SimulatedBus
 from flasher.driver import Tap
 from flasher.mock.faults import FaultInjector
 from flasher.mock.model import MockDevice
@@ -71,10 +71,11 @@ class UnitBench:
         text: str = USUAL + WRITES,
         profile: DeviceProfile = NEW_UNIT,
         targets: Sequence[Target] = (BMS,),
+        disturbance: Disturbance | None = None,
     ) -> None:
         self.recipe = make_recipe(folder, text)
         self.clock = VirtualClock()
-        self.bus = SimulatedBus(WELLING.bitrate_bps, self.clock)
+        self.bus = SimulatedBus(WELLING.bitrate_bps, self.clock, disturbance)
         self.units: dict[Target, FaultInjector] = {}
         for target in targets:
             self.put(MockDevice(target, bitrate_bps=WELLING.bitrate_bps, profile=profile))
