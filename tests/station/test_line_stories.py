@@ -1,0 +1,164 @@
+"""Stories of a whole line on virtual time, of the campaign `tests.campaigns.line_world`: which unit
+a label ends on when units and people change places, and an oracle that finds what it should.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+
+from flasher.station.socket import UNNAMED, Socket, Source
+from flasher.station.station import Station
+from tests.campaigns.line_world.play import Played, draw, play, shrink
+from tests.campaigns.line_world.stories import Story
+
+PULLED_IN_ITS_FLASH = (
+    "line sockets=2 ; unit label=1 ; unit label=3 pace=slow ; person name=jo ;"
+    " @3.0 card by=jo unit=3 socket=B ; @3.1 label by=jo unit=3 ; @3.2 put unit=3 socket=B ;"
+    " @6.0 pull unit=3 ; @9.0 put unit=1 socket=B"
+)
+CARD_HERE_LABEL_THERE = (
+    "line sockets=2 ; unit label=2 ; unit label=3 ; person name=jo source=jo ;"
+    " person name=al source=al ; @1.0 put unit=3 socket=B ; @2.0 card by=jo unit=3 ;"
+    " @4.0 label by=al unit=2"
+)
+PASSED_AND_EXCHANGED = (
+    "line sockets=2 ; unit label=1 ; unit label=2 ; person name=jo ; @3.0 put unit=1 socket=A ;"
+    " @4.0 card by=jo unit=1 ; @5.0 label by=jo unit=1 ; @12.0 pull unit=1 ;"
+    " @12.3 put unit=2 socket=A"
+)
+STORIES = {
+    "pulled in its flash": PULLED_IN_ITS_FLASH,
+    "card here, label there": CARD_HERE_LABEL_THERE,
+    "passed and exchanged": PASSED_AND_EXCHANGED,
+    "label here, card there": (
+        "line sockets=2 ; unit label=3 ; unit label=4 ; person name=jo source=jo ;"
+        " person name=al ; @3.0 label by=jo unit=4 ; @6.0 put unit=3 socket=B ;"
+        " @7.0 card by=al unit=3"
+    ),
+    "another number comes into the flash": (
+        "line sockets=2 recipe=plain ; unit label=1 number=other ; unit label=3 pace=slow ;"
+        " person name=jo ; @3.0 put unit=3 socket=A ; @4.0 card by=jo unit=3 ;"
+        " @4.5 label by=jo unit=3 ; @6.0 pull unit=3 ; @6.3 put unit=1 socket=A"
+    ),
+    "the number of the unit before": (
+        "line sockets=2 ; unit label=2 number=own ; unit label=3 ; person name=jo ;"
+        " @3.0 put unit=2 socket=A ; @4.8 pull unit=2 ; @5.0 put unit=3 socket=A ;"
+        " @5.1 label by=jo unit=2"
+    ),
+    "exchanged after the card": (
+        "line sockets=2 recipe=plain ; unit label=1 ; unit label=2 ; person name=al ;"
+        " @3.0 put unit=2 socket=B ; @13.0 card by=al unit=2 ; @14.0 pull unit=2 ;"
+        " @14.3 put unit=1 socket=B ; @16.0 label by=al unit=2"
+    ),
+    "everything dies": (
+        "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
+        " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"
+        " @4.5 worker socket=A ; @7.0 label by=jo unit=1 ; @7.6 dip socket=A seconds=0.5 ;"
+        " @12.0 put unit=2 socket=B ; @13.0 label by=jo unit=2 ; @13.4 station seconds=2.0 ;"
+        " @17.0 sleep unit=1 seconds=4.0 ; @18.0 label by=jo unit=1"
+    ),
+}
+
+
+def told(text: str) -> Played:
+    return play(Story.parse(text))
+
+
+@pytest.mark.parametrize("name", STORIES)
+def test_no_label_ends_on_another_unit_and_nobody_is_stuck(name: str) -> None:
+    assert told(STORIES[name]).text == ""
+
+
+def test_units_that_nobody_exchanges_pass() -> None:
+    played = told(
+        "line sockets=2 ; unit label=1 ; unit label=2 number=maker ; unit label=3 number=own ;"
+        " person name=jo ; @3.0 put unit=1 socket=A ; @4.0 card by=jo unit=1 ;"
+        " @4.5 label by=jo unit=1 ; @5.0 put unit=2 socket=B ; @6.0 card by=jo unit=2 ;"
+        " @6.5 label by=jo unit=2 ; @12.0 pull unit=1 ; @13.0 put unit=3 socket=A ;"
+        " @17.0 label by=jo unit=3"
+    )
+    assert played.seen is not None
+    assert (played.text, played.seen["PASS OK"], played.seen["runs"]) == ("", 3, 3)
+
+
+def test_a_story_that_is_printed_is_read_as_the_same() -> None:
+    for seed in range(3):
+        story = draw(seed, 6).story
+        assert Story.parse(str(story)) == story
+
+
+def test_a_seed_takes_the_same_course_each_time() -> None:
+    courses: list[list[str]] = [[], []]
+    story = draw(5, 12).story
+    for course in courses:
+        play(story, course.append)
+    assert courses[0] == courses[1]
+    assert draw(5, 12).story == story
+
+
+def test_nobody_puts_a_unit_where_another_one_is_awaited() -> None:
+    put = "@6.0 put unit=2 socket=A"
+    text = (
+        "line sockets=2 ; unit label=1 ; unit label=2 ; person name=jo ;"
+        f" @3.0 card by=jo unit=1 socket=A ; @4.0 label by=jo unit=1 ; {put}"
+    )
+    assert put not in str(told(text).story)
+    assert put in str(told(text.replace("@4.0 label by=jo unit=1 ;", "")).story)
+
+
+# -- faults that the oracle has to find -----------------------------------------------------------
+
+
+def let_all_scan_at_one_place(patch: pytest.MonkeyPatch) -> None:
+    real = Station.submit
+
+    def submit(self: Station, text: str, source: Source = UNNAMED) -> None:
+        real(self, text)
+
+    patch.setattr(Station, "submit", submit)
+
+
+def see_nobody_come(patch: pytest.MonkeyPatch) -> None:
+    real = Socket.hear
+
+    def hear(self: Socket, *args: object, **words: object) -> bool:
+        last = self.last, self.is_last_there
+        real(self, *args, **words)  # type: ignore[arg-type]
+        if last[0] is not None:
+            self.last, self.is_last_there = last
+        return False
+
+    patch.setattr(Socket, "hear", hear)
+
+
+def never_begin(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Socket, "is_due", lambda *_: False)
+
+
+@pytest.mark.parametrize(
+    ("plant", "story", "kind"),
+    [
+        (let_all_scan_at_one_place, CARD_HERE_LABEL_THERE, "NUMBER"),
+        (see_nobody_come, PASSED_AND_EXCHANGED, "GREEN"),
+        (never_begin, PASSED_AND_EXCHANGED, "STUCK"),
+    ],
+)
+def test_a_fault_of_the_station_is_found(
+    plant: Callable[[pytest.MonkeyPatch], None],
+    story: str,
+    kind: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    plant(monkeypatch)
+    assert told(story).kind == kind
+
+
+def test_a_story_is_shrunk_to_what_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    let_all_scan_at_one_place(monkeypatch)
+    found = told(CARD_HERE_LABEL_THERE.replace("@4.0", "@2.5 free by=al socket=A ; @4.137"))
+    assert found.kind == "NUMBER"
+    story = shrink(found).story
+    assert [each.NAME for each in story.acts] == ["put", "card", "label"]
+    assert all(each.when is not None and each.when.plus_s % 0.5 == 0 for each in story.acts)
