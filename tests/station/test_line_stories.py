@@ -114,7 +114,7 @@ def test_nobody_puts_a_unit_where_another_one_is_awaited() -> None:
 def let_all_scan_at_one_place(patch: pytest.MonkeyPatch) -> None:
     real = Station.submit
 
-    def submit(self: Station, text: str, source: Source = UNNAMED) -> None:
+    def submit(self: Station, text: str, _source: Source = UNNAMED) -> None:
         real(self, text)
 
     patch.setattr(Station, "submit", submit)
