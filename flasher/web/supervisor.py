@@ -43,7 +43,8 @@ from flasher.station.records.model import (
     StepName,
     UnitState,
 )
-from flasher.station.records.overview import By, Cut, Overview, Span
+from flasher.station.records.newest import Cut
+from flasher.station.records.overview import HOLDERS_COUNTED, By, Overview, Span
 from flasher.station.records.store import Store
 from flasher.station.reports import Report, csv_text, make_report
 from flasher.station.stories import explained
@@ -235,6 +236,7 @@ class Supervisor:
             chosen=chosen[0] if chosen else None,
             page=self.overview.holders(sha256, _cut(question)) if chosen else None,
             count=self.overview.holder_count(sha256) if chosen else 0,
+            counted_up_to=HOLDERS_COUNTED,
         )
 
     def file_of_holders(self, question: Question) -> Answer:

@@ -1,218 +1,217 @@
-"""Times each page of the supervisor over the records of a plant, and what a station notices of it.
+"""Times what a plant asks of the records of many runs, and what a station notices of it: pages of
+the supervisor, the certificate, the report of a day, the commit of a run.
 
-    python -m tests.benchmarks.supervisor_pages [--runs N]
+    python -m tests.benchmarks.supervisor_pages [--runs N] [--traces N] [--server] [--keep FOLDER]
 
-The first run is a station's own, with its trace. The others are rows like its rows, written past
-the station's rules, since 100,000 runs by its own operations take half an hour: 8 sockets, 40 lots,
-three images, two months of three shifts, every ninth unit bad at first. Their audit rows
-vouch for nothing, so the certificate is timed in records of its own, which a station made.
+`cold`: records opened anew, and nothing of them in the computer's memory (a server is started
+again for it). `warm`: asked once more. The records are made in bulk (`bulk_records`); with --keep
+they stay in FOLDER, and are used again from there.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import os
 import random
-import sqlite3
 import statistics
 import tempfile
 import threading
 import time
-from contextlib import closing
-from datetime import UTC, datetime, timedelta
+from collections.abc import Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass, field
+from datetime import timedelta
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from flasher.protocol.spec import BMS
+from flasher.station.recipe_file import LoadedRecipe
+from flasher.station.records.claims import Order
+from flasher.station.records.errors import ClaimRefusedError
 from flasher.station.records.keys import Keeping
-from flasher.station.records.model import AuditEvent, RunState, utc_text
+from flasher.station.records.model import (
+    AuditEvent,
+    Ending,
+    RunFilter,
+    RunId,
+    RunState,
+    StepState,
+    Verified,
+)
 from flasher.station.records.store import Store
+from flasher.station.reports import make_report
 from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.web.answers import AnswerProcesses, Question
-from flasher.web.supervisor import open_supervisor, place_of
-from tests.benchmarks.station_records import SERIAL_NUMBER, fill
-from tests.station.factory import HEAD, SERIAL, Bench, make_recipe, target_table
-from tests.web.answering import app_of, client_of
+from flasher.web.supervisor import PAGES, open_supervisor, place_of
+from tests.benchmarks import bulk_records
+from tests.benchmarks.bulk_records import FIRST_DAY, RUNS_A_DAY
+from tests.station.factory import BMS_VERSION, IMAGES, USUAL, Bench, FakeClock, make_recipe
+from tests.station.postgres import Server, find_programs, running_server
+from tests.station.traces import run_messages, write_trace
 
-REPEATS: Final = 5
-SOCKETS: Final = tuple("ABCDEFGH")
-CODES: Final = ("NO_ANSWER", "REFUSED", "WRONG_HARDWARE", "TRANSFER_FAILED", "OTHER_VERSION")
-STEPS: Final = (
-    ("connect", 0.4), ("identify", 0.1), ("check", 0.2), ("flash", 9.0), ("write", 0.6),
-    ("restart", 2.1), ("verify", 0.9), ("save", 0.05),
-)  # fmt: skip
-DAYS: Final = 60
-RUNS_OF_CERTIFICATE: Final = 2000
 TURNS: Final = 300
 TURN_S: Final = 0.02
-_Rows = dict[str, list[tuple[Any, ...]]]
+RUNS_MADE: Final = 40
 
 
-def make_plant(folder: Path, runs: int) -> Bench:
-    """Records of `runs` runs in `folder`."""
-    bench = Bench(folder)
-    bench.make(lot="L000")
-    bench.store.close()
-    with closing(sqlite3.connect(bench.path)) as connection:
-        rules = "SELECT name, sql FROM sqlite_master WHERE type = 'trigger'"
-        found = connection.execute(rules).fetchall()
-        for name, _ in found:
-            connection.execute(f"DROP TRIGGER {name}")
-        _copy_runs(connection, runs)
-        for _, statement in found:
-            connection.execute(statement)
-        connection.commit()
-    return bench
+@dataclass
+class Plant:
+    """Records of many runs."""
+
+    folder: Path
+    runs: int
+    server: Server | None = None
+    url: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.url = self.server.own_records() if self.server else str(self.folder / "records.sqlite")
+
+    def fill(self, traces: int) -> None:
+        bench = Bench(self.folder, url=self.url if self.server else None)
+        bench.make(lot="L000")
+        bulk_records.fill(bench, self.runs, traces)
+        bench.store.close()
+
+    def open(self, *, read_only: bool = True, clock: FakeClock | None = None) -> Store:
+        return Store.open(
+            self.url, station="line-2", folder=self.files, read_only=read_only, clock=clock,
+            keeping=Keeping(self.folder / "keys"),
+        )  # fmt: skip
+
+    @property
+    def files(self) -> Path:
+        return self.folder / ("files" if self.server else "records.sqlite.files")
+
+    def cool(self) -> None:
+        """Let the computer forget what it holds of the records."""
+        if self.server is not None:
+            self.server.restart()
+        for path in (self.server.folder if self.server else self.folder).rglob("*"):
+            if path.is_file():
+                handle = os.open(path, os.O_RDONLY)
+                os.posix_fadvise(handle, 0, 0, os.POSIX_FADV_DONTNEED)
+                os.close(handle)
 
 
-class _Table:
-    """Rows that are written past the rules, many at a time."""
-
-    def __init__(self, connection: sqlite3.Connection) -> None:
-        self._connection = connection
-        self._columns: dict[str, tuple[str, ...]] = {}
-        self._rows: _Rows = {}
-
-    def add(self, table: str, **values: Any) -> None:
-        self._columns.setdefault(table, tuple(values))
-        self._rows.setdefault(table, []).append(tuple(values.values()))
-
-    def write(self) -> None:
-        for table, rows in self._rows.items():
-            names = ", ".join(self._columns[table])
-            marks = ", ".join("?" * len(self._columns[table]))
-            self._connection.executemany(
-                f"INSERT INTO {table} ({names}) VALUES ({marks})",  # noqa: S608  our own names
-                rows,
-            )
-        self._rows.clear()
-
-
-def _copy_runs(connection: sqlite3.Connection, runs: int) -> None:
-    connection.row_factory = sqlite3.Row
-
-    def last(table: str) -> dict[str, Any]:
-        query = f"SELECT * FROM {table} ORDER BY id DESC LIMIT 1"  # noqa: S608  our own names
-        return dict(connection.execute(query).fetchone())
-
-    run, recipe, image, audit = (last(each) for each in ("run", "recipe", "artifact", "audit"))
-    chance, made, part = random.Random(7), _Table(connection), recipe["part"]
-    for other in range(1, len(SOCKETS)):
-        made.add("socket", id=other + 1, station_id=1, name=SOCKETS[other])
-    made.add("recipe", **{**recipe, "id": 2, "revision": "5", "sha256": "5" * 64})
-    made.add("artifact", **{**image, "id": 2, "name": "next.bin", "sha256": "e" * 64})
-    made.add("artifact", **{**image, "id": 3, "name": "pilot.bin", "sha256": "f" * 64})
-    for lot in range(1, 40):
-        made.add("lot", id=lot + 1, part=part, name=f"L{lot:03}")
-    unit, was_bad = 1, False
-    for run_id in range(2, runs + 1):
-        if not was_bad:
-            unit += 1
-            made.add("unit", id=unit, part=part, serial=f"W{unit:07}")
-        was_bad = not was_bad and chance.random() < 0.11
-        share = run_id / runs
-        at = datetime(2026, 4, 1, tzinfo=UTC) + timedelta(days=share * DAYS)
-        took_s = sum(seconds for _, seconds in STEPS)
-        made.add("run", **{
-            **run, "id": run_id, "unit_id": unit, "socket_id": 1 + run_id % len(SOCKETS),
-            "recipe_id": 1 + (share > 0.6), "lot_id": 1 + int(share * 39),
-            "state": (RunState.FAIL if was_bad else RunState.PASS).value,
-            "code": chance.choices(CODES, (50, 25, 12, 8, 5))[0] if was_bad else "OK",
-            "begun_at": utc_text(at), "begun_monotonic_s": run_id * 20.0,
-            "ended_at": utc_text(at + timedelta(seconds=took_s)),
-            "ended_monotonic_s": run_id * 20.0 + took_s, "log_sha256": f"{run_id:064x}",
-            "verification_reached": None if was_bad else 1,
-        })  # fmt: skip
-        image_id = 3 if run_id % 2000 == 0 else 1 + (share > 0.6)
-        made.add("run_target", run_id=run_id, artifact_id=image_id, position=0, target="bms",
-                 required=1, reached=None if was_bad else 1)  # fmt: skip
-        _parts_of_run(made, run_id, utc_text(at), chance, was_bad=was_bad)
-        for event in ("claimed", "finished"):
-            number = audit["number"] + 2 * run_id + (event == "finished")
-            made.add("audit", **{
-                **audit, "id": number + 10, "number": number, "at": utc_text(at), "event": event,
-                "run_id": run_id, "hash": f"{number:064x}", "previous_hash": f"{number - 1:064x}",
-            })  # fmt: skip
-        if run_id % 5000 == 0:
-            made.write()
-    made.write()
-
-
-def _parts_of_run(
-    made: _Table, run_id: int, at: str, chance: random.Random, *, was_bad: bool
-) -> None:
-    for position, (name, seconds) in enumerate(STEPS):
-        step_id = run_id * 10 + position
-        failed = was_bad and position == len(STEPS) - 2
-        made.add("step", id=step_id, run_id=run_id, position=position, name=name, try_number=1,
-                 state="FAIL" if failed else "PASS", code="", text="", begun_at=at,
-                 begun_monotonic_s=0.0, duration_s=seconds * chance.lognormvariate(0, 0.2),
-                 )  # fmt: skip
-        if position in (1, 2, 6):
-            made.add("measurement", step_id=step_id, name="voltage", value=36.2, unit="V", low=30.0,
-                     high=42.0, text=None, expected=None)  # fmt: skip
-    for what in ("flash", "serial-number"):
-        made.add("device_write", run_id=run_id, target="bms", what=what, value="V1", intended_at=at,
-                 intended_monotonic_s=0.0, read_back=None,
-                 verified_at=None if was_bad and what == "flash" else at)  # fmt: skip
-    made.add("attachment", run_id=run_id, kind="trace", name="t.log.gz", sha256=f"{run_id:064x}",
-             size_bytes=900)  # fmt: skip
-
-
-def pages_of(image: str, serial: str) -> tuple[str, ...]:
+def questions_of(plant: Plant) -> list[tuple[str, Question]]:
     """What is asked for, the usual first."""
-    return (
-        "/runs", "/runs?search=4321", "/runs?lot=L005&outcome=FAIL", "/runs?part=BAT-36",
-        "/runs?code=NOWHERE", "/runs?before=1000", f"/units?serial={serial}", "/runs/1/trace",
-        "/images", f"/images?sha256={image}", "/images?image=pilot", f"/images.csv?sha256={image}",
-        "/yield", "/yield?by=lot", "/yield?by=shift", "/yield?from=2026-04-01",
-        "/times", "/times?from=2026-04-01", "/audit", "/audit?event=begun",
-        "/runs.csv?lot=L005", "/runs.csv", "/runs.json", "/runs.xml",
-    )  # fmt: skip
+    runs = plant.runs
+    last = FIRST_DAY + timedelta(days=runs / RUNS_A_DAY)
+    a_day = {
+        "from": f"{last - timedelta(days=9):%Y-%m-%d}",
+        "to": f"{last - timedelta(days=8):%Y-%m-%d}",
+    }
+    image = {"sha256": "2" * 64}
+    lot = f"L{runs // 2 // bulk_records.RUNS_A_LOT:03}"
+    serial = _serial(plant)
+    asked: list[tuple[str, dict[str, str]]] = [
+        ("/runs", {}),
+        ("/runs", {"before": str(runs // 2)}),
+        ("/runs", {"search": serial[-5:]}),
+        ("/runs", {"search": "nowhere"}),
+        ("/runs", {"lot": lot, "outcome": "FAIL"}),
+        ("/runs", {"outcome": "FAIL"}),
+        ("/runs", {"outcome": "ABORTED"}),
+        ("/runs", {"part": "BAT-36"}),
+        ("/runs", {"code": "NOWHERE"}),
+        ("/runs", {"code": "OTHER_VERSION"}),
+        ("/runs", {"socket": "C"}),
+        ("/runs", {"recipe": "Battery 36 V"}),
+        ("/runs", a_day),
+        ("/runs", {"to": f"{FIRST_DAY + timedelta(days=3):%Y-%m-%d}"}),
+        ("/units", {"serial": serial}),
+        ("/images", {}),
+        ("/images", image),
+        ("/images", {"image": "pilot"}),
+        ("/yield", {}),
+        ("/yield", {"by": "lot"}),
+        ("/yield", {"by": "shift"}),
+        ("/yield", {"lot": lot}),
+        ("/yield", {"socket": "C"}),
+        ("/times", {}),
+        ("/times", {"lot": lot}),
+        ("/audit", {}),
+        ("/audit", {"event": "begun"}),
+        ("/audit", {"event": "finished"}),
+        ("/audit", a_day),
+        ("/runs.csv", a_day),
+        ("/runs.json", a_day),
+        ("/runs.xml", a_day),
+        ("/runs.csv", {"lot": lot}),
+        ("/units/certificate", {"serial": serial}),
+        ("/yield", {"from": f"{FIRST_DAY:%Y-%m-%d}"}),
+        ("/times", {"from": f"{FIRST_DAY:%Y-%m-%d}"}),
+        ("/images.csv", image),
+    ]
+    found = []
+    for path, fields in asked:
+        shown = path + (
+            "?" + "&".join(f"{name}={value[:12]}" for name, value in fields.items())
+            if fields
+            else ""
+        )
+        found.append((shown, Question(path, fields)))
+    found.insert(14, ("/runs/N/trace", Question("/runs/{run:int}/trace", run=runs - 1)))
+    return found
 
 
-def measure_pages(bench: Bench) -> None:
-    client = client_of(app_of(bench.path, bench.keys))
-    image = bench.recipe.targets[0].image.sha256
-    for path in pages_of(image, SERIAL):
-        taken_s = []
-        for _ in range(REPEATS):
-            began = time.perf_counter()
-            answer = client.get(path)
-            taken_s.append(time.perf_counter() - began)
-            if answer.status_code != 200:
-                raise SystemExit(f"{path}: {answer.status_code}\n{answer.text}")
-        shown = path if len(path) < 40 else f"{path[:37]}..."
+def _serial(plant: Plant) -> str:
+    with plant.open() as store:
+        return store.read.run(RunId(plant.runs - 1)).run.serial
+
+
+def measure_pages(plant: Plant, wanted: str) -> None:
+    place = (plant.url, plant.files, Keeping(plant.folder / "keys"), DEFAULT_SHIFTS)
+    questions = questions_of(plant)
+    open_supervisor(*place).answer(questions[0][1])  # templates and statements are there
+    for shown, question in questions:
+        if wanted not in shown:
+            continue
+        plant.cool()
+        began = time.perf_counter()
+        supervisor = open_supervisor(*place)
+        answer = PAGES[question.path](supervisor, question)
+        cold_s = time.perf_counter() - began
+        began = time.perf_counter()
+        PAGES[question.path](supervisor, question)
+        warm_s = time.perf_counter() - began
+        supervisor.store.close()
+        mark = "  !" if cold_s > 1.0 else ""
         print(
-            f"  {shown:<40} {statistics.median(taken_s) * 1000:7.0f} ms,"
-            f" longest {max(taken_s) * 1000:.0f}, {len(answer.content) / 1000:.0f} kB"
+            f"  {shown:<44} cold {cold_s * 1000:7.0f} ms, warm {warm_s * 1000:6.0f} ms,"
+            f" {len(answer.body) / 1000:6.0f} kB{mark}",
+            flush=True,
         )
 
 
-def measure_certificate(folder: Path, runs: int) -> None:
-    """In records that hold together: the whole audit trail is gone through."""
-    folder.mkdir()
-    bench = Bench(folder)
-    bench.recipe = make_recipe(folder, HEAD + SERIAL_NUMBER + target_table(BMS))
-    fill(bench, runs)
-    bench.store.close()
-    client = client_of(app_of(bench.path, bench.keys))
+def measure_report(plant: Plant) -> None:
+    """`flasher station report` over a day."""
+    end = FIRST_DAY + timedelta(days=plant.runs / RUNS_A_DAY - 3)
+    plant.cool()
     began = time.perf_counter()
-    answer = client.get("/units/certificate?serial=W0000017")
-    if answer.status_code != 200:
-        raise SystemExit(answer.text)
-    print(f"  certificate in records of {runs} runs    {time.perf_counter() - began:7.2f} s")
-
-
-def measure_station(bench: Bench) -> None:
-    """A station that records, alone and while two desks ask for pages without a pause."""
-    store = Store.open(
-        str(bench.path), station="line-2", clock=bench.clock, keeping=Keeping(bench.keys)
+    with plant.open() as store:
+        made = make_report(store.read, RunFilter(since=end - timedelta(days=1), until=end))
+        text = made.to_csv() + made.to_json() + made.to_junit()
+    print(
+        f"  report of a day, {len(made.runs)} runs {'':<12} cold"
+        f" {(time.perf_counter() - began) * 1000:7.0f} ms, {len(text) / 1000:.0f} kB"
     )
+
+
+def measure_station(plant: Plant) -> None:
+    """A station that records: its start, whole runs, notes while two desks ask for pages."""
+    plant.cool()
+    clock = FakeClock(FIRST_DAY + timedelta(days=plant.runs / RUNS_A_DAY + 1))
+    recipe = make_recipe(plant.folder, USUAL)
+    began = time.perf_counter()
+    store = plant.open(read_only=False, clock=clock)
+    store.recover()
+    print(f"  a station starts, cold {(time.perf_counter() - began) * 1000:7.0f} ms")
     answering = AnswerProcesses(partial(open_supervisor, *place_of(store), DEFAULT_SHIFTS))
     with closing(store), closing(answering):
-        store.recover()
+        _runs(store, clock, recipe, plant.folder)
         _commits(store, "alone")
         ended = threading.Event()
         asking = threading.Thread(target=lambda: asyncio.run(_ask(answering, ended)))
@@ -221,6 +220,35 @@ def measure_station(bench: Bench) -> None:
         _commits(store, "while pages are asked for")
         ended.set()
         asking.join()
+
+
+def _runs(store: Store, clock: FakeClock, recipe: LoadedRecipe, folder: Path) -> None:
+    taken_ms: dict[str, list[float]] = {"claim": [], "finish": [], "whole run, 5 commits": []}
+    for _ in range(RUNS_MADE):
+        serial = f"W27{random.randrange(1, 51):02}{random.randrange(1000):03}"
+        said = run_messages(serial, BMS_VERSION, IMAGES[BMS])
+        trace = write_trace(folder / "made.log.gz", said)
+        began = time.perf_counter()
+        try:
+            claim = store.claim(Order(serial, "A", recipe, "jo"))
+        except ClaimRefusedError:
+            continue  # this number was drawn before
+        claimed = time.perf_counter()
+        write = store.intent(claim.run_id, "bms", "flash", BMS_VERSION)
+        store.verified(write, BMS_VERSION)
+        store.step(claim.run_id, "flash", StepState.PASS, duration_s=8.0)
+        file = store.files.add("trace", trace)
+        ending = Ending(RunState.PASS, "OK", "", {"bms": Verified.VERSION}, file.sha256, [file])
+        worked = time.perf_counter()
+        store.finish(claim.run_id, ending)
+        ended = time.perf_counter()
+        for name, value in zip(
+            taken_ms, (claimed - began, ended - worked, ended - began), strict=True
+        ):
+            taken_ms[name].append(value * 1000)
+        clock.go_on(20.0)
+    for name, values in taken_ms.items():
+        print(f"  {name:<28} {statistics.median(values):6.1f} ms, most {max(values):.1f}")
 
 
 def _commits(store: Store, when: str) -> None:
@@ -258,20 +286,40 @@ async def _ask(answering: AnswerProcesses, ended: threading.Event) -> None:
     print(f"  {asked} pages in {time.perf_counter() - began:.0f} s")
 
 
+@contextmanager
+def plant_of(options: argparse.Namespace, folder: Path) -> Iterator[Plant]:
+    with ExitStack() as stack:
+        server = None
+        if options.server:
+            programs = find_programs()
+            assert programs is not None
+            server = stack.enter_context(running_server(programs))
+        plant = Plant(folder, options.runs, server)
+        if server is not None or not (folder / "records.sqlite").exists():
+            began = time.perf_counter()
+            plant.fill(options.traces)
+            os.sync()
+            print(
+                f"  {options.runs:,} runs made in {time.perf_counter() - began:.0f} s", flush=True
+            )
+        yield plant
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=100_000)
+    parser.add_argument("--traces", type=int, default=1000, help="the last runs that have one")
+    parser.add_argument("--server", action="store_true", help="on PostgreSQL, in place of a file")
+    parser.add_argument("--keep", type=Path, help="make them in this folder, or use those in it")
+    parser.add_argument("--pages", default="", help="only pages with this in their address")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        began = time.perf_counter()
-        plant = folder / "plant"
-        plant.mkdir()
-        bench = make_plant(plant, options.runs)
-        print(f"  {options.runs} runs made in {time.perf_counter() - began:.0f} s")
-        measure_pages(bench)
-        measure_station(bench)
-        measure_certificate(folder / "certificate", RUNS_OF_CERTIFICATE)
+        folder = options.keep or Path(temporary)
+        folder.mkdir(parents=True, exist_ok=True)
+        with plant_of(options, folder) as plant:
+            measure_pages(plant, options.pages)
+            measure_report(plant)
+            measure_station(plant)
 
 
 if __name__ == "__main__":

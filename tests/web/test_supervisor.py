@@ -29,7 +29,8 @@ from flasher.station.records.model import (
     RunState,
     StepState,
 )
-from flasher.station.records.overview import By, Cut, Overview, Span
+from flasher.station.records.newest import Cut
+from flasher.station.records.overview import By, Overview, Span
 from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.web.supervisor import open_supervisor, shifts_of, spans_of
 from tests.station.factory import BMS_VERSION, IMAGES, Bench

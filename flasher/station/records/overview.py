@@ -32,22 +32,17 @@ from flasher.station.records.model import (
     utc_moment,
     utc_text,
 )
-from flasher.station.records.queries import JUDGED, details_of, filtered, joined, run_query
+from flasher.station.records.newest import Cut, newest_runs
+from flasher.station.records.queries import JUDGED, details_of, filtered, run_query
+from flasher.station.records.rows import beside_index
 
 PAGE_SIZE: Final = 50
 LIFE_SIZE: Final = 10
 IMAGES_MAX: Final = 100
+HOLDERS_COUNTED: Final = 1000
 _SPANS_AT_ONCE: Final = 400
 """Spans in one query: SQLite takes 500 parts."""
 _Row = TypeVar("_Row")
-
-
-@dataclass(frozen=True)
-class Cut:
-    """Where a page begins: below or above the row with an id; neither: the newest rows."""
-
-    before: int | None = None
-    after: int | None = None
 
 
 @dataclass(frozen=True)
@@ -153,9 +148,11 @@ class Overview:
 
     def runs(self, chosen: RunFilter, cut: Cut, size: int = PAGE_SIZE) -> Page[RunRecord]:
         run_id = schema.run.c.id
-        query = filtered(run_query(schema.run.c.verification_reached.label("verified")), chosen)
+        with self._database.reading() as connection:
+            found = newest_runs(connection, chosen, cut, size + 1)
+        query = run_query(schema.run.c.verification_reached.label("verified"))
         # What no station writes is shown nowhere else: reports and `verify` name it.
-        return self._page(_RUNS, query, run_id, cut, size)
+        return self._page(_RUNS, query.where(run_id.in_(found)), run_id, cut, size)
 
     def parts(self, serial: str) -> tuple[str, ...]:
         unit = schema.unit.c
@@ -165,8 +162,9 @@ class Overview:
 
     def life(self, serial: str, part: str, cut: Cut, size: int = LIFE_SIZE) -> Page[RunDetails]:
         run_id = schema.run.c.id
-        query = filtered(joined(run_id), RunFilter(serial=serial, part=part))
-        page = self._page(_ROWS, query, run_id, cut, size)
+        with self._database.reading() as connection:
+            last = newest_runs(connection, RunFilter(serial=serial, part=part), cut, size + 1)
+        page = self._page(_ROWS, select(run_id).where(run_id.in_(last)), run_id, cut, size)
         with self._database.reading() as connection:
             found = tuple(details_of(connection, run_id.in_([row["id"] for row in page.rows])))
         return Page(found[::-1], page.older, page.newer)
@@ -184,9 +182,10 @@ class Overview:
 
     def last_begin(self, chosen: RunFilter) -> datetime | None:
         """When the last run of a filter began; None without runs."""
-        begun_at = schema.run.c.begun_at
-        query = filtered(joined(begun_at), chosen).order_by(begun_at.desc()).limit(1)
+        run = schema.run.c
         with self._database.reading() as connection:
+            last = newest_runs(connection, chosen, Cut(), 1)
+            query = select(run.begun_at).where(run.id.in_(last))
             found = connection.execute(query).scalar_one_or_none()
         return None if found is None else utc_moment(found)
 
@@ -220,49 +219,55 @@ class Overview:
 
     def holders(self, sha256: str, cut: Cut, size: int = PAGE_SIZE) -> Page[Holder]:
         """A page of the units whose last transfer was that of the image with this hash."""
-        return self._page(_HOLDERS, _holders(sha256), schema.run_target.c.id, cut, size)
+        query = _holders(self._artifacts(sha256))
+        return self._page(_HOLDERS, query, schema.run_target.c.id, cut, size)
 
     def all_holders(self, sha256: str) -> tuple[Holder, ...]:
         """All of them, in the order in which they were made."""
-        query = _holders(sha256).order_by(schema.run_target.c.id)
+        query = _holders(self._artifacts(sha256)).order_by(schema.run_target.c.id)
         with self._database.reading() as connection:
             return _HOLDERS.validate_python(
                 [dict(row) for row in connection.execute(query).mappings()]
             )
 
     def holder_count(self, sha256: str) -> int:
-        """How many units that are."""
-        query = _holders(sha256).with_only_columns(func.count(), maintain_column_froms=True)
+        """How many units that are, counted up to `HOLDERS_COUNTED` and one more."""
+        some = _holders(self._artifacts(sha256)).with_only_columns(
+            schema.run_target.c.id, maintain_column_froms=True
+        )
+        query = select(func.count()).select_from(some.limit(HOLDERS_COUNTED + 1).subquery())
         with self._database.reading() as connection:
             return int(connection.execute(query).scalar_one())
+
+    def _artifacts(self, sha256: str) -> list[int]:
+        """Looked up first: the index of one image is in the order of a page."""
+        query = select(schema.artifact.c.id).where(schema.artifact.c.sha256 == sha256)
+        with self._database.reading() as connection:
+            return list(connection.execute(query).scalars())
 
     # -- figures over time ------------------------------------------------------------------------
 
     def yields(self, chosen: RunFilter, spans: Sequence[Span]) -> list[SpanYield]:
-        run, first, last = schema.run.c, schema.run.alias(), schema.run.alias()
+        run = schema.run.c
+        # The id counts first, its last digit tells PASS: so the least is that of the first run.
+        ranked = run.id * 2 + case((run.state == RunState.PASS.value, 1), else_=0)
         found: dict[int, SpanYield] = {}
         for begin in range(0, len(spans), _SPANS_AT_ONCE):
             span = _table(spans[begin : begin + _SPANS_AT_ONCE], begin)
             of_unit = (
                 _counting(chosen, span.c.number, run.unit_id)
-                .add_columns(func.min(run.id).label("first"), func.max(run.id).label("last"))
+                .add_columns(func.min(ranked).label("first"), func.max(ranked).label("last"))
                 .join(span, _within(span))
-                .where(run.state.in_(JUDGED))
+                .where(beside_index(run.state).in_(JUDGED))
                 .group_by(span.c.number, run.unit_id)
                 .subquery()
             )
-            passed = RunState.PASS.value
-            query = (
-                select(
-                    of_unit.c.number,
-                    func.count(),
-                    func.sum(case((last.c.state == passed, 1), else_=0)),
-                    func.sum(case((first.c.state == passed, 1), else_=0)),
-                )
-                .join_from(of_unit, first, first.c.id == of_unit.c.first)
-                .join(last, last.c.id == of_unit.c.last)
-                .group_by(of_unit.c.number)
-            )
+            query = select(
+                of_unit.c.number,
+                func.count(),
+                func.sum(of_unit.c.last % 2),
+                func.sum(of_unit.c.first % 2),
+            ).group_by(of_unit.c.number)
             with self._database.reading() as connection:
                 for number, *counts in connection.execute(query):
                     found[number] = SpanYield(spans[number], *map(int, counts))
@@ -285,7 +290,7 @@ class Overview:
         self, chosen: RunFilter, by: By, shifts: Sequence[tuple[Span, str]]
     ) -> Iterator[tuple[Select[Any], Any]]:
         run = schema.run.c
-        bad = run.state.not_in((RunState.PASS.value, RunState.RUNNING.value))
+        bad = beside_index(run.state).not_in((RunState.PASS.value, RunState.RUNNING.value))
         if by is By.SHIFT:
             spans = [span for span, _ in shifts]
             for begin in range(0, len(spans), _SPANS_AT_ONCE):
@@ -303,6 +308,10 @@ class Overview:
         query = _counting(chosen, run.code, column, func.count()).where(bad)
         if by is By.SOCKET:
             query = query.join(socket, run.socket_id == socket.c.id)
+        elif by is By.RECIPE:
+            query = query.join(schema.recipe, run.recipe_id == recipe.id)
+        else:
+            query = query.outerjoin(schema.lot, run.lot_id == schema.lot.c.id)
         yield query.group_by(run.code, column), str
 
     def step_times(self, chosen: RunFilter) -> dict[str, Counter[float]]:
@@ -317,7 +326,8 @@ class Overview:
         )
         query = (
             _counting(chosen, step.name, rounded, func.count())
-            .join(schema.step, step.run_id == schema.run.c.id)
+            # From the runs to their steps, and not through all steps.
+            .join(schema.step, step.run_id == beside_index(schema.run.c.id))
             .where(step.state == StepState.PASS.value)
             .group_by(step.name, rounded)
         )
@@ -345,10 +355,18 @@ class Overview:
         )
         if event is not None:
             query = query.where(audit.event == event)
+        within = []
         if since is not None:
-            query = query.where(audit.at >= utc_text(since))
+            within.append(audit.at >= utc_text(since))
         if until is not None:
-            query = query.where(audit.at < utc_text(until))
+            within.append(audit.at < utc_text(until))
+        if within:
+            # By the station the index leads to the time; by the ids the newest come first.
+            within.append(audit.station_id.in_(select(schema.station.c.id)))
+            bounds = select(func.min(audit.id), func.max(audit.id)).where(*within)
+            with self._database.reading() as connection:
+                low, high = connection.execute(bounds).one()
+            query = query.where(audit.id >= low, audit.id <= high, *within)
         return self._page(_AUDIT, query, audit.id, cut, size)
 
     def _page(
@@ -359,13 +377,7 @@ class Overview:
         cut: Cut,
         size: int,
     ) -> Page[_Row]:
-        query = query.add_columns(row_id.label("cut_id"))
-        if cut.after is not None:
-            query = query.where(row_id > cut.after).order_by(row_id)
-        else:
-            query = query.order_by(row_id.desc())
-            if cut.before is not None:
-                query = query.where(row_id < cut.before)
+        query = cut.of(query.add_columns(row_id.label("cut_id")), row_id)
         with self._database.reading() as connection:
             rows = [dict(row) for row in connection.execute(query.limit(size + 1)).mappings()]
         has_more = len(rows) > size
@@ -384,7 +396,8 @@ class Overview:
 
 def _counting(chosen: RunFilter, *columns: Any) -> Select[Any]:
     """Columns of the runs of a filter that count in figures."""
-    return filtered(joined(*columns), chosen).where(schema.run.c.kind != RunKind.GOLDEN.value)
+    query = filtered(select(*columns).select_from(schema.run), chosen)
+    return query.where(beside_index(schema.run.c.kind) != RunKind.GOLDEN.value)
 
 
 def _table(spans: Sequence[Span], first: int) -> Any:
@@ -406,9 +419,9 @@ def _within(span: Any) -> ColumnElement[bool]:
     return and_(begun_at >= span.c.begin, begun_at < span.c.end)
 
 
-def _holders(sha256: str) -> Select[Any]:
-    """The runs that made the last transfer to a target of their unit, with this image."""
-    run, target, artifact = schema.run.c, schema.run_target, schema.artifact.c
+def _holders(artifacts: Sequence[int]) -> Select[Any]:
+    """The runs that made the last transfer to a target of their unit, with one of these images."""
+    run, target = schema.run.c, schema.run_target
     write, later_write = schema.device_write.c, schema.device_write.alias()
     later = schema.run.alias()
     of_run = and_(write.run_id == run.id, write.target == target.c.target, write.what == FLASH)
@@ -444,7 +457,7 @@ def _holders(sha256: str) -> Select[Any]:
         )
         .join_from(target, schema.run, target.c.run_id == run.id)
         .join(schema.unit, run.unit_id == schema.unit.c.id)
-        .where(target.c.artifact_id.in_(select(artifact.id).where(artifact.sha256 == sha256)))
+        .where(target.c.artifact_id.in_(artifacts))
         .where(exists(select(write.id).where(of_run).correlate(schema.run, target)))
         .where(~exists(overwritten))
     )

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
 from pydantic import TypeAdapter
-from sqlalchemy import Connection, Select, case, select
+from sqlalchemy import Connection, Select, case, literal, select
+from sqlalchemy.sql.expression import ColumnElement
 
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
@@ -27,7 +28,7 @@ from flasher.station.records.model import (
     Verified,
     utc_text,
 )
-from flasher.station.records.rows import batches, grouped
+from flasher.station.records.rows import batches, beside_index, grouped
 
 _EVERYTHING: Final = RunFilter()
 JUDGED: Final = (RunState.PASS.value, RunState.FAIL.value)
@@ -90,7 +91,7 @@ class Records:
     def figures(self, chosen: RunFilter = _EVERYTHING) -> Figures:
         run = schema.run.c
         duration_s = run.ended_monotonic_s - run.begun_monotonic_s
-        query = joined(run.unit_id, run.state, run.code, duration_s, run.is_virtual)
+        query = select(run.unit_id, run.state, run.code, duration_s, run.is_virtual)
         query = filtered(query, chosen).where(run.kind != RunKind.GOLDEN.value)
         with self._database.reading() as connection:
             return _figures_of(connection.execute(query.order_by(run.id)))
@@ -114,9 +115,15 @@ class Records:
 
     def natures(self) -> frozenset[bool]:
         """Whose runs there are: True for virtual units, False for real ones."""
+        is_virtual = schema.run.c.is_virtual
         with self._database.reading() as connection:
-            found = connection.execute(select(schema.run.c.is_virtual).distinct()).scalars()
-            return frozenset(map(bool, found))
+            return frozenset(
+                nature
+                for nature in (False, True)
+                if connection.execute(
+                    select(literal(1)).where(is_virtual == nature).limit(1)
+                ).first()
+            )
 
 
 def details_of(connection: Connection, chosen: Any) -> Iterator[RunDetails]:
@@ -162,21 +169,11 @@ def details_of(connection: Connection, chosen: Any) -> Iterator[RunDetails]:
         )
 
 
-def joined(*columns: Any) -> Select[Any]:
-    """Columns of runs with what `filtered` asks for."""
-    return (
-        select(*columns)
-        .join_from(schema.run, schema.unit, schema.run.c.unit_id == schema.unit.c.id)
-        .join(schema.recipe, schema.run.c.recipe_id == schema.recipe.c.id)
-        .outerjoin(schema.lot, schema.run.c.lot_id == schema.lot.c.id)
-    )
-
-
 def run_query(verified: Any) -> Select[Any]:
     """Runs with the columns of `RunRecord`."""
     run = schema.run.c
     return (
-        joined(
+        select(
             run.id.label("run_id"),
             schema.unit.c.serial,
             schema.unit.c.part,
@@ -199,6 +196,9 @@ def run_query(verified: Any) -> Select[Any]:
             run.log_sha256,
             run.reason,
         )
+        .join_from(schema.run, schema.unit, run.unit_id == schema.unit.c.id)
+        .join(schema.recipe, run.recipe_id == schema.recipe.c.id)
+        .outerjoin(schema.lot, run.lot_id == schema.lot.c.id)
         .join(schema.socket, run.socket_id == schema.socket.c.id)
         .join(schema.station, schema.socket.c.station_id == schema.station.c.id)
         .join(schema.operator, run.operator_id == schema.operator.c.id)
@@ -206,29 +206,52 @@ def run_query(verified: Any) -> Select[Any]:
 
 
 def filtered(query: Select[Any], chosen: RunFilter) -> Select[Any]:
-    """A query of `joined` or `run_query` for the runs of a filter."""
-    bounds: Mapping[Any, str | None] = {
-        schema.lot.c.name: chosen.lot,
-        schema.recipe.c.name: chosen.recipe,
-        schema.unit.c.serial: chosen.serial,
-        # An expression: nearly all units have one part, so its index would only lead to a sort.
-        schema.unit.c.part.concat(""): chosen.part,
-        schema.run.c.state: chosen.state,
-        schema.run.c.code: chosen.code,
-    }
-    for column, value in bounds.items():
+    """A query about runs, for those of a filter."""
+    run = schema.run.c
+    # Runs of a time lie together; a lot has few. All else would lead through runs of all years.
+    by_time = chosen.since is not None and chosen.lot is None
+    named: list[tuple[ColumnElement[Any], Select[Any] | None]] = [*named_in(chosen)]
+    for column, ids in [*named, (run.unit_id, units_of(chosen))]:
+        if ids is not None:
+            query = query.where((beside_index(column) if by_time else column).in_(ids))
+    for column, value in ((run.state, chosen.state), (run.code, chosen.code)):
         if value is not None:
-            query = query.where(column == value)
-    if chosen.search is not None:
-        query = query.where(schema.unit.c.serial.icontains(chosen.search, autoescape=True))
-    if chosen.socket is not None:
-        named = select(schema.socket.c.id).where(schema.socket.c.name == chosen.socket)
-        query = query.where(schema.run.c.socket_id.in_(named))
+            query = query.where((beside_index(column) if by_time else column) == value)
+    return query.where(*begun_in(chosen, run.begun_at))
+
+
+def begun_in(chosen: RunFilter, begun_at: ColumnElement[str]) -> list[ColumnElement[bool]]:
+    """The bounds of time of a filter."""
+    found = []
     if chosen.since is not None:
-        query = query.where(schema.run.c.begun_at >= utc_text(chosen.since))
+        found.append(begun_at >= utc_text(chosen.since))
     if chosen.until is not None:
-        query = query.where(schema.run.c.begun_at < utc_text(chosen.until))
-    return query
+        found.append(begun_at < utc_text(chosen.until))
+    return found
+
+
+def named_in(chosen: RunFilter) -> Iterator[tuple[ColumnElement[Any], Select[Any]]]:
+    """What a filter names and few rows have, by the column of the run: the ids that it allows."""
+    lot, recipe, socket, run = schema.lot.c, schema.recipe.c, schema.socket.c, schema.run.c
+    if chosen.lot is not None:
+        yield run.lot_id, select(lot.id).where(lot.name == chosen.lot)
+    if chosen.recipe is not None:
+        yield run.recipe_id, select(recipe.id).where(recipe.name == chosen.recipe)
+    if chosen.part is not None:  # a unit is of the part of its recipes
+        yield run.recipe_id, select(recipe.id).where(recipe.part == chosen.part)
+    if chosen.socket is not None:
+        yield run.socket_id, select(socket.id).where(socket.name == chosen.socket)
+
+
+def units_of(chosen: RunFilter) -> Select[Any] | None:
+    """The ids of the units of a filter; None: it names no serial number."""
+    unit = schema.unit.c
+    query = select(unit.id)
+    if chosen.serial is not None:
+        query = query.where(unit.serial == chosen.serial)
+    if chosen.search is not None:
+        query = query.where(unit.serial.icontains(chosen.search, autoescape=True))
+    return None if chosen.serial is None and chosen.search is None else query
 
 
 def _figures_of(rows: Iterable[Any]) -> Figures:

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator
 from itertools import islice
 from typing import Any, Final
 
-from sqlalchemy import Connection, Select, Table, select
+from sqlalchemy import Connection, Integer, Select, Table, select
+from sqlalchemy.sql.expression import ColumnElement
 
 _BATCH: Final = 500
 """Keys in one IN (...): every back end takes so many."""
@@ -42,3 +43,8 @@ def grouped(
         for row in connection.execute(query.where(column.in_(some))).mappings():
             found[row[column.name]].append(dict(row))
     return found
+
+
+def beside_index(column: ColumnElement[Any]) -> ColumnElement[Any]:
+    """The value of a column, as a database finds it in no index: another one is to lead."""
+    return column + 0 if isinstance(column.type, Integer) else column.concat("")

@@ -145,7 +145,7 @@ run: Final = _table(
     _to("unit"),
     _to("socket"),
     _to("recipe"),
-    _to("lot", nullable=True, index=True),
+    _to("lot", nullable=True),
     _to("operator"),
     _text("kind", 16),
     Column("is_virtual", Boolean, nullable=False),
@@ -163,9 +163,15 @@ run: Final = _table(
     Column("verification_reached", SmallInteger, nullable=True),
     _sha256("log_sha256", nullable=True),
     Index("run_of_unit", "unit_id", "id"),
+    # Each leads to its newest runs (`newest`).
     Index("run_of_socket", "socket_id", "id"),
+    Index("run_of_recipe", "recipe_id", "id"),
+    Index("run_of_lot", "lot_id", "id"),
+    Index("run_by_state", "state", "id"),
+    Index("run_by_code", "code", "id"),
+    Index("run_by_kind", "kind", "socket_id"),
+    Index("run_by_nature", "is_virtual"),
     Index("run_by_begin", "begun_at"),
-    Index("run_of_recipe", "recipe_id", "begun_at"),
     _one_of("state", RunState),
     _one_of("kind", RunKind),
     CheckConstraint("(state = 'RUNNING') = (ended_at IS NULL)", name="finished_has_an_end"),
@@ -215,6 +221,7 @@ run_target: Final = _table(
     Column("required", SmallInteger, nullable=False),
     Column("reached", SmallInteger, nullable=True),
     UniqueConstraint("run_id", "target"),
+    Index("target_with_image", "artifact_id", "id"),
     CheckConstraint(f"required {_LEVELS} AND reached {_LEVELS}", name="levels_are_known"),
 )
 
@@ -287,6 +294,7 @@ audit: Final = _table(
     UniqueConstraint("station_id", "previous_hash"),
     UniqueConstraint("hash"),
     Index("audit_by_time", "station_id", "at"),
+    Index("audit_by_event", "event", "id"),
 )
 """Append-only, one chain a station; each row's hash covers the row and the hash before it, and is
 signed with the station's key (`chain`)."""

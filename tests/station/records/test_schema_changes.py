@@ -277,7 +277,7 @@ def test_a_table_that_is_made_anew_keeps_rules_and_rows(old: Old, planted: Any) 
     after = old.catalogue()
     rules = {name: sql for name, sql in before.items() if name.startswith("trigger ")}
     assert rules == {name: after.get(name) for name in rules}
-    assert not before.keys() - after.keys()
+    assert before.keys() - after.keys() == {"index ix_run_lot_id"}  # schema 3 has a better one
     assert old.rows()["run"] == runs
 
 
