@@ -210,7 +210,7 @@ class _Plant:
             "ended_monotonic_s": begun_s + _TOOK_S, "log_sha256": sha256,
             "verification_reached": None if bad else 1,
         })  # fmt: skip
-        image = 3 if run_id % 2000 == 0 else 1 + (share > 0.6)
+        image = 3 if run_id % 250 == 0 else 1 + (share > 0.6)
         if trace is not None:
             image = 1  # the one that the trace carries
         target = self._add(schema.run_target, **{
