@@ -177,7 +177,7 @@ class Session(Runner[Result]):
         is_last = self._losses + 1 >= self._options.planned_attempts
         if self.done or (is_last and not self.goes_on):
             return False
-        return not self._is_upgrading or self._upgrade.may_begin_again
+        return self._upgrade.may_begin_again
 
     @property
     def _is_upgrading(self) -> bool:

@@ -71,8 +71,6 @@ _PHASES: Final = {
     State.CONFIRMING: Phase.CONFIRM,
 }
 """Phases that people are told, by state; the other states leave the phase as it is."""
-_RESUMED: Final = frozenset({State.TRANSFERRING, State.SETTLING, State.ENDING, State.CONFIRMING})
-"""States that go on where they stood when a lost adapter is back."""
 _FROM_THE_UPDATE: Final = frozenset({Reason.RESTARTED, Reason.REQUEST_LATE, Reason.BOOT_SILENT})
 """Reasons for an attempt that begins with the update command: the bootloader is there."""
 _SILENT: Final = frozenset({Ending.NO_BOOT_VERSION, Ending.NO_ANNOUNCEMENT})
@@ -238,17 +236,14 @@ class UpgradeStage:
     @property
     def may_begin_again(self) -> bool:
         """True when an attempt is left, or none is needed to go on after the adapter was lost."""
-        return (
-            not self._is_last_attempt
-            or self._ending is not None
-            or self.state in _RESUMED
-            or self._is_updating
-        )
+        return not self._is_last_attempt or self._ending is not None or self._is_updating
 
     @property
     def _is_updating(self) -> bool:
-        at = self._at
-        return self.state is State.AWAITING_REQUEST and at.first_update_left_at is not None
+        """True once the update command of this attempt has left: from there on, an adapter that is
+        back goes on where it stood.
+        """
+        return self._at.first_update_left_at is not None
 
     @property
     def goes_on(self) -> bool:
@@ -416,11 +411,9 @@ class UpgradeStage:
         self._run.send(split(request_id, encode(reset)), tag=Command.RESET)
 
     def _send_update(self) -> None:
-        self._tx.drop_unstarted()
         size_bytes = self._plan.image.size_bytes
-        not_before = self._update_left_at + self._timings.update_spacing_s
         self.in_session, self._asks_for_power = False, self._options.at_power_up
-        self._send(UpdateCommand(self._plan.target.update_text, size_bytes), not_before)
+        self._send(UpdateCommand(self._plan.target.update_text, size_bytes))
 
     def _send_packet(self) -> None:
         at, plan = self._at, self._plan
@@ -474,8 +467,6 @@ class UpgradeStage:
                 return timings.complete_timeout_s
             case (Command.RESET, State.RESETTING) | (Command.READ_VERSION, State.CONFIRMING):
                 return timings.command_repeat_s
-            case Command.RESET, State.AWAITING_BOOT:
-                return self._boot_timeout_s
         return None
 
     # -- actions: anywhere -----------------------------------------------------------------------

@@ -22,7 +22,7 @@ from flasher.image.image import Image
 from flasher.image.plan import plan
 from flasher.protocol import catalogue
 from flasher.protocol.catalogue import BY_KEY
-from flasher.protocol.contents import RunningInformation, Status, VersionInformation
+from flasher.protocol.contents import RunningInformation, Shutdown, Status, VersionInformation
 from flasher.protocol.fields import Content, Text
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import (
@@ -30,6 +30,7 @@ from flasher.protocol.messages import (
     Complete,
     EndOfTransfer,
     GeneralFeedback,
+    Nak,
     Packet,
     RequestTransfer,
     Reset,
@@ -50,6 +51,7 @@ VERSION, RUNNING = (0x720, 0x1540), (0x720, 0x1010)
 BATTERY = RunningInformation(40_000, -8, 8000, 9800, 22, 85, Status(0), 98, bytes(4))
 OTHER_TOOL = Frame(0x752, bytes.fromhex("55AA1605420501FF"))
 OPEN = UpgradeOptions(in_session=True)
+SHUTDOWN = next(item for item in catalogue.ITEMS if item.content is Shutdown)
 
 
 def version(firmware: str = OLD, serial: str = "W1") -> VersionInformation:
@@ -380,6 +382,132 @@ def test_a_query_of_another_tool_before_the_update_command_ends_it() -> None:
         dialogue.engine.receive(frame, dialogue.now)
     assert not dialogue.session.done
     assert dialogue.session.has_begun_to_erase
+
+
+@each("end", [Ending.CANCELLED, Ending.COMPLETED])
+def test_a_battery_that_switches_off_is_told_and_kept(end: Ending) -> None:
+    dialogue = Dialogue(identity=Identity() if end is Ending.CANCELLED else None)
+    shutdown = catalogue.encode(SHUTDOWN, SHUTDOWN.content())
+    for _ in range(2):
+        dialogue.say(shutdown)
+    dialogue.wait(0.05)
+    assert dialogue.seen(events.ShutdownHeard) == [events.ShutdownHeard("BMS")]
+    if end is Ending.CANCELLED:
+        dialogue.engine.cancel(dialogue.now)
+    else:
+        dialogue.to_packet(1)
+        dialogue.say(Ack(1))
+        dialogue.expect(EndOfTransfer)
+        dialogue.say(Complete())
+        dialogue.wait(LISTENS_ON_S)
+    assert dialogue.ended.ending is end
+    assert dialogue.result.shutdown_heard is True
+
+
+# -- a rule that the silent device could not be asked for -----------------------------------------
+
+
+def ruled() -> Identity:
+    return Identity(release_of(IMAGE, BMS, hardware_versions=["V1*"]))
+
+
+def test_a_silent_device_that_may_sit_in_its_session_is_not_refused_by_a_rule_yet() -> None:
+    dialogue = Dialogue(OPEN, identity=ruled())
+    dialogue.wait(2.0)
+    told = {e.check: e for e in dialogue.events if isinstance(e, events.CheckMade)}
+    assert told["hardware"].verdict == "warned"
+    assert told["hardware"].text.endswith(": only a device in an open session is upgraded")
+    assert told["other-target"].verdict == "passed"
+    dialogue.wait(12.0)
+    assert isinstance(dialogue.unread[-1], UpdateCommand)
+    dialogue._read = len(dialogue.sent)
+    dialogue.say(RequestTransfer())
+    assert dialogue.expect(Packet).number == 1
+
+
+def test_it_is_refused_when_it_announces_itself_after_all() -> None:
+    dialogue = Dialogue(OPEN, identity=ruled())
+    dialogue.wait(2.0)
+    dialogue.say(BOOT)
+    dialogue.wait(1.0)
+    assert dialogue.ended.ending is Ending.UNCHECKED
+    assert dialogue.ended.waiver == "hardware"
+    assert dialogue.ended.device_left is DeviceLeft.UNTOUCHED
+
+
+@each("options, announces", [(OPEN, True), (None, False), (None, True)])
+def test_one_that_is_in_no_session_is_refused_at_once(
+    options: UpgradeOptions | None, *, announces: bool
+) -> None:
+    dialogue = Dialogue(options, identity=ruled())
+    assert dialogue.asked() == 0x3300
+    if announces:
+        dialogue.say(BOOT)
+    dialogue.wait(2.0)
+    assert dialogue.ended.ending is Ending.UNCHECKED
+    assert not [row for row in dialogue.unread if isinstance(row, Reset)]
+
+
+def test_other_findings_refuse_a_silent_device_as_ever() -> None:
+    odd = replace(IMAGE, data=b"PK\3\4" + IMAGE.data[4:])
+    dialogue = Dialogue(OPEN, identity=Identity(replace(release_of(odd, BMS), target=OBC)))
+    assert dialogue.ended.ending is Ending.NOT_FOR_DEVICE
+
+
+# -- after the end --------------------------------------------------------------------------------
+
+
+def test_a_second_device_that_goes_on_after_the_end_is_no_success() -> None:
+    dialogue = Dialogue(level=Level.VERSION)
+    dialogue.to_packet(1)
+    dialogue.say(Ack(1))
+    dialogue.expect(EndOfTransfer)
+    dialogue.say(Complete())
+    dialogue.wait(0.05)
+    assert dialogue.session.goes_on is False, "nothing is left to be tried"
+    dialogue.say(Nak(1))
+    dialogue.wait(0.1)
+    found = dialogue.result.verification
+    assert (found.level, found.verdict) == (Level.VERSION, Verdict.TWO_DEVICES)
+    assert found.detail == "one device continued a transfer that another one had completed"
+    assert found.running_version is None
+
+
+def test_a_device_that_was_not_asked_has_no_version_before_the_upgrade() -> None:
+    dialogue = Dialogue(UpgradeOptions(at_power_up=True))
+    dialogue.say(BOOT)
+    dialogue.expect(UpdateCommand)
+    dialogue.say(RequestTransfer())
+    dialogue.expect(Packet)
+    dialogue.say(Ack(1))
+    dialogue.expect(EndOfTransfer)
+    dialogue.say(Complete())
+    dialogue.wait(LISTENS_ON_S)
+    assert dialogue.result.ok
+    assert dialogue.result.previous_version is None
+
+
+def test_attempts_that_were_limited_limit_lost_adapters_in_the_transfer_too() -> None:
+    dialogue = Dialogue(UpgradeOptions(attempts=3))
+    dialogue.to_packet(1)
+    for _ in range(2):
+        assert dialogue.may_begin_again()
+        dialogue.session.link_back(dialogue.now)
+        assert dialogue.expect(Packet).number == 1
+    assert not dialogue.may_begin_again()
+
+
+def test_a_question_that_was_cut_short_is_not_gone_on_with() -> None:
+    session = Session(PLAN, identity=Identity())
+    session.tick(0.0)
+    session.tick(LISTEN_FIRST_S)
+    first = session.next_frame(LISTEN_FIRST_S)
+    assert first is not None
+    session.frame_sent(LISTEN_FIRST_S)
+    session.link_back(LISTEN_FIRST_S)
+    assert session.next_frame(LISTEN_FIRST_S) is None
+    session.tick(2 * LISTEN_FIRST_S)
+    assert session.next_frame(2 * LISTEN_FIRST_S) == first
 
 
 # -- why nobody answered --------------------------------------------------------------------------

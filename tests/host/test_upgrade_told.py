@@ -29,7 +29,7 @@ from flasher.protocol.messages import (
 from flasher.protocol.spec import OBC
 from flasher.protocol.timing import Timings
 from flasher.protocol.wire import Message
-from tests.host.bench import BOOT, Bench
+from tests.host.bench import BOOT, Bench, answer_frames
 from tests.loops import each
 
 ONCE = UpgradeOptions(attempts=1)
@@ -353,3 +353,82 @@ def test_the_boot_version_of_the_device_is_in_the_outcome_and_escaped() -> None:
     assert bench.outcome.boot_version is not None
     assert bench.outcome.boot_version.endswith("S V1.2.3")
     assert "\x1b" not in bench.outcome.boot_version
+
+
+def test_at_the_deadline_the_last_failure_counts_and_silence_after_it_does_not() -> None:
+    """The device has no application to lose: attempts go on until the deadline."""
+
+    def restarts(bench: Bench) -> None:
+        for _ in range(4):
+            bench.now += 0.1
+            bench.say(BOOT)
+            bench.expect(UpdateCommand)
+            bench.say(RequestTransfer())
+            bench.expect(Packet)
+            bench.say(Ack(1))
+            bench.expect(Packet)
+
+    options = UpgradeOptions(timings=HURRIED, timeout_s=60.0)
+    bench = Bench(options=options)
+    bench.to_packet(2)
+    restarts(bench)
+    bench.now += 0.1
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
+    bench.wait(70.0)
+    assert bench.outcome.ending is Ending.NO_REQUEST, "the last failure that says something"
+    assert bench.outcome.statistics.attempts > 5
+    bench = Bench(options=options)
+    bench.to_packet(2)
+    restarts(bench)
+    bench.wait(70.0)
+    assert bench.outcome.ending is Ending.PACKET_FAILED
+    assert bench.outcome.packet == 2
+
+
+def test_an_adapter_that_is_back_while_an_erased_device_is_reset_takes_no_attempt() -> None:
+    bench = Bench(options=UpgradeOptions(timings=HURRIED))
+    bench.to_packet(2)
+    bench.expect(Packet)
+    bench.expect(Reset)
+    before = len(bench.seen(events.AttemptStarted))
+    for _ in range(5):
+        bench.engine.link_back(bench.now)
+        bench.expect(Reset, within_s=0.19)
+    assert len(bench.seen(events.AttemptStarted)) == before == 1
+
+
+# -- an adapter that takes nothing for a while ----------------------------------------------------
+
+
+def hears(bench: Bench, row: Row) -> None:
+    """The device speaks while the adapter takes nothing."""
+    for frame in answer_frames(row):
+        bench.engine.receive(frame, bench.now)
+
+
+def passes(bench: Bench, seconds: float) -> None:
+    bench.now += seconds
+    bench.engine.tick(bench.now)
+    bench.events += bench.engine.take_events()
+
+
+def test_a_timer_begins_when_the_message_has_left_and_not_before() -> None:
+    bench = Bench()
+    bench.to_end()
+    hears(bench, Nak(3))
+    passes(bench, 11.0)
+    assert bench.seen(events.MessageRepeated) == [
+        events.MessageRepeated("end of transfer", Reason.END_REFUSED.value, 2)
+    ]
+    bench = Bench()
+    bench.expect(Reset)
+    bench.engine.link_back(bench.now)
+    passes(bench, 0.3)
+    bench._flush()
+    assert bench.unread == [Reset()]
+    bench = Bench()
+    bench.to_transfer()
+    hears(bench, Ack(1))
+    passes(bench, 0.6)
+    assert bench.seen(events.MessageRepeated) == []

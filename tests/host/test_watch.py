@@ -162,6 +162,21 @@ def test_a_device_that_was_heard_gets_a_reset_that_only_another_application_answ
     assert bench.seen(events.PhaseEntered)[-1] == events.PhaseEntered(Phase.UPDATE, 1)
 
 
+def test_a_reset_that_leaves_late_is_followed_by_a_whole_watch() -> None:
+    bench = Bench()
+    bench.engine = Upgrade(plan(bench.image, BMS, WELLING.bitrate_bps))
+    bench.engine._upgrade.heard = BOOT.to_message(BMS.answer_id)
+    bench.sent.clear()
+    bench.engine.tick(bench.now)
+    bench.now += 1.0  # the adapter takes nothing
+    bench._step()
+    bench.expect(Reset)
+    left_at = bench.sent[0][0]
+    bench.wait(0.01)
+    bench.say(BOOT)
+    assert begins(bench, UpdateCommand) >= left_at + WATCH_S - 1e-6
+
+
 def test_an_application_that_answers_that_reset_is_waited_for() -> None:
     bench = heard_before()
     bench.expect(Reset)
