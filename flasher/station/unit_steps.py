@@ -245,9 +245,10 @@ class UnitSteps:
                 raise
             if self.has_lost_its_session:
                 if target.is_unheard:
-                    # Whoever lost its supply, or is put in now, announces itself.
+                    # Whoever lost its supply, or is put in now, announces itself; who was not
+                    # erased says so.
                     with suppress(BusError, InterruptedByUserError):
-                        target.listen(target.loaded.profile.timings.boot_version_timeout_s)
+                        target.await_anybody()
                 raise
             if not may_rescue:
                 raise

@@ -154,6 +154,13 @@ class UnitTarget:
                 self.continuity.settle()
                 return answer
 
+    def await_anybody(self) -> None:
+        """Find out who is there, after contact was lost; `continuity` notes it."""
+        if self.version_request is not None:
+            self.await_application()
+        else:
+            self.listen(self.loaded.profile.timings.boot_version_timeout_s)
+
     def confirm(self) -> None:
         """Ask it once more who it is: `continuity` compares the answer. Raises StepFailedError when
         an application that had answered does not any more; one that has restarted since is not

@@ -378,6 +378,28 @@ def test_a_device_that_falls_silent_in_its_transfer_is_not_reset(tmp_path: Path)
     assert len(tries) == 1
 
 
+@pytest.mark.parametrize("tries", [1, 2])
+def test_a_unit_that_was_not_erased_says_who_it_is_and_may_be_tried_again(
+    tmp_path: Path, tries: int
+) -> None:
+    """It did not receive the update command, and has started its application."""
+    lost = 0
+
+    def lose(frame: Frame, _now: float) -> tuple[Frame, ...]:
+        nonlocal lost
+        is_announcing = frame.can_id == BMS.answer_id and frame.data[4:6] == b"\xc1\x09"
+        is_update = frame.can_id == BMS.request_id and frame.data[4:6] == b"\xa1\x0b"
+        is_lost = (is_update and lost == 0) or (is_announcing and lost in range(1, 4))
+        lost += is_lost
+        return () if is_lost else (frame,)
+
+    text = f"{USUAL}{WRITES}\n[step.flash]\ntries = {tries}\n"
+    bench = UnitBench(tmp_path, text, disturbance=lose)
+    result = bench.run()
+    assert lost == 4
+    assert result.code == ("OK" if tries > 1 else "ERASE_FAILED"), result
+
+
 def test_an_adapter_that_is_lost_in_the_transfer_may_come_back(tmp_path: Path) -> None:
     bench = UnitBench(tmp_path)
     bench.recipe = with_larger_image(bench.recipe)

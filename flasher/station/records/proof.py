@@ -38,8 +38,9 @@ _BURST_QUIET_S: Final = 0.3
 """An announcement after so much silence begins another burst."""
 _LEFTOVER_S: Final = 0.25
 """Announcements up to here after request transfer may have been on their way."""
-_ERASING_QUIET_S: Final = 1.0
-"""The same for a device that was told to update, and has not answered yet."""
+_STALL_S: Final = 3.0
+"""The same where nothing came between, as frames that waited in a stalled computer bear the time at
+which they were read."""
 _IDENTITY: Final = ("model", "serial_number", "hardware_version")
 
 
@@ -52,6 +53,8 @@ class Restarts:
     uncaused: list[float] = field(default_factory=list)
     _is_identified: bool = False
     """It has answered, or was told to update: it has to stay."""
+    _is_running: bool = False
+    """It has answered since the last announcement."""
     _is_due: bool = False
     """A burst follows what was sent, at any time."""
     _is_told: bool = False
@@ -73,7 +76,7 @@ class Restarts:
 
     def answered(self) -> None:
         """Its application named its version."""
-        self._is_identified = True
+        self._is_identified = self._is_running = True
         self._is_due = self._is_told = False
 
     def take(self, row: object, at_s: float) -> None:
@@ -84,7 +87,9 @@ class Restarts:
             return
         since_s = inf if self._announced_at is None else at_s - self._announced_at
         self._announced_at = at_s
-        is_new = since_s >= _BURST_QUIET_S
+        goes_on_s = _BURST_QUIET_S if self._is_running else _STALL_S
+        is_new = since_s >= goes_on_s
+        self._is_running = False
         self._is_noted = self._is_noted and not is_new
         if self._requested_at is not None:
             is_uncaused = at_s - self._requested_at > _LEFTOVER_S
@@ -92,8 +97,6 @@ class Restarts:
             is_uncaused = False
         elif self._is_due:
             is_uncaused = self._is_due = False
-        elif self._is_told:
-            is_uncaused = since_s > _ERASING_QUIET_S
         else:
             is_uncaused = self._is_identified
         if is_uncaused and not self._is_noted:
