@@ -163,6 +163,8 @@ class UnitSteps:
             target.check_cancelled()
             measured += said_of(target, found)
             said.append(f"{target.name}: {state_words(target, found)}")
+        if self.targets[0].goes_on:
+            measured.append(Measurement(AFTER_RESTART, text=AfterRestart.CONTINUE.value))
         self._check_label()
         measured += self._reads.limits(StepName.IDENTIFY)
         check_measured(measured)
@@ -404,8 +406,6 @@ class UnitSteps:
         cycles = self.targets[0].continuity.power_cycles
         if cycles:
             yield Measurement(POWER_CYCLES, float(cycles))
-        if self.targets[0].goes_on:
-            yield Measurement(AFTER_RESTART, text=AfterRestart.CONTINUE.value)
 
     def _verify_image(self, target: UnitTarget, measured: list[Measurement]) -> Verified:
         """How far the image is proven now. Raises StepFailedError where something is against it."""
