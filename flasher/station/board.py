@@ -8,6 +8,7 @@ from typing import Final
 
 from flasher.protocol.text import printable
 from flasher.said import say
+from flasher.station import codes
 from flasher.station.events import (
     FiguresChanged,
     LabelFailed,
@@ -149,7 +150,8 @@ class Board:
     """Scanners that cannot be read, by their names."""
     unprinted: dict[str, LabelFailed] = field(default_factory=dict)
     """Labels that were not printed, by the serial numbers of their units."""
-    arrivals: int = 0
+    arrived: set[str] = field(default_factory=set)
+    """Labels of the virtual units that came so far."""
     virtual_sockets: tuple[str, ...] = ()
     broken: dict[str, str] = field(default_factory=dict)
     """Sockets that will not work any more, with the reason."""
@@ -185,7 +187,7 @@ class Board:
             case UnitArrived(socket, _, label):
                 self.labels[socket] = label
                 self.rows[socket].borne = printable(label)
-                self.arrivals += 1
+                self.arrived.add(label)
             case UnitRemoved(socket):
                 self.labels.pop(socket, None)
                 self.rows[socket].borne = ""
@@ -318,6 +320,12 @@ class Board:
             return say("VIRTUAL UNITS, no products.")
         names = ", ".join(map(printable, self.virtual_sockets))
         return say("VIRTUAL UNITS in {names}, no products.", names=names)
+
+    @property
+    def exchanged(self) -> frozenset[str]:
+        """Units that were not in their sockets any more when their last runs ended."""
+        changed = codes.UNIT_CHANGED.name
+        return frozenset(name for name, run in self.ended.items() if run.code == changed)
 
     @property
     def bad_units(self) -> tuple[RunEnded, ...]:

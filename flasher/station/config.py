@@ -51,6 +51,10 @@ class MockUnits(Table):
     """Units that take long."""
     dead: Share = 0.0
     """Units that never answer."""
+    exchanged: Share = 0.0
+    """Units that somebody exchanges for the next one while they are flashed; they come back."""
+    mislabelled: Share = 0.0
+    """Units with the serial number of another one in them than their label says."""
     seed: int = Field(default=1, ge=0)
     """The same seed and serial number is the same unit."""
 

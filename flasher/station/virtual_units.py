@@ -1,4 +1,6 @@
-"""Virtual units: they come into a socket, are good, slow, bad or dead, and leave again.
+"""Virtual units: they come into a socket, are good, slow, bad or dead, and leave again. They keep
+their labels, contents and numbers; some are exchanged for another one in the middle of their run
+and come back, and some bear the label of another one.
 
 For training, demonstration and tests. Each socket has a simulated bus of its own at the pace of a
 real one; what is decided about a unit follows from seed and serial number.
@@ -8,8 +10,9 @@ from __future__ import annotations
 
 import random
 import re
-from collections.abc import Iterator
-from dataclasses import replace
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
@@ -21,7 +24,14 @@ from flasher.image.release import Release
 from flasher.mock.faults import AtTime, FaultInjector, PowerCut
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.protocol.spec import IMAGE_MAX_SIZE, VERSION_FIELD_SIZE, Dialect, Target
+from flasher.protocol.frame import Frame
+from flasher.protocol.spec import (
+    IMAGE_MAX_SIZE,
+    PACKET_DATA_SIZE,
+    VERSION_FIELD_SIZE,
+    Dialect,
+    Target,
+)
 from flasher.protocol.text import encode_text
 from flasher.station.config import MockUnits
 from flasher.station.messages import PresenceChanged, VirtualUnits
@@ -33,6 +43,8 @@ NO_NUMBER: Final = "NONE"
 """What a new unit has for a serial number."""
 OTHER_HARDWARE: Final = "V0r0r1_20200101"
 POWER_OFF_S: Final = 1.0
+EXCHANGE_GAPS_S: Final = (0.3, 0.5, 1.0, 3.5)
+"""How long a socket is empty while its unit is exchanged."""
 SLOW_PROGRAM_S: Final = 0.01
 """Ten times as long for each packet as a good unit takes."""
 SLOW_ERASE_S: Final = 0.02
@@ -49,6 +61,10 @@ class Health(StrEnum):
     REFUSES = "refuses the image"
     WRONG_HARDWARE = "wrong hardware"
     DEAD = "dead"
+
+
+def _chance(units: MockUnits, what: str, serial: str) -> random.Random:
+    return random.Random(f"{units.seed} {what} {serial}")  # noqa: S311  a play, no secret
 
 
 def health_of(units: MockUnits, serial: str) -> Health:
@@ -101,6 +117,62 @@ def next_number(rule: SerialNumber, known: set[str]) -> int:
     return last + 1
 
 
+@dataclass(frozen=True)
+class VirtualUnit:
+    """A unit that keeps its paper label, its contents and its numbers wherever it is put."""
+
+    label: str
+    """On the paper."""
+    health: Health
+    devices: Mapping[str, MockDevice]
+    """By their targets; without power while it is in no socket."""
+
+
+class _Seat:
+    """The place of one target's device on the bus of a socket; an engine. `look` is called with
+    every moment at which something happens to it.
+    """
+
+    def __init__(self, look: Callable[[float], None]) -> None:
+        self.device: FaultInjector | None = None
+        self.due_at: float | None = None
+        """When the next unit is put in."""
+        self._look = look
+
+    @property
+    def done(self) -> bool:
+        return self.device is None or self.device.done
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if self.device is not None:
+            self.device.receive(frame, now)
+        self._look(now)
+
+    def tick(self, now: float) -> None:
+        if self.device is not None:
+            self.device.tick(now)
+        self._look(now)
+
+    def deadline(self) -> float | None:
+        wanted = None if self.device is None else self.device.deadline()
+        due = [each for each in (wanted, self.due_at) if each is not None]
+        return min(due, default=None)
+
+    def next_frame(self, now: float) -> Frame | None:
+        return None if self.device is None else self.device.next_frame(now)
+
+    def frame_sent(self, now: float) -> None:
+        if self.device is not None:
+            self.device.frame_sent(now)
+
+    def cancel(self, now: float) -> None:
+        if self.device is not None:
+            self.device.cancel(now)
+
+    def take_events(self) -> Sequence[object]:
+        return () if self.device is None else self.device.take_events()
+
+
 class VirtualSocket:
     """A socket with virtual units: a bus, and who comes and goes."""
 
@@ -113,16 +185,37 @@ class VirtualSocket:
         self.clock = clock or made
         self.dialect = recipe.targets[0].profile.dialect
         self._bus = SimulatedBus(self.dialect.bitrate_bps, self.clock)
-        self.devices: dict[str, FaultInjector] = {}
-        """Those of the unit in the socket, by their targets."""
+        self._seats = {target.name: _Seat(self._look) for target in recipe.targets}
+        for seat in self._seats.values():
+            self._bus.attach(seat)
         self.connection = Connection(self._bus.link(), self.clock, "virtual units")
         self._serials = serial_numbers(
             recipe.recipe.serial_number, virtual.first_number, virtual.number_step
         )
         self._left = virtual.count
-        self.serial = ""
-        """The label of the unit in the socket; empty: none is."""
+        self.unit: VirtualUnit | None = None
+        """The one in the socket."""
         self._next_at: float | None = self.clock.now() + virtual.arrive_after_s
+        self._returns: deque[VirtualUnit] = deque()
+        """Units that were exchanged for another one in their run, and come back."""
+        self._exchange_at_operation: int | None = None
+        """The operation of the flash during which the unit is pulled out."""
+        self._in_hand: VirtualUnit | None = None
+        """The unit that is put in its place, at `_put_at`."""
+        self._put_at = 0.0
+        self._is_other = False
+        """The unit was put in for another one in a run, and it is not told yet."""
+
+    @property
+    def serial(self) -> str:
+        """The label of the unit in the socket; empty: none is."""
+        return "" if self.unit is None else self.unit.label
+
+    @property
+    def devices(self) -> Mapping[str, FaultInjector]:
+        """Those of the unit in the socket, by their targets."""
+        seats = self._seats.items()
+        return {name: seat.device for name, seat in seats if seat.device is not None}
 
     def step(self) -> PresenceChanged | None:
         """Let a unit come or go in its time; None when nothing happened."""
@@ -130,49 +223,125 @@ class VirtualSocket:
         if self._next_at is None or now < self._next_at:
             return None
         self._next_at = None
-        if self.serial:
-            self.serial = ""
-            for device in self.devices.values():
-                self._bus.detach(device)
-            self.devices.clear()
+        if self._is_other and self.unit is not None:
+            self._is_other = False
+            return self._told("another virtual unit was put in")
+        if self.unit is not None:
+            self.take_out()
             self._next_at = now + self._virtual.arrive_after_s
             return PresenceChanged(is_there=False, is_certain=True)
+        unit = self._returns.popleft() if self._returns else self._new_unit()
+        if unit is None:
+            return None
+        self.put(unit)
+        return self._told("a virtual unit came")
+
+    def _told(self, how: str) -> PresenceChanged:
+        return PresenceChanged(is_there=True, how=how, label=self.serial, is_power_up=True)
+
+    def _new_unit(self) -> VirtualUnit | None:
+        """The next one from the box; None when it is empty."""
         if self._left == 0:
             return None
         if self._left is not None:
             self._left -= 1
-        self.arrive(next(self._serials))
-        return PresenceChanged(is_there=True, how="a virtual unit came", label=self.serial)
+        return self.make(next(self._serials))
+
+    def make(self, label: str) -> VirtualUnit:
+        """The unit with this label, as it comes to the end of the line."""
+        health, number = health_of(self._virtual.units, label), self._own_number(label)
+        devices, now = {}, self.clock.now()
+        for target in self._recipe.targets if health is not Health.DEAD else ():
+            device = make_device(target.target, self.dialect, health, target.release, number)
+            device.power_cut(now)
+            devices[target.name] = device
+        return VirtualUnit(label, health, devices)
 
     def arrive(self, serial: str) -> Health:
-        """Put the unit with this label in."""
-        self.serial = serial
-        health = health_of(self._virtual.units, serial)
-        own_number, now = self._own_number(serial), self.clock.now()
-        for target in self._recipe.targets if health is not Health.DEAD else ():
-            device = make_device(target.target, self.dialect, health, target.release, own_number)
-            # Its power comes with the socket: it passes through its bootloader.
-            device.power_cut(now)
+        """Put a new unit with this label in."""
+        unit = self.make(serial)
+        self.put(unit)
+        return unit.health
+
+    def put(self, unit: VirtualUnit) -> None:
+        """Put a unit in. Its power comes with the socket: it passes through its bootloader."""
+        self.unit, now = unit, self.clock.now()
+        for name, device in unit.devices.items():
             device.power_on(now)
-            self.devices[target.name] = FaultInjector(device)
-            self._bus.attach(self.devices[target.name])
-        return health
+            self._seats[name].device = FaultInjector(device)
+        self._exchange_at_operation = self._planned_exchange(unit)
+
+    def take_out(self) -> VirtualUnit | None:
+        """Take the unit out, with its power; None: none was in."""
+        unit, self.unit, now = self.unit, None, self.clock.now()
+        self._exchange_at_operation = None
+        for seat in self._seats.values():
+            injector, seat.device = seat.device, None
+            if injector is not None and injector.device.has_power:
+                injector.device.power_cut(now)
+        return unit
+
+    def _planned_exchange(self, unit: VirtualUnit) -> int | None:
+        """During which operation of its flash somebody exchanges this unit; None: nobody does."""
+        chance, units = _chance(self._virtual.units, "exchanged", unit.label), self._virtual.units
+        if not unit.devices or chance.random() >= units.exchanged:
+            return None
+        name = next(iter(unit.devices))
+        target = next(each for each in self._recipe.targets if each.name == name)
+        packets = -(-target.release.size_bytes // PACKET_DATA_SIZE)
+        return unit.devices[name].operations_done + int(packets * chance.uniform(0.2, 0.9))
+
+    def _look(self, now: float) -> None:
+        """Exchange the unit, when it is time for it."""
+        if self._in_hand is not None:
+            if now >= self._put_at:
+                self.put(self._in_hand)
+                self._in_hand = None
+                self._be_due(None)
+                self._is_other = True
+            return
+        if self._exchange_at_operation is None:
+            return
+        device = next(iter(self.devices.values())).device
+        if device.operations_done < self._exchange_at_operation:
+            return
+        self._exchange_at_operation = None
+        other = self._new_unit()
+        pulled = None if other is None else self.take_out()
+        if pulled is not None:
+            self._returns.append(pulled)
+            gap_s = _chance(self._virtual.units, "gap", pulled.label).choice(EXCHANGE_GAPS_S)
+            self._in_hand, self._put_at = other, now + gap_s
+            self._be_due(self._put_at)
+
+    def _be_due(self, at_s: float | None) -> None:
+        for seat in self._seats.values():
+            seat.due_at = at_s
 
     def _own_number(self, label: str) -> str:
         """What the unit says that it is: none yet where the recipe gives it its number, else what
-        its label says, as far as it has room for it.
+        its label says, as far as it has room for it; another one's where it is mislabelled.
         """
-        if any(write.item == SERIAL_NUMBER for write in self._recipe.recipe.write):
+        chance, units = _chance(self._virtual.units, "label", label), self._virtual.units
+        number = label
+        if chance.random() < units.mislabelled:
+            rule = self._recipe.recipe.serial_number
+            others = serial_numbers(rule, chance.randrange(1, _NUMBERS_TRIED), 1)
+            number = next(other for other in others if other != label)
+        elif any(write.item == SERIAL_NUMBER for write in self._recipe.recipe.write):
             return NO_NUMBER
         try:
-            encode_text(label, VERSION_FIELD_SIZE)
+            encode_text(number, VERSION_FIELD_SIZE)
         except ValueError:
             return ""
-        return label
+        return number
 
     def run_ended(self) -> None:
         """The run has ended: the unit leaves after a while."""
         self._next_at = self.clock.now() + self._virtual.leave_after_s
+        self._exchange_at_operation = None
+        if self._in_hand is not None:  # nobody drove the bus up to the moment
+            self._look(self._put_at)
 
     # -- the power of the socket ------------------------------------------------------------------
 

@@ -165,6 +165,19 @@ def test_virtual_units_are_scanned_and_flashed_until_the_wanted_number(
     assert kinds.count("RunEnded") == 3
 
 
+def test_virtual_units_that_are_exchanged_in_their_runs_pass_in_the_end(
+    flasher: Flasher, recipe: Path
+) -> None:
+    """The label of each stays with its own unit, and the station ends when they are back."""
+    words = ("--mock-sockets", "1", "--units", "2", "--mock-bad", "0", "--mock-exchanged", "1")
+    run = flasher("station", "run", "--recipe", recipe, *words, *FAST)
+    lines, document = lines_of(run)
+    ended = [(e["serial"], e["code"]) for e in lines if e["event"] == "RunEnded"]
+    first, second = (unit["serial"] for unit in document["units"])
+    assert ended == [(first, "UNIT_CHANGED"), (second, "OK"), (first, "OK")]
+    assert run.code == ExitCode.OK
+
+
 def test_a_file_of_scans_ends_the_station_and_a_bad_unit_is_exit_code_12(
     flasher: Flasher, recipe: Path, tmp_path: Path
 ) -> None:

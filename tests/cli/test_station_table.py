@@ -6,7 +6,7 @@ import io
 import json
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
@@ -249,11 +249,18 @@ def socket_view(name: str, *, is_there: bool = True, sees_units: bool = True) ->
     return Socket(name, out_of_service=None, sees_units=sees_units, occupancy=occupancy)
 
 
-def worked_off(scans: list[str], sockets: list[Socket], borne: dict[str, str]) -> list[str]:
-    """What is submitted in one turn."""
+def worked_off(
+    scans: list[str],
+    sockets: list[Socket],
+    borne: dict[str, str],
+    exchanged: Collection[str] = (),
+    turns: int = 1,
+) -> list[str]:
+    """What is submitted in so many turns."""
     submitted: list[str] = []
     file = ScanFile(scans, [socket.name for socket in sockets], submitted.append)
-    file.turn(sockets, borne)
+    for _ in range(turns):
+        file.turn(sockets, borne, exchanged)
     return submitted
 
 
@@ -273,6 +280,13 @@ def test_a_virtual_unit_gets_its_own_label() -> None:
     lines = [socket_view("A"), socket_view("B")]
     assert worked_off(["W1", "W2"], lines[1:], {"A": "W1", "B": "W2"}) == ["SOCKET B", "W2"]
     assert worked_off(["W1", "W2"], lines, {"A": "V1", "B": "V2"}) == ["SOCKET A", "W1"]
+
+
+def test_a_virtual_unit_that_was_exchanged_in_its_run_is_scanned_when_it_comes_back() -> None:
+    lines = [socket_view("A", is_there=False), socket_view("B")]
+    assert worked_off(["W2"], lines, {"B": "W1"}, {"W1"}) == ["SOCKET B", "W1"]
+    refused = worked_off(["W2"], lines, {"B": "W1"}, {"W1"}, turns=9)
+    assert refused == ["SOCKET B", "W1"] * 3 + ["SOCKET B", "W2"], "not without end"
 
 
 def test_commands_keep_their_place_between_labels() -> None:

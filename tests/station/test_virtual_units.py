@@ -8,10 +8,12 @@ from pathlib import Path
 
 import pytest
 
+from flasher.bus.link import VirtualClock
 from flasher.errors import UsageError
 from flasher.station.adapters import resolve, worker_setups
 from flasher.station.config import MockUnits, mock_config
-from flasher.station.messages import RunOrder, RunResult, VirtualUnits
+from flasher.station.messages import PresenceChanged, RunOrder, RunResult, VirtualUnits
+from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import RunId, RunKind
 from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import Health, VirtualSocket, health_of, serial_numbers
@@ -127,3 +129,66 @@ def test_a_unit_has_its_label_inside_where_the_recipe_writes_no_number(tmp_path:
     order = RunOrder(RunId(1), RunKind.PRODUCTION, "W2605002", DAY)
     result = UnitRun(order, recipe, socket.connection, Notes(), power=socket).run()
     assert result.code == "OK", result.text
+
+
+# -- units that are put elsewhere -----------------------------------------------------------------
+
+
+def run_in(socket: VirtualSocket, recipe: LoadedRecipe, serial: str) -> RunResult:
+    order = RunOrder(RunId(1), RunKind.PRODUCTION, serial, DAY)
+    result = UnitRun(order, recipe, socket.connection, Notes(), power=socket).run()
+    socket.run_ended()
+    return result
+
+
+def test_a_unit_keeps_what_is_in_it_wherever_it_is_put(tmp_path: Path) -> None:
+    recipe, clock = make_recipe(tmp_path, USUAL + WRITES), VirtualClock()
+    one, other = (VirtualSocket(recipe, VirtualUnits(MockUnits()), clock) for _ in range(2))
+    one.arrive("W2605002")
+    assert run_in(one, recipe, "W2605002").code == "OK"
+    unit = one.take_out()
+    assert unit is not None
+    assert (one.serial, dict(one.devices)) == ("", {})
+    image = unit.devices["bms"].stored_image
+    assert image is not None
+    other.put(unit)
+    assert (other.serial, other.devices["bms"].device.stored_image) == ("W2605002", image)
+    clock.wait_until(clock.now() + 1.0)
+    wrong = run_in(other, recipe, "W2605003")
+    assert wrong.code == "WRONG_UNIT", "it bears the number that the first run wrote"
+
+
+def test_a_mislabelled_unit_says_another_number_than_its_paper(tmp_path: Path) -> None:
+    for text in (USUAL, USUAL + WRITES):
+        recipe = make_recipe(tmp_path, text)
+        socket = VirtualSocket(recipe, VirtualUnits(MockUnits(mislabelled=1.0), speed=0))
+        socket.arrive("W2605002")
+        assert run_in(socket, recipe, "W2605002").code == "WRONG_UNIT"
+
+
+def until_something(socket: VirtualSocket) -> PresenceChanged:
+    for _ in range(100):
+        socket.clock.wait_until(socket.clock.now() + 0.5)
+        if change := socket.step():
+            return change
+    raise AssertionError("nobody comes or goes")
+
+
+def test_a_unit_that_is_exchanged_in_its_run_comes_back_as_it_was(tmp_path: Path) -> None:
+    recipe = make_recipe(tmp_path, USUAL + WRITES)
+    socket = VirtualSocket(recipe, VirtualUnits(MockUnits(exchanged=1.0), speed=0, count=2))
+    one = until_something(socket).label
+    first = socket.unit
+    result = run_in(socket, recipe, one)
+    assert result.code == "UNIT_CHANGED", result.text
+    change = until_something(socket)
+    assert change.is_power_up
+    assert change.label not in ("", one)
+    assert socket.devices["bms"].device.stored_image is not None, "nothing was sent to it"
+    assert run_in(socket, recipe, change.label).code == "OK", "no third one to exchange it for"
+    assert not until_something(socket).is_there
+    assert until_something(socket).label == one
+    assert first is not None
+    assert socket.unit is first
+    assert first.devices["bms"].stored_image is None, "torn, as it was pulled out"
+    assert run_in(socket, recipe, one).code == "OK"

@@ -236,6 +236,8 @@ class RunOptions:
     mock_bad: float
     mock_slow: float
     mock_dead: float
+    mock_exchanged: float
+    mock_mislabelled: float
     mock_seed: int
     mock_speed: float
 
@@ -277,6 +279,8 @@ class RunOptions:
     _mock_share_option("bad", 0.15, "refuse the image, or have the wrong hardware"),
     _mock_share_option("slow", 0.1, "take longer"),
     _mock_share_option("dead", 0.05, "never answer"),
+    _mock_share_option("exchanged", 0.0, "are exchanged for the next one while they are flashed"),
+    _mock_share_option("mislabelled", 0.0, "bear the label of another unit"),
     option(
         "--mock-seed", type=values.number, default="2", metavar="N", panel=_VIRTUAL,
         help="other ones",

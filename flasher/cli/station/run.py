@@ -59,6 +59,8 @@ END_LIMIT_S: Final = 10.0
 """How long stopped runs have to say their end; what does not is INTERRUPTED at the next start."""
 WAIT_LEFT_S: Final = 4.0
 """How long a label waits for its unit after the last scan."""
+RETURN_LIMIT_S: Final = 10.0
+"""A virtual unit that was exchanged in its run comes back sooner."""
 _LEAVE_S: Final = 2.0
 """A verdict on a virtual unit can be read so long."""
 
@@ -138,7 +140,13 @@ def _find_sockets(
                 "--mock-bad, --mock-slow and --mock-dead are more than all units together.",
                 remedy="Their sum is 1 at the most.",
             )
-        config = mock_config(options.mock_sockets, MockUnits(**shares, seed=options.mock_seed))
+        units = MockUnits(
+            **shares,
+            exchanged=options.mock_exchanged,
+            mislabelled=options.mock_mislabelled,
+            seed=options.mock_seed,
+        )
+        config = mock_config(options.mock_sockets, units)
     else:
         raise UsageError(
             "A station needs either its sockets or virtual ones.",
@@ -201,6 +209,8 @@ class _Session:
     _typing: Typing | None = None
     _was_submitted: bool = False
     _is_used_up: bool = False
+    _busy_at: float = 0.0
+    """When something went on last."""
     _used_up_at: float = 0.0
     """When the last scan was submitted."""
     _failure: FlasherError | None = None
@@ -308,7 +318,8 @@ class _Session:
             self._check_sockets()
             is_held = self.station.line.stopped is not None or bool(self.view.board.pin_of)
             if self.file is not None and not is_held:
-                self.file.turn(self.station.line.sockets.values(), self.view.board.labels)
+                sockets = self.station.line.sockets.values()
+                self.file.turn(sockets, self.view.board.labels, self.view.board.exchanged)
         except FlasherError as error:
             self._failure = error
             return True
@@ -323,6 +334,11 @@ class _Session:
         self._drop_what_waits()
         is_busy = any(socket.is_busy for socket in self.station.line.sockets.values())
         is_quiet = not (is_busy or self.view.board.waiting)
+        now = self.station.clock.monotonic_s()
+        if not is_quiet:
+            self._busy_at = now
+        if self.is_virtual and self.view.board.exchanged and now - self._busy_at < RETURN_LIMIT_S:
+            is_quiet = False
         self._is_used_up = was_submitted and self._was_submitted and is_quiet
         return self._is_used_up
 
@@ -351,7 +367,7 @@ class _Session:
             return self.file.is_used_up
         if self.scans_itself:
             wanted = self.options.units
-            return wanted is not None and self.view.board.arrivals >= wanted
+            return wanted is not None and len(self.view.board.arrived) >= wanted
         return self._pipe is not None and self._pipe.is_at_end
 
     # -- its end ----------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import os
 import re
 import sys
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from itertools import takewhile
@@ -35,6 +35,7 @@ Submit = Callable[[str], None]
 FILE_MAX_SIZE: Final = 4 * 1024 * 1024
 """In bytes."""
 OPTION: Final = "--scans"
+_AGAIN_MAX: Final = 3
 
 
 def read_scans(path: Path) -> list[str]:
@@ -88,19 +89,31 @@ class ScanFile:
         self.labels = frozenset(filter(self._is_label, scans))
         self._left = deque(scans)
         self._submit = submit
+        self._again: Counter[str] = Counter()
+        """How often labels were submitted once more."""
 
     @property
     def is_used_up(self) -> bool:
         """True when every scan was submitted."""
         return not self._left
 
-    def turn(self, sockets: Iterable[Socket], borne: Mapping[str, str]) -> None:
+    def turn(
+        self, sockets: Iterable[Socket], borne: Mapping[str, str], exchanged: Collection[str] = ()
+    ) -> None:
         """Submit the next scan, when its time has come. `borne` are the labels of virtual units, by
-        their sockets. Raises UsageError where no socket can tell that a unit is in it.
+        their sockets; `exchanged` those that were taken out in their run, which are scanned again
+        when they come back. Raises UsageError where no socket can tell that a unit is in it.
         """
+        sockets = tuple(sockets)
+        for socket in sockets:
+            label = borne.get(socket.name, "")
+            if socket.awaits_label and label in exchanged and self._again[label] < _AGAIN_MAX:
+                self._again[label] += 1
+                self._submit(f"{Word.SOCKET.value} {socket.name}")
+                self._submit(label)
+                return
         if not self._left:
             return
-        sockets = tuple(sockets)
         working = [socket for socket in sockets if socket.can_work]
         if working and not any(socket.sees_units for socket in working):
             raise UsageError(
