@@ -22,9 +22,7 @@ from flasher.protocol.fields import (
     Codec,
     Content,
     DateField,
-    Number,
     Reserved,
-    TextField,
     label,
 )
 from flasher.protocol.spec import Dialect, Mode, Node, Target
@@ -160,20 +158,15 @@ def make_content(writable: Writable, values: Sequence[object]) -> Content:
 
 
 def _value(name: str, codec: Codec, value: object) -> Any:
-    if not isinstance(value, str) or isinstance(codec, TextField):
-        return value
-    if isinstance(codec, DateField):
+    if isinstance(codec, DateField) and isinstance(value, str):
         return check_date(value)
+    if not isinstance(codec, Bytes) or not isinstance(value, str):
+        return value
     try:
-        if isinstance(codec, Bytes):
-            return bytes.fromhex(value.removeprefix("0x").replace(":", " "))
-        if isinstance(codec, Number):
-            return int(value, 0)
+        return bytes.fromhex(value.removeprefix("0x").replace(":", " "))
     except ValueError as error:
-        size = f"{codec.size_bytes} bytes in hexadecimal"
-        wanted = size if isinstance(codec, Bytes) else "a number"
+        wanted = f"{codec.size_bytes} bytes in hexadecimal"
         raise UsageError(f"{name}: {value!a} is not {wanted}.") from error
-    return value
 
 
 def check_date(text: str) -> str:

@@ -11,6 +11,7 @@ from flasher.host.items import check_date, readable, writable
 from flasher.host.query import Request
 from flasher.host.survey import Survey
 from flasher.protocol.catalogue import BY_KEY, decode
+from flasher.protocol.contents import Fault, Faults
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import BMS, MOTINOVA, OBC, WELLING, WMC, Dialect, Node, Target
 from flasher.protocol.wire import Message
@@ -135,6 +136,74 @@ def test_a_message_is_named_and_its_last_content_kept(
     assert heard.not_in_dialect == (set() if is_in_dialect else {title})
     decoded = decode(Message(*message))
     assert heard.last == ({} if decoded is None else {title: decoded.content})
+
+
+def heard(engine: Survey, can_id: int, mode: int, command: int, data: bytes) -> None:
+    for part in payloads(build(can_id, mode, command, data)):
+        engine.receive(Frame(can_id, part), 0.1)
+
+
+def test_all_faults_of_the_battery_are_kept_together() -> None:
+    engine = survey()
+    engine.tick(0.0)
+    assert survey().faults is None
+    heard(engine, 0x720, 0x0C, 0x1204, bytes((4, 0, 1, 0)))
+    assert engine.faults == Faults(Fault(0x00010004))
+    heard(engine, 0x720, 0x0C, 0x1204, bytes((8, 0, 0, 0)))
+    assert engine.faults == Faults(Fault(0x0001000C))
+
+
+@each(
+    "message, dialect, why",
+    [
+        ((0x740, 0x0C, 0x1305, b"READY"), MOTINOVA, "a display unit (HMI) sends"),
+        ((0x725, 0x0C, 0xC109, b"BMSV1.2.3"), WELLING, "a bootloader announces itself"),
+        ((0x710, 0x0C, 0x1808, b"SHUTDOWN"), WELLING, "the WMC sent 'SHUTDOWN'"),
+        ((0x720, 0x0C, 0x1204, bytes((4, 0, 1, 0))), None, "the same in both dialects"),
+        ((0x720, 0x0C, 0x1308, b"SHUTDOWN"), None, "the same in both dialects"),
+    ],
+)
+def test_the_dialect_is_guessed_by_what_only_one_of_the_two_has(
+    message: tuple[int, int, int, bytes], dialect: Dialect | None, why: str
+) -> None:
+    engine = survey()
+    engine.tick(0.0)
+    assert engine.guess_dialect()[0] is None
+    heard(engine, *message)
+    guessed, reason = engine.guess_dialect()
+    assert guessed is dialect
+    assert why in reason
+
+
+def test_the_announcement_of_a_bootloader_is_kept() -> None:
+    engine = survey()
+    engine.tick(0.0)
+    heard(engine, 0x725, 0x0C, 0xC109, b"BMSV1.2.3")
+    assert engine.heard[Node.BMS].boot_version == "BMS V1.2.3"
+    heard(engine, 0x725, 0x0C, 0xC202, b"\1\0")
+    assert engine.heard[Node.BMS].boot_version == "BMS V1.2.3"
+
+
+@each("is_heard, asked", [(False, 3), (True, 5)])
+def test_a_device_that_is_silent_to_three_questions_is_asked_no_more(
+    *, is_heard: bool, asked: int
+) -> None:
+    requests = [Request(BY_KEY[0x752, command]) for command in (0x3300, 0x3400, 0x3500, 0x3600,
+                                                                0x3700)]  # fmt: skip
+    engine = Survey(requests, listen_s=0.0, bitrate_bps=250_000, dialect=WELLING)
+    engine.tick(0.0)
+    if is_heard:
+        engine.receive(Frame(0x720, b"\x05"), 0.0)
+    now = 0.0
+    while not engine.done:
+        while engine.next_frame(now) is not None:
+            engine.frame_sent(now)
+        wanted = engine.deadline()
+        assert wanted is not None
+        now = max(now, wanted)
+        engine.tick(now)
+    assert len(engine.queries) == asked
+    assert not engine.cancelled
 
 
 def test_a_tool_that_is_heard_while_listening_is_not_disturbed_by_questions() -> None:

@@ -11,7 +11,7 @@ from flasher import events
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import Disturbance, SimulatedBus
 from flasher.driver import drive
-from flasher.errors import ExitCode
+from flasher.errors import ExitCode, UsageError
 from flasher.host.options import UpgradeOptions
 from flasher.host.runner import Runner
 from flasher.host.session import Result, Session
@@ -19,6 +19,7 @@ from flasher.host.verify import (
     Level,
     Verdict,
     Verification,
+    as_level,
     memory_check,
     possible_levels,
     version_check,
@@ -196,8 +197,52 @@ def test_the_memory_is_read_piece_by_piece_and_compared() -> None:
     assert check.result.running_version == NEW
     ends = [question.end for question in application.asked if isinstance(question, ReadMemory)]
     assert ends == [BASE + 128, BASE + 256, BASE + len(BYTES)]
-    progress = check.take_events()
-    assert progress[-1] == events.MemoryRead(len(BYTES), len(BYTES))
+    assert check.take_events() == [
+        events.MemoryRead(128, len(BYTES)),
+        events.MemoryRead(256, len(BYTES)),
+        events.MemoryRead(len(BYTES), len(BYTES)),
+    ]
+
+
+def test_an_image_that_lies_at_zero_is_read_from_there() -> None:
+    check = memory_check(planned(Image.from_bytes(BYTES, base=0)), UpgradeOptions(), NEW)
+    application = Application(check)
+    while (question := application.next_question()) is not None:
+        assert isinstance(question, ReadMemory)
+        piece = BYTES[question.start : question.end].ljust(128, b"\xff")
+        application.answer(MEMORY, Memory(question.start, question.end, piece))
+    assert check.result.verdict is Verdict.MEMORY_RIGHT
+
+
+@each("size_bytes, verdict", [(200, Verdict.INTERRUPTED), (100, Verdict.MEMORY_RIGHT)])
+def test_a_memory_check_that_is_cancelled_after_an_answer_says_so_unless_it_has_all(
+    size_bytes: int, verdict: Verdict
+) -> None:
+    """The question was repeated: the answer to the other copy may still come."""
+    image = Image.from_bytes(BYTES[:size_bytes], base=BASE)
+    check = memory_check(planned(image), UpgradeOptions(), NEW)
+    application = Application(check)
+    question = application.next_question()
+    assert application.next_question() == question
+    assert question is not None
+    application.answer(MEMORY, memory(question))
+    assert not check.done
+    check.cancel(application.now)
+    assert check.result == Verification(
+        Level.MEMORY, verdict, NEW if verdict is Verdict.MEMORY_RIGHT else None
+    )
+
+
+def test_a_memory_check_that_is_cancelled_in_a_question_says_so() -> None:
+    check = memory_check(planned(), UpgradeOptions(), NEW)
+    Application(check).next_question()
+    check.cancel(0.1)
+    assert check.result == Verification(Level.MEMORY, Verdict.INTERRUPTED)
+
+
+def test_there_is_no_other_verification() -> None:
+    with pytest.raises(UsageError, match="'hash'; there are none, version, memory"):
+        as_level("hash")
 
 
 def test_the_first_difference_is_named() -> None:

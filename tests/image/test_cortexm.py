@@ -201,6 +201,48 @@ def test_of_an_image_that_is_no_program_no_more_is_said_than_that() -> None:
     assert f"0x{BASE + 512:08X}" in note
 
 
+@each(
+    "nmi, hard_fault, is_odd",
+    [(BASE + 9, BASE + 13, False), (BASE + 8, BASE + 13, True), (BASE + 9, BASE + 12, True),
+     (0, BASE + 13, False), (BASE + 8, 0, True)],
+)  # fmt: skip
+def test_a_handler_without_thumb_bit_is_none(nmi: int, hard_fault: int, *, is_odd: bool) -> None:
+    table = known(vector_table(image(STACK, BASE + 5, nmi, hard_fault)))
+    problem = "its NMI or hard fault vector has no Thumb bit"
+    assert table.problems == ((problem,) if is_odd else ())
+    assert table.plausible is not is_odd
+
+
+END = BASE + 0x1000
+
+
+@each(
+    "vectors, is_program",
+    [
+        ((0x205, 0x209, 0x20D), True),
+        ((0x204, 0x209, 0x20D), False),  # no Thumb bit
+        ((0x205, 0x208, 0x20D), False),
+        ((0x205, 0x209, 0x1FD), False),  # before it
+        ((0x201, 0x209, 0x20D), True),
+        ((0x1FF, 0x209, 0x20D), False),
+        ((0xFFF, 0x209, 0x20D), True),
+        ((0x1001, 0x209, 0x20D), False),  # behind the image
+    ],
+)
+def test_a_second_program_has_all_its_handlers_inside_the_image(
+    vectors: tuple[int, ...], *, is_program: bool
+) -> None:
+    inner = (STACK, *(BASE + each_offset for each_offset in vectors))
+    table = known(vector_table(image(STACK, BASE + 5, *(0,) * 126, *inner)))
+    assert bool(table.notes) is is_program
+
+
+def test_an_image_that_starts_outside_names_the_check_that_refused() -> None:
+    with pytest.raises(ImageError) as refused:
+        check_starts_inside(image(STACK, END + 5))
+    assert refused.value.waiver == "outside-vector"
+
+
 def known(table: VectorTable | None) -> VectorTable:
     assert table is not None
     return table
