@@ -26,6 +26,8 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from sqlalchemy import create_engine
+
 from flasher.protocol.spec import BMS
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.claims import Order
@@ -73,6 +75,9 @@ class Plant:
         bench.make(lot="L000")
         bulk_records.fill(bench, self.runs, traces)
         bench.store.close()
+        if self.server is not None:
+            with create_engine(self.url, isolation_level="AUTOCOMMIT").connect() as connection:
+                connection.exec_driver_sql("VACUUM ANALYZE")  # as a server does by itself
 
     def open(self, *, read_only: bool = True, clock: FakeClock | None = None) -> Store:
         return Store.open(
