@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import getpass
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -31,7 +32,14 @@ class RecordsPlace:
     station: str | None
     """The station's name, where the options name its file."""
 
-    def open(self, station: str, *, create: bool = True, read_only: bool = False) -> Store:
+    def open(
+        self,
+        station: str,
+        *,
+        create: bool = True,
+        read_only: bool = False,
+        told: Callable[[str], None] = lambda _text: None,
+    ) -> Store:
         """The records as a station opens them. Raises UsageError, RecordError."""
         return Store.open(
             self.url,
@@ -41,6 +49,7 @@ class RecordsPlace:
             create=create,
             read_only=read_only,
             keeping=self.keeping,
+            told=told,
         )
 
 

@@ -80,7 +80,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
         view = JsonLines(output)
     elif options.lines or os.environ.get("TERM") == "dumb":
         view = Lines(output)
-    with _opened_records(options, records, config) as store:
+    with _opened_records(options, records, config, output) as store:
         session = _Session(
             options, pages, output, store, view, crew, config, is_virtual,
             is_temporary=_is_temporary(options, records),
@@ -173,14 +173,14 @@ def _is_temporary(options: RunOptions, records: RecordsOptions) -> bool:
 
 @contextmanager
 def _opened_records(
-    options: RunOptions, records: RecordsOptions, config: StationConfig
+    options: RunOptions, records: RecordsOptions, config: StationConfig, output: Output
 ) -> Iterator[Store]:
     """The records; those of virtual units without --database are gone afterwards.
 
     Raises UsageError, RecordError.
     """
     if not _is_temporary(options, records):
-        with records_of(records).open(config.name) as store:
+        with records_of(records).open(config.name, told=output.progress) as store:
             yield store
         return
     with tempfile.TemporaryDirectory(prefix="flasher-station-") as folder:

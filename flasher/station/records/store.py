@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from datetime import UTC, datetime, timedelta
 from functools import partial
@@ -111,11 +111,13 @@ class Store:
         create: bool = True,
         read_only: bool = False,
         keeping: Keeping = _USUAL,
+        told: Callable[[str], None] = lambda _text: None,
     ) -> Self:
         """The records at an SQLAlchemy URL, or in an SQLite file; made when they are not there and
         `create` is true. `folder` holds the attachments (beside an SQLite file by default). A file
         of an older schema is brought up to date, after a backup beside it (`upgrade`).
-        `read_only` changes nothing, not even the journal.
+        `read_only` changes nothing, not even the journal. `told` gets a sentence about what takes
+        long.
 
         Raises UsageError for a place that cannot be, SchemaVersionError, or another RecordError.
         """
@@ -136,6 +138,7 @@ class Store:
             # What is on a server is for its owner to change, after a backup of the server's own.
             if read_only or location.file is None:
                 raise
+            told(f"Records of an older flasher: copies, then changes {location.shown} (minutes).")
             upgrade(
                 location,
                 choose=lambda _: station,

@@ -44,10 +44,10 @@ class Old:
     def place(self) -> dict[str, Any]:
         return {"folder": self.files, "keeping": Keeping(self.folder / "keys")}
 
-    def open(self, station: str = "line-2", *, read_only: bool = False) -> Store:
+    def open(self, station: str = "line-2", *, read_only: bool = False, **more: Any) -> Store:
         return Store.open(
             self.url, station=station, create=False, read_only=read_only, lock_timeout_s=0.5,
-            **self.place,
+            **self.place, **more,
         )  # fmt: skip
 
     def upgrade(self, station: str = "line-2") -> Upgraded:
@@ -123,7 +123,9 @@ def test_old_records_are_taken_over_whole(old: Old, request: pytest.FixtureReque
 
 def test_a_station_upgrades_its_file_at_its_start_and_keeps_a_copy(old_file: Old) -> None:
     before = old_file.rows()
-    with old_file.open() as store:
+    said: list[str] = []
+    with old_file.open(told=said.append) as store:
+        assert "minutes" in said[0]
         assert not store.examine().problems
         assert store.recover() != ()
     (copy,) = old_file.folder.glob("*.schema-2")
