@@ -100,7 +100,7 @@ class Store:
         self._lock = database.station_lock(station)
 
     @classmethod
-    def open(
+    def open(  # noqa: PLR0913  each setting of the records
         cls,
         url: str,
         *,
