@@ -432,3 +432,117 @@ def test_a_timer_begins_when_the_message_has_left_and_not_before() -> None:
     hears(bench, Ack(1))
     passes(bench, 0.6)
     assert bench.seen(events.MessageRepeated) == []
+
+
+def test_a_reset_that_has_not_left_when_it_is_needed_no_more_is_not_sent() -> None:
+    bench = Bench()
+    bench.expect(Reset)
+    passes(bench, 0.25)
+    hears(bench, GeneralFeedback())
+    bench._flush()
+    assert bench.unread == []
+
+
+def update_that_waits() -> Bench:
+    """The update command is queued, and the adapter takes nothing."""
+    bench = Bench(options=ONCE)
+    bench.to_boot()
+    hears(bench, BOOT)
+    passes(bench, 0.03)
+    assert not stage(bench).has_begun_to_erase
+    return bench
+
+
+def test_an_adapter_that_is_back_before_the_update_command_has_left_begins_with_the_reset() -> None:
+    bench = update_that_waits()
+    bench.engine.link_back(bench.now)
+    bench._flush()
+    bench.expect(Reset)
+
+
+def test_a_request_before_the_update_command_has_left_is_reported_and_not_answered() -> None:
+    bench = update_that_waits()
+    hears(bench, RequestTransfer())
+    bench.events += bench.engine.take_events()
+    assert reported(bench) == [OUT_OF_PLACE]
+    bench._flush()
+    bench.expect(UpdateCommand)
+    bench.say(RequestTransfer())
+    assert bench.expect(Packet).number == 1
+
+
+def test_a_request_that_never_comes_is_missed_although_the_adapter_was_lost_meanwhile() -> None:
+    bench = Bench(options=ONCE)
+    bench.to_request()
+    bench.wait(0.05)
+    hears(bench, BOOT)  # answered by another update command, which does not leave
+    bench.engine.link_back(bench.now)
+    bench.wait(10.1)
+    assert bench.outcome.ending is Ending.NO_REQUEST
+
+
+def test_a_boot_version_after_an_update_command_into_the_silence_is_told() -> None:
+    bench = Bench(options=replace(ONCE, in_session=True))
+    bench.wait(10.1)
+    assert isinstance(bench.unread[-1], UpdateCommand)
+    assert bench.seen(events.BootVersionSeen) == []
+    bench._read = len(bench.sent)
+    bench.wait(1.0)
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
+    assert bench.seen(events.BootVersionSeen) == [events.BootVersionSeen("BMS", "V1.2.3")]
+
+
+def test_an_erased_device_that_announces_on_and_on_is_reset_and_told_again() -> None:
+    bench = Bench()
+    bench.to_packet(2)
+    bench.now += 0.1
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
+    told_at = bench.now
+    while bench.now < told_at + 10.1:
+        bench.now += 0.05
+        bench.say(BOOT)
+    started = [e.reason for e in bench.events if isinstance(e, events.AttemptStarted)]
+    assert started[:2] == [Reason.RESTARTED.value, Reason.REQUEST_GIVEN_UP.value]
+    assert not bench.engine.done
+
+
+@each(
+    "attempts, comes_back, ending",
+    [(2, True, Ending.NO_REQUEST), (3, False, Ending.PACKET_FAILED)],
+)
+def test_no_request_after_a_failed_packet_is_named_by_whether_the_device_came_back(
+    attempts: int, ending: Ending, *, comes_back: bool
+) -> None:
+    bench = Bench(options=UpgradeOptions(timings=HURRIED, attempts=attempts))
+    bench.to_packet(2)
+    bench.expect(Packet)
+    bench.expect(Reset)
+    if comes_back:
+        bench.say(BOOT)
+        bench.expect(UpdateCommand)
+    bench.wait(60.0)
+    assert bench.outcome.ending is ending
+    assert bench.outcome.packet == (2 if ending is Ending.PACKET_FAILED else None)
+
+
+def test_nobody_is_asked_for_power_before_an_update_command_went_into_the_silence() -> None:
+    bench = Bench(options=UpgradeOptions(timings=HURRIED))
+    bench.to_packet(2)
+    bench.now += 0.1
+    bench.say(BOOT)
+    bench.expect(UpdateCommand)
+    bench.wait(12.0)
+    assert bench.seen(events.PowerCycleAwaited) == []
+    assert Reset() in bench.unread
+
+
+def test_the_wait_for_the_power_begins_anew_when_the_adapter_is_back() -> None:
+    bench = Bench(options=UpgradeOptions(at_power_up=True, power_up_timeout_s=30.0))
+    bench.wait(20.0)
+    bench.engine.link_back(bench.now)
+    bench.wait(20.0)
+    assert not bench.engine.done
+    bench.wait(11.0)
+    assert bench.outcome.ending is Ending.NO_ANNOUNCEMENT

@@ -128,6 +128,12 @@ def test_the_application_is_reset_again_when_the_announcements_have_ended() -> N
     assert bench.expect(Packet).number == 1
 
 
+def test_that_reset_is_repeated_as_ever() -> None:
+    bench, _ = beside()
+    bench.expect(Reset)
+    bench.expect(Reset, within_s=0.3)
+
+
 def test_it_is_reset_again_once() -> None:
     bench, _ = beside()
     bench.expect(Reset)
@@ -160,6 +166,13 @@ def test_a_device_that_was_heard_gets_a_reset_that_only_another_application_answ
     left_at = bench.sent[0][0]
     assert begins(bench, UpdateCommand) == pytest.approx(left_at + WATCH_S, abs=1e-6)
     assert bench.seen(events.PhaseEntered)[-1] == events.PhaseEntered(Phase.UPDATE, 1)
+
+
+def test_another_kind_of_device_that_announces_itself_after_that_reset_is_refused() -> None:
+    bench = heard_before()
+    bench.expect(Reset)
+    bench.say(BootVersion("OBC", "V1.2.3"))
+    assert bench.outcome.ending is Ending.WRONG_DEVICE
 
 
 def test_a_reset_that_leaves_late_is_followed_by_a_whole_watch() -> None:
