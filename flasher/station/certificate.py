@@ -6,13 +6,15 @@ A unit that did not pass gets a page as well, and the page says so in its first 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Any, Final
 
 import segno
 from markupsafe import Markup
 
+from flasher import __version__
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
 from flasher.report.base import Status, render_page
@@ -29,6 +31,7 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.signatures import fingerprint
 from flasher.station.records.store import Store
+from flasher.station.sealed import LEFT_OUT, Sealed, as_text, plain
 
 EARLIER_SHOWN: Final = 50
 """Earlier runs in the table; the page says how many more there are."""
@@ -36,6 +39,7 @@ _WRITES_ON_SHEET: Final = 4
 """With more of them, or longer ones, all stand in the annex in full."""
 _TEXT_ON_SHEET: Final = 40
 _TEXT_IN_CODE: Final = 80
+_ROW: Final = ("number", "at", "event", "run_id", "data", "previous_hash", "hash")
 UNIT_WORDS: Final = {
     UnitState.PASS: (Status.GOOD, say("PASS"), "This unit passed."),
     UnitState.FAIL: (Status.BAD, say("FAIL"), "This unit did not pass: it is no good unit."),
@@ -71,6 +75,12 @@ class Proof:
     """It was compared with those beside the key."""
     examined_at: str = ""
     """When all records up to its row were examined; empty where they were not since."""
+    content: Mapping[str, Any] = field(default_factory=dict)
+    """The rows of the run, which the page carries."""
+    row: Mapping[str, Any] = field(default_factory=dict)
+    """The signed audit row."""
+    seal: str = ""
+    """What a page carries that was made before; empty to make it."""
 
 
 def proven(store: Store, life: UnitLife) -> Proof:
@@ -86,17 +96,26 @@ def proven(store: Store, life: UnitLife) -> Proof:
             remedy="Look at all of it with flasher station verify.",
         )
     head, record_sha256 = store.read.head_of(last.run_id), store.read.record_sha256(last.run_id)
+    content, row = store.read.content_of(last.run_id)
     return Proof(
-        head, record_sha256, bool(found.elsewhere), found.is_beside, found.examined_at or ""
+        head,
+        record_sha256,
+        bool(found.elsewhere),
+        found.is_beside,
+        (found.examined_at or "")[:10],
+        content,
+        row,
     )
 
 
-def render_certificate(life: UnitLife, made_at: datetime, proof: Proof) -> str:
-    """The page. Raises UsageError for a unit without any run."""
-    return render_page("certificate.html", **sheet(life, made_at, proof))
+def render_certificate(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) -> str:
+    """The page. Raises UsageError for a unit without any run. `left_out`: how many earlier runs are
+    not in `life`.
+    """
+    return render_page("certificate.html", **sheet(life, made_at, proof, left_out))
 
 
-def sheet(life: UnitLife, made_at: datetime, proof: Proof) -> dict[str, Any]:
+def sheet(life: UnitLife, made_at: datetime, proof: Proof, left_out: int = 0) -> dict[str, Any]:
     """What the template of the page needs. Raises UsageError for a unit without any run."""
     last = life.last
     if last is None:
@@ -116,7 +135,8 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof) -> dict[str, Any]:
         "key": fingerprint(proof.head.key) if proof.head else "",
         "is_kept": proof.is_kept,
         "is_beside": proof.is_beside,
-        "examined_at": proof.examined_at[:10],
+        "examined_at": proof.examined_at,
+        "seal": proof.seal or _seal(life, made_at, proof),
         "record_sha256": proof.record_sha256,
         "code": "" if proof.head is None else _code(last, proof.record_sha256, proof.head),
         "writes": last.writes[:_WRITES_ON_SHEET],
@@ -137,17 +157,48 @@ def sheet(life: UnitLife, made_at: datetime, proof: Proof) -> dict[str, Any]:
             (run, RUN_WORDS[run.state][1])
             for run in (details.run for details in earlier[-EARLIER_SHOWN:])
         ],
-        "earlier_left_out": max(0, len(earlier) - EARLIER_SHOWN),
+        "earlier_left_out": max(0, len(earlier) - EARLIER_SHOWN) + left_out,
         "moment": _moment,
         "number": number,
         "made_at": _moment(made_at),
     }
 
 
+def _seal(life: UnitLife, made_at: datetime, proof: Proof) -> str:
+    if proof.head is None or not proof.row:
+        return ""
+    earlier = [details.run for details in life.runs[:-1]]
+    recipe = proof.content["recipe"]
+    return as_text(
+        Sealed(
+            flasher=__version__,
+            made_at=made_at.isoformat(),
+            is_kept=proof.is_kept,
+            is_beside=proof.is_beside,
+            examined_at=proof.examined_at,
+            content={k: value for k, value in proof.content.items() if k not in LEFT_OUT},
+            recipe={name: recipe[name] for name in ("name", "revision", "sha256")},
+            row={name: proof.row[name] for name in _ROW},
+            station=proof.head.station,
+            signature=proof.head.signature,
+            key=proof.head.key,
+            earlier=tuple(map(plain, earlier[-EARLIER_SHOWN:])),
+            earlier_left_out=max(0, len(earlier) - EARLIER_SHOWN),
+        )
+    )
+
+
 def _code(last: RunDetails, record_sha256: str, head: Head) -> Markup:
-    """What a reader of the paper can hold against the records, as a QR code."""
+    """What a reader of the paper can compare with the records, as a QR code."""
+    lines = code_lines(last, record_sha256, head)
+    drawn = segno.make("\n".join(lines), error="m", micro=False, boost_error=False)
+    return Markup(drawn.svg_inline(omitsize=True, svgclass=None, lineclass=None))  # noqa: S704
+
+
+def code_lines(last: RunDetails, record_sha256: str, head: Head) -> tuple[str, ...]:
+    """The text of the QR code."""
     run = last.run
-    lines = (
+    return (
         "flasher record 1",
         f"unit {printable(run.serial)[:_TEXT_IN_CODE]}",
         f"part {printable(run.part)[:_TEXT_IN_CODE]}",
@@ -158,8 +209,6 @@ def _code(last: RunDetails, record_sha256: str, head: Head) -> Markup:
         f"signature {head.signature}",
         f"key {head.key}",
     )
-    drawn = segno.make("\n".join(lines), error="m", micro=False, boost_error=False)
-    return Markup(drawn.svg_inline(omitsize=True, svgclass=None, lineclass=None))  # noqa: S704
 
 
 def limits_of(each: Measurement) -> str:

@@ -101,6 +101,31 @@ def test_a_unit_whose_records_were_changed_gets_no_page(
     assert [path.name for path in (tmp_path / "pages").iterdir()] == [f"{SERIAL}.html"]
 
 
+def test_a_certificate_is_checked(
+    flasher: Flasher,
+    bench: Bench,
+    place: tuple[str, ...],
+    tmp_path: Path,
+    schema: dict[str, Any],
+) -> None:
+    page = tmp_path / "good.html"
+    flasher("station", "unit", SERIAL, *place, "--certificate", page)
+    good = flasher("station", "verify", *place, "--certificate", page)
+    assert good.code == ExitCode.OK
+    assert good.out.splitlines()[0] == f"{SERIAL}, part BAT-36: run 1, PASS"
+    assert "  signed by line-2, key " in good.out
+    assert "  unchanged, and the run is in these records" in good.out
+    text = page.read_text("utf-8")
+    page.write_text(text.replace("bms.bin", "bmw.bin", 1), encoding="utf-8")
+    bad = flasher("station", "verify", *place, "--certificate", page, "--json")
+    hold_output(schema, bad.out, ExitCode.VERIFICATION)
+    assert bad.document["problems"][0].startswith("its page was changed: it says ")
+    assert "unchanged" not in flasher("station", "verify", *place, "--certificate", page).out
+    none = flasher("station", "verify", *place, "--certificate", bench.folder / "recipe.toml")
+    assert none.code == ExitCode.USAGE
+    assert "carries no signed certificate" in none.err
+
+
 def test_a_key_is_shown_rotated_and_replaced(
     flasher: Flasher, bench: Bench, place: tuple[str, ...], schema: dict[str, Any]
 ) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from flasher.station.certificate_check import check_certificate
 from flasher.station.records.model import Measurement, RunState, StepState
 from flasher.web.server import Server
 from tests.station.factory import Bench
@@ -25,8 +26,8 @@ _SCREENS: tuple[tuple[int, Any], ...] = ((390, "dark"), (1280, "light"))
 
 
 @pytest.fixture(scope="module")
-def url() -> Iterator[str]:
-    """The pages of records with good and bad units, and texts as long as they may be."""
+def plant() -> Iterator[Bench]:
+    """Records with good and bad units, and texts as long as they may be."""
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder))
         for number in range(1, 9):
@@ -41,9 +42,15 @@ def url() -> Iterator[str]:
             run_id, "check", StepState.FAIL, duration_s=0.5, text=LONG, measurements=[out]
         )
         bench.store.finish(run_id, bench.ending(RunState.FAIL, "LIMIT"))
-        with Server(app_of(bench.path, bench.keys), "127.0.0.1", 0) as server:
-            yield server.url
+        yield bench
         bench.store.close()
+
+
+@pytest.fixture(scope="module")
+def url(plant: Bench) -> Iterator[str]:
+    """Their pages."""
+    with Server(app_of(plant.path, plant.keys), "127.0.0.1", 0) as server:
+        yield server.url
 
 
 @pytest.mark.parametrize("path", PAGES)
@@ -88,3 +95,26 @@ def test_a_certificate_is_one_sheet_with_an_annex(tab: Tab, url: str) -> None:
     assert heights < 297 - 28  # mm of A4 between its margins
     pages = page.pdf(format="A4", prefer_css_page_size=True).count(b"/Type /Page\n")
     assert pages == 2
+
+
+@pytest.mark.parametrize("has_edges", [False, True])
+def test_a_printed_certificate_is_checked(
+    tab: Tab, url: str, plant: Bench, *, has_edges: bool
+) -> None:
+    page = tab.page
+    page.goto(f"{url}units/certificate?serial=W2605009")
+    page.emulate_media(media="print")
+    whole = page.pdf(format="A4", prefer_css_page_size=True, display_header_footer=has_edges)
+    found = check_certificate(plant.store, whole)
+    assert found.problems == ()
+    assert found.serial == "W2605009"
+    page.evaluate(
+        """() => {
+          const walker = document.createTreeWalker(document.querySelector("main"), 4);
+          while (!walker.nextNode().data.includes("voltage"));
+          walker.currentNode.data = walker.currentNode.data.replace("voltage", "voltags");
+        }"""
+    )
+    changed = page.pdf(format="A4", prefer_css_page_size=True, display_header_footer=has_edges)
+    (problem,) = check_certificate(plant.store, changed).problems
+    assert "voltags" in problem

@@ -22,6 +22,7 @@ from flasher.cli.station.documents import (
 )
 from flasher.cli.station.place import open_to_read, operator_of, records_of, the_station
 from flasher.errors import ExitCode, UsageError
+from flasher.files import read
 from flasher.protocol.text import printable
 from flasher.station.records.database import locate, no_records, open_database
 from flasher.station.records.model import Examination, Problem
@@ -29,6 +30,7 @@ from flasher.station.records.roles import check_roles, grant_roles
 from flasher.station.records.signatures import fingerprint
 from flasher.station.records.store import Store, SystemClock
 from flasher.station.records.upgrade import upgrade as upgrade_records
+from flasher.station.sealed import CERTIFICATE_MAX_SIZE
 
 ELSEWHERE: Final = "a head kept elsewhere"
 
@@ -72,6 +74,25 @@ def verify(output: Output, records: RecordsOptions, *, is_all: bool) -> int:
         _say_what_was_checked(found, output)
     code = ExitCode.VERIFICATION if found.problems else ExitCode.OK
     return output.document(document_of(VerifiedRecordsDocument, found), exit_code=code)
+
+
+def verify_certificate(output: Output, records: RecordsOptions, file: Path) -> int:
+    from flasher.station.certificate_check import check_certificate  # noqa: PLC0415  loads jinja2
+
+    data = read(file, CERTIFICATE_MAX_SIZE, what="certificate")
+    with closing(open_to_read(records)) as store:
+        found = check_certificate(store, data)
+    shown = f"{found.serial}, part {found.part}: run {found.run_id}, {found.state.value}"
+    output.result(printable(shown))
+    for line in found.problems:
+        output.result(printable(f"  NOT PROVEN: {line}"))
+    if not found.problems:
+        output.result(printable(f"  signed by {found.station}, key {found.fingerprint}"))
+        output.result("  unchanged, and the run is in these records")
+    for line in found.remarks:
+        output.progress(f"note: {printable(line)}")
+    code = ExitCode.VERIFICATION if found.problems else ExitCode.OK
+    return output.document(found, exit_code=code)
 
 
 def _problem_lines(problems: Sequence[Problem]) -> Iterator[str]:

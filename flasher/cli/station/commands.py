@@ -30,6 +30,7 @@ examples:
   flasher station unit W2605002 --certificate W2605002.html
   flasher station backup /mnt/plant/records.sqlite
   flasher station verify --heads /mnt/plant/heads
+  flasher station verify --certificate W2605002.html
   flasher station key
   flasher station pin
   flasher station roles --database postgresql://flasher_owner@plant-db/flasher
@@ -406,9 +407,18 @@ def roles(output: Output, station_role: str, reader_role: str, records: RecordsO
     "--all", "is_all", is_flag=True, brief=True,
     help="examine everything again; else what came after the last examination without a problem",
 )  # fmt: skip
+@_path_option(
+    "--certificate", brief=True,
+    help="check this certificate instead: HTML as flasher wrote it, its print as PDF, or a text "
+    "with its signed lines or its QR code",
+)  # fmt: skip
 @_records_options
-def verify(output: Output, records: RecordsOptions, *, is_all: bool) -> int:
-    """Tell whether the records were changed."""
+def verify(
+    output: Output, records: RecordsOptions, certificate: Path | None, *, is_all: bool
+) -> int:
+    """Tell whether the records, or a certificate of them, were changed."""
+    if certificate is not None:
+        return _call("care.verify_certificate", output, records, certificate)
     return _call("care.verify", output, records, is_all=is_all)
 
 

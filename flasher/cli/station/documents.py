@@ -18,6 +18,7 @@ from flasher.station.records.model import (
     UnitLife,
 )
 from flasher.station.records.upgrade import Upgraded
+from flasher.station.sealed import CheckedCertificate
 from flasher.trace.story import Cause, Story
 
 
@@ -243,6 +244,7 @@ DOCUMENTS: Final = (
     UnitDocument,
     Backup,
     VerifiedRecordsDocument,
+    CheckedCertificate,
     StationRolesDocument,
     SigningKeyDocument,
     AcceptedDocument,

@@ -187,6 +187,13 @@ def lost_of(data: Mapping[str, Any]) -> range:
     return range(0)
 
 
+def ending_of(connection: Connection, run_id: int) -> dict[str, Any]:
+    """The row that vouches for a finished run; empty where there is none."""
+    query = select(audit).where(audit.c.run_id == run_id, audit.c.event.in_(ENDINGS))
+    row = connection.execute(query.order_by(audit.c.id.desc()).limit(1)).mappings().one_or_none()
+    return {} if row is None else dict(row)
+
+
 def hash_at(connection: Connection, station_name: str, number: int) -> str | None:
     """The hash of a row; None where the chain has no such row."""
     query = _rows_of(station_name, audit.c.hash).where(audit.c.number == number)
@@ -242,6 +249,20 @@ def digests_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dict
     """The digests of runs, by what they cover; a run that is not there is left out. They cover
     names and contents, not keys of tables alone.
     """
+    return {
+        run_id: {name: digest(value) for name, value in content.items()}
+        for run_id, content in contents_of(connection, run_ids).items()
+    }
+
+
+def claim_of(content: Mapping[str, Any]) -> list[Any]:
+    """What a run was begun with, of its content."""
+    claim = {name: value for name, value in content["run"].items() if name not in _OUTCOME}
+    return [claim, [{**each, "reached": None} for each in content["targets"]]]
+
+
+def contents_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dict[str, Any]]:
+    """The rows of runs and of all that they name, by what they are."""
     known: dict[tuple[str, Any], dict[str, Any] | None] = {}
 
     def row_of(table: Table, key: Any) -> dict[str, Any] | None:
@@ -269,12 +290,10 @@ def digests_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dict
     runs = select(schema.run).order_by(schema.run.c.id)
     found = {}
     for run_id, (row,) in grouped(connection, runs, schema.run.c.id, run_ids).items():
-        claim = {name: value for name, value in row.items() if name not in _OUTCOME}
-        wanted = [{**each, "reached": None} for each in targets[run_id]]
         socket = row_of(schema.socket, row["socket_id"])
         data = {
             "run": row,
-            CLAIM: [claim, wanted],
+            CLAIM: claim_of({"run": row, "targets": targets[run_id]}),
             "unit": row_of(schema.unit, row["unit_id"]),
             "socket": socket,
             "station": row_of(schema.station, socket and socket["station_id"]),
@@ -284,5 +303,5 @@ def digests_of(connection: Connection, run_ids: Iterable[int]) -> dict[int, dict
             "artifacts": [row_of(schema.artifact, each["artifact_id"]) for each in targets[run_id]],
             **{name: rows[run_id] for name, rows in parts.items()},
         }
-        found[run_id] = {name: digest(value) for name, value in data.items()}
+        found[run_id] = data
     return found

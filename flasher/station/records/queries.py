@@ -113,6 +113,14 @@ class Records:
         with self._database.reading() as connection:
             return chain.digest(chain.digests_of(connection, [run_id])[run_id])
 
+    def content_of(self, run_id: RunId) -> tuple[dict[str, Any], dict[str, Any]]:
+        """The rows of a finished run by what they are, and the audit row that vouches for them.
+        Raises KeyError for a run that is not there.
+        """
+        with self._database.reading() as connection:
+            content = chain.contents_of(connection, [run_id])[run_id]
+            return content, chain.ending_of(connection, run_id)
+
     def natures(self) -> frozenset[bool]:
         """Whose runs there are: True for virtual units, False for real ones."""
         is_virtual = schema.run.c.is_virtual

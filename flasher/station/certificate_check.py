@@ -1,0 +1,276 @@
+"""Checks a certificate: signed by which station, unchanged, and of a run that is in these records.
+
+It may be the HTML file as flasher wrote it, a PDF that a browser printed of it, the lines of its
+signed content, or the text of its QR code.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+import unicodedata
+from collections.abc import Iterator
+from datetime import datetime
+from html.parser import HTMLParser
+from typing import Final
+
+from pydantic import ValidationError
+
+from flasher import __version__
+from flasher.errors import UsageError
+from flasher.protocol.text import printable
+from flasher.station.certificate import EARLIER_SHOWN, Proof, code_lines, render_certificate
+from flasher.station.records.errors import NotFoundError, UnprovenError
+from flasher.station.records.model import RunId
+from flasher.station.records.signatures import fingerprint, is_signed
+from flasher.station.records.store import Store
+from flasher.station.sealed import CheckedCertificate, Sealed, as_text, plain, sealed_in
+
+_PDF: Final = b"%PDF-"
+_CODE: Final = re.compile(r"flasher record 1\n(?:[^\n]+\n){7}key [0-9a-f]{64}")
+_AROUND: Final = 24
+_EDGE_LINES: Final = 4
+_HIDDEN: Final = frozenset({"style", "script", "title", "svg"})
+
+
+def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
+    """Check the bytes of a file. Raises UsageError for one that is no certificate, UnprovenError
+    for one whose signed content cannot be read any more; RecordError.
+    """
+    is_pdf = data.startswith(_PDF)
+    pages = list(_pages_of_pdf(data)) if is_pdf else []
+    text = "\n".join(pages) if is_pdf else data.decode("utf-8", "replace")
+    code = _CODE.search(text.replace("\r\n", "\n").strip())
+    if code is not None:
+        return _check_code(store, code[0])
+    sealed = sealed_in(text)
+    try:
+        problems = sealed.wrong()
+        life = sealed.life()
+        made_at = datetime.fromisoformat(sealed.made_at)
+        proof = Proof(
+            sealed.head,
+            sealed.record_sha256,
+            sealed.is_kept,
+            sealed.is_beside,
+            sealed.examined_at,
+            seal=as_text(sealed),
+        )
+        page = render_certificate(life, made_at, proof, sealed.earlier_left_out)
+    except (ValidationError, KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UnprovenError(
+            "The certificate was changed: what it carries is no run.",
+            remedy="Ask for the certificate anew.",
+        ) from error
+    if is_pdf:
+        where = _difference_of_print(page, pages)
+    elif "<html" in text:
+        where = "" if page.encode("utf-8") == data else _difference(_text_of(page), _text_of(text))
+    else:
+        where = ""  # the signed lines alone
+    if where:
+        problems.append(f"its page was changed: {where}")
+        if sealed.flasher != __version__:
+            problems.append(
+                f"it was made by flasher {printable(sealed.flasher)}, and this is {__version__}:"
+                " that version tells whether the page was changed"
+            )
+    found, remarks = _in_records(store, sealed)
+    last = life.runs[-1].run
+    return CheckedCertificate(
+        last.serial,
+        last.part,
+        last.state,
+        int(last.run_id),
+        sealed.station,
+        _shown_key(sealed.key),
+        f"{made_at:%Y-%m-%d %H:%M} UTC",
+        (*problems, *found),
+        remarks,
+    )
+
+
+def _shown_key(key: str) -> str:
+    try:
+        return fingerprint(key)
+    except ValueError:
+        return "none"
+
+
+# -- in these records ------------------------------------------------------------------------------
+
+
+def _in_records(store: Store, sealed: Sealed) -> tuple[list[str], tuple[str, ...]]:
+    """What of it is not so in the records, and what came after it."""
+    run_id = RunId(sealed.row["run_id"])
+    head = store.read.head_of(run_id)
+    if head is None or (head.station, head.number, head.hash) != (
+        sealed.station, sealed.row["number"], sealed.row["hash"],
+    ):  # fmt: skip
+        return ["the run is not in these records"], ()
+    problems = []
+    if head.key != sealed.key:
+        problems.append("it is not signed with the key that the station had in these records")
+    examined = store.examine_run(run_id)
+    problems += [f"{each.where} in the records: {each.what}" for each in examined.problems]
+    if problems:
+        return problems, ()
+    last = store.read.run(run_id)
+    if sealed.life().last != last:
+        problems.append("it does not say what the records say of the run")
+    runs = [each.run for each in store.read.unit(last.run.serial, last.run.part).runs]
+    before = [plain(run) for run in runs if run.run_id < run_id]
+    carried = [dict(each) for each in sealed.earlier]
+    if before[-EARLIER_SHOWN:] != carried or sealed.earlier_left_out != max(
+        0, len(before) - EARLIER_SHOWN
+    ):
+        problems.append("it does not say what the records say of the earlier runs of the unit")
+    later = [run for run in runs if run.run_id > run_id]
+    remarks = tuple(
+        f"the unit had a later run: {run.run_id}, {run.begun_at:%Y-%m-%d}, {run.state.value}"
+        for run in later[-1:]
+    )
+    return problems, remarks
+
+
+def _check_code(store: Store, text: str) -> CheckedCertificate:
+    """Check the text of a QR code: it says which run, and its hashes and signature."""
+    run_line = re.search(r"\nrun (\d{1,18}) ", text)
+    try:
+        run_id = RunId(int(run_line[1])) if run_line else RunId(0)
+        details = store.read.run(run_id)
+    except NotFoundError as error:
+        raise UnprovenError(
+            "The run of this code is not in these records.",
+            cause="the code is of other records, or was changed",
+        ) from error
+    problems = []
+    head = store.read.head_of(run_id)
+    if head is None:
+        problems.append("the run is not signed in these records")
+    else:
+        expected = code_lines(details, store.read.record_sha256(run_id), head)
+        found = text.split("\n")
+        problems += [
+            f"the code says '{printable(said)}', the records '{printable(line)}'"
+            for line, said in zip(expected, found, strict=True)
+            if line != said
+        ]
+        if not is_signed(head.hash, head.signature, head.key):
+            problems.append("the signature in the records is not that of the station's key")
+    examined = store.examine_run(run_id)
+    problems += [f"{each.where} in the records: {each.what}" for each in examined.problems]
+    run = details.run
+    return CheckedCertificate(
+        run.serial,
+        run.part,
+        run.state,
+        int(run.run_id),
+        head.station if head else "",
+        _shown_key(head.key) if head else "none",
+        "",
+        tuple(problems),
+        (),
+    )
+
+
+# -- the page --------------------------------------------------------------------------------------
+
+
+class _Text(HTMLParser):
+    """The text of a page that a reader sees, and the heads of its tables."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.text: list[str] = []
+        self.heads: list[str] = []
+        self._hidden = 0
+        self._is_head = False
+
+    def handle_starttag(self, tag: str, attrs: object) -> None:
+        self._hidden += tag in _HIDDEN
+        if tag == "thead":
+            self._is_head = True
+            self.heads.append("")
+
+    def handle_endtag(self, tag: str) -> None:
+        self._hidden -= tag in _HIDDEN
+        self._is_head = self._is_head and tag != "thead"
+
+    def handle_data(self, data: str) -> None:
+        if not self._hidden:
+            self.text.append(data)
+            if self._is_head:
+                self.heads[-1] += data
+
+
+def _text_of(page: str) -> str:
+    parser = _Text()
+    parser.feed(page)
+    return _bare("".join(parser.text))
+
+
+def _bare(text: str) -> str:
+    """Text without what a printer may change: spaces, breaks of lines, ligatures."""
+    return re.sub(r"\s", "", unicodedata.normalize("NFKC", text))
+
+
+def _difference(expected: str, found: str) -> str:
+    """Where two texts differ first, in words."""
+    if expected == found:
+        return "its text is the same, its markup is another"
+    at = next(
+        (at for at, pair in enumerate(zip(expected, found, strict=False)) if pair[0] != pair[1]),
+        min(len(expected), len(found)),
+    )
+    begin = max(0, at - _AROUND)
+    said, signed = (printable(each[begin : at + _AROUND]) for each in (found, expected))
+    return f"it says '{said}', the station signed '{signed}'"
+
+
+def _difference_of_print(page: str, pages: list[str]) -> str:
+    """Where a print differs from the page; empty where it does not. What a browser prints at the
+    edges of the paper and heads of tables that go on are no part of the page.
+    """
+    parser = _Text()
+    parser.feed(page)
+    expected = _bare("".join(parser.text))
+    heads = [_bare(each) for each in parser.heads]
+    title = re.search(r"<title>(.*?)</title>", page, re.DOTALL)
+    edge = _edge(title[1] if title else "")
+    found = ""
+    for number, text in enumerate(pages):
+        lines = text.strip().split("\n")
+        for _ in range(_EDGE_LINES):
+            if lines and edge.fullmatch(lines[0].strip()):
+                del lines[0]
+            if lines and edge.fullmatch(lines[-1].strip()):
+                del lines[-1]
+        more = _bare("".join(lines))
+        for head in heads if number else ():
+            if more.startswith(head) and not expected.startswith(head, len(found)):
+                more = more.removeprefix(head)
+                break
+        found += more
+    return "" if expected == found else _difference(expected, found)
+
+
+def _edge(title: str) -> re.Pattern[str]:
+    """What a browser prints at the edges of the paper: date, title, address, number of the page."""
+    said = re.escape(unicodedata.normalize("NFKC", title))
+    return re.compile(rf"(?:[\d/.,:\- ]+|AM|PM|{said}|about:blank|\w{{2,5}}://\S+|\d+/\d+|\s)+")
+
+
+def _pages_of_pdf(data: bytes) -> Iterator[str]:
+    """The text of each page. Raises UsageError for a file that cannot be read."""
+    from pypdf import PdfReader  # noqa: PLC0415  only for a PDF
+    from pypdf.errors import PyPdfError  # noqa: PLC0415
+
+    try:
+        for page in PdfReader(io.BytesIO(data)).pages:
+            yield unicodedata.normalize("NFKC", page.extract_text())
+    except (PyPdfError, ValueError, KeyError, TypeError, RecursionError, AttributeError) as error:
+        raise UsageError(
+            "The PDF cannot be read.",
+            remedy="Print the certificate to a PDF in a browser, or name its HTML file.",
+        ) from error

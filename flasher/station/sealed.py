@@ -1,0 +1,212 @@
+"""What a certificate carries: the content of its run, canonical, with the audit row that states the
+digests of that content, and the station's signature of the row.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+import re
+import zlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from datetime import datetime
+from enum import Enum
+from typing import Any, Final
+
+from pydantic import TypeAdapter, ValidationError
+
+from flasher.errors import UsageError
+from flasher.station.records import chain
+from flasher.station.records.errors import UnprovenError
+from flasher.station.records.heads import Head
+from flasher.station.records.model import RunDetails, RunRecord, RunState, UnitLife, UnitState
+from flasher.station.records.signatures import is_signed
+
+CERTIFICATE_MAX_SIZE: Final = 8 * 1024 * 1024
+"""In bytes, of a file with a certificate."""
+_BEGIN: Final = "-----BEGIN FLASHER CERTIFICATE-----"
+_END: Final = "-----END FLASHER CERTIFICATE-----"
+_LINE: Final = 96
+_CARRIED: Final = re.compile(r"(?!\d+/\d+$)[A-Za-z0-9+/=]+")
+"""Other lines are what a browser printed where the paper ended, as "1/2"."""
+_MAX_SIZE: Final = 4 * 1024 * 1024
+"""In bytes, of what is carried."""
+LEFT_OUT: Final = ("recipe", "claim")
+"""The text of the recipe is not given away with each certificate; a claim follows from the run."""
+
+
+@dataclass(frozen=True)
+class Sealed:
+    """The content of a certificate."""
+
+    flasher: str
+    made_at: str
+    """When the page was made."""
+    is_kept: bool
+    is_beside: bool
+    examined_at: str
+    """As in `certificate.Proof`."""
+    content: dict[str, Any]
+    """The rows of the run and of all that it names, by what they are."""
+    recipe: dict[str, str]
+    """Its name, revision and SHA-256; the rest of it is in the records."""
+    row: dict[str, Any]
+    """The audit row."""
+    station: str
+    signature: str
+    key: str
+    earlier: tuple[dict[str, Any], ...]
+    """Earlier runs of the unit; the signature does not cover them, the records tell."""
+    earlier_left_out: int
+
+    @property
+    def head(self) -> Head:
+        row = self.row
+        return Head(self.station, row["number"], row["at"], row["hash"], self.signature, self.key)
+
+    @property
+    def digests(self) -> Mapping[str, str]:
+        """What the audit row states."""
+        found = chain.data_of(self.row["data"]).get("digests")
+        return found if isinstance(found, dict) else {}
+
+    @property
+    def record_sha256(self) -> str:
+        return chain.digest(dict(self.digests))
+
+    def wrong(self) -> list[str]:
+        """What of it is not as the station signed it, in words; empty where all is."""
+        row = self.row
+        if chain.row_hash(row) != row["hash"]:
+            return ["the audit row in it was changed"]
+        if not is_signed(row["hash"], self.signature, self.key):
+            return ["the signature is not that of the key in it"]
+        found = {name: chain.digest(value) for name, value in self.content.items()}
+        found["claim"] = chain.digest(chain.claim_of(self.content))
+        words = chain.OWN | chain.NAMED
+        wrong = [
+            words.get(part, part)
+            for part, stated in self.digests.items()
+            if part != "recipe" and found.get(part) != stated
+        ]
+        if not self.digests or row["run_id"] != self.content["run"]["id"]:
+            wrong.append("which run it is about")
+        return [f"it was changed after it was signed: {', '.join(wrong)}"] if wrong else []
+
+    def life(self) -> UnitLife:
+        """The unit as the page shows it. Raises ValidationError, KeyError, TypeError."""
+        details = details_of_content(self.content, self.recipe)
+        runs = [RunDetails(_RUN.validate_python(run), (), (), (), ()) for run in self.earlier]
+        state = UnitState.after(details.run.state)
+        return UnitLife(details.run.serial, details.run.part, state, (*runs, details))
+
+
+@dataclass(frozen=True)
+class CheckedCertificate:
+    """What was found about a certificate."""
+
+    serial: str
+    part: str
+    state: RunState
+    run_id: int
+    station: str
+    """Which signed it."""
+    fingerprint: str
+    """Of the key."""
+    made_at: str
+    """Empty where it does not say."""
+    problems: tuple[str, ...]
+    """Empty where it is signed by that station, unchanged, and in these records."""
+    remarks: tuple[str, ...]
+    """What a person should know, though nothing is wrong with it."""
+
+
+_TYPE: Final = TypeAdapter(Sealed)
+_DETAILS: Final = TypeAdapter(RunDetails)
+_RUN: Final = TypeAdapter(RunRecord)
+
+
+def plain(run: RunRecord) -> dict[str, Any]:
+    """A run as values of JSON, from which it can be read again."""
+    return {
+        name: value.value
+        if isinstance(value, Enum)
+        else value.isoformat()
+        if isinstance(value, datetime)
+        else value
+        for name, value in asdict(run).items()
+    }
+
+
+def details_of_content(content: Mapping[str, Any], recipe: Mapping[str, str]) -> RunDetails:
+    """A run of the rows that are carried. Raises ValidationError, KeyError, TypeError."""
+    run, unit = content["run"], content["unit"]
+    ended_s, begun_s = run["ended_monotonic_s"], run["begun_monotonic_s"]
+    images = {each["id"]: each for each in content["artifacts"]}
+    facts = {
+        **{name: unit[name] for name in ("serial", "part")},
+        "run_id": run["id"],
+        "lot": content["lot"] and content["lot"]["name"],
+        "duration_s": None if ended_s is None else ended_s - begun_s,
+        **{name: content[name]["name"] for name in ("station", "socket", "operator")},
+        "recipe": recipe["name"],
+        "recipe_revision": recipe["revision"],
+        "recipe_sha256": recipe["sha256"],
+        "verified": run["verification_reached"],
+    }
+    targets = [
+        each
+        | {
+            "image": images[each["artifact_id"]]["name"],
+            "image_sha256": images[each["artifact_id"]]["sha256"],
+            "version": images[each["artifact_id"]]["version"],
+        }
+        for each in content["targets"]
+    ]
+    steps = [
+        each | {"measurements": [m for m in content["measurements"] if m["step_id"] == each["id"]]}
+        for each in content["steps"]
+    ]
+    return _DETAILS.validate_python(
+        {
+            "run": run | facts,
+            "targets": targets,
+            "steps": steps,
+            "writes": [each | {"write_id": each["id"]} for each in content["writes"]],
+            "attachments": content["attachments"],
+        }
+    )
+
+
+def as_text(sealed: Sealed) -> str:
+    """Lines that survive printing."""
+    data = chain.canonical(_TYPE.dump_python(sealed, mode="json")).encode("ascii")
+    text = base64.b64encode(zlib.compress(data, 9)).decode("ascii")
+    lines = [text[at : at + _LINE] for at in range(0, len(text), _LINE)]
+    return "\n".join([_BEGIN, *lines, _END])
+
+
+def sealed_in(text: str) -> Sealed:
+    """What a text carries. Raises UsageError where it carries nothing, UnprovenError where that was
+    changed.
+    """
+    start = text.find(_BEGIN)
+    stop = text.find(_END, start)
+    if start < 0 or stop < 0:
+        raise UsageError(
+            "The file carries no signed certificate.",
+            remedy="Name a certificate as flasher wrote or printed it, with its annex.",
+        )
+    lines = (line.strip() for line in text[start + len(_BEGIN) : stop].splitlines())
+    carried = "".join(line for line in lines if _CARRIED.fullmatch(line))
+    try:
+        data = base64.b64decode(carried, validate=True)
+        found = zlib.decompressobj().decompress(data, _MAX_SIZE)
+        return _TYPE.validate_python(json.loads(found))
+    except (binascii.Error, zlib.error, ValueError, ValidationError, RecursionError) as error:
+        raise UnprovenError(
+            "The certificate was changed: what it carries cannot be read.",
+            remedy="Ask for the certificate anew.",
+        ) from error
