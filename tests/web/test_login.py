@@ -576,7 +576,9 @@ def test_a_stream_ends_with_its_sign_in() -> None:
             await asyncio.sleep(0)
         place.login.sign_ins.end_all(place.login.sign_ins.listed()[0])
         place.said.put_nowait("after")
-        await looking
+        for _ in range(20):
+            await asyncio.sleep(0)
+        assert looking.done()
 
     in_own_loop(look())
     assert not any(b"after" in each.get("body", b"") for each in sent)
