@@ -501,3 +501,30 @@ def test_a_file_has_so_many_lines_and_no_more(
     monkeypatch.setattr(records, "LINES_MAX", text.count(b"\n") - 1)
     with pytest.raises(ImageError, match="it has more than"):
         load(path)
+
+
+def test_a_raw_binary_may_end_with_the_last_address(tmp_path: Path) -> None:
+    path = tmp_path / "top.bin"
+    path.write_bytes(b"\1\2" * 8)
+    assert load(path, base=0xFFFF_FFF0).size_bytes == 16
+    with pytest.raises(UsageError, match="does not end below 4 GiB with the base 0xFFFFFFF1"):
+        load(path, base=0xFFFF_FFF1)
+
+
+def test_a_part_in_the_middle_of_a_raw_binary_is_read_and_no_more(tmp_path: Path) -> None:
+    path = tmp_path / "whole.bin"
+    path.write_bytes(bytes(range(256)))
+    part = load(path, base=0x1000, range_=(0x1010, 0x1020), allow_outside_vector=True)
+    assert (part.data, part.base) == (bytes(range(16, 32)), 0x1010)
+    path.write_bytes(bytes(IMAGE_MAX_SIZE + 300))
+    with pytest.raises(ImageError, match=f" {IMAGE_MAX_SIZE + 44} bytes to send"):
+        load(path, base=0x1000, range_=(0x1100, 0x8000_0000))
+
+
+def test_a_limit_of_zero_fills_no_gap() -> None:
+    with pytest.raises(ImageError):
+        load(SAMPLES / "bad" / "gap.hex", fill_gaps_up_to=0)
+    for name in ("bms.hex", "bms.bin"):
+        assert load(SAMPLES / name, fill_gaps_up_to=0).filled_bytes == 0
+    with pytest.raises(UsageError, match="filled up to -1 bytes"):
+        load(SAMPLES / "bms.hex", fill_gaps_up_to=-1)

@@ -71,6 +71,14 @@ def test_an_image_with_texts_of_several_devices_names_them_all() -> None:
     assert named_targets(b"BMS\0" + VERSION + bytes(200) + b"\0WMC_UPD\0") == {BMS, WMC}
 
 
+@each("distance, counts", [(61, True), (62, False)])
+def test_the_last_byte_that_belongs_to_a_version(distance: int, *, counts: bool) -> None:
+    assert bool(named_targets(VERSION + bytes(distance) + b"BMS")) is counts
+    assert not named_targets(VERSION + bytes(60) + b"BMSX")
+    assert not named_targets(VERSION + bytes(61) + b"BMSX")
+    assert named_targets(bytes(3) + b"BMS" + bytes(50) + VERSION) == {BMS}
+
+
 def test_random_code_names_nothing() -> None:
     code = random.Random(1).randbytes(1 << 20)
     assert named_targets(code) == frozenset()

@@ -11,11 +11,11 @@ import pytest
 from flasher.errors import ImageError, UsageError
 from flasher.image.image import Image
 from flasher.image.load import load
-from flasher.image.plan import Plan, plan
+from flasher.image.plan import Plan, make_plan, plan
 from flasher.protocol.bittime import frame_bits
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import Packet, decode
-from flasher.protocol.spec import BMS, IMAGE_MAX_SIZE, OBC, TARGETS, WMC, Target
+from flasher.protocol.spec import BMS, IMAGE_MAX_SIZE, MOTINOVA, OBC, TARGETS, WMC, Target
 from flasher.protocol.wire import Message, Reassembler, encode, split
 from tests.loops import each
 
@@ -47,6 +47,9 @@ def test_the_document_s_own_example_comes_to_613_packets() -> None:
     # feedback 2, boot version 3, request transfer 2, complete 2, each ACK 2
     assert result.device_frames == 2 + 3 + 2 + 2 + 613 * 2
     assert result.frames == result.host_frames + result.device_frames
+    # reset, update command, end of transfer, and the packets
+    assert result.host_messages == 3 + 613
+    assert sum(result.packet_bits) / BITRATE_BPS < result.transfer_wire_s < result.wire_s
     # the same messages in bytes: 16 + 22 + 12, 14 + 20 + 13 + 13, and 144 + 13 a packet
     assert result.bytes_on_wire == 50 + 60 + 613 * 157
     # 18 full frames of 111 bits at the least and 135 at the most, and 2 frames of ACK
@@ -160,3 +163,25 @@ def test_a_bit_rate_is_positive(bitrate_bps: int) -> None:
 def test_plans_of_the_same_image_are_equal() -> None:
     assert made(300) == made(300)
     assert made(300) != made(300, OBC)
+
+
+@each("total", [1, 2, 1024, 1025, 1026])
+def test_each_packet_has_its_seconds_on_the_wire(total: int) -> None:
+    result = made(total * 128)
+    seconds = [result.packet_wire_s(number) for number in range(1, total + 1)]
+    assert len(result.packet_bits) == total
+    assert min(seconds) > 18 * 47 / BITRATE_BPS
+
+
+def test_one_bit_a_second_is_a_bit_rate() -> None:
+    assert plan(Image.from_bytes(b"\1"), BMS, 1).wire_s > 1000
+
+
+def test_a_plan_by_names_takes_the_bit_rate_of_the_dialect_unless_one_is_given() -> None:
+    image = Image.from_bytes(bytes(200))
+    assert make_plan(image, "bms") == plan(image, BMS, 250_000)
+    assert make_plan(image, "pbu", "welling", bitrate_bps=500_000) == plan(image, OBC, 500_000)
+    assert make_plan(image, WMC, MOTINOVA, has_upgrade=True).bitrate_bps == 125_000
+    for dialect, has_upgrade in ((MOTINOVA, None), ("welling", False)):
+        with pytest.raises(UsageError, match="dialect has no upgrade"):
+            make_plan(image, "bms", dialect, has_upgrade=has_upgrade)

@@ -94,3 +94,30 @@ def test_seven_bytes_have_no_vector_table() -> None:
 @each("name", ["bms.hex", "bms.bin", "wmc.s19", "obc.elf", "station/bms.bin"])
 def test_every_good_sample_is_plausible(name: str) -> None:
     check_plausible(load(SAMPLES / name))
+
+
+@each(
+    "data, text, is_certain",
+    [
+        (b"\0\0", "one byte again and again (0x00)", True),
+        (b"\1\1", "one byte again and again (0x01)", True),
+        (b"\1", "too short to begin with a vector table", False),
+        (b"MZ" + bytes(50) + b"\1" * 150, "no Cortex-M vector table", False),
+        (b"MZ" + bytes(58) + struct.pack("<I", 1 << 24) + b"PE\0\0" + bytes(9), "no Cortex", False),
+        (bytes(58) + b"\1\1" + struct.pack("<I", 64) + b"PE\0\0" + bytes(60), "no Cortex", False),
+        (b"\xe4" * 9 + b"line\n", "no Cortex", False),
+        (b"\xe4b" * 127 + b"\n\xe4", "a text", True),
+        (b"\xe4b" * 127 + b"\n", "no Cortex", False),
+        (b"\xe4b" * 200, "no Cortex", False),  # no line in it
+    ],
+)  # fmt: skip
+def test_what_is_certain_and_what_is_only_unlikely(
+    data: bytes, text: str, *, is_certain: bool
+) -> None:
+    found = doubt(Image.from_bytes(data))
+    assert found is not None
+    assert text in found.text
+    assert found.is_certain is is_certain
+    with pytest.raises(ImageError) as refused:
+        check_plausible(Image.from_bytes(data))
+    assert (refused.value.cause == "the wrong file") is is_certain
