@@ -6,7 +6,8 @@ annotations, decorators, bases, assertions (`raise RuntimeError` is one), `__all
 of attributes in `__init__` (their values are changed), the order of the table's moves. The checkout
 stays as it is: mutants live in a copy in a temporary folder. The tests that run a changed line are
 tried, the quickest first. A mutant is killed by a failed test, and by far more computing time or
-memory than its package's tests need.
+memory than its package's tests need. Tests marked `no_cover` are left out: they play random worlds
+and take longer than all others together.
 
 `mutants_excused.txt` lists the mutants that nothing can tell from the original, with reasons.
 """
@@ -412,7 +413,7 @@ class Ground:
                 if name.partition(".")[0] in {"flasher", "tests"}:
                     del sys.modules[name]
             words = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
-            words += ["-W", "ignore:Module already imported"]
+            words += ["-m", "not no_cover", "-W", "ignore:Module already imported"]
             words += ["--basetemp", str(self._folder / "temporary"), "--timeout", str(self._test_s)]
             sys.exit(int(pytest.main([*words, *tests], plugins=[plugin()])))
 
