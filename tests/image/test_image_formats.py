@@ -277,3 +277,23 @@ def test_no_single_changed_character_gives_other_bytes(
             else:
                 assert data == (bytes(range(1, 9)), 0x0800_0010), (at, char)
     assert refused > 20 * len(text)
+
+
+@each(
+    "line, what",
+    [
+        (":0G", "':0G' is not made of pairs of hex digits"),
+        (":" + "Z" * 39, f"':{'Z' * 39}' is not made of pairs of hex digits"),
+        (":" + "Z" * 40, f"':{'Z' * 39}...' is not made of pairs of hex digits"),
+        (":00000001", "':00000001' does not have the length that it states"),
+        (":00000001FE", "the check sum is FE, computed FF"),
+    ],
+)
+def test_a_damaged_line_is_shown_and_not_more_of_it_than_fits(
+    line: str, what: str, tmp_path: Path
+) -> None:
+    with pytest.raises(ImageError) as refused:
+        load(write(tmp_path, "bad.hex", f"{line}\n"), format="hex")
+    assert refused.value.what.endswith(f"bad.hex is a damaged Intel HEX file: {what}")
+    assert refused.value.where == "line 1"
+    assert refused.value.cause == "damaged while it was copied, or edited by hand"
