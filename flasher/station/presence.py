@@ -66,6 +66,8 @@ class TargetWatcher:
         """Announcements that began after a pause, or after the application was heard."""
         self.is_in_bootloader = False
         """Nothing but announcements was heard since it announced itself."""
+        self.known_at = float("-inf")
+        """When its application was heard, or an announcement to its end."""
         self._paused_s = 0.0
         """The last pause between announcements, and when it ended."""
         self._paused_at = float("-inf")
@@ -78,7 +80,7 @@ class TargetWatcher:
         if frame.can_id in self._own_ids:
             self.heard_at = now
             if frame.can_id != self._boot.can_id:
-                self.is_in_bootloader = False
+                self.is_in_bootloader, self.known_at = False, now
         if frame.can_id == self._boot.can_id:
             for found in self._boot.feed(frame.data, now):
                 row = decode(found) if isinstance(found, Message) else None
@@ -105,7 +107,8 @@ class TargetWatcher:
         if pause_s > PAUSE_S:
             self._paused_s, self._paused_at = pause_s, now
         self.announcements += 1
-        self.announced_at, self.is_in_bootloader = now, True
+        self.announced_at = self.known_at = now
+        self.is_in_bootloader = True
 
     def _take(self, message: Message) -> None:
         """A message that may be the answer."""
@@ -165,6 +168,20 @@ class Presence:
     def _forget_serials(self) -> None:
         for watcher in self._watchers:
             watcher.serial = None
+
+    @property
+    def known_at(self) -> float:
+        """When it was known last whether the unit that is heard has had power all the time."""
+        return max(watcher.known_at for watcher in self._watchers)
+
+    @property
+    def has_application(self) -> bool:
+        """True when a unit is there whose application was heard since its power came."""
+        return bool(self.is_there) and not self._told_in_bootloader
+
+    def ask_now(self) -> None:
+        """Let the next `probe` ask, although its time has not come."""
+        self._probed_at = None
 
     def probe(self, now: float) -> list[Frame]:
         """What is to be sent now: a question to each target that can be asked, in its time."""

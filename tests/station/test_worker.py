@@ -15,6 +15,8 @@ from flasher.api import Connection
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.errors import UsageError
+from flasher.mock.model import MockDevice
+from flasher.protocol.frame import Frame
 from flasher.protocol.spec import WELLING
 from flasher.station.config import MockUnits
 from flasher.station.events import StepStarted
@@ -38,8 +40,9 @@ from flasher.station.messages import (
     WorkerSetup,
 )
 from flasher.station.records.model import RunId, RunKind, RunState, WriteId
-from flasher.station.virtual_units import VirtualSocket
+from flasher.station.virtual_units import Health, VirtualSocket, make_device
 from flasher.station.worker import StationPipe, Worker, load_same
+from tests.loops import each
 from tests.station.factory import DAY, USUAL, make_recipe
 from tests.station.unit_bench import WRITES
 
@@ -224,3 +227,94 @@ def test_an_adapter_that_goes_is_told_once_and_opened_again(
     kinds = [type(m).__name__ for m in socket.channel.sent if not isinstance(m, Beat)]
     assert kinds == ["Ready", "AdapterDown", "Ready"]
     assert socket.channel.of(AdapterDown)[0].reason
+
+
+# -- the unit of the label ------------------------------------------------------------------------
+
+
+class RealSocket(Socket):
+    """A socket without virtual units: a battery talks on its bus, and a test pulls it out."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.clock = VirtualClock()
+        self.bus = SimulatedBus(WELLING.bitrate_bps, self.clock)
+        self.bus.attach(self.unit("NONE"))
+
+    def unit(self, number: str) -> MockDevice:
+        target = self.recipe.targets[0]
+        return make_device(target.target, WELLING, Health.GOOD, target.release, number)
+
+    def answer(self, channel: FakeChannel, message: FromWorker) -> None:
+        if isinstance(message, PresenceChanged):
+            if message.is_there and message.serial is not None and not channel.of(Finished):
+                self.begin()
+        else:
+            super().answer(channel, message)
+
+    def begin(self) -> None:
+        order = RunOrder(RunId(1), RunKind.PRODUCTION, "W2605002", DAY)
+        self.channel.waiting.append(Begin(order, self.trace))
+
+    def work(self) -> Finished | None:
+        connection = Connection(self.bus.link(), self.clock, "a bus")
+        Worker(self.setup, self.recipe, self.line, connection).work()
+        ended: Finished = self.channel.of(Finished)[-1]
+        return ended
+
+
+class Pulled(RealSocket):
+    """The label is scanned, and its unit was pulled out a moment before; the next one follows."""
+
+    gap_s = 0.3
+
+    def begin(self) -> None:
+        (old,) = (each.engine for each in self.bus._devices)
+        self.bus.detach(old)
+        self.other = Late(self.unit("NONE"), self.clock.now() + self.gap_s)
+        self.bus.attach(self.other)
+        super().begin()
+
+
+class Late:
+    """A unit that is put in at a time; an engine."""
+
+    def __init__(self, device: MockDevice, at_s: float) -> None:
+        self.device, self.at_s = device, at_s
+        self.is_in = False
+        device.power_cut(0.0)
+
+    def receive(self, frame: Frame, now: float) -> None:
+        if self.is_in:
+            self.device.receive(frame, now)
+
+    def tick(self, now: float) -> None:
+        if not self.is_in and now >= self.at_s:
+            self.is_in = True
+            self.device.power_on(now)
+        elif self.is_in:
+            self.device.tick(now)
+
+    def deadline(self) -> float | None:
+        return self.device.deadline() if self.is_in else self.at_s
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.device, name)
+
+
+def test_a_unit_that_stays_is_run_at_once(tmp_path: Path) -> None:
+    ended = RealSocket(tmp_path).work()
+    assert ended is not None
+    assert ended.result.outcome is RunState.PASS, ended.result.text
+
+
+@each("gap_s", [0.3, 0.5, 1.0, 1.8, 3.5])
+def test_a_label_is_not_for_the_unit_that_is_put_in_after_it(tmp_path: Path, gap_s: float) -> None:
+    folder = tmp_path / str(gap_s)
+    folder.mkdir()
+    socket = Pulled(folder)
+    socket.gap_s = gap_s
+    ended = socket.work()
+    assert ended is not None
+    assert ended.result.code == "UNIT_CHANGED", ended.result.text
+    assert socket.other.device.program_count == 0
