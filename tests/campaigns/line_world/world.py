@@ -41,6 +41,8 @@ WINDOW_S: Final = 0.1
 """The station looks at its processes at least so often."""
 HAND_S: Final = 0.1
 """The fastest hand takes so long from pulling a unit to putting another one in."""
+CALM_S: Final = 3.0
+"""After this time a unit that was put in runs its application, or announces itself for good."""
 GREEN_S: Final = 5.0
 """A tile that is green for a unit which is not in its socket has to change within this time."""
 NONE: Final = "NONE"
@@ -79,10 +81,13 @@ class Bay:
     changed_at: float = 0.0
     """Since when the same unit is in it, and the station can see it."""
     emptied_at: float = float("-inf")
+    disturbed_at: float = 0.0
+    """When a hand, a failure or sleep last touched its unit or its process."""
     has_spoken: bool = False
     """The unit sent something since then."""
     run: str = ""
     """The label of the run that the station works on."""
+    run_at: float = 0.0
     is_working: bool = False
     """The process works on a run."""
     heard: dict[str, None] = field(default_factory=dict)
@@ -142,6 +147,7 @@ class World:
         self._answers: list[StationEvent] = []
         self._power_at: dict[str, float] = {}
         self._pulled_at: dict[int, float] = {}
+        self._last_end = ""
         self._scanning: tuple[str, str] | None = None
         self._begin_station()
 
@@ -222,7 +228,7 @@ class World:
     def _launch(self, setup: WorkerSetup) -> Process:
         bay = self.bays[setup.socket]
         bay.is_working = False
-        bay.changed_at = self.now
+        bay.changed_at = bay.disturbed_at = self.now
         bay.process = Process(
             setup, self.bench.recipe, bay.bus, lambda message: self._sent(bay, message)
         )
@@ -255,7 +261,8 @@ class World:
             case SocketChanged():
                 self.bays[event.socket].shown = event
             case RunStarted():
-                self.bays[event.socket].run = event.serial
+                bay = self.bays[event.socket]
+                bay.run, bay.run_at = event.serial, self.now
                 self.seen["runs"] += 1
                 for person in self.people.values():
                     if person.label is not None and label_of(person.label) == event.serial:
@@ -295,6 +302,7 @@ class World:
         if self.awaits_another(bay, act.unit) or round(moved_s, 6) < HAND_S:
             return False
         bay.unit, bay.changed_at, bay.has_spoken = unit, self.now, False
+        bay.disturbed_at = self.now
 
         def sent(_now: float) -> None:
             bay.has_spoken = True
@@ -322,7 +330,7 @@ class World:
         if bay is None or bay.unit is None:
             return False
         unit, bay.unit, bay.changed_at = bay.unit, None, self.now
-        bay.emptied_at = self._pulled_at[act.unit] = self.now
+        bay.emptied_at = bay.disturbed_at = self._pulled_at[act.unit] = self.now
         bay.bus.pull(unit)
         unit.on_sent = lambda _now: None
         unit.sleeps_until = float("-inf")
@@ -446,6 +454,7 @@ class World:
         if unit is None or bay is None:
             return False
         unit.sleeps_until = self.now + act.seconds
+        bay.disturbed_at = unit.sleeps_until
         return True
 
     def _dip(self, act: stories.Dip) -> bool:
@@ -456,7 +465,7 @@ class World:
             bay.bus.pull(bay.unit)
             bay.unit.engine.power_cut(self.now)
             bay.bus.attach(bay.unit)
-        self._power_at[act.socket] = self.now + act.seconds
+        self._power_at[act.socket] = bay.disturbed_at = self.now + act.seconds
         return True
 
     def _switch_on(self, bay: Bay) -> None:
@@ -501,9 +510,17 @@ class World:
 
     def _end(self, bay: Bay, event: RunEnded) -> None:
         bay.run = ""
-        self.seen[f"{event.outcome.value} {event.code}"] += 1
+        self._last_end = f"{event.outcome.value} {event.code}"
+        self.seen[self._last_end] += 1
         if event.code == "INTERNAL":
             raise Violation("CRASH", f"the run of {event.serial} ended with a bug: {event.text}")
+        is_calm = bay.disturbed_at < bay.run_at - CALM_S
+        if event.code == "UNIT_CHANGED" and is_calm:
+            raise Violation(
+                "ACCUSED",
+                f"{event.serial} in {bay.name} was touched by nobody, and is said to be another"
+                f" unit: {event.text}",
+            )
         if event.outcome is not RunState.PASS:
             return
         self.passed.add(event.serial)
@@ -555,6 +572,8 @@ class World:
         if self.now - bay.changed_at < GREEN_S:
             return
         unit = bay.unit
+        if unit is None and self.setup.line.recipe == "writes":
+            raise Violation("GREEN", f"{bay.name} is empty and shows PASS of {shown.serial}")
         if unit is not None and unit.label != shown.serial and bay.has_spoken:
             raise Violation(
                 "GREEN",
@@ -583,12 +602,12 @@ class World:
                 person.card = person.label = None
                 if person.source != "mounted":
                     self._scan("CANCEL", person)
-            for each in self.units:
-                self._pull(stories.Pull(unit=each))
+            for other in self.units:
+                self._pull(stories.Pull(unit=other))
             self.go_to(self.now + _READY_S)
-            if attempt:
-                for name in self.bays:
-                    self._scan(f"FREE {name}", self._careful)
+            for each in self.bays.values():
+                if attempt or self.awaits_another(each, number):
+                    self._scan(f"FREE {each.name}", self._careful)
             bay = self.bays[list(self.bays)[attempt % len(self.bays)]]
             if not self._put(stories.Put(unit=number, socket=bay.name)):
                 self._stuck(number, f"{bay.name} waits for another unit")
@@ -606,11 +625,20 @@ class World:
             said = "; ".join(f"{e.code} {e.reason} {e.remedy}" for e in refusals)
             if self.seen["runs"] > runs:
                 self._await_ends()
-                return
+                if label in self.passed or not self._has_to_pass(number):
+                    return
+                said = f"its run ended with {self._last_end}"
         self._stuck(number, said)
 
+    def _has_to_pass(self, number: int) -> bool:
+        """A good unit passes, whatever befell it before."""
+        unit = next(each for each in self.setup.units if each.label == number)
+        writes = self.setup.line.recipe == "writes"
+        numbers = ("none", "own", "maker") if writes else ("none", "own")
+        return unit.answers and unit.number in numbers
+
     def _stuck(self, number: int, said: str) -> NoReturn:
-        raise Violation("STUCK", f"no way of scans leads to a run of {label_of(number)}: {said}")
+        raise Violation("STUCK", f"no way of scans leads {label_of(number)} to its end: {said}")
 
     @property
     def _careful(self) -> PersonAtWork:
