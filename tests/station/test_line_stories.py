@@ -8,8 +8,12 @@ from collections.abc import Callable
 
 import pytest
 
+from flasher.station import codes
 from flasher.station.socket import UNNAMED, Socket, Source
 from flasher.station.station import Station
+from flasher.station.unit_run import UnitRun
+from flasher.station.unit_steps import UnitSteps
+from flasher.station.unit_target import StepFailedError
 from tests.campaigns.line_world.play import Played, draw, play, shrink
 from tests.campaigns.line_world.stories import Story
 
@@ -25,8 +29,8 @@ CARD_HERE_LABEL_THERE = (
 )
 PASSED_AND_EXCHANGED = (
     "line sockets=2 ; unit label=1 ; unit label=2 ; person name=jo ; @3.0 put unit=1 socket=A ;"
-    " @4.0 card by=jo unit=1 ; @5.0 label by=jo unit=1 ; @12.0 pull unit=1 ;"
-    " @12.3 put unit=2 socket=A"
+    " @7.0 card by=jo unit=1 ; @8.0 label by=jo unit=1 ; @14.0 pull unit=1 ;"
+    " @14.3 put unit=2 socket=A"
 )
 STORIES = {
     "pulled in its flash": PULLED_IN_ITS_FLASH,
@@ -133,6 +137,19 @@ def see_nobody_come(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Socket, "hear", hear)
 
 
+def accuse_everybody(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(
+        UnitRun, "_changed", lambda *_: StepFailedError(codes.UNIT_CHANGED, "It differs.")
+    )
+
+
+def write_and_fail(patch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise StepFailedError(codes.NOT_RUNNING, "It does not answer.")
+
+    patch.setattr(UnitSteps, "_verify", fail)
+
+
 def never_begin(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Socket, "is_due", lambda *_: False)
 
@@ -142,6 +159,8 @@ def never_begin(patch: pytest.MonkeyPatch) -> None:
     [
         (let_all_scan_at_one_place, CARD_HERE_LABEL_THERE, "NUMBER"),
         (see_nobody_come, PASSED_AND_EXCHANGED, "GREEN"),
+        (accuse_everybody, PASSED_AND_EXCHANGED, "ACCUSED"),
+        (write_and_fail, PASSED_AND_EXCHANGED, "STUCK"),
         (never_begin, PASSED_AND_EXCHANGED, "STUCK"),
     ],
 )
