@@ -355,14 +355,17 @@ def open_database(
         raise no_records(location)
     database = Database(location, lock_timeout_s, read_only=read_only)
     try:
-        _check_version(database, now, create=create)
+        check_schema(database, now, create=create)
     except BaseException:
         database.close()
         raise
     return database
 
 
-def _check_version(database: Database, now: datetime, *, create: bool) -> None:
+def check_schema(database: Database, now: datetime, *, create: bool) -> None:
+    """Raises OldSchemaError for records that can be brought up to date, SchemaVersionError for all
+    others that this flasher cannot use, RecordError.
+    """
     where = database.location.shown
     with database.reading() as connection:
         has_tables = inspect(connection).get_table_names()

@@ -6,9 +6,9 @@ what the audit trail states of them, and the differences stay recorded in it wit
 
 from __future__ import annotations
 
-import contextlib
+import importlib.util
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -16,18 +16,26 @@ from typing import Any, Final
 
 from sqlalchemy import Connection, inspect, select, update
 
-from flasher.errors import UsageError
+from flasher.errors import ErrorCode, UsageError
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.chain import Trail
 from flasher.station.records.database import (
     Database,
     Location,
+    check_schema,
     copy_checked,
     pin_search_path,
     revision_of,
 )
-from flasher.station.records.errors import NOT_SAVED, RecordError, RecordsDamagedError, mapped
+from flasher.station.records.errors import (
+    NOT_SAVED,
+    OldSchemaError,
+    RecordError,
+    RecordsDamagedError,
+    RecordsReadOnlyError,
+    mapped,
+)
 from flasher.station.records.files import whole_file
 from flasher.station.records.keys import Keeping
 from flasher.station.records.roles import grant_again
@@ -72,10 +80,17 @@ def upgrade(
     """
     database = Database(location, lock_timeout_s, changes_schema=True)
     with closing(database), ExitStack() as held:
+        with suppress(OldSchemaError):
+            check_schema(database, now(), create=False)
+            return Upgraded(NEWEST, NEWEST, None, ())
         with database.reading() as connection:
             before, begun = revision_of(connection), _stations(connection)
-        if before == NEWEST:
-            return Upgraded(before, before, None, ())
+        if importlib.util.find_spec("alembic") is None:
+            raise UsageError(
+                "Records of an older flasher need a package that is not installed: alembic.",
+                remedy="In the checkout: pip install -c .ci/constraints.txt '.[station]'",
+                code=ErrorCode.PACKAGE_MISSING,
+            )
         station = choose(begun) if begun else None
         if station is not None and station not in begun:
             raise UsageError(
@@ -91,7 +106,7 @@ def upgrade(
         with database.reading() as connection:
             if revision_of(connection) == NEWEST:  # another process was faster
                 return Upgraded(NEWEST, NEWEST, None, ())
-        with _unchanged_on_error(before), _backup(location.file, before) as backup:
+        with _unchanged_on_error(before, database), _backup(location.file, before) as backup:
             if station is None:
                 with database.writing("schema") as connection:
                     _change(connection)
@@ -113,10 +128,12 @@ def _stations(connection: Connection) -> tuple[str, ...]:
 
 
 @contextmanager
-def _unchanged_on_error(before: str) -> Iterator[None]:
+def _unchanged_on_error(before: str, database: Database) -> Iterator[None]:
     try:
         yield
     except RecordError as error:
+        if isinstance(error, RecordsReadOnlyError) and database.location.file is None:
+            error.remedy = "Give --database the URL of the owner of the records."
         error.what = error.what.replace(
             NOT_SAVED, f"The records were not brought to schema {NEWEST}, they keep schema {before}"
         )
@@ -137,7 +154,7 @@ def _backup(file: Path | None, before: str) -> Iterator[Path | None]:
     try:
         yield backup
     except BaseException:
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             backup.unlink()
         raise
 

@@ -12,12 +12,13 @@ from typing import Any
 import pytest
 from sqlalchemy import create_engine, inspect, text
 
-from flasher.errors import ExitCode, FlasherError
+from flasher.errors import ExitCode, FlasherError, UsageError
 from flasher.station.records import database, schema, upgrade
 from flasher.station.records.errors import (
     DiskFullError,
     OldSchemaError,
     RecordsLockedError,
+    RecordsReadOnlyError,
     RuleBrokenError,
     SchemaVersionError,
     StationBusyError,
@@ -191,6 +192,13 @@ def test_roles_keep_their_rights_and_get_those_of_new_tables(old: Old) -> None:
         for role, rights in (("old_line", "SELECT, INSERT"), ("old_reader", "SELECT")):
             connection.execute(text(f"CREATE ROLE {role} LOGIN"))
             connection.execute(text(f"GRANT {rights} ON ALL TABLES IN SCHEMA public TO {role}"))
+    url = old.url.replace("postgres@", "old_line@")
+    with old.engine.begin() as connection:
+        connection.execute(text("ALTER ROLE old_line PASSWORD 'x'"))
+    by_station = Old(old.folder, url.replace("old_line@", "old_line:x@"))
+    with pytest.raises(RecordsReadOnlyError, match="keep schema 2") as caught:
+        by_station.upgrade()
+    assert "owner" in caught.value.remedy
     old.upgrade()
     with old.engine.begin() as connection:
         may = "has_table_privilege('{}', 'alembic_version', '{}')"
@@ -313,6 +321,16 @@ def test_a_copy_for_which_there_is_no_room_stops_the_change(
     assert old_file.catalogue() == before
 
 
+def test_without_its_package_nothing_is_changed(
+    old_file: Old, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    with pytest.raises(UsageError, match="alembic") as caught:
+        old_file.open()
+    assert ".[station]" in caught.value.remedy
+    assert not list(old_file.folder.glob("*.schema-2*"))
+
+
 def test_records_that_another_program_holds_are_not_changed(old_file: Old) -> None:
     with closing(sqlite3.connect(old_file.url, isolation_level=None)) as holder:
         holder.execute("BEGIN IMMEDIATE")
@@ -327,6 +345,8 @@ def test_a_revision_that_is_not_known_is_refused(old_file: Old, revision: str) -
     old_file.upgrade()
     with old_file.engine.begin() as connection:
         connection.execute(schema.alembic_version.update().values(version_num=revision))
+    with pytest.raises(SchemaVersionError, match=revision):
+        old_file.upgrade()
     with pytest.raises(SchemaVersionError, match=revision) as caught:
         old_file.open()
     assert caught.value.exit_code is ExitCode.USAGE
@@ -345,3 +365,12 @@ def test_the_newest_change_is_the_schema_of_this_flasher() -> None:
     folder = Path(upgrade.__file__).parent / "migrations" / "versions"
     numbers = sorted(int(path.name[1:].partition("_")[0]) for path in folder.glob("v*.py"))
     assert numbers == list(range(2, schema.SCHEMA_VERSION + 1))
+
+
+def test_what_holds_no_records_is_not_upgraded(tmp_path: Path) -> None:
+    other = Old(tmp_path, str(tmp_path / "other.sqlite"))
+    with other.engine.begin() as connection:
+        connection.execute(text("CREATE TABLE holiday (photo BLOB)"))
+    with pytest.raises(SchemaVersionError, match="something else"):
+        other.upgrade()
+    other.engine.dispose()
