@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from contextlib import contextmanager
 from dataclasses import dataclass
-from ipaddress import IPv6Address, ip_address, ip_network
 from math import ceil
 from typing import Any, Final
 from urllib.parse import parse_qs
@@ -31,6 +30,7 @@ from flasher.station.people import Person, Role
 from flasher.station.records.model import AuditEvent, Clock
 from flasher.web.answers import question_of
 from flasher.web.pages import Pages
+from flasher.web.server import client_at
 from flasher.web.sign_ins import IDLE_S, SHIFT_S, Note, SignIn, SignIns
 from flasher.web.supervisor import frame
 
@@ -315,14 +315,4 @@ async def _form(request: Request) -> dict[str, str] | None:
 
 
 def _address(request: Request) -> str:
-    """The client of a request. Of IPv6 the network: one client has all addresses of one."""
-    host = "" if request.client is None else request.client.host
-    try:
-        found = ip_address(host.partition("%")[0])
-    except ValueError:
-        return host
-    if not isinstance(found, IPv6Address):
-        return str(found)
-    if found.ipv4_mapped is not None:
-        return str(found.ipv4_mapped)
-    return str(found) if found.is_loopback else f"{ip_network((found, 64), strict=False)}"
+    return "" if request.client is None else client_at(request.client.host)

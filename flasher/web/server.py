@@ -6,6 +6,7 @@ import asyncio
 import logging
 import socket
 import threading
+from ipaddress import IPv6Address, ip_address, ip_network
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -24,25 +25,36 @@ _END_LIMIT_S: Final = 1.0
 
 
 _CONNECTIONS_MAX: Final = 200
-_OF_ONE_ADDRESS_MAX: Final = 100
-"""Open connections from one address, so that one client does not take those of all."""
+_OF_ONE_MAX: Final = 100
+"""Open connections of one client, so that it does not take those of all."""
 
 
 class _Protocol(H11Protocol):
-    """Ends connections from an address that has too many."""
+    """Ends connections of a client that has too many."""
+
+    place = ""
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
-        address = _client_of(self)
-        if sum(_client_of(each) == address for each in self.connections) > _OF_ONE_ADDRESS_MAX:
+        self.place = "" if self.client is None else client_at(self.client[0])
+        same = [each for each in self.connections if getattr(each, "place", "") == self.place]
+        if len(same) > _OF_ONE_MAX:
             # At once, and not when the loop has ended it: many may come together.
             self.connections.discard(self)
             transport.abort()
 
 
-def _client_of(connection: Any) -> str | None:
-    client: tuple[str, int] | None = connection.client
-    return client and client[0]
+def client_at(host: str) -> str:
+    """The client at an address: one has all addresses of this computer, or of an IPv6 network."""
+    try:
+        found = ip_address(host.partition("%")[0])
+    except ValueError:
+        return host
+    if isinstance(found, IPv6Address) and found.ipv4_mapped is not None:
+        found = found.ipv4_mapped
+    if found.is_loopback:
+        return "127.0.0.1"
+    return str(ip_network((found, 64), strict=False)) if found.version == 6 else str(found)
 
 
 class Tls(NamedTuple):

@@ -342,7 +342,9 @@ def test_one_client_does_not_lock_out_everybody() -> None:
         ("2001:db8:0:1::1", "2001:db8:0:2::1", False),
         ("::ffff:192.0.2.1", "192.0.2.1", True),
         ("fe80::1%eth0", "fe80::2%eth0", True),
-        ("::1", "127.0.0.1", False),
+        ("::1", "127.0.0.1", True),
+        ("127.0.0.9", "127.0.0.1", True),
+        ("::ffff:127.0.0.9", "127.0.0.1", True),
     ],
 )
 def test_a_client_is_known_by_its_address(one: str, other: str, *, is_one: bool) -> None:
