@@ -5,7 +5,7 @@ uninterrupted unit:
 
 - its bootloader announces itself, although the run has neither reset it, nor ended a transfer, nor
   switched its power (R28); or after a silence in which it has not confirmed the reset;
-- it announces itself in the middle of a transfer;
+- it announces itself in the middle of a transfer, or an application answers, which is erased then;
 - a version answer, whoever asked for it, or an announced boot version, differs from the first one
   in something that the run has not written.
 
@@ -117,7 +117,7 @@ class Continuity:
     def settle(self) -> None:
         """Its application has answered a question of the run: what was restarted has started."""
         self.is_running, self.is_told_to_update = True, False
-        self._awaits_confirmation = False
+        self._awaits_confirmation, self._requested_at = False, None
         self._burst_until, self._announced_s = -inf, None
 
     def complete(self) -> None:
@@ -171,6 +171,8 @@ class Continuity:
         if watcher.announcements > announcements:
             self._take_announcement(now)
         if watcher.answers > answers and watcher.answer is not None and self._is_identified:
+            if self._requested_at is not None and not self._goes_on:
+                self._lose("runs an application in the middle of its transfer")
             self._compare(watcher.answer)
 
     def _note_sent(self, frame: Frame, now: float) -> None:

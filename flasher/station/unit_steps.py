@@ -246,11 +246,8 @@ class UnitSteps:
             if failed.code not in codes.NEED_POWER_CYCLE:
                 raise
             if self.has_lost_its_session:
-                if target.is_unheard:
-                    # Whoever lost its supply, or is put in now, announces itself; who was not
-                    # erased says so.
-                    with suppress(BusError, InterruptedByUserError):
-                        target.await_anybody()
+                with suppress(BusError, InterruptedByUserError):
+                    target.find_out_who_is_there()
                 raise
             if not may_rescue:
                 raise

@@ -6,6 +6,7 @@ Nothing here decides what a bad answer means: `unit_steps` does.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -32,6 +33,8 @@ from flasher.station.presence import SILENCE_S
 from flasher.station.recipe_file import LoadedTarget
 
 _LOOK_EVERY_S: Final = 0.05
+_SHARE_OF_TRIES: Final = 0.8
+"""Of the time in which a packet is tried: a device that is there has sent something in it."""
 _WAITING_MAX: Final = 10_000
 """Frames that are taken at once: a babbling bus must not hold up a run."""
 
@@ -154,12 +157,21 @@ class UnitTarget:
                 self.continuity.settle()
                 return answer
 
-    def await_anybody(self) -> None:
-        """Find out who is there, after contact was lost; `continuity` notes it."""
-        if self.version_request is not None:
+    def find_out_who_is_there(self) -> None:
+        """Ask and listen after a transfer that failed; `continuity` notes what comes. One that has
+        sent nothing for a while is waited for: it announces itself when it has its supply again.
+        """
+        timings = self.loaded.profile.timings
+        tried_s = timings.packet_tries * timings.ack_timeout_s
+        heard_at, silence_s = self.watcher.heard_at, min(SILENCE_S, _SHARE_OF_TRIES * tried_s)
+        is_silent = heard_at is None or self.clock.now() - heard_at >= silence_s
+        if self.version_request is None:
+            self.listen(timings.boot_version_timeout_s if is_silent else 0.0)
+        elif is_silent:
             self.await_application()
         else:
-            self.listen(self.loaded.profile.timings.boot_version_timeout_s)
+            with suppress(NoAnswerError):
+                self.device.version()
 
     def confirm(self) -> None:
         """Ask it once more who it is: `continuity` compares the answer. Raises StepFailedError when
@@ -172,12 +184,6 @@ class UnitTarget:
             return
         if not self.goes_on:
             raise StepFailedError(codes.UNIT_CHANGED, f"The {self.name} fell silent.")
-
-    @property
-    def is_unheard(self) -> bool:
-        """True when it has sent nothing for a while, not even something damaged."""
-        heard_at = self.watcher.heard_at
-        return heard_at is None or self.clock.now() - heard_at >= SILENCE_S
 
     def hear_waiting(self) -> None:
         """Take what came while nobody listened."""
