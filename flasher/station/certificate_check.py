@@ -19,6 +19,7 @@ from pydantic import ValidationError
 from flasher import __version__
 from flasher.errors import UsageError
 from flasher.protocol.text import printable
+from flasher.said import say
 from flasher.station.certificate import EARLIER_SHOWN, Proof, code_lines, render_certificate
 from flasher.station.records.errors import NotFoundError, UnprovenError
 from flasher.station.records.model import RunId
@@ -59,8 +60,8 @@ def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
         page = render_certificate(life, made_at, proof, sealed.earlier_left_out)
     except (ValidationError, KeyError, TypeError, ValueError, AttributeError) as error:
         raise UnprovenError(
-            "The certificate was changed: what it carries is no run.",
-            remedy="Ask for the certificate anew.",
+            say("The certificate was changed: what it carries is no run."),
+            remedy=say("Ask for the certificate anew."),
         ) from error
     if is_pdf:
         where = _difference_of_print(page, pages)
@@ -69,11 +70,15 @@ def check_certificate(store: Store, data: bytes) -> CheckedCertificate:
     else:
         where = ""  # the signed lines alone
     if where:
-        problems.append(f"its page was changed: {where}")
+        problems.append(say("its page was changed: {where}", where=where))
         if sealed.flasher != __version__:
             problems.append(
-                f"it was made by flasher {printable(sealed.flasher)}, and this is {__version__}:"
-                " that version tells whether the page was changed"
+                say(
+                    "it was made by flasher {other}, and this is {version}: that version tells"
+                    " whether the page was changed",
+                    other=printable(sealed.flasher),
+                    version=__version__,
+                )
             )
     found, remarks = _in_records(store, sealed)
     last = life.runs[-1].run
@@ -107,27 +112,32 @@ def _in_records(store: Store, sealed: Sealed) -> tuple[list[str], tuple[str, ...
     if head is None or (head.station, head.number, head.hash) != (
         sealed.station, sealed.row["number"], sealed.row["hash"],
     ):  # fmt: skip
-        return ["the run is not in these records"], ()
-    problems = []
+        return [say("the run is not in these records")], ()
+    problems: list[str] = []
     if head.key != sealed.key:
-        problems.append("it is not signed with the key that the station had in these records")
+        problems.append(say("it is not signed with the key that the station had in these records"))
     examined = store.examine_run(run_id)
     problems += [f"{each.where} in the records: {each.what}" for each in examined.problems]
     if problems:
         return problems, ()
     last = store.read.run(run_id)
     if sealed.life().last != last:
-        problems.append("it does not say what the records say of the run")
+        problems.append(say("it does not say what the records say of the run"))
     runs = [each.run for each in store.read.unit(last.run.serial, last.run.part).runs]
     before = [plain(run) for run in runs if run.run_id < run_id]
     carried = [dict(each) for each in sealed.earlier]
     if before[-EARLIER_SHOWN:] != carried or sealed.earlier_left_out != max(
         0, len(before) - EARLIER_SHOWN
     ):
-        problems.append("it does not say what the records say of the earlier runs of the unit")
+        problems.append(say("it does not say what the records say of the earlier runs of the unit"))
     later = [run for run in runs if run.run_id > run_id]
-    remarks = tuple(
-        f"the unit had a later run: {run.run_id}, {run.begun_at:%Y-%m-%d}, {run.state.value}"
+    remarks: tuple[str, ...] = tuple(
+        say(
+            "the unit had a later run: {run}, {day}, {state}",
+            run=run.run_id,
+            day=f"{run.begun_at:%Y-%m-%d}",
+            state=run.state.value,
+        )
         for run in later[-1:]
     )
     return problems, remarks
@@ -141,23 +151,27 @@ def _check_code(store: Store, text: str) -> CheckedCertificate:
         details = store.read.run(run_id)
     except NotFoundError as error:
         raise UnprovenError(
-            "The run of this code is not in these records.",
+            say("The run of this code is not in these records."),
             cause="the code is of other records, or was changed",
         ) from error
-    problems = []
+    problems: list[str] = []
     head = store.read.head_of(run_id)
     if head is None:
-        problems.append("the run is not signed in these records")
+        problems.append(say("the run is not signed in these records"))
     else:
         expected = code_lines(details, store.read.record_sha256(run_id), head)
         found = text.split("\n")
         problems += [
-            f"the code says '{printable(said)}', the records '{printable(line)}'"
+            say(
+                "the code says '{said}', the records '{line}'",
+                said=printable(said),
+                line=printable(line),
+            )
             for line, said in zip(expected, found, strict=True)
             if line != said
         ]
         if not is_signed(head.hash, head.signature, head.key):
-            problems.append("the signature in the records is not that of the station's key")
+            problems.append(say("the signature in the records is not that of the station's key"))
     examined = store.examine_run(run_id)
     problems += [f"{each.where} in the records: {each.what}" for each in examined.problems]
     run = details.run
@@ -218,14 +232,14 @@ def _bare(text: str) -> str:
 def _difference(expected: str, found: str) -> str:
     """Where two texts differ first, in words."""
     if expected == found:
-        return "its text is the same, its markup is another"
+        return say("its text is the same, its markup is another")
     at = next(
         (at for at, pair in enumerate(zip(expected, found, strict=False)) if pair[0] != pair[1]),
         min(len(expected), len(found)),
     )
     begin = max(0, at - _AROUND)
     said, signed = (printable(each[begin : at + _AROUND]) for each in (found, expected))
-    return f"it says '{said}', the station signed '{signed}'"
+    return say("it says '{said}', the station signed '{signed}'", said=said, signed=signed)
 
 
 def _difference_of_print(page: str, pages: list[str]) -> str:
@@ -271,6 +285,6 @@ def _pages_of_pdf(data: bytes) -> Iterator[str]:
             yield unicodedata.normalize("NFKC", page.extract_text())
     except (PyPdfError, ValueError, KeyError, TypeError, RecursionError, AttributeError) as error:
         raise UsageError(
-            "The PDF cannot be read.",
-            remedy="Print the certificate to a PDF in a browser, or name its HTML file.",
+            say("The PDF cannot be read."),
+            remedy=say("Print the certificate to a PDF in a browser, or name its HTML file."),
         ) from error

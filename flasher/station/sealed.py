@@ -18,6 +18,7 @@ from typing import Any, Final
 from pydantic import TypeAdapter, ValidationError
 
 from flasher.errors import UsageError
+from flasher.said import say
 from flasher.station.records import chain
 from flasher.station.records.errors import UnprovenError
 from flasher.station.records.heads import Head
@@ -80,9 +81,9 @@ class Sealed:
         """What of it is not as the station signed it, in words; empty where all is."""
         row = self.row
         if chain.row_hash(row) != row["hash"]:
-            return ["the audit row in it was changed"]
+            return [say("the audit row in it was changed")]
         if not is_signed(row["hash"], self.signature, self.key):
-            return ["the signature is not that of the key in it"]
+            return [say("the signature is not that of the key in it")]
         found = {name: chain.digest(value) for name, value in self.content.items()}
         found["claim"] = chain.digest(chain.claim_of(self.content))
         words = chain.OWN | chain.NAMED
@@ -93,7 +94,11 @@ class Sealed:
         ]
         if not self.digests or row["run_id"] != self.content["run"]["id"]:
             wrong.append("which run it is about")
-        return [f"it was changed after it was signed: {', '.join(wrong)}"] if wrong else []
+        return (
+            [say("it was changed after it was signed: {what}", what=", ".join(wrong))]
+            if wrong
+            else []
+        )
 
     def life(self) -> UnitLife:
         """The unit as the page shows it. Raises ValidationError, KeyError, TypeError."""
@@ -196,8 +201,8 @@ def sealed_in(text: str) -> Sealed:
     stop = text.find(_END, start)
     if start < 0 or stop < 0:
         raise UsageError(
-            "The file carries no signed certificate.",
-            remedy="Name a certificate as flasher wrote or printed it, with its annex.",
+            say("The file carries no signed certificate."),
+            remedy=say("Name a certificate as flasher wrote or printed it, with its annex."),
         )
     lines = (line.strip() for line in text[start + len(_BEGIN) : stop].splitlines())
     carried = "".join(line for line in lines if _CARRIED.fullmatch(line))
@@ -207,6 +212,6 @@ def sealed_in(text: str) -> Sealed:
         return _TYPE.validate_python(json.loads(found))
     except (binascii.Error, zlib.error, ValueError, ValidationError, RecursionError) as error:
         raise UnprovenError(
-            "The certificate was changed: what it carries cannot be read.",
-            remedy="Ask for the certificate anew.",
+            say("The certificate was changed: what it carries cannot be read."),
+            remedy=say("Ask for the certificate anew."),
         ) from error

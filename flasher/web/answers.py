@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import signal
 from collections.abc import Awaitable, Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, Final, Protocol
 
@@ -46,6 +46,8 @@ class Question:
     token: str = ""
     sign_in: SignIn | None = None
     """Of who asks."""
+    body: bytes = b""
+    """What was sent; empty where the page was only asked for."""
 
 
 @dataclass(frozen=True)
@@ -151,12 +153,17 @@ def question_of(path: str, request: Request, pages: Pages) -> Question:
     )
 
 
-def answer_routes(pages: Pages, ask: Ask, paths: Iterable[str]) -> list[BaseRoute]:
-    """The routes of pages that are answered by `ask`."""
+def answer_routes(
+    pages: Pages, ask: Ask, paths: Iterable[str], uploads: Iterable[str] = ()
+) -> list[BaseRoute]:
+    """The routes of pages that are answered by `ask`; those of `uploads` take a file too."""
 
     async def page(path: str, request: Request) -> Response:
+        question = question_of(path, request, pages)
+        if request.method == "POST":
+            question = replace(question, body=await request.body())
         try:
-            answer = await ask(question_of(path, request, pages))
+            answer = await ask(question)
         except TimeoutError:
             return PlainTextResponse("That took too long: narrow it down.", 503)
         if answer.location:
@@ -166,4 +173,5 @@ def answer_routes(pages: Pages, ask: Ask, paths: Iterable[str]) -> list[BaseRout
             headers["content-disposition"] = f'attachment; filename="{answer.file_name}"'
         return Response(answer.body, answer.status, headers, answer.media_type)
 
-    return [Route(path, partial(page, path)) for path in paths]
+    methods = {path: ["GET", "POST"] for path in uploads}
+    return [Route(path, partial(page, path), methods=methods.get(path)) for path in paths]

@@ -5,6 +5,7 @@ Times are those of the clock on the wall where the server is; the pages name its
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -26,9 +27,11 @@ from flasher.station.certificate import (
     limits_of,
     number,
     proven,
+    render_certificate,
     sheet,
     verdict_of,
 )
+from flasher.station.certificate_check import check_certificate
 from flasher.station.records import chain
 from flasher.station.records.errors import NotFoundError, RecordError, UnprovenError
 from flasher.station.records.keys import Keeping
@@ -47,6 +50,7 @@ from flasher.station.records.newest import Cut
 from flasher.station.records.overview import HOLDERS_COUNTED, By, Overview, Span
 from flasher.station.records.store import Store
 from flasher.station.reports import Report, csv_text, make_report
+from flasher.station.sealed import CERTIFICATE_MAX_SIZE
 from flasher.station.stories import explained
 from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.trace.figures import Distribution
@@ -63,6 +67,8 @@ _HOURS_UP_TO: Final = timedelta(days=2)
 _DAYS_UP_TO: Final = timedelta(days=62)
 _WEEKS_UP_TO: Final = timedelta(days=430)
 SPANS_MAX: Final = 400
+CHECK: Final = "/certificate"
+"""The page that takes a certificate."""
 _NAMES: Final = {
     "/runs": say("Runs"),
     "/units": say("Units"),
@@ -70,6 +76,7 @@ _NAMES: Final = {
     "/times": say("Times"),
     "/images": say("Images"),
     "/audit": say("Audit trail"),
+    CHECK: say("Check a certificate"),
 }
 """The menu."""
 _SIGN_INS: Final = {"/sign-ins": say("Sign-ins")}
@@ -220,6 +227,24 @@ class Supervisor:
         life = self.store.read.unit(fields.get("serial", ""), fields.get("part"))
         made = sheet(life, datetime.now(UTC), proven(self.store, life))
         return self._page(question, "certificate.html", path="/units", **made)
+
+    def file_of_certificate(self, question: Question) -> Answer:
+        """The certificate as a file, which can be checked."""
+        fields = question.fields
+        life = self.store.read.unit(fields.get("serial", ""), fields.get("part"))
+        made = render_certificate(life, datetime.now(UTC), proven(self.store, life))
+        name = re.sub(r"[^\w.-]", "_", life.serial, flags=re.ASCII)
+        return Answer(made.encode("utf-8"), file_name=f"{name}.html")
+
+    def check(self, question: Question) -> Answer:
+        """Tell of a certificate whether it is signed, unchanged, and of these records."""
+        found = error = None
+        if question.body.strip():
+            try:
+                found = check_certificate(self.store, question.body)
+            except (UsageError, UnprovenError) as wrong:
+                error = wrong
+        return self._page(question, "check.html", found=found, error=error)
 
     # -- images -----------------------------------------------------------------------------------
 
@@ -379,6 +404,11 @@ def frame(question: Question, now: datetime) -> dict[str, Any]:
     }
 
 
+def upload_limit(usual: int) -> Callable[[str], int]:
+    """The limit of a path's body in bytes, for the guard."""
+    return lambda path: CERTIFICATE_MAX_SIZE if path == CHECK else usual
+
+
 Place = tuple[str, Path, Keeping]
 
 
@@ -401,6 +431,8 @@ PAGES: Final[dict[str, Callable[[Supervisor, Question], Answer]]] = {
     "/runs/{run:int}/trace": Supervisor.trace,
     "/units": Supervisor.units,
     "/units/certificate": Supervisor.certificate,
+    "/units/certificate.html": Supervisor.file_of_certificate,
+    CHECK: Supervisor.check,
     "/images": Supervisor.images,
     "/images.csv": Supervisor.file_of_holders,
     "/yield": Supervisor.yields,

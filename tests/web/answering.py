@@ -12,10 +12,16 @@ from starlette.types import ASGIApp
 from flasher.station.records.keys import Keeping
 from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.web.answers import Answer, Question, answer_routes
-from flasher.web.guard import application
+from flasher.web.guard import BODY_MAX, application
 from flasher.web.login import Login
 from flasher.web.pages import Pages
-from flasher.web.supervisor import PAGES, Supervisor, open_supervisor
+from flasher.web.supervisor import (
+    CHECK,
+    PAGES,
+    Supervisor,
+    open_supervisor,
+    upload_limit,
+)
 
 _KEY = "of the test"
 
@@ -34,10 +40,11 @@ def app_with(supervisor: Supervisor, login: Login | None = None, *more: BaseRout
 
     pages = Pages()
     return application(
-        [*more, *answer_routes(pages, ask, PAGES)],
+        [*more, *answer_routes(pages, ask, PAGES, [CHECK])],
         hosts={"127.0.0.1"},
         secret=_KEY,
         login=login,
+        uploads=upload_limit(BODY_MAX),
     )
 
 

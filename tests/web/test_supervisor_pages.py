@@ -21,6 +21,7 @@ LONG = "W" * 90
 PAGES = (
     "/runs", "/runs?from=yesterday", "/units", "/units?serial=W2605001", "/runs/2/trace",
     "/units/certificate?serial=W2605001", "/yield?by=lot", "/times", "/images", "/audit",
+    "/certificate",
 )  # fmt: skip
 _SCREENS: tuple[tuple[int, Any], ...] = ((390, "dark"), (1280, "light"))
 
@@ -95,6 +96,27 @@ def test_a_certificate_is_one_sheet_with_an_annex(tab: Tab, url: str) -> None:
     assert heights < 297 - 28  # mm of A4 between its margins
     pages = page.pdf(format="A4", prefer_css_page_size=True).count(b"/Type /Page\n")
     assert pages == 2
+
+
+@pytest.mark.parametrize("language", ["en", "de", "zh"])
+def test_a_certificate_is_checked_by_a_page(
+    tab: Tab, url: str, tmp_path: Path, language: str
+) -> None:
+    page = tab.page
+    page.goto(f"{url}units?serial=W2605003&lang={language}")
+    with page.expect_download() as download:
+        page.locator("a[href*='certificate.html']").click()
+    file = tmp_path / "W2605003.html"
+    download.value.save_as(file)
+    page.goto(f"{url}certificate?lang={language}")
+    for text, verdict in (("", "good"), ("bms.bin", "bad"), ("BEGIN FLASHER", "bad")):
+        if text:
+            file.write_text(file.read_text("utf-8").replace(text, "x"), encoding="utf-8")
+        page.set_input_files("input[type=file]", file)
+        page.locator("#check button").click()
+        page.wait_for_selector(f"#found .verdict.{verdict}")
+        assert barriers(page) == ""
+    assert tab.wrong == []
 
 
 @pytest.mark.parametrize("has_edges", [False, True])

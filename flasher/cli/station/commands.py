@@ -46,8 +46,8 @@ next safe place; they have to be scanned again. Exit code 12 when a unit did not
 """
 
 _PAGES_NOTES: Final = """\
-Open the address that is shown: /runs, /units, /yield, /times, /images, /audit. A station that runs
-with --web serves them too, beside its operator page.
+Open the address that is shown: /runs, /units, /yield, /times, /images, /audit, /certificate. A
+station that runs with --web serves them too, beside its operator page.
 """
 
 

@@ -41,13 +41,13 @@ from flasher.station.records.store import SystemClock
 from flasher.station.station import Station
 from flasher.station.tally import DEFAULT_SHIFTS, EndedRun, Tally
 from flasher.web.answers import AnswerProcesses, answer_routes
-from flasher.web.guard import application
+from flasher.web.guard import BODY_MAX, application
 from flasher.web.login import Badges, Login
 from flasher.web.operator import LINE, Lot, OperatorPage, Screen
 from flasher.web.pages import Pages
 from flasher.web.server import LOOPBACK, Server, Tls
 from flasher.web.sign_ins import Note
-from flasher.web.supervisor import PAGES, open_supervisor, place_of
+from flasher.web.supervisor import CHECK, PAGES, open_supervisor, place_of, upload_limit
 
 _TURN_S: Final = 0.1
 PASSWORD_MIN: Final = 8
@@ -125,7 +125,7 @@ def operator_page(
     view = OperatorView(screen, station, board)
     # In processes of their own: a page takes no time from the station.
     answering = AnswerProcesses(partial(open_supervisor, *place_of(store), config.shifts))
-    routes = [*operator.routes, *answer_routes(pages, answering.ask, PAGES)]
+    routes = [*operator.routes, *answer_routes(pages, answering.ask, PAGES, [CHECK])]
     server = served(
         options,
         address,
@@ -157,7 +157,7 @@ def serve(output: Output, address: Address, options: PagesOptions, records: Reco
         place = place_of(store)
     pages = Pages(options.language)
     answering = AnswerProcesses(partial(open_supervisor, *place, shifts))
-    routes = [Route("/", _start), *answer_routes(pages, answering.ask, PAGES)]
+    routes = [Route("/", _start), *answer_routes(pages, answering.ask, PAGES, [CHECK])]
     with (
         closing(answering),
         stop_on_signal() as stopped,
@@ -230,6 +230,7 @@ def served(
         secret=secrets.token_urlsafe(32) if keeping is None else kept_secret(keeping),
         login=login,
         is_tls=tls is not None,
+        uploads=upload_limit(BODY_MAX),
     )
     with Server(app, address.host, address.port, tls) as server:
         yield server.url

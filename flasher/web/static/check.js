@@ -1,0 +1,26 @@
+"use strict";
+// The page that checks certificates: sends the file, or the text, and shows what was found.
+
+byId("check").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  const form = event.target;
+  const code = form.elements.code.value.trim();
+  const body = code ? new Blob([code]) : form.elements.file.files[0];
+  if (!body) {
+    form.elements.file.focus();
+    return;
+  }
+  const found = byId("found");
+  found.textContent = "";
+  try {
+    const answer = await fetch(location.href, {
+      method: "POST",
+      headers: { "x-flasher-token": token },
+      body,
+    });
+    const page = new DOMParser().parseFromString(await answer.text(), "text/html");
+    found.replaceChildren(...page.getElementById("found").childNodes);
+  } catch {
+    found.textContent = form.dataset.failed;
+  }
+});
