@@ -302,6 +302,11 @@ def test_the_running_version_is_compared_with_the_new_one(
     assert found.text.startswith(text)
 
 
+def test_a_version_that_is_only_written_in_another_way_is_not_older() -> None:
+    same = replace(IMAGE, version=NEW.replace("V2", "V02"))
+    assert judged(same, device=seen(NEW))[DOWNGRADE].verdict is PASSED
+
+
 def test_the_images_own_version_counts_before_the_manifests() -> None:
     named = replace(release_of(NAMELESS, BMS), firmware_version=NEW)
     assert new_version(NAMELESS, named) == NEW
