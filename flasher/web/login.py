@@ -222,6 +222,7 @@ class Login:
         person = badges.find(code)
         if person is not None and not (person.pin or badges.needs_pin):
             self._count(address, code)
+            self._attempts.was_right(address, code)
             return person
         if not pin:  # a scanner ends what it types by Enter
             self._count(address, None)
@@ -252,7 +253,7 @@ class Login:
         data = {"name": name, "address": address, "why": why}
         pause_s = self._attempts.pause_s(address, badge, self._clock.monotonic_s())
         if pause_s:
-            data["pause"] = f"{pause_s:g} s"
+            data["pause"] = f"{ceil(pause_s)} s"
         self._note(AuditEvent.SIGN_IN_REFUSED, data)
         return _RefusedError(say("That is not it."))
 
@@ -296,8 +297,8 @@ class Login:
         if fields is not None and by is not None:
             if "all" in fields:
                 self.sign_ins.end_all(by)
-            elif fields.get("number", "").isdecimal():
-                self.sign_ins.end(int(fields["number"]), by)
+            else:
+                self.sign_ins.end(fields.get("number", ""), by)
         return RedirectResponse(SIGN_INS, 303)
 
 

@@ -131,10 +131,10 @@ class SignIns:
             if other.name == sign_in.name:
                 self._end(other, by=sign_in.name)
 
-    def end(self, number: int, by: SignIn) -> None:
+    def end(self, number: str, by: SignIn) -> None:
         """End the sign-in of somebody, by a supervisor. One that has ended is none."""
         for each in self.listed():
-            if each.number == number:
+            if str(each.number) == number:
                 self._end(each, by=by.name or _BY_PASSWORD)
 
     def end_all(self, by: SignIn) -> None:

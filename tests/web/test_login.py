@@ -607,7 +607,9 @@ def test_a_supervisor_sees_who_is_there_and_ends_it() -> None:
     assert [each["name"] for each in place.told(AuditEvent.SIGN_IN)] == ["Sue", "Rea"]
 
 
-@each("fields", [{"number": "99"}, {"number": "x"}, {"number": "\u0663"}, {}])
+@each(
+    "fields", [{"number": "99"}, {"number": "x"}, {"number": "\u0663"}, {"number": "9" * 5000}, {}]
+)
 def test_what_is_no_sign_in_ends_nothing(fields: dict[str, str]) -> None:
     place = Place()
     sue = as_sue(place.browser())
@@ -640,6 +642,14 @@ def test_sign_ins_of_one_person_are_limited() -> None:
     assert known.find(first, is_use=True) is None
     assert known.find(other, is_use=True) is not None
     assert notes.count(AuditEvent.SIGN_IN_ENDED) == 1
+
+
+@each("badge, pin", [("BADGE-2", PIN), ("BADGE-3", "")])
+def test_who_signs_in_again_and_again_in_a_shift_is_let_in(badge: str, pin: str) -> None:
+    place = Place()
+    for _ in range(4 * TRIES_MAX):
+        assert sign_in(place.browser(), badge=badge, pin=pin)[0] == 303
+        place.clock.go_on(PAUSE_S / 2)
 
 
 @pytest.mark.parametrize("page", ["/login", "/sign-ins"])
