@@ -25,13 +25,23 @@ from typing import Final
 
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import BMS, Command, Mode
+from flasher.protocol.spec import (
+    BMS,
+    COMMAND_SIZE,
+    HEADER,
+    MODE_SIZE,
+    PREFIX_SIZE,
+    Command,
+    Mode,
+)
 from flasher.protocol.wire import Message, Reassembler
 from flasher.station.presence import TargetWatcher
 from flasher.station.recipe_file import LoadedTarget
 
-IDENTITY: Final = ("model", "serial_number", "hardware_version")
+_FIELDS: Final = ("model", "serial_number", "hardware_version")
 """The fields of a version answer that stay as they are; the firmware version does not."""
+_WRITE: Final = HEADER + Mode.WRITE.to_bytes(MODE_SIZE, "big")
+"""Begins a message that may restart a device."""
 _SPACINGS_OF_QUIET: Final = 6
 _QUIET_MIN_S: Final = 0.3
 _PACE_TOLERANCE: Final = 1.5
@@ -86,8 +96,8 @@ class Continuity:
         """The same for when it was heard again after a silence that allows an exchange."""
         self._awaits_confirmation = False
         """A reset was sent to an application that runs, and is not confirmed."""
-        self._requested_at: float | None = None
-        """When the transfer that goes on was requested."""
+        self._requested_s: float | None = None
+        """The same for when the transfer that goes on was requested; None: none does."""
         self._is_identified = False
         self._is_asked = self.watcher.request is not None
         self._boot_version = ""
@@ -117,7 +127,7 @@ class Continuity:
     def settle(self) -> None:
         """Its application has answered a question of the run: what was restarted has started."""
         self.is_running, self.is_told_to_update = True, False
-        self._awaits_confirmation, self._requested_at = False, None
+        self._awaits_confirmation, self._requested_s = False, None
         self._burst_until, self._announced_s = -inf, None
 
     def complete(self) -> None:
@@ -167,17 +177,20 @@ class Continuity:
         if watcher.confirmations > confirmations and self._awaits_confirmation:
             self.is_running = self._awaits_confirmation = False
         if watcher.transfer_requests > requests and self.is_told_to_update:
-            self._requested_at, self._burst_until = now, -inf
+            self._requested_s, self._burst_until = self._listened_s, -inf
         if watcher.announcements > announcements:
             self._take_announcement(now)
         if watcher.answers > answers and watcher.answer is not None and self._is_identified:
-            if self._requested_at is not None and not self._goes_on:
+            if self._requested_s is not None and not self._goes_on:
                 self._lose("runs an application in the middle of its transfer")
             self._compare(watcher.answer)
 
     def _note_sent(self, frame: Frame, now: float) -> None:
-        if frame.can_id == self._supply_id:
-            self._supplied_until = now + self._start_s
+        if frame.can_id == self._supply_id and frame.data.startswith(_WRITE):
+            command = int.from_bytes(frame.data[PREFIX_SIZE : PREFIX_SIZE + COMMAND_SIZE], "big")
+            if command != Command.PACKET:
+                is_long = command == Command.UPDATE
+                self._supplied_until = inf if is_long else now + self._start_s
         if frame.can_id != self._sent.can_id:
             return
         for found in self._sent.feed(frame.data, now):
@@ -186,7 +199,7 @@ class Continuity:
             if found.command == Command.RESET and self.is_running:
                 # As long as it has not confirmed that, it goes on running.
                 self._awaits_confirmation = True
-                self._burst_until, self._requested_at = inf, None
+                self._burst_until, self._requested_s = inf, None
             elif found.command in (self._reset_command, Command.RESET):
                 self._restart()
             elif found.command == Command.UPDATE:
@@ -195,14 +208,14 @@ class Continuity:
                 self.is_running = self._awaits_confirmation = False
                 self.is_told_to_update = True
                 # A burst that the reset before it has caused may still come: it was lost then.
-                self._requested_at = None
+                self._requested_s = None
             elif found.command == Command.END_OF_TRANSFER:
-                self._requested_at = None
+                self._requested_s = None
                 self._burst_until = inf
 
     def _restart(self) -> None:
         self.is_running = self._awaits_confirmation = False
-        self._requested_at = None
+        self._requested_s = None
         # However late: only an answer of the application shows that no burst will follow.
         self._burst_until = inf
 
@@ -213,8 +226,8 @@ class Continuity:
             if since_s < inf:
                 self._longest_pause_s = max(self._longest_pause_s, since_s)
             return
-        if self._requested_at is not None:
-            if now - self._requested_at > self._leftover_s:
+        if self._requested_s is not None:
+            if self._listened_s - self._requested_s > self._leftover_s:
                 self._lose_by_restart("in the middle of the transfer")
             return
         if goes_on:
@@ -251,4 +264,4 @@ class Continuity:
 
 
 def _identity(content: Content) -> dict[str, str]:
-    return {name: str(getattr(content, name)) for name in IDENTITY if hasattr(content, name)}
+    return {name: str(getattr(content, name)) for name in _FIELDS if hasattr(content, name)}

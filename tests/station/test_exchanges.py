@@ -210,13 +210,12 @@ def test_a_unit_that_is_exchanged_at_once_or_much_later(tmp_path: Path, gap_s: f
     world.check_caught()
 
 
-@BOTH_KINDS
 @pytest.mark.parametrize("note", BETWEEN, ids=" ".join)
 def test_a_unit_that_is_exchanged_while_nobody_listens(
-    tmp_path: Path, numbers: tuple[str, str], note: tuple[str, ...]
+    tmp_path: Path, note: tuple[str, ...]
 ) -> None:
     second = replace(NEW_UNIT, factory_version=BMS_VERSION)
-    world = Exchange(tmp_path, numbers, second=second)
+    world = Exchange(tmp_path, second=second)
     world.while_the_record_is_saved(*note)
     world.check_caught()
 
@@ -509,6 +508,42 @@ def test_a_unit_in_its_bootloader_is_not_identified_before_flashing(tmp_path: Pa
     assert identified.text == "bms: in its bootloader V1.0.0, not identified before flashing"
     measured = {m.name: m.text for m in identified.measurements}
     assert measured == {"bms identity": "not identified before flashing"}
+
+
+@pytest.mark.parametrize("is_supplied", [True, False])
+def test_a_controller_may_restart_while_the_battery_does(
+    tmp_path: Path, *, is_supplied: bool
+) -> None:
+    """The battery supplies it. Later, another one may have come."""
+    text = HEAD + SERIAL_NUMBER + target_table(WMC) + target_table(BMS) + WRITES
+    bench = UnitBench(tmp_path, text, targets=(WMC, BMS))
+    battery = bench.units[BMS].device
+    was_cut = False
+
+    def wait(wait_s: float) -> None:
+        until = bench.clock.now() + wait_s
+        while bench.clock.now() < until:
+            bench.bus.advance(until)
+
+    def look() -> bool:
+        nonlocal was_cut
+        is_over = ("step", "write", "PASS", "") in bench.journal.rows
+        if not was_cut and (battery.program_count > 0 if is_supplied else is_over):
+            was_cut = True
+            bench.units[WMC].set(PowerCut(0.1), AtTime(bench.clock.now()))
+        return False
+
+    def save() -> None:
+        if not is_supplied:
+            wait(6.0)
+            look()
+            wait(1.0)
+
+    bench.is_cancelled = look
+    bench.journal.on_note = save
+    result = bench.run()
+    assert was_cut
+    assert result.code == ("OK" if is_supplied else "UNIT_CHANGED"), result
 
 
 # -- a unit that stays ----------------------------------------------------------------------------
