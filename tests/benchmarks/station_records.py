@@ -122,9 +122,11 @@ def measure(folder: Path, runs: int) -> None:
         timed("one unit", lambda: as_json(records.unit("W0000017")))
         timed("certificate", lambda: certificate(store, records.unit("W0000017")))
         timed("backup", lambda: store.backup(folder / "backup.sqlite"))
-        began = time.perf_counter()
-        problems = store.examine().problems
-        print(f"  verify: {len(problems)} problems, {time.perf_counter() - began:.1f} s")
+        for goes_on in (False, True):
+            began = time.perf_counter()
+            problems = store.examine(goes_on=goes_on).problems
+            what = "verify, again" if goes_on else "verify --all"
+            print(f"  {what}: {len(problems)} problems, {time.perf_counter() - began:.1f} s")
         print(f"  figures: {records.figures()}")
     size_bytes = (folder / "backup.sqlite").stat().st_size
     print(f"  database: {size_bytes / 1e6:.1f} MB, {size_bytes / (runs + REPEATS):.0f} bytes a run")

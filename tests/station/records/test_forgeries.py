@@ -8,11 +8,13 @@ import json
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import create_engine
+from sqlalchemy.exc import DBAPIError
 
 from flasher.station.records.chain import canonical, row_hash
 from flasher.station.records.keys import Keeping
@@ -20,6 +22,7 @@ from flasher.station.records.model import Problem, RunId, RunState
 from flasher.station.records.signatures import SigningKey
 from flasher.station.records.store import Store
 from tests.station.factory import BMS_VERSION, IMAGES, SERIAL, Bench
+from tests.station.postgres import Server
 from tests.station.traces import run_messages, write_trace
 
 OTHER = "W2605003"
@@ -30,10 +33,7 @@ FAILED = "W2605004"
 def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     """Records of two good units, a bad one and one that runs, with nothing wrong in them."""
     made = Bench(tmp_path_factory.mktemp("plant"))
-    made.make(lot="L1")
-    made.make(serial=OTHER)
-    made.make(RunState.FAIL, FAILED)
-    made.work(made.claim("W2605005").run_id)
+    fill(made)
     found = made.store.examine()
     assert not found.problems
     assert not found.is_checked_elsewhere  # its heads are beside the key
@@ -42,6 +42,13 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
     made.store.backup(made.folder / "copy.sqlite")
     yield made
     made.store.close()
+
+
+def fill(made: Bench) -> None:
+    made.make(lot="L1")
+    made.make(serial=OTHER)
+    made.make(RunState.FAIL, FAILED)
+    made.work(made.claim("W2605005").run_id)
 
 
 class Forger:
@@ -156,6 +163,37 @@ def test_a_changed_row_is_told(
 ) -> None:
     problems = examined(plant, tmp_path, lambda forger, _: forger(statement))
     assert told(problems, where, what), problems
+
+
+def test_a_changed_row_on_a_server_is_told(
+    postgres: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each in a transaction of its own, which is examined and then rolled back: that is quicker."""
+    made = Bench(tmp_path, url=postgres.records())
+    fill(made)
+    keeping, files = Keeping(made.keys), made.store.files
+    engine = create_engine(postgres_url := str(made.url))
+    refused = []
+    with Store.open(
+        postgres_url, station="x", folder=files.folder, read_only=True, keeping=keeping
+    ) as store:
+        for statement, where, what in PLAIN:
+            with engine.connect() as connection:
+                connection.exec_driver_sql("SET session_replication_role = replica")
+                monkeypatch.setattr(store.database, "reading", lambda c=connection: nullcontext(c))
+                try:
+                    connection.exec_driver_sql(statement)
+                except DBAPIError:  # by a type, or a constraint, which no setting takes away
+                    refused.append(statement)
+                else:
+                    if not statement.startswith("UPDATE step SET run_id"):
+                        problems = store.examine().problems
+                        assert told(problems, where, what), (statement, problems)
+                connection.rollback()
+    engine.dispose()
+    made.store.close()
+    assert len(PLAIN) - len(refused) >= 25
+    assert all("'GOOD'" in each or "'x'" in each or "X'00FF'" in each for each in refused), refused
 
 
 def to_pass(forger: Forger, folder: Path) -> None:
