@@ -474,8 +474,8 @@ class Line:
         if not waiting.text:
             return Refused(
                 "NO_SOCKET",
-                say("The socket that was scanned before it cannot take it."),
-                say("Scan the card of a socket that can, then the label again."),
+                say("The card that was scanned before it does not count."),
+                say("Scan the card of the socket that the unit is in, then the label again."),
             )
         return Refused(
             "CARD_WAITS" if waiting.card is not None else "LABEL_WAITS",
@@ -813,6 +813,8 @@ class Line:
                     _AGAIN,
                 )
                 waiting.is_in_doubt = False
+            if waiting.is_in_doubt and waiting.forget_at_s is None:
+                waiting.forget_at_s = now + SCAN_LIMIT_S
             if not (waiting.text or waiting.is_in_doubt):
                 del self._waiting[waiting.source.name]
         asked = self._crew.asked

@@ -322,6 +322,18 @@ def test_a_card_does_not_live_longer_than_its_unit(
         assert floor.runs == [(label, where)], (gap_s, name, label)
 
 
+def test_a_dropped_card_is_forgotten_in_the_end(recipe: LoadedRecipe) -> None:
+    floor = Floor(recipe)
+    floor.put_all(*pair())
+    floor.scan("SOCKET A")
+    floor.change_places(0.5)
+    floor.go_on(121.0)
+    floor.scan("W1")
+    assert floor.refused()[-1].text == "SOCKET A", "W1 was not refused"
+    floor.scan("SOCKET B")
+    assert floor.runs == [("W1", "B")]
+
+
 def test_what_was_dropped_is_shown_for_a_while(recipe: LoadedRecipe) -> None:
     floor = Floor(recipe)
     floor.put_all(*pair())
