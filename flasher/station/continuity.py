@@ -57,7 +57,14 @@ class Continuity:
     `stall_s` is the longest time between two calls in which somebody has listened.
     """
 
-    def __init__(self, loaded: LoadedTarget, *, stall_s: float, goes_on: bool = False) -> None:
+    def __init__(
+        self,
+        loaded: LoadedTarget,
+        *,
+        stall_s: float,
+        goes_on: bool = False,
+        was_running: bool = False,
+    ) -> None:
         timings = loaded.profile.timings
         self.watcher = TargetWatcher(loaded)
         self.lost = ""
@@ -69,6 +76,8 @@ class Continuity:
         self.power_cycles = 0
         self._goes_on = goes_on
         """A restart is no evidence."""
+        self._was_running = was_running
+        """Its application was heard just before the run, after its label was scanned."""
         self._name = loaded.name
         self._reset_command = loaded.profile.reset_command
         self._sent = Reassembler(loaded.target.request_id, timings.inter_frame_timeout_s)
@@ -225,6 +234,8 @@ class Continuity:
         if not self._is_identified:
             if since_s < inf:
                 self._longest_pause_s = max(self._longest_pause_s, since_s)
+            if self._was_running and now > max(self._burst_until, self._supplied_until):
+                self._lose_by_restart("before it was identified, although its application had run")
             return
         if self._requested_s is not None:
             if self._listened_s - self._requested_s > self._leftover_s:

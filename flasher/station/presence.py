@@ -40,6 +40,7 @@ class TargetWatcher:
 
     def __init__(self, loaded: LoadedTarget) -> None:
         limit_s = loaded.profile.timings.inter_frame_timeout_s
+        self.name = loaded.name
         self._boot = Reassembler(loaded.target.answer_id, limit_s)
         self._own_ids = frozenset(sent_ids(loaded.target))
         self.request = loaded.profile.upgrade_options().version_request_for(loaded.target)
@@ -157,6 +158,8 @@ class Presence:
         self._told_serial: str | None = None
         self._told_in_bootloader = False
         self._told_power_ups = self._power_ups
+        for watcher in self._watchers:
+            watcher.is_in_bootloader, watcher.known_at = False, float("-inf")
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         """One frame of an idle bus."""
@@ -174,10 +177,13 @@ class Presence:
         """When it was known last whether the unit that is heard has had power all the time."""
         return max(watcher.known_at for watcher in self._watchers)
 
-    @property
-    def has_application(self) -> bool:
-        """True when a unit is there whose application was heard since its power came."""
-        return bool(self.is_there) and not self._told_in_bootloader
+    def running(self, now: float) -> frozenset[str]:
+        """The targets whose applications are heard."""
+        return frozenset(
+            watcher.name
+            for watcher in self._watchers
+            if not watcher.is_in_bootloader and now - watcher.known_at < SILENCE_S
+        )
 
     def ask_now(self) -> None:
         """Let the next `probe` ask, although its time has not come."""

@@ -7,7 +7,7 @@ begun, tried again, timed, recorded and judged.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from typing import Final
 
@@ -72,7 +72,7 @@ class _NotedPower:
 class UnitRun:
     """A run. `cancelled` is asked again and again while it runs, and stays True once it was."""
 
-    def __init__(
+    def __init__(  # noqa: PLR0913  what a run is made of
         self,
         order: RunOrder,
         recipe: LoadedRecipe,
@@ -83,7 +83,9 @@ class UnitRun:
         tell: Callable[[RunEvent], None] = lambda _event: None,
         cancelled: Callable[[], bool] = lambda: False,
         power: PowerControl | None = None,
+        running: Collection[str] = (),
     ) -> None:
+        """`running`: targets whose applications were heard just before; they have to stay."""
         self._order = order
         self._recipe = recipe
         self._connection = connection
@@ -95,7 +97,10 @@ class UnitRun:
         goes_on = recipe.recipe.after_restart is AfterRestart.CONTINUE
         stall_s = STALL_S * connection.clock.speed
         self._continuity = {
-            each.name: Continuity(each, stall_s=stall_s, goes_on=goes_on) for each in recipe.targets
+            each.name: Continuity(
+                each, stall_s=stall_s, goes_on=goes_on, was_running=each.name in running
+            )
+            for each in recipe.targets
         }
         self._goes_on = goes_on
         self._power = None if power is None else _NotedPower(power, self._continuity.values())

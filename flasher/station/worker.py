@@ -287,6 +287,7 @@ class Worker:
                     tell=self._pipe.tell,
                     cancelled=self._pipe.is_stopped,
                     power=self._power,
+                    running=self._presence.running(self._connection.clock.now()),
                 )
                 result = _error_result(codes.UNIT_CHANGED, reason) if reason else run.run()
         except StationGoneError:
@@ -320,7 +321,7 @@ class Worker:
         presence, link, clock = self._presence, self._connection.link, self._connection.clock
         if self._virtual is not None or not presence.is_there:
             return ""
-        was_running = presence.has_application
+        was_running = bool(presence.running(clock.now()))
         asked_at, is_asked = clock.now() + _UNDER_WAY_S, False
         try:
             while not self._pipe.is_stopped():
