@@ -180,3 +180,12 @@ def test_of_a_header_that_is_cut_off_before_it_the_processor_is_not_known() -> N
     assert machine_of(file[:20]) == EM_ARM
     assert machine_of(file[:19]) is None
     assert machine_of(file[:5] + b"\x03" + file[6:]) is None
+
+
+def test_a_header_alone_is_whole_and_holds_no_program() -> None:
+    header = elf_file([], [], content=b"")
+    assert len(header) == 52
+    with pytest.raises(ImageError, match="holds no loadable segment"):
+        read_back(header)
+    with pytest.raises(ImageError, match="its header is not whole"):
+        read_back(header[:-1])
