@@ -192,7 +192,9 @@ class StationConfig(Table):
     @field_validator("heads", mode="before")
     @classmethod
     def _one_is_a_list(cls, value: Any) -> Any:
-        return [value] if isinstance(value, str) else value
+        if isinstance(value, str):
+            return (value,)
+        return tuple(value) if isinstance(value, list) else value
 
     @field_validator("heads")
     @classmethod

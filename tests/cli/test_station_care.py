@@ -58,7 +58,8 @@ def test_verify_says_what_the_records_were_held_against(
     assert not told.document["is_checked_elsewhere"]
     shutil.copytree(bench.keys, bench.folder / "share", ignore=shutil.ignore_patterns("*.key"))
     again = flasher("station", "verify", *place)
-    assert "only what came after the examination of" in again.out
+    assert again.out.startswith("nothing in the records since the examination of ")
+    assert "--all examines everything again" in again.out
     two = flasher("station", "verify", *place, "--all", "--heads", bench.folder / "share")
     assert two.out.splitlines()[:3] == [
         "records, traces and audit trails are as they were written",
@@ -72,6 +73,10 @@ def test_verify_says_what_the_records_were_held_against(
     assert without.code == ExitCode.OK
     assert "NOT CHECKED against a head kept elsewhere" in without.out
     assert "as they were written" not in without.out
+    assert "line-2: no heads of it were found" in without.out
+    for wrong in ("sqlite:///x.db", "mysql://x/y"):
+        refused = flasher("station", "verify", *place, "--heads", wrong)
+        assert refused.code == ExitCode.USAGE
     named = flasher("station", "verify", *place, "--heads", bench.folder)
     assert named.code == ExitCode.VERIFICATION
     assert "none of these records is kept" in named.out

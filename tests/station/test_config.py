@@ -73,6 +73,18 @@ def test_a_station_file_is_read_with_places_beside_it(tmp_path: Path) -> None:
     assert load_config(written(tmp_path, f'records = "{url}"\n' + USUAL)).records == url
 
 
+def test_the_heads_are_kept_in_one_place_or_in_several(tmp_path: Path) -> None:
+    url = "postgresql://flasher_heads@plant-db/heads"
+    for said, places in {
+        '"share"': (str(tmp_path / "share"),),
+        f'["/mnt/heads", "{url}"]': ("/mnt/heads", url),
+    }.items():
+        assert load_config(written(tmp_path, f"heads = {said}\n{USUAL}")).heads == places
+    for wrong in ('""', '["a", ""]', "7", "[7]"):
+        with pytest.raises(UsageError, match="heads"):
+            load_config(written(tmp_path, f"heads = {wrong}\n{USUAL}"))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "why"),
     [

@@ -113,18 +113,20 @@ def _problem_lines(problems: Sequence[Problem]) -> Iterator[str]:
 
 
 def _say_what_was_checked(found: Examination, output: Output) -> None:
+    since = ""
+    if found.since is not None:
+        since = f" since the examination of {found.since[:16].replace('T', ' ')} UTC"
     if found.is_checked_elsewhere:
-        output.result("records, traces and audit trails are as they were written")
+        output.result(f"records, traces and audit trails{since} are as they were written")
     elif found.kept:
         output.result(
-            f"nothing in the records differs; NOT CHECKED as a whole against {ELSEWHERE}: whoever"
-            " can write beside the key could have made records and heads anew"
+            f"nothing in the records{since} differs; NOT CHECKED as a whole against {ELSEWHERE}:"
+            " whoever can write beside the key could have made records and heads anew"
         )
     else:
-        output.result(f"nothing in the records differs; NOT CHECKED against {ELSEWHERE}")
-    if found.since is not None:
-        since = f"{found.since[:16].replace('T', ' ')} UTC"
-        output.result(f"  only what came after the examination of {since}; --all: everything")
+        output.result(f"nothing in the records{since} differs; NOT CHECKED against {ELSEWHERE}")
+    if since:
+        output.result("  what is older was examined then; --all examines everything again")
     for each in found.kept:
         where = "the heads in" if each.is_elsewhere else "the heads beside the key, in"
         rows = f"{each.station}: rows {each.first:,} to {each.last:,}"
@@ -133,8 +135,12 @@ def _say_what_was_checked(found: Examination, output: Output) -> None:
             output.result(f"    the rows before row {each.first:,} are compared with no head there")
         if each.last < each.rows:
             output.result(f"    the rows after row {each.last:,} are not kept there yet")
+    beside = {each.station for each in found.kept}
     for name in found.unkept:
-        output.result(f"  {printable(name)}: no heads are kept elsewhere than beside the key")
+        missing = "no heads are kept elsewhere than beside the key"
+        if name not in beside:
+            missing = "no heads of it were found; an older copy would look the same"
+        output.result(f"  {printable(name)}: {missing}")
     output.result(f"  {counted(found.traces, 'trace')} of runs that passed agree with the records")
     if found.unkept:
         output.progress(

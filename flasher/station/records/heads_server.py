@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any, Final
 
 from sqlalchemy import (
@@ -25,7 +24,7 @@ from sqlalchemy import (
     text,
 )
 
-from flasher.station.records.database import Location, locate
+from flasher.station.records.database import Location
 from flasher.station.records.errors import mapped
 from flasher.station.records.heads import Head
 from flasher.station.records.server import make_engine
@@ -59,11 +58,10 @@ FOR EACH STATEMENT EXECUTE FUNCTION kept_head_stays();
 class ServerPlace:
     """A database of a server."""
 
-    def __init__(self, url: str) -> None:
-        """Raises UsageError for a URL that cannot be."""
-        self.location = locate(url, Path())
-        self.shown = self.location.shown
-        self._engine = make_engine(self.location.url, _PATIENCE_S)
+    def __init__(self, location: Location) -> None:
+        self.location = location
+        self.shown = location.shown
+        self._engine = make_engine(location.url, _PATIENCE_S)
 
     def of(self, station: str, records_id: str) -> ServerHeads:
         return ServerHeads(self, station, records_id)

@@ -11,9 +11,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
 
-from flasher.errors import FlasherError
+from flasher.errors import ErrorCode, FlasherError, UsageError
 from flasher.protocol.text import printable
-from flasher.station.records.database import Location
+from flasher.station.records.database import Location, locate
 from flasher.station.records.errors import RecordError
 from flasher.station.records.heads import Checkpoint, Fault, Head, HeadsFile, Position
 from flasher.station.records.signatures import SigningKey
@@ -86,10 +86,22 @@ def place_of(text: str) -> Place:
     """
     if "://" not in text:
         return FolderPlace(Path(text))
-    # The driver is an extra.
-    from flasher.station.records.heads_server import ServerPlace  # noqa: PLC0415
-
-    return ServerPlace(text)
+    location = locate(text, Path())
+    if location.url.get_backend_name() != "postgresql":
+        raise UsageError(
+            f"{location.shown} is no place for heads.",
+            remedy="Name a folder, or postgresql://USER@HOST/NAME.",
+        )
+    try:
+        from flasher.station.records.heads_server import ServerPlace  # noqa: PLC0415
+    except ImportError as error:
+        raise UsageError(
+            "Heads on a PostgreSQL server need a driver that is not installed.",
+            cause=printable(str(error)),
+            remedy="In the checkout: pip install -c .ci/constraints.txt '.[station,postgres]'",
+            code=ErrorCode.PACKAGE_MISSING,
+        ) from error
+    return ServerPlace(location)
 
 
 def file_name(station: str, records_id: str, suffix: str) -> str:
