@@ -247,6 +247,8 @@ class Socket:
         before = self.occupancy
         is_out = is_certain or self.is_own_known or before is Occupancy.EMPTY
         self.occupancy = Occupancy.EMPTY if is_out else Occupancy.SILENT
+        if is_out:
+            self.is_last_there = False
         self.own, self.is_own_known, self.borne, self.is_in_bootloader = None, False, "", False
         self._forget_note()
         if is_certain:

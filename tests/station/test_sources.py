@@ -22,7 +22,7 @@ from flasher.protocol.wire import Message, encode, split
 from flasher.station import line
 from flasher.station.events import ScanRefused, SocketState, StationEvent
 from flasher.station.line import Line
-from flasher.station.messages import Ready
+from flasher.station.messages import AdapterDown, Ready
 from flasher.station.presence import Presence
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import RunState
@@ -374,6 +374,27 @@ def test_green_goes_with_its_unit_however_fast_the_next_one_is(recipe: LoadedRec
     floor.change_places(0.3)
     assert floor.state("A") is SocketState.SCAN
     assert floor.text("A").startswith("After PASS of W1 it was silent or without power.")
+
+
+def test_green_does_not_come_back_to_an_empty_socket(recipe: LoadedRecipe) -> None:
+    """Its process ends, and what is in it is not known for a while."""
+    floor = Floor(recipe)
+    floor.put_all(*pair(("W1", "W2")))
+    floor.scan("W1")
+    floor.end_run("A")
+    floor.go_on(2.0)
+    assert floor.state("A") is SocketState.PASS
+    unit = floor.units.pop("A")
+    floor.go_on(3.0)
+    assert floor.state("A") is SocketState.EMPTY
+    floor.line.feed("A", AdapterDown("its process ended"), floor.now)
+    floor.carry_out()
+    assert floor.state("A") is SocketState.ERROR
+    floor.presences["A"].begin()
+    floor.line.feed("A", Ready("a bus", sees_units=True), floor.now)
+    floor.put(unit, "A")
+    floor.go_on(3.0)
+    assert floor.state("A") is SocketState.PASS, "it is back, and says who it is"
 
 
 def test_a_unit_that_is_switched_off_and_on_is_known_by_its_number(recipe: LoadedRecipe) -> None:
