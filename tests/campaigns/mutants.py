@@ -35,7 +35,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import coverage
-import hypothesis  # noqa: F401  loaded here once, not in each process that is forked
+import hypothesis  # loaded here once, not in each process that is forked
 import pytest
 
 import flasher.cli.main  # noqa: F401  for the libraries: a process loads its own flasher again
@@ -412,6 +412,9 @@ class Ground:
             for name in [*sys.modules]:
                 if name.partition(".")[0] in {"flasher", "tests"}:
                     del sys.modules[name]
+            # A busy machine is no failure.
+            hypothesis.settings.register_profile("mutants", deadline=None)
+            hypothesis.settings.load_profile("mutants")
             words = ["-x", "-q", "-n", "0", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
             words += ["-m", "not no_cover", "-W", "ignore:Module already imported"]
             words += ["--basetemp", str(self._folder / "temporary"), "--timeout", str(self._test_s)]
