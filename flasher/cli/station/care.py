@@ -142,7 +142,7 @@ def _say_what_was_checked(found: Examination, output: Output) -> None:
             missing = "no heads of it were found; an older copy would look the same"
         output.result(f"  {printable(name)}: {missing}")
     output.result(f"  {counted(found.traces, 'trace')} of runs that passed agree with the records")
-    if found.unkept:
+    if found.unkept and not found.unreached:
         output.progress(
             "Name a second place of the heads: heads in the station's file, or --heads."
         )

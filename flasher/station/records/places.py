@@ -220,21 +220,29 @@ class Copying:
     def _put(self, some: list[Head], position: Position) -> None:
         self._target.append(some, self._key())
         self._position = position
+        self._note_known()
+
+    def _note_known(self) -> None:
+        """Remember that heads are kept there from now on."""
+        known = self._known_places()
+        if self.shown not in known:
+            self._known.write_text("".join(f"{each}\n" for each in [*known, self.shown]), "utf-8")
+
+    def _known_places(self) -> list[str]:
+        return self._known.read_text("utf-8").splitlines() if self._known.exists() else []
 
     def _find(self) -> Position:
         """Where to go on. Raises RecordError for a place that lost what it had."""
         last = self._target.last()
-        known = self._known.read_text("utf-8").splitlines() if self._known.exists() else []
-        if last is None and self.shown in known:
+        if last is None and self.shown in self._known_places():
             raise RecordError(
                 f"The heads that were kept in {self.shown} are gone.",
                 cause="the heads that were kept there are gone: is it the right share?",
                 remedy=f"Mount the share. To begin anew there, delete {self._known}.",
             )
-        if self.shown not in known:
-            self._known.write_text("".join(f"{each}\n" for each in [*known, self.shown]), "utf-8")
         if last is None:
             return Position()
+        self._note_known()
         found = self._source.position_after(last)
         if found is not None:
             return found

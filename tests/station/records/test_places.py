@@ -255,6 +255,21 @@ def test_a_share_that_is_not_mounted_is_not_begun_anew(tmp_path: Path) -> None:
     assert not list(share.iterdir())
 
 
+def test_a_place_that_was_never_reached_is_begun_when_it_can_be(tmp_path: Path) -> None:
+    share = tmp_path / "share"
+    share.write_text("no folder yet")
+    bench = Bench(tmp_path, heads=(share,))
+    bench.make()
+    (copying,) = bench.store.signer.copies
+    assert copying.wait()
+    assert copying.fault
+    share.unlink()
+    bench.make(serial=OTHER)
+    assert copying.wait()
+    assert not copying.fault
+    assert verified(bench).is_checked_elsewhere
+
+
 def test_a_new_place_gets_the_heads_from_the_first_on(tmp_path: Path) -> None:
     bench = Bench(tmp_path)
     bench.make()
