@@ -118,6 +118,7 @@ class Process:
         self.connection = Connection(bus.link(), bus.clock, f"bus {setup.socket}")
         self.has_asked = False
         """It waits for the station."""
+        self.stalled_until = 0.0
 
         def main() -> None:
             pipe = StationPipe(self._pipe, bus.clock.now)
@@ -138,6 +139,8 @@ class Process:
     def go_on(self, horizon: float) -> None:
         """Run until this time, or until it waits for the station."""
         self._bus.horizon, self.has_asked = horizon, False
+        if horizon <= self.stalled_until:
+            self._bus.idle(horizon)
         if not self.is_over and self._bus.clock.now() < horizon:
             self._greenlet.parent = getcurrent()
             self._greenlet.switch()

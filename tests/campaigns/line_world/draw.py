@@ -208,7 +208,9 @@ class Teller:
             socket = chance.choice(list(self.world.bays))
             seconds = round(chance.choice((0.05, 0.5, 2.0, 4.0)), 3)
             way = chance.random()
-            if way < 0.4:
+            if way < 0.15:
+                yield wait, stories.Stall(socket=socket, seconds=seconds)
+            elif way < 0.4:
                 unit = chance.choice(list(self.world.units))
                 yield wait, stories.Sleep(unit=unit, seconds=seconds)
             elif way < 0.65:

@@ -147,6 +147,15 @@ class Dip(Act):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Stall(Act):
+    """The process of a socket stands still for a time."""
+
+    NAME = "stall"
+    socket: str
+    seconds: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
 class KillWorker(Act):
     NAME = "worker"
     socket: str
@@ -163,8 +172,8 @@ class KillStation(Act):
 CLAUSES: Final[dict[str, type[Clause]]] = {
     kind.NAME: kind
     for kind in (
-        LineSetup, UnitSetup, Person, Put, Pull, Card, Label, Cancel, Free, Sleep, Dip, KillWorker,
-        KillStation,
+        LineSetup, UnitSetup, Person, Put, Pull, Card, Label, Cancel, Free, Sleep, Dip, Stall,
+        KillWorker, KillStation,
     )
 }  # fmt: skip
 

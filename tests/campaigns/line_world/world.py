@@ -472,6 +472,13 @@ class World:
         if bay.unit is not None and not bay.unit.engine.has_power:
             bay.unit.engine.power_on(self.now)
 
+    def _stall(self, act: stories.Stall) -> bool:
+        bay = self.bays.get(act.socket)
+        if bay is None or bay.process is None or bay.process.is_over:
+            return False
+        bay.process.stalled_until = self.now + act.seconds
+        return True
+
     def _kill_worker(self, act: stories.KillWorker) -> bool:
         bay = self.bays.get(act.socket)
         if self.station is None or bay is None or bay.process is None or bay.process.is_over:
@@ -502,6 +509,7 @@ class World:
         stories.Free: _free,
         stories.Sleep: _sleep,
         stories.Dip: _dip,
+        stories.Stall: _stall,
         stories.KillWorker: _kill_worker,
         stories.KillStation: _kill_station,
     }
