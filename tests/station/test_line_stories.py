@@ -56,6 +56,21 @@ STORIES = {
         " @3.0 put unit=2 socket=B ; @13.0 card by=al unit=2 ; @14.0 pull unit=2 ;"
         " @14.3 put unit=1 socket=B ; @16.0 label by=al unit=2"
     ),
+    "exchanged just before the label": (
+        "line sockets=1 recipe=plain ; unit label=1 ; unit label=2 ; person name=jo ;"
+        " @3.0 put unit=2 socket=A ; @3.1 card by=jo unit=2 ; @6.5 pull unit=2 ;"
+        " @6.6 put unit=1 socket=A ; @6.64 label by=jo unit=2"
+    ),
+    "exchanged while it is identified": (
+        "line sockets=2 ; unit label=1 ; unit label=3 ; person name=jo ; @3.0 put unit=1 socket=B ;"
+        " @12.0 card by=jo unit=1 ; @13.0 label by=jo unit=1 ; @13.1 pull unit=1 ;"
+        " @13.5 put unit=3 socket=B"
+    ),
+    "exchanged just before the reset": (
+        "line sockets=1 ; unit label=1 ; unit label=3 pace=slow ; person name=jo ;"
+        " @3.0 put unit=3 socket=A ; @5.0 label by=jo unit=3 ; @5.4 pull unit=3 ;"
+        " @5.7 put unit=1 socket=A"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"
