@@ -144,8 +144,12 @@ class UnitTarget:
         return asked and found.seen.version is None and not found.is_in_bootloader
 
     def await_application(self) -> Content | None:
-        """Its version answer as soon as it runs; None when it does not in the time of a start."""
-        give_up_at = self.clock.now() + self.loaded.profile.timings.application_start_timeout_s
+        """Its version answer as soon as it runs; None when it does not in the time of a start, or,
+        where it has run, when it is silent.
+        """
+        may_start = self.goes_on or not self.continuity.is_running
+        start_s = self.loaded.profile.timings.application_start_timeout_s
+        give_up_at = self.clock.now() + (start_s if may_start else SILENCE_S)
         while True:
             try:
                 answer = self.device.version()

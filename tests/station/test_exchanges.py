@@ -123,7 +123,7 @@ class Exchange:
         result = self.bench.run()
         assert (result.outcome, result.code) == (RunState.ERROR, "UNIT_CHANGED"), result
         assert result.verified == {}
-        assert self.is_done or self.gap_s > 5
+        assert self.is_done or self.gap_s > 2
         if is_untouched:
             self.check_untouched()
         return result
@@ -199,6 +199,18 @@ def test_a_unit_that_is_exchanged_between_two_steps(
     """The second one runs the new version already: only who it is tells them apart."""
     second = replace(NEW_UNIT, factory_version=BMS_VERSION)
     world = Exchange(tmp_path, numbers, gap_s=gap_s, second=second)
+    world.at_note(*note)
+    world.check_caught()
+
+
+@pytest.mark.parametrize(("numbers", "gap_s"), [(BLANK, 3.5), (OF_MAKER, 3.5), (OF_MAKER, 0.3)])
+@pytest.mark.parametrize("note", BETWEEN, ids=" ".join)
+def test_a_unit_that_keeps_its_supply_and_announces_nothing(
+    tmp_path: Path, numbers: tuple[str, str], gap_s: float, note: tuple[str, ...]
+) -> None:
+    """It is another one by its number, or because nothing answered for a while."""
+    second = replace(NEW_UNIT, factory_version=BMS_VERSION)
+    world = Exchange(tmp_path, numbers, gap_s=gap_s, second=second, is_announced=False)
     world.at_note(*note)
     world.check_caught()
 
