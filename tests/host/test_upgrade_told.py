@@ -188,13 +188,27 @@ def test_an_end_that_is_not_answered_is_a_silence_and_one_with_announcements_is_
     bench.say(RequestTransfer())
     bench.expect(Packet)
     bench.say(Ack(1))
-    bench.expect(EndOfTransfer)
-    bench.expect(EndOfTransfer)
+    for _ in range(3):
+        bench.expect(EndOfTransfer)
     bench.say(BootVersion("PBU", "V1.2.3"))
     bench.wait(1.0)
     assert bench.outcome.ending is Ending.UNCONFIRMED
-    assert bench.outcome.statistics.timeouts == 1
-    assert bench.outcome.statistics.repetitions == 1
+    assert bench.outcome.statistics.timeouts == 2
+    assert bench.outcome.statistics.repetitions == 2
+
+
+def test_an_end_that_is_sent_again_while_the_version_is_asked_is_waited_for_as_ever() -> None:
+    bench = Bench()
+    bench.to_end()
+    for _ in range(2):
+        bench.expect(EndOfTransfer)
+    assert bench.expect(Message).command == 0x3300
+    bench.say(Nak(3))
+    bench.expect(EndOfTransfer)
+    assert stage(bench).standing == "waiting for the final answer"
+    bench.wait(9.9)
+    assert bench.unread == []
+    assert bench.expect(Message, within_s=0.2).command == 0x3300
 
 
 def test_an_upgrade_that_came_to_no_transfer_has_no_time_of_it() -> None:
