@@ -6,6 +6,8 @@ uninterrupted unit:
 - its bootloader announces itself, although the run has neither reset it, nor ended a transfer, nor
   switched its power (R28); or after a silence in which it has not confirmed the reset;
 - it announces itself in the middle of a transfer, or an application answers, which is erased then;
+- before the run has sent anything that restarts it, the watcher counts another power-up of what it
+  had heard, also in the time before the run;
 - a version answer, whoever asked for it, or an announced boot version, differs from the first one
   in something that the run has not written.
 
@@ -60,13 +62,14 @@ class Continuity:
     def __init__(
         self,
         loaded: LoadedTarget,
+        watcher: TargetWatcher,
         *,
         stall_s: float,
         goes_on: bool = False,
-        was_running: bool = False,
+        was_exchanged: bool = False,
     ) -> None:
         timings = loaded.profile.timings
-        self.watcher = TargetWatcher(loaded)
+        self.watcher = watcher
         self.lost = ""
         """What speaks against the same unit; empty while nothing does."""
         self.is_running = False
@@ -76,8 +79,6 @@ class Continuity:
         self.power_cycles = 0
         self._goes_on = goes_on
         """A restart is no evidence."""
-        self._was_running = was_running
-        """Its application was heard just before the run, after its label was scanned."""
         self._name = loaded.name
         self._reset_command = loaded.profile.reset_command
         self._sent = Reassembler(loaded.target.request_id, timings.inter_frame_timeout_s)
@@ -108,10 +109,16 @@ class Continuity:
         self._requested_s: float | None = None
         """The same for when the transfer that goes on was requested; None: none does."""
         self._is_identified = False
+        self._has_acted = False
+        """The run has sent something after which the unit may restart, or switched its power."""
         self._is_asked = self.watcher.request is not None
         self._boot_version = ""
         self._known: dict[str, frozenset[str]] = {}
         """What each field of its identity may be; empty before it has answered."""
+        if watcher.answer is not None:
+            self._compare(watcher.answer)
+        if was_exchanged:
+            self._lose("was exchanged, or had no power, before the run began")
 
     # -- what the run knows -----------------------------------------------------------------------
 
@@ -126,6 +133,11 @@ class Continuity:
         if content is not None:
             self._compare(content)
             self.settle()
+
+    @property
+    def has_answered(self) -> bool:
+        """True when it has answered who it is, before the run or in it."""
+        return bool(self._known)
 
     def _stay(self) -> None:
         self._is_identified = True
@@ -168,6 +180,8 @@ class Continuity:
         passed_s = now - self._now
         if passed_s <= self._stall_s:
             self._listened_s += passed_s
+        elif passed_s < inf:
+            self.watcher.miss(passed_s)
         self._now = now
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
@@ -178,7 +192,10 @@ class Continuity:
         watcher = self.watcher
         requests, announcements = watcher.transfer_requests, watcher.announcements
         answers, confirmations = watcher.answers, watcher.confirmations
+        was_heard, power_ups = watcher.is_known, watcher.power_ups
         watcher(frame, sent=False, now=now)
+        if was_heard and watcher.power_ups > power_ups:
+            self._take_power_up(now)
         if watcher.heard_at == now:
             if self._listened_s - self._heard_s > _EXCHANGE_S:
                 self._returned_s = self._listened_s
@@ -205,6 +222,7 @@ class Continuity:
         for found in self._sent.feed(frame.data, now):
             if not isinstance(found, Message) or found.mode != Mode.WRITE:
                 continue
+            self._has_acted = True
             if found.command == Command.RESET and self.is_running:
                 # As long as it has not confirmed that, it goes on running.
                 self._awaits_confirmation = True
@@ -224,9 +242,19 @@ class Continuity:
 
     def _restart(self) -> None:
         self.is_running = self._awaits_confirmation = False
+        self._has_acted = True
         self._requested_s = None
         # However late: only an answer of the application shows that no burst will follow.
         self._burst_until = inf
+
+    def _take_power_up(self, now: float) -> None:
+        """Its power came, and it was heard before."""
+        if self._has_acted or now <= self._supplied_until:
+            return
+        if self.watcher.is_in_bootloader:
+            self._lose_by_restart("although this run had not restarted it")
+        elif not self._goes_on:
+            self._lose("only announced its bootloader before, and runs an application now")
 
     def _take_announcement(self, now: float) -> None:
         since_s = inf if self._announced_s is None else self._listened_s - self._announced_s
@@ -234,8 +262,6 @@ class Continuity:
         if not self._is_identified:
             if since_s < inf:
                 self._longest_pause_s = max(self._longest_pause_s, since_s)
-            if self._was_running and now > max(self._burst_until, self._supplied_until):
-                self._lose_by_restart("before it was identified, although its application had run")
             return
         if self._requested_s is not None:
             if self._listened_s - self._requested_s > self._leftover_s:

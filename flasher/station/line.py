@@ -268,12 +268,13 @@ class Line:
         reason = say("Socket {socket} is out of service.", socket=socket.name)
         self._drop_scans(socket, _FORGOTTEN, reason, say("Scan it again when it works again."))
         # What happens in it cannot be seen now. What was silent before stays doubtful.
-        socket.own, socket.is_own_known = None, False
+        socket.own, socket.is_own_known, socket.presence_number = None, False, 0
         if socket.occupancy is not Occupancy.SILENT:
             socket.occupancy = Occupancy.UNKNOWN
 
     def _unit(self, socket: Socket, what: PresenceChanged, now: float) -> None:
         """A unit is heard, reports its serial number, or is not heard any more."""
+        socket.presence_number = what.number
         if not what.is_there:
             reason = say("Its unit is not heard any more.")
             remedy = say("Scan it again when it is connected.")

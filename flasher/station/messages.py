@@ -144,6 +144,10 @@ class Begin:
 
     order: RunOrder
     trace: Path
+    presence: int = 0
+    """The number of the last change of presence that the station knows: the label was given to
+    the unit of which that is true.
+    """
 
 
 @dataclass(frozen=True)
@@ -203,11 +207,13 @@ class PresenceChanged:
     is_certain: bool = False
     """Nothing is in the socket; else nothing is heard, which may be a unit that sleeps."""
     is_power_up: bool = False
-    """A bootloader announced that its power came: of a unit that was put in, which may be another
-    one than was heard before.
+    """A bootloader announced that its power came, or a unit that had only announced itself has an
+    application now: of a unit that was put in, which may be another one than was heard before.
     """
     is_in_bootloader: bool = False
     """Only announcements of a bootloader are heard, and no application."""
+    number: int = 0
+    """Changes are numbered; 0 of a virtual unit."""
 
 
 @dataclass(frozen=True)

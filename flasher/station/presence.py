@@ -39,8 +39,8 @@ class TargetWatcher:
     """
 
     def __init__(self, loaded: LoadedTarget) -> None:
-        limit_s = loaded.profile.timings.inter_frame_timeout_s
-        self.name = loaded.name
+        timings = loaded.profile.timings
+        limit_s = timings.inter_frame_timeout_s
         self._boot = Reassembler(loaded.target.answer_id, limit_s)
         self._own_ids = frozenset(sent_ids(loaded.target))
         self.request = loaded.profile.upgrade_options().version_request_for(loaded.target)
@@ -64,14 +64,22 @@ class TargetWatcher:
         self.answer: Content | None = None
         """The last one."""
         self.power_ups = 0
-        """Announcements that began after a pause, or after the application was heard."""
-        self.is_in_bootloader = False
-        """Nothing but announcements was heard since it announced itself."""
-        self.known_at = float("-inf")
-        """When its application was heard, or an announcement to its end."""
+        """How often another unit may have come: announcements that began after a pause, or after
+        the application was heard; an application that was heard after announcements of which no
+        end was to be expected.
+        """
+        self.has_application = False
+        """It was heard since it announced itself."""
+        self._announcing_on_s = timings.announcing_on_s
+        self._announcing_s = 0.0
+        """How long it has announced itself."""
         self._paused_s = 0.0
-        """The last pause between announcements, and when it ended."""
+        """The last pause between announcements, 0 before one, and when it ended."""
         self._paused_at = float("-inf")
+        self._is_pace_unknown = False
+        """There was only one announcement before the last pause, the first one."""
+        self._missed_s = 0.0
+        """How long nobody has listened since the last announcement."""
         self.serial: str | None = None
         """The serial number in its last answer, empty without one; None: it has not answered."""
 
@@ -81,7 +89,7 @@ class TargetWatcher:
         if frame.can_id in self._own_ids:
             self.heard_at = now
             if frame.can_id != self._boot.can_id:
-                self.is_in_bootloader, self.known_at = False, now
+                self._hear_application()
         if frame.can_id == self._boot.can_id:
             for found in self._boot.feed(frame.data, now):
                 row = decode(found) if isinstance(found, Message) else None
@@ -97,19 +105,58 @@ class TargetWatcher:
                 if isinstance(found, Message):
                     self._take(found)
 
+    @property
+    def is_in_bootloader(self) -> bool:
+        """True when nothing but announcements was heard since it announced itself."""
+        return self.announcements > 0 and not self.has_application
+
+    @property
+    def is_known(self) -> bool:
+        """True when it has announced itself, or its application was heard."""
+        return self.announcements > 0 or self.has_application
+
+    def _hear_application(self) -> None:
+        if self.is_in_bootloader and self._announcing_s > self._announcing_on_s:
+            self._powered_up()  # one that has no application does not start it
+        self.has_application = True
+
+    def miss(self, missed_s: float) -> None:
+        """Nobody has listened for so long: that is no pause of the device."""
+        self._missed_s += missed_s
+
     def _announced(self, now: float) -> None:
-        pause_s = float("inf") if self.announced_at is None else now - self.announced_at
+        pause_s = float("inf")
+        if self.announced_at is not None:
+            pause_s = now - self.announced_at - self._missed_s
+        self._missed_s = 0.0
+        is_pause = pause_s > PAUSE_S
         is_rhythm = (
             self._paused_s / _ALIKE < pause_s < self._paused_s * _ALIKE
             and now - pause_s - self._paused_at < _RHYTHM_S
         )
-        if not self.is_in_bootloader or (pause_s > PAUSE_S and not is_rhythm):
-            self.power_ups += 1
-        if pause_s > PAUSE_S:
+        # After one announcement, a pause may be the pace of this bootloader: the next one shows it.
+        is_first_pause = self._announcing_s == 0.0 and pause_s < _RHYTHM_S
+        is_sooner = self._is_pace_unknown and not is_rhythm
+        if (
+            not self.is_in_bootloader
+            or is_sooner
+            or (is_pause and not is_rhythm and not is_first_pause)
+        ):
+            self._powered_up()
+            is_first_pause = False
+        else:
+            self._announcing_s += pause_s
+        self._is_pace_unknown = is_pause and is_first_pause
+        if is_pause:
             self._paused_s, self._paused_at = pause_s, now
         self.announcements += 1
-        self.announced_at = self.known_at = now
-        self.is_in_bootloader = True
+        self.announced_at, self.has_application = now, False
+
+    def _powered_up(self) -> None:
+        """What it answered before may be of another unit."""
+        self.power_ups += 1
+        self._announcing_s = 0.0
+        self.serial = self.answer = None
 
     def _take(self, message: Message) -> None:
         """A message that may be the answer."""
@@ -126,10 +173,12 @@ class Presence:
     """Watches an idle bus; pure: frames and times come from outside."""
 
     def __init__(self, targets: Sequence[LoadedTarget]) -> None:
-        self._watchers = [TargetWatcher(each) for each in targets]
-        self._requests = [each.request for each in self._watchers if each.request is not None]
+        self._targets = targets
         self._probed_at: float | None = None
+        self._number = 0
+        """Of the last change."""
         self.begin()
+        self._requests = [each.request for each in self.watchers if each.request is not None]
 
     @property
     def sees_units(self) -> bool:
@@ -138,13 +187,13 @@ class Presence:
 
     @property
     def _power_ups(self) -> int:
-        return sum(watcher.power_ups for watcher in self._watchers)
+        return sum(watcher.power_ups for watcher in self.watchers)
 
     def _is_in_bootloader(self, now: float) -> bool:
         """True when nothing is heard but announcements."""
         return all(
             watcher.is_in_bootloader
-            for watcher in self._watchers
+            for watcher in self.watchers
             if watcher.heard_at is not None and now - watcher.heard_at < SILENCE_S
         )
 
@@ -154,40 +203,23 @@ class Presence:
         """None: not known yet."""
         self._heard_at: float | None = None
         self._began_at: float | None = None
-        self._forget_serials()
-        self._told_serial: str | None = None
         self._told_in_bootloader = False
-        self._told_power_ups = self._power_ups
-        for watcher in self._watchers:
-            watcher.is_in_bootloader, watcher.known_at = False, float("-inf")
+        self.exchanged_number = 0
+        """The number of the last change after which another unit may be there."""
+        self._forget_unit()
+
+    def _forget_unit(self) -> None:
+        self.watchers = [TargetWatcher(each) for each in self._targets]
+        """One for each target: what was heard of the unit that is there."""
+        self._told_serial: str | None = None
+        self._told_power_ups = 0
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         """One frame of an idle bus."""
-        for watcher in self._watchers:
+        for watcher in self.watchers:
             watcher(frame, sent=sent, now=now)
             if watcher.heard_at == now:
                 self._heard_at = now
-
-    def _forget_serials(self) -> None:
-        for watcher in self._watchers:
-            watcher.serial = None
-
-    @property
-    def known_at(self) -> float:
-        """When it was known last whether the unit that is heard has had power all the time."""
-        return max(watcher.known_at for watcher in self._watchers)
-
-    def running(self, now: float) -> frozenset[str]:
-        """The targets whose applications are heard."""
-        return frozenset(
-            watcher.name
-            for watcher in self._watchers
-            if not watcher.is_in_bootloader and now - watcher.known_at < SILENCE_S
-        )
-
-    def ask_now(self) -> None:
-        """Let the next `probe` ask, although its time has not come."""
-        self._probed_at = None
 
     def probe(self, now: float) -> list[Frame]:
         """What is to be sent now: a question to each target that can be asked, in its time."""
@@ -209,21 +241,22 @@ class Presence:
         if is_soon and not heard:
             return None
         is_power_up = heard and self._power_ups > self._told_power_ups
-        if is_power_up and self.is_there:
-            self._forget_serials()  # what answered before may be out
         in_bootloader = heard and self._is_in_bootloader(now)
         # What the unit says that it is; None before it has said anything.
-        said = [each.serial for each in self._watchers if each.serial is not None]
+        said = [each.serial for each in self.watchers if each.serial is not None]
         serial = next(filter(None, said), "") if said else None
         told = (self.is_there, self._told_serial, self._told_in_bootloader)
         if (heard, serial, in_bootloader) == told and not is_power_up:
             return None
+        self._number += 1
+        is_other = None not in (self._told_serial, serial) and self._told_serial != serial
+        if self.is_there and (is_power_up or is_other or not heard):
+            self.exchanged_number = self._number
         self.is_there, self._told_in_bootloader = heard, in_bootloader
         self._told_power_ups = self._power_ups
         if not heard:
-            self._forget_serials()
-            self._told_serial = None
-            return PresenceChanged(is_there=False)
+            self._forget_unit()
+            return PresenceChanged(is_there=False, number=self._number)
         self._told_serial = serial
         return PresenceChanged(
             is_there=True,
@@ -231,4 +264,5 @@ class Presence:
             serial=serial,
             is_power_up=is_power_up,
             is_in_bootloader=in_bootloader,
+            number=self._number,
         )

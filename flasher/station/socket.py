@@ -126,6 +126,8 @@ class Socket:
     """When the run begins although no unit is heard, or although it does not say who it is."""
     bound_at_s: float = 0.0
     """When it got its label."""
+    presence_number: int = 0
+    """Of the last change of presence that was reported."""
     arrived_at_s: float = 0.0
     """When the unit in it was heard first."""
     is_in_bootloader: bool = False

@@ -456,9 +456,9 @@ class Station:
         run = self._going(socket)
         if run is None:
             return
-        order, is_virtual = run.order, self.line.sockets[socket].is_virtual
-        self.tell(RunStarted(socket, order.serial, order.run_id, order.kind, is_virtual))
-        if not self.supervisor.send(socket, Begin(run.order, run.trace)):
+        order, at = run.order, self.line.sockets[socket]
+        self.tell(RunStarted(socket, order.serial, order.run_id, order.kind, at.is_virtual))
+        if not self.supervisor.send(socket, Begin(order, run.trace, at.presence_number)):
             self._end_lost(socket, codes.PROCESS_DIED.meaning, hung=False)
 
     def _going(self, socket: str) -> ActiveRun | None:

@@ -7,7 +7,7 @@ begun, tried again, timed, recorded and judged.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from typing import Final
 
@@ -33,6 +33,7 @@ from flasher.station.messages import (
     StepReport,
 )
 from flasher.station.power import PowerControl
+from flasher.station.presence import TargetWatcher
 from flasher.station.recipe import AfterRestart, StepRule
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import Measurement, RunState, StepName, StepState
@@ -70,7 +71,11 @@ class _NotedPower:
 
 
 class UnitRun:
-    """A run. `cancelled` is asked again and again while it runs, and stays True once it was."""
+    """A run. `cancelled` is asked again and again while it runs, and stays True once it was.
+
+    `watchers` know what was heard of the unit before the run, one for each target; the run goes on
+    with them. `was_exchanged`: another unit may have come since the label was bound to the socket.
+    """
 
     def __init__(  # noqa: PLR0913  what a run is made of
         self,
@@ -83,9 +88,9 @@ class UnitRun:
         tell: Callable[[RunEvent], None] = lambda _event: None,
         cancelled: Callable[[], bool] = lambda: False,
         power: PowerControl | None = None,
-        running: Collection[str] = (),
+        watchers: Sequence[TargetWatcher] | None = None,
+        was_exchanged: bool = False,
     ) -> None:
-        """`running`: targets whose applications were heard just before; they have to stay."""
         self._order = order
         self._recipe = recipe
         self._connection = connection
@@ -96,11 +101,12 @@ class UnitRun:
         self._cancelled = cancelled
         goes_on = recipe.recipe.after_restart is AfterRestart.CONTINUE
         stall_s = STALL_S * connection.clock.speed
+        watchers = watchers or [TargetWatcher(each) for each in recipe.targets]
         self._continuity = {
             each.name: Continuity(
-                each, stall_s=stall_s, goes_on=goes_on, was_running=each.name in running
+                each, watcher, stall_s=stall_s, goes_on=goes_on, was_exchanged=was_exchanged
             )
-            for each in recipe.targets
+            for each, watcher in zip(recipe.targets, watchers, strict=True)
         }
         self._goes_on = goes_on
         self._power = None if power is None else _NotedPower(power, self._continuity.values())

@@ -135,7 +135,7 @@ class UnitSteps:
 
     def _connect(self, measured: list[Measurement]) -> str:
         connection = self.targets[0].device.connection
-        connection.link.drain()
+        self.targets[0].hear_waiting()  # it belongs to what was heard before the run
         error = connection.link.health().error(connection.name)
         if error is not None:
             raise error
@@ -153,6 +153,9 @@ class UnitSteps:
                 raise StepFailedError(
                     codes.TWO_DEVICES, f"Two devices answer as {target.name}: {found.two_devices}."
                 )
+            is_known = target.continuity.has_answered and not target.goes_on
+            if is_known and found.seen.version is None:
+                raise StepFailedError(codes.UNIT_CHANGED, f"The {target.name} fell silent.")
             may_await_power = self._power is not None or target.goes_on
             is_rescue = self._order.kind is RunKind.RECHECK and may_await_power
             if target.is_silent(found) and not is_rescue:

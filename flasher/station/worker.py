@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from flasher.api import Connection, connect
-from flasher.bus.link import AT_ONCE
 from flasher.errors import BusError, FlasherError, TransmitBlockedError, UsageError
 from flasher.files import make_private
 from flasher.log import log_event
@@ -64,8 +63,6 @@ _REOPEN_S: Final = 1.0
 BEAT_S: Final = 0.5
 """How often it says that it is alive."""
 IDLE_S: Final = 0.05
-_UNDER_WAY_S: Final = 0.05
-"""What a unit sent before may still come within this time."""
 REPLY_LIMIT_S: Final = 60.0
 """How long it waits until the station has something on disk."""
 _LOOK_S: Final = 0.1
@@ -274,11 +271,16 @@ class Worker:
 
     def _run(self, begin: Begin) -> None:
         recorder: Recorder | None = None
+        watchers, was_exchanged = None, False
+        if self._virtual is None:
+            presence = self._presence
+            if (change := presence.change(self._connection.clock.now())) is not None:
+                self._pipe.send(change)
+            watchers, was_exchanged = presence.watchers, presence.exchanged_number > begin.presence
         try:
             with Recorder(begin.trace) as recorder:
                 recorder.channel = self._connection.channel
-                reason = self._why_changed()
-                run = UnitRun(
+                result = UnitRun(
                     begin.order,
                     self._recipe,
                     self._connection,
@@ -287,9 +289,9 @@ class Worker:
                     tell=self._pipe.tell,
                     cancelled=self._pipe.is_stopped,
                     power=self._power,
-                    running=self._presence.running(self._connection.clock.now()),
-                )
-                result = _error_result(codes.UNIT_CHANGED, reason) if reason else run.run()
+                    watchers=watchers,
+                    was_exchanged=was_exchanged,
+                ).run()
         except StationGoneError:
             return
         except FlasherError as error:
@@ -310,43 +312,6 @@ class Worker:
         with suppress(BusError):
             self._connection.link.drain()
         self._presence.begin()
-
-    def _why_changed(self) -> str:
-        """Why the unit that was heard is not the one that is there now; "" where it is.
-
-        The label was scanned for the unit that was heard last. It may have been pulled out less
-        than `SILENCE_S` ago, which is not noticed yet, and the next one be in before it is
-        identified: so it has to be heard once more, without a power-up before it.
-        """
-        presence, link, clock = self._presence, self._connection.link, self._connection.clock
-        if self._virtual is not None or not presence.is_there:
-            return ""
-        was_running = bool(presence.running(clock.now()))
-        asked_at, is_asked = clock.now() + _UNDER_WAY_S, False
-        try:
-            while not self._pipe.is_stopped():
-                until = (
-                    min(clock.now() + IDLE_S, asked_at) if not is_asked else clock.now() + IDLE_S
-                )
-                frame = link.receive(until)
-                while frame is not None:
-                    presence(frame, sent=False, now=clock.now())
-                    frame = link.receive(AT_ONCE)
-                change = presence.change(clock.now())
-                if change is not None and change.is_power_up:
-                    return "The unit was exchanged, or had no power, before the run began."
-                if change is not None and not change.is_there:
-                    return "The unit is not heard any more." if was_running else ""
-                if is_asked and presence.known_at > asked_at:
-                    return ""
-                if not is_asked and clock.now() >= asked_at:
-                    is_asked = True
-                    presence.ask_now()
-                for question in presence.probe(clock.now()) if is_asked else ():
-                    link.send(question)
-        except BusError:
-            pass  # the run says so
-        return ""
 
 
 def pack(path: Path) -> TraceFile:

@@ -72,6 +72,31 @@ STORIES = {
         " @3.0 put unit=3 socket=A ; @5.0 label by=jo unit=3 ; @5.4 pull unit=3 ;"
         " @5.7 put unit=1 socket=A"
     ),
+    "a second burst before it is identified": (
+        "line sockets=3 ; unit label=1 ; unit label=4 ; person name=jo ;"
+        " @3.0 card by=jo unit=4 socket=C ; @5.0 label by=jo unit=4 ; @5.5 put unit=4 socket=C ;"
+        " @6.0 pull unit=4 ; @7.0 put unit=1 socket=C"
+    ),
+    "exchanged where identify ends": (
+        "line sockets=3 recipe=plain ; unit label=3 ; unit label=4 number=own ; person name=al ;"
+        " @3.0 card by=al unit=3 socket=C ; @3.5 label by=al unit=3 ; @3.7 put unit=3 socket=C ;"
+        " @4.269 pull unit=3 ; @4.5 put unit=4 socket=C"
+    ),
+    "a bootloader for an application": (
+        "line sockets=2 recipe=plain ; unit label=1 ; unit label=3 application=none ;"
+        " person name=al ; @3.0 put unit=3 socket=B ; @3.1 card by=al unit=3 ;"
+        " @4.0 label by=al unit=3 ; @4.5 pull unit=3 ; @5.0 put unit=1 socket=B"
+    ),
+    "a bootloader for an application, fast": (
+        "line sockets=1 recipe=plain ; unit label=2 ; unit label=4 application=none ;"
+        " person name=jo ; @3.0 put unit=4 socket=A ; @5.0 card by=jo unit=4 ;"
+        " @15.6 pull unit=4 ; @15.7 put unit=2 socket=A ; @18.0 label by=jo unit=4"
+    ),
+    "an application for a bootloader that sleeps": (
+        "line sockets=1 ; unit label=3 application=none ; unit label=4 ; person name=jo ;"
+        " @3.0 put unit=3 socket=A ; @3.5 card by=jo unit=3 socket=A ; @4.5 label by=jo unit=3 ;"
+        " @5.0 sleep unit=3 seconds=4.0 ; @8.0 pull unit=3 ; @8.1 put unit=4 socket=A"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"

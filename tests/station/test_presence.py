@@ -14,6 +14,7 @@ from flasher.protocol.messages import BootVersion
 from flasher.protocol.spec import BMS, WMC, Mode
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message, encode, split
+from flasher.station.messages import PresenceChanged
 from flasher.station.presence import Presence
 from tests.loops import each
 from tests.station.unit_bench import UnitBench
@@ -158,6 +159,65 @@ def test_what_was_said_before_a_power_up_is_not_of_this_unit(presence: Presence)
     assert (change.serial, change.is_in_bootloader) == (None, False)
 
 
+def hear(presence: Presence, frames: list[Frame], now: float) -> PresenceChanged | None:
+    for frame in frames:
+        presence(frame, sent=False, now=now)
+    return presence.change(now)
+
+
+@each("announced_s", [0.9, 1.2])
+def test_a_unit_that_only_announced_itself_and_has_an_application_now_is_another_one(
+    tmp_path: Path, announced_s: float
+) -> None:
+    presence = Presence(UnitBench(tmp_path).recipe.targets)
+    announce(presence, *(1.0 + 0.05 * at for at in range(round(announced_s / 0.05) + 1)))
+    change = hear(presence, version_answer(""), 1.2 + announced_s)
+    assert change is not None
+    assert change.is_power_up == (announced_s > 1.0), "one that starts goes on for less than 1 s"
+    assert change.serial == ""
+    assert presence.exchanged_number == (change.number if announced_s > 1.0 else 0)
+
+
+def test_changes_are_numbered_and_the_last_exchange_is_known(presence: Presence) -> None:
+    found = [hear(presence, version_answer("W2605002"), 1.0)]
+    assert presence.exchanged_number == 0
+    found.append(hear(presence, version_answer("W2605003"), 1.5))
+    assert presence.exchanged_number == 2
+    found.append(presence.change(4.0))
+    assert presence.exchanged_number == 3
+    found.append(hear(presence, version_answer(""), 5.0))
+    assert [None if each is None else each.number for each in found] == [1, 2, 3, 4]
+    assert presence.exchanged_number == 3, "it was put into an empty socket"
+    presence.begin()
+    assert presence.exchanged_number == 0
+
+
+def test_a_number_from_before_a_power_up_is_forgotten_however_late_it_is_looked(
+    presence: Presence,
+) -> None:
+    hear(presence, version_answer("W2605002"), 1.0)
+    message = BootVersion("BMS", "V1.0.0").to_message(BMS.answer_id)
+    for frame in split(BMS.answer_id, encode(message)):
+        presence(frame, sent=False, now=1.4)
+    change = hear(presence, version_answer("W2605003"), 1.42)
+    assert change is not None
+    assert (change.serial, change.is_power_up) == ("W2605003", True), "the answer is the new one's"
+
+
+def test_a_pause_after_one_announcement_is_judged_by_the_next_one(presence: Presence) -> None:
+    announce(presence, 1.0)
+    assert announce(presence, 1.4) == []
+    assert announce(presence, 1.45) == [(True, True)], "its pace is another one: another unit"
+
+
+def test_time_in_which_nobody_listened_is_no_pause(presence: Presence) -> None:
+    announce(presence, 1.0, 1.05)
+    for watcher in presence.watchers:
+        watcher.miss(2.0)
+    assert announce(presence, 3.1) == []
+    assert announce(presence, 3.6) == [(True, True)]
+
+
 @each(
     "cadence_s",
     [0.05, 0.24, 0.4, 1.0],
@@ -169,6 +229,6 @@ def test_a_bootloader_that_goes_on_announcing_powers_up_once(
     times = [1.0 + cadence_s * at for at in range(20)]
     changes = announce(presence, *times)
     assert changes[0] == (True, True)
-    # Of a slow one the first pause may be an exchange.
-    assert len(changes) <= (1 if cadence_s < 0.25 else 2)
+    # Of a very slow one the first pause may be an exchange.
+    assert len(changes) <= (1 if cadence_s < 1.0 else 2)
     assert announce(presence, times[-1] + cadence_s + 0.65) == [(True, True)], "another one"

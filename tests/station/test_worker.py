@@ -324,6 +324,40 @@ def test_a_unit_that_stays_is_run_at_once(tmp_path: Path) -> None:
     assert ended.result.outcome is RunState.PASS, ended.result.text
 
 
+class Exchanged(RealSocket):
+    """The unit is exchanged, and the process has reported that, when the order arrives that was
+    given before it.
+    """
+
+    def answer(self, channel: FakeChannel, message: FromWorker) -> None:
+        if isinstance(message, PresenceChanged) and message.serial is not None:
+            if self.numbers:
+                order = RunOrder(RunId(1), RunKind.PRODUCTION, "W2605002", DAY)
+                self.channel.waiting.append(Begin(order, self.trace, self.numbers[self.known]))
+            else:
+                (old,) = (each.engine for each in self.bus._devices)
+                self.bus.detach(old)
+                self.bus.attach(Visitor(self.unit("NONE"), self.clock.now() + 0.3))
+            self.numbers.append(message.number)
+        elif not isinstance(message, PresenceChanged):
+            super().answer(channel, message)
+
+    def knowing(self, known: int) -> Exchanged:
+        """An order of somebody who knows so many reports of a number."""
+        self.known = known
+        self.numbers: list[int] = []
+        return self
+
+
+def test_an_order_that_crosses_the_report_of_an_exchange_is_not_carried_out(
+    tmp_path: Path,
+) -> None:
+    ended = Exchanged(tmp_path).knowing(0).work()
+    assert ended is not None
+    assert ended.result.code == "UNIT_CHANGED", ended.result.text
+    assert "before the run began" in ended.result.text
+
+
 @each("gap_s", [0.3, 0.5, 1.0, 3.5])
 @each("pulled_after_s", [0.0, 0.04, 0.06, 0.08, 0.1, 0.13, 0.15, 0.2, 0.3])
 def test_a_label_is_not_for_the_unit_that_is_put_in_after_it(
