@@ -97,6 +97,11 @@ STORIES = {
         " @3.0 put unit=3 socket=A ; @3.5 card by=jo unit=3 socket=A ; @4.5 label by=jo unit=3 ;"
         " @5.0 sleep unit=3 seconds=4.0 ; @8.0 pull unit=3 ; @8.1 put unit=4 socket=A"
     ),
+    "its label again, and cancelled": (
+        "line sockets=2 ; unit label=1 ; person name=jo ; @3.0 put unit=1 socket=B ;"
+        " @7.0 card by=jo unit=1 ; @8.0 label by=jo unit=1 ; @10.5 pull unit=1 ;"
+        " @14.0 label by=jo unit=1 ; @14.5 cancel by=jo ; @20.0 free by=jo socket=A"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"
