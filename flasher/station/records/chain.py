@@ -18,7 +18,7 @@ from sqlalchemy import Connection, Row, Table, select
 from flasher.station.records import schema
 from flasher.station.records.heads import Head
 from flasher.station.records.model import AuditEvent, utc_text
-from flasher.station.records.rows import grouped, named
+from flasher.station.records.rows import beside_index, grouped, named
 from flasher.station.records.schema import audit, station
 from flasher.station.records.signatures import SigningKey
 from flasher.station.records.triggers import fingerprint_of
@@ -205,7 +205,7 @@ def latest(connection: Connection, station_name: str) -> str | None:
     released = without_run(connection, station_name, [CLOCK])
     query = (
         _rows_of(station_name, audit.c.at)
-        .where(audit.c.number >= (released[-1].number if released else 0))
+        .where(beside_index(audit.c.number) >= (released[-1].number if released else 0))
         .order_by(audit.c.at.desc())
         .limit(1)
     )
@@ -213,7 +213,9 @@ def latest(connection: Connection, station_name: str) -> str | None:
 
 
 def _rows_of(station_name: str, *columns: Any) -> Any:
-    return select(*columns).join_from(audit, station).where(station.c.name == station_name)
+    # No join: a server would sort all rows of the chain, where an index has them in order.
+    named = select(station.c.id).where(station.c.name == station_name).scalar_subquery()
+    return select(*columns).where(audit.c.station_id == named)
 
 
 CLAIM: Final = "claim"

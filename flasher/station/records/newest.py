@@ -49,7 +49,9 @@ def newest_runs(connection: Connection, chosen: RunFilter, cut: Cut, size: int) 
     is_short = False
     begun = begun_in(chosen, run.begun_at)
     if begun:
-        bounds = select(func.min(run_id), func.max(run_id)).where(*begun)
+        # Beside its index, or a server would go along it until it met the first run of the time.
+        plain = beside_index(run_id)
+        bounds = select(func.min(plain), func.max(plain)).where(*begun)
         low, high = connection.execute(bounds).one()
         if low is None:
             return []

@@ -363,7 +363,8 @@ class Overview:
         if within:
             # By the station the index leads to the time; by the ids the newest come first.
             within.append(audit.station_id.in_(select(schema.station.c.id)))
-            bounds = select(func.min(audit.id), func.max(audit.id)).where(*within)
+            row_id = beside_index(audit.id)
+            bounds = select(func.min(row_id), func.max(row_id)).where(*within)
             with self._database.reading() as connection:
                 low, high = connection.execute(bounds).one()
             query = query.where(audit.id >= low, audit.id <= high, *within)
