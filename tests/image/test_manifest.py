@@ -203,6 +203,21 @@ def test_bytes_that_differ_are_refused_with_both_values(
     assert "the bytes to be sent have" in refused.value.where
 
 
+def test_each_statement_stands_beside_what_the_bytes_have() -> None:
+    other = replace(IMAGE, data=b"OBC" + IMAGE.data[3:])
+    findings = release().findings(other)
+    compared = {each.key: (each.stated, each.found, each.agrees) for each in findings}
+    size = str(IMAGE.size_bytes)
+    assert compared["target"] == ("BMS", "OBC", False)
+    assert compared["size_bytes"] == (size, size, True)
+    assert compared["sha256"] == (IMAGE.sha256, other.sha256, False)
+    assert compared["firmware_version"] == (VERSION, VERSION, True)
+
+
+def test_an_image_is_shown_without_its_bytes() -> None:
+    assert "data" not in repr(IMAGE)
+
+
 def test_one_changed_bit_is_found() -> None:
     other = replace(IMAGE, data=IMAGE.data[:-1] + b"\x01")
     with pytest.raises(ImageError, match="sha256"):
