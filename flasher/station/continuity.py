@@ -14,10 +14,10 @@ uninterrupted unit:
 That an application fell silent is not seen here: whoever asks it knows.
 
 What a single unit may do is no evidence: announcements of one burst, however many; another burst
-after every reset that was sent, as the first one may have come too late; a burst that follows a
-reset so soon that nobody can have put another unit in, although the confirmation was lost; a burst
-after the end of a transfer, or none; a restart of what the battery supplies while the battery
-restarts. Nor is a pause of this computer: time in which nobody listened does not count.
+after every reset that was sent and not ignored, as the first one may have come too late; a burst
+that follows a reset so soon that nobody can have put another unit in, although the confirmation was
+lost; a burst after the end of a transfer, or none; a restart of what the battery supplies while the
+battery restarts. Nor is a pause of this computer: time in which nobody listened does not count.
 """
 
 from __future__ import annotations
@@ -49,6 +49,10 @@ _QUIET_MIN_S: Final = 0.3
 _PACE_TOLERANCE: Final = 1.5
 _EXCHANGE_S: Final = 0.25
 """Nobody puts another unit in within so short a silence."""
+_ANNOUNCED_ON: Final = 2
+"""A bootloader that announces itself so often after a reset, without a pause, ignores it (R18): one
+announcement may have been under way.
+"""
 _MESSAGE_S: Final = 0.1
 """The frames of one announcement come within this time."""
 
@@ -85,8 +89,7 @@ class Continuity:
         # The battery supplies the others: when it restarts, they may.
         self._supply_id = None if loaded.target is BMS else BMS.request_id
         self._supplied_until = -inf
-        self._start_s = timings.application_start_timeout_s
-        self._leftover_s = timings.leftover_boot_version_s
+        self._timings = timings
         self.quiet_s = max(_QUIET_MIN_S, _SPACINGS_OF_QUIET * timings.boot_version_spacing_s)
         """No further announcement for so long: the burst (4 of them, 50 ms apart) is over."""
         self._gap_s = self.quiet_s
@@ -104,6 +107,8 @@ class Continuity:
         """How long somebody had listened when the unit was heard last."""
         self._returned_s = -inf
         """The same for when it was heard again after a silence that allows an exchange."""
+        self._announced_on = 0
+        """Announcements of the burst that goes on, since the last reset."""
         self._awaits_confirmation = False
         """A reset was sent to an application that runs, and is not confirmed."""
         self._requested_s: float | None = None
@@ -111,7 +116,6 @@ class Continuity:
         self._is_identified = False
         self._has_acted = False
         """The run has sent something after which the unit may restart, or switched its power."""
-        self._is_asked = self.watcher.request is not None
         self._boot_version = ""
         self._known: dict[str, frozenset[str]] = {}
         """What each field of its identity may be; empty before it has answered."""
@@ -127,7 +131,7 @@ class Continuity:
         has to stay. One that cannot be asked is identified by nothing: it has to stay from the
         first update command on.
         """
-        if self._is_identified or not self._is_asked:
+        if self._is_identified or self.watcher.request is None:
             return
         self._stay()
         if content is not None:
@@ -154,12 +158,13 @@ class Continuity:
     def complete(self) -> None:
         """A target that cannot be asked has the complete image: it may start by its bootloader."""
         self.is_told_to_update = False
-        self._burst_until = self._now + self._start_s
+        self._burst_until = self._now + self._timings.application_start_timeout_s
 
     def cycle_power(self) -> None:
         """The run switches its power off and on."""
         self.power_cycles += 1
         self._restart()
+        self._announced_on = _ANNOUNCED_ON  # the power may go a moment later
 
     def allow(self, content: Content) -> None:
         """This is going to be written to it: the old value is as good as the new one."""
@@ -216,18 +221,22 @@ class Continuity:
             command = int.from_bytes(frame.data[PREFIX_SIZE : PREFIX_SIZE + COMMAND_SIZE], "big")
             if command != Command.PACKET:
                 is_long = command == Command.UPDATE
-                self._supplied_until = inf if is_long else now + self._start_s
+                self._supplied_until = (
+                    inf if is_long else now + self._timings.application_start_timeout_s
+                )
         if frame.can_id != self._sent.can_id:
             return
         for found in self._sent.feed(frame.data, now):
             if not isinstance(found, Message) or found.mode != Mode.WRITE:
                 continue
             self._has_acted = True
+            is_reset = found.command in (self._reset_command, Command.RESET)
+            self._announced_on = 0 if is_reset else self._announced_on
             if found.command == Command.RESET and self.is_running:
                 # As long as it has not confirmed that, it goes on running.
                 self._awaits_confirmation = True
                 self._burst_until, self._requested_s = inf, None
-            elif found.command in (self._reset_command, Command.RESET):
+            elif is_reset:
                 self._restart()
             elif found.command == Command.UPDATE:
                 if not self._is_identified:
@@ -239,6 +248,7 @@ class Continuity:
             elif found.command == Command.END_OF_TRANSFER:
                 self._requested_s = None
                 self._burst_until = inf
+                self._announced_on = _ANNOUNCED_ON
 
     def _restart(self) -> None:
         self.is_running = self._awaits_confirmation = False
@@ -264,10 +274,13 @@ class Continuity:
                 self._longest_pause_s = max(self._longest_pause_s, since_s)
             return
         if self._requested_s is not None:
-            if self._listened_s - self._requested_s > self._leftover_s:
+            if self._listened_s - self._requested_s > self._timings.leftover_boot_version_s:
                 self._lose_by_restart("in the middle of the transfer")
             return
         if goes_on:
+            self._announced_on += 1
+            if self._announced_on == _ANNOUNCED_ON:
+                self._burst_until = -inf
             return
         if now <= self._burst_until:
             self._burst_until = -inf

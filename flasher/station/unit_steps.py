@@ -59,6 +59,7 @@ _OF_VERDICT: Final = {
     Verdict.INTERRUPTED: codes.OPERATOR_ABORT,
 }
 """What a bad verification is in the records."""
+_SPACINGS_OF_WATCH: Final = 3
 Act = Callable[[list[Measurement]], str]
 
 
@@ -287,9 +288,16 @@ class UnitSteps:
                         text = say("Switch the {target} off, wait 3 s, and on again.", target=name)
                         self._prompt(text, wait_s)
 
+        options = replace(target.options(timeout_s=limit_s), at_power_up=at_power_up)
+        if self._identified[target.name].is_in_bootloader:
+            # It goes on announcing itself: whether it ignores a reset shows before it is erased.
+            timings = options.timings
+            watch_s = _SPACINGS_OF_WATCH * timings.boot_version_spacing_s
+            watched = replace(timings, boot_watch_s=max(timings.boot_watch_s, watch_s))
+            options = replace(options, timings=watched)
         result = target.device.upgrade(
             target.plan,
-            options=replace(target.options(timeout_s=limit_s), at_power_up=at_power_up),
+            options=options,
             verify=Level.NONE if target.version_request is None else Level.VERSION,
             identity=target.identity,
             on_event=hear,

@@ -384,6 +384,28 @@ def test_another_bootloader_after_the_second_restart(tmp_path: Path) -> None:
     assert "V1.0.0 before, and V1.0.1 now" in result.text
 
 
+@pytest.mark.parametrize("pulled_after_s", [0.2, 0.5, 0.9])
+@pytest.mark.parametrize("gap_s", [0.3, 1.0, 3.5])
+def test_a_unit_that_comes_while_the_one_in_its_bootloader_is_erased(
+    tmp_path: Path, gap_s: float, pulled_after_s: float
+) -> None:
+    """The first one ignored the reset, which is no cause for the announcement of the second one."""
+    world = Exchange(tmp_path, gap_s=gap_s)
+    profile = replace(NEW_UNIT, erase_time_s=1.0)
+    first = MockDevice(BMS, bitrate_bps=250_000, profile=profile, has_application=False)
+    world.bench.put(first)
+    began_at = None
+
+    def when() -> bool:
+        nonlocal began_at
+        if began_at is None and first.state.value == "erasing":
+            began_at = world.bench.clock.now()
+        return began_at is not None and world.bench.clock.now() > began_at + pulled_after_s
+
+    world.when = when
+    world.check_caught()
+
+
 def test_a_blank_unit_exactly_alike_at_the_very_moment_cannot_be_told_from_the_first(
     tmp_path: Path,
 ) -> None:

@@ -102,6 +102,11 @@ STORIES = {
         " @7.0 card by=jo unit=1 ; @8.0 label by=jo unit=1 ; @10.5 pull unit=1 ;"
         " @14.0 label by=jo unit=1 ; @14.5 cancel by=jo ; @20.0 free by=jo socket=A"
     ),
+    "an application for a bootloader that erases": (
+        "line sockets=1 ; unit label=1 ; unit label=2 application=none pace=slow ; person name=jo ;"
+        " @3.0 put unit=2 socket=A ; @4.0 card by=jo unit=2 ; @6.0 label by=jo unit=2 ;"
+        " @7.5 pull unit=2 ; @8.0 put unit=1 socket=A"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"
