@@ -206,8 +206,10 @@ def accept(
 def upgrade(output: Output, records: RecordsOptions) -> int:
     place = records_of(records)
     location = locate(place.url, place.files or Path())
-    if location.file is not None and not location.file.exists():
-        raise no_records(location)
+    if location.file is not None:
+        if not location.file.exists():
+            raise no_records(location)
+        location = locate(place.url, place.files)  # the lock of a station is in its own folder
     done = upgrade_records(
         location,
         choose=lambda names: place.station or the_station(names),
