@@ -121,8 +121,10 @@ class TargetWatcher:
         self.has_application = True
 
     def miss(self, missed_s: float) -> None:
-        """Nobody has listened for so long: that is no pause of the device."""
+        """Nobody has listened for so long: that is no pause of the device, and no silence."""
         self._missed_s += missed_s
+        if self.heard_at is not None:
+            self.heard_at += missed_s
 
     def _announced(self, now: float) -> None:
         pause_s = float("inf")
@@ -220,6 +222,13 @@ class Presence:
             watcher(frame, sent=sent, now=now)
             if watcher.heard_at == now:
                 self._heard_at = now
+
+    def miss(self, missed_s: float) -> None:
+        """Nobody has listened for so long."""
+        for watcher in self.watchers:
+            watcher.miss(missed_s)
+        if self._heard_at is not None:
+            self._heard_at += missed_s
 
     def probe(self, now: float) -> list[Frame]:
         """What is to be sent now: a question to each target that can be asked, in its time."""

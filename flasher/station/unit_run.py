@@ -108,6 +108,8 @@ class UnitRun:
             )
             for each, watcher in zip(recipe.targets, watchers, strict=True)
         }
+        for each in self._continuity.values():
+            each.listened(self._clock.now())
         self._goes_on = goes_on
         self._power = None if power is None else _NotedPower(power, self._continuity.values())
         self._step: tuple[StepName, str] = (StepName.CONNECT, "")

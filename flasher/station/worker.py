@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from flasher.api import Connection, connect
+from flasher.driver import STALL_S
 from flasher.errors import BusError, FlasherError, TransmitBlockedError, UsageError
 from flasher.files import make_private
 from flasher.log import log_event
@@ -202,6 +203,7 @@ class Worker:
         self._virtual = virtual
         self._power: PowerControl | None = PowerCommand(setup.power) if setup.power else virtual
         self._presence = Presence(recipe.targets)
+        self._listened_at = connection.clock.now()
         self._is_down = False
         """The adapter failed."""
         self._is_blocked = False
@@ -246,10 +248,18 @@ class Worker:
         except BusError as error:
             self._is_down = True
             self._pipe.send(AdapterDown(error.what))
+        self._listened()
         virtual = self._virtual
         change = self._presence.change(clock.now()) if virtual is None else virtual.step()
         if change is not None:
             self._pipe.send(change)
+
+    def _listened(self) -> None:
+        """Up to now, unless this computer stood still meanwhile."""
+        now, stall_s = self._connection.clock.now(), STALL_S * self._connection.clock.speed
+        if now - self._listened_at > stall_s:
+            self._presence.miss(now - self._listened_at)
+        self._listened_at = now
 
     def _reopen(self) -> None:
         now = time.perf_counter()
@@ -271,15 +281,17 @@ class Worker:
 
     def _run(self, begin: Begin) -> None:
         recorder: Recorder | None = None
-        watchers, was_exchanged = None, False
-        if self._virtual is None:
-            presence = self._presence
-            if (change := presence.change(self._connection.clock.now())) is not None:
-                self._pipe.send(change)
-            watchers, was_exchanged = presence.watchers, presence.exchanged_number > begin.presence
         try:
             with Recorder(begin.trace) as recorder:
                 recorder.channel = self._connection.channel
+                watchers, was_exchanged = None, False
+                if self._virtual is None:
+                    self._listened()
+                    presence = self._presence
+                    if (change := presence.change(self._connection.clock.now())) is not None:
+                        self._pipe.send(change)
+                    watchers = presence.watchers
+                    was_exchanged = presence.exchanged_number > begin.presence
                 result = UnitRun(
                     begin.order,
                     self._recipe,

@@ -107,6 +107,15 @@ STORIES = {
         " @3.0 put unit=2 socket=A ; @4.0 card by=jo unit=2 ; @6.0 label by=jo unit=2 ;"
         " @7.5 pull unit=2 ; @8.0 put unit=1 socket=A"
     ),
+    "a process that stands still": (
+        "line sockets=2 ; unit label=1 ; person name=jo source=jo ; @3.0 put unit=1 socket=B ;"
+        " @16.0 stall socket=B seconds=4.0 ; @18.0 card by=jo unit=1 ; @19.0 label by=jo unit=1"
+    ),
+    "a process that stands still beside a bootloader": (
+        "line sockets=2 ; unit label=1 application=none ; person name=jo source=jo ;"
+        " @3.0 put unit=1 socket=B ; @16.0 stall socket=B seconds=4.0 ; @18.0 card by=jo unit=1 ;"
+        " @19.0 label by=jo unit=1"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"

@@ -210,6 +210,13 @@ def test_a_pause_after_one_announcement_is_judged_by_the_next_one(presence: Pres
     assert announce(presence, 1.45) == [(True, True)], "its pace is another one: another unit"
 
 
+def test_time_in_which_nobody_listened_is_no_silence(presence: Presence) -> None:
+    hear(presence, version_answer("W2605002"), 1.0)
+    presence.miss(4.0)
+    assert presence.change(6.9) is None
+    assert presence.change(7.0) is not None
+
+
 def test_time_in_which_nobody_listened_is_no_pause(presence: Presence) -> None:
     announce(presence, 1.0, 1.05)
     for watcher in presence.watchers:

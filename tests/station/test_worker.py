@@ -17,6 +17,7 @@ from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.errors import UsageError
 from flasher.mock.model import MockDevice
+from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
 from flasher.protocol.spec import WELLING
 from flasher.station.config import MockUnits
@@ -41,6 +42,8 @@ from flasher.station.messages import (
     WorkerSetup,
 )
 from flasher.station.records.model import RunId, RunKind, RunState, WriteId
+from flasher.station.unit_run import UnitRun
+from flasher.station.unit_steps import UnitSteps
 from flasher.station.virtual_units import Health, VirtualSocket, make_device
 from flasher.station.worker import StationPipe, Worker, load_same
 from tests.loops import each
@@ -324,6 +327,22 @@ def test_a_unit_that_stays_is_run_at_once(tmp_path: Path) -> None:
     assert ended.result.outcome is RunState.PASS, ended.result.text
 
 
+class InBootloader(RealSocket):
+    """Its unit has no application."""
+
+    def unit(self, number: str) -> MockDevice:
+        target = self.recipe.targets[0].target
+        profile = DeviceProfile(serial_number=number, application_area_bytes=8192)
+        rate = WELLING.bitrate_bps
+        return MockDevice(target, bitrate_bps=rate, profile=profile, has_application=False)
+
+    def answer(self, channel: FakeChannel, message: FromWorker) -> None:
+        if not isinstance(message, PresenceChanged):
+            super().answer(channel, message)
+        elif not channel.of(Finished):
+            self.begin()
+
+
 class Exchanged(RealSocket):
     """The unit is exchanged, and the process has reported that, when the order arrives that was
     given before it.
@@ -375,3 +394,22 @@ def test_a_label_is_not_for_the_unit_that_is_put_in_after_it(
     codes = ("UNIT_CHANGED", "NO_ANSWER") if gap_s > 0.5 else ("UNIT_CHANGED",)
     assert ended.result.code in codes, ended.result.text
     assert socket.other.device.program_count == 0
+
+
+def test_a_slow_start_of_a_run_is_no_pause_of_a_unit_in_its_bootloader(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """This computer makes a plan of the image, and nobody listens meanwhile."""
+    socket = InBootloader(tmp_path)
+    real = UnitRun._steps
+
+    def steps(run: UnitRun) -> UnitSteps:
+        until = socket.clock.now() + 1.0
+        while socket.clock.now() < until:
+            socket.bus.advance(until)
+        return real(run)
+
+    monkeypatch.setattr(UnitRun, "_steps", steps)
+    ended = socket.work()
+    assert ended is not None
+    assert ended.result.outcome is RunState.PASS, ended.result.text
