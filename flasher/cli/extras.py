@@ -11,7 +11,7 @@ from flasher.errors import ErrorCode, UsageError
 
 _PACKAGES: Final = {
     "mf4": ("asammdf",),
-    "station": ("argon2", "cryptography", "segno", "sqlalchemy", "stdnum"),
+    "station": ("alembic", "argon2", "cryptography", "segno", "sqlalchemy", "stdnum"),
     "web": ("babel", "itsdangerous", "pygal", "starlette", "uvicorn"),
 }
 """By the extra that brings them."""

@@ -72,7 +72,7 @@ QUESTIONS: Final = (
         "line",
         "How does an auditor see that nobody has changed the records?",
         "how-to/station_records.html#tell-whether-records-were-changed",
-        "holds the trail against its hashes",
+        "compares the trail with its hashes",
     ),
     Question(
         "bootloader",
