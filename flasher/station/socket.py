@@ -247,7 +247,10 @@ class Socket:
     def fall_silent(self, *, is_certain: bool) -> bool:
         """Nothing is heard any more, or nothing is in it for certain. True when a unit was."""
         before = self.occupancy
-        is_out = is_certain or self.is_own_known or before is Occupancy.EMPTY
+        last = self.last
+        # One that has passed has answered at the end of its run: it does not sleep, it was pulled.
+        is_pulled = last is not None and last.outcome is RunState.PASS and not last.has_talked
+        is_out = is_certain or self.is_own_known or is_pulled or before is Occupancy.EMPTY
         self.occupancy = Occupancy.EMPTY if is_out else Occupancy.SILENT
         if is_out:
             self.is_last_there = False

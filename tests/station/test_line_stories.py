@@ -116,6 +116,10 @@ STORIES = {
         " @3.0 put unit=1 socket=B ; @16.0 stall socket=B seconds=4.0 ; @18.0 card by=jo unit=1 ;"
         " @19.0 label by=jo unit=1"
     ),
+    "a unit that is pulled as its run ends": (
+        "line sockets=1 ; unit label=1 ; person name=jo source=jo ; @0.0 put unit=1 socket=A ;"
+        " @0.83 label by=jo unit=1 ; @2.21 pull unit=1"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"
