@@ -30,6 +30,11 @@ def test_neighbours_in_any_order_are_one_span() -> None:
     assert result.join(0) == (b"aabbccd", 4)
 
 
+def test_neighbours_after_a_gap_are_joined_to_the_span_before_them() -> None:
+    result = sparse((4, b"a"), (10, b"c"), (8, b"bb"))
+    assert result.spans() == (Span(4, 1), Span(8, 3))
+
+
 def test_a_gap_within_the_limit_is_filled_with_ff() -> None:
     result = sparse((4, b"a"), (8, b"b"))
     assert result.join(3) == (b"a\xff\xff\xffb", 4)

@@ -17,13 +17,7 @@ from flasher.cli.output import Output
 from flasher.cli.station.commands import PagesOptions, RecordsOptions, RunOptions
 from flasher.cli.station.documents import StationRunDocument, figures_document
 from flasher.cli.station.place import operator_of, records_of
-from flasher.cli.station.scans import (
-    LineReader,
-    ScanFile,
-    Typing,
-    keyboard,
-    read_scans,
-)
+from flasher.cli.station.scans import LineReader, ScanFile, Typing, keyboard, read_scans
 from flasher.cli.station.setup import crew_of, labels_of, scanners_of
 from flasher.cli.station.views import JsonLines, Lines, Table, View, figures_line
 from flasher.cli.stop import stop_on_signal
