@@ -11,7 +11,7 @@ from __future__ import annotations
 import random
 import re
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
@@ -101,20 +101,17 @@ def serial_numbers(rule: SerialNumber, first: int, step: int) -> Iterator[str]:
     )
 
 
-def next_number(rule: SerialNumber, known: set[str]) -> int:
-    """The number behind that of the last virtual unit in `known` serial numbers."""
-    last, left = 0, set(known)
+def next_number(rule: SerialNumber, known: Callable[[Collection[str]], Collection[str]]) -> int:
+    """The number after that of the last virtual unit that records know; `known` returns those of
+    some serial numbers that they know.
+    """
+    numbers: dict[str, int] = {}
     for number in range(1, _NUMBERS_TRIED):
         try:
-            serial = next(serial_numbers(rule, number, 1))
+            numbers.setdefault(next(serial_numbers(rule, number, 1)), number)
         except UsageError:
             break
-        if serial in left:
-            left.remove(serial)
-            last = number
-        if not left:
-            break
-    return last + 1
+    return max((numbers[serial] for serial in known(numbers)), default=0) + 1
 
 
 @dataclass(frozen=True)

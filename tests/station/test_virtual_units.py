@@ -16,7 +16,13 @@ from flasher.station.messages import PresenceChanged, RunOrder, RunResult, Virtu
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import RunId, RunKind
 from flasher.station.unit_run import UnitRun
-from flasher.station.virtual_units import Health, VirtualSocket, health_of, serial_numbers
+from flasher.station.virtual_units import (
+    Health,
+    VirtualSocket,
+    health_of,
+    next_number,
+    serial_numbers,
+)
 from tests.station.factory import DAY, HEAD, SERIAL_NUMBER, USUAL, make_recipe
 from tests.station.unit_bench import WRITES, Notes
 
@@ -40,6 +46,17 @@ def test_numbers_follow_the_recipe_and_sockets_do_not_meet(tmp_path: Path) -> No
     two = list(islice(serial_numbers(rule, 2, 2), 20))
     assert one[:2] == ["W0000001", "W0000003"]
     assert len(set(one) | set(two)) == 40
+
+
+@pytest.mark.parametrize(
+    ("known", "number"),
+    [((), 1), (("W0000001",), 2), (("W0000003", "W0000700"), 701), (("X", "W0020000"), 1)],
+)
+def test_the_next_number_comes_after_the_last_one_that_records_know(
+    tmp_path: Path, known: tuple[str, ...], number: int
+) -> None:
+    rule = make_recipe(tmp_path).recipe.serial_number
+    assert next_number(rule, set(known).intersection) == number
 
 
 def test_check_digits_are_kept(tmp_path: Path) -> None:

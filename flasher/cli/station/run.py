@@ -81,8 +81,7 @@ def run(output: Output, options: RunOptions, pages: PagesOptions, records: Recor
         )  # fmt: skip
         first = 1
         if is_virtual:  # numbers that these records do not know yet
-            rows, part = store.read.table(), recipe.recipe.part
-            known = {str(row["serial"]) for row in rows if row["part"] == part}
+            known = partial(store.read.known, recipe.recipe.part)
             first = next_number(recipe.recipe.serial_number, known)
         session.station = Station(
             store,

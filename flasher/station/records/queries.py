@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any, Final
 
 from pydantic import TypeAdapter
@@ -72,6 +72,17 @@ class Records:
                 state = UnitState.after(runs[-1].run.state if runs else None)
                 lives.append(UnitLife(serial, part, state, runs))
             return tuple(lives)
+
+    def known(self, part: str, serials: Collection[str]) -> set[str]:
+        """Those of some serial numbers that units of a part have."""
+        unit = schema.unit.c
+        query = select(unit.serial).where(unit.part == part)
+        with self._database.reading() as connection:
+            found = (
+                connection.execute(query.where(unit.serial.in_(some))).scalars()
+                for some in batches(serials)
+            )
+            return {serial for some in found for serial in some}
 
     def unit(self, serial: str, part: str | None = None) -> UnitLife:
         """The one unit with this serial number. Raises NotFoundError, also for several parts."""

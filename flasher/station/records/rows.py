@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from itertools import islice
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 from sqlalchemy import Connection, Integer, Select, Table, select
 from sqlalchemy.sql.expression import ColumnElement
 
+_Key = TypeVar("_Key")
 _BATCH: Final = 500
 """Keys in one IN (...): every back end takes so many."""
 
@@ -27,7 +28,7 @@ def named(connection: Connection, table: Table, **key: Any) -> int:
     return insert(connection, table, **key) if found is None else int(found)
 
 
-def batches(keys: Iterable[int]) -> Iterator[list[int]]:
+def batches(keys: Iterable[_Key]) -> Iterator[list[_Key]]:
     """The keys in parts that fit into one IN (...)."""
     rest = iter(keys)
     while some := list(islice(rest, _BATCH)):

@@ -84,6 +84,9 @@ def image_count(bench: Bench) -> int:
         pytest.param(claim, id="claim and end"),
         pytest.param(lambda bench: bench.store.signer.public, id="key"),
         pytest.param(lambda bench: bench.store.read.natures(), id="natures"),
+        pytest.param(
+            lambda bench: bench.store.read.known("BAT-36", ["W0000007", "W0000008"]), id="numbers"
+        ),
         pytest.param(runs(), id="runs"),
         pytest.param(runs(state=RunState.ABORTED), id="runs aborted"),
         pytest.param(runs(code="NOWHERE"), id="runs with a code"),

@@ -110,6 +110,12 @@ def test_a_clock_that_is_set_back_spoils_no_record(bench: Bench) -> None:
     assert run.duration_s == 8.0
 
 
+def test_numbers_of_units_of_a_part_are_known(bench: Bench) -> None:
+    bench.make(RunState.PASS, "W2605002")
+    assert bench.store.read.known("BAT-36", ["W2605001", "W2605002"]) == {"W2605002"}
+    assert bench.store.read.known("BAT-48", ["W2605002"]) == set()
+
+
 def test_runs_and_units_that_are_not_there_are_named(bench: Bench) -> None:
     with pytest.raises(NotFoundError, match="no unit W1"):
         bench.store.read.unit("W1")
