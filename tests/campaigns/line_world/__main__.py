@@ -34,7 +34,7 @@ def say(line: str = "") -> None:
 def played(seed: int, *, acts: int, shrinks: bool) -> tuple[int, Played, int]:
     """The seed, the story as it is to be shown, and the steps that were played."""
     found = draw(seed, acts)
-    steps = len(found.story.acts)
+    steps = len(found.done)
     return seed, shrink(found) if found.kind and shrinks else found, steps
 
 

@@ -13,7 +13,7 @@ from typing import Final
 from flasher.station.events import SocketState
 from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.stories import Story
-from tests.campaigns.line_world.world import Bay, World
+from tests.campaigns.line_world.world import Bay, World, last_look
 
 Step = tuple[float, stories.Act | None]
 """Seconds to wait, and what is done then; None: nothing, only look again."""
@@ -65,7 +65,8 @@ class Teller:
             if act is not None:
                 yield replace(act, when=stories.at(moment))
             else:
-                self.world.go_to(moment)
+                # A story holds acts alone: who does nothing sees what the station shows by itself.
+                self.world.go_to(last_look(moment))
             gap, following = next(actor)
             upcoming[index] = (max(moment, self.world.now) + gap, following, actor)
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import random
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from math import inf
 from typing import Final
 
 from tests.campaigns.line_world import stories
@@ -22,48 +23,45 @@ class Played:
     """A story that was played, and what came of it."""
 
     story: Story
+    """Up to a violation, with acts that were skipped: each moment at which somebody looked counts.
+    """
+    done: Sequence[stories.Act] = ()
+    """Its acts that were not skipped."""
     kind: str = ""
     """Of the violation; empty without one."""
     text: str = ""
     seen: Counter[str] | None = None
 
 
-def _silent(_line: str) -> None:
-    pass
-
-
-def play(story: Story, log: Callable[[str], None] = _silent) -> Played:
+def play(story: Story, log: Callable[[str], None] | None = None) -> Played:
     """Play a story as it is written, then bring every unit home."""
-    done: list[stories.Act] = []
     with World(story, log) as world:
-        try:
-            for act in story.acts:
-                done += [act] if world.do(act) else []
-            world.go_home()
-        except Violation as violation:
-            kept = [each for each in story.acts if each in done or time_of(each) >= world.now]
-            return Played(replace(story, acts=kept), violation.kind, str(violation), world.seen)
-        return Played(replace(story, acts=done), seen=world.seen)
+        return _played(world, iter(story.acts))
 
 
-def draw(seed: int, steps: int) -> Played:
+def draw(seed: int, steps: int, log: Callable[[str], None] | None = None) -> Played:
     """Draw a story of so many acts, and play it at once."""
     chance = random.Random(seed)
-    setup = setup_of(chance)
-    acts: list[stories.Act] = []
-    with World(setup) as world:
-        kind = text = ""
-        try:
-            for act in Teller(chance, world).acts():
-                acts.append(act)
-                if not world.do(act):
-                    acts.pop()
-                if len(acts) >= steps or world.now > 20.0 * steps:
-                    break
-            world.go_home()
-        except Violation as violation:
-            kind, text = violation.kind, str(violation)
-        return Played(replace(setup, acts=acts), kind, text, world.seen)
+    with World(setup_of(chance), log) as world:
+        return _played(world, Teller(chance, world).acts(), steps)
+
+
+def _played(world: World, acts: Iterator[stories.Act], steps: float = inf) -> Played:
+    tried: list[stories.Act] = []
+    done: list[stories.Act] = []
+    kind = text = ""
+    try:
+        for act in acts:
+            tried.append(act)
+            done.append(act)
+            if not world.do(act):
+                done.pop()
+            if len(done) >= steps or world.now > 20.0 * steps:
+                break
+        world.go_home()
+    except Violation as violation:
+        kind, text = violation.kind, str(violation)
+    return Played(replace(world.setup, acts=tried), done, kind, text, world.seen)
 
 
 # -- shrinking -------------------------------------------------------------------------------------
@@ -84,6 +82,7 @@ def shrink(found: Played, most: int = 400) -> Played:
     best = is_bad(found.story)
     if best is None:
         return found  # it would not be the same when it is played again
+    best = is_bad(replace(best.story, acts=best.done)) or best
     best = _without_acts(best, is_bad)
     best = _simpler_setup(best, is_bad)
     best = _rounder(best, is_bad)
@@ -147,7 +146,7 @@ def _rounder(best: Played, is_bad: Callable[[Story], Played | None]) -> Played:
             if acts == list(best.story.acts):
                 break
             found = is_bad(replace(best.story, acts=acts)) if _are_apart(acts) else None
-            if found is not None and len(found.story.acts) == len(acts):
+            if found is not None and len(found.done) == len(acts):
                 best = found
                 break
     return best

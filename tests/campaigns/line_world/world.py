@@ -9,6 +9,8 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field
+from datetime import timedelta
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
@@ -34,11 +36,13 @@ from flasher.station.socket import Source
 from flasher.station.station import Station
 from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.clockwork import PaperUnit, Process, SocketBus, scratch
-from tests.station.factory import IMAGES, USUAL, Bench
+from tests.station.factory import IMAGES, USUAL, Bench, FakeClock
 from tests.station.unit_bench import WRITES
 
 WINDOW_S: Final = 0.1
-"""The station looks at its processes at least so often."""
+"""The station looks at its processes at least so often, at multiples of this time: so a story is
+played as it was drawn.
+"""
 HAND_S: Final = 0.1
 """The fastest hand takes so long from pulling a unit to putting another one in."""
 CALM_S: Final = 3.0
@@ -118,17 +122,14 @@ class _Stored:
 class World:
     """One line. `do` carries out an act at its time; everything raises Violation."""
 
-    def __init__(
-        self, setup: stories.Story, log: Callable[[str], None] = lambda _line: None
-    ) -> None:
+    def __init__(self, setup: stories.Story, log: Callable[[str], None] | None = None) -> None:
         self.now = 0.0
-        self.log = log
+        self._write = log
         self.seen: Counter[str] = Counter()
         self.setup = setup
         self._closing = ExitStack()
         folder = self._closing.enter_context(tempfile.TemporaryDirectory(dir=scratch()))
         self.bench = Bench(Path(folder))
-        self._began_at = self.bench.clock.seconds
         if setup.line.recipe != "plain":
             self.bench.use(_RECIPES[setup.line.recipe])
         self.bays = {name: Bay(name, SocketBus()) for name in stories.SOCKETS[: setup.line.sockets]}
@@ -165,6 +166,11 @@ class World:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    def _log(self, indent: str, line: Callable[[], str]) -> None:
+        """Show a line, which is made only where somebody reads it."""
+        if self._write is not None:
+            self._write(f"{self.now:9.4f}{indent}{line()}".rstrip())
+
     # -- time -------------------------------------------------------------------------------------
 
     def go_to(self, moment: float) -> None:
@@ -173,7 +179,7 @@ class World:
             due = [
                 each for each in (self._station_at, *self._power_at.values()) if each is not None
             ]
-            horizon = min(moment, self.now + WINDOW_S, *due)
+            horizon = min(moment, _next_look(self.now), *due)
             for bay in self.bays.values():
                 if bay.process is None:
                     bay.bus.idle(horizon)
@@ -181,10 +187,16 @@ class World:
                 bay.process.go_on(horizon)
                 if bay.process.has_asked:
                     horizon = max(self.now, min(horizon, bay.bus.clock.now()))
-            self.bench.clock.go_on(horizon - self.now)
             self.now = horizon
+            self._set_clock()
             self._come_back()
             self.turn()
+
+    def _set_clock(self) -> None:
+        """Not by adding, of which the sum depends on the steps."""
+        clock, began = self.bench.clock, FakeClock()
+        clock.seconds = began.seconds + self.now
+        clock.now = began.now + timedelta(seconds=self.now)
 
     def _come_back(self) -> None:
         for name, moment in list(self._power_at.items()):
@@ -252,7 +264,7 @@ class World:
     _found: Violation | None = None
 
     def _judge(self, event: StationEvent) -> None:
-        self.log(f"{self.now:9.4f}      {_shown(event)}")
+        self._log("      ", partial(_shown, event))
         match event:
             case ScanAccepted() | ScanRefused() | OperatorPrompted():
                 self._answers.append(event)
@@ -290,7 +302,7 @@ class World:
         is_done = self._ACTS[type(act)](self, act)
         if is_done:
             self.seen["acts"] += 1
-            self.log(f"{self.now:9.4f}  {' '.join(str(act).split()[1:])}".rstrip())
+            self._log("  ", lambda: " ".join(str(act).split()[1:]))
         self.turn()
         return is_done
 
@@ -436,7 +448,7 @@ class World:
         if self.station is None:
             return False
         self.seen["scans"] += 1
-        self.log(f"{self.now:9.4f}    scan {text} by {person.name}")
+        self._log("    ", lambda: f"scan {text} by {person.name}")
         before = len(self._answers)
         name = f"scanner {mounted}" if mounted else person.source
         self._scanning = text, name
@@ -690,6 +702,21 @@ def _stored(unit: PaperUnit) -> _Stored:
     assert isinstance(application, BmsApplication)
     number = application.kept["serial number"]
     return _Stored(str(getattr(number, "serial_number", "")), unit.engine.operations_done)
+
+
+def last_look(moment: float) -> float:
+    """When the station looked at its processes last, if nothing else happened."""
+    return max(each for each in _looks(moment) if each <= moment)
+
+
+def _next_look(moment: float) -> float:
+    return min(each for each in _looks(moment) if each > moment)
+
+
+def _looks(moment: float) -> list[float]:
+    """Those around a moment, each always the same number."""
+    nearest = round(moment / WINDOW_S)
+    return [round(each * WINDOW_S, 6) for each in (nearest - 1, nearest, nearest + 1)]
 
 
 def _words(labels: list[str]) -> str:
