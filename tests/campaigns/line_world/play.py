@@ -67,8 +67,10 @@ def _played(world: World, acts: Iterator[stories.Act], steps: float = inf) -> Pl
 # -- shrinking -------------------------------------------------------------------------------------
 
 
-def shrink(found: Played, most: int = 400) -> Played:
-    """A shorter story with a violation of the same kind."""
+def shrink(
+    found: Played, accepts: Callable[[Story], bool] = lambda _story: True, most: int = 400
+) -> Played:
+    """A shorter story with a violation of the same kind, one that is accepted."""
     tries = 0
 
     def is_bad(story: Story) -> Played | None:
@@ -77,7 +79,7 @@ def shrink(found: Played, most: int = 400) -> Played:
         if tries > most:
             return None
         played = play(story)
-        return played if played.kind == found.kind else None
+        return played if played.kind == found.kind and accepts(played.story) else None
 
     best = is_bad(found.story)
     if best is None:

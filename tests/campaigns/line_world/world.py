@@ -214,7 +214,10 @@ class World:
     def turn(self) -> None:
         """A turn of the station, and a look at all units."""
         if self.station is not None:
-            self.station.turn(0.0)
+            try:
+                self.station.turn(0.0)
+            except Exception as error:
+                raise Violation("CRASH", f"the station ended with {error!r}") from error
         self._look()
 
     # -- the station ------------------------------------------------------------------------------
