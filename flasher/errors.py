@@ -92,6 +92,7 @@ class ErrorCode(StrEnum):
     IMAGE_OUTSIDE = "E307"
     MANIFEST = "E308"
     IMAGE_SAMPLE = "E309"
+    IMAGE_READINGS = "E310"
     BUS = "E400"
     ADAPTER_NOT_OPENED = "E401"
     ADAPTER_IN_USE = "E402"

@@ -1,21 +1,27 @@
-"""Intel HEX and Motorola S-record: lines of hex digits with a check sum.
+"""Intel HEX and Motorola S-record files: checked here, loaded by intelhex and bincopy.
 
-Every record is checked and decoded in one pass, in constant memory. Libraries that read these
-formats accept a missing end record, addresses that wrap around and bytes that contradict each
-other, and hold a file many times over; in the tests they are the referees.
+The libraries accept a missing end record, addresses that wrap around and lost records, refuse
+records that repeat each other, and take a hundred bytes of memory for each byte of an image. So a
+strict pass comes first: it refuses what is wrong with a file, and keeps nothing. The libraries get
+the records that passed, some hundred at a time. Before their bytes are used, the addresses, count
+and CRC-32 of them have to be those that the strict pass computed: two independent readings.
 """
 
 from __future__ import annotations
 
 from binascii import Error as HexError
 from binascii import unhexlify
-from collections.abc import Iterator
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from io import StringIO
+from itertools import pairwise
 from typing import BinaryIO, Final
+from zlib import crc32
 
 from flasher.errors import ErrorCode, ImageError
 from flasher.image.image import ADDRESS_SPACE
-from flasher.image.segments import SparseBytes
+from flasher.image.segments import PIECES_MAX, SparseBytes, scattered
 
 LINES_MAX: Final = 1_100_000
 """The largest image has 1,048,560 records of eight bytes, and programs write 16 or 32. Bounds the
@@ -92,31 +98,127 @@ class _Scanner:
             raise self.refuse(f"the check sum is {record[-1]:02X}, computed {computed:02X}")
         return record
 
-    def add(self, into: SparseBytes, address: int, data: bytes) -> None:
-        """Take the data of a record. Raises ImageError beyond the 32-bit address space."""
-        if address + len(data) > ADDRESS_SPACE:
-            raise self.refuse("the record runs past the last 32-bit address, 0xFFFFFFFF")
-        into.add(address, data, self.place)
-
     def refuse(self, what: str, cause: str = "") -> ImageError:
         """The error for the line read last."""
         return ImageError(
             f"{self.source} is a damaged {self.format} file: {what}",
-            where=self.place(0),
+            where=_place(self.line),
             cause=cause or "damaged while it was copied, or edited by hand",
             remedy="copy or make the file again",
             code=ErrorCode.IMAGE_DAMAGED,
         )
 
-    def place(self, _address: int) -> str:
-        """Where the record read last stands."""
-        return f"line {self.line}"
+
+def _place(line: int) -> str:
+    return f"line {line}"
 
 
 def _shown(text: str) -> str:
     """A line for a message: escaped, and not too long."""
     cut = text if len(text) <= _SHOWN_MAX else f"{text[:_SHOWN_MAX]}..."
     return ascii(cut)
+
+
+# -- two readings ---------------------------------------------------------------------------------
+
+
+_Piece = tuple[int, bytes]
+"""An address, and the bytes from there on."""
+_Source = tuple[int, str, str]
+"""Where a piece was read: the number of the line, the record that says what the address in it is
+relative to (empty where the format has none), and the line itself."""
+_Load = Callable[[str], list[_Piece]]
+"""A library: from lines to pieces, ascending."""
+_BATCH_MAX: Final = 1024
+"""Records that a library gets at once. Bounds its memory, and the time of bincopy, which grows with
+the square of the pieces that it holds."""
+
+
+class _Reading:
+    """Collects the records that passed, has a library load them, and compares the two readings."""
+
+    def __init__(self, scanner: _Scanner, load: _Load, into: SparseBytes) -> None:
+        self._scanner = scanner
+        self._load = load
+        self._into = into
+        self._batch: dict[_Piece, _Source] = {}
+        """In the order of the file, without repetitions: intelhex refuses them."""
+        self._loads_left = PIECES_MAX
+
+    def add(self, address: int, data: bytes, text: str, prefix: str = "") -> None:
+        """Take a record. Raises ImageError beyond the 32-bit address space, and what
+        `SparseBytes.add` raises.
+        """
+        end = address + len(data)
+        if end > ADDRESS_SPACE:
+            raise self._scanner.refuse("the record runs past the last 32-bit address, 0xFFFFFFFF")
+        if not self._into.leaves_out(address, end):
+            self._batch.setdefault((address, data), (self._scanner.line, prefix, text))
+            if len(self._batch) == _BATCH_MAX:
+                self.finish()
+
+    def finish(self) -> None:
+        """Load what was collected."""
+        batch, self._batch = list(self._batch.items()), {}
+        if batch:
+            self._load_apart(batch)
+
+    def _load_apart(self, batch: Sequence[tuple[_Piece, _Source]]) -> None:
+        """Load a batch: in halves where its records overlap, since a library refuses that or lets
+        one of two contradicting bytes win.
+        """
+        ascending = sorted(batch)
+        checked = [piece for piece, _ in ascending]
+        if any(start + len(data) > after for (start, data), (after, _) in pairwise(checked)):
+            half = len(batch) // 2
+            self._load_apart(batch[:half])
+            self._load_apart(batch[half:])
+            return
+        self._loads_left -= 1
+        if self._loads_left < 0:
+            raise scattered(self._into.source)
+        sources = [source for _, source in ascending]
+        loaded = self._loaded(sources)
+        if _digest(loaded) != _digest(checked):
+            raise self._differs(sources)
+        starts = [start for start, _ in checked]
+        for start, data in loaded:
+            self._into.add(start, data, lambda at: _place(sources[bisect_right(starts, at) - 1][0]))
+
+    def _loaded(self, sources: Sequence[_Source]) -> list[_Piece]:
+        lines, last = [], ""
+        for _, prefix, text in sources:
+            if prefix != last:
+                lines.append(prefix)
+                last = prefix
+            lines.append(text)
+        try:
+            return self._load("\n".join(lines))
+        except Exception as error:  # whatever it is, the records had passed
+            raise self._differs(sources) from error
+
+    def _differs(self, sources: Sequence[_Source]) -> ImageError:
+        return ImageError(
+            f"{self._into.source} was read twice, and the two readings differ: nothing of it is "
+            "used.",
+            where=f"records between {_place(min(sources)[0])} and {_place(max(sources)[0])}",
+            cause="a fault of this program, of the library that reads the format, or of this "
+            "computer's memory",
+            remedy="Convert the file to a raw binary (objcopy -O binary), name its address with "
+            "--base, and report it with the file.",
+            code=ErrorCode.IMAGE_READINGS,
+        )
+
+
+def _digest(pieces: Sequence[_Piece]) -> tuple[list[list[int]], int]:
+    """Where there are bytes, as start and end, neighbours joined; and the CRC-32 of all of them."""
+    spans: list[list[int]] = []
+    end = -1
+    for start, data in pieces:
+        if start != end:
+            spans.append([start, start])
+        end = spans[-1][1] = start + len(data)
+    return spans, crc32(b"".join([data for _, data in pieces]))
 
 
 # -- Intel HEX ------------------------------------------------------------------------------------
@@ -131,10 +233,15 @@ _OVERHEAD_SIZE: Final = _HEAD_SIZE + 1
 _SEGMENT_SIZE: Final = 0x1_0000
 
 
+_FROM_ZERO: Final = ":020000040000FA"
+"""What holds at the start of a file, as a record."""
+
+
 def read_hex(file: BinaryIO, source: str, into: SparseBytes) -> None:
     """All data of an Intel HEX file. Raises ImageError with the line number on any damage."""
     scanner = _Scanner(file, source, "Intel HEX")
-    offset = 0
+    reading = _Reading(scanner, _by_intelhex, into)
+    offset, prefix = 0, _FROM_ZERO
     is_linear = False
     for text in scanner.lines():
         if text[0] != ":":
@@ -153,14 +260,24 @@ def read_hex(file: BinaryIO, source: str, into: SparseBytes) -> None:
             # format has it wrap around and programs do not agree on it.
             if not is_linear and address + len(data) > _SEGMENT_SIZE:
                 raise scanner.refuse("the record runs past the end of its 64 KiB segment")
-            scanner.add(into, offset + address, data)
+            reading.add(offset + address, data, text, prefix)
         elif kind in (_SEGMENT, _LINEAR):
             if address:
                 raise scanner.refuse("an extended address record has an address of its own")
-            is_linear = kind == _LINEAR
+            is_linear, prefix = kind == _LINEAR, text
             offset = int.from_bytes(data, "big") << (16 if is_linear else 4)
         elif kind == _END:
             scanner.ended = True
+    reading.finish()
+
+
+def _by_intelhex(lines: str) -> list[_Piece]:
+    from intelhex import IntelHex  # noqa: PLC0415  only for such a file
+
+    loaded = IntelHex(StringIO(lines))
+    first, end = loaded.minaddr(), loaded.maxaddr() + 1
+    spans = [(first, end)] if end - first == len(loaded) else loaded.segments()
+    return [(start, loaded.gets(start, end - start)) for start, end in spans]
 
 
 # -- Motorola S-record ----------------------------------------------------------------------------
@@ -181,6 +298,7 @@ _ENDS: Final = "789"
 def read_srec(file: BinaryIO, source: str, into: SparseBytes) -> None:
     """All data of an S-record file. Raises ImageError with the line number on any damage."""
     scanner = _Scanner(file, source, "Motorola S-record")
+    reading = _Reading(scanner, _by_bincopy, into)
     data_records = 0
     first_line = 0
     for text in scanner.lines():
@@ -200,7 +318,8 @@ def read_srec(file: BinaryIO, source: str, into: SparseBytes) -> None:
             )
         if kind in _DATA_KINDS:
             data_records += 1
-            scanner.add(into, address, data)
+            if data:
+                reading.add(address, data, text)
         scanner.counted = kind in _COUNTS
         if scanner.counted and address != data_records:
             raise scanner.refuse(
@@ -208,3 +327,12 @@ def read_srec(file: BinaryIO, source: str, into: SparseBytes) -> None:
                 "lines were lost or doubled",
             )
         scanner.ended = kind in _ENDS
+    reading.finish()
+
+
+def _by_bincopy(lines: str) -> list[_Piece]:
+    from bincopy import BinFile  # noqa: PLC0415  only for such a file
+
+    loaded = BinFile()
+    loaded.add_srec(lines)
+    return [(segment.address, bytes(segment.data)) for segment in loaded.segments]

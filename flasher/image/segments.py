@@ -64,6 +64,13 @@ class SparseBytes:
                 data = data[common:]
                 start += common
 
+    def leaves_out(self, start: int, end: int) -> bool:
+        """True when none of these addresses is inside the window; they are noted then."""
+        if self.window is None or (start < self.window[1] and self.window[0] < end):
+            return False
+        self.note(start, end)
+        return True
+
     def note(self, start: int, end: int) -> None:
         """The file has bytes from `start` to before `end`, whether they are wanted or not."""
         low, high = self._seen or (start, end)
@@ -116,12 +123,7 @@ class SparseBytes:
             self._pieces[index - 1] += data
             return index
         if len(self._pieces) == PIECES_MAX:
-            raise ImageError(
-                f"{self.source} holds more than {PIECES_MAX} separate pieces of data",
-                cause="a damaged file, or none that a linker made",
-                remedy="make the file again, or choose a part of it with --range START:END",
-                code=ErrorCode.IMAGE_GAP,
-            )
+            raise scattered(self.source)
         # A piece that ends where the next one starts is left apart: joining it would copy the next
         # one, again and again for a file in descending order.
         self._starts.insert(index, start)
@@ -179,6 +181,16 @@ def empty(source: str) -> ImageError:
         cause="the build or the conversion that made it failed",
         remedy="make the file again",
         code=ErrorCode.IMAGE_EMPTY,
+    )
+
+
+def scattered(source: str) -> ImageError:
+    """The refusal of more pieces than any linker makes."""
+    return ImageError(
+        f"{source} holds more than {PIECES_MAX} separate pieces of data",
+        cause="a damaged file, or none that a linker made",
+        remedy="make the file again, or choose a part of it with --range START:END",
+        code=ErrorCode.IMAGE_GAP,
     )
 
 

@@ -268,7 +268,8 @@ def test_no_command_is_imported_for_the_list_of_commands() -> None:
     script = (
         "import sys; from flasher.cli.main import COMMANDS, main; main(['--help']); "
         "names = {e.place.partition(':')[0] for e in COMMANDS.values()}; "
-        "print([n for n in ('can', 'tqdm', 'jinja2', 'pydantic', 'intelhex') if n in sys.modules], "
+        "libraries = ('can', 'tqdm', 'jinja2', 'pydantic', 'intelhex', 'bincopy'); "
+        "print([n for n in libraries if n in sys.modules], "
         "[n for n in names if f'flasher.cli.{n}' in sys.modules])"
     )
     done = subprocess.run(
