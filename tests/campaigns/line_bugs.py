@@ -100,7 +100,7 @@ def hunt(seed: int, limit_s: float, *, shrinks: bool) -> None:
 
     while time.process_time() < limit_s:
         found = draw(seed, ACTS)
-        seed, steps = seed + 1, steps + len(found.story.acts)
+        seed, steps = seed + 1, steps + len(found.done)
         if found.kind and is_ours(found.story):
             took_s = time.process_time()
             shrunk = shrink(found, is_ours) if shrinks else found

@@ -55,7 +55,7 @@ class Teller:
 
     def acts(self) -> Iterator[stories.Act]:
         """Acts with their times, each drawn when the one before it is done."""
-        actors = [self._person(each.name) for each in self.world.people.values()]
+        actors = [self._person(each.name) for each in self.world.setup.people]
         actors.append(self._fate())
         now = self.world.now
         upcoming = [(now + gap, act, actor) for actor in actors for gap, act in (next(actor),)]
@@ -106,6 +106,7 @@ class Teller:
             self._clear: 5.0,
             self._cancel: 0.6,
             self._free: 0.4,
+            self._abort: 0.3,
         }
         while True:
             yield self._pause(), None
@@ -199,6 +200,11 @@ class Teller:
         empty = self._bays(full=False)
         if empty:
             yield self._pause(), stories.Free(by=name, socket=self.chance.choice(empty).name)
+
+    def _abort(self, name: str) -> Iterator[Step]:
+        working = self._bays(full=True, working=True)
+        if working:
+            yield self._pause(), stories.Abort(by=name, socket=self.chance.choice(working).name)
 
     # -- what befalls them ------------------------------------------------------------------------
 

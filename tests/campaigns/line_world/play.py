@@ -13,7 +13,7 @@ from typing import Final
 from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.draw import Teller, setup_of
 from tests.campaigns.line_world.stories import Story, time_of
-from tests.campaigns.line_world.world import Violation, World
+from tests.campaigns.line_world.world import STUCK, Violation, World
 
 _GRID_S: Final = (1.0, 0.5, 0.1, 0.01, 0.001)
 
@@ -50,18 +50,28 @@ def _played(world: World, acts: Iterator[stories.Act], steps: float = inf) -> Pl
     tried: list[stories.Act] = []
     done: list[stories.Act] = []
     kind = text = ""
-    try:
+
+    def go(acts: Iterator[stories.Act], steps: float = inf) -> None:
         for act in acts:
             tried.append(act)
             done.append(act)
             if not world.do(act):
                 done.pop()
             if len(done) >= steps or world.now > 20.0 * steps:
-                break
-        world.go_home()
+                return
+
+    drawn: tuple[list[stories.Act], list[stories.Act]] = tried, done
+    try:
+        go(acts, steps)
+        drawn = tried.copy(), done.copy()
+        go(world.way_home())
     except Violation as violation:
         kind, text = violation.kind, str(violation)
-    return Played(replace(world.setup, acts=tried), done, kind, text, world.seen)
+        if kind != STUCK and len(tried) > len(drawn[0]):
+            # What was done on the way home belongs to it, and the time until it was seen.
+            end = stories.Look(when=stories.at(world.now))
+            drawn = [*tried, end], [*done, end]
+    return Played(replace(world.setup, acts=drawn[0]), drawn[1], kind, text, world.seen)
 
 
 # -- shrinking -------------------------------------------------------------------------------------

@@ -125,6 +125,21 @@ class Free(Scan):
     socket: str
 
 
+@dataclass(frozen=True, kw_only=True)
+class Abort(Scan):
+    """Scan ABORT of a socket."""
+
+    NAME = "abort"
+    socket: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Look(Act):
+    """Do nothing: time passes."""
+
+    NAME = "look"
+
+
 # -- what befalls them -----------------------------------------------------------------------------
 
 
@@ -172,8 +187,8 @@ class KillStation(Act):
 CLAUSES: Final[dict[str, type[Clause]]] = {
     kind.NAME: kind
     for kind in (
-        LineSetup, UnitSetup, Person, Put, Pull, Card, Label, Cancel, Free, Sleep, Dip, Stall,
-        KillWorker, KillStation,
+        LineSetup, UnitSetup, Person, Put, Pull, Card, Label, Cancel, Free, Abort, Look, Sleep, Dip,
+        Stall, KillWorker, KillStation,
     )
 }  # fmt: skip
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import tempfile
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import timedelta
@@ -56,6 +56,10 @@ _SLOW: Final = {"erase_time_s": 0.5, "program_time_s": 0.25}
 _READY_S: Final = 4.0
 _RUN_LIMIT_S: Final = 150.0
 _TRIES: Final = 4
+STUCK: Final = "STUCK"
+"""The kind of a violation: nobody knows what to scan."""
+CAREFUL: Final = "careful"
+"""Who brings each unit home; nobody of a story."""
 _SCAN_LABEL: Final = "Scan the label of the unit that is in this socket"
 """A tile says so while its card waits for a label."""
 _FINAL: Final = ("DUPLICATE", "JUST_PASSED", "WRONG_UNIT")
@@ -141,7 +145,8 @@ class World:
         self._stored = {number: _stored(unit) for number, unit in self.units.items()}
         self.passed: set[str] = set()
         """Labels whose PASS was shown."""
-        self.people = {each.name: PersonAtWork(each.name, each.source) for each in setup.people}
+        people = (*setup.people, stories.Person(name=CAREFUL, source=CAREFUL))
+        self.people = {each.name: PersonAtWork(each.name, each.source) for each in people}
         self.station: Station | None = None
         self._station_at: float | None = None
         """When a station that died is started again."""
@@ -446,6 +451,13 @@ class World:
         self._scan(f"FREE {bay.name}", person)
         return True
 
+    def _abort(self, act: stories.Abort) -> bool:
+        person, bay = self.people.get(act.by), self.bays.get(act.socket)
+        if self.station is None or person is None or bay is None:
+            return False
+        self._scan(f"ABORT {bay.name}", person)
+        return True
+
     def _scan(self, text: str, person: PersonAtWork, mounted: str = "") -> bool:
         """Scan, and read the answer: True when it was accepted."""
         if self.station is None:
@@ -522,6 +534,8 @@ class World:
         stories.Label: _label,
         stories.Cancel: _cancel,
         stories.Free: _free,
+        stories.Abort: _abort,
+        stories.Look: lambda _world, _act: True,
         stories.Sleep: _sleep,
         stories.Dip: _dip,
         stories.Stall: _stall,
@@ -606,42 +620,44 @@ class World:
 
     # -- nobody is stuck --------------------------------------------------------------------------
 
-    def go_home(self) -> None:
-        """Nothing happens any more, and a careful person brings each unit to a finished run."""
-        self.go_to(self.now + 0.5)
+    def way_home(self) -> Iterator[stories.Act]:
+        """Nothing else happens any more, and a careful person brings each unit to a finished run:
+        what that takes, each act drawn when the one before it is done.
+        """
+        self._wait(0.5)
         while self.station is None or self._power_at:
-            self.go_to(self.now + 1.0)
+            self._wait(1.0)
         for unit in self.units.values():
             unit.sleeps_until = float("-inf")
         for number in self.units:
             if label_of(number) not in self.passed:
-                self._bring_home(number)
+                yield from self._bring_home(number)
 
-    def _bring_home(self, number: int) -> None:
+    def _wait(self, seconds: float) -> None:
+        self.go_to(round(self.now + seconds, 6))
+
+    def _bring_home(self, number: int) -> Iterator[stories.Act]:
         label, said = label_of(number), ""
         for attempt in range(_TRIES):
             self._await_ends()
-            for person in self.people.values():
-                person.card = person.label = None
-                if person.source != "mounted":
-                    self._scan("CANCEL", person)
-            for other in self.units:
-                self._pull(stories.Pull(unit=other))
-            self.go_to(self.now + _READY_S)
+            yield from self._empty()
+            self._wait(_READY_S)
+            now = stories.at(self.now)
             for each in self.bays.values():
                 if attempt or self.awaits_another(each, number):
-                    self._scan(f"FREE {each.name}", self._careful)
+                    yield stories.Free(when=now, by=CAREFUL, socket=each.name)
             bay = self.bays[list(self.bays)[attempt % len(self.bays)]]
-            if not self._put(stories.Put(unit=number, socket=bay.name)):
+            yield stories.Put(when=now, unit=number, socket=bay.name)
+            if self.where(number) is None:
                 self._stuck(number, f"{bay.name} waits for another unit")
-            self.go_to(self.now + _READY_S)
+            self._wait(_READY_S)
             before, runs = len(self._answers), self.seen["runs"]
-            self._scan(f"SOCKET {bay.name}", self._careful)
-            self.go_to(self.now + 1.0)
-            self._scan(label, self._careful)
+            yield stories.Card(when=stories.at(self.now), by=CAREFUL, unit=number)
+            self._wait(1.0)
+            yield stories.Label(when=stories.at(self.now), by=CAREFUL, unit=number)
             give_up_at = self.now + 30.0
             while self.seen["runs"] == runs and self.now < give_up_at:
-                self.go_to(self.now + 0.5)
+                self._wait(0.5)
             refusals = [e for e in self._answers[before:] if isinstance(e, ScanRefused)]
             if any(each.code in _FINAL for each in refusals):
                 return
@@ -653,6 +669,17 @@ class World:
                 said = f"its run ended with {self._last_end}"
         self._stuck(number, said)
 
+    def _empty(self) -> Iterator[stories.Act]:
+        """Nothing waits for a scan, and no unit is in a socket."""
+        now = stories.at(self.now)
+        for person in self.people.values():
+            person.card = person.label = None
+            if person.source != "mounted":
+                yield stories.Cancel(when=now, by=person.name)
+        for unit in self.units:
+            if self.where(unit) is not None:
+                yield stories.Pull(when=now, unit=unit)
+
     def _has_to_pass(self, number: int) -> bool:
         """A good unit passes, whatever befell it before."""
         unit = next(each for each in self.setup.units if each.label == number)
@@ -661,19 +688,15 @@ class World:
         return unit.answers and unit.number in numbers
 
     def _stuck(self, number: int, said: str) -> NoReturn:
-        raise Violation("STUCK", f"no way of scans leads {label_of(number)} to its end: {said}")
-
-    @property
-    def _careful(self) -> PersonAtWork:
-        return PersonAtWork("careful", "careful")
+        raise Violation(STUCK, f"no way of scans leads {label_of(number)} to its end: {said}")
 
     def _await_ends(self) -> None:
         give_up_at = self.now + _RUN_LIMIT_S
         while any(bay.run or bay.is_working for bay in self.bays.values()):
             if self.now >= give_up_at:
                 running = [f"{bay.run} in {bay.name}" for bay in self.bays.values() if bay.run]
-                raise Violation("STUCK", f"no end of the run of {_words(running)}")
-            self.go_to(self.now + 0.5)
+                raise Violation(STUCK, f"no end of the run of {_words(running)}")
+            self._wait(0.5)
 
 
 def _make(setup: stories.UnitSetup, none: str) -> PaperUnit:
