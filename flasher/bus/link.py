@@ -22,6 +22,10 @@ _AWAKE_S: Final = 0.0001
 """Real seconds that a paced clock waits awake."""
 
 
+_MADE_UP_S: Final = 0.1
+"""The longest pause in real seconds after which a steady clock hurries to keep its pace."""
+
+
 class Clock(Protocol):
     """Seconds that only go forward."""
 
@@ -138,6 +142,33 @@ class PacedClock:
             time.sleep(remaining_s - _AWAKE_S)
         while time.perf_counter() < until:
             pass
+
+
+class SteadyClock:
+    """Virtual time at the pace of real time, or `speed` times as fast: it passes only while
+    somebody waits for it. A pause of this computer pauses what is simulated as well.
+    """
+
+    def __init__(self, speed: float = 1.0) -> None:
+        self.speed = speed
+        self._now = 0.0
+        self._reached_at = time.perf_counter()
+        """When it should have been this time."""
+
+    def now(self) -> float:
+        """Simulated seconds since the clock was made."""
+        return self._now
+
+    def wait_until(self, moment: float) -> None:
+        """Sleep until the simulated `moment`. What a short pause has cost is made up for."""
+        if moment <= self._now:
+            return
+        real = time.perf_counter()
+        from_s = max(self._reached_at, real - _MADE_UP_S)
+        self._reached_at = from_s + (moment - self._now) / self.speed
+        if self._reached_at > real:
+            time.sleep(self._reached_at - real)
+        self._now = moment
 
 
 class VirtualClock:

@@ -109,6 +109,11 @@ UNIT_CHANGED: Final = _error(
     say("the unit in the socket may be another one than at the beginning of the run"),
     say("Put the unit of this label into the socket, and scan the label again."),
 )
+NOT_OBSERVED: Final = _error(
+    "NOT_OBSERVED",
+    say("this computer stood still, so that it did not see whether the unit stayed in the socket"),
+    say("Scan the unit again; it is not judged."),
+)
 TWO_DEVICES: Final = _error(
     "TWO_DEVICES",
     say("two devices of one kind answer"),
@@ -174,5 +179,7 @@ OF_ENDING: Final[Mapping[Ending, Code]] = {
 """What a bad end of an upgrade is in the records."""
 NEED_POWER_CYCLE: Final = frozenset({NO_BOOTLOADER, ERASE_FAILED, TRANSFER_FAILED})
 """After these a power cycle may reach the bootloader again."""
+OF_ANOTHER: Final = frozenset({UNIT_CHANGED.name, NOT_OBSERVED.name})
+"""The names of those after which another unit may have been in the socket."""
 OF_SILENCE: Final = frozenset({NO_ANSWER, NOT_RUNNING, WRITE_FAILED, NO_BOOTLOADER, NO_RESTART})
 """What a unit fails with that is not there any more."""

@@ -17,7 +17,9 @@ What a single unit may do is no evidence: announcements of one burst, however ma
 after every reset that was sent and not ignored, as the first one may have come too late; a burst
 that follows a reset so soon that nobody can have put another unit in, although the confirmation was
 lost; a burst after the end of a transfer, or none; a restart of what the battery supplies while the
-battery restarts. Nor is a pause of this computer: time in which nobody listened does not count.
+battery restarts. Nor is a pause of this computer: time in which nobody listened does not count. But
+where another unit could have come in that time and would be taken for this one, `unobserved` says
+so.
 """
 
 from __future__ import annotations
@@ -60,7 +62,7 @@ _MESSAGE_S: Final = 0.1
 class Continuity:
     """What was sent to one target and what came from it, since it was identified.
 
-    `stall_s` is the longest time between two calls in which somebody has listened.
+    `blind_s`: nobody has listened in a longer time between two calls.
     """
 
     def __init__(
@@ -68,7 +70,7 @@ class Continuity:
         loaded: LoadedTarget,
         watcher: TargetWatcher,
         *,
-        stall_s: float,
+        blind_s: float,
         goes_on: bool = False,
         was_exchanged: bool = False,
     ) -> None:
@@ -76,6 +78,8 @@ class Continuity:
         self.watcher = watcher
         self.lost = ""
         """What speaks against the same unit; empty while nothing does."""
+        self.unobserved = ""
+        """When nobody listened, although another unit could have come; empty while somebody did."""
         self.is_running = False
         """Its application has answered since the last restart."""
         self.is_told_to_update = False
@@ -95,18 +99,20 @@ class Continuity:
         self._gap_s = self.quiet_s
         self._longest_pause_s = 0.0
         """Between two announcements before it was identified."""
-        self._stall_s = stall_s
-        self._now = -inf
-        self._listened_s = 0.0
-        """How long somebody has listened so far."""
+        self._blind_s, self._missed_s = blind_s, 0.0
+        """How long nobody has listened since the last announcement, or since the reset of an
+        application.
+        """
+        self._now, self._listened_s = -inf, 0.0
+        """Up to when, and how long, somebody has listened so far."""
         self._announced_s: float | None = None
         """The same when the last announcement of the burst came that goes on; None: none does."""
         self._burst_until = -inf
         """Up to when a burst may begin that the run has caused."""
-        self._heard_s = 0.0
-        """How long somebody had listened when the unit was heard last."""
-        self._returned_s = -inf
-        """The same for when it was heard again after a silence that allows an exchange."""
+        self._heard_s, self._returned_s = 0.0, -inf
+        """How long somebody had listened when the unit was heard last, and when it was heard again
+        after a silence that allows an exchange.
+        """
         self._announced_on = 0
         """Announcements of the burst that goes on, since the last reset."""
         self._awaits_confirmation = False
@@ -183,9 +189,10 @@ class Continuity:
     def listened(self, now: float) -> None:
         """Somebody has listened up to now; called again and again while the run uses the bus."""
         passed_s = now - self._now
-        if passed_s <= self._stall_s:
+        if passed_s <= self._blind_s:
             self._listened_s += passed_s
         elif passed_s < inf:
+            self._missed_s += passed_s
             self.watcher.miss(passed_s)
         self._now = now
 
@@ -232,6 +239,8 @@ class Continuity:
             self._has_acted = True
             is_reset = found.command in (self._reset_command, Command.RESET)
             self._announced_on = 0 if is_reset else self._announced_on
+            if is_reset and self.is_running:
+                self._missed_s = 0.0
             if found.command == Command.RESET and self.is_running:
                 # As long as it has not confirmed that, it goes on running.
                 self._awaits_confirmation = True
@@ -269,6 +278,7 @@ class Continuity:
     def _take_announcement(self, now: float) -> None:
         since_s = inf if self._announced_s is None else self._listened_s - self._announced_s
         goes_on, self._announced_s = since_s < self._gap_s, self._listened_s
+        self._judge_missed(since_s, goes_on=goes_on, is_caused=now <= self._burst_until)
         if not self._is_identified:
             if since_s < inf:
                 self._longest_pause_s = max(self._longest_pause_s, since_s)
@@ -293,6 +303,20 @@ class Continuity:
         version, self._boot_version = self._boot_version, self.watcher.version
         if version and version != self._boot_version:
             self._lose(f"announced boot version {version} before, and {self._boot_version} now")
+
+    def _judge_missed(self, since_s: float, *, goes_on: bool, is_caused: bool) -> None:
+        """Whether the announcement may be of another unit, which came while nobody listened."""
+        missed_s, self._missed_s = self._missed_s, 0.0
+        if is_caused:
+            is_after_reset = not goes_on and self._announced_on < _ANNOUNCED_ON
+            could_be_other = is_after_reset and missed_s >= _EXCHANGE_S
+        else:
+            could_be_other = goes_on and missed_s > 0.0 and since_s + missed_s >= self._gap_s
+        if could_be_other and not self._goes_on and not self.unobserved:
+            self.unobserved = (
+                f"This computer did not listen to the {self._name} for {missed_s:.1f} s:"
+                " another unit could have come, and would announce itself in the same way."
+            )
 
     def _lose_by_restart(self, when: str) -> None:
         self.is_running = False

@@ -21,6 +21,11 @@ from flasher.settings.profile import sent_ids
 from flasher.station.messages import PresenceChanged
 from flasher.station.recipe_file import LoadedTarget
 
+BLIND_S: Final = 0.15
+"""In a longer time between two looks at the bus, in real seconds, nobody has listened: whoever
+listens looks every 0.1 s. With what is thrown away before the next look it has to stay below
+`PAUSE_S`.
+"""
 SILENCE_S: Final = 2.0
 """A unit of which nothing was heard for so long is out."""
 PROBE_S: Final = 0.5

@@ -140,7 +140,7 @@ def with_history(
     runs = [] if life is None else list(life.runs)
     still_open = _after(runs, lambda run: run.run.state not in _OPEN)
     unfinished = _after(runs, lambda run: run.run.state is RunState.PASS)
-    of_this_unit = _after(still_open, lambda run: run.run.code == codes.UNIT_CHANGED.name)
+    of_this_unit = _after(still_open, lambda run: run.run.code in codes.OF_ANOTHER)
     passed = next((run for run in reversed(runs) if run.run.state is RunState.PASS), None)
     written = passed.writes if passed is not None else ()
     return replace(

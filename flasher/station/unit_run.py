@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Final
 
 from flasher.api import Connection
-from flasher.driver import STALL_S, Tap
+from flasher.driver import Tap
 from flasher.errors import (
     BusError,
     FlasherError,
@@ -33,7 +33,7 @@ from flasher.station.messages import (
     StepReport,
 )
 from flasher.station.power import PowerControl
-from flasher.station.presence import TargetWatcher
+from flasher.station.presence import BLIND_S, TargetWatcher
 from flasher.station.recipe import AfterRestart, StepRule
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import Measurement, RunState, StepName, StepState
@@ -100,11 +100,11 @@ class UnitRun:
         self._tell = tell
         self._cancelled = cancelled
         goes_on = recipe.recipe.after_restart is AfterRestart.CONTINUE
-        stall_s = STALL_S * connection.clock.speed
+        blind_s = BLIND_S * connection.clock.speed
         watchers = watchers or [TargetWatcher(each) for each in recipe.targets]
         self._continuity = {
             each.name: Continuity(
-                each, watcher, stall_s=stall_s, goes_on=goes_on, was_exchanged=was_exchanged
+                each, watcher, blind_s=blind_s, goes_on=goes_on, was_exchanged=was_exchanged
             )
             for each, watcher in zip(recipe.targets, watchers, strict=True)
         }
@@ -116,6 +116,12 @@ class UnitRun:
         self._step_began_at = 0.0
         self._step_ends_at: float | None = None
         self._told_at = float("-inf")
+        self._hear_waiting: Callable[[], None] = lambda: None
+
+    def listen_meanwhile(self) -> None:
+        """Hear what came; called while the records save something, so that this is no pause."""
+        with suppress(BusError):  # whoever uses the adapter next says so
+            self._hear_waiting()
 
     def run(self) -> RunResult:
         """Do it. Raises nothing but what is a bug."""
@@ -150,6 +156,7 @@ class UnitRun:
                 )
                 for each in self._recipe.targets
             ]
+            self._hear_waiting = targets[0].hear_waiting
             return UnitSteps(
                 self._order,
                 self._recipe,
@@ -236,9 +243,11 @@ class UnitRun:
     def _changed(self, steps: UnitSteps) -> StepFailedError | None:
         """What ends the run where the unit may be another one: that goes before all else."""
         lost = next((each.lost for each in self._continuity.values() if each.lost), "")
-        if not lost:
+        unobserved = next((e.unobserved for e in self._continuity.values() if e.unobserved), "")
+        if not (lost or unobserved):
             return None
-        return StepFailedError(codes.UNIT_CHANGED, f"{lost} {steps.left_behind}".strip())
+        code = codes.UNIT_CHANGED if lost else codes.NOT_OBSERVED
+        return StepFailedError(code, f"{lost or unobserved} {steps.left_behind}".strip())
 
     def _of_silence(self, steps: UnitSteps, failed: StepFailedError) -> StepFailedError:
         """Something has no answer: an application that had answered, and does not any more, means
@@ -274,7 +283,7 @@ class UnitRun:
         now = self._clock.now()
         for each in self._continuity.values():
             each.listened(now)
-            if each.lost:
+            if each.lost or each.unobserved:
                 return True
         ends_at = self._step_ends_at
         return self._cancelled() or (ends_at is not None and now >= ends_at)

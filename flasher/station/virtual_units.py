@@ -17,7 +17,7 @@ from enum import StrEnum
 from typing import Final
 
 from flasher.api import Connection
-from flasher.bus.link import Clock, PacedClock, VirtualClock
+from flasher.bus.link import Clock, SteadyClock, VirtualClock
 from flasher.bus.simulated import SimulatedBus
 from flasher.errors import UsageError
 from flasher.image.release import Release
@@ -178,7 +178,7 @@ class VirtualSocket:
     ) -> None:
         self._recipe = recipe
         self._virtual = virtual
-        made = PacedClock(virtual.speed) if virtual.speed else VirtualClock()
+        made = SteadyClock(virtual.speed) if virtual.speed else VirtualClock()
         self.clock = clock or made
         self.dialect = recipe.targets[0].profile.dialect
         self._bus = SimulatedBus(self.dialect.bitrate_bps, self.clock)

@@ -23,7 +23,6 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from flasher.api import Connection, connect
-from flasher.driver import STALL_S
 from flasher.errors import BusError, FlasherError, TransmitBlockedError, UsageError
 from flasher.files import make_private
 from flasher.log import log_event
@@ -53,7 +52,7 @@ from flasher.station.messages import (
     WorkerSetup,
 )
 from flasher.station.power import PowerCommand, PowerControl
-from flasher.station.presence import Presence
+from flasher.station.presence import BLIND_S, Presence
 from flasher.station.recipe_file import LoadedRecipe, load_recipe
 from flasher.station.records.model import RunState, WriteId
 from flasher.station.unit_run import UnitRun
@@ -98,6 +97,8 @@ class StationPipe:
         self._beat_at = float("-inf")
         self._begin: Begin | None = None
         self._replies: dict[int, Reply] = {}
+        self.meanwhile: Callable[[], None] = lambda: None
+        """Called again and again while it waits for the station."""
         self.is_aborted = False
         self.is_over = False
         """The station is gone, or wants the process to end."""
@@ -169,6 +170,7 @@ class StationPipe:
             if self._now() >= give_up_at:
                 raise JournalError(f"The station did not save within {REPLY_LIMIT_S:g} s.")
             self.look(IDLE_S)
+            self.meanwhile()
         reply = self._replies.pop(self._asked)
         if reply.error:
             raise JournalError(reply.error)
@@ -256,8 +258,8 @@ class Worker:
 
     def _listened(self) -> None:
         """Up to now, unless this computer stood still meanwhile."""
-        now, stall_s = self._connection.clock.now(), STALL_S * self._connection.clock.speed
-        if now - self._listened_at > stall_s:
+        now, blind_s = self._connection.clock.now(), BLIND_S * self._connection.clock.speed
+        if now - self._listened_at > blind_s:
             self._presence.miss(now - self._listened_at)
         self._listened_at = now
 
@@ -292,7 +294,7 @@ class Worker:
                         self._pipe.send(change)
                     watchers = presence.watchers
                     was_exchanged = presence.exchanged_number > begin.presence
-                result = UnitRun(
+                run = UnitRun(
                     begin.order,
                     self._recipe,
                     self._connection,
@@ -303,7 +305,9 @@ class Worker:
                     power=self._power,
                     watchers=watchers,
                     was_exchanged=was_exchanged,
-                ).run()
+                )
+                self._pipe.meanwhile = run.listen_meanwhile
+                result = run.run()
         except StationGoneError:
             return
         except FlasherError as error:

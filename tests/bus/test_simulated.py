@@ -4,10 +4,18 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Callable
 
 import pytest
 
-from flasher.bus.link import SEND_LIMIT_S, MonotonicClock, PacedClock, VirtualClock
+from flasher.bus.link import (
+    SEND_LIMIT_S,
+    Clock,
+    MonotonicClock,
+    PacedClock,
+    SteadyClock,
+    VirtualClock,
+)
 from flasher.bus.simulated import SimulatedBus
 from flasher.errors import TransmitBlockedError
 from flasher.protocol.bittime import frame_bits
@@ -198,9 +206,12 @@ def test_drain_forgets_what_has_arrived() -> None:
     link.close()
 
 
-def test_a_paced_bus_takes_the_real_time_divided_by_its_speed() -> None:
+@pytest.mark.parametrize("make", [PacedClock, SteadyClock])
+def test_a_paced_bus_takes_the_real_time_divided_by_its_speed(
+    make: Callable[[float], Clock],
+) -> None:
     speed = 50.0
-    clock = PacedClock(speed)
+    clock = make(speed)
     bus = SimulatedBus(BITRATE, clock)
     frames = [Frame(0x725, bytes([number % 256] * 8)) for number in range(1000)]
     bus.attach(Talker(*frames))
@@ -214,11 +225,35 @@ def test_a_paced_bus_takes_the_real_time_divided_by_its_speed() -> None:
 
 
 def test_the_clocks_only_go_forward_and_do_not_wait_for_the_past() -> None:
-    for clock in (MonotonicClock(), PacedClock(2.0), VirtualClock()):
+    for clock in (MonotonicClock(), PacedClock(2.0), SteadyClock(2.0), VirtualClock()):
         before = clock.now()
         clock.wait_until(before - 100.0)
         clock.wait_until(before + 0.001)
         assert clock.now() >= before + 0.001
+
+
+def test_a_pause_of_this_computer_pauses_a_steady_clock(monkeypatch: pytest.MonkeyPatch) -> None:
+    real_s, slept_s = 100.0, 0.0
+
+    def sleep(seconds: float) -> None:
+        nonlocal real_s, slept_s
+        real_s, slept_s = real_s + seconds, slept_s + seconds
+
+    monkeypatch.setattr("flasher.bus.link.time.perf_counter", lambda: real_s)
+    monkeypatch.setattr("flasher.bus.link.time.sleep", sleep)
+    clock = SteadyClock(10.0)
+    clock.wait_until(1.0)
+    assert slept_s == pytest.approx(0.1)
+    real_s += 0.05
+    assert clock.now() == 1.0
+    clock.wait_until(2.0)
+    assert slept_s == pytest.approx(0.15), "it hurries after a short pause"
+    real_s += 60.0
+    assert clock.now() == 2.0
+    clock.wait_until(4.0)
+    assert slept_s == pytest.approx(0.25), "and goes on from where it is after a long one"
+    clock.wait_until(5.0)
+    assert slept_s == pytest.approx(0.35)
 
 
 # -- several senders of one id --------------------------------------------------------------------

@@ -614,21 +614,93 @@ def test_a_unit_that_stays_passes(tmp_path: Path, text: str, change: dict[str, o
 def test_a_unit_that_stays_passes_however_long_the_records_take(
     tmp_path: Path, *, has_application: bool, reset: str, reset_delay_s: float
 ) -> None:
-    """One without an application announces itself all the time, also while nobody listens."""
+    """One without an application announces itself all the time."""
     profile = replace(NEW_UNIT, reset_in_bootloader=reset, reset_delay_s=reset_delay_s)  # type: ignore[arg-type]
     bench = UnitBench(tmp_path)
     bench.put(
         MockDevice(BMS, bitrate_bps=250_000, profile=profile, has_application=has_application)
     )
 
-    def save_slowly() -> None:
-        until = bench.clock.now() + 2.0
-        while bench.clock.now() < until:
-            bench.bus.advance(until)
-
-    bench.journal.on_note = save_slowly
+    bench.save_slowly(2.0, listens=True)
     result = bench.run()
     assert result.outcome is RunState.PASS, result
+
+
+def without_application(**profile: object) -> MockDevice:
+    profile_of_it = replace(NEW_UNIT, **profile)  # type: ignore[arg-type]
+    return MockDevice(BMS, bitrate_bps=250_000, profile=profile_of_it, has_application=False)
+
+
+@pytest.mark.parametrize("stall_s", [0.1, 0.14, 0.16, 0.2, 0.23, 0.24])
+@pytest.mark.parametrize("kind", [RunKind.PRODUCTION, RunKind.RECHECK])
+def test_a_computer_that_stands_still_for_a_moment_is_no_pause_of_a_bootloader(
+    tmp_path: Path, kind: RunKind, stall_s: float
+) -> None:
+    bench = UnitBench(tmp_path)
+    bench.put(without_application())
+    bench.save_slowly(stall_s, listens=False)
+    result = bench.run(kind)
+    assert result.outcome is RunState.PASS, result
+
+
+@pytest.mark.parametrize("stall_s", [0.35, 1.0, 10.0])
+@pytest.mark.parametrize("reset", ["ignored", "restarts"])
+@pytest.mark.parametrize("has_application", [True, False])
+def test_what_a_computer_that_stands_still_did_not_see_does_not_accuse_the_unit(
+    tmp_path: Path, *, has_application: bool, reset: str, stall_s: float
+) -> None:
+    """An application says who it is; a bootloader could be another one."""
+    bench = UnitBench(tmp_path)
+    profile = replace(NEW_UNIT, reset_in_bootloader=reset)  # type: ignore[arg-type]
+    bench.put(
+        MockDevice(BMS, bitrate_bps=250_000, profile=profile, has_application=has_application)
+    )
+    bench.save_slowly(stall_s, listens=False)
+    result = bench.run()
+    assert result.code == ("OK" if has_application else "NOT_OBSERVED"), result
+    if not has_application:
+        assert f"did not listen to the bms for {stall_s:.1f} s" in result.text
+        assert bench.device.erase_count == 0
+        bench.journal.on_note = lambda: None
+        assert bench.run().code == "OK"
+
+
+@pytest.mark.parametrize("gap_s", [0.1, 0.3, 1.0])
+@pytest.mark.parametrize("note", BETWEEN[:3], ids=" ".join)
+def test_units_in_their_bootloaders_that_change_places_while_nobody_listens(
+    tmp_path: Path, note: tuple[str, ...], gap_s: float
+) -> None:
+    """Nothing speaks for another one, but nobody has seen that it is the same."""
+    world = Exchange(tmp_path, gap_s=gap_s)
+    world.bench.put(without_application())
+    world.second = without_application()
+    world.second.power_cut(0.0)
+    world.while_the_record_is_saved(*note)
+    result = world.bench.run()
+    assert result.code == "NOT_OBSERVED", result
+    world.check_untouched()
+
+
+def test_a_unit_that_is_exchanged_after_the_reset_while_nobody_listens(tmp_path: Path) -> None:
+    world = Exchange(tmp_path, gap_s=0.3)
+    bench, stalls = world.bench, 0
+
+    def stand_still_after_the_reset(frame: Frame, *, sent: bool, now: float) -> None:
+        nonlocal stalls
+        is_feedback = frame.can_id == BMS.answer_id and frame.data[4:6] == b"\x55\x03"
+        if sent or stalls or not is_feedback:
+            return
+        stalls, until = 1, now + 1.0
+        world.when = lambda: True
+        while bench.clock.now() < until:
+            bench.bus.advance(min(until, bench.clock.now() + 0.01))
+            world.look()
+
+    bench.taps = (stand_still_after_the_reset,)
+    result = bench.run()
+    assert stalls
+    assert result.code == "NOT_OBSERVED", result
+    world.check_untouched()
 
 
 @pytest.mark.parametrize("spacing_s", [0.2, 0.4, 0.9])

@@ -151,9 +151,11 @@ def test_a_unit_has_its_label_inside_where_the_recipe_writes_no_number(tmp_path:
 # -- units that are put elsewhere -----------------------------------------------------------------
 
 
-def run_in(socket: VirtualSocket, recipe: LoadedRecipe, serial: str) -> RunResult:
+def run_in(
+    socket: VirtualSocket, recipe: LoadedRecipe, serial: str, notes: Notes | None = None
+) -> RunResult:
     order = RunOrder(RunId(1), RunKind.PRODUCTION, serial, DAY)
-    result = UnitRun(order, recipe, socket.connection, Notes(), power=socket).run()
+    result = UnitRun(order, recipe, socket.connection, notes or Notes(), power=socket).run()
     socket.run_ended()
     return result
 
@@ -189,6 +191,31 @@ def until_something(socket: VirtualSocket) -> PresenceChanged:
         if change := socket.step():
             return change
     raise AssertionError("nobody comes or goes")
+
+
+def test_a_computer_that_is_slow_accuses_no_virtual_unit(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At 20 times, 20 ms of this computer would be 0.4 s on the bus."""
+    real_s = 100.0
+
+    def pass_time(seconds: float = 0.02) -> None:
+        nonlocal real_s
+        real_s += seconds
+
+    monkeypatch.setattr("flasher.bus.link.time.perf_counter", lambda: real_s)
+    monkeypatch.setattr("flasher.bus.link.time.sleep", pass_time)
+    recipe = make_recipe(tmp_path, USUAL + WRITES)
+    socket = VirtualSocket(recipe, VirtualUnits(MockUnits(exchanged=1.0), speed=20, count=2))
+    notes = Notes(on_note=pass_time)
+    one = until_something(socket).label
+    assert run_in(socket, recipe, one, notes).code == "UNIT_CHANGED"
+    other = until_something(socket).label
+    assert run_in(socket, recipe, other, notes).code == "OK"
+    assert not until_something(socket).is_there
+    assert until_something(socket).label == one
+    result = run_in(socket, recipe, one, notes)
+    assert result.code == "OK", result.text
 
 
 def test_a_unit_that_is_exchanged_in_its_run_comes_back_as_it_was(tmp_path: Path) -> None:

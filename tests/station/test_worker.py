@@ -343,6 +343,37 @@ class InBootloader(RealSocket):
             self.begin()
 
 
+class SlowRecords(InBootloader):
+    """The station takes 2 s to save something."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.line = StationPipe(self.channel, self.clock.now)
+        self.channel.poll = self.poll  # type: ignore[method-assign]
+        self.due: list[tuple[float, Ask]] = []
+
+    def answer(self, channel: FakeChannel, message: FromWorker) -> None:
+        if isinstance(message, Ask):
+            self.due.append((self.clock.now() + 2.0, message))
+        else:
+            super().answer(channel, message)
+
+    def poll(self, timeout: float = 0.0) -> bool:
+        until = self.clock.now() + timeout
+        while self.due and self.clock.now() < until:
+            self.bus.advance(until)
+        if self.due and self.clock.now() >= self.due[0][0]:
+            super().answer(self.channel, self.due.pop(0)[1])
+        return bool(self.channel.waiting)
+
+
+def test_it_listens_while_the_station_saves(tmp_path: Path) -> None:
+    """A slow disk is no pause: a unit in its bootloader is seen to stay."""
+    ended = SlowRecords(tmp_path).work()
+    assert ended is not None
+    assert ended.result.code == "OK", ended.result.text
+
+
 class Exchanged(RealSocket):
     """The unit is exchanged, and the process has reported that, when the order arrives that was
     given before it.

@@ -18,6 +18,7 @@ from flasher.station.messages import JournalError, RunEvent, RunOrder, RunResult
 from flasher.station.power import PowerControl
 from flasher.station.records.model import RunId, RunKind, StepName, StepState, WriteId
 from flasher.station.unit_run import UnitRun
+from flasher.station.worker import IDLE_S
 from tests.station.factory import DAY, SERIAL, USUAL, make_recipe
 
 WRITES = """
@@ -117,7 +118,7 @@ class UnitBench:
             flashed_before,
             written_before or {},
         )
-        return UnitRun(
+        self.unit_run = UnitRun(
             order,
             self.recipe,
             self.connection,
@@ -126,7 +127,22 @@ class UnitBench:
             tell=self.notes.append,
             cancelled=self._is_cancelled,
             power=self.power,
-        ).run()
+        )
+        return self.unit_run.run()
+
+    def save_slowly(self, seconds: float, *, listens: bool) -> None:
+        """Let the records take their time for each note; while it `listens`, the run hears what
+        comes, as the process of a socket does, else the computer stands still.
+        """
+
+        def save() -> None:
+            until = self.clock.now() + seconds
+            while self.clock.now() < until:
+                self.bus.advance(min(until, self.clock.now() + IDLE_S))
+                if listens:
+                    self.unit_run.listen_meanwhile()
+
+        self.journal.on_note = save
 
     def _is_cancelled(self) -> bool:
         return self.is_cancelled()
