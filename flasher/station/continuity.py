@@ -100,8 +100,8 @@ class Continuity:
         self._longest_pause_s = 0.0
         """Between two announcements before it was identified."""
         self._blind_s, self._missed_s = blind_s, 0.0
-        """How long nobody has listened since the last announcement, or since the reset of an
-        application.
+        """How long nobody has listened since the last announcement, or since the reset of one
+        that announced nothing.
         """
         self._now, self._listened_s = -inf, 0.0
         """Up to when, and how long, somebody has listened so far."""
@@ -239,7 +239,7 @@ class Continuity:
             self._has_acted = True
             is_reset = found.command in (self._reset_command, Command.RESET)
             self._announced_on = 0 if is_reset else self._announced_on
-            if is_reset and self.is_running:
+            if is_reset and self._pause_s >= self._gap_s:
                 self._missed_s = 0.0
             if found.command == Command.RESET and self.is_running:
                 # As long as it has not confirmed that, it goes on running.
@@ -259,6 +259,11 @@ class Continuity:
                 self._burst_until = inf
                 self._announced_on = _ANNOUNCED_ON
 
+    @property
+    def _pause_s(self) -> float:
+        """Since the last announcement of a burst that may go on."""
+        return inf if self._announced_s is None else self._listened_s - self._announced_s
+
     def _restart(self) -> None:
         self.is_running = self._awaits_confirmation = False
         self._has_acted = True
@@ -276,7 +281,7 @@ class Continuity:
             self._lose("only announced its bootloader before, and runs an application now")
 
     def _take_announcement(self, now: float) -> None:
-        since_s = inf if self._announced_s is None else self._listened_s - self._announced_s
+        since_s = self._pause_s
         goes_on, self._announced_s = since_s < self._gap_s, self._listened_s
         self._judge_missed(since_s, goes_on=goes_on, is_caused=now <= self._burst_until)
         if not self._is_identified:
