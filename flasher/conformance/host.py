@@ -18,8 +18,10 @@ _QUERY_PERIOD_S: Final = 0.2
 """The tool repeats a query at this interval (4.3)."""
 _QUERY_TRIES: Final = 5
 """A query stops after 1 s (4.3)."""
-_UPDATE_SPACING_S: Final = 0.03
-"""Update commands are at least this far apart (R2)."""
+UPDATE_SPACING_S: Final = 0.03
+"""Update commands are at least this far apart; a boot version that comes sooner after one was sent
+before it (R2).
+"""
 _QUIET_S: Final = 0.05
 """After a repetition the bus is quiet for so long before the next message (R10)."""
 _SETTLE_S: Final = 0.3
@@ -29,7 +31,7 @@ _BLIND_S: Final = 1.0
 UPDATES_MAX: Final = 50
 _WINDOW_MAX_S: Final = 1.0
 """How long the window lasts at the most where the profile does not know it (up_04)."""
-_LEFTOVER_S: Final = 0.06
+LEFTOVER_S: Final = 0.06
 """A boot version so soon after request transfer was sent before it (R11)."""
 _PACKET_ANSWERS: Final = (Kind.ACK, Kind.NAK, Kind.BOOT_VERSION, Kind.COMPLETE)
 
@@ -184,7 +186,7 @@ class PatientHost:
         """What follows an update command: request transfer, or a boot version that is far enough
         behind it (R2); None after `within_s`.
         """
-        not_before = asked_at + _UPDATE_SPACING_S
+        not_before = asked_at + UPDATE_SPACING_S
         return self._tester.wait_for(
             Kind.REQUEST,
             Kind.BOOT_VERSION,
@@ -224,7 +226,7 @@ class PatientHost:
 
         def is_stale(one: Received) -> bool:
             if one.kind is Kind.BOOT_VERSION:
-                return one.at < began_at + _LEFTOVER_S
+                return one.at < began_at + LEFTOVER_S
             return one.kind is Kind.ACK and one.number != number
 
         last = "no answer"

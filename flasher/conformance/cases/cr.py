@@ -9,7 +9,7 @@ from typing import Final
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probing import Probe
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
-from flasher.conformance.host import UPDATES_MAX
+from flasher.conformance.host import UPDATE_SPACING_S, UPDATES_MAX
 from flasher.conformance.tester import Fault, FaultKind
 from flasher.conformance.wire import (
     BOOT_VERSION,
@@ -28,8 +28,6 @@ from flasher.conformance.wire import (
     joined,
 )
 
-_LEFTOVER_S: Final = 0.03
-"""A boot version so soon after an update command was sent before it (R2)."""
 _FIELDS: Final = (
     ("header", 0, 2),
     ("mode", 2, 3),
@@ -285,7 +283,7 @@ class _Exact:
                 heard = bench.next_message(limit("erase_s"))
                 # Boot versions sent before it was heard do not count (R2).
                 is_version = heard is not None and heard.kind is Kind.BOOT_VERSION
-                if heard is None or not is_version or heard.at > sent.left_at + _LEFTOVER_S:
+                if heard is None or not is_version or heard.at > sent.left_at + UPDATE_SPACING_S:
                     break
             if heard is None or heard.kind is not Kind.BOOT_VERSION:
                 break

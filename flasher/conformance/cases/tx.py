@@ -10,6 +10,7 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.catalogue import DESTRUCTIVE, LONG, case
+from flasher.conformance.host import LEFTOVER_S, UPDATE_SPACING_S
 from flasher.conformance.judge import Times
 from flasher.conformance.restore import needs_power
 from flasher.conformance.results import Unsupported
@@ -48,8 +49,6 @@ _CHECKSUM_BYTES: Final = 4
 _WRAP_S: Final = 66.0
 """More than 65.536 s, where a clock of milliseconds in 16 bits wraps."""
 _APART_S: Final = 3.0
-_LEFTOVER_S: Final = 0.03
-"""A boot version so soon after an update command was sent before it (R2)."""
 
 
 def transfer_image(bench: Bench) -> bytes:
@@ -573,7 +572,7 @@ def _reset_while_it_erases(bench: Bench) -> None:
     bench.wait_to_be_heard()
     bench.send(bench.encoder.update(len(image)) + bench.encoder.reset())
     # Boot versions that were on their way when the update command came do not count (R11).
-    bench.wait(_LEFTOVER_S)
+    bench.wait(UPDATE_SPACING_S)
     within_s = bench.limit("erase_s") + bench.limit("first_version_s")
     heard = bench.wait_for(Kind.REQUEST, Kind.BOOT_VERSION, within_s=within_s)
     found = bench.require_received(heard, "request transfer, or boot version", within_s)
@@ -583,7 +582,7 @@ def _reset_while_it_erases(bench: Bench) -> None:
         restarts = bench.wait_for(
             Kind.BOOT_VERSION,
             within_s=min(bench.limit("first_version_s"), _JUST_NOT * bench.limit("pause_s")),
-            unlike=lambda one: one.at < found.at + 2 * _LEFTOVER_S,
+            unlike=lambda one: one.at < found.at + LEFTOVER_S,
         )
     if restarts is not None and restarts.kind is Kind.BOOT_VERSION:
         bench.update(len(image))

@@ -18,6 +18,7 @@ from typing import Final
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.explore.refused import PACKETS, REFUSED, UPDATES, Place, make
+from flasher.conformance.host import LEFTOVER_S, UPDATE_SPACING_S
 from flasher.conformance.wire import (
     PACKET_BYTES,
     Kind,
@@ -31,10 +32,6 @@ from flasher.conformance.wire import (
     version_in,
 )
 
-_LEFTOVER_S: Final = 0.06
-"""A boot version so soon after request transfer was sent before it (R11)."""
-_UPDATE_SPACING_S: Final = 0.03
-"""Update commands are at least this far apart (R2)."""
 _GAP_S: Final = 0.02
 _BUS_OFF_S: Final = 0.02
 _UPDATES_MAX: Final = 8
@@ -245,7 +242,7 @@ class Walk:
         self._naks_due -= 1
 
     def _judge_version(self, heard: Received) -> None:
-        is_leftover = heard.at < self._requested_at + _LEFTOVER_S and not self._may_restart
+        is_leftover = heard.at < self._requested_at + LEFTOVER_S and not self._may_restart
         if self.phase in _IN_TRANSFER and is_leftover:
             return
         is_expected = self._may_restart or self.phase is Phase.UNCLEAR
@@ -417,11 +414,11 @@ class Walk:
             sent = bench.send(frames)
             heard = self._listen(
                 bench.limit("erase_s"),
-                partial(_answers_update, not_before=sent.left_at + _UPDATE_SPACING_S),
+                partial(_answers_update, not_before=sent.left_at + UPDATE_SPACING_S),
             )
             if heard is None or heard.kind is Kind.REQUEST:
                 break
-            is_late = heard.at > sent.left_at + _LEFTOVER_S
+            is_late = heard.at > sent.left_at + LEFTOVER_S
             if is_late and bench.choice("up_04_burst") == "accepted":
                 break
             self._feedback_due += 1
@@ -429,7 +426,7 @@ class Walk:
             raise Violation("no request", "no request transfer after a valid update command")
         # An erase for each of them is right too (R25), and so is one answer.
         while self._updates_unanswered and self._listen(
-            _LEFTOVER_S, lambda one: one.kind is Kind.REQUEST
+            LEFTOVER_S, lambda one: one.kind is Kind.REQUEST
         ):
             pass
 

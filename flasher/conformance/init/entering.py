@@ -7,6 +7,7 @@ from math import ceil
 from statistics import median
 from typing import Final
 
+from flasher.conformance.host import UPDATE_SPACING_S
 from flasher.conformance.init.answers import Answer, Findings, Trial
 from flasher.conformance.init.session import REPEATS, Session, told
 from flasher.conformance.judge import Times
@@ -32,8 +33,6 @@ _ERASE_LEAST_S: Final = 10.0
 _ERASE_MOST_S: Final = 120.0
 _UNKNOWN: Final = 0x7704
 """A command that nobody has."""
-_AGAIN: Final = 0.03
-"""Update commands are at least this far apart (R2)."""
 
 
 def burst(it: Session) -> Findings:
@@ -392,7 +391,7 @@ def _is_size_taken(it: Session, frames: list[RawFrame], within_s: float) -> bool
         if heard.kind is Kind.REQUEST:
             bench.measure(Times.REQUEST, heard.at - sent.left_at)
             return True
-        versions += heard.at > sent.left_at + _AGAIN
+        versions += heard.at > sent.left_at + UPDATE_SPACING_S
     return False
 
 
