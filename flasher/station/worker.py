@@ -256,6 +256,10 @@ class Worker:
         if change is not None:
             self._pipe.send(change)
 
+    def _watch_anew(self) -> None:
+        self._presence.begin()
+        self._listened_at = self._connection.clock.now()
+
     def _listened(self) -> None:
         """Up to now, unless this computer stood still meanwhile."""
         now, blind_s = self._connection.clock.now(), BLIND_S * self._connection.clock.speed
@@ -276,7 +280,7 @@ class Worker:
         self._is_blocked = False
         if self._is_down:
             self._is_down = False
-            self._presence.begin()
+            self._watch_anew()
             self._pipe.send(Ready(self._connection.name, self._presence.sees_units))
 
     # -- a run ------------------------------------------------------------------------------------
@@ -327,7 +331,7 @@ class Worker:
         # What waits was said in the run, and says nothing of who is there now.
         with suppress(BusError):
             self._connection.link.drain()
-        self._presence.begin()
+        self._watch_anew()
 
 
 def pack(path: Path) -> TraceFile:

@@ -127,6 +127,12 @@ STORIES = {
         "line sockets=1 ; unit label=1 ; person name=jo source=jo ; @0.0 put unit=1 socket=A ;"
         " @0.83 label by=jo unit=1 ; @2.21 pull unit=1"
     ),
+    "a unit that is pulled soon after its run": (
+        "line sockets=3 ; unit label=2 pace=slow ; person name=jo source=jo ;"
+        " @3.0 put unit=2 socket=B ; @9.0 card by=jo unit=2 ; @10.0 label by=jo unit=2 ;"
+        " @10.5 pull unit=2 ; @58.0 put unit=2 socket=C ; @125.5 card by=jo unit=2 ;"
+        " @126.0 label by=jo unit=2"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"

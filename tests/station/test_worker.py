@@ -41,6 +41,7 @@ from flasher.station.messages import (
     VirtualUnits,
     WorkerSetup,
 )
+from flasher.station.presence import SILENCE_S
 from flasher.station.records.model import RunId, RunKind, RunState, WriteId
 from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
@@ -325,6 +326,30 @@ def test_a_unit_that_stays_is_run_at_once(tmp_path: Path) -> None:
     ended = RealSocket(tmp_path).work()
     assert ended is not None
     assert ended.result.outcome is RunState.PASS, ended.result.text
+
+
+class PulledAfterItsRun(RealSocket):
+    """The unit is pulled out as soon as it is heard after its run, and missed some time later."""
+
+    pulled_at = gone_at = inf
+
+    def answer(self, channel: FakeChannel, message: FromWorker) -> None:
+        if not channel.of(Finished):
+            super().answer(channel, message)
+        elif isinstance(message, PresenceChanged) and message.is_there:
+            self.bus.detach(self.bus._devices[0].engine)
+            self.pulled_at = self.clock.now()
+        elif isinstance(message, PresenceChanged) or self.clock.now() > self.pulled_at + 60.0:
+            self.gone_at = self.clock.now()
+            channel.waiting.append(Quit())
+
+
+def test_a_unit_that_is_pulled_after_its_run_is_missed_soon(tmp_path: Path) -> None:
+    """Nobody has watched for units in the run: that is no pause of the watch after it."""
+    socket = PulledAfterItsRun(tmp_path)
+    socket.line = StationPipe(socket.channel, socket.clock.now)
+    socket.work()
+    assert socket.gone_at - socket.pulled_at < SILENCE_S + 0.2
 
 
 class InBootloader(RealSocket):
