@@ -162,6 +162,8 @@ def is_secret(name: str) -> bool:
 
 def printable(text: str) -> str:
     """`text` with everything but printable ASCII escaped."""
+    if text.isascii() and text.isprintable():
+        return text
     return "".join(
         char if char.isascii() and char.isprintable() else char.encode("unicode_escape").decode()
         for char in text

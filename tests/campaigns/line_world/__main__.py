@@ -15,9 +15,11 @@ import os
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import closing, suppress
 from functools import partial
+from math import inf
 
 from tests.campaigns.line_world.play import Played, draw, play, shrink
 from tests.campaigns.line_world.stories import Story
@@ -45,14 +47,17 @@ def replay(line: str) -> int:
     return int(bool(found.kind))
 
 
-def results(chosen: argparse.Namespace) -> Iterator[tuple[int, Played, int]]:
+def results(chosen: argparse.Namespace) -> Generator[tuple[int, Played, int], None, None]:
     work = partial(played, acts=chosen.acts, shrinks=not chosen.no_shrink)
     seeds = range(chosen.seed, chosen.seed + -(-chosen.steps // chosen.acts))
     if chosen.jobs == 1:
         yield from map(work, seeds)
         return
-    with ProcessPoolExecutor(chosen.jobs, initializer=partial(os.nice, 10)) as pool:
+    pool = ProcessPoolExecutor(chosen.jobs, initializer=partial(os.nice, 10))
+    try:
         yield from pool.map(work, seeds, chunksize=4)
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 def main() -> int:
@@ -60,7 +65,8 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=10_000)
     parser.add_argument("--acts", type=int, default=ACTS, help="steps of one story")
     parser.add_argument("--seed", type=int, default=0, help="of the first story")
-    parser.add_argument("--jobs", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--minutes", type=float, default=inf, help="end after so long")
     parser.add_argument("--most", type=int, default=5, help="end after so many violations")
     parser.add_argument("--no-shrink", action="store_true")
     parser.add_argument("--replay", metavar="LINE", help="play this story; - reads it from stdin")
@@ -69,19 +75,24 @@ def main() -> int:
         return replay(sys.stdin.read() if chosen.replay == "-" else chosen.replay)
     began = time.perf_counter()
     steps = bad = stories = 0
+    following = chosen.seed
     seen: Counter[str] = Counter()
     kinds: Counter[str] = Counter()
-    for seed, found, count in results(chosen):
-        steps, stories = steps + count, stories + 1
-        seen += found.seen or Counter()
-        if found.kind:
-            bad += 1
-            kinds[found.kind] += 1
-            say(f"{found.text}\n  seed {seed}, {len(found.story.acts)} acts\n  {found.story}\n")
-            if bad >= chosen.most:
+    with closing(results(chosen)) as found_ones, suppress(KeyboardInterrupt):
+        for seed, found, count in found_ones:
+            steps, stories, following = steps + count, stories + 1, seed + 1
+            seen += found.seen or Counter()
+            if found.kind:
+                bad += 1
+                kinds[found.kind] += 1
+                acts = len(found.story.acts)
+                say(f"{found.text}\n  seed {seed}, {acts} acts\n  {found.story}\n")
+            took_s = time.perf_counter() - began
+            if stories % 100 == 0:
+                pace = 60 * steps / took_s
+                say(f"{steps} steps, {pace:,.0f} a minute, {bad} violations; next seed {following}")
+            if bad >= chosen.most or took_s > 60 * chosen.minutes:
                 break
-        if stories % 100 == 0:
-            say(f"{steps} steps, {60 * steps / (time.perf_counter() - began):,.0f} a minute")
     took_s = time.perf_counter() - began
     say(
         f"{steps} steps in {stories} stories, {60 * steps / took_s:,.0f} a minute; {bad} violations"
@@ -90,6 +101,7 @@ def main() -> int:
         say(f"  {count} {kind}")
     for what, count in seen.most_common():
         say(f"{count:8} {what}")
+    say(f"Seeds {chosen.seed} to {following - 1}; --seed {following} goes on.")
     return int(bad > 0)
 
 

@@ -4,17 +4,14 @@ that looks into each unit.
 
 from __future__ import annotations
 
-import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial
-from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from flasher.mock.bms import BmsApplication
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, WELLING
@@ -35,7 +32,8 @@ from flasher.station.records.model import RunState, StepName
 from flasher.station.socket import Source
 from flasher.station.station import Station
 from tests.campaigns.line_world import stories
-from tests.campaigns.line_world.clockwork import PaperUnit, Process, SocketBus, scratch
+from tests.campaigns.line_world.again import empty_folder, same_engine
+from tests.campaigns.line_world.clockwork import PaperUnit, Process, SocketBus
 from tests.station.factory import IMAGES, USUAL, Bench, FakeClock
 from tests.station.unit_bench import WRITES
 
@@ -132,8 +130,9 @@ class World:
         self.seen: Counter[str] = Counter()
         self.setup = setup
         self._closing = ExitStack()
-        folder = self._closing.enter_context(tempfile.TemporaryDirectory(dir=scratch()))
-        self.bench = Bench(Path(folder))
+        folder = self._closing.enter_context(empty_folder())
+        with same_engine():
+            self.bench = Bench(folder)
         if setup.line.recipe != "plain":
             self.bench.use(_RECIPES[setup.line.recipe])
         self.bays = {name: Bay(name, SocketBus()) for name in stories.SOCKETS[: setup.line.sockets]}
@@ -581,6 +580,8 @@ class World:
         if self._found is not None:
             raise self._found
         for number, unit in self.units.items():
+            if unit.has_not_changed():
+                continue
             before, after = self._stored[number], _stored(unit)
             if after == before:
                 continue
@@ -724,10 +725,8 @@ def _make(setup: stories.UnitSetup, none: str) -> PaperUnit:
 
 
 def _stored(unit: PaperUnit) -> _Stored:
-    application = unit.engine.application
-    assert isinstance(application, BmsApplication)
-    number = application.kept["serial number"]
-    return _Stored(str(getattr(number, "serial_number", "")), unit.engine.operations_done)
+    number, operations = unit.memory
+    return _Stored(str(getattr(number, "serial_number", "")), operations)
 
 
 def last_look(moment: float) -> float:
