@@ -18,7 +18,8 @@ import shutil
 import signal
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -59,7 +60,8 @@ from flasher.station.unit_run import UnitRun
 from flasher.station.virtual_units import VirtualSocket
 from flasher.trace.recorder import Recorder
 
-_REOPEN_S: Final = 1.0
+REOPEN_S: Final = 1.0
+"""How often an adapter that has failed is opened again."""
 BEAT_S: Final = 0.5
 """How often it says that it is alive."""
 IDLE_S: Final = 0.05
@@ -131,6 +133,12 @@ class StationPipe:
                 self._take(self._channel.recv())
         except (EOFError, OSError):
             self.is_gone = self.is_over = True
+
+    def wait(self, limit_s: float) -> None:
+        """Wait so long, unless the process is to end."""
+        until = self._now() + limit_s
+        while self._now() < until and not self.is_over:
+            self.look(IDLE_S)
 
     def is_stopped(self) -> bool:
         """Asked between frames: a person aborted, or the station is gone."""
@@ -268,11 +276,11 @@ class Worker:
         self._listened_at = now
 
     def _reopen(self) -> None:
-        now = time.perf_counter()
-        if now < self._reopen_at:
+        clock = self._connection.clock
+        if clock.now() < self._reopen_at:
             self._pipe.look(IDLE_S)
             return
-        self._reopen_at = now + _REOPEN_S
+        self._reopen_at = clock.now() + REOPEN_S * clock.speed
         try:
             self._connection.link.reopen()
         except BusError:
@@ -351,6 +359,10 @@ def _error_result(code: codes.Code, text: str) -> RunResult:
     return RunResult(code.outcome, code.name, printable(text), 0.0)
 
 
+Opened = AbstractContextManager[tuple[Connection, VirtualSocket | None]]
+"""The connection of a socket, and its virtual units if it has them."""
+
+
 @contextmanager
 def open_socket(
     setup: WorkerSetup, recipe: LoadedRecipe
@@ -376,6 +388,27 @@ def load_same(setup: WorkerSetup) -> LoadedRecipe:
     return recipe
 
 
+def work_on(
+    pipe: StationPipe, setup: WorkerSetup, recipe: LoadedRecipe, opened: Callable[[], Opened]
+) -> None:
+    """Work in a socket until the station ends the process; an adapter that cannot be opened is
+    tried again. Raises StationGoneError.
+    """
+    is_down = False
+    while not pipe.is_over:
+        try:
+            with opened() as (connection, virtual):
+                Worker(setup, recipe, pipe, connection, virtual).work()
+        except UsageError as error:
+            pipe.send(CannotWork(error.what))
+            return
+        except BusError as error:
+            if not is_down:
+                pipe.send(AdapterDown(error.what))
+            is_down = True
+            pipe.wait(REOPEN_S)
+
+
 def worker_main(channel: Channel, setup: WorkerSetup) -> None:
     # Ctrl-C and a closed terminal are the station's business: it tells its processes what to do.
     for name in ("SIGINT", "SIGHUP", "SIGBREAK"):  # Windows has no SIGHUP, others no SIGBREAK
@@ -388,18 +421,4 @@ def worker_main(channel: Channel, setup: WorkerSetup) -> None:
         except FlasherError as error:
             pipe.send(CannotWork(error.what))
             return
-        is_down = False
-        while not pipe.is_over:
-            try:
-                with open_socket(setup, recipe) as (connection, virtual):
-                    Worker(setup, recipe, pipe, connection, virtual).work()
-            except UsageError as error:
-                pipe.send(CannotWork(error.what))
-                return
-            except BusError as error:
-                if not is_down:
-                    pipe.send(AdapterDown(error.what))
-                is_down = True
-                wait_until = time.perf_counter() + _REOPEN_S
-                while time.perf_counter() < wait_until and not pipe.is_over:
-                    pipe.look(IDLE_S)
+        work_on(pipe, setup, recipe, partial(open_socket, setup, recipe))

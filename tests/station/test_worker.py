@@ -5,17 +5,19 @@ from __future__ import annotations
 import gzip
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
 from math import inf
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
 from flasher.api import Connection
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
-from flasher.errors import UsageError
+from flasher.errors import BusError, UsageError
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.frame import Frame
@@ -46,7 +48,7 @@ from flasher.station.records.model import RunId, RunKind, RunState, WriteId
 from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
 from flasher.station.virtual_units import Health, VirtualSocket, make_device
-from flasher.station.worker import StationPipe, Worker, load_same
+from flasher.station.worker import StationPipe, Worker, load_same, work_on
 from tests.loops import each
 from tests.station.factory import DAY, USUAL, make_recipe
 from tests.station.unit_bench import WRITES
@@ -211,27 +213,76 @@ def test_another_recipe_than_the_stations_is_refused(tmp_path: Path) -> None:
 # -- a real adapter -------------------------------------------------------------------------------
 
 
-def test_an_adapter_that_goes_is_told_once_and_opened_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    socket = Socket(tmp_path)
-    clock = VirtualClock()
-    bus = SimulatedBus(WELLING.bitrate_bps, clock)
-    connection = Connection(bus.link(), clock, "a bus")
-    monkeypatch.setattr("flasher.station.worker._REOPEN_S", 0.0)
+class RealAdapter(Socket):
+    """A socket with an adapter on a simulated bus, whose time passes while it waits for the
+    station.
+    """
 
-    def answer(channel: FakeChannel, message: FromWorker) -> None:
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder)
+        self.clock = VirtualClock()
+        self.bus = SimulatedBus(WELLING.bitrate_bps, self.clock)
+        self.line = StationPipe(self.channel, self.clock.now)
+        self.ready_at: list[float] = []
+
+        def poll(timeout: float = 0.0) -> bool:
+            until = self.clock.now() + timeout
+            while self.clock.now() < until:
+                self.bus.advance(until)
+            return bool(self.channel.waiting)
+
+        vars(self.channel)["poll"] = poll
+
+    @property
+    def kinds(self) -> list[str]:
+        return [type(m).__name__ for m in self.channel.sent if not isinstance(m, Beat)]
+
+    def connection(self) -> Connection:
+        return Connection(self.bus.link(), self.clock, "a bus")
+
+    def answer(self, channel: FakeChannel, message: FromWorker) -> None:
         if isinstance(message, Ready):
-            if len(channel.of(Ready)) == 1:
-                bus.unplug(back_after_s=0.0)
-            else:
+            self.ready_at.append(self.clock.now())
+            if channel.of(AdapterDown):
                 channel.waiting.append(Quit())
+            else:
+                self.bus.unplug(back_after_s=2.5)
 
-    socket.channel._answer = answer
-    Worker(socket.setup, socket.recipe, socket.line, connection).work()
-    kinds = [type(m).__name__ for m in socket.channel.sent if not isinstance(m, Beat)]
-    assert kinds == ["Ready", "AdapterDown", "Ready"]
+
+def test_an_adapter_that_goes_is_told_once_and_opened_again(tmp_path: Path) -> None:
+    socket = RealAdapter(tmp_path)
+    Worker(socket.setup, socket.recipe, socket.line, socket.connection()).work()
+    assert socket.kinds == ["Ready", "AdapterDown", "Ready"]
     assert socket.channel.of(AdapterDown)[0].reason
+    assert 2.5 <= socket.ready_at[-1] < 3.6
+
+
+def test_an_adapter_that_cannot_be_opened_is_told_once_and_tried_again(tmp_path: Path) -> None:
+    socket = RealAdapter(tmp_path)
+    tries: list[float] = []
+
+    @contextmanager
+    def opened() -> Iterator[tuple[Connection, None]]:
+        tries.append(socket.clock.now())
+        if len(tries) < 4:
+            raise BusError("It is not there.")
+        yield socket.connection(), None
+
+    work_on(socket.line, socket.setup, socket.recipe, opened)
+    assert socket.kinds == ["AdapterDown", "Ready"]
+    assert [after - before for before, after in pairwise(tries)] == pytest.approx(
+        [1.0] * 3, abs=0.1
+    )
+
+
+def test_a_socket_that_cannot_be_used_is_told_and_not_tried_again(tmp_path: Path) -> None:
+    socket = RealAdapter(tmp_path)
+
+    def opened() -> NoReturn:
+        raise UsageError("There is no such interface.")
+
+    work_on(socket.line, socket.setup, socket.recipe, opened)
+    assert socket.kinds == ["CannotWork"]
 
 
 # -- the unit of the label ------------------------------------------------------------------------
