@@ -18,7 +18,7 @@ from statistics import median
 from typing import Final, NamedTuple
 
 from flasher.report.scale import Axis, Tick, duration_text, linear_ticks, slices, whole_ticks
-from flasher.trace.figures import Distribution
+from flasher.trace.figures import Distribution, Ranked
 
 WIDTHS: Final = {"wide": 880, "narrow": 340}
 """Width of a drawing for each class of the style sheet; a page holds both and shows one."""
@@ -295,10 +295,10 @@ def histogram(values: Iterable[float] | Mapping[float, int], width: float) -> Hi
             edges = (_value_at(x_axis, index / _BINS), _value_at(x_axis, (index + 1) / _BINS))
             tip = f"{duration_text(edges[0])} to {duration_text(edges[1])}: {count:,}"
             bars.append(Bar(round(begin + 1, 1), bottom - tall, round(bin_width - 2, 1), tall, tip))
-    ordered = sorted(times.elements())
+    ordered = Ranked(times)
     description = (
         f"{len(ordered):,} values from {duration_text(ordered[0])} to"
-        f" {duration_text(ordered[-1])}, median {duration_text(median(ordered))}."
+        f" {duration_text(ordered[-1])}, median {duration_text(ordered.median)}."
     )
     return Histogram(frame, x_axis, y_ticks, tuple(bars), description)
 

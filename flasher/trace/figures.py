@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import math
 from array import array
-from collections.abc import Iterable
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Final, Self
 
 from flasher.protocol.frame import Frame
@@ -33,9 +36,11 @@ class Distribution:
     maximum_s: float
 
     @classmethod
-    def of(cls, values: Iterable[float]) -> Self | None:
-        """The distribution of these seconds; None when there are none."""
-        ranked = sorted(values)
+    def of(cls, values: Iterable[float] | Mapping[float, int]) -> Self | None:
+        """The distribution of these seconds, or of how often each came; None when there are
+        none.
+        """
+        ranked = Ranked(values)
         if not ranked:
             return None
         return cls(
@@ -48,7 +53,29 @@ class Distribution:
         )
 
 
-def _nearest_rank(ranked: list[float], share: float) -> float:
+class Ranked:
+    """Values in order, each as often as it came; millions of them take the place of those that
+    differ.
+    """
+
+    def __init__(self, values: Iterable[float] | Mapping[float, int]) -> None:
+        counts = Counter(values)
+        self._values = sorted(counts)
+        self._ends = list(accumulate(counts[value] for value in self._values))
+
+    def __len__(self) -> int:
+        return self._ends[-1] if self._ends else 0
+
+    def __getitem__(self, rank: int) -> float:
+        return self._values[bisect_right(self._ends, rank % len(self))]
+
+    @property
+    def median(self) -> float:
+        """The middle value, or the mean of the two in the middle."""
+        return (self[(len(self) - 1) // 2] + self[len(self) // 2]) / 2
+
+
+def _nearest_rank(ranked: Ranked, share: float) -> float:
     return ranked[max(0, math.ceil(share * len(ranked)) - 1)]
 
 

@@ -13,6 +13,8 @@ from datetime import UTC, datetime, time, timedelta
 from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
+from threading import Thread
+from time import sleep
 from typing import Any, Final, NamedTuple
 from urllib.parse import urlencode
 
@@ -48,6 +50,7 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.newest import Cut
 from flasher.station.records.overview import HOLDERS_COUNTED, By, Overview, Span
+from flasher.station.records.rollup import Rollup
 from flasher.station.records.store import Store
 from flasher.station.reports import Report, csv_text, make_report
 from flasher.station.sealed import CERTIFICATE_MAX_SIZE
@@ -279,7 +282,11 @@ class Supervisor:
     def _figured(self, question: Question) -> tuple[RunFilter, Span]:
         """The filter of a page of figures, and the time that they are of."""
         chosen = filter_of(question)
-        end = chosen.until or self.overview.last_begin(chosen) or self.now()
+        # Whenever the period begins, its last run is the newest one, or it has none.
+        last = None if chosen.until else self.overview.last_begin(replace(chosen, since=None))
+        if last is not None and chosen.since is not None and last < chosen.since:
+            last = None
+        end = chosen.until or last or self.now()
         if chosen.until is None:
             end += timedelta(microseconds=1)
         begin = chosen.since or end - timedelta(days=USUAL_DAYS)
@@ -288,8 +295,8 @@ class Supervisor:
     def yields(self, question: Question) -> Answer:
         chosen, span = self._figured(question)
         said = translator(question.language)
-        spans = list(spans_of(span))
-        rows = [each for each in self.overview.yields(chosen, spans) if each.units]
+        yields, whole = self.overview.yields(chosen, list(spans_of(span)))
+        rows = [each for each in yields if each.units]
         by = By(question.fields["by"]) if question.fields.get("by") in set(By) else By.SOCKET
         groups, causes = self._causes(chosen, span, by, said)
         return self._page(
@@ -298,7 +305,7 @@ class Supervisor:
             span=span,
             rows=rows,
             name_of=_name_of,
-            whole=self.overview.yields(chosen, [span])[0],
+            whole=whole,
             chart=lines(
                 said(say("Yield over time")),
                 [_name_of(row.span).removeprefix(f"{span.end.astimezone():%Y-}") for row in rows],
@@ -358,7 +365,7 @@ class Supervisor:
         rows = [
             (
                 name,
-                Distribution.of(Counter(dict(sorted(found[name].items()))).elements()),
+                Distribution.of(found[name]),
                 {kind: histogram(found[name], width) for kind, width in WIDTHS.items()},
             )
             for name in sorted(found, key=lambda name: order.get(name.split()[0], 99))
@@ -422,6 +429,18 @@ def open_supervisor(url: str, folder: Path, keeping: Keeping, shifts: Sequence[t
     """Answers of the records of a place, which are only read. Raises what `Store.open` does."""
     store = Store.open(url, station="pages", folder=folder, read_only=True, keeping=keeping)
     return Supervisor(store, shifts)
+
+
+def serve_supervisor(
+    url: str, folder: Path, keeping: Keeping, shifts: Sequence[time]
+) -> Supervisor:
+    """The same, and adds up the days for figures as long as this process lives."""
+    supervisor = open_supervisor(url, folder, keeping, shifts)
+    rollup = Rollup(supervisor.store.database)
+    Thread(
+        target=rollup.keep_up, args=(lambda: datetime.now(UTC), sleep), name="sums", daemon=True
+    ).start()
+    return supervisor
 
 
 PAGES: Final[dict[str, Callable[[Supervisor, Question], Answer]]] = {

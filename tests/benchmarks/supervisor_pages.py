@@ -21,7 +21,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -42,11 +42,13 @@ from flasher.station.records.model import (
     StepState,
     Verified,
 )
+from flasher.station.records.overview import Overview
+from flasher.station.records.rollup import Rollup
 from flasher.station.records.store import Store
 from flasher.station.reports import make_report
 from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.web.answers import AnswerProcesses, Question
-from flasher.web.supervisor import PAGES, open_supervisor, place_of
+from flasher.web.supervisor import PAGES, open_supervisor, place_of, serve_supervisor
 from tests.benchmarks import bulk_records
 from tests.benchmarks.bulk_records import FIRST_DAY, RUNS_A_DAY
 from tests.station.factory import BMS_VERSION, IMAGES, USUAL, Bench, FakeClock, make_recipe
@@ -66,9 +68,14 @@ class Plant:
     runs: int
     server: Server | None = None
     url: str = field(init=False)
+    is_filled: bool = field(init=False)
 
     def __post_init__(self) -> None:
-        self.url = self.server.own_records() if self.server else str(self.folder / "records.sqlite")
+        self.is_filled = self.files.exists()
+        self.url = str(self.folder / "records.sqlite")
+        if self.server is not None:
+            is_new = not self.is_filled
+            self.url = self.server.own_records() if is_new else self.server.url("test_1")
 
     def fill(self, traces: int) -> None:
         bench = Bench(self.folder, url=self.url if self.server else None)
@@ -147,13 +154,17 @@ def questions_of(plant: Plant) -> list[tuple[str, Question]]:
         ("/runs.csv", {"lot": lot}),
         ("/units/certificate", {"serial": serial}),
         ("/yield", {"from": f"{FIRST_DAY:%Y-%m-%d}"}),
+        ("/yield", {"from": f"{FIRST_DAY:%Y-%m-%d}", "by": "shift"}),
+        ("/yield", {"from": f"{FIRST_DAY:%Y-%m-%d}", "by": "lot", "socket": "C"}),
+        ("/yield", {"from": f"{FIRST_DAY + timedelta(days=7):%Y-%m-%d}T05:17"}),
         ("/times", {"from": f"{FIRST_DAY:%Y-%m-%d}"}),
+        ("/times", {"from": f"{FIRST_DAY + timedelta(days=7):%Y-%m-%d}T05:17", "socket": "C"}),
         ("/images.csv", image),
     ]
     found = []
     for path, fields in asked:
         shown = path + (
-            "?" + "&".join(f"{name}={value[:12]}" for name, value in fields.items())
+            "?" + "&".join(f"{name}={value[:16]}" for name, value in fields.items())
             if fields
             else ""
         )
@@ -192,6 +203,23 @@ def measure_pages(plant: Plant, wanted: str) -> None:
         )
 
 
+def measure_sums(plant: Plant) -> None:
+    """What a process of the pages does in the background: the sums of days, the first time all."""
+    began, batches_s = time.perf_counter(), []
+    with plant.open() as store:
+        rollup = Rollup(store.database)
+        has_more = True
+        while has_more:
+            batch_began = time.perf_counter()
+            has_more = rollup.add(datetime.now(UTC) + timedelta(days=3650))
+            batches_s.append(time.perf_counter() - batch_began)
+    size = (plant.files / "figures.sqlite").stat().st_size
+    print(
+        f"  sums of all days made in {time.perf_counter() - began:.0f} s,"
+        f" at once at most {max(batches_s):.1f} s; {size / 1e6:.0f} MB"
+    )
+
+
 def measure_report(plant: Plant) -> None:
     """`flasher station report` over a day."""
     end = FIRST_DAY + timedelta(days=plant.runs / RUNS_A_DAY - 3)
@@ -209,13 +237,16 @@ def measure_report(plant: Plant) -> None:
 def measure_station(plant: Plant) -> None:
     """A station that records: its start, whole runs, notes while two desks ask for pages."""
     plant.cool()
-    clock = FakeClock(FIRST_DAY + timedelta(days=plant.runs / RUNS_A_DAY + 1))
+    with plant.open() as store:
+        last = Overview(store.database).last_begin(RunFilter())
+    assert last is not None
+    clock = FakeClock(last + timedelta(hours=1))
     recipe = make_recipe(plant.folder, USUAL)
     began = time.perf_counter()
     store = plant.open(read_only=False, clock=clock)
     store.recover()
     print(f"  a station starts, cold {(time.perf_counter() - began) * 1000:7.0f} ms")
-    answering = AnswerProcesses(partial(open_supervisor, *place_of(store), DEFAULT_SHIFTS))
+    answering = AnswerProcesses(partial(serve_supervisor, *place_of(store), DEFAULT_SHIFTS))
     with closing(store), closing(answering):
         _runs(store, clock, recipe, plant.folder)
         _commits(store, "alone")
@@ -299,9 +330,12 @@ def plant_of(options: argparse.Namespace, folder: Path) -> Iterator[Plant]:
         if options.server:
             programs = find_programs()
             assert programs is not None
-            server = stack.enter_context(running_server(programs))
+            kept = options.keep and options.keep / "server"
+            if kept is not None:
+                kept.mkdir(exist_ok=True)
+            server = stack.enter_context(running_server(programs, kept))
         plant = Plant(folder, options.runs, server)
-        if server is not None or not (folder / "records.sqlite").exists():
+        if not plant.is_filled:
             began = time.perf_counter()
             plant.fill(options.traces)
             os.sync()
@@ -323,6 +357,7 @@ def main() -> None:
         folder = options.keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
         with plant_of(options, folder) as plant:
+            measure_sums(plant)
             measure_pages(plant, options.pages)
             measure_report(plant)
             measure_station(plant)

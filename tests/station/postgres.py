@@ -100,8 +100,9 @@ class Server:
 
     def start(self) -> None:
         data = self.folder / "data"
-        self._run("initdb", "-D", str(data), "-U", OWNER, "-A", "trust", "-N", "-E", "UTF8")
-        (data / "pg_hba.conf").write_text(_RULES, encoding="ascii")
+        if not data.exists():
+            self._run("initdb", "-D", str(data), "-U", OWNER, "-A", "trust", "-N", "-E", "UTF8")
+            (data / "pg_hba.conf").write_text(_RULES, encoding="ascii")
         self._start()
 
     def _start(self) -> None:
@@ -110,10 +111,10 @@ class Server:
         log = str(self.folder / "log")
         self._run("pg_ctl", "-D", str(data), "-w", "-l", log, "-o", f"{where} {_FAST}", "start")
 
-    def stop(self) -> None:
+    def stop(self, mode: str = "immediate") -> None:
         if self._shared is not None:
             self._shared.dispose()
-        self._run("pg_ctl", "-D", str(self.folder / "data"), "-m", "immediate", "stop")
+        self._run("pg_ctl", "-D", str(self.folder / "data"), "-m", mode, "stop")
 
     def _run(self, program: str, *words: str) -> None:
         # The server refuses to be run by root.
@@ -138,10 +139,10 @@ def find_programs() -> Path | None:
 
 
 @contextmanager
-def running_server(programs: Path) -> Iterator[Server]:
-    """A server from start to end."""
+def running_server(programs: Path, kept: Path | None = None) -> Iterator[Server]:
+    """A server from start to end; with a folder that is `kept`, its databases are there again."""
     # A short path, since the server's socket lies in it.
-    folder = Path(tempfile.mkdtemp(prefix="flasher-pg-"))
+    folder = kept or Path(tempfile.mkdtemp(prefix="flasher-pg-"))
     try:
         if os.geteuid() == 0:
             shutil.chown(folder, OWNER)
@@ -149,7 +150,10 @@ def running_server(programs: Path) -> Iterator[Server]:
             port = probe.getsockname()[1]
         server = Server(programs, folder, port)
         server.start()
-        yield server
-        server.stop()
+        try:
+            yield server
+        finally:
+            server.stop("immediate" if kept is None else "fast")
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        if kept is None:
+            shutil.rmtree(folder, ignore_errors=True)

@@ -47,7 +47,7 @@ from flasher.web.operator import LINE, Lot, OperatorPage, Screen
 from flasher.web.pages import Pages
 from flasher.web.server import LOOPBACK, Server, Tls
 from flasher.web.sign_ins import Note
-from flasher.web.supervisor import CHECK, PAGES, open_supervisor, place_of, upload_limit
+from flasher.web.supervisor import CHECK, PAGES, place_of, serve_supervisor, upload_limit
 
 _TURN_S: Final = 0.1
 PASSWORD_MIN: Final = 8
@@ -124,7 +124,7 @@ def operator_page(
     operator = OperatorPage(pages, screen.feed, station.submit, sound_volume=config.sound_volume)
     view = OperatorView(screen, station, board)
     # In processes of their own: a page takes no time from the station.
-    answering = AnswerProcesses(partial(open_supervisor, *place_of(store), config.shifts))
+    answering = AnswerProcesses(partial(serve_supervisor, *place_of(store), config.shifts))
     routes = [*operator.routes, *answer_routes(pages, answering.ask, PAGES, [CHECK])]
     server = served(
         options,
@@ -156,7 +156,7 @@ def serve(output: Output, address: Address, options: PagesOptions, records: Reco
     with closing(open_to_read(records)) as store:  # what is wrong with them is said before
         place = place_of(store)
     pages = Pages(options.language)
-    answering = AnswerProcesses(partial(open_supervisor, *place, shifts))
+    answering = AnswerProcesses(partial(serve_supervisor, *place, shifts))
     routes = [Route("/", _start), *answer_routes(pages, answering.ask, PAGES, [CHECK])]
     with (
         closing(answering),

@@ -6,15 +6,17 @@ The database counts; what is fetched has a bounded size, however many runs there
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from enum import StrEnum
+from itertools import chain as joined
 from typing import Annotated, Any, Final, Generic, TypeVar
 
 from pydantic import BeforeValidator, TypeAdapter
-from sqlalchemy import Select, and_, case, exists, func, literal, or_, select, union_all
+from sqlalchemy import Connection, Select, and_, case, exists, func, literal, or_, select, union_all
 from sqlalchemy.sql.expression import ColumnElement
 
 from flasher.station.records import schema
@@ -34,6 +36,15 @@ from flasher.station.records.model import (
 )
 from flasher.station.records.newest import Cut, newest_runs
 from flasher.station.records.queries import JUDGED, details_of, filtered, run_query
+from flasher.station.records.rollup import (
+    ALL_SPANS,
+    WITHOUT_CAUSE,
+    Rest,
+    Rollup,
+    StepTimes,
+    Units,
+    rounded_s,
+)
 from flasher.station.records.rows import beside_index
 
 PAGE_SIZE: Final = 50
@@ -145,6 +156,7 @@ class Overview:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._rollup = Rollup(database)
 
     def runs(self, chosen: RunFilter, cut: Cut, size: int = PAGE_SIZE) -> Page[RunRecord]:
         run_id = schema.run.c.id
@@ -247,11 +259,35 @@ class Overview:
 
     # -- figures over time ------------------------------------------------------------------------
 
-    def yields(self, chosen: RunFilter, spans: Sequence[Span]) -> list[SpanYield]:
+    def yields(self, chosen: RunFilter, spans: Sequence[Span]) -> tuple[list[SpanYield], SpanYield]:
+        """Of each of some spans, one right after the other, and of all of them as one."""
+        whole = Span(spans[0].begin, spans[-1].end)
+        found: dict[int, Units] | None = None
+        with self._rollup.rolled(chosen) as rolled:
+            if rolled is not None:
+                texts = [(utc_text(span.begin), utc_text(span.end)) for span in spans]
+                found = rolled.units(texts, self._judged_units)
+        if found is None:
+            found = self._units(chosen, spans)
+            found[ALL_SPANS] = self._units(chosen, [whole]).get(0, Units())
+
+        def of(span: Span, place: int) -> SpanYield:
+            return SpanYield(span, **asdict(found.get(place, Units())))
+
+        return [of(span, place) for place, span in enumerate(spans)], of(whole, ALL_SPANS)
+
+    def _judged_units(self, rest: Rest) -> Sequence[int]:
+        run = schema.run.c
+        query = _counting(rest.chosen, run.unit_id).where(*rest.conditions)
+        query = query.where(beside_index(run.state).in_(JUDGED))
+        with self._database.reading() as connection:
+            return connection.execute(query).scalars().all()
+
+    def _units(self, chosen: RunFilter, spans: Sequence[Span]) -> dict[int, Units]:
         run = schema.run.c
         # The id counts first, its last digit tells PASS: so the least is that of the first run.
         ranked = run.id * 2 + case((run.state == RunState.PASS.value, 1), else_=0)
-        found: dict[int, SpanYield] = {}
+        found: dict[int, Units] = {}
         for begin in range(0, len(spans), _SPANS_AT_ONCE):
             span = _table(spans[begin : begin + _SPANS_AT_ONCE], begin)
             of_unit = (
@@ -270,71 +306,58 @@ class Overview:
             ).group_by(of_unit.c.number)
             with self._database.reading() as connection:
                 for number, *counts in connection.execute(query):
-                    found[number] = SpanYield(spans[number], *map(int, counts))
-        return [found.get(number, SpanYield(span)) for number, span in enumerate(spans)]
+                    found[number] = Units(*map(int, counts))
+        return found
 
     def causes(
         self, chosen: RunFilter, by: By, shifts: Sequence[tuple[Span, str]] = ()
     ) -> dict[str, Counter[str]]:
         """How often each code ended a run without PASS, in each group; for BY.SHIFT `shifts` are
-        the spans with their names.
+        the spans with their names, in order.
         """
+        run = schema.run.c
         found: dict[str, Counter[str]] = defaultdict(Counter)
-        with self._database.reading() as connection:
-            for query, named in self._causes(chosen, by, shifts):
-                for code, group, count in connection.execute(query):
-                    found[code][named(group)] += count
+        rest = Rest(chosen, [])
+        with self._rollup.rolled(chosen) as rolled, self._database.reading() as connection:
+            column, name_of = _group_of(connection, by, shifts)
+            counts: Iterable[Any] = ()
+            if rolled is not None:
+                counts, rest = rolled.bad(column.name), rolled.tail
+            # Beside their indexes, which would lead through all runs.
+            code, group = beside_index(run.code), beside_index(column)
+            query = (
+                _counting(rest.chosen, code, group, func.count())
+                .where(beside_index(run.state).not_in(WITHOUT_CAUSE), *rest.conditions)
+                .group_by(code, group)
+            )
+            for failed, value, count in joined(counts, connection.execute(query)):
+                name = name_of(value)
+                if name is not None:
+                    found[failed][name] += count
         return dict(found)
 
-    def _causes(
-        self, chosen: RunFilter, by: By, shifts: Sequence[tuple[Span, str]]
-    ) -> Iterator[tuple[Select[Any], Any]]:
-        run = schema.run.c
-        bad = beside_index(run.state).not_in((RunState.PASS.value, RunState.RUNNING.value))
-        if by is By.SHIFT:
-            spans = [span for span, _ in shifts]
-            for begin in range(0, len(spans), _SPANS_AT_ONCE):
-                span = _table(spans[begin : begin + _SPANS_AT_ONCE], begin)
-                query = _counting(chosen, run.code, span.c.number, func.count())
-                query = query.join(span, _within(span)).where(bad)
-                yield query.group_by(run.code, span.c.number), lambda at: shifts[at][1]
-            return
-        recipe, socket = schema.recipe.c, schema.socket
-        column: ColumnElement[Any] = {
-            By.SOCKET: socket.c.name,
-            By.RECIPE: recipe.name + literal(", ") + recipe.revision,
-            By.LOT: func.coalesce(schema.lot.c.name, ""),
-        }[by]
-        query = _counting(chosen, run.code, column, func.count()).where(bad)
-        if by is By.SOCKET:
-            query = query.join(socket, run.socket_id == socket.c.id)
-        elif by is By.RECIPE:
-            query = query.join(schema.recipe, run.recipe_id == recipe.id)
-        else:
-            query = query.outerjoin(schema.lot, run.lot_id == schema.lot.c.id)
-        yield query.group_by(run.code, column), str
-
-    def step_times(self, chosen: RunFilter) -> dict[str, Counter[float]]:
+    def step_times(self, chosen: RunFilter) -> StepTimes:
         """How often each duration in seconds was that of a step that passed, by the step's name.
         Durations are rounded to three digits, no finer than a millisecond.
         """
         step = schema.step.c
-        rounded = case(
-            (step.duration_s < 1, func.round(step.duration_s * 1000) / 1000),
-            (step.duration_s < 10, func.round(step.duration_s * 100) / 100),
-            else_=func.round(step.duration_s * 10) / 10,
-        )
-        query = (
-            _counting(chosen, step.name, rounded, func.count())
-            # From the runs to their steps, and not through all steps.
-            .join(schema.step, step.run_id == beside_index(schema.run.c.id))
-            .where(step.state == StepState.PASS.value)
-            .group_by(step.name, rounded)
-        )
-        found: dict[str, Counter[float]] = defaultdict(Counter)
-        with self._database.reading() as connection:
-            for name, seconds, count in connection.execute(query):
-                found[name][float(seconds)] += count
+        rounded = rounded_s()
+        found: StepTimes = defaultdict(Counter)
+        rests = [Rest(chosen, [])]
+        with self._rollup.rolled(chosen) as rolled:
+            if rolled is not None:
+                found, rests = rolled.step_times()
+        for rest in rests:
+            query = (
+                _counting(rest.chosen, step.name, rounded, func.count())
+                # From the runs to their steps, and not through all steps.
+                .join(schema.step, step.run_id == beside_index(schema.run.c.id))
+                .where(step.state == StepState.PASS.value, *rest.conditions)
+                .group_by(step.name, rounded)
+            )
+            with self._database.reading() as connection:
+                for name, seconds, count in connection.execute(query):
+                    found[name][float(seconds)] += count
         return dict(found)
 
     # -- the audit trail --------------------------------------------------------------------------
@@ -399,6 +422,30 @@ def _counting(chosen: RunFilter, *columns: Any) -> Select[Any]:
     """Columns of the runs of a filter that count in figures."""
     query = filtered(select(*columns).select_from(schema.run), chosen)
     return query.where(beside_index(schema.run.c.kind) != RunKind.GOLDEN.value)
+
+
+def _group_of(
+    connection: Connection, by: By, shifts: Sequence[tuple[Span, str]]
+) -> tuple[ColumnElement[Any], Callable[[Any], str | None]]:
+    """The column of a run that has its group, and the name of a value; None: no group has it."""
+    run = schema.run.c
+    if by is By.SHIFT:
+        texts = [(utc_text(span.begin), utc_text(span.end)) for span, _ in shifts]
+
+        def shift_of(begun_at: str) -> str | None:
+            at = bisect_right(texts, begun_at, key=lambda text: text[0]) - 1
+            return shifts[at][1] if at >= 0 and begun_at < texts[at][1] else None
+
+        return run.begun_at, shift_of
+    recipe = schema.recipe.c
+    column, query = {
+        By.SOCKET: (run.socket_id, select(schema.socket.c.id, schema.socket.c.name)),
+        By.RECIPE: (run.recipe_id, select(recipe.id, recipe.name, recipe.revision)),
+        By.LOT: (run.lot_id, select(schema.lot.c.id, schema.lot.c.name)),
+    }[by]
+    names: dict[int | None, str] = {None: ""}
+    names |= {row_id: ", ".join(parts) for row_id, *parts in connection.execute(query)}
+    return column, names.get
 
 
 def _table(spans: Sequence[Span], first: int) -> Any:

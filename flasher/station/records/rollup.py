@@ -1,0 +1,593 @@
+"""Adds up the runs of each day, so that pages of figures do not read all runs of all years.
+
+The sums are in a file of their own beside the attachments, up to one run (`Rolled.run`); what a
+page asks for besides, later runs and days that its period cuts, is read from the records. The file
+is derived from the records: it is made anew where it does not fit them, nothing that is signed or
+verified depends on it, and it may be deleted at any time.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import sqlite3
+import zlib
+from bisect import bisect_left, bisect_right
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field, replace
+from datetime import datetime, time, timedelta
+from itertools import groupby
+from typing import Any, Final, NamedTuple
+
+from sqlalchemy import Connection, case, func, select
+from sqlalchemy.sql.expression import ColumnElement
+
+from flasher.station.records import schema
+from flasher.station.records.database import Database
+from flasher.station.records.errors import RecordError
+from flasher.station.records.model import (
+    RunFilter,
+    RunKind,
+    RunState,
+    StepState,
+    utc_moment,
+    utc_text,
+)
+from flasher.station.records.queries import JUDGED, begun_in, named_in
+from flasher.station.records.rows import batches, beside_index
+
+_LOG: Final = logging.getLogger(__name__)
+_LAYOUT: Final = 1
+_RUNS_AT_ONCE: Final = 5000
+_PAUSE_S: Final = 0.2
+"""Leaves the computer to others."""
+_UNTIL_NEXT_S: Final = 600.0
+_SETTLED: Final = timedelta(hours=1)
+"""Younger runs are not added: on a server, one with a lower id may still be on its way."""
+WITHOUT_CAUSE: Final = (RunState.PASS.value, RunState.RUNNING.value)
+_TABLES: Final = """
+CREATE TABLE state (content TEXT);
+CREATE TABLE day (number INTEGER PRIMARY KEY, begin TEXT, end TEXT, month TEXT);
+CREATE TABLE history (
+    day INTEGER, recipe INTEGER, socket INTEGER, passed INTEGER, later TEXT, units INTEGER,
+    PRIMARY KEY (day, recipe, socket, passed, later)
+) WITHOUT ROWID;
+CREATE TABLE bad (
+    begun_at TEXT, run INTEGER, recipe_id INTEGER, socket_id INTEGER, lot_id INTEGER, code TEXT,
+    PRIMARY KEY (begun_at, run)
+) WITHOUT ROWID;
+CREATE TABLE times (
+    period TEXT, recipe INTEGER, socket INTEGER, content BLOB,
+    PRIMARY KEY (period, recipe, socket)
+) WITHOUT ROWID;
+"""
+"""`history`: how many units have the same judged runs, one after the other: the first one, and the
+others as text. `bad`: runs that ended without PASS. `times`: how often each time of a step came in
+a day (its number) or month.
+"""
+
+
+_NOWHERE: Final = -1
+"""The place of a run that no span has."""
+ALL_SPANS: Final = -2
+
+
+class Judged(NamedTuple):
+    """A run that told PASS from FAIL, in its day."""
+
+    day: int
+    recipe: int
+    socket: int
+    passed: int
+
+
+History = tuple[Judged, ...]
+"""The judged runs of a unit, in their order. Golden ones are left out."""
+
+
+class Day(NamedTuple):
+    """A day of the clock on the wall, in UTC."""
+
+    number: int
+    begin: str
+    end: str
+    month: str
+
+
+StepTimes = dict[str, Counter[float]]
+"""By the name of a step: how often each of its times came."""
+_Times = dict[str, Counter[str]]
+"""The same, with the times as JSON has them."""
+_ALL: Final = (0, 0)
+"""In place of a recipe and a socket: the times of all."""
+
+
+def rounded_s() -> ColumnElement[float]:
+    """How long a step took, to three digits and no finer than a millisecond."""
+    duration_s = schema.step.c.duration_s
+    return case(
+        (duration_s < 1, func.round(duration_s * 1000) / 1000),
+        (duration_s < 10, func.round(duration_s * 100) / 100),
+        else_=func.round(duration_s * 10) / 10,
+    )
+
+
+@dataclass(frozen=True)
+class Rest:
+    """Runs that the sums are without: those of a filter, with further conditions."""
+
+    chosen: RunFilter
+    conditions: list[ColumnElement[bool]]
+
+
+@dataclass
+class Units:
+    """How many units were judged, passed at their last run, and at their first one."""
+
+    units: int = 0
+    passed: int = 0
+    first_passed: int = 0
+
+
+class Rollup:
+    """The file with the sums of the records in a database."""
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+        self._file = database.location.folder / "figures.sqlite"
+
+    # -- adding up --------------------------------------------------------------------------------
+
+    def add(self, now: datetime) -> bool:
+        """Add some of the runs that are missing; True where more are. Another process may do the
+        same. Raises RecordError when the records cannot be read, sqlite3.Error, OSError.
+        """
+        self._file.parent.mkdir(parents=True, exist_ok=True)
+        self._file.touch(0o600)
+        try:
+            return self._add(now)
+        except sqlite3.OperationalError:
+            raise
+        except sqlite3.DatabaseError:  # it is damaged, or none
+            for left in self._file.parent.glob(f"{self._file.name}*"):
+                left.unlink()
+            self._file.touch(0o600)
+            return self._add(now)
+
+    def _add(self, now: datetime) -> bool:
+        with closing(sqlite3.connect(self._file, timeout=0, isolation_level=None)) as sums:
+            sums.execute("PRAGMA journal_mode = WAL")
+            sums.execute("PRAGMA synchronous = NORMAL")
+            sums.execute("BEGIN IMMEDIATE")
+            with self._database.reading() as connection:
+                begun = _begun(sums, connection)
+                if begun is None:
+                    _begin_anew(sums)
+                    begun = 0
+                last = _last_to_add(connection, begun, now)
+                if last > begun:
+                    _Addition(sums, connection, begun, last).add()
+                    sums.execute("DELETE FROM state")
+                    content = json.dumps(_state(connection, last))
+                    sums.execute("INSERT INTO state VALUES (?)", (content,))
+            sums.execute("COMMIT")
+        return last == begun + _RUNS_AT_ONCE
+
+    def keep_up(self, now: Callable[[], datetime], wait: Callable[[float], object]) -> None:
+        """Add what is missing, and again when further days are over; never returns."""
+        while True:
+            has_more = False
+            try:
+                has_more = self.add(now())
+            except (RecordError, sqlite3.Error, OSError) as error:
+                # Another process adds, or nothing can be written: the records themselves are read.
+                _LOG.info("no runs were added to %s: %s", self._file, error)
+            wait(_PAUSE_S if has_more else _UNTIL_NEXT_S)
+
+    # -- reading ----------------------------------------------------------------------------------
+
+    @contextmanager
+    def rolled(self, chosen: RunFilter) -> Iterator[Rolled | None]:
+        """The sums for a filter; None where there are none. Raises RecordError."""
+        is_counted = (chosen.lot, chosen.serial, chosen.search, chosen.state, chosen.code)
+        if any(each is not None for each in is_counted) or not self._file.exists():
+            yield None
+            return
+        with self._database.reading() as connection:
+            try:
+                sums = sqlite3.connect(f"{self._file.resolve().as_uri()}?mode=rw", uri=True)
+            except sqlite3.Error:
+                yield None
+                return
+            with closing(sums):
+                yield _rolled(sums, connection, chosen)
+
+
+def _rolled(sums: sqlite3.Connection, connection: Connection, chosen: RunFilter) -> Rolled | None:
+    try:
+        sums.execute("BEGIN")
+        run = _begun(sums, connection)
+        days = _Days(Day(*row) for row in sums.execute("SELECT * FROM day"))
+    except sqlite3.Error:  # not whole, or not for this user: the records themselves are read
+        return None
+    if not run:
+        return None
+    allowed: dict[str, set[int]] = {}
+    for column, query in named_in(chosen):
+        found = set(connection.execute(query).scalars())
+        allowed[column.name] = allowed.get(column.name, found) & found
+    return Rolled(
+        sums, connection, chosen, run, days, allowed.get("recipe_id"), allowed.get("socket_id")
+    )
+
+
+def _state(connection: Connection, run: int) -> dict[str, Any]:
+    """Tells the records and the last run that was added; the newest audit row changes in records
+    that were restored, and go on from there.
+    """
+    audit = schema.audit.c
+    newest = select(audit.id, audit.hash).order_by(audit.id.desc()).limit(1)
+    row = connection.execute(newest).one()
+    records = connection.execute(select(schema.schema_info.c.records_id)).scalar_one()
+    return {
+        "layout": _LAYOUT, "records": records, "run": run, "audit": row.id, "hash": row.hash
+    }  # fmt: skip
+
+
+def _begun(sums: sqlite3.Connection, connection: Connection) -> int | None:
+    """The last run that was added; None where the sums are not those of these records."""
+    if not sums.execute("SELECT 1 FROM sqlite_master WHERE name = 'state'").fetchone():
+        return None
+    row = sums.execute("SELECT content FROM state").fetchone()
+    if row is None:
+        return 0
+    found = json.loads(row[0])
+    if found["layout"] != _LAYOUT:
+        return None
+    audit, info = schema.audit.c, schema.schema_info.c
+    is_same = select(audit.id).where(audit.id == found["audit"], audit.hash == found["hash"])
+    records = select(info.records_id).where(info.records_id == found["records"])
+    if any(connection.execute(query).first() is None for query in (is_same, records)):
+        return None
+    return int(found["run"])
+
+
+def _begin_anew(sums: sqlite3.Connection) -> None:
+    for (name,) in sums.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall():
+        sums.execute(f"DROP TABLE {name}")
+    for statement in _TABLES.split(";"):
+        sums.execute(statement)
+
+
+def _last_to_add(connection: Connection, begun: int, now: datetime) -> int:
+    """Up to which run the sums may go on: of a day that is over, and every one ended."""
+    run = schema.run.c
+    today = datetime.combine(now.astimezone(), time()).astimezone()
+    over = utc_text(min(today, now - _SETTLED))
+    newest = (
+        select(run.id)
+        .where(run.id > begun, beside_index(run.begun_at) < over)
+        .order_by(run.id.desc())
+        .limit(1)
+    )
+    last = connection.execute(newest).scalar_one_or_none() or begun
+    running = select(func.min(beside_index(run.id))).where(
+        run.state == RunState.RUNNING.value, run.id > begun
+    )
+    goes_on = connection.execute(running).scalar_one_or_none()
+    return min(last, begun + _RUNS_AT_ONCE, last if goes_on is None else goes_on - 1)
+
+
+class _Addition:
+    """Adds the runs after `first`, up to `last`."""
+
+    def __init__(
+        self, sums: sqlite3.Connection, connection: Connection, first: int, last: int
+    ) -> None:
+        self._sums, self._connection = sums, connection
+        self._first, self._last = first, last
+        self._days = _Days(Day(*row) for row in sums.execute("SELECT * FROM day"))
+
+    def add(self) -> None:
+        run = schema.run.c
+        query = (
+            select(
+                run.id, run.unit_id, run.recipe_id, run.socket_id, run.lot_id, run.state, run.code,
+                run.begun_at,
+            )
+            .where(run.id > self._first, run.id <= self._last)
+            .where(beside_index(run.kind) != RunKind.GOLDEN.value)
+            .order_by(run.id)
+        )  # fmt: skip
+        runs = self._connection.execute(query).all()
+        for row in runs:
+            if self._days.find(row.begun_at) is None:
+                day = self._days.make(row.begun_at)
+                self._sums.execute("INSERT INTO day VALUES (?, ?, ?, ?)", day)
+        self._sums.executemany(
+            "INSERT INTO bad VALUES (?, ?, ?, ?, ?, ?)",
+            [
+                (row.begun_at, row.id, row.recipe_id, row.socket_id, row.lot_id, row.code)
+                for row in runs
+                if row.state not in WITHOUT_CAUSE
+            ],
+        )
+        self._add_histories(runs)
+        self._add_times({row.id: row for row in runs})
+
+    def _add_histories(self, runs: Iterable[Any]) -> None:
+        added: dict[int, list[Judged]] = defaultdict(list)
+        for row in runs:
+            if row.state in JUDGED:
+                added[row.unit_id].append(self._days.judged(row))
+        before: dict[int, list[Judged]] = defaultdict(list)
+        for row in _judged_runs(self._connection, added, schema.run.c.id <= self._first):
+            before[row.unit_id].append(self._days.judged(row))
+        change: Counter[History] = Counter()
+        for unit_id, more in added.items():
+            if unit_id in before:
+                change[tuple(before[unit_id])] -= 1
+            change[(*before[unit_id], *more)] += 1
+        self._sums.executemany(
+            "INSERT INTO history VALUES (?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE"
+            " SET units = units + excluded.units",
+            [(*first, _text_of(later), units) for (first, *later), units in change.items()],
+        )
+        self._sums.executemany(
+            "DELETE FROM history WHERE units = 0"
+            " AND (day, recipe, socket, passed, later) = (?, ?, ?, ?, ?)",
+            [(*first, _text_of(later)) for (first, *later), units in change.items() if units < 0],
+        )
+
+    def _add_times(self, runs: Mapping[int, Any]) -> None:
+        step = schema.step.c
+        query = select(step.run_id, step.name, rounded_s()).where(
+            step.run_id > self._first,
+            step.run_id <= self._last,
+            step.state == StepState.PASS.value,
+        )
+        days = {run_id: self._days.of(row.begun_at) for run_id, row in runs.items()}
+        added: dict[tuple[str, int, int], _Times] = defaultdict(lambda: defaultdict(Counter))
+        for run_id, name, seconds in self._connection.execute(query):
+            if run_id in runs:
+                key = (str(days[run_id].number), runs[run_id].recipe_id, runs[run_id].socket_id)
+                added[key][name][str(float(seconds))] += 1
+        months = {str(day.number): day.month for day in days.values()}
+        for (number, recipe, socket), times in list(added.items()):
+            for place in ((recipe, socket), _ALL):
+                _merge(added[months[number], *place], times)
+            _merge(added[number, *_ALL], times)
+        for key, times in added.items():
+            known = self._sums.execute(
+                "SELECT content FROM times WHERE (period, recipe, socket) = (?, ?, ?)", key
+            ).fetchone()
+            if known is not None:
+                _merge(times, json.loads(zlib.decompress(known[0])))
+            packed = zlib.compress(json.dumps(times).encode("utf-8"), 1)
+            self._sums.execute("REPLACE INTO times VALUES (?, ?, ?, ?)", (*key, packed))
+
+
+class _Days:
+    """The days that have runs, in order; they do not overlap."""
+
+    def __init__(self, days: Iterable[Day]) -> None:
+        self._days = sorted(days, key=lambda day: day.begin)
+        self._begins = [day.begin for day in self._days]
+
+    def __iter__(self) -> Iterator[Day]:
+        return iter(self._days)
+
+    def find(self, begun_at: str) -> Day | None:
+        at = bisect_right(self._begins, begun_at) - 1
+        return self._days[at] if at >= 0 and begun_at < self._days[at].end else None
+
+    def of(self, begun_at: str) -> Day:
+        day = self.find(begun_at)
+        assert day is not None  # noqa: S101  a run that was added has its day
+        return day
+
+    def make(self, begun_at: str) -> Day:
+        """The day of a moment, on the clock of this computer; where that was set to another time
+        zone, what other days leave of it.
+        """
+        date = utc_moment(begun_at).astimezone().date()
+        begin, end = (
+            utc_text(datetime.combine(each, time()).astimezone())
+            for each in (date, date + timedelta(days=1))
+        )
+        at = bisect_right(self._begins, begun_at)
+        if at > 0:
+            begin = max(begin, self._days[at - 1].end)
+        if at < len(self._days):
+            end = min(end, self._days[at].begin)
+        day = Day(len(self._days) + 1, begin, end, f"{date:%Y-%m}")
+        self._days.insert(at, day)
+        self._begins.insert(at, begin)
+        return day
+
+    def judged(self, row: Any) -> Judged:
+        is_passed = row.state == RunState.PASS.value
+        return Judged(self.of(row.begun_at).number, row.recipe_id, row.socket_id, int(is_passed))
+
+
+def _judged_runs(
+    connection: Connection, units: Iterable[int], *conditions: ColumnElement[bool]
+) -> Iterator[Any]:
+    """The judged runs of some units, those of each in their order."""
+    run = schema.run.c
+    query = (
+        select(run.id, run.unit_id, run.recipe_id, run.socket_id, run.state, run.begun_at)
+        .where(beside_index(run.state).in_(JUDGED), *conditions)
+        .where(beside_index(run.kind) != RunKind.GOLDEN.value)
+        .order_by(run.unit_id, run.id)
+    )
+    for some in batches(units):
+        yield from connection.execute(query.where(run.unit_id.in_(some)))
+
+
+def _text_of(later: Iterable[Judged]) -> str:
+    return ";".join(",".join(map(str, each)) for each in later)
+
+
+def _later(text: str) -> Iterator[Judged]:
+    for each in text.split(";") if text else ():
+        day, recipe, socket, passed = map(int, each.split(","))
+        yield Judged(day, recipe, socket, passed)
+
+
+def _merge(into: _Times, times: Mapping[str, Mapping[str, int]]) -> None:
+    for name, counts in times.items():
+        into[name].update(counts)
+
+
+@dataclass(frozen=True)
+class Rolled:
+    """The sums for a filter, up to the run `run`."""
+
+    _sums: sqlite3.Connection
+    _connection: Connection
+    chosen: RunFilter
+    run: int
+    _days: _Days
+    _recipes: set[int] | None
+    """The ids that the filter allows; None: it allows all."""
+    _sockets: set[int] | None
+    _since: str = field(init=False)
+    _until: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        since, until = self.chosen.since, self.chosen.until
+        object.__setattr__(self, "_since", "" if since is None else utc_text(since))
+        object.__setattr__(self, "_until", "~" if until is None else utc_text(until))
+
+    def _allows(self, recipe: int, socket: int) -> bool:
+        return (self._recipes is None or recipe in self._recipes) and (
+            self._sockets is None or socket in self._sockets
+        )
+
+    def _whole(self, cuts: Sequence[str] = ()) -> list[Day]:
+        """The days of the period that neither it nor these moments cut; they are in order."""
+        return [
+            day
+            for day in self._days
+            if self._since <= day.begin and day.end <= self._until
+            if bisect_right(cuts, day.begin) == bisect_left(cuts, day.end)
+        ]
+
+    @property
+    def tail(self) -> Rest:
+        """The runs that were not added yet."""
+        within = begun_in(self.chosen, beside_index(schema.run.c.begun_at))
+        chosen = replace(self.chosen, since=None, until=None)
+        return Rest(chosen, [schema.run.c.id > self.run, *within])
+
+    def _cut(self, whole: Collection[Day]) -> Iterator[Rest]:
+        """The runs of days that are in part in the period, or that something cuts."""
+        kept = {day.number for day in whole}
+        condition = beside_index(schema.run.c.id) <= self.run
+        for day in self._days:
+            if day.number in kept or day.end <= self._since or day.begin >= self._until:
+                continue
+            since = utc_moment(max(day.begin, self._since))
+            until = utc_moment(min(day.end, self._until))
+            yield Rest(replace(self.chosen, since=since, until=until), [condition])
+
+    def bad(self, group: str) -> Iterator[tuple[str, Any, int]]:
+        """How often each code ended a run without PASS, by a column of these runs, but for the
+        `tail`.
+        """
+        allowed = (
+            None if ids is None else json.dumps(sorted(ids))
+            for ids in (self._recipes, self._sockets)
+        )
+        return self._sums.execute(
+            f"SELECT code, {group}, count(*) FROM bad"  # noqa: S608
+            " WHERE begun_at >= ?1 AND begun_at < ?2"
+            " AND (?3 IS NULL OR recipe_id IN (SELECT value FROM json_each(?3)))"
+            " AND (?4 IS NULL OR socket_id IN (SELECT value FROM json_each(?4)))"
+            f" GROUP BY code, {group}",
+            (self._since, self._until, *allowed),
+        )
+
+    def step_times(self) -> tuple[StepTimes, list[Rest]]:
+        """The times of steps that passed, and what they are without."""
+        whole = self._whole()
+        in_all = Counter(day.month for day in self._days)
+        months = {
+            month for month, days in Counter(day.month for day in whole).items()
+            if days == in_all[month]
+        }  # fmt: skip
+        periods = [*months, *(str(day.number) for day in whole if day.month not in months)]
+        summed: _Times = defaultdict(Counter)
+        is_all = self._recipes is None and self._sockets is None
+        for some in batches(periods):
+            marks = ", ".join("?" * len(some))
+            for *place, content in self._sums.execute(
+                f"SELECT recipe, socket, content FROM times WHERE period IN ({marks})"  # noqa: S608
+                " AND (recipe = 0) = ?",
+                [*some, is_all],
+            ):
+                if is_all or self._allows(*place):
+                    _merge(summed, json.loads(zlib.decompress(content)))
+        found: StepTimes = defaultdict(Counter)
+        for name, counts in summed.items():
+            found[name] = Counter({float(seconds): count for seconds, count in counts.items()})
+        return found, [self.tail, *self._cut(whole)]
+
+    def units(
+        self, spans: Sequence[tuple[str, str]], units_of: Callable[[Rest], Iterable[int]]
+    ) -> dict[int, Units] | None:
+        """The units of the spans that have any, by the place of the span, and of `ALL_SPANS`. These
+        are in order and do not overlap; `units_of` finds the units of runs that the sums are
+        without. None where the sums have no whole day of these spans.
+        """
+        whole = self._whole(sorted({each for span in spans for each in span}))
+        if not whole:
+            return None
+        begins = [begin for begin, _ in spans]
+
+        def place_of(begun_at: str) -> int:
+            at = bisect_right(begins, begun_at) - 1
+            is_in = at >= 0 and self._since <= begun_at < self._until
+            return at if is_in and begun_at < spans[at][1] else _NOWHERE
+
+        found: dict[int, Units] = defaultdict(Units)
+        # Of units with other runs the records have the history that counts.
+        apart = {unit for rest in (self.tail, *self._cut(whole)) for unit in units_of(rest)}
+        counted_apart: Counter[History] = Counter()
+        for _, runs in groupby(
+            _judged_runs(self._connection, sorted(apart)), key=lambda row: row.unit_id
+        ):
+            history: list[Judged] = []
+            placed: list[Judged] = []
+            for row in runs:
+                if row.id <= self.run:
+                    history.append(self._days.judged(row))
+                passed = int(row.state == RunState.PASS.value)
+                placed.append(Judged(place_of(row.begun_at), row.recipe_id, row.socket_id, passed))
+            counted_apart[tuple(history)] += 1
+            self._count(found, placed, 1)
+        places = {day.number: place_of(day.begin) for day in whole}
+        for *first, text, all_units in self._sums.execute("SELECT * FROM history"):
+            history = [Judged(*first), *_later(text)]
+            units = all_units - counted_apart[tuple(history)]
+            if units:
+                placed = [run._replace(day=places.get(run.day, _NOWHERE)) for run in history]
+                self._count(found, placed, units)
+        return found
+
+    def _count(self, found: dict[int, Units], runs: Iterable[Judged], units: int) -> None:
+        """Count so many units with these runs; the `day` of each is the place of its span."""
+        first: dict[int, int] = {}
+        last: dict[int, int] = {}
+        for at, recipe, socket, passed in runs:
+            if at != _NOWHERE and self._allows(recipe, socket):
+                for each in (at, ALL_SPANS):
+                    first.setdefault(each, passed)
+                    last[each] = passed
+        for at, passed in last.items():
+            found[at].units += units
+            found[at].passed += units * passed
+            found[at].first_passed += units * first[at]

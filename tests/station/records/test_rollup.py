@@ -1,0 +1,305 @@
+"""Sums of days: what a page shows from them is what the records themselves say."""
+
+from __future__ import annotations
+
+import random
+import sqlite3
+import time
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import dataclass
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import insert, select, text
+
+from flasher.station.records import rollup, schema
+from flasher.station.records.model import RunFilter, RunKind, RunState, utc_text
+from flasher.station.records.overview import By, Overview, Span
+from flasher.station.records.rollup import Rollup
+from flasher.station.tally import DEFAULT_SHIFTS
+from flasher.web.supervisor import shifts_of, spans_of
+from tests.station.factory import Bench
+
+BEGIN = datetime(2026, 3, 27, 20, tzinfo=UTC)
+"""Before a night in which clocks are set forward in Europe, and a month ends."""
+DAYS = 6
+NOW = BEGIN + timedelta(days=DAYS + 3)
+ENDED = ("PASS", "FAIL", "PASS", "PASS", "ERROR", "ABORTED", "INTERRUPTED")
+
+
+@dataclass
+class Lines:
+    """Random runs of two sockets, two recipes, some lots; units come again, days later too."""
+
+    bench: Bench
+    chance: random.Random
+    runs: int = 1
+
+    def add(self, count: int) -> None:
+        """Add runs of any order in time, past the rules of the database."""
+        with self.bench.store.database.engine.connect() as connection:
+            is_server = connection.dialect.name == "postgresql"
+            if is_server:
+                connection.exec_driver_sql("SET session_replication_role = replica")
+            rules = self._rules(connection)
+            if not is_server:
+                for name, _ in rules:
+                    connection.exec_driver_sql(f"DROP TRIGGER {name}")
+            like = dict(
+                connection.execute(select(schema.run).where(schema.run.c.id == 1)).mappings().one()
+            )
+            for number in range(self.runs + 1, self.runs + 1 + count):
+                self._add(connection, like, number)
+            for _, statement in rules if not is_server else ():
+                connection.exec_driver_sql(statement)
+            connection.commit()
+        self.runs += count
+
+    @staticmethod
+    def _rules(connection: Any) -> list[tuple[str, str]]:
+        if connection.dialect.name == "postgresql":
+            return []
+        query = text("SELECT name, sql FROM sqlite_master WHERE type = 'trigger'")
+        return [(name, sql) for name, sql in connection.execute(query)]
+
+    def _add(self, connection: Any, like: dict[str, Any], number: int) -> None:
+        chance = self.chance
+        state = chance.choice(ENDED)
+        at = (
+            BEGIN
+            + timedelta(days=DAYS * number / 400)
+            + timedelta(hours=chance.choice((0, 0, 0, -30, 1)))
+        )
+        connection.execute(
+            insert(schema.run).values(
+                **{
+                    **like, "id": number, "unit_id": chance.randint(1, 60),
+                    "socket_id": chance.randint(1, 2), "recipe_id": chance.randint(1, 2),
+                    "lot_id": chance.choice((None, 1, 2)), "state": state,
+                    "code": "OK" if state == "PASS" else chance.choice(("NO_ANSWER", "REFUSED")),
+                    "kind": RunKind.GOLDEN.value if chance.random() < 0.1 else "production",
+                    "begun_at": utc_text(at), "ended_at": utc_text(at + timedelta(hours=5)),
+                }
+            )
+        )  # fmt: skip
+        for position, name in enumerate(("flash", "verify"), 1):
+            connection.execute(
+                insert(schema.step).values(
+                    run_id=number, position=position, name=name, try_number=1,
+                    state=chance.choice(("PASS", "PASS", "FAIL")), code="", text="",
+                    begun_at=utc_text(at), begun_monotonic_s=0.0,
+                    duration_s=chance.lognormvariate(position, 1.0),
+                )
+            )  # fmt: skip
+
+
+def name_things(bench: Bench) -> None:
+    """A second socket and recipe, lots, units."""
+    with bench.store.database.engine.connect() as connection:
+        recipe = dict(connection.execute(select(schema.recipe)).mappings().one())
+        connection.execute(insert(schema.socket).values(id=2, station_id=1, name="B"))
+        connection.execute(
+            insert(schema.recipe).values(
+                **{**recipe, "id": 2, "name": "Other", "part": "BAT-48", "sha256": "5" * 64}
+            )
+        )
+        for number in (1, 2):
+            connection.execute(
+                insert(schema.lot).values(id=number, part="BAT-36", name=f"L{number}")
+            )
+        for number in range(2, 61):
+            connection.execute(
+                insert(schema.unit).values(id=number, part="BAT-36", serial=f"U{number}")
+            )
+        connection.commit()
+
+
+def filters() -> Iterator[dict[str, Any]]:
+    yield {}
+    yield {"recipe": "Other", "socket": "B"}
+    yield {"part": "BAT-36"}
+    yield {"lot": "lot 1"}
+    yield {"socket": "nowhere"}
+
+
+def periods(chance: random.Random) -> Iterator[Span]:
+    midnight = BEGIN.astimezone().replace(hour=0, minute=0)
+    yield Span(midnight - timedelta(days=40), midnight + timedelta(days=40))
+    begin = BEGIN + timedelta(hours=chance.randint(-30, 40), minutes=chance.randint(0, 59))
+    yield Span(begin, begin + timedelta(hours=chance.randint(60, 130)))
+    yield Span(begin, begin + timedelta(hours=chance.randint(1, 40)))
+
+
+def figures_of(overview: Overview, chance: random.Random) -> list[Any]:
+    """Everything that pages of figures show, for filters and periods."""
+    found: list[Any] = []
+    for span in periods(chance):
+        shifts = list(shifts_of(span, DEFAULT_SHIFTS))
+        for words in chance.sample(list(filters()), 2):
+            chosen = RunFilter(since=span.begin, until=span.end, **words)
+            found.append(
+                [overview.yields(chosen, spans) for spans in ([span], list(spans_of(span)))]
+            )
+            found.append([overview.causes(chosen, by, shifts) for by in By])
+            found.append(overview.step_times(chosen))
+    found += [overview.step_times(RunFilter()), overview.causes(RunFilter(), By.RECIPE)]
+    return found
+
+
+def check(lines: Lines) -> None:
+    """Compare the sums, as they are, with the records."""
+    rolled, direct = Overview(lines.bench.store.database), Overview(lines.bench.store.database)
+    direct._rollup._file = Path("nowhere")
+    seed = lines.chance.random()
+    assert figures_of(rolled, random.Random(seed)) == figures_of(direct, random.Random(seed))
+
+
+@pytest.fixture(
+    params=[("Europe/Berlin", "sqlite"), ("Asia/Kathmandu", "postgresql")], ids=lambda pair: pair[1]
+)
+def lines(
+    request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[Lines]:
+    zone, backend = request.param
+    url = request.getfixturevalue("postgres").records() if backend == "postgresql" else None
+    monkeypatch.setenv("TZ", zone)
+    time.tzset()
+    monkeypatch.setattr(rollup, "_RUNS_AT_ONCE", 90)
+    bench = Bench(tmp_path, url=url)
+    bench.make(RunState.PASS, "W2605001")
+    name_things(bench)
+    with closing(bench.store):
+        yield Lines(bench, random.Random(zone))
+    monkeypatch.undo()
+    time.tzset()
+
+
+def add_up(lines: Lines, now: datetime = NOW) -> None:
+    sums = Rollup(lines.bench.store.database)
+    while sums.add(now):
+        pass
+
+
+def summed_up_to(lines: Lines) -> int | None:
+    """The last run in the sums; None where the records do not use them."""
+    with Rollup(lines.bench.store.database).rolled(RunFilter()) as rolled:
+        return None if rolled is None else rolled.run
+
+
+def test_sums_and_records_give_the_same_figures(lines: Lines) -> None:
+    lines.add(300)
+    add_up(lines)
+    check(lines)
+    lines.add(80)
+    check(lines)
+    add_up(lines)
+    assert summed_up_to(lines) == lines.runs
+    check(lines)
+    lines.add(20)
+    check(lines)
+
+
+def test_days_of_a_clock_in_another_zone_are_cut(
+    lines: Lines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines.add(150)
+    add_up(lines)
+    monkeypatch.setenv("TZ", "America/New_York")
+    time.tzset()
+    check(lines)
+    lines.add(150)
+    add_up(lines)
+    check(lines)
+
+
+# -- what is not in the sums, and sums of other records --------------------------------------------
+
+
+@pytest.fixture
+def made(bench: Bench) -> Lines:
+    """Four runs of a day."""
+    for number in range(1, 5):
+        bench.make(RunState.PASS, f"W260500{number}")
+    return Lines(bench, random.Random(1), runs=4)
+
+
+def test_a_day_that_goes_on_is_read_from_the_records(made: Lines) -> None:
+    now = made.bench.clock.now
+    add_up(made, now)
+    assert summed_up_to(made) is None
+    add_up(made, now + timedelta(days=2))
+    assert summed_up_to(made) == 4
+
+
+def test_sums_end_before_a_run_that_goes_on(made: Lines) -> None:
+    run_id = made.bench.claim("W2605005").run_id
+    made.bench.make(RunState.PASS, "W2605006", "B")
+    later = made.bench.clock.now + timedelta(days=2)
+    add_up(made, later)
+    assert summed_up_to(made) == run_id - 1
+    made.bench.work(run_id)
+    made.bench.store.finish(run_id, made.bench.ending(trace=made.bench.traced("W2605005")))
+    add_up(made, later)
+    assert summed_up_to(made) == run_id + 1
+
+
+def test_sums_of_records_that_were_restored_are_made_anew(made: Lines) -> None:
+    bench = made.bench
+    backup = bench.folder / "backup.sqlite"
+    bench.store.backup(backup)
+    bench.make(RunState.PASS, "W2605005")
+    later = bench.clock.now + timedelta(days=2)
+    add_up(made, later)
+    assert summed_up_to(made) == 5
+    bench.store.close()
+    bench.path.with_name(bench.path.name + "-wal").unlink(missing_ok=True)
+    bench.path.write_bytes(backup.read_bytes())
+    bench.store = bench.opened()
+    assert summed_up_to(made) is None
+    add_up(made, later)
+    assert summed_up_to(made) == 4
+
+
+@pytest.mark.parametrize("content", [b"", b"no database" * 500])
+def test_a_file_that_holds_no_sums_is_no_obstacle(made: Lines, content: bytes) -> None:
+    file = made.bench.store.files.folder / "figures.sqlite"
+    file.write_bytes(content)
+    assert summed_up_to(made) is None
+    add_up(made, made.bench.clock.now + timedelta(days=2))
+    assert summed_up_to(made) == 4
+
+
+def test_a_process_adds_until_nothing_is_missing_and_again_later(
+    made: Lines, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(rollup, "_RUNS_AT_ONCE", 2)
+    waited: list[float] = []
+
+    def wait(seconds: float) -> None:
+        waited.append(seconds)
+        if len(waited) == 5:
+            raise TimeoutError
+
+    later = made.bench.clock.now + timedelta(days=2)
+    with pytest.raises(TimeoutError):
+        Rollup(made.bench.store.database).keep_up(lambda: later, wait)
+    assert [seconds < 1 for seconds in waited] == [True, True, False, False, False]
+    assert summed_up_to(made) == 4
+
+
+def test_a_process_goes_on_where_another_one_adds(made: Lines) -> None:
+    later = made.bench.clock.now + timedelta(days=2)
+    add_up(made, later)
+    file = made.bench.store.files.folder / "figures.sqlite"
+    with closing(sqlite3.connect(file, isolation_level=None)) as other:
+        other.execute("BEGIN IMMEDIATE")
+        with pytest.raises(TimeoutError):
+            Rollup(made.bench.store.database).keep_up(lambda: later, _end)
+        assert summed_up_to(made) == 4
+
+
+def _end(_seconds: float) -> None:
+    raise TimeoutError
