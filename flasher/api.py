@@ -1,21 +1,29 @@
 """What a program calls: a connection, the devices on it, and `flash`, the whole job in one call.
 
-`Device` blocks; `AsyncDevice` is the same for programs with an event loop. Both run the procedures
-of `flasher.procedures`.
+`Device` blocks; `AsyncDevice` is the same in a thread, for programs with an event loop.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Sequence
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
+from contextvars import copy_context
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import partial, update_wrapper
 from threading import Lock
-from typing import TYPE_CHECKING, Any, Final, TypedDict, TypeVar, Unpack, overload
+from typing import (
+    TYPE_CHECKING,
+    Any,
+    Concatenate,
+    Final,
+    ParamSpec,
+    TypeVar,
+    Unpack,
+    overload,
+)
 
-from flasher.driver import Tap, adrive, drive
-from flasher.errors import FlasherError, UsageError
+from flasher.errors import FlasherError, InterruptedByUserError, UsageError
 from flasher.host import waivers
 from flasher.host.identity import WAIVABLE, Check, CheckResult, Identity, judge_image
 from flasher.host.options import UpgradeOptions
@@ -30,17 +38,7 @@ from flasher.image.image import Image
 from flasher.image.load import load
 from flasher.image.plan import Plan, make_plan
 from flasher.image.release import Release
-from flasher.log import log_event
-from flasher.procedures import (
-    DeviceInfo,
-    Procedure,
-    Procedures,
-    Run,
-    Step,
-    Tell,
-    WaitUntil,
-    plan_for,
-)
+from flasher.procedures import DeviceInfo, EventHandler, Procedures, Watch, plan_for
 from flasher.protocol.engine import Engine
 from flasher.protocol.fields import Content
 from flasher.protocol.spec import Dialect, Target, as_dialect, as_target
@@ -48,6 +46,8 @@ from flasher.settings.manifest import find_release
 from flasher.settings.profile import Profile
 
 if TYPE_CHECKING:
+    from asyncio import AbstractEventLoop
+
     from flasher.bus.bit_rate import BitRate
     from flasher.bus.fallback import Fallback
     from flasher.bus.link import Clock, Link
@@ -90,24 +90,13 @@ __all__ = [
     "Written",
 ]
 
-EventHandler = Callable[[object], None]
 T = TypeVar("T")
+P = ParamSpec("P")
 C = TypeVar("C", bound=Content)
 _TURN_PAUSE_S: Final = 0.01
-"""Between two looks whether the call of another task has ended."""
-
-
-class Watch(TypedDict, total=False):
-    """How a call is watched and ended; what is left out is as the device was made."""
-
-    taps: Sequence[Tap]
-    """See every frame in both directions."""
-    on_event: EventHandler | None
-    """Gets what happens, as dataclasses of `flasher.events`."""
-    cancelled: Callable[[], bool] | None
-    """Asked while it runs; ends it at the next message boundary."""
-    hung_up: Callable[[], bool] | None
-    """The same for a terminal that is gone: it does not end an upgrade that has begun to erase."""
+"""Between two looks whether the call of another task has ended, and whether this one is over."""
+_LOOP_GONE_S: Final = 5.0
+"""An event loop that was left alone for so long with an event in its hands is not coming back."""
 
 
 # -- the bus --------------------------------------------------------------------------------------
@@ -162,15 +151,15 @@ class Connection:
         """Listen for a moment for another tool, as every question does before it is sent. Raises
         BusError when there is one.
         """
-        device = self.device("bms", dialect=dialect)
-        device._run(device._steps.listen_first(), watch)  # noqa: SLF001  of this module
+        with self.device("bms", dialect=dialect)._turn(watch) as steps:  # noqa: SLF001  of this module
+            steps.listen_first()
 
     def scan(self, dialect: str | Dialect = "welling", **watch: Unpack[Watch]) -> Survey:
         """Listen for a second, then ask the BMS for its version and state: who was heard, with
         what. Raises BusError, and InterruptedByUserError when it was cancelled.
         """
-        device = self.device("bms", dialect=dialect)
-        return device._run(device._steps.scan(), watch)  # noqa: SLF001  of this module
+        with self.device("bms", dialect=dialect)._turn(watch) as steps:  # noqa: SLF001  of this module
+            return steps.scan()
 
 
 def _default_profile(target: str | Target, dialect: str | Dialect) -> Profile:
@@ -285,18 +274,28 @@ def bit_rate(
 # -- a device -------------------------------------------------------------------------------------
 
 
-class _OnBus:
-    """What `Device` and `AsyncDevice` share: everything but the waiting."""
+class Device:
+    """A device on a bus, for programs that wait for it; made by `Connection.device`.
+
+    Every method takes the keywords of `Watch`, and raises BusError when the adapter fails or
+    another tool speaks on the bus, InterruptedByUserError when `cancelled` said so, UsageError
+    while another call is under way on the connection (in another thread, or around `on_event`).
+    """
 
     def __init__(
-        self, connection: Connection, profile: Profile, *, is_alone: bool, watch: Watch
+        self,
+        connection: Connection,
+        profile: Profile,
+        *,
+        is_alone: bool,
+        watch: Watch,
+        awaits_turn: bool = False,
     ) -> None:
         self.connection = connection
         self.profile = profile
+        self._is_alone = is_alone
         self._watch = watch
-        self._steps = Procedures(
-            connection.link, connection.clock, profile, connection.bit_rate, is_alone
-        )
+        self._awaits_turn = awaits_turn
 
     @property
     def target(self) -> Target:
@@ -305,65 +304,7 @@ class _OnBus:
 
     def plan(self, image: Image | Plan) -> Plan:
         """What an upgrade with this image would send. Raises ImageError and UsageError."""
-        return self._steps.plan(image)
-
-    def _job(
-        self,
-        image: str | os.PathLike[str] | Image,
-        options: UpgradeOptions | None,
-        verify: Level | str | None,
-        identity: Identity | None,
-        *,
-        in_session: bool,
-        at_power_up: bool = False,
-    ) -> Job:
-        rate = self.connection.bit_rate
-        job = prepare(
-            image,
-            self.profile,
-            bitrate_bps=None if rate is None else rate.bps,
-            options=options,
-            verify=verify,
-            identity=identity,
-            at_power_up=at_power_up,
-        )
-        return job.in_session() if in_session else job
-
-    def _cancelled(self, step: Run | WaitUntil, watch: Watch) -> Callable[[], bool] | None:
-        """What ends a step before its end."""
-        asked = watch.get("cancelled") or _never
-        hung_up = watch.get("hung_up") or _never
-        may_hang_up = step.hang_up_ends
-        if isinstance(step, Run) and not step.may_cancel:
-            return None
-        if may_hang_up is None:
-            return asked
-        return lambda: asked() or (hung_up() and may_hang_up())
-
-
-def _never() -> bool:
-    return False
-
-
-def _teller(watch: Watch, of_step: EventHandler | None = None) -> EventHandler:
-    """Logs an event, and hands it to the step and to the caller."""
-    handlers = [each for each in (of_step, watch.get("on_event")) if each is not None]
-
-    def tell(event: object) -> None:
-        log_event(event)
-        for handle in handlers:
-            handle(event)
-
-    return tell
-
-
-class Device(_OnBus):
-    """A device on a bus, for programs that wait for it; made by `Connection.device`.
-
-    Every method takes the keywords of `Watch`, and raises BusError when the adapter fails or
-    another tool speaks on the bus, InterruptedByUserError when `cancelled` said so, UsageError
-    while another call is under way on the connection (in another thread, or around `on_event`).
-    """
+        return self._steps({}).plan(image)
 
     def identify(self, **watch: Unpack[Watch]) -> DeviceInfo:
         """Ask it everything that the documents let one ask; listen only where they give nothing.
@@ -371,19 +312,22 @@ class Device(_OnBus):
         Silence is no error: see `DeviceInfo.is_there`. Takes 12 s when nothing is answered by a
         device that is heard, 4 s when it is not heard either.
         """
-        return self._run(self._steps.identify(), watch)
+        with self._turn(watch) as steps:
+            return steps.identify()
 
     def is_heard(self, **watch: Unpack[Watch]) -> bool:
         """True when it sends a message, or answers a question for its version: nothing else is sent
         to it. Takes 5 s at the most.
         """
-        return self._run(self._steps.is_heard(), watch)
+        with self._turn(watch) as steps:
+            return steps.is_heard()
 
     def version(self, **watch: Unpack[Watch]) -> Content:
         """Its version information, or the answer to the product's own version query. Raises
         NoAnswerError when it does not answer, or nobody knows how to ask it.
         """
-        return self._run(self._steps.version(), watch)
+        with self._turn(watch) as steps:
+            return steps.version()
 
     @overload
     def read(self, what: type[C], **watch: Unpack[Watch]) -> C: ...
@@ -396,11 +340,13 @@ class Device(_OnBus):
 
         Raises UsageError for what is not there, NoAnswerError when it does not answer.
         """
-        return self._run(self._steps.read(what), watch)
+        with self._turn(watch) as steps:
+            return steps.read(what)
 
     def ask(self, request: Request, **watch: Unpack[Watch]) -> Content:
         """Ask a question of your own. Raises NoAnswerError."""
-        return self._run(self._steps.ask(request), watch)
+        with self._turn(watch) as steps:
+            return steps.ask(request)
 
     def read_memory(self, start: int, end: int, **watch: Unpack[Watch]) -> bytes:
         """The bytes from address `start` up to `end`, which is not read any more (R5).
@@ -408,7 +354,8 @@ class Device(_OnBus):
         Raises UsageError for an impossible range and for a target whose memory the documents do not
         let one read, NoAnswerError when a piece is not answered.
         """
-        return self._run(self._steps.read_memory(start, end), watch)
+        with self._turn(watch) as steps:
+            return steps.read_memory(start, end)
 
     def write(
         self,
@@ -423,15 +370,18 @@ class Device(_OnBus):
         value that does not fit, NoAnswerError when the device is silent before anything was
         written, VerificationError when the write is not confirmed or reads back differently.
         """
-        return self._run(self._steps.write(name, values, manufacturer=manufacturer), watch)
+        with self._turn(watch) as steps:
+            return steps.write(name, values, manufacturer=manufacturer)
 
     def content_before(self, plan: WritePlan, **watch: Unpack[Watch]) -> Content:
         """The first half of a write: what the device holds now."""
-        return self._run(self._steps.content_before(plan), watch)
+        with self._turn(watch) as steps:
+            return steps.content_before(plan)
 
     def carry_out(self, plan: WritePlan, before: Content | None, **watch: Unpack[Watch]) -> Written:
         """The second half: write and read back. What went wrong stands in the result."""
-        return self._run(self._steps.carry_out(plan, before), watch)
+        with self._turn(watch) as steps:
+            return steps.carry_out(plan, before)
 
     def flash(
         self,
@@ -452,8 +402,7 @@ class Device(_OnBus):
         nothing to do; every other one is raised as the FlasherError that stands for it (see
         flasher.errors).
         """
-        job = self._job(image, options, verify, identity, in_session=in_session)
-        return _checked(self._run(job.procedure(self._steps), watch))
+        return self._carried_out(image, options, verify, identity, watch, in_session=in_session)
 
     def rescue(
         self,
@@ -469,8 +418,9 @@ class Device(_OnBus):
         bootloader at power-up, for `power_up_timeout_s` of the options, and upgrades it then. With
         `in_session` it is looked for as by `flash` before.
         """
-        job = self._job(image, options, verify, identity, in_session=in_session, at_power_up=True)
-        return _checked(self._run(job.procedure(self._steps), watch))
+        return self._carried_out(
+            image, options, verify, identity, watch, in_session=in_session, at_power_up=True
+        )
 
     def upgrade(
         self,
@@ -489,7 +439,8 @@ class Device(_OnBus):
         be verified so, BusError when the adapter fails, saying how far the upgrade had come and in
         what state the device is left.
         """
-        return self._run(self._steps.upgrade(image, options, verify, identity), watch)
+        with self._turn(watch) as steps:
+            return steps.upgrade(image, options, verify, identity)
 
     def verify(
         self, image: Image | Plan, level: Level | str = Level.VERSION, **watch: Unpack[Watch]
@@ -497,204 +448,199 @@ class Device(_OnBus):
         """Whether it runs this image: by the version that it names, or by its memory too. What
         speaks against it stands in the result. Raises UsageError for a level that is not possible.
         """
-        return self._run(self._steps.verify(image, as_level(level)), watch)
+        with self._turn(watch) as steps:
+            return steps.verify(image, as_level(level))
 
     def reset(self, **watch: Unpack[Watch]) -> None:
         """Restart its application. Raises NoAnswerError when it does not confirm, or when the
         documents give no reset for it.
         """
-        self._run(self._steps.reset(), watch)
+        with self._turn(watch) as steps:
+            steps.reset()
 
     def run(self, engine: Engine, **watch: Unpack[Watch]) -> None:
         """Run an engine of your own on the connection."""
-        self._run(_alone(engine), watch)
+        with self._turn(watch) as steps:
+            steps.run(engine)
 
-    def _run(self, procedure: Procedure[T], of_call: Watch) -> T:
+    def _carried_out(
+        self,
+        image: str | os.PathLike[str] | Image,
+        options: UpgradeOptions | None,
+        verify: Level | str | None,
+        identity: Identity | None,
+        watch: Watch,
+        *,
+        in_session: bool,
+        at_power_up: bool = False,
+    ) -> Result:
+        rate = self.connection.bit_rate
+        job = prepare(
+            image,
+            self.profile,
+            bitrate_bps=None if rate is None else rate.bps,
+            options=options,
+            verify=verify,
+            identity=identity,
+            at_power_up=at_power_up,
+        )
+        if in_session:
+            job = job.in_session()
+        with self._turn(watch) as steps:
+            result = job.carry_out(steps)
+        error = result.error()
+        if error is not None:
+            raise error
+        return result
+
+    def _steps(self, watch: Watch) -> Procedures:
+        link, clock, rate = self.connection.link, self.connection.clock, self.connection.bit_rate
+        return Procedures(link, clock, self.profile, rate, self._is_alone, watch)
+
+    @contextmanager
+    def _turn(self, of_call: Watch) -> Iterator[Procedures]:
+        """What a call does, while no other call is under way on the connection."""
+        watch: Watch = {**self._watch, **of_call}
         turn = self.connection._turn  # noqa: SLF001  of this module
-        if not turn.acquire(blocking=False):
-            raise UsageError(
-                f"Another call is under way on {self.connection.name}.",
-                cause="two threads use one connection, or a call is made from on_event",
-                remedy="Make one call after the other; from several tasks use async_device.",
-            )
+        cancelled = watch.get("cancelled")
+        while not turn.acquire(timeout=_TURN_PAUSE_S if self._awaits_turn else 0):
+            if not self._awaits_turn:
+                raise UsageError(
+                    f"Another call is under way on {self.connection.name}.",
+                    cause="two threads use one connection, or a call is made from on_event",
+                    remedy="Make one call after the other; from several tasks use async_device.",
+                )
+            if cancelled is not None and cancelled():
+                raise InterruptedByUserError("Interrupted by the user.")
         try:
-            return self._finished(procedure, {**self._watch, **of_call})
+            yield self._steps(watch)
         finally:
             turn.release()
 
-    def _finished(self, procedure: Procedure[T], watch: Watch) -> T:
-        try:
-            step = next(procedure)
-            while True:
-                try:
-                    came = self._do(step, watch)
-                except (FlasherError, KeyboardInterrupt) as error:
-                    step = procedure.throw(error)
-                else:
-                    step = procedure.send(came)
-        except StopIteration as end:
-            result: T = end.value
-            return result
 
-    def _do(self, step: Step, watch: Watch) -> bool:
-        link, clock = self.connection.link, self.connection.clock
-        match step:
-            case Run():
-                drive(
-                    step.engine,
-                    link,
-                    clock,
-                    taps=(*watch.get("taps", ()), *step.taps),
-                    on_event=_teller(watch, step.on_event),
-                    cancelled=self._cancelled(step, watch),
-                )
-            case WaitUntil():
-                clock.wait_until(step.moment)
-                cancelled = self._cancelled(step, watch)
-                return cancelled is not None and cancelled()
-            case Tell():
-                _teller(watch)(step.event)
-        return False
+def _in_thread(
+    method: Callable[Concatenate[Device, P], T],
+) -> Callable[Concatenate[AsyncDevice, P], Coroutine[Any, Any, T]]:
+    """A method of `Device` for `AsyncDevice`."""
+
+    async def call(self: AsyncDevice, /, *args: P.args, **kwargs: P.kwargs) -> T:
+        return await self._call(method, *args, **kwargs)
+
+    update_wrapper(call, method)
+    return call
 
 
-class AsyncDevice(_OnBus):
+class AsyncDevice:
     """`Device` for programs with an event loop; made by `Connection.async_device`. Every method is
-    that of `Device`, awaited. A task that is cancelled ends at the next message boundary first.
-    Calls of several tasks on one connection wait for each other.
+    that of `Device`, in a thread. `on_event` is called in the event loop, and the thread waits for
+    it; `taps` and `cancelled` are called in the thread. A task that is cancelled ends at the next
+    message boundary first; a write that was begun is read back. Calls of several tasks on one
+    connection wait for each other.
     """
 
-    async def identify(self, **watch: Unpack[Watch]) -> DeviceInfo:
-        return await self._run(self._steps.identify(), watch)
+    def __init__(
+        self, connection: Connection, profile: Profile, *, is_alone: bool, watch: Watch
+    ) -> None:
+        self.connection = connection
+        self.profile = profile
+        self._watch = watch
+        self._device = Device(connection, profile, is_alone=is_alone, watch=watch, awaits_turn=True)
 
-    async def version(self, **watch: Unpack[Watch]) -> Content:
-        return await self._run(self._steps.version(), watch)
+    @property
+    def target(self) -> Target:
+        """Which device it is."""
+        return self.profile.target
+
+    def plan(self, image: Image | Plan) -> Plan:
+        """What an upgrade with this image would send. Raises ImageError and UsageError."""
+        return self._device.plan(image)
+
+    identify = _in_thread(Device.identify)
+    is_heard = _in_thread(Device.is_heard)
+    version = _in_thread(Device.version)
+    ask = _in_thread(Device.ask)
+    read_memory = _in_thread(Device.read_memory)
+    write = _in_thread(Device.write)
+    content_before = _in_thread(Device.content_before)
+    carry_out = _in_thread(Device.carry_out)
+    flash = _in_thread(Device.flash)
+    rescue = _in_thread(Device.rescue)
+    upgrade = _in_thread(Device.upgrade)
+    verify = _in_thread(Device.verify)
+    reset = _in_thread(Device.reset)
+    run = _in_thread(Device.run)
 
     @overload
     async def read(self, what: type[C], **watch: Unpack[Watch]) -> C: ...
     @overload
     async def read(self, what: str, **watch: Unpack[Watch]) -> Content: ...
     async def read(self, what: str | type[Content], **watch: Unpack[Watch]) -> Content:
-        return await self._run(self._steps.read(what), watch)
+        """Read an item, as `Device.read` does."""
+        return await self._call(Device.read, what, **watch)
 
-    async def read_memory(self, start: int, end: int, **watch: Unpack[Watch]) -> bytes:
-        return await self._run(self._steps.read_memory(start, end), watch)
-
-    async def write(
-        self,
-        name: str,
-        *values: object,
-        manufacturer: bool = False,
-        **watch: Unpack[Watch],
-    ) -> Written:
-        return await self._run(self._steps.write(name, values, manufacturer=manufacturer), watch)
-
-    async def flash(
-        self,
-        image: str | os.PathLike[str] | Image,
-        *,
-        options: UpgradeOptions | None = None,
-        verify: Level | str | None = None,
-        identity: Identity | None = None,
-        in_session: bool = False,
-        **watch: Unpack[Watch],
-    ) -> Result:
+    async def _call(self, method: Callable[..., T], *args: object, **kwargs: Any) -> T:
         import asyncio  # noqa: PLC0415  for programs that have it already
 
-        job = await asyncio.to_thread(
-            partial(self._job, image, options, verify, identity, in_session=in_session)
-        )
-        return _checked(await self._run(job.procedure(self._steps), watch))
-
-    async def rescue(
-        self,
-        image: str | os.PathLike[str] | Image,
-        *,
-        options: UpgradeOptions | None = None,
-        verify: Level | str | None = None,
-        identity: Identity | None = None,
-        in_session: bool = False,
-        **watch: Unpack[Watch],
-    ) -> Result:
-        import asyncio  # noqa: PLC0415  for programs that have it already
-
-        job = await asyncio.to_thread(
-            partial(
-                self._job, image, options, verify, identity, in_session=in_session, at_power_up=True
-            )
-        )
-        return _checked(await self._run(job.procedure(self._steps), watch))
-
-    async def upgrade(
-        self,
-        image: Image | Plan,
-        *,
-        options: UpgradeOptions | None = None,
-        verify: Level | None = None,
-        identity: Identity | None = None,
-        **watch: Unpack[Watch],
-    ) -> Result:
-        return await self._run(self._steps.upgrade(image, options, verify, identity), watch)
-
-    async def verify(
-        self, image: Image | Plan, level: Level | str = Level.VERSION, **watch: Unpack[Watch]
-    ) -> Verification:
-        return await self._run(self._steps.verify(image, as_level(level)), watch)
-
-    async def reset(self, **watch: Unpack[Watch]) -> None:
-        await self._run(self._steps.reset(), watch)
-
-    async def _run(self, procedure: Procedure[T], of_call: Watch) -> T:
-        import asyncio  # noqa: PLC0415  for programs that have it already
-
-        turn = self.connection._turn  # noqa: SLF001  of this module
-        while not turn.acquire(blocking=False):
-            await asyncio.sleep(_TURN_PAUSE_S)
-        try:
-            return await self._finished(procedure, {**self._watch, **of_call})
-        finally:
-            turn.release()
-
-    async def _finished(self, procedure: Procedure[T], watch: Watch) -> T:
-        import asyncio  # noqa: PLC0415  for programs that have it already
-
-        try:
-            step = next(procedure)
-            while True:
-                try:
-                    came = await self._do(step, watch)
-                except (FlasherError, asyncio.CancelledError) as error:
-                    step = procedure.throw(error)
-                else:
-                    step = procedure.send(came)
-        except StopIteration as end:
-            result: T = end.value
-            return result
-
-    async def _do(self, step: Step, watch: Watch) -> bool:
-        link, clock = self.connection.link, self.connection.clock
-        match step:
-            case Run():
-                await adrive(
-                    step.engine,
-                    link,
-                    clock,
-                    taps=(*watch.get("taps", ()), *step.taps),
-                    on_event=_teller(watch, step.on_event),
-                    cancelled=self._cancelled(step, watch),
-                )
-            case WaitUntil():
-                import asyncio  # noqa: PLC0415  for programs that have it already
-
-                await asyncio.to_thread(clock.wait_until, step.moment)
-                cancelled = self._cancelled(step, watch)
-                return cancelled is not None and cancelled()
-            case Tell():
-                _teller(watch)(step.event)
-        return False
+        watch = {**self._watch, **kwargs}
+        loop = asyncio.get_running_loop()
+        hand = _Hand(loop, watch.get("on_event"), watch.get("cancelled"))
+        kwargs["cancelled"] = hand.is_cancelled
+        if hand.on_event is not None:
+            kwargs["on_event"] = hand.over
+        call = partial(copy_context().run, method, self._device, *args, **kwargs)
+        # Not to_thread: its task is cancelled with all others at the end of a loop, before the call
+        # has ended.
+        work = loop.run_in_executor(None, call)
+        while not work.done():
+            try:
+                await asyncio.wait([work])
+            except asyncio.CancelledError:
+                hand.task_is_cancelled = True
+        if hand.task_is_cancelled:
+            raise asyncio.CancelledError from work.exception()
+        return work.result()
 
 
-def _alone(engine: Engine) -> Procedure[None]:
-    yield Run(engine)
+@dataclass
+class _Hand:
+    """Between a call in a thread and the event loop that awaits it."""
+
+    loop: AbstractEventLoop
+    on_event: EventHandler | None
+    cancelled: Callable[[], bool] | None
+    task_is_cancelled: bool = False
+    loop_is_gone: bool = False
+
+    def is_cancelled(self) -> bool:
+        """Asked in the thread."""
+        if self.task_is_cancelled or self.loop_is_gone or self.loop.is_closed():
+            return True
+        return self.cancelled is not None and self.cancelled()
+
+    def over(self, event: object) -> None:
+        """Have the loop handle an event, and wait for that in the thread: as long as there is a
+        loop. Raises what the handler raised.
+        """
+        from concurrent.futures import Future, wait  # noqa: PLC0415  no use without a loop
+
+        handled: Future[None] = Future()
+
+        def handle() -> None:
+            try:
+                if self.on_event is not None:
+                    self.on_event(event)
+            except BaseException as error:  # noqa: BLE001  raised in the thread
+                handled.set_exception(error)
+            else:
+                handled.set_result(None)
+
+        with suppress(RuntimeError):  # it has been closed
+            self.loop.call_soon_threadsafe(handle)
+        while not (self.loop_is_gone or self.loop.is_closed()):
+            if wait([handled], _LOOP_GONE_S).done:
+                handled.result()
+                return
+            self.loop_is_gone = not self.loop.is_running()
 
 
 # -- an image for a device ------------------------------------------------------------------------
@@ -717,8 +663,8 @@ class Job:
         """The same for a device that an earlier upgrade may have left in its session (R26)."""
         return replace(self, options=replace(self.options, in_session=True))
 
-    def procedure(self, steps: Procedures) -> Procedure[Result]:
-        """What carries it out, to its end, good or bad."""
+    def carry_out(self, steps: Procedures) -> Result:
+        """To its end, good or bad."""
         return steps.upgrade(self.plan, self.options, self.level, self.identity)
 
 
@@ -759,14 +705,6 @@ def prepare(
     level = default_level(plan.target, chosen) if verify is None else as_level(verify)
     check_level(plan, level, chosen)
     return Job(plan, chosen, level, identity, tuple(checks), tuple(sorted(names)))
-
-
-def _checked(result: Result) -> Result:
-    """The result of a good session. Raises the error of every other one."""
-    error = result.error()
-    if error is not None:
-        raise error
-    return result
 
 
 def flash(

@@ -1,7 +1,5 @@
 """The one loop: runs an engine on a link against a clock until it is done.
 
-`drive` blocks while it waits for a frame; `adrive` awaits it. All else they share.
-
 Its rules: everything that waits is received before `tick`, which is told the time of before, so
 that a stall of the computer does not become a timeout of the device; frames go out one at a time
 and the engine is told when each was accepted; waiting is a blocking receive with a deadline.
@@ -9,7 +7,7 @@ and the engine is told when each was accepted; waiting is a blocking receive wit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
 from flasher import events
@@ -50,75 +48,6 @@ def drive(
     loop for more than `STALL_S`; `cancelled` is asked between frames, and ends the engine at its
     next message boundary. Raises BusError when the link fails.
     """
-    turns = _turns(engine, link, clock, taps, on_event, cancelled)
-    until = next(turns, None)
-    while until is not None:
-        try:
-            until = turns.send(link.receive(until))
-        except StopIteration:
-            return
-
-
-async def adrive(
-    engine: Engine,
-    link: Link,
-    clock: Clock,
-    *,
-    taps: Sequence[Tap] = (),
-    on_event: Callable[[object], None] | None = None,
-    cancelled: Callable[[], bool] | None = None,
-) -> None:
-    """`drive` for programs with an event loop: the link is used in a thread, one turn at a time.
-
-    `on_event` is called in the event loop, `taps` and `cancelled` in the thread. A task that is
-    cancelled meanwhile first ends the engine at its next message boundary.
-    """
-    import asyncio  # noqa: PLC0415  for programs that have it already
-
-    happened: list[object] = []
-    is_given_up = False
-
-    def is_cancelled() -> bool:
-        return is_given_up or (cancelled is not None and cancelled())
-
-    turns = _turns(engine, link, clock, taps, happened.append, is_cancelled)
-
-    def turn(until: float | None) -> float | None:
-        if until is None:
-            return next(turns, None)
-        try:
-            return turns.send(link.receive(until))
-        except StopIteration:
-            return None
-
-    until: float | None = None
-    while True:
-        work = asyncio.ensure_future(asyncio.to_thread(turn, until))
-        while not work.done():
-            try:
-                await asyncio.wait([work])
-            except asyncio.CancelledError:
-                is_given_up = True
-        for event in happened:
-            if on_event is not None:
-                on_event(event)
-        happened.clear()
-        until = work.result()
-        if until is None:
-            break
-    if is_given_up:
-        raise asyncio.CancelledError
-
-
-def _turns(
-    engine: Engine,
-    link: Link,
-    clock: Clock,
-    taps: Sequence[Tap],
-    on_event: Callable[[object], None] | None,
-    cancelled: Callable[[], bool] | None,
-) -> Generator[float, Frame | None]:
-    """The loop without its waiting: yields until when to receive, and is sent what came."""
     link.drain()
     cancel_seen = False
     came = None
@@ -154,7 +83,7 @@ def _turns(
         until = rests_at + MAX_WAIT_S * clock.speed
         if wanted is not None:
             until = min(until, wanted)
-        came = yield until
+        came = link.receive(until)
         late_s = rests_at - now + max(0.0, clock.now() - max(until, rests_at))
 
 

@@ -1,21 +1,17 @@
-"""What is done with a device, step by step, without the waiting.
-
-A procedure is a generator: it yields what has to happen next (an engine to run, a moment to wait
-for), and returns its result. `flasher.api` runs procedures: `Device` blocks meanwhile,
-`AsyncDevice` awaits. An error of a step is thrown into the procedure.
-"""
+"""What a `Device` of `flasher.api` does, step by step: engines that are run one after the other."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from math import ceil, inf
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypedDict
 
 from flasher import events
 from flasher.bus.health import LinkHealth, TroubleKind, bus_off_error
 from flasher.bus.link import SEND_LIMIT_S, Clock, Link
-from flasher.driver import Tap
+from flasher.driver import Tap, drive
 from flasher.errors import (
     BusError,
     ErrorCode,
@@ -57,6 +53,7 @@ from flasher.host.write import WritePlan, Written, plan_write
 from flasher.image.image import Image
 from flasher.image.plan import Plan, make_plan
 from flasher.image.sample import is_sample, refused_sample
+from flasher.log import log_event
 from flasher.prose import prose
 from flasher.protocol.catalogue import BY_KEY, Item
 from flasher.protocol.contents import Memory, Reset, VersionInformation
@@ -79,43 +76,20 @@ _REOPEN_PAUSE_S: Final = 0.1
 """Between two tries to open a lost adapter again."""
 
 
-@dataclass(frozen=True)
-class Run:
-    """A step: run this engine until it is done. `taps` see the frames beside those of the caller.
-
-    Without `may_cancel` the user does not end it; a terminal that hangs up ends it only while
-    `hang_up_ends` says so. `on_event` gets its events before the caller does.
-    """
-
-    engine: Engine
-    taps: Sequence[Tap] = ()
-    may_cancel: bool = True
-    hang_up_ends: Callable[[], bool] | None = None
-    on_event: Callable[[object], None] | None = None
+EventHandler = Callable[[object], None]
 
 
-@dataclass(frozen=True)
-class WaitUntil:
-    """A step: wait for this moment of the connection's clock. True is sent back when the user has
-    cancelled, or when the terminal hung up and that ends it.
-    """
+class Watch(TypedDict, total=False):
+    """How a call is watched and ended; what is left out is as the device was made."""
 
-    moment: float
-    hang_up_ends: Callable[[], bool]
-
-
-@dataclass(frozen=True)
-class Tell:
-    """A step: report this event."""
-
-    event: object
-
-
-Step = Run | WaitUntil | Tell
-
-
-T = TypeVar("T")
-Procedure = Generator[Step, bool, T]
+    taps: Sequence[Tap]
+    """See every frame in both directions."""
+    on_event: EventHandler | None
+    """Gets what happens, as dataclasses of `flasher.events`."""
+    cancelled: Callable[[], bool] | None
+    """Asked while it runs; ends it at the next message boundary."""
+    hung_up: Callable[[], bool] | None
+    """The same for a terminal that is gone: it does not end an upgrade that has begun to erase."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +152,7 @@ class DeviceInfo:
 
 @dataclass(frozen=True)
 class Procedures:
-    """The procedures for the target of a profile, on a link with its clock."""
+    """The procedures for the target of a profile, on a link with its clock: for one call."""
 
     link: Link
     clock: Clock
@@ -186,31 +160,77 @@ class Procedures:
     bit_rate: BitRate | None
     is_alone: bool
     """Nobody else can speak as the tool on this bus: it is not listened for before asking."""
+    watch: Watch
 
     @property
     def target(self) -> Target:
         return self.profile.target
 
+    # -- waiting ---------------------------------------------------------------------------------
+
+    def run(
+        self,
+        engine: Engine,
+        *,
+        taps: Sequence[Tap] = (),
+        may_cancel: bool = True,
+        hang_up_ends: Callable[[], bool] | None = None,
+        on_event: EventHandler | None = None,
+    ) -> None:
+        """Run an engine until it is done. `taps` see the frames after those of the caller, and
+        `on_event` gets its events before the caller does.
+
+        Without `may_cancel` the user does not end it; a terminal that hangs up ends it only while
+        `hang_up_ends` says so.
+        """
+        drive(
+            engine,
+            self.link,
+            self.clock,
+            taps=(*self.watch.get("taps", ()), *taps),
+            on_event=partial(self._tell, of_step=on_event),
+            cancelled=partial(self._is_cancelled, hang_up_ends) if may_cancel else None,
+        )
+
+    def _wait_until(self, moment: float, hang_up_ends: Callable[[], bool]) -> bool:
+        """Wait for this moment of the clock. True when the user has cancelled, or when the terminal
+        hung up and that ends it.
+        """
+        self.clock.wait_until(moment)
+        return self._is_cancelled(hang_up_ends)
+
+    def _is_cancelled(self, hang_up_ends: Callable[[], bool] | None) -> bool:
+        cancelled, hung_up = self.watch.get("cancelled"), self.watch.get("hung_up")
+        if cancelled is not None and cancelled():
+            return True
+        return bool(hang_up_ends and hung_up and hung_up() and hang_up_ends())
+
+    def _tell(self, event: object, of_step: EventHandler | None = None) -> None:
+        log_event(event)
+        for handle in (of_step, self.watch.get("on_event")):
+            if handle is not None:
+                handle(event)
+
     # -- asking ----------------------------------------------------------------------------------
 
-    def listen_first(self) -> Procedure[None]:
+    def listen_first(self, *, may_cancel: bool = True) -> None:
         """Listen for another tool before asking: a question in the middle of its packet spoils it.
         Raises BusError when there is one.
         """
         if not self.is_alone:
-            _check_no_other_tool((yield from self._survey((), LISTEN_FIRST_S)))
+            _check_no_other_tool(self._survey((), LISTEN_FIRST_S, may_cancel=may_cancel))
 
-    def ask(self, request: Request, *, for_write: str = "") -> Procedure[Content]:
+    def ask(self, request: Request, *, for_write: str = "") -> Content:
         """Ask one question. Raises NoAnswerError, and what `_asked` raises."""
-        yield from self.listen_first()
-        query = yield from self._asked(request, for_write=for_write)
+        self.listen_first()
+        query = self._asked(request, for_write=for_write)
         if query.cancelled:
             raise _interrupted()
         if query.answer is None:
             raise _no_answer(query)
         return query.answer
 
-    def read(self, what: str | type[Content]) -> Procedure[Content]:
+    def read(self, what: str | type[Content]) -> Content:
         """Read an item by its name, or by the type of its content."""
         return self.ask(Request(self._readable(what).item))
 
@@ -228,7 +248,7 @@ class Procedures:
             remedy=f"Read by name: {names or ', '.join(items) or 'there are none'}.",
         )
 
-    def version(self) -> Procedure[Content]:
+    def version(self) -> Content:
         """The answer to the version request of the document or the product."""
         request = self.profile.upgrade_options().version_request_for(self.target)
         if request is None:
@@ -238,15 +258,15 @@ class Procedures:
             )
         return self.ask(request)
 
-    def read_memory(self, start: int, end: int) -> Procedure[bytes]:
+    def read_memory(self, start: int, end: int) -> bytes:
         """The bytes from `start` up to `end`, exclusive (R5)."""
         if READ_MEMORY.receiver is not self.target.node:
             node = self.target.node.name
             raise UsageError(f"The documents give no way to read memory of the {node}.")
         check_range(start, end)
-        yield from self.listen_first()
+        self.listen_first()
         reading = self._queries(memory_requests(start, end))
-        yield Run(reading)
+        self.run(reading)
         data = b"".join(piece_of(each) for each in reading.answers if isinstance(each, Memory))
         if len(data) == end - start:
             return data
@@ -257,7 +277,7 @@ class Procedures:
         error.cause = "the address is outside of what the device shows, or it went away"
         raise error
 
-    def reset(self) -> Procedure[None]:
+    def reset(self) -> None:
         """Restart the application, by the reset of the document or the product (R3)."""
         profile = self.profile
         reset = BY_KEY.get((self.target.request_id, Command.RESET))
@@ -267,48 +287,44 @@ class Procedures:
                 f"The documents give no reset for the {self.target.name}.",
                 code=ErrorCode.NOT_IN_DOCUMENTS,
             )
-        yield from self.ask(Request(reset, Reset()))
+        self.ask(Request(reset, Reset()))
 
     # -- writing ---------------------------------------------------------------------------------
 
-    def content_before(self, plan: WritePlan) -> Procedure[Content]:
+    def content_before(self, plan: WritePlan) -> Content:
         """What the device holds before a write."""
         request = Request(plan.writable.read_back.item)
         try:
-            return (yield from self.ask(request, for_write="Nothing was written."))
+            return self.ask(request, for_write="Nothing was written.")
         except NoAnswerError as error:
             error.remedy = f"Nothing was written. {error.remedy}"
             raise
 
-    def carry_out(self, plan: WritePlan, before: Content | None) -> Procedure[Written]:
+    def carry_out(self, plan: WritePlan, before: Content | None) -> Written:
         """Write, wait for general feedback, read back. What went wrong stands in the result.
 
         A write that was begun is looked after: it takes seconds, and is not ended by the user.
         """
-        for step in self.listen_first():
-            assert isinstance(step, Run)  # noqa: S101  it listens
-            yield replace(step, may_cancel=False)
+        self.listen_first(may_cancel=False)
         request = Request(plan.writable.item, plan.content)
         both = "Each of them may hold the new value."
-        query = yield from self._asked(request, may_cancel=False, for_write=both)
+        query = self._asked(request, may_cancel=False, for_write=both)
         written = Written(plan, before, query.answer is not None, None)
         for _ in range(2):
             # An answer on a broadcast id may be one to somebody who asked before the write.
             request = Request(plan.writable.read_back.item)
-            again = yield from self._asked(request, may_cancel=False)
+            again = self._asked(request, may_cancel=False)
             written = replace(written, read_back=again.answer)
             if not written.differences:
                 break
         return written
 
-    def write(
-        self, name: str, values: Sequence[object], *, manufacturer: bool
-    ) -> Procedure[Written]:
+    def write(self, name: str, values: Sequence[object], *, manufacturer: bool) -> Written:
         """Write an item by name and read it back."""
         dialect = self.profile.dialect
         plan = plan_write(name, values, self.target, dialect=dialect, manufacturer=manufacturer)
-        before = yield from self.content_before(plan)
-        written = yield from self.carry_out(plan, before)
+        before = self.content_before(plan)
+        written = self.carry_out(plan, before)
         error = written.error()
         if error is not None:
             raise error
@@ -316,11 +332,11 @@ class Procedures:
 
     # -- looking ---------------------------------------------------------------------------------
 
-    def identify(self) -> Procedure[DeviceInfo]:
+    def identify(self) -> DeviceInfo:
         """Ask everything that the documents let one ask; listen only where they give nothing."""
         items = readable(self.target, self.profile.dialect)
         asked = [entry for entry in items.values() if not entry.field]
-        survey = yield from self._survey(
+        survey = self._survey(
             [Request(entry.item) for entry in asked],
             INFO_LISTEN_S if asked else INFO_LISTEN_ONLY_S,
         )
@@ -330,10 +346,10 @@ class Procedures:
         readings = tuple(_reading(entry, done.get(entry.name)) for entry in asked)
         return DeviceInfo(self.target, self.profile.dialect, readings, survey)
 
-    def is_heard(self) -> Procedure[bool]:
+    def is_heard(self) -> bool:
         """Listen for the device, and ask it for its version where it has a query for that."""
         request = self.profile.upgrade_options().version_request_for(self.target)
-        survey = yield from self._survey(
+        survey = self._survey(
             () if request is None else [request],
             INFO_LISTEN_ONLY_S if request is None else INFO_LISTEN_S,
         )
@@ -341,13 +357,15 @@ class Procedures:
         heard = survey.heard.get(self.target.node)
         return heard is not None and bool(heard.messages)
 
-    def scan(self) -> Procedure[Survey]:
+    def scan(self) -> Survey:
         """Listen for a second, then ask the BMS for its version and state."""
         items = readable(BMS, self.profile.dialect)
         names = ("version-information", "running-information")
         return self._survey([Request(items[name].item) for name in names], SCAN_LISTEN_S)
 
-    def _survey(self, requests: Sequence[Request], listen_s: float) -> Procedure[Survey]:
+    def _survey(
+        self, requests: Sequence[Request], listen_s: float, *, may_cancel: bool = True
+    ) -> Survey:
         survey = Survey(
             requests,
             listen_s=listen_s,
@@ -355,19 +373,17 @@ class Procedures:
             dialect=self.profile.dialect,
             timings=self.profile.timings,
         )
-        yield Run(survey)
+        self.run(survey, may_cancel=may_cancel)
         if survey.cancelled:
             raise _interrupted()
         return survey
 
-    def _asked(
-        self, request: Request, *, may_cancel: bool = True, for_write: str = ""
-    ) -> Procedure[Query]:
+    def _asked(self, request: Request, *, may_cancel: bool = True, for_write: str = "") -> Query:
         """The question, asked. Raises WrongDeviceError when two devices answer in a write; its
         argument says what may be written.
         """
         queries = self._queries([request])
-        yield Run(queries, may_cancel=may_cancel)
+        self.run(queries, may_cancel=may_cancel)
         if for_write and queries.twins.evidence:
             raise two_devices(self.target, queries.twins.evidence, for_write)
         return queries.queries[0]
@@ -393,22 +409,22 @@ class Procedures:
         rate = None if self.bit_rate is None else self.bit_rate.bps
         return plan_for(image, self.profile, rate)
 
-    def verify(self, image: Image | Plan, level: Level) -> Procedure[Verification]:
+    def verify(self, image: Image | Plan, level: Level) -> Verification:
         """Whether the device runs this image: by its version, then by its memory."""
         plan, options = self.plan(image), self.profile.upgrade_options()
         check_level(plan, level, options)
         if level is Level.NONE:
             return NOT_ASKED
-        yield from self.listen_first()
-        verification = yield from self.checked(version_check(plan, options))
+        self.listen_first()
+        verification = self.checked(version_check(plan, options))
         if level is Level.MEMORY and verification.ok:
             check = memory_check(plan, options, verification.running_version)
-            verification = yield from self.checked(check)
+            verification = self.checked(check)
         return verification
 
-    def checked(self, check: Runner[Verification]) -> Procedure[Verification]:
+    def checked(self, check: Runner[Verification]) -> Verification:
         """What a check found. Raises InterruptedByUserError when it did not come to its end."""
-        yield Run(check)
+        self.run(check)
         if check.result.verdict is Verdict.INTERRUPTED:
             raise _interrupted()
         return check.result
@@ -419,7 +435,7 @@ class Procedures:
         options: UpgradeOptions | None,
         verify: Level | None,
         identity: Identity | None,
-    ) -> Procedure[Result]:
+    ) -> Result:
         """Run one upgrade to its end, good or bad, and verify a good one. Raises ImageError for a
         firmware sample on a physical adapter.
 
@@ -441,7 +457,7 @@ class Procedures:
             )
         return self._session(Session(plan, chosen, level, identity or Identity()), chosen)
 
-    def _session(self, session: Session, options: UpgradeOptions) -> Procedure[Result]:
+    def _session(self, session: Session, options: UpgradeOptions) -> Result:
         stalls_s: list[float] = []
         has_sent = False
 
@@ -454,7 +470,7 @@ class Procedures:
             has_sent = has_sent or sent
 
         taps = (note_sent, self._end_when_off)
-        run = Run(session, taps, hang_up_ends=_may_end(session), on_event=note_stall)
+        may_end = _may_end(session)
         link = self.link
         before = link.health()
         self._check_bus("before anything was sent", session, before)
@@ -462,14 +478,14 @@ class Procedures:
         try:
             while True:
                 try:
-                    yield run
+                    self.run(session, taps=taps, hang_up_ends=may_end, on_event=note_stall)
                     break
                 except TransmitBlockedError as error:
-                    received = yield from self._await_contact(session, error, received)
+                    received = self._await_contact(session, error, received)
                 except BusError as error:
                     limit_s = inf if has_sent else BRIEF_ADAPTER_RETURN_S
                     wait_s = min(options.adapter_return_s, limit_s)
-                    yield from self._await_adapter(session, error, wait_s)
+                    self._await_adapter(session, error, wait_s)
                 session.link_back(self.clock.now())
         except (BusError, InterruptedByUserError) as error:
             # The adapter does not know what it was used for.
@@ -513,7 +529,7 @@ class Procedures:
 
     def _await_contact(
         self, session: Session, blocked: TransmitBlockedError, told_at: int | None
-    ) -> Procedure[int]:
+    ) -> int:
         """Let a session go on whose frames do not leave: a device without power acknowledges none.
         Reported unless nothing has arrived since it was, at `told_at` frames; returns how many
         have. Raises the error where there is something to lose, and where the overall deadline
@@ -524,19 +540,19 @@ class Procedures:
             raise blocked
         received = self.link.health().frames_received
         if received != told_at:
-            yield Tell(events.BusBlocked(blocked.what, left_s))
-        yield WaitUntil(self.clock.now() + _REOPEN_PAUSE_S, _may_end(session))
+            self._tell(events.BusBlocked(blocked.what, left_s))
+        self._wait_until(self.clock.now() + _REOPEN_PAUSE_S, _may_end(session))
         return received
 
-    def _await_adapter(self, session: Session, lost: BusError, wait_s: float) -> Procedure[None]:
+    def _await_adapter(self, session: Session, lost: BusError, wait_s: float) -> None:
         """Wait for a lost adapter, where an attempt is left for it; raises BusError without."""
         if not session.may_begin_again or not wait_s:
             raise lost
-        yield Tell(events.AdapterLost(lost.what, wait_s))
-        yield from self._reopen(session, lost, wait_s)
-        yield Tell(events.AdapterBack())
+        self._tell(events.AdapterLost(lost.what, wait_s))
+        self._reopen(session, lost, wait_s)
+        self._tell(events.AdapterBack())
 
-    def _reopen(self, session: Session, lost: BusError, wait_s: float) -> Procedure[None]:
+    def _reopen(self, session: Session, lost: BusError, wait_s: float) -> None:
         """Open a lost adapter again, as soon as it is back. Raises BusError when it is not within
         the time given and the overall deadline, InterruptedByUserError when the user has enough.
         """
@@ -547,8 +563,8 @@ class Procedures:
                 raise lost
             give_up_at = min(give_up_at, session.deadline_at)
         told_s = ceil(wait_s)
-        yield Tell(events.AdapterAwaited(told_s))
-        is_cancelled = yield WaitUntil(now, _may_end(session))
+        self._tell(events.AdapterAwaited(told_s))
+        is_cancelled = self._wait_until(now, _may_end(session))
         while True:
             if is_cancelled:
                 raise InterruptedByUserError(
@@ -572,9 +588,9 @@ class Procedures:
                 left_s = ceil(give_up_at - now)
                 if left_s < told_s:
                     told_s = left_s
-                    yield Tell(events.AdapterAwaited(left_s))
+                    self._tell(events.AdapterAwaited(left_s))
                 until = min(give_up_at, now + _REOPEN_PAUSE_S)
-                is_cancelled = yield WaitUntil(until, _may_end(session))
+                is_cancelled = self._wait_until(until, _may_end(session))
             else:
                 return
 
