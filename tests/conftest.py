@@ -5,16 +5,49 @@ from __future__ import annotations
 import gc
 import os
 import sys
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Generator, Iterator
+from typing import TYPE_CHECKING, TypeVar
 
 import pytest
 
 if TYPE_CHECKING:
     from tests.station.postgres import Server
 
-POSTGRES_REQUIRED = "FLASHER_TEST_POSTGRES"
-"""With this variable a missing server is an error, not a reason to skip."""
+_Report = TypeVar("_Report", pytest.TestReport, pytest.CollectReport)
+
+NO_SKIPS = "FLASHER_TEST_NO_SKIPS"
+"""With this variable a skipped test has failed: nothing that it needs may be missing."""
+_SLOW_FIXTURES = frozenset({"browser", "postgres"})
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """`pytest` alone runs the first lane; `pytest -m slow` the second; what is named runs whole."""
+    if config.args_source is not pytest.Config.ArgsSource.ARGS and not config.option.markexpr:
+        config.option.markexpr = "not slow and not kernel"
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        needed = getattr(item, "fixturenames", ())
+        if not _SLOW_FIXTURES.isdisjoint(needed) or "postgresql" in item.nodeid:
+            item.add_marker(pytest.mark.slow)
+
+
+def _fail_if_skipped(report: _Report) -> _Report:
+    if report.skipped and os.environ.get(NO_SKIPS) and not hasattr(report, "wasxfail"):
+        report.outcome = "failed"
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    return _fail_if_skipped((yield))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report() -> Generator[None, pytest.CollectReport, pytest.CollectReport]:
+    return _fail_if_skipped((yield))
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -64,9 +97,6 @@ def postgres() -> Iterator[Server]:
 
     programs = find_programs()
     if programs is None:
-        why = "PostgreSQL is not installed (Debian: apt-get install postgresql)"
-        if os.environ.get(POSTGRES_REQUIRED):
-            pytest.fail(f"{why}, and {POSTGRES_REQUIRED} wants it")
-        pytest.skip(why)
+        pytest.skip("PostgreSQL is not installed (Debian: apt-get install postgresql)")
     with running_server(programs) as server:
         yield server

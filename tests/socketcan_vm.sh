@@ -72,7 +72,7 @@ if [ -n "$candlelight" ]; then
     mkfifo "$FLASHER_CANDLELIGHT"
     "$candlelight" "$FLASHER_CANDLELIGHT" 2>"$folder/candlelight.log" &
 fi
-"$PYTHON" -m pytest -n 0 -m socketcan -k "$only" -v -rsP --color=no --tb=short --durations=5 \
+"$PYTHON" -m pytest -n 0 -m kernel -k "$only" -v -rsP --color=no --tb=short --durations=5 \
     -p no:cacheprovider -p tests.end_to_end.forks -p no:hypothesispytest -p no:anyio \
     tests/end_to_end/test_{socketcan,candlelight,sja1000,printed_commands,can_tools}.py
 [ -n "$here" ] || echo "$SECONDS s in all"

@@ -12,6 +12,8 @@ from threading import Event as Flag
 from threading import Thread
 from types import FrameType
 
+import pytest
+
 from flasher import events
 from flasher.bus.adapter import open_adapter
 from flasher.bus.link import MonotonicClock
@@ -30,10 +32,12 @@ CALLS_MAX = 250
 HOPS_MAX = 12
 
 
+@pytest.mark.slow
 def test_the_drawing_is_that_of_the_imports() -> None:
     assert architecture.page(TEXT) == TEXT, "draw it anew: python -m tests.architecture"
 
 
+@pytest.mark.slow
 def test_no_package_imports_itself_by_way_of_others() -> None:
     edges = architecture.imports()
     assert [name for name in edges if name in architecture._reached(edges, name)] == []

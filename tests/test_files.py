@@ -17,6 +17,8 @@ from flasher.files import opened, read
 from flasher.protocol.spec import BMS, IMAGE_MAX_SIZE
 from flasher.settings.profile import load_profile
 
+pytestmark = pytest.mark.slow
+
 
 def append(path: Path) -> None:
     with path.open("ab") as file:

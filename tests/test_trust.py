@@ -220,6 +220,7 @@ def test_a_file_that_no_trace_can_be_written_to_is_neither_made_nor_emptied(
     assert path.read_bytes() == b"of before"
 
 
+@pytest.mark.slow
 def test_what_a_device_told_is_its_owners(
     flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -427,6 +427,7 @@ def test_a_bad_image_is_refused_before_anything_is_opened(
 # -- the tour in the package's docstring ----------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_examples_of_the_tour_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

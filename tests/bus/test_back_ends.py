@@ -710,6 +710,7 @@ def socketcand() -> Iterator[tuple[CanLink, socket.socket]]:
         server.close()
 
 
+@pytest.mark.slow
 def test_a_socketcand_that_sends_nonsense_or_is_gone_is_lost() -> None:
     with socketcand() as (link, server):
         server.sendall(b"< frame 725 0.1 01 >< frame 7zz 0.2 01 >")

@@ -111,6 +111,7 @@ def test_a_serial_port_is_the_same_by_its_link(tmp_path: Path) -> None:
     give_back()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="needs links and SIGKILL")
 def test_who_was_killed_holds_nothing() -> None:
     script = (

@@ -340,6 +340,7 @@ def test_the_devices_choices_decide_the_exit_code(
 # -- as a process ---------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_help_is_quick_and_importing_flasher_loads_no_command_line_and_no_can() -> None:
     code = (
         "import sys, flasher; "

@@ -109,6 +109,7 @@ def test_what_never_began_is_not_kept(flasher: Flasher, file: Path, words: tuple
     assert not file.exists()
 
 
+@pytest.mark.slow
 def test_one_that_was_killed_shows_without_an_end(flasher: Flasher) -> None:
     words = [sys.executable, "-m", "flasher", "flash", WMC, "-t", "wmc", "--mock"]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as process:

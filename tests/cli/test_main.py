@@ -147,6 +147,7 @@ def test_a_result_that_cannot_be_written_is_an_error_of_its_own(
     assert "Standard output cannot be written: No space left" in said
 
 
+@pytest.mark.slow
 @posix_pipes
 def test_a_pipe_that_breaks_in_the_transfer_leaves_upgrade_and_exit_code_alone(
     tmp_path: Path,

@@ -198,6 +198,7 @@ def test_a_bus_is_watched_and_nothing_is_sent(flasher: Flasher) -> None:
     assert run.out.count("foreign frame") == 3
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX")
 def test_ctrl_c_ends_it_with_exit_code_0() -> None:
     process = subprocess.Popen(

@@ -126,6 +126,7 @@ def test_the_wait_for_a_lost_adapter_is_counted_down_in_one_line(
 # -- a real process on a terminal -----------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_bar_with_bytes_and_rate_appears_and_does_not_tear_the_lines(
     terminal: Terminal,
 ) -> None:
@@ -141,6 +142,7 @@ def test_a_bar_with_bytes_and_rate_appears_and_does_not_tear_the_lines(
     assert max(map(len, shown)) <= COLUMNS
 
 
+@pytest.mark.slow
 def test_quiet_shows_no_bar_on_a_terminal(terminal: Terminal) -> None:
     code, written = flash_on(
         terminal, "-q", "flash", OBC_BIN, "-t", "obc", "--mock", "--mock-speed", "5"
@@ -160,6 +162,7 @@ def test_errors_are_coloured_on_a_terminal_unless_no_color_is_set(
     assert flasher("flash", bad, "-t", "obc", "--mock").err.startswith("error: ")
 
 
+@pytest.mark.slow
 def test_no_color_is_honoured(terminal: Terminal) -> None:
     bad = str(SAMPLES / "bad" / "no_end.hex")
     code, written = flash_on(terminal, "flash", bad, "-t", "obc", "--mock", NO_COLOR="1")

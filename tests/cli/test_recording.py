@@ -126,6 +126,7 @@ def test_what_fails_before_a_frame_was_sent_or_heard_leaves_nothing(
     assert bundles(bundle_folder) == bundles(tmp_path) == []
 
 
+@pytest.mark.slow
 def test_the_users_own_folder_keeps_the_last_fifty_and_explain_finds_the_latest(
     flasher: Flasher, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,6 +32,8 @@ from tests.cli.station_threads import ThreadPort
 from tests.loops import each
 from tests.station.factory import Bench
 
+pytestmark = pytest.mark.slow
+
 RECIPE = SAMPLES / "station" / "recipe.toml"
 RUN = ("station", "run", "--recipe", RECIPE, "--mock-sockets", "2", "--mock-speed", "0")
 

@@ -14,6 +14,8 @@ import pytest
 from tests.cli.conftest import Flasher
 from tests.station.factory import SERIAL, Bench
 
+pytestmark = pytest.mark.slow
+
 
 def test_records_are_served_until_ctrl_c(tmp_path: Path) -> None:
     """To who signs in: that is in the log, since the station alone writes the audit trail."""

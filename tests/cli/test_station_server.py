@@ -19,6 +19,8 @@ from tests.schema_document import SCHEMA
 from tests.station.factory import USUAL, write_recipe
 from tests.station.postgres import Server
 
+pytestmark = pytest.mark.slow
+
 SECRETS = ("s3cr3t", "s3cr3t@x/y:z")
 """The second one is percent-encoded in a URL."""
 ENCODED = {"s3cr3t": "s3cr3t", "s3cr3t@x/y:z": "s3cr3t%40x%2Fy%3Az"}

@@ -155,6 +155,7 @@ def test_what_is_shown_comes_escaped_and_is_no_markup() -> None:
     assert "Battery [b]" in text
 
 
+@pytest.mark.slow
 @each("width", [40, 60, 80, 120, 200])
 @each("height", [12, 24, 60])
 @each("sockets", [1, 4, 16, 64])
@@ -304,6 +305,7 @@ def test_sockets_that_see_no_units_take_no_file() -> None:
 # -- the whole, on a terminal ----------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="terminals of POSIX")
 def test_on_a_terminal_the_table_is_refreshed_and_the_summary_stays(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

@@ -23,6 +23,8 @@ from tests.cli.conftest import SAMPLES, Flasher
 from tests.end_to_end.processes import FLASHER, clean_environment, lines_until
 from tests.loops import each
 
+pytestmark = pytest.mark.slow
+
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 signals_reach_processes = pytest.mark.skipif(
     sys.platform == "win32", reason="Windows sends no Ctrl-C to a single process"

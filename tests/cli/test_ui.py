@@ -103,6 +103,7 @@ def test_an_upgrade_that_went_through_ends_well(
     assert re.fullmatch(r"http://127\.0\.0\.1:\d+/enter\?key=\S{40,}", document["address"])
 
 
+@pytest.mark.slow
 def test_ctrl_c_in_an_upgrade_says_what_is_left(
     flasher: Flasher, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

@@ -113,6 +113,7 @@ def test_a_device_that_resets_at_random_fails_and_the_run_goes_on() -> None:
     assert exit_code(report, was_stopped=False) is ExitCode.PARTIAL
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 def test_behind_a_node_that_takes_the_whole_bus_nothing_can_be_judged() -> None:
     report = run(MockSubject("bms", others=[Babbler(0.0)]), IMPATIENT, selection=SELECTION)
@@ -131,6 +132,7 @@ class BabblingDevice(MockDevice):
         return 0.0
 
 
+@pytest.mark.slow
 def test_a_device_that_babbles_on_its_own_id_does_not_keep_the_run_from_its_end() -> None:
     report = run(
         MockSubject("bms", make_device=device_maker(BabblingDevice)), IMPATIENT, selection=SELECTION

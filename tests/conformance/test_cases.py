@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import pytest
+
 from flasher.conformance.catalogue import CASES, GROUPS, Selection, group_of
 from flasher.conformance.mock import MOCK_PROFILE, MockSubject, profile_of_mock, variant_maker
 from flasher.conformance.profile import profile_keys
@@ -38,6 +40,7 @@ def test_the_mock_passes_as_obc() -> None:
     assert failed(target="obc", only=("RS-01", "RS-04", "UP-06")) == []
 
 
+@pytest.mark.slow
 @each(
     "choices",
     [

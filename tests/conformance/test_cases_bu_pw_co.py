@@ -44,6 +44,7 @@ def test_a_target_without_a_version_query_passes() -> None:
     assert not_passed(*QUICK, target="wmc") == []
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each(
     "choices",

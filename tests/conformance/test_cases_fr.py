@@ -55,6 +55,7 @@ def test_the_mock_passes(target: str, only: tuple[str, ...]) -> None:
     assert failed(report(target=target, only=only)) == []
 
 
+@pytest.mark.slow
 @each(
     "only, choices",
     [
@@ -86,6 +87,7 @@ def test_a_device_that_says_nothing_to_damaged_packets_is_judged_all_the_same() 
     assert failed(report(only=("CR-02",), bad_packet="silence", pause_in_transfer="waits")) == []
 
 
+@pytest.mark.slow
 def test_no_damaged_packet_is_taken_by_the_mock() -> None:
     assert failed(report(only=LONGEST)) == []
 

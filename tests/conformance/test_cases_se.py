@@ -22,6 +22,7 @@ def test_a_target_without_a_version_query_passes() -> None:
     assert not_passed("SE-03", "SE-04", target="wmc") == []
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each(
     "cases, choices",

@@ -27,6 +27,7 @@ def test_a_target_without_a_version_query_passes(target: str) -> None:
     assert not_passed("TX-01", "TX-13", target=target) == []
 
 
+@pytest.mark.slow
 @each(
     "cases, choices",
     [

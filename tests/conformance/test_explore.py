@@ -32,6 +32,7 @@ def _found(explored: Explored) -> tuple[str, str]:
     return explored.finding.rule, " ".join(explored.finding.steps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "choices",
     [
@@ -55,6 +56,7 @@ def test_nothing_is_found_on_a_right_device(target: str) -> None:
     assert explored.steps >= 250
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("variant", "rule", "last", "count"),
     [

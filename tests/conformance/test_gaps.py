@@ -8,6 +8,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import pytest
+
 from flasher.conformance.catalogue import (
     BARE,
     CASES,
@@ -85,11 +87,13 @@ def check_full_bench(cases: Sequence[str]) -> None:
     assert report.in_full == f"{count} of {count} passes were judged in full"
 
 
+@pytest.mark.slow
 @each("target, address", BENCHES)
 def test_what_a_bare_bench_cannot_judge_is_said_beforehand(target: str, address: int) -> None:
     check_bare_bench(target, address, SHORT)
 
 
+@pytest.mark.slow
 def test_on_a_bench_with_everything_every_pass_is_in_full() -> None:
     check_full_bench(SHORT)
 

@@ -169,6 +169,7 @@ def test_every_key_is_asked_or_it_is_said_why_not() -> None:
     assert sorted([*asked, *LIMITS, *NOT_ASKED]) == sorted(profile_keys())
 
 
+@pytest.mark.slow
 @each("turn", range(3))
 def test_each_value_of_each_choice_of_the_device_model_is_seen(turn: int) -> None:
     """No choice has more than three values."""
@@ -187,6 +188,7 @@ def test_each_value_of_each_choice_of_the_device_model_is_seen(turn: int) -> Non
     assert set(asked.open) - {"limits.pause_s"} == OPEN
 
 
+@pytest.mark.slow
 @each(
     "make, wanted",
     [
@@ -237,6 +239,7 @@ def test_other_ways_are_seen(make: Callable[[], Subject], wanted: dict[str, Any]
     assert {key: found[key] for key in wanted} == wanted
 
 
+@pytest.mark.slow
 def test_no_limit_is_shorter_than_what_the_device_needs() -> None:
     slow = values(ask(bench(SlowBursts("bms", capacity_bytes=3000)), ConformanceProfile()))
     assert slow["limits.ack_s"] > 3 * 0.4
@@ -270,6 +273,7 @@ def test_what_differs_is_either_or_stays_open() -> None:
     assert unheard.seen == "no value describes this: COMPLETE to it, 1 of 1 times"
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each("seed", ["7/0"])
 def test_the_suite_passes_by_the_profile_that_is_written(seed: str) -> None:
@@ -287,11 +291,13 @@ def check_python_bootloader(cases: Sequence[str]) -> None:
     assert [str(one.first_failure) for one in report.results if one.first_failure] == []
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 def test_the_bootloader_of_others_passes_by_its_profile() -> None:
     check_python_bootloader(("UP-05", "UP-08", "EN-02"))
 
 
+@pytest.mark.slow
 def test_only_the_good_image_is_completed_and_it_is_there_in_the_end() -> None:
     subject = mock(Witness)
     assert isinstance(subject.device, Witness)
@@ -325,6 +331,7 @@ def test_one_that_is_stopped_has_its_good_image() -> None:
 # -- the command ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_profile_that_is_read_again(flasher: Flasher, tmp_path: Path) -> None:
     path = tmp_path / "p.toml"
     model = ("-t", "bms", "--mock", "--set", "application_area_bytes=34K", "--set", "window_s=0.1")

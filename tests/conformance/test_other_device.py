@@ -142,10 +142,12 @@ def check_right_device(cases: Sequence[str]) -> None:
     assert judged(ScriptedDevice, cases) == {}
 
 
+@pytest.mark.slow
 def test_a_right_device_of_others_passes() -> None:
     check_right_device([case_id for case_id in CASES if case_id not in _LONGEST])
 
 
+@pytest.mark.slow
 @each(
     "kind, cases, choices",
     [

@@ -5,11 +5,14 @@
 
 from __future__ import annotations
 
+import pytest
+
 from flasher.conformance.catalogue import Selection
 from tests.campaigns.right_devices import faults_of, right_device
 from tests.loops import each
 
 
+@pytest.mark.slow
 @each("seed", (2, 7))
 def test_the_quick_suite_holds_nothing_against_a_right_device(seed: int) -> None:
     assert faults_of(seed, Selection(quick=True)) == []

@@ -348,6 +348,7 @@ def test_a_node_that_babbles_beside_the_device_is_no_failure_of_it() -> None:
     assert report.ok
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 def test_a_bus_that_is_taken_ends_the_run_in_bounded_time() -> None:
     short = {f"limits.{name}_s": 0.02 for name in ("first_version", "pause", "erase", "silence")}

@@ -167,6 +167,7 @@ def test_time_passes_for_one_that_polls_the_clock() -> None:
     assert _run(_FLAWS + "WaitsForTheClock", "EN-01").ok
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("flaw", "case_id", "found"),
     [
@@ -185,6 +186,7 @@ def test_what_a_chip_does_not_allow_is_a_finding(flaw: str, case_id: str, found:
     assert found in _failures(report) + report.not_upgradable + report.stopped
 
 
+@pytest.mark.slow
 def test_a_call_that_does_not_return_is_ended_and_is_a_finding(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -216,6 +218,7 @@ class ReadsForEver(PythonBootloader):
             self.host.flash_read(0, 0x1000)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("flaw", ["ReadsForEver", "LogsForEver"])
 def test_a_call_that_asks_its_hardware_for_ever_is_ended_and_is_a_finding(flaw: str) -> None:
     report = _run(_FLAWS + flaw, "EN-01")

@@ -6,6 +6,8 @@ The table is docs/reference/variants.md; the gate compares more of it, with
 
 from __future__ import annotations
 
+import pytest
+
 from flasher.conformance.catalogue import BRING_UP, CASES, WEAR
 from flasher.mock.variants import VARIANTS
 from tests.loops import each
@@ -63,6 +65,7 @@ def test_a_variant_fails_nothing_but_its_clause_and_what_it_says_that_it_touches
             assert groups_passed(Row(name, fails, 0)), name
 
 
+@pytest.mark.slow
 @each("name", SAMPLE)
 def test_the_suite_says_what_the_table_says_of_the_case_of_the_clause(name: str) -> None:
     clause = VARIANTS[name].clause

@@ -95,6 +95,7 @@ def test_a_slower_bootloader_is_seen_in_the_comparison_and_fails_a_limit() -> No
     assert "packet to ACK at most 3 ms" in str(late.first_failure)
 
 
+@pytest.mark.slow
 @each(
     "window_s, verdict",
     [(0.2, CaseVerdict.PASS), (0.15, CaseVerdict.FAIL), (0.22, CaseVerdict.FAIL)],
@@ -117,6 +118,7 @@ def test_a_device_on_a_bus_is_asked_about(flasher: Flasher) -> None:
     assert "Add --yes." in ran.err
 
 
+@pytest.mark.slow
 def test_the_text_draws_how_times_are_spread(flasher: Flasher) -> None:
     ran = flasher("conformance", "-t", "bms", "--mock", "--group", "SP", "--upgrades", "40")
     assert ran.code == 0

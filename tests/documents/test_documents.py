@@ -14,6 +14,8 @@ from tests.documents.blocks import LANGUAGES, ROOT, Block, blocks, pages
 from tests.documents.reader import PageReader, hold_options, is_told
 from tests.terminal_picture import COMMAND, PICTURE
 
+pytestmark = pytest.mark.slow
+
 FOLLOWED = {
     path.relative_to(ROOT).as_posix(): found
     for path in pages()

@@ -62,6 +62,7 @@ def faults(text: str) -> list[str]:
     return found
 
 
+@pytest.mark.slow
 def test_no_passage_leads_a_sample_to_an_adapter() -> None:
     found = {place: wrong for place, text in texts() if (wrong := faults(text))}
     assert found == {}
@@ -95,6 +96,7 @@ def test_others_are_let_through(text: str) -> None:
     assert not faults(text)
 
 
+@pytest.mark.slow
 def test_every_page_and_every_help_text_is_looked_at() -> None:
     seen = {place.partition(":")[0] for place, _ in texts()}
     assert {"README.md", "docs/index.md", "flasher/cli/main.py", "docs/tutorials/bike.md"} <= seen

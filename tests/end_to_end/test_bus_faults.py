@@ -74,6 +74,7 @@ def flipped(frame: Frame) -> list[Frame]:
     return [frame._replace(data=bytes([frame.data[0] ^ 0x10]) + frame.data[1:])]
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each("index", range(TOTAL))
 @each(

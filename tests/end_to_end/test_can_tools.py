@@ -31,7 +31,7 @@ from tests.end_to_end.kernel import (
 )
 from tests.firmware import VECTORS
 
-pytestmark = [pytest.mark.socketcan, GUEST_TIMEOUT, needs_candlelight]
+pytestmark = [pytest.mark.kernel, GUEST_TIMEOUT, needs_candlelight]
 SIZE_BYTES = 6_000
 SAME_S = 0.001
 """Two recordings of one bus differ by less: the times at which USB hands frames over."""

@@ -30,7 +30,7 @@ from tests.end_to_end.kernel import (
 from tests.end_to_end.test_foreign_traffic import CANOPEN, NEIGHBOURS, OTHER_KINDS, UDS, XCP
 from tests.firmware import VECTORS
 
-pytestmark = [pytest.mark.socketcan, GUEST_TIMEOUT, needs_candlelight]
+pytestmark = [pytest.mark.kernel, GUEST_TIMEOUT, needs_candlelight]
 IMAGE = VECTORS + random.Random(25).randbytes(19_984)
 IMPATIENT = ("--set", "pause_in_transfer=announces", "--set", "transfer_timeout_s=2")
 """A device that waits in its transfer for ever would need a power cycle."""

@@ -5,9 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import pytest
+
 from tests.end_to_end.processes import MockProcess, run_flasher
 from tests.end_to_end.test_processes import bus
 from tests.firmware import VECTORS
+
+pytestmark = pytest.mark.slow
 
 __all__ = ["bus"]
 IMAGE = VECTORS + b"V2r0r1_20240131" + bytes(range(256)) * 2

@@ -22,6 +22,8 @@ from tests.cli import conftest
 from tests.cli.conftest import SAMPLES, Flasher, Run
 from tests.firmware import VECTORS
 
+pytestmark = pytest.mark.slow
+
 flasher = conftest.flasher
 """The fixture, for the tests here too."""
 

@@ -15,6 +15,8 @@ from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment, 
 from tests.end_to_end.test_processes import GROUP, bus, free_port
 from tests.firmware import VECTORS
 
+pytestmark = pytest.mark.slow
+
 __all__ = ["GROUP", "bus", "free_port"]  # `bus` is a fixture
 
 PACKETS = 40

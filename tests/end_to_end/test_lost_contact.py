@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 
+import pytest
+
 from tests.campaigns.beside_a_flash import on_the_simulated_bus
 from tests.campaigns.lost_contact import Fault, trial
 from tests.loops import each
+
+pytestmark = pytest.mark.slow
 
 SEEDS = (6, 10, 11, 25)
 """The moments of which lie in the restart, in the erase, in the transfer and at the end."""

@@ -15,6 +15,8 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from tests.end_to_end.stage import IMAGE, SMALL, Stage
 
+pytestmark = pytest.mark.slow
+
 ONE_TRY = UpgradeOptions(attempts=1, timings=replace(DEFAULT_TIMINGS, packet_tries=1))
 """No pause may use up a try, nor an attempt."""
 

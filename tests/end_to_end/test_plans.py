@@ -34,6 +34,7 @@ def test_the_strangers_messages_are_those_of_the_document() -> None:
         assert [frame.data.hex() for frame in frames] == vector["can_frames"], vector["name"]
 
 
+@pytest.mark.slow
 def test_a_plan_that_is_printed_is_read_as_the_same() -> None:
     for seed in range(300):
         plan = drawn(seed)
@@ -65,6 +66,7 @@ def test_a_line_replays_a_run_frame_by_frame(seed: int) -> None:
     assert play(plan) == play(Plan.parse(str(plan)))
 
 
+@pytest.mark.slow
 def test_random_plans_end_in_no_false_success_and_no_false_claim() -> None:
     for seed in range(60):
         verdict = play(drawn(seed, twin_share=0.0))

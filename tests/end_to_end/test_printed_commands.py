@@ -30,7 +30,7 @@ from tests.end_to_end.kernel import (
 )
 from tests.firmware import VECTORS
 
-pytestmark = [pytest.mark.socketcan, GUEST_TIMEOUT]
+pytestmark = [pytest.mark.kernel, GUEST_TIMEOUT]
 PROGRAMS = ("ip", "dmesg", "flasher")
 QUOTED = re.compile(r"`([^`]+)`")
 NAMED = re.compile(r"\bflasher ([a-z]+(?:-[a-z]+)*)\b")

@@ -14,6 +14,8 @@ import pytest
 from tests.end_to_end.processes import MockProcess, transfer
 from tests.firmware import VECTORS
 
+pytestmark = pytest.mark.slow
+
 GROUP = "239.74.163.2"
 
 

@@ -7,12 +7,16 @@ import random
 import subprocess
 from pathlib import Path
 
+import pytest
+
 from tests.cli import conftest
 from tests.cli.conftest import Flasher
 from tests.end_to_end.processes import FLASHER, MockProcess, clean_environment
 from tests.end_to_end.stranger import Stranger
 from tests.end_to_end.test_processes import GROUP, bus, free_port
 from tests.firmware import VECTORS
+
+pytestmark = pytest.mark.slow
 
 __all__ = ["GROUP", "bus", "free_port"]  # `bus` is a fixture
 

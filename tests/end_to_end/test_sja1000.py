@@ -25,7 +25,7 @@ from tests.end_to_end.kernel import (
 )
 from tests.firmware import VECTORS
 
-pytestmark = [pytest.mark.socketcan, GUEST_TIMEOUT, needs_sja1000]
+pytestmark = [pytest.mark.kernel, GUEST_TIMEOUT, needs_sja1000]
 IMAGE = VECTORS + random.Random(30).randbytes(9_984)
 FLASH = ("flash", "image.bin", "-t", "bms", "--frame-gap", "0.002")
 """Without a gap the receiver is overrun by frames that take no time."""

@@ -33,6 +33,8 @@ from tests.end_to_end.lawicel import ERROR, Damage, Lawicel, Program
 from tests.end_to_end.processes import run_flasher
 from tests.end_to_end.stage import SMALL, image_of
 
+pytestmark = pytest.mark.slow
+
 IMAGE = image_of(8)
 HASTY = UpgradeOptions(timings=replace(DEFAULT_TIMINGS, ack_timeout_s=0.1), adapter_return_s=2.0)
 

@@ -40,7 +40,7 @@ def exists(*names: str) -> bool:
         return False
 
 
-pytestmark = [pytest.mark.socketcan, GUEST_TIMEOUT]
+pytestmark = [pytest.mark.kernel, GUEST_TIMEOUT]
 needs_vcan = pytest.mark.skipif(not exists("vcan0"), reason="there is no interface vcan0")
 needs_pair = pytest.mark.skipif(not exists("vx0", "vx1"), reason="there is no pair vx0/vx1")
 

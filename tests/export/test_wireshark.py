@@ -37,7 +37,7 @@ FRAME_S: Final = 0.0005
 PAUSE_S: Final = 0.3
 VECTORS: Final = Path(__file__).parents[1] / "vectors.json"
 
-pytestmark = needs_tshark
+pytestmark = [needs_tshark, pytest.mark.slow]
 
 
 class Reel:

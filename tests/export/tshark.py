@@ -9,7 +9,6 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
 
 import pytest
 
@@ -18,10 +17,8 @@ from flasher.protocol.frame import Frame
 from flasher.trace.pcapng import PcapngWriter
 from flasher.trace.recorder import message_of
 
-REQUIRED: Final = os.environ.get("FLASHER_TEST_TSHARK") == "required"
-
 needs_tshark = pytest.mark.skipif(
-    shutil.which("tshark") is None and not REQUIRED,
+    shutil.which("tshark") is None,
     reason="tshark is not installed (apt-get install tshark)",
 )
 

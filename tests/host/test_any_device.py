@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -51,6 +52,7 @@ pauses = st.sampled_from([0.0, 0.001, 0.02, 0.05, 0.1, 0.5, 1.0, 5.0, 10.0])
 script = st.lists(st.tuples(pauses, st.one_of(rows, rows, rows, frames)), max_size=40)
 
 
+@pytest.mark.slow
 @given(script)
 @settings(max_examples=200, deadline=None, derandomize=True)
 def test_the_host_ends_explicitly_whatever_the_device_says(
@@ -121,6 +123,7 @@ def test_one_update_command_at_most_goes_into_silence_and_none_to_an_application
             assert GeneralFeedback() not in [row for said_at, row in said if said_at < at]
 
 
+@pytest.mark.slow
 @given(st.lists(rows, min_size=1, max_size=6))
 @settings(max_examples=40, deadline=None, derandomize=True)
 def test_memory_and_time_are_bounded_when_a_device_repeats_itself_for_ever(

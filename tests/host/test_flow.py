@@ -353,6 +353,7 @@ def test_a_device_that_answers_every_packet_at_the_last_moment_is_not_cut_off() 
     assert bench.complete().ok
 
 
+@pytest.mark.slow
 def test_a_device_that_answers_only_the_last_try_is_ended_by_the_overall_deadline() -> None:
     """TM-03: always just in time, for ever."""
     bench = Bench(128 * 1000)

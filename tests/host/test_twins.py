@@ -427,6 +427,7 @@ def test_a_link_that_doubles_every_frame_is_no_second_device() -> None:
 SOME = range(1, 61)
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each("seed", SOME)
 def test_two_units_that_both_show_themselves_are_never_a_success(seed: int) -> None:
@@ -435,12 +436,14 @@ def test_two_units_that_both_show_themselves_are_never_a_success(seed: int) -> N
     assert not judged.is_missed, world(seed, units=2)
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 def test_nearly_all_worlds_with_two_units_end_as_two_devices() -> None:
     ended = [play(world(seed, units=2)).is_two for seed in range(1001, 1041)]
     assert sum(ended) > 0.85 * len(ended)
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each("seed", SOME)
 def test_one_unit_is_never_two(seed: int) -> None:

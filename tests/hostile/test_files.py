@@ -13,6 +13,8 @@ import pytest
 from tests.campaigns.hostile_files import READERS, Campaign, run_rows
 from tests.hostile.files import COSTLY, ROWS, SAMPLE
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
 def test_no_file_hurts_whoever_reads_it(tmp_path: Path) -> None:

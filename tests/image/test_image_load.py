@@ -468,6 +468,7 @@ def test_a_file_that_spans_gigabytes_is_refused_quickly_and_in_little_memory() -
     assert megabytes < 64
 
 
+@pytest.mark.slow
 def test_the_largest_binary_is_planned_in_time_and_memory(tmp_path: Path) -> None:
     path = write(tmp_path, "app.bin", bytes(range(251, 0, -1)) * 33_000)
     said, seconds, megabytes = measure(path)
@@ -476,6 +477,7 @@ def test_the_largest_binary_is_planned_in_time_and_memory(tmp_path: Path) -> Non
     assert megabytes < 150
 
 
+@pytest.mark.slow
 def test_a_hex_file_of_one_mebibyte_is_planned_in_little_memory(tmp_path: Path) -> None:
     lines = []
     for upper in range(16):

@@ -147,6 +147,7 @@ def test_an_empty_and_a_too_large_image_are_refused() -> None:
         plan(Image.from_bytes(bytes(IMAGE_MAX_SIZE + 1)), BMS, BITRATE_BPS)
 
 
+@pytest.mark.slow
 def test_an_image_of_exactly_the_largest_size_is_planned(monkeypatch: pytest.MonkeyPatch) -> None:
     # The bits of 65,535 packets take a second.
     monkeypatch.setattr("flasher.image.plan._packet_bits", lambda *_: array("H", [2_200]))

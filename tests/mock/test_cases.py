@@ -734,6 +734,7 @@ def test_an_end_while_the_record_is_written_is_answered_once() -> None:
 # -- SE: anything at all --------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @each("seed", range(20))
 def test_random_traffic_leaves_the_device_reachable_and_an_application_old_or_none(
     seed: int,

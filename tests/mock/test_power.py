@@ -100,6 +100,7 @@ def cut_at(bench: Bench, operation: int, share: float) -> None:
     cycle_power(bench)
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each("profile", PROFILES.values())
 @each("moment", MOMENTS)
@@ -149,6 +150,7 @@ def test_the_upgrade_is_as_many_frames_as_the_cuts_below_go_through() -> None:
     assert len(upgrade_frames(bench_with_old())) == ALL_FRAMES
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 @each("heard", range(ALL_FRAMES + 1))
 def test_a_power_cut_at_any_received_frame_leaves_the_old_application_or_none(heard: int) -> None:

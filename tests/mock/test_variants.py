@@ -775,6 +775,7 @@ def make_right(variant: Variant) -> MockDevice:
     return MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=profile)
 
 
+@pytest.mark.slow
 @each("name", ACTS)
 def test_a_variant_does_wrong_what_the_right_device_does_right(name: str) -> None:
     act, right, wrong = ACTS[name]
@@ -782,6 +783,7 @@ def test_a_variant_does_wrong_what_the_right_device_does_right(name: str) -> Non
     assert act(Tool(make_wrong(name))) == wrong
 
 
+@pytest.mark.slow
 @each("name", VARIANTS)
 def test_apart_from_its_fault_a_variant_can_be_upgraded(name: str) -> None:
     body = image_of(1100)

@@ -146,6 +146,7 @@ def test_very_long_texts_are_cut() -> None:
     assert len(html) < 60_000
 
 
+@pytest.mark.slow
 @pytest.mark.no_cover
 def test_the_largest_upgrade_makes_a_page_of_bounded_size() -> None:
     html = render(stories.story(stories.upgrade(65_535)))
@@ -153,6 +154,7 @@ def test_the_largest_upgrade_makes_a_page_of_bounded_size() -> None:
     assert "65,535 packets" in html
 
 
+@pytest.mark.slow
 def test_a_trace_full_of_trouble_makes_a_page_of_bounded_size() -> None:
     packets = tuple(
         PacketStory(number, attempt, 5, 4, number / 10, None, None)

@@ -28,12 +28,12 @@ _DATE: Final = (1980, 1, 1, 0, 0, 0)
 
 def build(folder: Path, *, jobs: str = "auto") -> bool:
     """Build it anew in place of a site that is there; whether Sphinx had nothing against it."""
+    if folder.exists() and any(folder.iterdir()) and not (folder / _MADE_BY_SPHINX).exists():
+        sys.exit(f"{folder} holds something else than a site: name another folder, or empty it")
     try:
         from sphinx.cmd.build import build_main  # noqa: PLC0415  an extra that may be absent
     except ImportError as error:
         sys.exit(f"{error.name} is missing: pip install -c .ci/constraints.txt -e '.[docs]'")
-    if folder.exists() and any(folder.iterdir()) and not (folder / _MADE_BY_SPHINX).exists():
-        sys.exit(f"{folder} holds something else than a site: name another folder, or empty it")
     shutil.rmtree(folder, ignore_errors=True)
     arguments = ["-b", "html", "-W", "--keep-going", "-q", "-j", jobs]
     trees = folder.with_name(f"{folder.name}.trees")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -91,6 +92,7 @@ def test_all_clients_together_have_a_limit() -> None:
     assert attempts.begin(Y, "B", 60.0) == 0.0
 
 
+@pytest.mark.slow
 def test_memory_stays_small_under_guesses_without_end() -> None:
     attempts = Attempts()
     for number in range(4000):

@@ -97,6 +97,7 @@ def test_records_on_a_server_prove_their_certificates(postgres: Server, tmp_path
     bench.store.close()
 
 
+@pytest.mark.slow
 def test_one_changed_character_is_reported(plant: Bench) -> None:
     text = page(plant)
     chance = random.Random(24)
@@ -106,6 +107,7 @@ def test_one_changed_character_is_reported(plant: Bench) -> None:
         assert is_refused(plant, text[:at] + other + text[at + 1 :]), text[at - 20 : at + 20]
 
 
+@pytest.mark.slow
 def test_every_word_that_a_reader_sees_is_covered(plant: Bench) -> None:
     text = page(plant)
     for said, changed in {
@@ -141,6 +143,7 @@ CHANGES: dict[str, Callable[[dict[str, Any]], object]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("what", CHANGES)
 def test_carried_content_that_was_changed_is_reported(plant: Bench, what: str) -> None:
     content = carried(page(plant))
@@ -214,6 +217,7 @@ def test_what_is_no_certificate_is_refused(plant: Bench, data: bytes | str) -> N
         check_certificate(plant.store, data if isinstance(data, bytes) else data.encode())
 
 
+@pytest.mark.slow
 def test_what_swells_when_it_is_unpacked_is_refused(plant: Bench) -> None:
     data = base64.b64encode(zlib.compress(b" " * 100_000_000, 9)).decode()
     with pytest.raises(UnprovenError):

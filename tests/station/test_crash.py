@@ -15,6 +15,8 @@ import pytest
 from tests.campaigns.scripted_units import bus_of, free_port
 from tests.campaigns.station_kill import campaign
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(autouse=True)
 def multicast() -> None:

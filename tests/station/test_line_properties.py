@@ -19,6 +19,8 @@ from flasher.station.socket import Binding, Occupancy, Phase, Socket, Source
 from tests.loops import each
 from tests.station.line_world import Walk, World
 
+pytestmark = pytest.mark.slow
+
 STEPS = 100
 Plant = Callable[[pytest.MonkeyPatch], None]
 

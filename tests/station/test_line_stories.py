@@ -23,6 +23,8 @@ from flasher.station.unit_target import StepFailedError
 from tests.campaigns.line_world.play import Played, draw, play, shrink
 from tests.campaigns.line_world.stories import Story
 
+pytestmark = pytest.mark.slow
+
 SAMPLE = 8
 SAMPLE_ACTS = 24
 PULLED_IN_ITS_FLASH = (

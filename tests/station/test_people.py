@@ -139,6 +139,7 @@ ALLOWED = {
 }
 
 
+@pytest.mark.slow
 @each("badge", list(ALLOWED))
 def test_an_override_needs_a_role_that_may(bench: Bench, badge: str) -> None:
     for command in sorted(ALLOWED[SUPERVISOR]):

@@ -20,6 +20,7 @@ from flasher.station.scanners import Scanner
 from tests.station.scanner_keys import KEYS
 
 pytestmark = [
+    pytest.mark.kernel,
     pytest.mark.timeout(300),
     pytest.mark.skipif(
         not os.access("/dev/uinput", os.W_OK) or importlib.util.find_spec("evdev") is None,

@@ -461,6 +461,7 @@ def test_its_labels_are_not_the_pin_that_somebody_types(bench: Bench) -> None:
     assert accepted == [("Rea", ""), (SERIAL, "A"), ("REASON x", "")]
 
 
+@pytest.mark.slow
 def test_500_labels_at_the_speed_of_a_scanner_go_where_they_belong(bench: Bench) -> None:
     """Every one is answered, in its order and for its socket."""
     person = Person(name="Jo", code="BADGE-1", role=Role.OPERATOR)

@@ -498,6 +498,7 @@ def exchange(floor: Floor, chance: random.Random, table: deque[Unit], name: str)
     floor.go_on(chance.choice((1.0, 3.0)))
 
 
+@pytest.mark.slow
 def test_no_run_is_begun_on_another_unit_and_nobody_is_stuck(recipe: LoadedRecipe) -> None:
     runs = 0
     for seed in range(30):

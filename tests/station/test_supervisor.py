@@ -16,6 +16,8 @@ from flasher.station.supervisor import ProcessPort, Supervisor, WorkerLost
 from tests.loops import each
 from tests.station.factory import make_recipe
 
+pytestmark = pytest.mark.slow
+
 LIMIT_S = 30.0
 
 

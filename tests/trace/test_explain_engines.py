@@ -35,6 +35,7 @@ class Tapped(Traffic):
         return explain(frames, source="engines")
 
 
+@pytest.mark.slow
 @each(
     "script, ending, cause",
     [

@@ -1,12 +1,23 @@
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from importlib.util import find_spec
+from typing import TYPE_CHECKING
 
 import pytest
-from playwright.sync_api import Browser, Page
 
-from tests.web.browser import chromium
+from tests.conftest import NO_SKIPS
+
+if TYPE_CHECKING:
+    from playwright.sync_api import Browser, Page
+
+if find_spec("axe_playwright_python") is None and not os.environ.get(NO_SKIPS):
+    # They drive a browser with what the extra `dev` brings, and are all of the second lane.
+    collect_ignore = [f"test_{of}.py" for of in (
+        "bench_page", "login_pages", "operator_page", "supervisor_pages"
+    )]  # fmt: skip
 
 
 @dataclass
@@ -20,6 +31,8 @@ class Tab:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Browser]:
+    from tests.web.browser import chromium  # noqa: PLC0415  needs Playwright
+
     with chromium() as started:
         yield started
 

@@ -5,9 +5,13 @@ from __future__ import annotations
 from contextlib import closing
 from functools import partial
 
+import pytest
+
 from flasher.errors import UsageError
 from flasher.web.answers import Answer, Answering, AnswerProcesses, Question
 from tests.web.own_loop import in_own_loop
+
+pytestmark = pytest.mark.slow
 
 
 class Echo:

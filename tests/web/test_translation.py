@@ -17,6 +17,7 @@ _CARDS = re.compile(rf"\b({'|'.join(Word)})\b")
 """What stands on the operator's cards is the same in every language."""
 
 
+@pytest.mark.slow
 def test_nothing_is_left_untranslated() -> None:
     """`python -m tests.catalogue` adds what is missing."""
     everything = set(catalogue.said())  # it reads the whole package
@@ -34,6 +35,7 @@ def test_values_and_scans_stand_in_every_language(language: str) -> None:
             assert set(_CARDS.findall(said)) == set(_CARDS.findall(english)), english
 
 
+@pytest.mark.slow
 def test_a_sentence_is_said_by_its_template() -> None:
     wanted = say("Put {label} into socket {socket}.", label="W1", socket="A")
     assert wanted == "Put W1 into socket A."

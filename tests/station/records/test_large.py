@@ -19,6 +19,8 @@ from tests.benchmarks import bulk_records
 from tests.benchmarks.bulk_records import FIRST_DAY, RUNS_A_DAY
 from tests.station.factory import Bench
 
+pytestmark = pytest.mark.slow
+
 FEW, MANY = 300, 2400
 GROWTH_MAX = 2.0
 """Eight times as many runs are no reason for twice the work; a walk through all is one."""

@@ -31,6 +31,8 @@ from flasher.station.records.upgrade import NEWEST, Upgraded
 from tests.station.factory import FakeClock
 from tests.station.records import old_records
 
+pytestmark = pytest.mark.slow
+
 
 class Old:
     """Records of schema 2."""
@@ -72,6 +74,9 @@ class Old:
                 for name in sorted(set(inspect(connection).get_table_names()))
                 if name not in ("alembic_version", "schema_info")
             }
+
+
+ON_A_SERVER = pytest.mark.parametrize("old", ["postgresql"], indirect=True)
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -145,9 +150,8 @@ def test_who_reads_changes_no_schema(old: Old) -> None:
     assert old.catalogue() == before
 
 
+@ON_A_SERVER
 def test_records_on_a_server_wait_for_their_owner(old: Old) -> None:
-    if old.is_file:
-        pytest.skip("a file is upgraded by its station")
     with pytest.raises(OldSchemaError) as caught:
         old.open()
     assert "pg_dump" in caught.value.remedy
@@ -185,9 +189,8 @@ def test_a_rule_that_was_taken_away_before_is_told_and_stays_told(old: Old) -> N
     assert told == [f"found at the migration: {problem}" for problem in done.problems]
 
 
+@ON_A_SERVER
 def test_roles_keep_their_rights_and_get_those_of_new_tables(old: Old) -> None:
-    if old.is_file:
-        pytest.skip("a file has no roles")
     with old.engine.begin() as connection:
         for role, rights in (("old_line", "SELECT, INSERT"), ("old_reader", "SELECT")):
             connection.execute(text(f"CREATE ROLE {role} LOGIN"))

@@ -27,6 +27,8 @@ from tests.station.factory import SERIAL, USUAL, Bench
 from tests.station.postgres import Server
 from tests.station.records.test_rules import refused
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def bench(server_bench: Bench) -> Bench:
