@@ -41,6 +41,8 @@ MEMORY_BYTES: Final = 128
 """What one memory query asks for at the most."""
 
 FRAME_BYTES: Final = 8
+_OVERHEAD_BYTES: Final = 9
+"""Header, mode, length, CRC and tail."""
 PACKET_BYTES: Final = 128
 PACKET_FRAMES: Final = 18
 """CAN frames of a packet, all of them full."""
@@ -105,6 +107,14 @@ def build(can_id: int, mode: int, command: int, data: bytes = b"") -> bytes:
     """
     body = struct.pack(">BBH", mode, 2 + len(data), command) + data
     return b"\x55\xaa" + body + message_crc(can_id, body) + b"\xf0"
+
+
+def is_intact(can_id: int, raw: bytes) -> bool:
+    """True for one whole message with the right CRC, in which length and command fit the data."""
+    is_whole = len(raw) >= _OVERHEAD_BYTES + 2 and raw[3] == len(raw) - _OVERHEAD_BYTES
+    if not is_whole or raw[5] != raw[3] - 2 or not raw.startswith(b"\x55\xaa"):
+        return False
+    return raw[-5:] == message_crc(can_id, raw[2:-5]) + b"\xf0"
 
 
 def split(can_id: int, raw: bytes, size_bytes: int = 8) -> list[RawFrame]:
@@ -267,8 +277,6 @@ class Encoder:
 
 # -- from the device to the tool -----------------------------------------------------------------
 
-_OVERHEAD_BYTES: Final = 9
-"""Header, mode, length, CRC and tail."""
 _FIRMWARE_AT: Final = slice(48, 64)
 """The fourth of the four texts of version information."""
 _BOOT_VERSION_TEXT: Final = re.compile(rb"V\d\.\d\.\d")
@@ -387,9 +395,7 @@ class Decoder:
         yield replace(heard, padding=raw[size:]) if raw[size:] else heard
 
     def _judge(self, raw: bytes, first_at: float, at: float, can_id: int) -> Received:
-        body, found_crc, tail = raw[2:-5], raw[-5:-1], raw[-1:]
-        is_whole = raw[3] >= 2 and raw[5] == raw[3] - 2
-        if not is_whole or tail != b"\xf0" or found_crc != message_crc(can_id, body):
+        if not is_intact(can_id, raw):
             return Received(Kind.DAMAGED, first_at, at, can_id, raw)
         mode, command, data = raw[2], int.from_bytes(raw[4:6], "big"), raw[6:-5]
         kind = self._kind(can_id, mode, command, data)

@@ -37,7 +37,7 @@ _JUNK_FRAMES: Final = (b"\x12", bytes(8), b"\xaa\x55\xf0", b"\xf0" * 8 + b"\xaa"
 """None of them holds a header, nor the beginning of one at its end."""
 _LONG_JUNK_BYTES: Final = 300
 """More than the longest message."""
-_JUNK_IN_FRAME: Final = (b"\x12", b"\x55", b"\x55\x55", b"\xaa", b"\xf0\x00\x34", b"\x12" * 7)
+JUNK_IN_FRAME: Final = (b"\x12", b"\x55", b"\x55\x55", b"\xaa", b"\xf0\x00\x34", b"\x12" * 7)
 _CRCS: Final = tuple(
     map(
         bytes.fromhex,
@@ -49,7 +49,7 @@ _CRCS: Final = tuple(
 )
 _FREE_BYTES: Final = 8
 _WRONG_TAILS: Final = (0x00, 0x0F, 0xF1, 0x55, 0xFF)
-_PADDINGS: Final = (0x00, 0xFF, 0xAA, 0x55, 0xF0)
+PADDINGS: Final = (0x00, 0xFF, 0xAA, 0x55, 0xF0)
 _UNKNOWN: Final = 0x77FD
 """A command that nobody has, with as many bytes as a message can hold."""
 _LONG_UNKNOWN: Final = (0x77F5, 0x77F7, _UNKNOWN)
@@ -126,7 +126,7 @@ def junk(bench: Bench) -> None:
         with bench.step(f"{len(own)} bytes before it, the last one {own[-1]:02X}"):
             wanted = after_half if own[-1] == 0x55 else ACCEPTED
             probe.offer(bench.encoder.frames(own) + probe.frames(), wanted)
-    for own in _JUNK_IN_FRAME:
+    for own in JUNK_IN_FRAME:
         with bench.step(f"{own.hex(' ').upper()} in its first frame"):
             probe.offer(bench.encoder.frames(own + probe.raw()), in_frame)
     probe.check_stored()
@@ -249,7 +249,7 @@ def wrong_length(bench: Bench) -> None:
 )
 def padded(bench: Bench) -> None:
     choice, probe = _wanted(bench, "fr_07"), Probe(bench, bench.filler(1))
-    for index, filler in enumerate(_PADDINGS):
+    for index, filler in enumerate(PADDINGS):
         with bench.step(f"update command padded with {filler:02X}"):
             # In the midst of a transfer where the device starts over, which takes no pause (UP-08).
             if index and bench.choice("up_08") != "starts_over":

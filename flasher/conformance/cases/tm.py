@@ -72,7 +72,7 @@ def gaps(bench: Bench) -> None:
 )
 def times(bench: Bench) -> None:
     image = bench.good_image
-    _enter(bench)
+    bench.reset_measured(_PATIENCE * bench.limit("first_version_s"))
     if packet_count(len(image)) < _PACKETS:
         with bench.step("transfer of many packets"):
             filler = (bench.filler(_PACKETS) + _REST)[: bench.number("largest_image_bytes")]
@@ -105,25 +105,9 @@ def check_times(bench: Bench) -> None:
     check(Times.COMPLETE, high_s=limit("complete_s"))
 
 
-def _enter(bench: Bench) -> Received:
-    """Reset the device; returns the first boot version. The times are judged at the end."""
-    bench.forget()
-    limit_s = _PATIENCE * bench.limit("first_version_s")
-    with bench.tester.hearing_feedback():
-        sent = bench.send(bench.encoder.reset())
-        feedback = bench.next_message(limit_s)
-    if feedback is not None and feedback.kind is Kind.FEEDBACK:
-        bench.measure(Times.FEEDBACK, feedback.at - sent.left_at)
-    is_there = feedback is not None and feedback.kind is Kind.BOOT_VERSION
-    first = feedback if is_there else bench.wait_for(Kind.BOOT_VERSION, within_s=limit_s)
-    found = bench.require_received(first, Kind.BOOT_VERSION.value, limit_s)
-    bench.measure(Times.FIRST, found.at - sent.left_at)
-    return found
-
-
 def measure_burst(bench: Bench, *, wait: bool = True) -> Received:
     """One reset and its burst; returns its last boot version, with `wait` when it is over."""
-    last = _enter(bench)
+    last = bench.reset_measured(_PATIENCE * bench.limit("first_version_s"))
     for _ in range(bench.number("versions") - 1):
         within_s = _PATIENCE * bench.limit("version_spacing_s")
         heard = bench.wait_for(Kind.BOOT_VERSION, within_s=within_s)

@@ -5,7 +5,7 @@ pauses and resets during a transfer.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final
 
 from flasher.conformance.bench import Bench
@@ -78,33 +78,6 @@ def _stops(bench: Bench, image: bytes, numbers: Iterable[int]) -> Iterator[int]:
     bench.finish(image, done + 1)
 
 
-def _check_rejected(bench: Bench, wanted: int, named: int, *, is_plain: bool = True) -> None:
-    """A packet was rejected as tx_01 says, by NAK or silence. With `is_plain` false the device may
-    answer with the wanted number whatever tx_01 says: the number in the packet is not credible.
-    """
-    choice = bench.choice("tx_01")
-    numbers = {wanted} if choice == "nak_expected" else {named}
-    if not is_plain or choice == "either":
-        numbers.add(wanted)
-    _check_naks(bench, numbers, counts=_nak_counts(choice))
-
-
-def _nak_counts(choice: str) -> tuple[int, ...]:
-    """How many NAKs a packet may get that has to be rejected, for a value of tx_01."""
-    return {"silence": (0,), "either": (0, 1)}.get(choice, (1,))
-
-
-def _check_naks(bench: Bench, numbers: Collection[int] | None, counts: Collection[int]) -> None:
-    """One of `counts` NAKs came, with one of `numbers` (None: any), and nothing else."""
-    heard = bench.answers()
-    naks = [one for one in heard if one.kind is Kind.NAK]
-    right = [one for one in naks if numbers is None or one.number in numbers]
-    which = "" if numbers is None else " " + " or ".join(map(str, sorted(numbers)))
-    expected = {0: "silence", 1: f"NAK{which}"}
-    wanted = " or ".join(expected[count] for count in sorted(counts, reverse=True))
-    bench.check(len(heard) == len(right) in counts, f"rejected: {wanted}", describe(heard))
-
-
 def check_out_of_turn(bench: Bench, frames: Sequence[RawFrame]) -> None:
     """Packet or end of transfer to the announcing bootloader: whatever it says, it is none of what
     answers them in a transfer.
@@ -136,13 +109,13 @@ def damaged(bench: Bench) -> None:
     for number in _stops(bench, image, (1, 2, *lost, total)):
         if number in lost:
             index, choice = lost[number], bench.choice("tx_01_lost_frame")
-            # Without the first frame there is nothing to know a packet by.
-            counts = {"nak": (1,), "silence": (0,)}.get(choice if index else "", (0, 1))
             trusts_it = bench.choice("tx_01") in ("nak_received", "either")
             with bench.step(f"packet {number} without its frame {index + 1}"):
                 frames = bench.encoder.packet_of(image, number)
                 bench.send(frames[:index] + frames[index + 1 :])
-                _check_naks(bench, None if trusts_it and index <= _NUMBER_IN else {number}, counts)
+                # Without the first frame there is nothing to know a packet by.
+                named = None if trusts_it and index <= _NUMBER_IN else number
+                bench.check_naks([named], choice if index else "either")
             continue
         neighbours = {
             number: "wrong CRC",
@@ -153,12 +126,12 @@ def damaged(bench: Bench) -> None:
             if 1 <= named <= total:
                 with bench.step(f"packet {number}, {step}"):
                     bench.send(bench.encoder.damaged_packet_of(image, named))
-                    _check_rejected(bench, number, named)
+                    bench.check_packet_rejected(number, named)
         with bench.step(f"packet {number}, a wrong bit"):
             raw = bytearray(joined(bench.encoder.packet_of(image, number)))
             raw[_DATA_AT] ^= 0x10
             bench.send(bench.encoder.frames(bytes(raw)))
-            _check_rejected(bench, number, number)
+            bench.check_packet_rejected(number, number)
 
 
 # -- repetitions ----------------------------------------------------------------------------------
@@ -237,19 +210,16 @@ def out_of_order(bench: Bench) -> None:
                 continue
             with bench.step(f"after packet {stored}, number {number}"):
                 bench.send(bench.encoder.packet(number, total, bytes(PACKET_BYTES)))
-                if stored < total:
-                    # The number 0 is not credible.
-                    _check_rejected(bench, stored + 1, number, is_plain=number != 0)
-                else:
-                    # All is there: which number is wanted is nobody's business.
-                    _check_naks(bench, None, _nak_counts(bench.choice("tx_01")))
+                # When all is there, which number is wanted is nobody's business.
+                is_open = stored == total
+                bench.check_packet_rejected(*(None, None) if is_open else (stored + 1, number))
         for number in range(1, _STORED) if stored == _STORED else ():
             payload = packet_payload(image, number)
             for what, data in (("the right", payload), ("other", inverted(payload))):
                 with bench.step(f"after packet {stored}, packet {number} with {what} data"):
                     bench.send(bench.encoder.packet(number, total, data))
                     if choice in ("nak", "silence"):
-                        _check_naks(bench, {number, _STORED + 1}, (int(choice == "nak"),))
+                        bench.check_naks([number, _STORED + 1], choice)
                         continue
                     allowed = [f"ACK {number}"]
                     if choice == "either":
@@ -278,7 +248,7 @@ def wrong_total(bench: Bench) -> None:
         for named in wrong:
             with bench.step(f"packet {number} of {named}"):
                 bench.send(bench.encoder.packet(number, named, packet_payload(image, number)))
-                _check_rejected(bench, number, number)
+                bench.check_packet_rejected(number, number)
 
 
 @case(
@@ -298,7 +268,7 @@ def wrong_start_byte(bench: Bench) -> None:
         for start in _START_BYTES:
             with bench.step(f"packet {number} with {start:02X}"):
                 bench.send(bench.encoder.packet(number, total, payload, start=start))
-                _check_rejected(bench, number, number)
+                bench.check_packet_rejected(number, number)
 
 
 # -- the ends of the range ------------------------------------------------------------------------
@@ -401,7 +371,7 @@ def other_filler(bench: Bench) -> None:
         bench.expect(Kind.ACK, number=total)
         bench.finish(image, total + 1)
     else:
-        _check_rejected(bench, total, total)
+        bench.check_packet_rejected(total, total)
         bench.finish(image, total)
 
 

@@ -21,6 +21,7 @@ from flasher.conformance.wire import (
     RawFrame,
     build,
     crc,
+    is_intact,
     joined,
     packet_count,
     packet_payload,
@@ -222,18 +223,12 @@ NO_CONCERN: Final[dict[str, Maker]] = {
     "load": lambda _: [RawFrame(0x7A0 + number % 5, bytes(8)) for number in range(_LOAD_FRAMES)],
 }
 REFUSED: Final = {**PACKETS, **UPDATES, **ENDS, **NO_CONCERN}
-_INTACT_WRITES: Final = frozenset(
-    {
-        *("packet-skip", "packet-far", "packet-zero", "packet-beyond", "packet-total"),
-        *("packet-total-far", "packet-start", "update-zero", "update-huge", "update-large"),
-        *("update-wraps", "update-name", "update-name-end", "end-mark", "reset-text"),
-        *("reset-text-end", "unknown"),
-    }
-)
 
 
 def make(name: str, place: Place) -> Refused:
     """What is sent in the step of that name."""
     made = REFUSED[name](place)
     frames = place.encoder.frames(made) if isinstance(made, bytes) else made
-    return Refused(frames, name in _INTACT_WRITES)
+    raw, can_id = joined(frames), place.encoder.to_device
+    is_own = all(frame.can_id == can_id for frame in frames)
+    return Refused(frames, is_own and is_intact(can_id, raw) and raw[2] == WRITE)

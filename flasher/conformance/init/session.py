@@ -81,16 +81,7 @@ class Session:
     def enter(self, version: int = 1) -> Received:
         """Reset the application; returns that boot version of the burst."""
         bench = self.bench
-        bench.forget()
-        limit_s = bench.limit("first_version_s")
-        with bench.tester.hearing_feedback():
-            sent = bench.send(bench.encoder.reset())
-            heard = bench.wait_for(Kind.FEEDBACK, Kind.BOOT_VERSION, within_s=limit_s)
-        if heard is not None and heard.kind is Kind.FEEDBACK:
-            bench.measure(Times.FEEDBACK, heard.at - sent.left_at)
-            heard = bench.wait_for(Kind.BOOT_VERSION, within_s=limit_s)
-        found = bench.require_received(heard, Kind.BOOT_VERSION.value, limit_s)
-        bench.measure(Times.FIRST, found.at - sent.left_at)
+        found = bench.reset_measured(bench.limit("first_version_s"))
         for _ in range(version - 1):
             found = bench.await_message(Kind.BOOT_VERSION, within_s=_BURST_GAP_S)
         return found
@@ -152,9 +143,13 @@ class Session:
             self.begin()
         self.packets(max(stored, self.stored))
 
+    def packet(self, number: int) -> list[RawFrame]:
+        """A packet of the image."""
+        return self.bench.encoder.packet_of(self.image, number)
+
     def frames(self) -> list[RawFrame]:
         """The next packet as it should be."""
-        return self.bench.encoder.packet_of(self.image, self.stored + 1)
+        return self.packet(self.stored + 1)
 
     def raw(self) -> bytes:
         """The next packet, header to tail."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import floor
 from typing import Final
 
+from flasher.conformance.cases.fr import JUNK_IN_FRAME, PADDINGS
 from flasher.conformance.init.answers import Answer, Findings, Trial
 from flasher.conformance.init.session import REPEATS, Session, told
 from flasher.conformance.judge import Times
@@ -13,16 +14,14 @@ from flasher.conformance.wire import (
     FRAME_BYTES,
     PACKET_BYTES,
     Kind,
-    Received,
+    RawFrame,
     filled_up,
     joined,
     packet_payload,
 )
 
 _LOST_FRAMES: Final = (1, 9, 17)
-_JUNK: Final = (b"\x12", b"\x55", b"\x55\x55", b"\xaa", b"\xf0\x00\x34", b"\x12" * 7)
 _WRONG_TAILS: Final = (0x00, 0x55)
-_PADDINGS: Final = (0x00, 0xFF, 0xAA, 0x55, 0xF0)
 _RANDOM_SPLITS: Final = 4
 _SHARES: Final = (0.1, 0.25, 0.5, 0.75, 0.9)
 _LATER_S: Final = 0.5
@@ -35,49 +34,51 @@ _PACKETS_READ_BACK: Final = 33
 # -- repetitions and bad packets ------------------------------------------------------------------
 
 
+def _asked(
+    it: Session, stimulus: str, frames: Sequence[RawFrame], words: Mapping[str, str]
+) -> Iterator[Trial]:
+    """Send that some times. `words` are those for the answers, "NAK" for any other NAK."""
+    for _ in range(REPEATS):
+        it.bench.forget()
+        it.bench.send(frames)
+        heard = it.bench.answers()
+        is_nak = [one.kind for one in heard] == [Kind.NAK]
+        value = words.get(told(heard)) or words.get(Kind.NAK.value if is_nak else "", "")
+        yield Trial(value, told(heard), stimulus)
+
+
 def repeated_packet(it: Session) -> Findings:
     """The packet stored last, again."""
-    bench = it.bench
     it.begin()
     for stored in (1, 2):
         it.reach(stored, 1)
-        for _ in range(REPEATS):
-            bench.forget()
-            bench.send_packet(it.image, it.stored)
-            heard = told(bench.answers())
-            words = {f"ACK {it.stored}": "ack", f"NAK {it.stored + 1}": "nak_next"}
-            yield Trial(words.get(heard, ""), heard, f"packet {it.stored} again")
+        words = {f"ACK {stored}": "ack", f"NAK {stored + 1}": "nak_next"}
+        yield from _asked(it, f"packet {stored} again", it.packet(stored), words)
     it.finish()
 
 
 def older_packet(it: Session) -> Findings:
     """A packet before the one stored last."""
-    bench = it.bench
     it.begin()
     it.reach(3, 1)
     for number in (1, 2):
-        for _ in range(REPEATS):
-            bench.forget()
-            bench.send_packet(it.image, number)
-            heard = bench.answers()
-            words = {"silence": "silence", f"ACK {number}": "ack"}
-            is_nak = [one.kind for one in heard] == [Kind.NAK]
-            value = "nak" if is_nak else words.get(told(heard), "")
-            yield Trial(value, told(heard), f"packet {number} after packet {it.stored}")
+        words = {f"ACK {number}": "ack", "silence": "silence", "NAK": "nak"}
+        stimulus = f"packet {number} after packet {it.stored}"
+        yield from _asked(it, stimulus, it.packet(number), words)
     it.finish()
 
 
 def bad_packet(it: Session) -> Findings:
     """Packets that are damaged, or make no sense."""
-    bench, trials = it.bench, []
+    trials = list[Trial]()
     it.begin()
     it.reach(2, 3)
-    wanted, after, encoder = it.stored + 1, it.stored + 2, bench.encoder
+    wanted, after, encoder = it.stored + 1, it.stored + 2, it.bench.encoder
     payload = packet_payload(it.image, wanted)
     stimuli = {
         f"packet {wanted} with a wrong CRC": (wanted, encoder.damaged_packet_of(it.image, wanted)),
         f"packet {after} with a wrong CRC": (after, encoder.damaged_packet_of(it.image, after)),
-        f"packet {after} in the place of {wanted}": (after, encoder.packet_of(it.image, after)),
+        f"packet {after} in the place of {wanted}": (after, it.packet(after)),
         f"packet {wanted} of {it.total + 1}": (
             wanted,
             encoder.packet(wanted, it.total + 1, payload),
@@ -88,11 +89,10 @@ def bad_packet(it: Session) -> Findings:
         ),
     }
     for stimulus, (named, frames) in stimuli.items():
-        for _ in range(REPEATS):
-            bench.forget()
-            bench.send(frames)
-            heard = bench.answers()
-            trials.append(Trial(_nak_word(heard, wanted, named), told(heard), stimulus))
+        words = {f"NAK {named}": "nak_received", f"NAK {wanted}": "nak_expected"}
+        if wanted == named:
+            words = {f"NAK {named}": "nak"}
+        trials += _asked(it, stimulus, frames, {**words, "silence": "silence"})
     it.insist()
     it.finish()
     # A NAK with the one number that both ways give says only that there is a NAK.
@@ -106,17 +106,6 @@ def bad_packet(it: Session) -> Findings:
     if "" in telling:
         word = ""
     yield from (trial._replace(value=word) for trial in trials)
-
-
-def _nak_word(heard: Sequence[Received], wanted: int, named: int) -> str:
-    """The value of tx_01 that one answer shows; `nak` where both kinds of NAK are the same."""
-    if not heard:
-        return "silence"
-    if [one.kind for one in heard] != [Kind.NAK] or heard[0].number not in (wanted, named):
-        return ""
-    if wanted == named:
-        return "nak"
-    return "nak_expected" if heard[0].number == wanted else "nak_received"
 
 
 def lost_frame(it: Session) -> Findings:
@@ -194,7 +183,7 @@ def splits(it: Session) -> Findings:
 def junk(it: Session) -> Findings:
     """Junk in the frame in which a packet begins."""
     it.begin()
-    for own in _JUNK:
+    for own in JUNK_IN_FRAME:
         for _ in range(REPEATS):
             it.reach(0, 1)
             taken = it.offer(it.bench.encoder.frames(own + it.raw()))
@@ -223,7 +212,7 @@ def padded(it: Session) -> Findings:
     within_s = bench.limit("complete_s")
     if bench.choice("tx_12") == "announces":  # while the transfer still lasts
         within_s = min(within_s, bench.limit("pause_s") / 2)
-    for byte in _PADDINGS:
+    for byte in PADDINGS:
         it.enter()
         bench.wait_to_be_heard()
         taken = it.offer_update(filled_up(bench.encoder.update(len(it.image)), byte))
