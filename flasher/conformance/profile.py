@@ -198,6 +198,11 @@ def profile_keys() -> dict[str, Key]:
     return {path: key for path, key in _READER.keys.items() if path != DEVIATIONS}
 
 
+def words(name: str) -> list[str]:
+    """What a choice can be, besides `either`."""
+    return [word for word in profile_keys()[name].choices if word != "either"]
+
+
 @dataclass(frozen=True)
 class ConformanceProfile:
     """What differs from the defaults, by path (`tx_02`, `limits.erase_s`), with the rationales.
@@ -220,6 +225,10 @@ class ConformanceProfile:
     def choice(self, name: str) -> str:
         """The choice of that name ("tx_02"). Raises KeyError for one that does not exist."""
         return str(self.value(name))
+
+    def allows(self, name: str, word: str) -> bool:
+        """True where an answer that is this word of a choice is right."""
+        return self.choice(name) in (word, "either")
 
     def limit(self, name: str) -> float:
         """The time of that name in the table `limits` ("erase_s"), in seconds."""

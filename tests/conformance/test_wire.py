@@ -157,3 +157,13 @@ def test_many_messages_are_described_in_a_line() -> None:
 def test_an_image_that_names_two_versions_names_none() -> None:
     assert wire.version_in(b"..V1r0r4_20220512..") == "V1r0r4_20220512"
     assert wire.version_in(b"V1r0r4_20220512 V1r0r5_20220512") is None
+
+
+def test_a_message_is_intact_where_length_command_crc_and_tail_fit() -> None:
+    right = wire.build(0x752, wire.WRITE, 0x6F03, b"abc")
+    assert wire.is_intact(0x752, right)
+    longer = wire.build(0x752, wire.WRITE, 0x6F02, b"abc")
+    others = (b"", right[:-1], right + b"\0", right[:-1] + b"\xf1", longer, right + right)
+    damaged = bytes((*right[:7], right[7] ^ 1, *right[8:]))
+    assert not any(wire.is_intact(0x752, raw) for raw in (*others, damaged))
+    assert not wire.is_intact(0x751, right)

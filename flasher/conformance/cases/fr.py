@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator, Mapping
-from typing import Final
+from typing import Final, NamedTuple
 
 from flasher.conformance.bench import Bench
 from flasher.conformance.cases.probing import ACCEPTED, EITHER, REJECTED, Probe, is_as
 from flasher.conformance.catalogue import DESTRUCTIVE, case
 from flasher.conformance.judge import Times
+from flasher.conformance.profile import words
 from flasher.conformance.results import Unsupported
 from flasher.conformance.wire import (
     END,
@@ -22,6 +23,7 @@ from flasher.conformance.wire import (
     START,
     UPDATE,
     WRITE,
+    Encoder,
     Kind,
     RawFrame,
     build,
@@ -31,7 +33,6 @@ from flasher.conformance.wire import (
 )
 
 _HEADER: Final = b"\x55\xaa"
-_SIZES: Final = range(1, FRAME_BYTES)
 _RANDOM_SPLITS: Final = 7
 _JUNK_FRAMES: Final = (b"\x12", bytes(8), b"\xaa\x55\xf0", b"\xf0" * 8 + b"\xaa" * 8 + b"\x16" * 3)
 """None of them holds a header, nor the beginning of one at its end."""
@@ -95,9 +96,7 @@ def splits(bench: Bench) -> None:
     with bench.step("update command in frames of 5 bytes"):
         update = joined(bench.encoder.update(len(probe.image)))
         probe.enter(bench.encoder.frames(update, 5), choice)
-    for size in _SIZES:
-        with bench.step(f"packet in frames of {size} bytes"):
-            probe.offer(bench.encoder.frames(probe.raw(), size), choice)
+    _offer_forms(bench, probe, "fr_01")
     with bench.step("packet in frames of 8 bytes"):
         probe.offer(probe.frames(), ACCEPTED)
     for turn in range(_RANDOM_SPLITS):
@@ -126,9 +125,7 @@ def junk(bench: Bench) -> None:
         with bench.step(f"{len(own)} bytes before it, the last one {own[-1]:02X}"):
             wanted = after_half if own[-1] == 0x55 else ACCEPTED
             probe.offer(bench.encoder.frames(own) + probe.frames(), wanted)
-    for own in JUNK_IN_FRAME:
-        with bench.step(f"{own.hex(' ').upper()} in its first frame"):
-            probe.offer(bench.encoder.frames(own + probe.raw()), in_frame)
+    _offer_forms(bench, probe, "fr_02")
     probe.check_stored()
 
 
@@ -166,17 +163,12 @@ def header_in_data(bench: Bench) -> None:
     choices=("fr_04",),
 )
 def wrong_tail(bench: Bench) -> None:
-    behind = _wanted(bench, "fr_04")
     probe = Probe(bench)
     probe.begin()
     for tail in _WRONG_TAILS:
         with bench.step(f"packet that ends with {tail:02X}"):
             probe.discard(bench.encoder.frames(probe.raw()[:-1] + bytes((tail,))))
-    query = joined(bench.encoder.query_version())
-    for tail in (0x00, 0x55):
-        with bench.step(f"query that ends with {tail:02X}, packet in the same frame"):
-            broken = query[:-1] + bytes((tail,))
-            probe.offer(bench.encoder.frames(broken + probe.raw()), behind)
+    _offer_forms(bench, probe, "fr_04")
     probe.check_stored()
 
 
@@ -376,9 +368,16 @@ def unknown(bench: Bench) -> None:
 
 def _wanted(bench: Bench, key: str) -> str:
     """Whether the message that a choice of the profile is about has to be accepted."""
-    choice = bench.choice(key)
-    means = {"found": ACCEPTED, "rescanned": ACCEPTED, "ignored": ACCEPTED}
-    return means.get(choice, REJECTED if choice in ("lost", "dropped") else choice)
+    taken, not_taken = words(key)
+    return {taken: ACCEPTED, not_taken: REJECTED}.get(bench.choice(key), EITHER)
+
+
+def _offer_forms(bench: Bench, probe: Probe, key: str) -> None:
+    """The next packets, in the forms that this key decides about."""
+    for form in forms(bench.encoder)[key]:
+        with bench.step(form.step):
+            frames = bench.encoder.frames(form.before + probe.raw(), form.frame_bytes)
+            probe.offer(frames, _wanted(bench, key))
 
 
 def _of_command(bench: Bench, command: int) -> list[RawFrame]:
@@ -387,6 +386,38 @@ def _of_command(bench: Bench, command: int) -> list[RawFrame]:
 
 
 # -- stimuli --------------------------------------------------------------------------------------
+
+
+class Form(NamedTuple):
+    """A form of an intact packet: `step` names it in a case, `asked` in a profile of `init`; the
+    bytes `before` it stand in its first frame.
+    """
+
+    step: str
+    asked: str
+    before: bytes = b""
+    frame_bytes: int = FRAME_BYTES
+
+
+def forms(encoder: Encoder) -> dict[str, list[Form]]:
+    """Forms of a packet by the key of the profile that decides about them: its first word is for a
+    packet that is taken, the second one for the other. Cases, `init` and walks send all of them.
+    """
+    splits = {size: f"packet in frames of {size} bytes" for size in range(1, FRAME_BYTES)}
+    junk = {f"{own.hex(' ').upper()} in its first frame": own for own in JUNK_IN_FRAME}
+    query = joined(encoder.query_version())[:-1]
+    return {
+        "fr_01": [Form(step, f"a {step}", frame_bytes=size) for size, step in splits.items()],
+        "fr_02": [Form(step, f"a packet behind {step}", own) for step, own in junk.items()],
+        "fr_04": [
+            Form(
+                f"query that ends with {tail:02X}, packet in the same frame",
+                f"a packet behind a tail {tail:02X} in its first frame",
+                query + bytes((tail,)),
+            )
+            for tail in (0x00, 0x55)
+        ],
+    }
 
 
 def _treacherous_payloads(bench: Bench) -> Iterator[tuple[str, bytes]]:

@@ -6,12 +6,16 @@ import random
 import re
 from typing import Final, NamedTuple
 
+from flasher.conformance.cases.fr import forms
 from flasher.conformance.explore.refused import ENDS, NO_CONCERN, PACKETS, UPDATES
 from flasher.conformance.explore.walk import ALL_STEPS, Phase, Walk
+from flasher.conformance.wire import Encoder
 from flasher.errors import UsageError, did_you_mean
 
 _NUMBER: Final = re.compile("[0-9]{1,9}")
 _SHARE: Final = 12 / len(PACKETS)
+_OPEN: Final = "packet-open"
+"""Any of the forms that the profile decides about."""
 _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
     Phase.APPLICATION: {
         "reset": 14,
@@ -48,7 +52,8 @@ _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
         "update=good": 2,
         **dict.fromkeys(("packet-slow", "packet-behind", "packet-between"), 1),
         **dict.fromkeys(("end", "reset", "wait=0.3", "power", "query"), 1),
-        **dict.fromkeys(("packet-open=short", "packet-open=junk", "wait=pause"), 0.7),
+        "wait=pause": 0.7,
+        _OPEN: 1.4,
         **dict.fromkeys(PACKETS, _SHARE),
         **dict.fromkeys((*ENDS, *UPDATES, *NO_CONCERN, "bus-off"), 0.3),
     },
@@ -67,7 +72,8 @@ _WEIGHTS: Final[dict[Phase, dict[str, float]]] = {
         "update=good": 2,
         "update=300": 1,
         **dict.fromkeys(("packet-slow", "packet-behind", "packet-between", "reset", "power"), 1),
-        **dict.fromkeys(("packet-open=short", "packet-open=junk", "wait=pause"), 0.7),
+        "wait=pause": 0.7,
+        _OPEN: 1.4,
         **dict.fromkeys(("wait=0.3", "query"), 0.5),
         **dict.fromkeys(PACKETS, _SHARE),
         **dict.fromkeys((*ENDS, *UPDATES, *NO_CONCERN, "bus-off"), 0.3),
@@ -120,7 +126,7 @@ _ARGUMENTS: Final = {
 def parse_step(text: str) -> Step:
     """A step as it is written. Raises UsageError for one that does not exist."""
     name, _, argument = text.partition("=")
-    known = _ARGUMENTS.get(name, set())
+    known = set(_forms()) if name == _OPEN else _ARGUMENTS.get(name, set())
     is_number = _NUMBER.fullmatch(argument) and any(map(_NUMBER.fullmatch, known))
     if argument not in known and not is_number:
         hint = did_you_mean(text, ALL_STEPS).rstrip()
@@ -138,7 +144,16 @@ def next_step(walk: Walk, chance: random.Random) -> Step:
     }
     texts = [text for text in weights if not lacks.get(text.partition("=")[0])]
     (text,) = chance.choices(texts, [weights[text] for text in texts])
-    return parse_step(text)
+    return Step(_OPEN, chance.choice(_forms())) if text == _OPEN else parse_step(text)
+
+
+def _forms() -> list[str]:
+    """The arguments of `packet-open`."""
+    return [
+        f"{key}-{index}"
+        for key, each in forms(Encoder("bms")).items()
+        for index in range(len(each))
+    ]
 
 
 def reachable_pairs() -> list[tuple[Phase, str]]:
@@ -146,5 +161,5 @@ def reachable_pairs() -> list[tuple[Phase, str]]:
     return [
         (phase, name)
         for phase, weights in _WEIGHTS.items()
-        for name in dict.fromkeys(parse_step(text).name for text in weights)
+        for name in dict.fromkeys(text.partition("=")[0] for text in weights)
     ]

@@ -17,8 +17,10 @@ from math import inf
 from typing import Final
 
 from flasher.conformance.bench import Bench
+from flasher.conformance.cases.fr import forms
 from flasher.conformance.explore.refused import PACKETS, REFUSED, UPDATES, Place, make
 from flasher.conformance.host import LEFTOVER_S, UPDATE_SPACING_S
+from flasher.conformance.profile import words
 from flasher.conformance.wire import (
     PACKET_BYTES,
     Kind,
@@ -621,21 +623,21 @@ class Walk:
         self._packet("", [*query, *self.bench.encoder.frames(self._place.next_packet)])
 
     def _packet_open(self, argument: str) -> None:
-        """The next packet in a form that the profile decides about: in short frames, or behind
-        junk in its first frame.
-        """
-        raw = self._place.next_packet
-        key, right = {"short": ("fr_01", "accepted"), "junk": ("fr_02", "found")}[argument]
-        short = self.bench.encoder.frames(raw, 5)
-        frames = short if argument == "short" else self.bench.encoder.frames(b"\x00\x12\x34" + raw)
-        if self.bench.choice(key) == right:
+        """The next packet in a form that the profile decides about: `fr_02-1` is one of fr_02."""
+        bench, (key, _, index) = self.bench, argument.partition("-")
+        form = forms(bench.encoder)[key][int(index)]
+        raw = form.before + self._place.next_packet
+        frames = bench.encoder.frames(raw, form.frame_bytes)
+        taken, not_taken = words(key)
+        if not bench.profile.allows(key, not_taken):
             self._packet("", frames)
             return
-        if self.phase in (Phase.BEGUN, Phase.TRANSFER, Phase.UNCLEAR):
+        is_next = self.phase in (Phase.BEGUN, Phase.TRANSFER, Phase.UNCLEAR)
+        if is_next and bench.profile.allows(key, taken):
             self._acks_due[self.wanted] += 1
         self._naks_due, self._nak_numbers = 4, None
         self._feedback_due += 1
-        self.bench.send(frames)
+        bench.send(frames)
         self._quiet()
         self._acks_due.clear()
 

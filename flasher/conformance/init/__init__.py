@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from flasher.conformance.init import entering, transferring
@@ -50,8 +51,8 @@ QUESTIONS: Final[tuple[tuple[Question, tuple[str, ...]], ...]] = (
     (transferring.older_packet, ("tx_03",)),
     (transferring.filler, ("tx_08",)),
     (transferring.splits, ("fr_01",)),
-    (transferring.junk, ("fr_02",)),
-    (transferring.wrong_tail, ("fr_04",)),
+    (partial(transferring.in_forms, key="fr_02"), ("fr_02",)),
+    (partial(transferring.in_forms, key="fr_04"), ("fr_04",)),
     (transferring.padded, ("fr_07",)),
     (transferring.gaps, ("tm_02",)),
     (transferring.end_again, ("en_02",)),

@@ -6,12 +6,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from math import floor
 from typing import Final
 
-from flasher.conformance.cases.fr import JUNK_IN_FRAME, PADDINGS
+from flasher.conformance.cases.fr import PADDINGS, Form, forms
 from flasher.conformance.init.answers import Answer, Findings, Trial
 from flasher.conformance.init.session import REPEATS, Session, told
 from flasher.conformance.judge import Times
+from flasher.conformance.profile import words
 from flasher.conformance.wire import (
-    FRAME_BYTES,
     PACKET_BYTES,
     Kind,
     RawFrame,
@@ -21,7 +21,6 @@ from flasher.conformance.wire import (
 )
 
 _LOST_FRAMES: Final = (1, 9, 17)
-_WRONG_TAILS: Final = (0x00, 0x55)
 _RANDOM_SPLITS: Final = 4
 _SHARES: Final = (0.1, 0.25, 0.5, 0.75, 0.9)
 _LATER_S: Final = 0.5
@@ -169,10 +168,8 @@ def splits(it: Session) -> Findings:
         if not taken:  # the window is over by now
             it.await_application()
             it.begin()
-        for size in range(1, FRAME_BYTES):
-            it.reach(0, 1)
-            taken = it.offer(bench.encoder.frames(it.raw(), size))
-            yield _taken(taken, f"a packet in frames of {size} bytes")
+        for form in forms(bench.encoder)["fr_01"]:
+            yield _offered(it, form, "fr_01")
         for _ in range(_RANDOM_SPLITS):
             it.reach(0, 1)
             taken = it.offer(bench.encoder.frames_by_chance(it.raw(), bench.random))
@@ -180,30 +177,19 @@ def splits(it: Session) -> Findings:
         it.finish()
 
 
-def junk(it: Session) -> Findings:
-    """Junk in the frame in which a packet begins."""
+def in_forms(it: Session, key: str) -> Findings:
+    """Packets in the forms that one key of the profile decides about."""
     it.begin()
-    for own in JUNK_IN_FRAME:
+    for form in forms(it.bench.encoder)[key]:
         for _ in range(REPEATS):
-            it.reach(0, 1)
-            taken = it.offer(it.bench.encoder.frames(own + it.raw()))
-            stimulus = f"a packet behind {own.hex(' ').upper()} in its first frame"
-            yield _taken(taken, stimulus, "found", "lost")
+            yield _offered(it, form, key)
     it.finish()
 
 
-def wrong_tail(it: Session) -> Findings:
-    """A packet in the frame in which a message with a wrong tail ends."""
-    bench = it.bench
-    query = joined(bench.encoder.query_version())
-    it.begin()
-    for tail in _WRONG_TAILS:
-        for _ in range(REPEATS):
-            it.reach(0, 1)
-            taken = it.offer(bench.encoder.frames(query[:-1] + bytes((tail,)) + it.raw()))
-            stimulus = f"a packet behind a tail {tail:02X} in its first frame"
-            yield _taken(taken, stimulus, "rescanned", "dropped")
-    it.finish()
+def _offered(it: Session, form: Form, key: str) -> Trial:
+    it.reach(0, 1)
+    taken = it.offer(it.bench.encoder.frames(form.before + it.raw(), form.frame_bytes))
+    return _taken(taken, form.asked, *words(key))
 
 
 def padded(it: Session) -> Findings:
