@@ -11,7 +11,7 @@ from flasher.conformance.bench import Bench
 from flasher.conformance.mock import GOOD_IMAGE, MOCK_PROFILE, SECOND_IMAGE, profile_of_mock
 from flasher.conformance.results import CaseLimitReached, CaseStopped
 from flasher.conformance.tester import Fault, FaultKind
-from flasher.conformance.wire import Kind, RawFrame
+from flasher.conformance.wire import Kind, RawFrame, packet_count
 from tests.loops import each
 
 from .bench import PROFILE, subject
@@ -121,3 +121,19 @@ def test_a_packet_that_is_rejected_is_judged_by_the_profile(choice: Any) -> None
     assert bench.check_packet_rejected(wanted=1, named=4)
     bench.send_packet(GOOD_IMAGE, 1)
     assert not bench.check_packet_rejected(wanted=1, named=1)
+
+
+def test_the_number_of_a_nak_is_open_where_the_packets_is_not_credible_or_none_is_given() -> None:
+    device = replace(MOCK_PROFILE, bad_packet="nak_expected")
+    stated = profile_of_mock(replace(MOCK_PROFILE, bad_packet="nak_received"))
+    bench = Bench(subject(profile=device), stated, limit_s=100.0)
+    bench.start_transfer(len(GOOD_IMAGE))
+    for named, is_right in ((0, True), (3, False), (None, True)):
+        number = 3 if named is None else named
+        bench.send(bench.encoder.packet(number, packet_count(len(GOOD_IMAGE)), bytes(128)))
+        assert bench.check_packet_rejected(1, named) is is_right
+    assert [check.expected for check in bench.judge.checks[-3:]] == [
+        "rejected: NAK 0 or 1",
+        "rejected: NAK 3",
+        "rejected: NAK",
+    ]
