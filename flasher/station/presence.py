@@ -8,16 +8,16 @@ it is not seen; then only a person knows.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, Protocol
 
 from flasher.protocol import catalogue
 from flasher.protocol.fields import Content
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import BootVersion, GeneralFeedback, RequestTransfer, decode
-from flasher.protocol.spec import data_size
+from flasher.protocol.spec import Target, data_size
 from flasher.protocol.text import printable
 from flasher.protocol.wire import Message, Reassembler, encode, split
-from flasher.settings.profile import sent_ids
+from flasher.settings.profile import Profile, sent_ids
 from flasher.station.messages import PresenceChanged
 from flasher.station.recipe_file import LoadedTarget
 
@@ -38,12 +38,21 @@ _ALIKE: Final = 1.5
 """Two pauses that differ by less than this factor are alike."""
 
 
+class Watched(Protocol):
+    """A target, and what holds for it."""
+
+    @property
+    def target(self) -> Target: ...
+    @property
+    def profile(self) -> Profile: ...
+
+
 class TargetWatcher:
     """A driver's tap: what a device says by itself, and what it answers when it is asked for its
     version.
     """
 
-    def __init__(self, loaded: LoadedTarget) -> None:
+    def __init__(self, loaded: Watched) -> None:
         timings = loaded.profile.timings
         limit_s = timings.inter_frame_timeout_s
         self._boot = Reassembler(loaded.target.answer_id, limit_s)

@@ -11,7 +11,7 @@ import hashlib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from math import inf
-from typing import Final
+from typing import Final, NamedTuple
 
 from flasher.host.options import firmware_version
 from flasher.protocol import catalogue, messages
@@ -22,6 +22,8 @@ from flasher.protocol.spec import BMS, TARGETS, Mode, Node, Target, can_id, pack
 from flasher.protocol.text import printable
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.protocol.wire import Message, Reassembler
+from flasher.settings.profile import Profile
+from flasher.station.presence import BLIND_S, TargetWatcher
 from flasher.station.records.model import (
     AFTER_RESTART,
     BY_POWER,
@@ -51,8 +53,10 @@ class Restarts:
     """
 
     uncaused: list[float] = field(default_factory=list)
-    _is_identified: bool = False
+    is_identified: bool = False
     """It has answered, or was told to update: it has to stay."""
+    _has_acted: bool = False
+    """The tool has sent something after which it may restart."""
     _is_running: bool = False
     """It has answered since the last announcement."""
     _is_due: bool = False
@@ -66,17 +70,25 @@ class Restarts:
 
     def sent(self, message: Message, row: object) -> None:
         """The tool sent something to it."""
+        self._has_acted = self._has_acted or message.mode == Mode.WRITE
         if isinstance(row, messages.UpdateCommand):
-            self._is_identified = self._is_told = True
+            self.is_identified = self._is_told = True
             self._is_due, self._requested_at = False, None
         elif isinstance(row, Reset | messages.EndOfTransfer | messages.Unknown):
             # Products may have a reset of their own.
             self._is_due = self._is_due or message.mode == Mode.WRITE
             self._requested_at = None
 
+    def powered_up(self, at_s: float) -> None:
+        """It was heard before it is identified, and its bootloader announces itself: it has to be
+        the unit of the label from the beginning on.
+        """
+        if not self._has_acted:
+            self.uncaused.append(at_s)
+
     def answered(self) -> None:
         """Its application named its version."""
-        self._is_identified = self._is_running = True
+        self.is_identified = self._is_running = True
         self._is_due = self._is_told = False
 
     def take(self, row: object, at_s: float) -> None:
@@ -98,10 +110,17 @@ class Restarts:
         elif self._is_due:
             is_uncaused = self._is_due = False
         else:
-            is_uncaused = self._is_identified
+            is_uncaused = self.is_identified
         if is_uncaused and not self._is_noted:
             self._is_noted = True
             self.uncaused.append(at_s)
+
+
+class _Usual(NamedTuple):
+    """A target without settings of a product: the records hold none."""
+
+    target: Target
+    profile: Profile
 
 
 @dataclass
@@ -129,6 +148,23 @@ class TraceOfTarget:
     """As answered last."""
     _written: dict[str, set[str]] = field(default_factory=dict)
     """What the tool has written to these fields."""
+
+    def __post_init__(self) -> None:
+        self._watcher = TargetWatcher(_Usual(self.target, Profile(self.target)))
+
+    def hear(self, frame: Frame, at_s: float, gap_s: float) -> None:
+        """Any frame before it is identified, `gap_s` after the last one; the computer may have
+        stood still meanwhile.
+        """
+        watcher = self._watcher
+        if BLIND_S < gap_s < _STALL_S:
+            watcher.miss(gap_s)
+        was_known, power_ups = watcher.is_known, watcher.power_ups
+        watcher(frame, sent=False, now=at_s)
+        # How long a bootloader announces itself before its application starts, the profile says.
+        is_power_up = watcher.power_ups > power_ups and watcher.is_in_bootloader
+        if was_known and is_power_up:
+            self.restarts.powered_up(at_s)
 
     def take(self, message: Message, at_s: float) -> None:
         """One intact message, of the tool or of the device."""
@@ -207,9 +243,14 @@ def traces_of_targets(
         for of_id in (each.target.request_id, *ids_of[each.target.node])
     }
     began_s: float | None = None
+    before_s = 0.0
     for moment_s, frame in frames:
         began_s = moment_s if began_s is None else began_s
         at_s = moment_s - began_s
+        gap_s, before_s = at_s - before_s, at_s
+        for each in traces.values():
+            if not each.restarts.is_identified:
+                each.hear(frame, at_s, gap_s)
         if not frame.is_payload or frame.can_id not in streams:
             continue
         stream, each = streams[frame.can_id]

@@ -15,7 +15,7 @@ from flasher.protocol.contents import Reset, SerialNumber
 from flasher.protocol.fields import Text
 from flasher.protocol.frame import Frame
 from flasher.protocol.messages import BootVersion, RequestTransfer, UpdateCommand
-from flasher.protocol.spec import BMS, WMC, Command
+from flasher.protocol.spec import BMS, WMC, Command, Mode, can_id
 from flasher.protocol.text import encode_text
 from flasher.protocol.wire import Message, encode, split
 from flasher.station.records.model import (
@@ -40,6 +40,9 @@ REQUEST = RequestTransfer().to_message(BMS.answer_id)
 NUMBER = catalogue.encode(
     catalogue.BY_KEY[BMS.request_id, 0x4110], SerialNumber(Text(encode_text(SERIAL, 16)))
 )
+QUESTION = Message(BMS.request_id, Mode.READ, Command.READ_VERSION, b"")
+DATA = Message(can_id(BMS.node, None), Mode.REPORT, 0x1410, bytes(16))
+"""Of an application, which does not name itself."""
 BLANK = version_answer("NONE", "V1")
 OWN = version_answer(SERIAL, "V1")
 OTHER = version_answer("MK-2", "V1")
@@ -73,6 +76,30 @@ def test_an_announcement_without_a_cause(
 ) -> None:
     heard = traces_of_targets(["bms"], frames(*said))["bms"]
     assert heard.restarts.uncaused == pytest.approx(uncaused, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("said", "uncaused"),
+    [
+        ([(0, DATA), (1, BOOT), (1.05, BOOT), (2, OWN)], [1.001]),
+        ([(0, DATA), (1, QUESTION), (1.5, QUESTION), (2, BOOT), (3, OWN)], [2.001]),
+        ([(0, BOOT), (0.05, BOOT), (4, BOOT), (5, OWN)], [4.001]),
+        ([(0, BOOT), (0.05, BOOT), (1, DATA), (2, BOOT), (3, OWN), (4, BOOT)], [2.001, 4.001]),
+        ([(0, BOOT), (0.05, BOOT), (2, BOOT), (5, OWN)], []),
+        ([(0, QUESTION), (4, BOOT), (4.05, BOOT), (5, OWN)], []),
+        ([(0, DATA), (0.5, RESET), (1, BOOT), (5, BOOT), (6, OWN)], []),
+    ],
+    ids=[
+        "of a running one", "while it is asked", "of another one in its bootloader",
+        "before and after it was identified", "maybe while the computer stood still",
+        "the first one", "after a reset",
+    ],
+)  # fmt: skip
+def test_an_announcement_before_the_unit_is_identified(
+    said: list[tuple[float, Message]], uncaused: list[float]
+) -> None:
+    heard = traces_of_targets(["bms"], frames(*said))["bms"]
+    assert heard.restarts.uncaused == pytest.approx(uncaused, abs=1e-3)
 
 
 def test_a_burst_after_the_end_of_a_transfer_has_its_cause_and_another_one_has_none() -> None:
