@@ -320,7 +320,7 @@ class Socket:
             words = say("Scan the label of the unit that is in this socket, or goes into it.")
             return SocketState.SCAN, self.label, words
         last = self.verdict
-        if last is not None and last.outcome is not None:
+        if last is not None and last.outcome is not None and not self.label:
             told = last.action if self.note_until_s is None else self.note
             return _state_after(last.outcome), last.serial, told
         if self.out_of_service is not None:
