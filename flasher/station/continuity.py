@@ -239,7 +239,7 @@ class Continuity:
             self._has_acted = True
             is_reset = found.command in (self._reset_command, Command.RESET)
             self._announced_on = 0 if is_reset else self._announced_on
-            if is_reset and self._pause_s >= self._gap_s:
+            if is_reset and not self.is_announcing:
                 self._missed_s = 0.0
             if found.command == Command.RESET and self.is_running:
                 # As long as it has not confirmed that, it goes on running.
@@ -258,6 +258,11 @@ class Continuity:
                 self._requested_s = None
                 self._burst_until = inf
                 self._announced_on = _ANNOUNCED_ON
+
+    @property
+    def is_announcing(self) -> bool:
+        """True while its bootloader announces itself, at its own pace."""
+        return self._pause_s < self._gap_s
 
     @property
     def _pause_s(self) -> float:

@@ -280,7 +280,7 @@ class UnitSteps:
                     was_away = True
                 case events.PacketAcknowledged(number, total):
                     self._progress(number / total)
-                case events.PowerCycleAwaited(wait_s):
+                case events.PowerCycleAwaited(wait_s) if not target.continuity.is_announcing:
                     if self._power is not None:
                         self._power.begin_cycle()
                     else:
@@ -288,8 +288,14 @@ class UnitSteps:
                         text = say("Switch the {target} off, wait 3 s, and on again.", target=name)
                         self._prompt(text, wait_s)
 
+        is_in_bootloader = self._identified[target.name].is_in_bootloader
         options = replace(target.options(timeout_s=limit_s), at_power_up=at_power_up)
-        if self._identified[target.name].is_in_bootloader:
+        if is_in_bootloader and target.continuity.is_announcing:
+            # Its next announcement comes by itself. It ignores a reset (R18), after which that of
+            # another unit would be taken for its own.
+            wait_s = options.timings.boot_version_timeout_s
+            options = replace(options, at_power_up=True, power_up_timeout_s=wait_s)
+        if is_in_bootloader:
             # It goes on announcing itself: whether it ignores a reset shows before it is erased.
             timings = options.timings
             watch_s = _SPACINGS_OF_WATCH * timings.boot_version_spacing_s

@@ -125,7 +125,11 @@ class UnitTarget:
         found = self._identify_once()
         if not found.is_in_bootloader or self.version_request is None:
             return found
-        self.listen(self.loaded.profile.timings.announcing_on_s, self._is_quiet)
+        until = self.clock.now() + self.loaded.profile.timings.announcing_on_s
+        with suppress(NoAnswerError):
+            # It is not reset: an application beside it would show itself only by its answer.
+            self.device.version()
+        self.listen(until - self.clock.now(), self._is_quiet)
         if not self._is_quiet(self.clock.now()) or self.await_application() is None:
             return found
         return self._identify_once()

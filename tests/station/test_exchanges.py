@@ -643,7 +643,7 @@ def test_a_computer_that_stands_still_for_a_moment_is_no_pause_of_a_bootloader(
     assert result.outcome is RunState.PASS, result
 
 
-@pytest.mark.parametrize("stall_s", [0.35, 1.0, 10.0])
+@pytest.mark.parametrize("stall_s", [0.4, 1.0, 10.0])
 @pytest.mark.parametrize("reset", ["ignored", "restarts"])
 @pytest.mark.parametrize("has_application", [True, False])
 def test_what_a_computer_that_stands_still_did_not_see_does_not_accuse_the_unit(
@@ -716,3 +716,49 @@ def test_a_bootloader_may_announce_itself_at_a_pace_of_its_own(
     )
     result = bench.run()
     assert result.outcome is RunState.PASS, result
+
+
+@pytest.mark.parametrize("gap_s", [0.3, 1.0, 3.5])
+@pytest.mark.parametrize("pulled_after_s", [0.0, 0.02, 0.05, 0.1, 0.15, 0.2])
+def test_a_unit_in_its_bootloader_that_is_exchanged_as_its_flash_begins(
+    tmp_path: Path, pulled_after_s: float, gap_s: float
+) -> None:
+    """It is not reset, so that no announcement after a pause is its own."""
+    world = Exchange(tmp_path, gap_s=gap_s)
+    world.bench.put(without_application())
+    begins_at: list[float] = []
+
+    def is_time() -> bool:
+        now = world.bench.clock.now()
+        if ("intent", "bms", "flash") in world.bench.journal.rows:
+            begins_at.append(now)
+        return bool(begins_at) and now >= begins_at[0] + pulled_after_s
+
+    world.when = is_time
+    world.check_caught()
+
+
+def test_a_unit_in_its_bootloader_is_flashed_without_a_prompt(tmp_path: Path) -> None:
+    bench = UnitBench(tmp_path)
+    bench.put(without_application())
+    resets: list[float] = []
+
+    def see(frame: Frame, *, sent: bool, now: float) -> None:
+        if sent and frame.can_id == BMS.request_id and frame.data[4:6] == b"\x42\x05":
+            resets.append(now)
+
+    bench.taps = (see,)
+    assert bench.run().outcome is RunState.PASS
+    assert not any(isinstance(each, OperatorPrompted) for each in bench.notes)
+    assert len(resets) == 1, "the restart after the writes"
+
+
+def test_an_application_beside_a_bootloader_ends_the_run_before_anything_is_sent(
+    tmp_path: Path,
+) -> None:
+    bench = UnitBench(tmp_path)
+    bench.put(without_application())
+    beside = MockDevice(BMS, bitrate_bps=WELLING.bitrate_bps, profile=NEW_UNIT)
+    bench.bus.attach(beside)
+    assert bench.run().outcome is RunState.ERROR
+    assert (bench.device.erase_count, beside.erase_count) == (0, 0)
