@@ -249,7 +249,12 @@ class Socket:
         before = self.occupancy
         last = self.last
         # One that has passed has answered at the end of its run: it does not sleep, it was pulled.
-        is_pulled = last is not None and last.outcome is RunState.PASS and not last.has_talked
+        # Nor does one that has reported its number since, whatever happened to the adapter.
+        is_pulled = (
+            last is not None
+            and last.outcome is RunState.PASS
+            and (not last.has_talked or (last.has_said and self.is_last_there))
+        )
         is_out = is_certain or self.is_own_known or is_pulled or before is Occupancy.EMPTY
         self.occupancy = Occupancy.EMPTY if is_out else Occupancy.SILENT
         if is_out:

@@ -135,6 +135,11 @@ STORIES = {
         " @10.5 pull unit=2 ; @58.0 put unit=2 socket=C ; @125.5 card by=jo unit=2 ;"
         " @126.0 label by=jo unit=2"
     ),
+    "a unit that is pulled while the adapter is away": (
+        "line sockets=1 ; unit label=1 ; person name=jo ; @3.0 put unit=1 socket=A ;"
+        " @7.0 label by=jo unit=1 ; @12.0 unplug socket=A seconds=0.5 ; @12.2 pull unit=1 ;"
+        " @20.0 look"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"

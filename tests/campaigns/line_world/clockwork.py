@@ -9,8 +9,8 @@ same course each time.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 from greenlet import getcurrent, greenlet  # type: ignore[import-untyped]
@@ -23,7 +23,7 @@ from flasher.protocol.frame import Frame
 from flasher.protocol.spec import WELLING
 from flasher.station.messages import Ask, Finished, FromWorker, ToWorker, WorkerSetup
 from flasher.station.recipe_file import LoadedRecipe
-from flasher.station.worker import StationGoneError, StationPipe, Worker
+from flasher.station.worker import StationGoneError, StationPipe, work_on
 
 
 class SocketBus(SimulatedBus):
@@ -56,6 +56,14 @@ class SocketBus(SimulatedBus):
             if any(getattr(sender, "engine", None) is engine for sender in senders):
                 self._sending = None
         self.detach(engine)
+
+    @contextmanager
+    def opened(self) -> Iterator[tuple[Connection, None]]:
+        """The adapter of the socket. Raises BusError while it is not plugged in."""
+        self.close_adapter()
+        link = self.link()
+        link.reopen()
+        yield Connection(link, self.clock, "an adapter"), None
 
     def close_adapter(self) -> None:
         """What the process of the socket had still to send is gone with it."""
@@ -113,8 +121,6 @@ class Process:
     ) -> None:
         self._bus = bus
         self._pipe = Pipe(bus, on_sent)
-        bus.close_adapter()
-        self.connection = Connection(bus.link(), bus.clock, f"bus {setup.socket}")
         self.has_asked = False
         """It waits for the station."""
         self.stalled_until = 0.0
@@ -122,7 +128,7 @@ class Process:
         def main() -> None:
             pipe = StationPipe(self._pipe, bus.clock.now)
             with suppress(StationGoneError):
-                Worker(setup, recipe, pipe, self.connection).work()
+                work_on(pipe, setup, recipe, bus.opened)
 
         self._greenlet = greenlet(main)
         bus.stop = self._stop

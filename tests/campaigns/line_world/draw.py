@@ -215,14 +215,22 @@ class Teller:
             socket = chance.choice(list(self.world.bays))
             seconds = round(chance.choice((0.05, 0.5, 2.0, 4.0)), 3)
             way = chance.random()
-            if way < 0.15:
+            if way < 0.12:
                 yield wait, stories.Stall(socket=socket, seconds=seconds)
-            elif way < 0.4:
+            elif way < 0.34:
                 unit = chance.choice(list(self.world.units))
                 yield wait, stories.Sleep(unit=unit, seconds=seconds)
-            elif way < 0.65:
+            elif way < 0.54:
                 yield wait, stories.Dip(socket=socket, seconds=seconds)
-            elif way < 0.85:
+            elif way < 0.68:
                 yield wait, stories.KillWorker(socket=socket)
+            elif way < 0.8:
+                yield wait, stories.Unplug(socket=socket, seconds=seconds)
+            elif way < 0.86:
+                yield wait, stories.FillDisk(seconds=4 * seconds)
+                name = chance.choice(self.world.setup.people).name
+                yield chance.uniform(0.0, 8 * seconds), stories.Resume(by=name)
+            elif way < 0.9:
+                yield wait, stories.KillPower(seconds=seconds)
             else:
                 yield wait, stories.KillStation(seconds=1.0 + seconds)

@@ -134,6 +134,13 @@ class Abort(Scan):
 
 
 @dataclass(frozen=True, kw_only=True)
+class Resume(Scan):
+    """Scan RESUME, when the line has stopped."""
+
+    NAME = "resume"
+
+
+@dataclass(frozen=True, kw_only=True)
 class Look(Act):
     """Do nothing: time passes."""
 
@@ -184,11 +191,36 @@ class KillStation(Act):
     seconds: float = 2.0
 
 
+@dataclass(frozen=True, kw_only=True)
+class KillPower(Act):
+    """Nothing at the line has power for a time: units, the computer, the station."""
+
+    NAME = "power"
+    seconds: float = 2.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unplug(Act):
+    """The adapter of a socket is pulled out for a time."""
+
+    NAME = "unplug"
+    socket: str
+    seconds: float = 1.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class FillDisk(Act):
+    """Nothing can be saved for a time."""
+
+    NAME = "disk"
+    seconds: float = 4.0
+
+
 CLAUSES: Final[dict[str, type[Clause]]] = {
     kind.NAME: kind
     for kind in (
         LineSetup, UnitSetup, Person, Put, Pull, Card, Label, Cancel, Free, Abort, Look, Sleep, Dip,
-        Stall, KillWorker, KillStation,
+        Stall, KillWorker, KillStation, KillPower, Unplug, FillDisk, Resume,
     )
 }  # fmt: skip
 

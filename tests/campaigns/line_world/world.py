@@ -12,10 +12,14 @@ from datetime import timedelta
 from functools import partial
 from typing import Any, Final, NoReturn
 
+from sqlalchemy import event
+
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
 from flasher.protocol.spec import BMS, WELLING
 from flasher.station.events import (
+    LineResumed,
+    LineStopped,
     OperatorPrompted,
     RunEnded,
     RunStarted,
@@ -28,7 +32,8 @@ from flasher.station.events import (
     WorkerFailed,
 )
 from flasher.station.messages import Finished, FromWorker, WorkerSetup
-from flasher.station.records.model import RunState, StepName
+from flasher.station.records.errors import RecordError
+from flasher.station.records.model import RunFilter, RunState, StepName
 from flasher.station.socket import Source
 from flasher.station.station import Station
 from tests.campaigns.line_world import stories
@@ -51,6 +56,8 @@ NONE: Final = "NONE"
 """What a new unit has for a serial number, where the recipe writes one."""
 _RECIPES: Final = {"writes": USUAL + WRITES, "plain": USUAL}
 _SLOW: Final = {"erase_time_s": 0.5, "program_time_s": 0.25}
+_AGAIN_S: Final = 1.0
+"""After this time a station that could not start is started again."""
 _READY_S: Final = 4.0
 _RUN_LIMIT_S: Final = 150.0
 _TRIES: Final = 4
@@ -151,6 +158,10 @@ class World:
         """When a station that died is started again."""
         self._answers: list[StationEvent] = []
         self._power_at: dict[str, float] = {}
+        self._room_at: float | None = None
+        """When there is room on the disk again; None while there is."""
+        self.is_stopped = False
+        """The line begins no run until RESUME is scanned."""
         self._pulled_at: dict[int, float] = {}
         self._last_end = ""
         self._scanning: tuple[str, str] | None = None
@@ -161,6 +172,9 @@ class World:
             if bay.process is not None:
                 bay.process.kill()
         self.station = None
+        if self._room_at is not None:
+            self._room_at = None
+            self._change_disk()
         self.bench.store.close()
         self._closing.close()
 
@@ -181,7 +195,9 @@ class World:
         """Let time pass up to this moment."""
         while self.now < moment:
             due = [
-                each for each in (self._station_at, *self._power_at.values()) if each is not None
+                each
+                for each in (self._station_at, self._room_at, *self._power_at.values())
+                if each is not None
             ]
             horizon = min(moment, _next_look(self.now), *due)
             for bay in self.bays.values():
@@ -207,6 +223,9 @@ class World:
             if moment <= self.now and self._are_level():
                 del self._power_at[name]
                 self._switch_on(self.bays[name])
+        if self._room_at is not None and self._room_at <= self.now:
+            self._room_at = None
+            self._change_disk()
         if self._station_at is not None and self._station_at <= self.now and self._are_level():
             self._station_at = None
             self._begin_station()
@@ -242,7 +261,11 @@ class World:
             clock=self.bench.clock,
             launch=self._launch,
         )
-        self.station.start()
+        try:
+            self.station.start()
+        except RecordError:
+            # Nothing can be saved: who starts it is told, and tries it again.
+            self.station, self._station_at = None, self.now + _AGAIN_S
 
     def _launch(self, setup: WorkerSetup) -> Process:
         bay = self.bays[setup.socket]
@@ -279,6 +302,10 @@ class World:
                     self._forget(event.text, event.source)
             case SocketChanged():
                 self.bays[event.socket].shown = event
+                if event.state is SocketState.PASS and event.serial not in self.passed:
+                    raise Violation("GREEN", f"PASS of {event.serial} is shown, and not saved")
+            case LineStopped() | LineResumed():
+                self.is_stopped = isinstance(event, LineStopped)
             case RunStarted():
                 bay = self.bays[event.socket]
                 bay.run, bay.run_at = event.serial, self.now
@@ -513,9 +540,49 @@ class World:
         bay.is_working = False
         return True
 
+    def _kill_power(self, act: stories.KillPower) -> bool:
+        if self._power_at or not self._kill_station(stories.KillStation(seconds=act.seconds)):
+            return False
+        for name, bay in self.bays.items():
+            if bay.process is not None:
+                bay.process.kill()
+                bay.is_working = False
+            self._dip(stories.Dip(socket=name, seconds=act.seconds))
+        return True
+
+    def _unplug(self, act: stories.Unplug) -> bool:
+        bay = self.bays.get(act.socket)
+        if bay is None or not bay.bus.faults.is_plugged:
+            return False
+        bay.bus.unplug(back_after_s=act.seconds)
+        bay.disturbed_at = max(bay.disturbed_at, self.now + act.seconds)
+        return True
+
+    def _fill_disk(self, act: stories.FillDisk) -> bool:
+        if self._room_at is not None:
+            return False
+        self._room_at = self.now + act.seconds
+        self._change_disk()
+        return True
+
+    def _change_disk(self) -> None:
+        """The next connection to the database finds room, or none."""
+        engine = self.bench.store.database.engine
+        change = event.remove if self._room_at is None else event.listen
+        change(engine, "connect", _take_no_page)
+        engine.dispose()
+
+    def _resume(self, act: stories.Resume) -> bool:
+        person = self.people.get(act.by)
+        if self.station is None or person is None or not self.is_stopped:
+            return False
+        self._scan("RESUME", person)
+        return True
+
     def _kill_station(self, act: stories.KillStation) -> bool:
         if self.station is None:
             return False
+        self.is_stopped = False
         self.station = None
         for bay in self.bays.values():
             if bay.process is not None:
@@ -540,6 +607,10 @@ class World:
         stories.Stall: _stall,
         stories.KillWorker: _kill_worker,
         stories.KillStation: _kill_station,
+        stories.KillPower: _kill_power,
+        stories.Unplug: _unplug,
+        stories.FillDisk: _fill_disk,
+        stories.Resume: _resume,
     }
 
     # -- the oracle -------------------------------------------------------------------------------
@@ -626,13 +697,27 @@ class World:
         what that takes, each act drawn when the one before it is done.
         """
         self._wait(0.5)
-        while self.station is None or self._power_at:
+        while self.station is None or self._power_at or self._room_at is not None:
             self._wait(1.0)
+        while not all(bay.bus.faults.is_plugged for bay in self.bays.values()):
+            self._wait(1.0)
+        if self.is_stopped:
+            yield stories.Resume(when=stories.at(self.now), by=CAREFUL)
+            if self.is_stopped:
+                raise Violation(STUCK, "there is room on the disk, and RESUME does not go on")
         for unit in self.units.values():
             unit.sleeps_until = float("-inf")
         for number in self.units:
             if label_of(number) not in self.passed:
                 yield from self._bring_home(number)
+        self._look_at_records()
+
+    def _look_at_records(self) -> None:
+        """Every PASS that was shown is in the records."""
+        rows = self.bench.store.read.table(RunFilter(state=RunState.PASS))
+        lost = self.passed - {str(row["serial"]) for row in rows}
+        if lost:
+            raise Violation("LOST", f"PASS of {_words(sorted(lost))} was shown, and is not saved")
 
     def _wait(self, seconds: float) -> None:
         self.go_to(round(self.now + seconds, 6))
@@ -698,6 +783,10 @@ class World:
                 running = [f"{bay.run} in {bay.name}" for bay in self.bays.values() if bay.run]
                 raise Violation(STUCK, f"no end of the run of {_words(running)}")
             self._wait(0.5)
+
+
+def _take_no_page(connection: Any, _record: object) -> None:
+    connection.execute("PRAGMA max_page_count = 1")
 
 
 def _make(setup: stories.UnitSetup, none: str) -> PaperUnit:
