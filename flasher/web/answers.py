@@ -10,13 +10,14 @@ import asyncio
 import multiprocessing
 import os
 import signal
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from http import HTTPStatus
 from typing import Any, Final, Protocol
 
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.responses import PlainTextResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import BaseRoute, Route
 
 from flasher.errors import FlasherError
@@ -61,6 +62,8 @@ class Answer:
     """Of a file to save."""
     location: str = ""
     """Another page of this server."""
+    after: str = ""
+    """Of a file in parts: where the next one begins, a field of the question for it."""
 
 
 class Answering(Protocol):
@@ -153,6 +156,16 @@ def question_of(path: str, request: Request, pages: Pages) -> Question:
     )
 
 
+async def _parts(ask: Ask, question: Question, answer: Answer) -> AsyncIterator[bytes]:
+    """A file in parts, however long it is. Raises what `ask` does: a file that breaks off."""
+    yield answer.body
+    while answer.after:
+        answer = await ask(replace(question, fields={**question.fields, "after": answer.after}))
+        if answer.status != HTTPStatus.OK:
+            raise RuntimeError("a part of a file cannot be read")
+        yield answer.body
+
+
 def answer_routes(
     pages: Pages, ask: Ask, paths: Iterable[str], uploads: Iterable[str] = ()
 ) -> list[BaseRoute]:
@@ -171,6 +184,9 @@ def answer_routes(
         headers = {}
         if answer.file_name:
             headers["content-disposition"] = f'attachment; filename="{answer.file_name}"'
+        if answer.after:
+            parts = _parts(ask, question, answer)
+            return StreamingResponse(parts, answer.status, headers, answer.media_type)
         return Response(answer.body, answer.status, headers, answer.media_type)
 
     methods = {path: ["GET", "POST"] for path in uploads}

@@ -49,7 +49,7 @@ from flasher.station.records.model import (
     UnitState,
 )
 from flasher.station.records.newest import Cut
-from flasher.station.records.overview import HOLDERS_COUNTED, By, Overview, Span
+from flasher.station.records.overview import HOLDERS_COUNTED, By, Overview, Page, Span
 from flasher.station.records.rollup import Rollup
 from flasher.station.records.store import Store
 from flasher.station.reports import Report, csv_text, make_report
@@ -90,8 +90,11 @@ BY_WORDS: Final = {
     By.LOT: say("lot"),
     By.SHIFT: say("shift"),
 }
+PART_SIZE: Final = 2000
+"""Rows of a file that are read at once."""
+_CSV: Final = "text/csv; charset=utf-8"
 _FILES: Final[dict[str, tuple[str, Callable[[Report], str]]]] = {
-    "/runs.csv": ("text/csv; charset=utf-8", Report.to_csv),
+    "/runs.csv": (_CSV, Report.to_csv),
     "/runs.json": ("application/json", Report.to_json),
     "/runs.xml": ("application/xml", Report.to_junit),
 }
@@ -161,6 +164,10 @@ class Supervisor:
 
     def file_of_runs(self, question: Question) -> Answer:
         media_type, make = _FILES[question.path]
+        if make is Report.to_csv:
+            page = self.overview.rows(filter_of(question), _oldest(question), PART_SIZE)
+            rows = [row.values() for row in page.rows[::-1]]
+            return _part(question, page, page.rows[0] if page.rows else (), rows)
         report = make_report(self.store.read, filter_of(question))
         name = question.path.lstrip("/")
         return Answer(make(report).encode("utf-8"), media_type, file_name=name)
@@ -268,14 +275,17 @@ class Supervisor:
         )
 
     def file_of_holders(self, question: Question) -> Answer:
-        rows: list[tuple[object, ...]] = [
-            ("serial", "part", "target", "confirmed", "run", "outcome", "begun_at")
-        ]
-        for each in self.overview.all_holders(question.fields.get("sha256", "")):
-            row = (each.serial, each.part, each.target, each.is_confirmed, each.run_id)
-            moment = each.begun_at.isoformat(timespec="seconds")
-            rows.append((*row, each.state.value, moment))
-        return Answer(csv_text(rows).encode("utf-8"), "text/csv", file_name="units.csv")
+        heads = ("serial", "part", "target", "confirmed", "run", "outcome", "begun_at")
+        sha256 = question.fields.get("sha256", "")
+        page = self.overview.holders(sha256, _oldest(question), PART_SIZE)
+        rows = [
+            (
+                each.serial, each.part, each.target, each.is_confirmed, each.run_id,
+                each.state.value, each.begun_at.isoformat(timespec="seconds"),
+            )
+            for each in page.rows[::-1]
+        ]  # fmt: skip
+        return _part(question, page, heads, rows)
 
     # -- figures ----------------------------------------------------------------------------------
 
@@ -494,6 +504,22 @@ def _moment(question: Question, name: str) -> datetime | None:
         raise UsageError(
             f"{text!a:.40} is no time.", remedy="Write 2026-05-17 or 2026-05-17T06:00."
         ) from error
+
+
+def _oldest(question: Question) -> Cut:
+    """Where a part of a file begins; the first one with the oldest row."""
+    return Cut(after=_cut(question).after or 0)
+
+
+def _part(
+    question: Question, page: Page[Any], heads: Iterable[str], rows: Iterable[Iterable[object]]
+) -> Answer:
+    """A part of a file for a spreadsheet; the first one has the heads."""
+    name = {"/images.csv": "units.csv"}.get(question.path, question.path.lstrip("/"))
+    is_first = bool(page.rows) and "after" not in question.fields
+    text = csv_text([*([heads] if is_first else []), *rows])
+    after = "" if page.newer is None else str(page.newer.after)
+    return Answer(text.encode("utf-8"), _CSV, file_name=name, after=after)
 
 
 def _cut(question: Question) -> Cut:

@@ -203,6 +203,28 @@ def measure_pages(plant: Plant, wanted: str) -> None:
         )
 
 
+def measure_files(plant: Plant) -> None:
+    """Files of everything, which are sent in parts."""
+    place = (plant.url, plant.files, Keeping(plant.folder / "keys"), DEFAULT_SHIFTS)
+    supervisor = open_supervisor(*place)
+    for path, fields in (("/images.csv", {"sha256": "2" * 64}), ("/runs.csv", {})):
+        parts_s: list[float] = []
+        began, size, after = time.perf_counter(), 0, ""
+        while after or not parts_s:
+            part_began = time.perf_counter()
+            answer = PAGES[path](
+                supervisor, Question(path, fields | ({"after": after} if after else {}))
+            )
+            after, size = answer.after, size + len(answer.body)
+            parts_s.append(time.perf_counter() - part_began)
+        print(
+            f"  {path}, all of it: {time.perf_counter() - began:.0f} s, {size / 1e6:.0f} MB,"
+            f" {len(parts_s)} parts of at most {max(parts_s) * 1000:.0f} ms",
+            flush=True,
+        )
+    supervisor.store.close()
+
+
 def measure_sums(plant: Plant) -> None:
     """What a process of the pages does in the background: the sums of days, the first time all."""
     began, batches_s = time.perf_counter(), []
@@ -351,6 +373,7 @@ def main() -> None:
     parser.add_argument("--traces", type=int, default=1000, help="the last runs that have one")
     parser.add_argument("--server", action="store_true", help="on PostgreSQL, in place of a file")
     parser.add_argument("--keep", type=Path, help="make them in this folder, or use those in it")
+    parser.add_argument("--files", action="store_true", help="whole files, too")
     parser.add_argument("--pages", default="", help="only pages with this in their address")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as temporary:
@@ -359,6 +382,8 @@ def main() -> None:
         with plant_of(options, folder) as plant:
             measure_sums(plant)
             measure_pages(plant, options.pages)
+            if options.files:
+                measure_files(plant)
             measure_report(plant)
             measure_station(plant)
 

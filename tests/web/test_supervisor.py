@@ -32,7 +32,9 @@ from flasher.station.records.model import (
 from flasher.station.records.newest import Cut
 from flasher.station.records.overview import By, Overview, Span
 from flasher.station.tally import DEFAULT_SHIFTS
-from flasher.web.supervisor import open_supervisor, shifts_of, spans_of
+from flasher.web import supervisor
+from flasher.web.answers import Answer, Question
+from flasher.web.supervisor import Supervisor, open_supervisor, shifts_of, spans_of
 from tests.station.factory import BMS_VERSION, IMAGES, Bench
 from tests.station.postgres import Server
 from tests.web.answering import app_of, app_with, client_of
@@ -130,17 +132,47 @@ def test_the_trail_and_the_certificate_of_a_server_are_shown(server_client: Test
         assert server_client.get(page, follow_redirects=True).status_code == 200
 
 
+@pytest.mark.parametrize("path", ["/runs.csv", "/runs.csv?lot=L2", f"/images.csv?sha256={IMAGE}"])
+def test_a_file_in_parts_is_the_whole_file(
+    client: TestClient, monkeypatch: pytest.MonkeyPatch, path: str
+) -> None:
+    whole = client.get(path)
+    monkeypatch.setattr(supervisor, "PART_SIZE", 2)
+    in_parts = client.get(path)
+    assert in_parts.text == whole.text
+    assert len(whole.text.splitlines()) > 3
+    assert in_parts.headers["content-disposition"] == whole.headers["content-disposition"]
+
+
+def test_a_file_breaks_off_where_a_part_cannot_be_read(
+    plant: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(supervisor, "PART_SIZE", 2)
+    pages = open_supervisor(
+        str(plant.path), plant.store.files.folder, Keeping(plant.keys), DEFAULT_SHIFTS
+    )
+    asked: list[Question] = []
+    usual = supervisor.Supervisor.answer
+
+    def answer(self: Supervisor, question: Question) -> Answer:
+        asked.append(question)
+        return Answer(status=503) if len(asked) == 3 else usual(self, question)
+
+    monkeypatch.setattr(supervisor.Supervisor, "answer", answer)
+    with closing(pages.store), pytest.raises(RuntimeError, match="cannot be read"):
+        client_of(app_with(pages)).get("/runs.csv")
+    assert [question.fields.get("after") for question in asked] == [None, "2", "4"]
+
+
 @pytest.fixture(scope="module")
 def server_client(postgres: Server) -> Iterator[TestClient]:
     url = postgres.records()
     with tempfile.TemporaryDirectory() as folder:
         bench = Bench(Path(folder), url=url)
         _units(bench)
-        supervisor = open_supervisor(
-            url, bench.store.files.folder, Keeping(bench.keys), DEFAULT_SHIFTS
-        )
-        with closing(bench.store), closing(supervisor.store):
-            yield client_of(app_with(supervisor))
+        pages = open_supervisor(url, bench.store.files.folder, Keeping(bench.keys), DEFAULT_SHIFTS)
+        with closing(bench.store), closing(pages.store):
+            yield client_of(app_with(pages))
 
 
 def _without_times(text: str) -> str:
@@ -300,7 +332,7 @@ def test_the_units_that_hold_an_image_are_those_it_was_last_sent_to(bench: Bench
     bench.store.finish(
         untouched, bench.ending(RunState.FAIL, "NO_ANSWER", bench.traced("W2605004"))
     )
-    first = {each.serial: each.is_confirmed for each in overview.all_holders(IMAGE)}
+    first = {each.serial: each.is_confirmed for each in overview.holders(IMAGE, Cut()).rows}
     assert first == {"W2605001": True, "W2605002": False, "W2605003": True}
     assert overview.holder_count(IMAGE) == 3
 
@@ -308,8 +340,8 @@ def test_the_units_that_hold_an_image_are_those_it_was_last_sent_to(bench: Bench
     _other_image(bench, data)
     newer = bench.recipe.targets[0].image.sha256
     _flash(bench, "W2605002", RunState.PASS)
-    assert {each.serial for each in overview.all_holders(newer)} == {"W2605002"}
-    assert {each.serial for each in overview.all_holders(IMAGE)} == {"W2605001", "W2605003"}
+    assert {each.serial for each in overview.holders(newer, Cut()).rows} == {"W2605002"}
+    assert {each.serial for each in overview.holders(IMAGE, Cut()).rows} == {"W2605001", "W2605003"}
 
     client = client_of(app_of(bench.path, bench.keys))
     html = client.get(f"/images?image={newer[:12].upper()}").text

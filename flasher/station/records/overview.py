@@ -35,7 +35,7 @@ from flasher.station.records.model import (
     utc_text,
 )
 from flasher.station.records.newest import Cut, newest_runs
-from flasher.station.records.queries import JUDGED, details_of, filtered, run_query
+from flasher.station.records.queries import JUDGED, VERIFIED, details_of, filtered, run_query
 from flasher.station.records.rollup import (
     ALL_SPANS,
     WITHOUT_CAUSE,
@@ -166,6 +166,13 @@ class Overview:
         # What no station writes is shown nowhere else: reports and `verify` name it.
         return self._page(_RUNS, query.where(run_id.in_(found)), run_id, cut, size)
 
+    def rows(self, chosen: RunFilter, cut: Cut, size: int) -> Page[dict[str, Any]]:
+        """The same as a report has them (`Records.table`)."""
+        with self._database.reading() as connection:
+            found = newest_runs(connection, chosen, cut, size + 1)
+        run_id = schema.run.c.id
+        return self._page(_ROWS, run_query(VERIFIED).where(run_id.in_(found)), run_id, cut, size)
+
     def parts(self, serial: str) -> tuple[str, ...]:
         unit = schema.unit.c
         query = select(unit.part).where(unit.serial == serial).order_by(unit.part)
@@ -234,18 +241,14 @@ class Overview:
         query = _holders(self._artifacts(sha256))
         return self._page(_HOLDERS, query, schema.run_target.c.id, cut, size)
 
-    def all_holders(self, sha256: str) -> tuple[Holder, ...]:
-        """All of them, in the order in which they were made."""
-        query = _holders(self._artifacts(sha256)).order_by(schema.run_target.c.id)
-        with self._database.reading() as connection:
-            return _HOLDERS.validate_python(
-                [dict(row) for row in connection.execute(query).mappings()]
-            )
-
     def holder_count(self, sha256: str) -> int:
         """How many units that are, counted up to `HOLDERS_COUNTED` and one more."""
-        some = _holders(self._artifacts(sha256)).with_only_columns(
-            schema.run_target.c.id, maintain_column_froms=True
+        target_id = schema.run_target.c.id
+        # In the order of the index of the image, or a server would go through the runs of all.
+        some = (
+            _holders(self._artifacts(sha256))
+            .with_only_columns(target_id, maintain_column_froms=True)
+            .order_by(target_id.desc())
         )
         query = select(func.count()).select_from(some.limit(HOLDERS_COUNTED + 1).subquery())
         with self._database.reading() as connection:

@@ -33,6 +33,10 @@ from flasher.station.records.rows import batches, beside_index, grouped
 _EVERYTHING: Final = RunFilter()
 JUDGED: Final = (RunState.PASS.value, RunState.FAIL.value)
 """Runs that say something about the unit; the others are about the station."""
+VERIFIED: Final = case(
+    {int(level): level.name.lower() for level in Verified}, value=schema.run.c.verification_reached
+).label("verified")
+"""How far a run was verified, by its word."""
 _DETAILS: Final = TypeAdapter(list[RunDetails])
 
 
@@ -48,9 +52,7 @@ class Records:
         """The runs of a filter as plain rows, for reports over many of them: names as in
         `RunRecord`, times as texts in UTC, verification by its word.
         """
-        words = {int(level): level.name.lower() for level in Verified}
-        verified = case(words, value=schema.run.c.verification_reached).label("verified")
-        query = filtered(run_query(verified), chosen).order_by(schema.run.c.id)
+        query = filtered(run_query(VERIFIED), chosen).order_by(schema.run.c.id)
         with self._database.reading() as connection:
             return [dict(row) for row in connection.execute(query).mappings()]
 
