@@ -1,21 +1,29 @@
-"""Real time and real processes: units that keep their number and image are pulled in the middle of
-a run, and another one is put in: `python -m tests.campaigns.pulled_units`, with `--count N`,
-`--sockets N` and `--seed N`.
+"""Real time and real processes: units that keep their paper label, number and image are pulled, and
+others are put in, in the middle of a run or between the scans of cards and labels:
+
+    python -m tests.campaigns.pulled_units [--count N] [--lines N] [--sockets N] [--seed N]
 
 The units are the scripted ones (`scripted_units`), in a process of their own on udp_multicast, one
-bus for each socket; each socket runs one trial after the other. It counts what the runs ended as;
-exit code 1 when a run passed, or when the second unit was written to.
+bus for each socket. `--count` trials are single runs that are disturbed, `--lines` trials belong to
+a station's process with cards, labels and two scanners (`crossed_scans`); two stations
+work at a time, one with two sockets and one with three. A table tells what each scenario ended as.
+The exit code is 1 when a label ended on another unit: a PASS of a unit with another paper label, a
+unit with the number of another one's label, or one that was flashed or written in a run of another
+label.
 """
 
 from __future__ import annotations
 
 import argparse
 import logging
+import os
 import random
 import sys
 import tempfile
 import threading
-from collections import Counter
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Final
@@ -29,7 +37,9 @@ from flasher.station.messages import RunOrder, RunResult
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import RunId, RunKind, RunState
 from flasher.station.unit_run import UnitRun
+from tests.campaigns.crossed_scans import Line, line_of, make_plan
 from tests.campaigns.scripted_units import NEW_VERSION, Units, bus_of, free_port
+from tests.campaigns.station_operator import Fault
 from tests.station.factory import DAY, SERIAL, USUAL, make_recipe
 from tests.station.unit_bench import Notes
 
@@ -51,6 +61,8 @@ NOTES: Final = (
     ("step", "restart", "PASS", ""),
 )
 """Between which steps a unit is pulled."""
+_ON_ANOTHER: Final = (Fault.UNTRUE, Fault.MISBOUND)
+"""A label ended on another unit."""
 _PACKETS: Final = 100
 _FRAMES_OF_PACKET: Final = 18
 
@@ -123,31 +135,50 @@ class Trial:
             second = self.units.look(self.names[1])
             self.units.out(self.names[1])
         if result.outcome is RunState.PASS:
-            return "passed"
-        if second["serial"] != self.own[1] or second["image"]:
-            return f"the second unit was written to: {second['serial']}"
+            return f"{Fault.UNTRUE.value}: passed"
+        if second["serial"] != self.own[1] or second["done"]:
+            return f"{Fault.MISBOUND.value}: second unit, {second['serial']!r} {second['done']}"
         return ""
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--count", type=int, default=300)
-    parser.add_argument("--sockets", type=int, default=3)
-    parser.add_argument("--seed", type=int, default=1)
-    chosen = parser.parse_args()
-    logging.disable(logging.CRITICAL)
-    ended: Counter[str] = Counter()
-    problems: list[str] = []
-    numbers = iter(range(chosen.count))
-    lock, taking = threading.Lock(), threading.Lock()
+Table = dict[str, Counter[str]]
+"""How often each scenario ended as what."""
 
-    def work(port: int, units: Units, recipe: LoadedRecipe) -> None:
-        while True:
-            with taking:
-                number = next(numbers, None)
-            if number is None:
-                return
-            chance = random.Random(chosen.seed * 1_000_003 + number)
+
+class Trials:
+    """Takes numbers of trials for several threads, and keeps what came of them."""
+
+    def __init__(self, count: int) -> None:
+        self._numbers = iter(range(count))
+        self._lock = threading.Lock()
+        self.ended: Table = defaultdict(Counter)
+        self.problems: list[str] = []
+
+    def take(self) -> int | None:
+        with self._lock:
+            return next(self._numbers, None)
+
+    def note(self, scenario: str, ending: str, problems: Sequence[str] = ()) -> None:
+        with self._lock:
+            self.ended[scenario][ending] += 1
+            self.problems += problems
+            for problem in problems:
+                print(f"PROBLEM {problem}", flush=True)  # noqa: T201
+
+    @property
+    def done(self) -> int:
+        return sum(count for endings in self.ended.values() for count in endings.values())
+
+
+def disturb_runs(folder: Path, sockets: int, seed: int, trials: Trials) -> None:
+    """Trials of single runs, one after the other in each socket."""
+    lock = threading.Lock()
+    recipe = recipe_in(folder)
+    ports = [free_port() for _ in range(sockets)]
+
+    def work(port: int, units: Units) -> None:
+        while (number := trials.take()) is not None:
+            chance = random.Random(seed * 1_000_003 + number)
             kind = chance.choice(sorted(OWN_NUMBERS))
             share = chance.choice((0.2, 0.5, 0.9, None))
             names = (f"{number} first", f"{number} second")
@@ -158,29 +189,69 @@ def main() -> int:
             result = trial.run(recipe)
             where = f"at {share:.0%} of the flash" if share is not None else " ".join(trial.note)
             what = trial.wrong(result)
-            with taking:
-                where = where if trial.exchange is not None else "before anything was exchanged"
-                ended[f"{kind}, {where}: {result.code}"] += 1
-                if what:
-                    problems.append(f"{number}, {kind}, {where}, {trial.gap_s} s: {what}; {result}")
+            where = where if trial.exchange is not None else "before anything was exchanged"
+            problem = f"run {number}, {kind}, {where}, {trial.gap_s} s: {what}; {result}"
+            trials.note(f"pulled {where.strip()}", result.code, [problem] if what else [])
 
+    with Units(ports, folder / "units.log") as units:
+        _in_threads([lambda port=port: work(port, units) for port in ports])  # type: ignore[misc]
+
+
+def cross_scans(folder: Path, seed: int, trials: Trials, first: int) -> None:
+    """Trials of two stations."""
+
+    def work(line: Line) -> None:
+        while line.is_running and (number := trials.take()) is not None:
+            plan = make_plan(first + number, seed)
+            known = len(line.problems)
+            ending = line.play(plan)
+            trials.note(plan.scenario.value, ending, line.problems[known:])
+
+    lines = [line_of(folder / str(sockets), sockets, seed + sockets) for sockets in (2, 3)]
+    with ExitStack() as stack:
+        for line in lines:
+            stack.enter_context(line)
+        _in_threads([lambda line=line: work(line) for line in lines])  # type: ignore[misc]
+    for line in lines:
+        trials.problems += line.judged
+
+
+def _in_threads(works: Sequence[Callable[[], None]]) -> None:
+    threads = [threading.Thread(target=work) for work in works]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=150, help="single runs that are disturbed")
+    parser.add_argument("--lines", type=int, default=150, help="trials with cards and labels")
+    parser.add_argument("--first", type=int, default=0, help="number of the first of --lines")
+    parser.add_argument("--sockets", type=int, default=3, help="of the single runs")
+    parser.add_argument("--seed", type=int, default=1)
+    chosen = parser.parse_args()
+    logging.disable(logging.CRITICAL)
+    runs, lines = Trials(chosen.count), Trials(chosen.lines)
     with tempfile.TemporaryDirectory() as made:
         folder = Path(made)
-        recipe = recipe_in(folder)
-        ports = [free_port() for _ in range(chosen.sockets)]
-        with Units(ports, folder / "units.log") as units:
-            threads = [threading.Thread(target=work, args=(port, units, recipe)) for port in ports]
-            for thread in threads:
-                thread.start()
-            for thread in threads:
-                thread.join()
-    for how, count in sorted(ended.items()):
-        print(f"{count:6}  {how}")  # noqa: T201
+        os.environ["XDG_DATA_HOME"] = str(folder / "data")  # what a station keeps of its own
+        if chosen.count:
+            disturb_runs(folder, chosen.sockets, chosen.seed, runs)
+        if chosen.lines:
+            cross_scans(folder, chosen.seed, lines, chosen.first)
+    for scenario, endings in sorted({**runs.ended, **lines.ended}.items()):
+        print(f"{sum(endings.values()):4}  {scenario}")  # noqa: T201
+        for ending, count in endings.most_common():
+            print(f"          {count:4}  {ending}")  # noqa: T201
+    problems = runs.problems + lines.problems
     for problem in problems:
-        print(problem)  # noqa: T201
-    done = sum(ended.values())
-    print(f"{len(problems)} of {done} do not hold")  # noqa: T201
-    return 1 if problems or done < chosen.count else 0
+        print(f"PROBLEM {problem}")  # noqa: T201
+    done, wanted = runs.done + lines.done, chosen.count + chosen.lines
+    misbound = sum(any(fault.value in each for fault in _ON_ANOTHER) for each in problems)
+    print(f"{misbound} labels on another unit, {len(problems)} problems, {done} trials")  # noqa: T201
+    return 1 if problems or done < wanted else 0
 
 
 if __name__ == "__main__":

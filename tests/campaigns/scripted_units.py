@@ -5,7 +5,8 @@ peers, which shares no code with flasher, on one multicast bus for each socket.
 
 Orders are lines of JSON on stdin, each is answered by one on stdout: {"put": UNIT, "into": PORT},
 {"out": UNIT} and {"look": UNIT}. A unit is made at its first `put` ("own" is the serial number that
-it has then), and keeps its image and its number in and out of sockets.
+it has then), and keeps its image and its number in and out of sockets. It also notes what is done
+to it, with the time and the socket's port.
 """
 
 from __future__ import annotations
@@ -62,11 +63,16 @@ class Unit(ScriptedDevice):
         self._session_s = session_s
         """Silence after which it leaves an upgrade; None: never (R26)."""
         self._heard_at = 0.0
+        self.port = 0
+        """The socket that it was put into last."""
+        self._done: list[tuple[float, int, str]] = []
+        """When and where it was flashed or got a number, and which; empty for a flash."""
 
     def hear(self, mode: int, command: int, data: bytes, now: float) -> None:
         self._heard_at = now
         if self.state == "application" and (mode, command) == (WRITE, 0x4110):
             self.serial = data.partition(b".")[0].decode("ascii").rstrip()
+            self._done.append((time.time(), self.port, self.serial))
             self.say("feedback", literal(WORDINGS["bms"].feedback), not_before=now)
         elif self.state == "application" and (mode, command) == (READ, 0x3400):
             state = struct.pack("<HhHHBBBB4x", 36000, 0, 5000, 10000, 65, 50, 0, 100)
@@ -78,7 +84,10 @@ class Unit(ScriptedDevice):
             fields = map(_text, ("BM36", self.serial, "V1r2r0_20220512", firmware))
             self._report(0x1540, b"".join(fields), now)
         else:
+            taken = self.updates_taken
             super().hear(mode, command, data, now)
+            if self.updates_taken > taken:
+                self._done.append((time.time(), self.port, ""))
             if self.state in ("erasing", "transfer") and self._session_s is not None:
                 self.alarm(now + self._session_s, self._forget)
 
@@ -91,10 +100,15 @@ class Unit(ScriptedDevice):
         if self.state in ("erasing", "transfer") and left_s <= 0.0:
             self.power_on(now)
 
+    def power_off(self) -> None:
+        """What it was saying breaks off."""
+        self.clear_alarms()
+        self._outbox, self._sent_frames, self._partial = [], 0, b""
+
     def look(self) -> dict[str, Any]:
-        """What is in it, whoever asks."""
+        """What is in it, and what was done to it, whoever asks."""
         image = self.image.hex() if self.completed else ""
-        return {"serial": self.serial, "image": image, "state": self.state}
+        return {"serial": self.serial, "image": image, "state": self.state, "done": self._done}
 
 
 class _Bench:
@@ -146,9 +160,11 @@ class _Bench:
                 session_s = None if self._random.random() < 0.1 else 0.5
                 unit = self._units.setdefault(name, Unit(own, session_s))
                 self._inside[port] = unit
+                unit.port = port
                 unit.power_on(now)
             case {"out": name}:
                 unit = self._units[name]
+                unit.power_off()
                 self._inside = {at: each for at, each in self._inside.items() if each is not unit}
             case {"look": name}:
                 unit = self._units[name]

@@ -1,13 +1,18 @@
 """Kills the real station, and the processes of its sockets, while an operator works at it; and
 looks each time whether what was shown is true:
 
-    python -m tests.campaigns.station_kill --times 60 [--postgres]
+    python -m tests.campaigns.station_kill --times 60 [--database postgresql] [--seed N]
 
 Nothing of the station is looked into: it is the command `flasher station run`, its event stream and
-its scanner. The units are in a process of their own, which knows nothing of flasher. After each
-kill: every PASS that was shown is one of the records and of the unit itself (its serial number, its
-image); no unit bears the number of another one's label; the processes of the sockets ended with
-their station. After a few kills the operator is left in peace, and every unit has to get through.
+its scanner. The units are in a process of their own, which knows nothing of flasher; they keep
+their paper label, their contents and their numbers. While the station, or the process of a socket,
+is dead, units are pulled, put back, exchanged for others and between sockets.
+
+After each kill: every PASS that was shown is one of the records, and every PASS of the records is
+one of the unit itself (its serial number, its image); no unit has the number of another one's
+label, and none was flashed or written in a run of another label; the processes of the sockets ended
+with their station; `flasher station verify` finds nothing. After a few kills the operator is left
+in peace, and every unit has to get through.
 """
 
 from __future__ import annotations
@@ -19,6 +24,7 @@ import random
 import subprocess
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, redirect_stderr, redirect_stdout
 from io import StringIO
@@ -30,14 +36,16 @@ from flasher.image.image import Image
 from flasher.protocol.spec import BMS
 from flasher.settings.manifest import release_of, to_toml
 from tests.campaigns.scripted_units import NEW_VERSION, Units, bus_of, free_port
-from tests.campaigns.station_operator import Operator, Place, Station, is_running
+from tests.campaigns.station_operator import Fault, Operator, Place, Station, is_running
 from tests.station.postgres import find_programs, running_server
 
 KILLS_IN_A_ROW: Final = 3
-PEACE_LIMIT_S: Final = 120.0
+PEACE_LIMIT_S: Final = 240.0
 _KILL_LIMIT_S: Final = 20.0
 _MOMENTS_MAX: Final = 24
 _WORKERS_END_S: Final = 15.0
+_CARDS: Final = 0.4
+"""How often the card of a socket waits for its label when a process is killed."""
 IMAGE_BYTES: Final = 6000
 RECIPE: Final = """\
 name = "Campaign"
@@ -123,12 +131,29 @@ class Campaign:
         if not worker:
             self._orphans = station.kill()
             self._left("kills of the station")
+            self.operator.change_units(tuple(self.operator.places.values()))
             self._check()
             return
         workers = station.workers
         if workers:
-            subprocess.run(["kill", "-9", str(self._random.choice(workers))], check=False)
-            self.counts["kills of a worker"] += 1
+            self._kill_worker(self._random.choice(workers))
+
+    def _kill_worker(self, pid: int) -> None:
+        """Units change places while the process of a socket is dead."""
+        operator = self.operator
+        chosen = operator.choose_card() if self._random.random() < _CARDS else None
+        lost = len(operator.lost)
+        subprocess.run(["kill", "-9", str(pid)], check=False)
+        self.counts["kills of a worker"] += 1
+        latest = time.perf_counter() + _KILL_LIMIT_S
+        operator.work(
+            lambda: len(operator.lost) > lost or time.perf_counter() >= latest, scans=False
+        )
+        places = operator.lost[lost:]
+        if chosen in places:
+            operator.change_after_card(chosen)
+        elif places:
+            operator.change_units(places)
 
     def in_peace(self) -> None:
         """Every unit that is in a socket gets through; then the station ends."""
@@ -139,18 +164,21 @@ class Campaign:
         self.problems += operator.stuck()
         code = station.stop()
         if code not in (0, 12):  # 12: a run that a kill ended is no PASS
-            self.problems.append(f"a station in peace ended with {code}")
+            self._wrong(Fault.PROCESS, f"a station in peace ended with {code}")
         self._left("ended by Ctrl-C")
         self._check()
 
     def _open(self) -> Station:
         if self._station is not None and self._station.process.poll() is not None:
-            self.problems.append(f"a station ended by itself: {self._station.process.returncode}")
+            self._wrong(Fault.PROCESS, f"the station ended: {self._station.process.returncode}")
             self._left("ended by itself")
         if self._station is None:
             self._station = Station(self._folder, *self._words)
             self.operator.begin(self._station)
         return self._station
+
+    def _wrong(self, fault: Fault, what: str) -> None:
+        self.problems.append(f"{fault.value}: {what}")
 
     def _left(self, how: str) -> None:
         self.counts[how] += 1
@@ -164,38 +192,44 @@ class Campaign:
         while any(map(is_running, self._orphans)) and time.perf_counter() < give_up_at:
             time.sleep(0.05)
         left = [pid for pid in self._orphans if is_running(pid)]
-        self.problems += [f"process {pid} of a socket outlives its station" for pid in left]
+        self.problems += [
+            f"{Fault.PROCESS.value}: {pid} of a socket outlives its station" for pid in left
+        ]
         self._orphans = []
-        self.problems += self.operator.strange_units()
         self._check_records()
 
     def _check_records(self) -> None:
         """What was shown is in the records, and the records hold together."""
         said = {action: self._ask(action) for action in ("verify", "report")}
         problems = said["verify"]["problems"]
-        self.problems += [f"{each['where']}: {each['what']}" for each in problems]
+        for each in problems:
+            self._wrong(Fault.RECORDS, f"{each['where']}: {each['what']}")
+        self.problems += self.operator.strange_units(said["report"]["runs"])
+        self.problems += self.operator.false_passes(said["report"]["runs"])
         runs = {run["run_id"]: run for run in said["report"]["runs"]}
         for event in self.operator.shown:
             run = runs.get(event["run_id"])
             if run is None or run["serial"] != event["serial"]:
-                self.problems.append(f"lost: {event}")
+                self._wrong(Fault.LOST, str(event))
             elif event["event"] == "RunEnded" and (run["state"], run["code"]) != (
                 event["outcome"],
                 event["code"],
             ):
-                self.problems.append(f"shown {event}, saved {run['state']} {run['code']}")
+                self._wrong(Fault.LOST, f"{event}, saved {run['state']} {run['code']}")
         for what in [each for each in self.counts if each.startswith("saved ")]:
             del self.counts[what]
         states = [run["state"] for run in runs.values()]
         for state in set(states):
             self.counts[f"saved {state}"] = states.count(state)
+        passes = sum(event.get("outcome") == "pass" for event in self.operator.shown)
+        self.counts["saved pass, the kill was before it was shown"] = states.count("pass") - passes
 
     def _ask(self, action: str) -> dict[str, list[dict[str, str]]]:
         with redirect_stdout(StringIO()) as said, redirect_stderr(StringIO()):
             flasher(["station", action, "--json", *self._words[2:4]])
         document: dict[str, list[dict[str, str]]] = json.loads(said.getvalue().splitlines()[-1])
         if "error" in document:
-            self.problems.append(f"station {action}: {document['error']}")
+            self._wrong(Fault.RECORDS, f"station {action}: {document['error']}")
         return {"problems": [], "runs": [], **document}
 
 
@@ -227,14 +261,16 @@ def main() -> int:
     parser.add_argument("--times", type=int, default=60, help="kills in all")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--sockets", type=int, default=2)
-    parser.add_argument("--postgres", action="store_true", help="records on a server of its own")
+    parser.add_argument(
+        "--database", choices=("sqlite", "postgresql"), default="sqlite", help="of the records"
+    )
     options = parser.parse_args()
     began = time.perf_counter()
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         os.environ["XDG_DATA_HOME"] = str(folder / "data")  # what a station keeps of its own
         records = "records.sqlite"
-        if options.postgres:
+        if options.database == "postgresql":
             programs = find_programs()
             if programs is None:
                 parser.error("PostgreSQL is not installed")
@@ -253,6 +289,9 @@ def main() -> int:
         for what, count in sorted(made.counts.items()):
             print(f"{what:<40} {count}")  # noqa: T201
         print(f"{'PASS shown, each proven by its unit':<40} {len(made.operator.passed)}")  # noqa: T201
+        faults = Counter(problem.partition(":")[0] for problem in made.problems)
+        for fault in Fault:
+            print(f"{fault.value:<40} {faults[fault.value]}")  # noqa: T201
         for problem in made.problems:
             print(f"PROBLEM {problem}")  # noqa: T201
         errors = (folder / "stderr").read_text(errors="replace").strip()

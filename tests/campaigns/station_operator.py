@@ -2,7 +2,8 @@
 station says. Of the station it knows the event stream alone, which is what the screen is made of.
 
 Each unit bears a label; what the operator does with a unit, and which unit is in which socket, is
-known here for certain. So every word of the station can be held against the units.
+known here for certain. So every word of the station can be compared with the units: `Fault` names
+what may be wrong.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from datetime import datetime
+from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final
 
@@ -35,9 +38,37 @@ _TURN_S: Final = 0.02
 _AT_WORK: Final = ("running", "saving")
 _LEFT_S: Final = 8.0
 """A socket that shows a unit for so long which is not in it has to be told."""
+_KNOWN_S: Final = 6.0
+"""A unit that was put in is heard sooner."""
+_JUST_S: Final = 1.0
+"""What was done so short a time ago may have crossed what the station shows."""
+_GAPS_S: Final = (0.0, 0.3, 0.8)
+"""How long a socket is empty while its unit is exchanged."""
 _NAMED: Final = re.compile(r"\binto socket ([0-9]+)\b")
 _CARD: Final = re.compile(r"\bscan (the card|SOCKET)\b", re.IGNORECASE)
 _CYCLE: Final = re.compile(r"off.*on again")
+
+
+class Fault(StrEnum):
+    """What a problem is."""
+
+    UNTRUE = "false PASS"
+    LOST = "lost"
+    MISBOUND = "mis-bound"
+    STUCK = "stuck"
+    RECORDS = "records"
+    PROCESS = "process"
+
+
+class Change(StrEnum):
+    """What somebody does with the unit in a socket."""
+
+    NOTHING = "left alone"
+    AGAIN = "pulled and put back"
+    PULLED = "pulled"
+    OTHER = "exchanged for one that has not passed"
+    PASSED = "exchanged for one that has passed"
+    PLACES = "exchanged with the next socket"
 
 
 class Station:
@@ -131,6 +162,11 @@ class Place:
     unit: str = ""
     """The label on the unit that is in it."""
     changed_at: float = 0.0
+    before: str = ""
+    """The unit that was in it before the last exchange, which was at `exchanged_at`."""
+    exchanged_at: float = float("-inf")
+    is_green_over: str = ""
+    """The unit over which a PASS of another one was shown and counted."""
     tries: int = 0
     """Of this unit, since the last kill."""
 
@@ -147,6 +183,10 @@ class Operator:
     problems: list[str] = field(default_factory=list)
     shown: list[dict[str, Any]] = field(default_factory=list)
     """Every RunStarted and RunEnded."""
+    shelf: list[str] = field(default_factory=list)
+    """Units in no socket that have not passed."""
+    lost: list[Place] = field(default_factory=list)
+    """The sockets whose processes were lost, in their order."""
     station: Station | None = None
     moments: int = 0
     """Happenings of the running station at which a kill is of interest."""
@@ -193,8 +233,9 @@ class Operator:
 
     @property
     def is_done(self) -> bool:
-        """True when no unit is in a socket of a station that works."""
-        return self._is_open and not any(place.unit for place in self.places.values())
+        """True when the station works, and no unit is left to be done."""
+        is_empty = not any(place.unit for place in self.places.values())
+        return self._is_open and is_empty and not self.shelf
 
     # -- reading ----------------------------------------------------------------------------------
 
@@ -241,10 +282,11 @@ class Operator:
                 place.text, place.changed_at = event["text"], time.perf_counter()
             case "RunStarted":
                 self.shown.append(event)
-                if place.unit != event["serial"]:
-                    self.problems.append(
+                if not self._is_or_was_just(place, event["serial"]):
+                    self._wrong(
+                        Fault.MISBOUND,
                         f"the label {event['serial']} runs in socket {place.name}, where "
-                        f"{place.unit or 'nothing'} is"
+                        f"{place.unit or 'nothing'} is",
                     )
             case "RunEnded":
                 self.shown.append(event)
@@ -257,15 +299,25 @@ class Operator:
                 self.units.put(place.unit, place.port)
             case "WorkerFailed":
                 self.counts["worker failed"] += 1
+                self.lost.append(place)
+
+    def _wrong(self, fault: Fault, what: str) -> None:
+        self.problems.append(f"{fault.value}: {what}")
+
+    @staticmethod
+    def _is_or_was_just(place: Place, label: str) -> bool:
+        is_just = time.perf_counter() - place.exchanged_at < _JUST_S
+        return place.unit == label or (is_just and place.before == label)
 
     def _hold(self, serial: str, place: Place) -> None:
         """A PASS is shown: the unit with this label has to be what it says."""
         self._passed.add(serial)
         found = self.units.look(serial) if serial in self._own else {}
-        if place.unit != serial:
-            self.problems.append(f"PASS of {serial} in socket {place.name}, where {place.unit} is")
+        if not self._is_or_was_just(place, serial):
+            where = f"in socket {place.name}, where {place.unit or 'nothing'} is"
+            self._wrong(Fault.UNTRUE, f"{serial} {where}")
         if found.get("serial") != serial or found.get("image") != self.image.hex():
-            self.problems.append(f"false PASS of {serial}: its own number is {found.get('serial')}")
+            self._wrong(Fault.UNTRUE, f"the unit {serial} has number {found.get('serial')!r}")
 
     # -- doing ------------------------------------------------------------------------------------
 
@@ -279,17 +331,30 @@ class Operator:
         quiet_s = now - place.changed_at
         if place.state in ("starting", "error", *_AT_WORK) or quiet_s < _IDLE_S:
             return
-        if place.unit and place.unit in self._passed:
+        if place.unit and place.state == "pass" and place.serial != place.unit:
+            self._look_at_green(place, now)
+        elif place.unit and place.unit in self._passed:
             self._take_out(place)
         elif place.unit:
             place.tries += 1
             self._scan_unit(place, over)
         elif place.state in ("empty", "silent"):
-            if bring_units:
+            if bring_units or self.shelf:
                 self._bring(place, over)
         elif quiet_s > _LEFT_S:
             self._scan(f"FREE {place.name}")
             place.changed_at = now
+
+    def _look_at_green(self, place: Place, now: float) -> None:
+        """A PASS is shown in a socket where another unit is."""
+        if now - max(place.changed_at, place.exchanged_at) < _LEFT_S:
+            return
+        if place.is_green_over != place.unit:
+            place.is_green_over = place.unit
+            what = f"socket {place.name} shows that of {place.serial} over {place.unit}"
+            self._wrong(Fault.UNTRUE, what)
+        self._scan(f"FREE {place.name}")
+        place.changed_at = now
 
     def _take_out(self, place: Place) -> None:
         self.units.out(place.unit)
@@ -297,11 +362,8 @@ class Operator:
         place.unit, place.changed_at = "", time.perf_counter()
 
     def _bring(self, place: Place, over: Callable[[], bool]) -> None:
-        """A new unit: into the socket first, or its label first."""
-        self._number += 1
-        label = f"W{self._number:07d}"
-        # Some come with their number, the others have none yet.
-        self._own[label] = self.random.choice(("", label))
+        """A unit from the shelf, or a new one: into the socket first, or its label first."""
+        label = self._next_unit()
         if self.random.random() < 0.6:
             self._put(label, place)
             return
@@ -309,10 +371,113 @@ class Operator:
         if self._scan(label):
             place = self._named(place)
         self._put(label, place)
+        if label in self._passed:  # shown as it was pulled
+            return
         if self._answer == "accepted":
             if self._wants_card():
                 self._scan(f"SOCKET {place.name}")
             self._see_run(label, place, over)
+
+    def _next_unit(self) -> str:
+        if self.shelf:
+            return self.shelf.pop(0)
+        self._number += 1
+        label = f"W{self._number:07d}"
+        # Some come with their number, some with their maker's, the others have none yet.
+        self._own[label] = self.random.choice(("", f"MK{self._number:07d}", label))
+        return label
+
+    def change_units(self, places: Sequence[Place]) -> None:
+        """Somebody changes units in these sockets. A person who comes back to a station that was
+        left so scans CANCEL first: a label that waits may be of a unit that is elsewhere now.
+        """
+        for place in places:
+            self._pause(_TURN_S)
+            self._change(place, self.random.choice(tuple(Change)), self.random.choice(_GAPS_S))
+        if self._is_there():
+            self._scan("CANCEL")
+
+    def choose_card(self) -> Place | None:
+        """Scan the card of a socket whose unit waits for its label; None where none can wait."""
+        idle = [each for each in self.places.values() if each.state not in ("error", *_AT_WORK)]
+        place = self.random.choice(idle) if idle else None
+        if place is None:
+            return None
+        if place.unit in self._passed:
+            self._take_out(place)
+        if not place.unit:
+            self._put(self._next_unit(), place)
+        latest = time.perf_counter() + _KNOWN_S
+        self.work(lambda: place.state == "scan" or time.perf_counter() >= latest, scans=False)
+        return place if self._scan(f"SOCKET {place.name}") else None
+
+    def change_after_card(self, place: Place) -> None:
+        """Another unit is put in after the card of its socket was scanned and the socket's process
+        was lost; then the label of the unit that was there is scanned.
+        """
+        meant = place.unit
+        self._change(place, Change.OTHER, self.random.choice(_GAPS_S))
+        if self._is_there():
+            self._scan(meant)
+            self.counts[f"label of a unit that was exchanged after its card: {self._answer}"] += 1
+            self._scan("CANCEL")
+
+    def _change(self, place: Place, how: Change, gap_s: float) -> None:
+        before = place.unit
+        others = [each for each in self.places.values() if each is not place]
+        at_hand = sorted(self._passed.difference(each.unit for each in self.places.values()))
+        place.before, place.exchanged_at = before, time.perf_counter()
+        match how:
+            case Change.AGAIN if before:
+                self._pull(place)
+                self._pause(gap_s)
+                self._put(before, place)
+            case Change.PULLED if before:
+                self._pull(place)
+                self._shelve(before)
+            case Change.OTHER:
+                self._pull(place)
+                self._pause(gap_s)
+                self._put(self._next_unit(), place)
+                self._shelve(before)
+            case Change.PASSED if at_hand:
+                self._pull(place)
+                self._pause(gap_s)
+                self._put(self.random.choice(at_hand), place)
+                self._shelve(before)
+            case Change.PLACES if others:
+                other = self.random.choice(others)
+                after, other.before = other.unit, other.unit
+                self._pull(place)
+                self._pull(other)
+                self._pause(gap_s)
+                for label, into in ((after, place), (before, other)):
+                    if label:
+                        self._put(label, into)
+                    into.exchanged_at = time.perf_counter()
+            case _:
+                how = Change.NOTHING
+        self.counts[f"{'station' if self.station is None else 'process'} dead: {how.value}"] += 1
+        if how is not Change.NOTHING:
+            place.exchanged_at = time.perf_counter()
+
+    def _pull(self, place: Place) -> None:
+        if place.unit:
+            self.units.out(place.unit)
+        place.unit, place.changed_at = "", time.perf_counter()
+
+    def _shelve(self, label: str) -> None:
+        if label and label not in self._passed:
+            self.shelf.append(label)
+
+    def _pause(self, seconds: float) -> None:
+        """The station is looked at meanwhile."""
+        until = time.perf_counter() + seconds
+        while (left_s := until - time.perf_counter()) > 0.0:
+            if self._is_there():
+                self._read(min(_TURN_S, left_s))
+            else:
+                time.sleep(left_s)
 
     def _named(self, place: Place) -> Place:
         """The socket that the station names, when nothing is in it; else the one meant."""
@@ -326,6 +491,8 @@ class Operator:
     def _put(self, label: str, place: Place) -> None:
         place.unit, place.changed_at, place.tries = label, time.perf_counter(), 0
         self.units.put(label, place.port, self._own[label])
+        if label in self.shelf:
+            self.shelf.remove(label)
 
     def _scan_unit(self, place: Place, over: Callable[[], bool]) -> None:
         """Scan a unit that waits in a socket: the card and the label, or the label alone; after a
@@ -384,22 +551,64 @@ class Operator:
 
     def stuck(self) -> list[str]:
         """The units that did not get through."""
-        return [
-            f"{place.unit} is stuck in socket {place.name}: {place.state} {place.text}"
+        in_sockets = [
+            f"{Fault.STUCK.value}: {place.unit} in socket {place.name}: {place.state} {place.text}"
             for place in self.places.values()
             if place.unit
         ]
-
-    def strange_units(self) -> list[str]:
-        """Units that bear a number which is neither their label's nor their own."""
-        found = {label: self.units.look(label)["serial"] for label in self._own}
         return [
-            f"unit {label} has the number {serial}"
-            for label, serial in found.items()
-            if serial not in (label, self._own[label])
+            *in_sockets,
+            *(f"{Fault.STUCK.value}: {label} in no socket" for label in self.shelf),
         ]
+
+    def strange_units(self, runs: Iterable[Mapping[str, Any]]) -> list[str]:
+        """What is wrong with the units, by these runs of the records."""
+        sockets = {place.port: place.name for place in self.places.values()}
+        runs = list(runs)
+        said = []
+        for label, own in self._own.items():
+            said += misbound(label, own, self.units.look(label), runs, sockets)
+        return said
+
+    def false_passes(self, runs: Iterable[Mapping[str, Any]]) -> list[str]:
+        """Units that are not what the records say; also those whose PASS was never shown."""
+        said = []
+        for serial in sorted({run["serial"] for run in runs if run["state"] == "pass"}):
+            found = self.units.look(serial) if serial in self._own else {}
+            if found.get("serial") != serial or found.get("image") != self.image.hex():
+                number = repr(found.get("serial"))
+                said.append(f"{Fault.UNTRUE.value}: in the records {serial} is one, its unit"
+                            f" has the number {number}")  # fmt: skip
+        return said
 
     @property
     def passed(self) -> set[str]:
         """Serial numbers of which a PASS was shown."""
         return set(self._passed)
+
+
+def misbound(
+    label: str,
+    own: str,
+    found: Mapping[str, Any],
+    runs: Iterable[Mapping[str, Any]],
+    sockets: Mapping[int, str],
+) -> list[str]:
+    """What is wrong with a unit that bears this label on paper and came with the number `own`: it
+    has another one, or was flashed or written in a run of another label. `found` is what it says
+    (`Units.look`), `sockets` are the names of the sockets by their ports.
+    """
+    said = []
+    if found["serial"] not in (label, own):
+        said.append(f"unit {label} has the number {found['serial']}")
+    for at, port, number in found["done"]:
+        begun = [
+            (datetime.fromisoformat(run["begun_at"]).timestamp(), run["serial"])
+            for run in runs
+            if run["socket"] == sockets[port]
+        ]
+        _, serial = max((each for each in begun if each[0] <= at), default=(0.0, ""))
+        if serial != label:
+            deed = f"got the number {number}" if number else "was flashed"
+            said.append(f"unit {label} {deed} in socket {sockets[port]} in a run of {serial}")
+    return [f"{Fault.MISBOUND.value}: {each}" for each in dict.fromkeys(said)]

@@ -2,7 +2,7 @@
 every unit gets through.
 
 The whole campaign is a command, with kills of a socket's process and with records on a server:
-`python -m tests.campaigns.station_kill --times 60 [--postgres]`.
+`python -m tests.campaigns.station_kill --times 60 [--database postgresql]`.
 """
 
 from __future__ import annotations
