@@ -98,11 +98,11 @@ class Plan:
         )
 
 
-def make_plan(number: int, seed: int) -> Plan:
+def make_plan(number: int, seed: int, only: Scenario | None) -> Plan:
     """Scenarios, kinds and gaps take turns, so that each of them meets each; the rest is chance."""
     chance = random.Random(seed * 1_000_003 + number)
-    scenario = tuple(Scenario)[number % len(Scenario)]
-    turn = number // len(Scenario)
+    turn, at = divmod(number, len(Scenario))
+    scenario = only or tuple(Scenario)[at]
     order: tuple[Token, ...] = ()
     if scenario in (Scenario.ONE_STREAM, Scenario.TWO_SOURCES, Scenario.CROSSED):
         order = chance.choice(orders(at_one_source=scenario is Scenario.ONE_STREAM))

@@ -37,7 +37,7 @@ from flasher.station.messages import RunOrder, RunResult
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.records.model import RunId, RunKind, RunState
 from flasher.station.unit_run import UnitRun
-from tests.campaigns.crossed_scans import Line, line_of, make_plan
+from tests.campaigns.crossed_scans import Line, Scenario, line_of, make_plan
 from tests.campaigns.scripted_units import NEW_VERSION, Units, bus_of, free_port
 from tests.campaigns.station_operator import Fault
 from tests.station.factory import DAY, SERIAL, USUAL, make_recipe
@@ -197,12 +197,12 @@ def disturb_runs(folder: Path, sockets: int, seed: int, trials: Trials) -> None:
         _in_threads([lambda port=port: work(port, units) for port in ports])  # type: ignore[misc]
 
 
-def cross_scans(folder: Path, seed: int, trials: Trials, first: int) -> None:
+def cross_scans(folder: Path, seed: int, trials: Trials, first: int, only: Scenario | None) -> None:
     """Trials of two stations."""
 
     def work(line: Line) -> None:
         while line.is_running and (number := trials.take()) is not None:
-            plan = make_plan(first + number, seed)
+            plan = make_plan(first + number, seed, only)
             known = len(line.problems)
             ending = line.play(plan)
             trials.note(plan.scenario.value, ending, line.problems[known:])
@@ -231,16 +231,20 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first of --lines")
     parser.add_argument("--sockets", type=int, default=3, help="of the single runs")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", choices=[each.name.lower() for each in Scenario])
+    parser.add_argument("--keep", type=Path, help="a new folder for records and traces")
     chosen = parser.parse_args()
     logging.disable(logging.CRITICAL)
     runs, lines = Trials(chosen.count), Trials(chosen.lines)
+    only = None if chosen.only is None else Scenario[chosen.only.upper()]
     with tempfile.TemporaryDirectory() as made:
-        folder = Path(made)
+        folder = chosen.keep or Path(made)
+        folder.mkdir(parents=True, exist_ok=chosen.keep is None)
         os.environ["XDG_DATA_HOME"] = str(folder / "data")  # what a station keeps of its own
         if chosen.count:
             disturb_runs(folder, chosen.sockets, chosen.seed, runs)
         if chosen.lines:
-            cross_scans(folder, chosen.seed, lines, chosen.first)
+            cross_scans(folder, chosen.seed, lines, chosen.first, only)
     for scenario, endings in sorted({**runs.ended, **lines.ended}.items()):
         print(f"{sum(endings.values()):4}  {scenario}")  # noqa: T201
         for ending, count in endings.most_common():
