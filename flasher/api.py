@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Callable, Coroutine, Iterable, Iterat
 from contextlib import asynccontextmanager, contextmanager, suppress
 from contextvars import copy_context
 from dataclasses import dataclass, field, replace
-from functools import partial, update_wrapper
+from functools import cached_property, partial, update_wrapper
 from threading import Lock
 from typing import (
     TYPE_CHECKING,
@@ -483,15 +483,10 @@ class Device:
             verify=verify,
             identity=identity,
             at_power_up=at_power_up,
-        )
+        ).checked()
         if in_session:
             job = job.in_session()
-        with self._turn(watch) as steps:
-            result = job.carry_out(steps)
-        error = result.error()
-        if error is not None:
-            raise error
-        return result
+        return _good(job.run(self, **watch))
 
     def _steps(self, watch: Watch) -> Procedures:
         link, clock, rate = self.connection.link, self.connection.clock, self.connection.bit_rate
@@ -648,24 +643,47 @@ class _Hand:
 
 @dataclass(frozen=True)
 class Job:
-    """An upgrade whose image was checked as far as it can be without the device."""
+    """An upgrade as it was prepared without the device: what `flash`, the bench page and the
+    station run.
+    """
 
     plan: Plan
     options: UpgradeOptions
     level: Level
     identity: Identity
-    checks: tuple[CheckResult, ...]
-    """What was found; nothing that speaks against it."""
     waived: tuple[str, ...] = ()
     """Names of the checks that somebody has waived (flasher.host.waivers)."""
+
+    @cached_property
+    def checks(self) -> tuple[CheckResult, ...]:
+        """What the image and its manifest say of the target by themselves."""
+        return tuple(judge_image(self.plan.image, self.plan.target, self.identity))
+
+    def checked(self) -> Job:
+        """The same. Raises ImageError when the image is hardly a program for the device,
+        WrongDeviceError when it or its manifest speaks against the target, UsageError when the
+        upgrade cannot be verified so.
+        """
+        for found in self.checks:
+            error = refusal(self.plan, found)
+            if error is not None:
+                raise error
+        check_level(self.plan, self.level, self.options)
+        return self
 
     def in_session(self) -> Job:
         """The same for a device that an earlier upgrade may have left in its session (R26)."""
         return replace(self, options=replace(self.options, in_session=True))
 
-    def carry_out(self, steps: Procedures) -> Result:
-        """To its end, good or bad."""
-        return steps.upgrade(self.plan, self.options, self.level, self.identity)
+    def run(self, device: Device, **watch: Unpack[Watch]) -> Result:
+        """To its end, good or bad, as `Device.upgrade`."""
+        return device.upgrade(
+            self.plan,
+            options=self.options,
+            verify=self.level,
+            identity=self.identity,
+            **watch,
+        )
 
 
 def prepare(
@@ -679,32 +697,33 @@ def prepare(
     at_power_up: bool = False,
     waived: Iterable[str] = (),
 ) -> Job:
-    """What an upgrade does before a bus is needed: load, plan, check, and settle what is left
-    open as `Device.flash` does. `waived` names checks of flasher.host.waivers; what `identity` and
-    `options` say goes before it. Raises ImageError, UsageError and WrongDeviceError.
+    """What an upgrade settles before a bus is needed: load, plan, and choose what is left open.
+    Nothing speaks against it once it was `Job.checked`.
+
+    `waived` names checks of flasher.host.waivers; what `identity` and `options` say goes before it.
+    Raises ImageError and UsageError.
     """
     names = frozenset(waived)
     if isinstance(image, Image):
-        loaded, release = image, None
+        loaded, beside = image, None
     else:
         loaded = load(image, allow_outside_vector=waivers.OUTSIDE_VECTOR in names)
-        release = find_release(image) if identity is None else None
+        beside = find_release(image) if identity is None else None
     if identity is None:
         identity = profile.identity(
-            release=release,
+            release=beside,
             waived=frozenset(check for check in WAIVABLE if check.value in names),
             goes_on_unchecked=at_power_up,
         )
-    plan = plan_for(release_checked(loaded, identity.release), profile, bitrate_bps)
-    checks = check_image(plan, identity)
+    release = identity.release
+    plan = plan_for(release_checked(loaded, release), profile, bitrate_bps)
     chosen = options or profile.upgrade_options(allow_boot_name=waivers.BOOT_NAME in names or None)
-    if waivers.BOOT_VERSION not in names:
-        chosen = release_options(chosen, identity.release)
+    if chosen.minimum_boot_version is None and release and waivers.BOOT_VERSION not in names:
+        chosen = replace(chosen, minimum_boot_version=release.minimum_boot_version)
     if at_power_up:
         chosen = replace(chosen, at_power_up=True)
     level = default_level(plan.target, chosen) if verify is None else as_level(verify)
-    check_level(plan, level, chosen)
-    return Job(plan, chosen, level, identity, tuple(checks), tuple(sorted(names)))
+    return Job(plan, chosen, level, identity, tuple(sorted(names)))
 
 
 def flash(
@@ -724,18 +743,26 @@ def flash(
     `bus` are python-can's keywords, as for `connect`; with `mock` the built-in device model is
     upgraded instead. An image that cannot be flashed is refused before the bus is opened.
     """
-    loaded = image if isinstance(image, Image) else load(image)
-    if identity is None:
-        identity = Identity(None if isinstance(image, Image) else find_release(image))
-    rate = None if mock else bit_rate(dialect, **bus).bps
-    checked = release_checked(loaded, identity.release)
-    check_image(make_plan(checked, target, dialect, bitrate_bps=rate), identity)
-    level = None if verify is None else as_level(verify)
+    profile = _default_profile(target, dialect)
+    job = prepare(
+        image,
+        profile,
+        bitrate_bps=None if mock else bit_rate(dialect, **bus).bps,
+        options=options,
+        verify=verify,
+        identity=identity,
+    ).checked()
     opened = connect_mock(target, dialect) if mock else connect(dialect, **bus)
     with opened as connection:
-        return connection.device(target, dialect=dialect).flash(
-            checked, options=options, verify=level, identity=identity, on_event=on_event
-        )
+        return _good(job.run(connection.device(profile=profile), on_event=on_event))
+
+
+def _good(result: Result) -> Result:
+    """The result of a good session. Raises the error of every other one."""
+    error = result.error()
+    if error is not None:
+        raise error
+    return result
 
 
 def release_checked(image: Image, release: Release | None) -> Image:
@@ -747,28 +774,6 @@ def release_checked(image: Image, release: Release | None) -> Image:
         return image
     release.check_bytes(image)
     return image if image.version else replace(image, version=release.firmware_version)
-
-
-def release_options(options: UpgradeOptions | None, release: Release | None) -> UpgradeOptions:
-    """The options, with what the manifest asks of the bootloader where they do not say it."""
-    chosen = options or UpgradeOptions()
-    if release is None or chosen.minimum_boot_version is not None:
-        return chosen
-    return replace(chosen, minimum_boot_version=release.minimum_boot_version)
-
-
-def check_image(plan: Plan, identity: Identity) -> list[CheckResult]:
-    """What an image and its manifest say of the target by themselves, without a device.
-
-    Raises ImageError when it is hardly a program for the device, WrongDeviceError when they speak
-    against the target.
-    """
-    findings = list(judge_image(plan.image, plan.target, identity))
-    for found in findings:
-        error = refusal(plan, found)
-        if error is not None:
-            raise error
-    return findings
 
 
 def refusal(plan: Plan, found: CheckResult) -> FlasherError | None:

@@ -18,7 +18,7 @@ from flasher.host.identity import CheckResult, judge_device
 from flasher.host.options import firmware_version
 from flasher.host.outcome import DeviceLeft
 from flasher.host.session import Result
-from flasher.host.verify import Level, Verdict, memory_check
+from flasher.host.verify import Verdict, memory_check
 from flasher.host.write import WritePlan
 from flasher.prose import prose
 from flasher.protocol.fields import Content
@@ -209,7 +209,8 @@ class UnitSteps:
     def _judge(self, target: UnitTarget, measured: list[Measurement]) -> list[CheckResult]:
         """The manifest's rules and the recipe's. Raises StepFailedError."""
         loaded, seen = target.loaded, self._identified[target.name].seen
-        findings = list(judge_device(target.image, loaded.target, target.identity, seen))
+        image, identity = target.job.plan.image, target.job.identity
+        findings = list(judge_device(image, loaded.target, identity, seen))
         for finding in findings:
             name = f"{target.name} {finding.check.value}"
             measured.append(Measurement(name, text=finding.verdict.value))
@@ -239,7 +240,7 @@ class UnitSteps:
             and found.seen.firmware_version == target.loaded.version
         ):
             return "flashed before the interruption, and the device names the version"
-        value = flash_value(target.loaded.version, target.image.sha256)
+        value = flash_value(target.loaded.version, target.job.plan.image.sha256)
         write = self._journal.intent(name, FLASH, value)
         self._progress(0.0)
         target.confirm()
@@ -289,7 +290,9 @@ class UnitSteps:
                         self._prompt(text, wait_s)
 
         is_in_bootloader = self._identified[target.name].is_in_bootloader
-        options = replace(target.options(timeout_s=limit_s), at_power_up=at_power_up)
+        options = replace(target.job.options, at_power_up=at_power_up)
+        if limit_s is not None:
+            options = replace(options, timeout_s=limit_s)
         if is_in_bootloader and target.continuity.is_announcing:
             # Its next announcement comes by itself. It ignores a reset (R18), after which that of
             # another unit would be taken for its own.
@@ -301,13 +304,7 @@ class UnitSteps:
             watch_s = _SPACINGS_OF_WATCH * timings.boot_version_spacing_s
             watched = replace(timings, boot_watch_s=max(timings.boot_watch_s, watch_s))
             options = replace(options, timings=watched)
-        result = target.device.upgrade(
-            target.plan,
-            options=options,
-            verify=Level.NONE if target.version_request is None else Level.VERSION,
-            identity=target.identity,
-            on_event=hear,
-        )
+        result = replace(target.job, options=options).run(target.device, on_event=hear)
         left = result.outcome.device_left
         self.left_behind = f"State of the device: {prose(left)}." if left.needs_rescue else ""
         target.check_cancelled()
@@ -447,7 +444,7 @@ class UnitSteps:
             if isinstance(event, events.MemoryRead):
                 self._progress(event.read_bytes / event.total_bytes)
 
-        check = memory_check(target.plan, target.options(), running)
+        check = memory_check(target.job.plan, target.job.options, running)
         target.run(check, hear)
         found = check.result
         if not found.ok:

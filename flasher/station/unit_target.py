@@ -10,14 +10,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
-from flasher.api import Connection, release_checked, release_options
+from flasher.api import Connection, prepare
 from flasher.bus.link import AT_ONCE
 from flasher.driver import Tap
 from flasher.errors import ErrorCode, InterruptedByUserError, NoAnswerError
 from flasher.host.identify import identify
 from flasher.host.identity import DeviceAnswers
 from flasher.host.items import Readable, meaningful_fields
-from flasher.host.options import UpgradeOptions
 from flasher.host.query import Request
 from flasher.host.runner import Runner, Stage
 from flasher.protocol.catalogue import BY_KEY
@@ -94,27 +93,24 @@ class UnitTarget:
             taps=taps,
             cancelled=cancelled,
         )
-        self.image = release_checked(loaded.image, loaded.release)
-        self.plan = self.device.plan(self.image)
-        # A unit without an application is rescued here.
-        self.identity = loaded.profile.identity(release=loaded.release, goes_on_unchecked=True)
-        self.version_request = self.options().version_request_for(loaded.target)
+        rate = connection.bit_rate
+        self.job = prepare(
+            loaded.image,
+            loaded.profile,
+            bitrate_bps=None if rate is None else rate.bps,
+            # A unit that does not take its image in one session, or where it may go on in some
+            # attempts, is a failed one, and another tool a fault of the station.
+            options=loaded.profile.upgrade_options(
+                attempts=loaded.profile.attempts,
+                waits_for_other_tool=False,
+                single_session=not goes_on,
+            ),
+            # A unit without an application is rescued here.
+            identity=loaded.profile.identity(release=loaded.release, goes_on_unchecked=True),
+        )
+        self.version_request = self.job.options.version_request_for(loaded.target)
         """How it is asked for its version; None where nobody knows."""
         self._cancelled = cancelled
-
-    def options(self, **overrides: object) -> UpgradeOptions:
-        """The options of an upgrade, those of the product. A unit that does not take its image in
-        one session, or where it may go on in some attempts, is a failed one, and another tool a
-        fault of the station.
-        """
-        profile = self.loaded.profile
-        limited = {
-            "attempts": profile.attempts,
-            "waits_for_other_tool": False,
-            "single_session": not self.goes_on,
-        }
-        chosen = profile.upgrade_options(**(limited | overrides))
-        return release_options(chosen, self.loaded.release)
 
     # -- asking -----------------------------------------------------------------------------------
 
@@ -135,7 +131,7 @@ class UnitTarget:
         return self._identify_once()
 
     def _identify_once(self) -> Identified:
-        asking = identify(self.plan, self.options())
+        asking = identify(self.job.plan, self.job.options)
         before = self.watcher.announcements
         self.run(asking)
         asked = asking.result

@@ -406,7 +406,7 @@ class Bench:
             bitrate_bps=rate,
             at_power_up=self.state.is_rescue,
             waived=[waiver for waived, waiver in self.state.waived if waived == name],
-        )
+        ).checked()
 
     def _check_sample(self, image: Image) -> None:
         """Raises ImageError for a firmware sample on a real bus; the upgrade looks again."""

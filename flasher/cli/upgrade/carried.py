@@ -111,11 +111,8 @@ class Carried:
                         if left is not None:
                             on_event(left)
                         device = connection.device(plan.target, dialect=self.bus.dialect)
-                        result = device.upgrade(
-                            plan,
-                            options=job.options,
-                            verify=job.level,
-                            identity=job.identity,
+                        result = job.run(
+                            device,
                             taps=record.taps,
                             on_event=on_event,
                             cancelled=watch.get("cancelled"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shlex
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 import click
@@ -43,8 +43,6 @@ from flasher.host.outcome import AGAIN
 from flasher.host.verify import Level
 from flasher.host.waivers import OF_DEVICE, OUTSIDE_VECTOR
 from flasher.image.cortexm import vector_table
-from flasher.image.plan import Plan
-from flasher.image.release import Release
 from flasher.protocol.spec import Target
 from flasher.protocol.timing import DEFAULT_TIMINGS
 from flasher.settings.profile import Profile, load_profile
@@ -118,15 +116,15 @@ class UpgradeChoices:
         """True when --allow-NAME or --force was given."""
         return self.force or getattr(self, f"allow_{name.replace('-', '_')}")
 
-    def waived(self) -> frozenset[Check]:
+    def waived_checks(self) -> frozenset[Check]:
         """The checks of image and device that are waived."""
         return frozenset(check for check in WAIVABLE if self.allows(check.value))
 
-    def options(self, profile: Profile, release: Release | None) -> UpgradeOptions:
-        """The profile's choices, the command line's where it makes any, and what the manifest asks
-        of the bootloader. Raises UsageError where they do not go together.
+    def options(self, profile: Profile, wait: float | None) -> UpgradeOptions:
+        """The profile's choices, the command line's where it makes any. Raises UsageError where
+        they do not go together.
         """
-        chosen = profile.upgrade_options(
+        return profile.upgrade_options(
             packet_tries=self.retries,
             attempts=self.attempts,
             timeout_s=self.timeout,
@@ -136,18 +134,8 @@ class UpgradeChoices:
             nak_next_is_ack=self.nak_next_is_ack or None,
             in_session=self.in_session,
             allow_boot_name=self.allows("boot-name") or None,
+            power_up_timeout_s=wait,
         )
-        return chosen if self.allows("boot-version") else api.release_options(chosen, release)
-
-    def level(self, plan: Plan, chosen: UpgradeOptions) -> Level:
-        """How far the upgrade is verified. Raises UsageError for a level that the target has no
-        query for.
-        """
-        if self.verify is None:
-            return api.default_level(plan.target, chosen)
-        level = Level(self.verify)
-        api.check_level(plan, level, chosen)
-        return level
 
 
 _upgrade_options: Final = option_set(
@@ -295,58 +283,52 @@ class _Upgrade:
         output.ending = text.failed
         profile = load_profile(choices.profile, self.target, self.bus.dialect)
         release = api.find_release(self.image.image, choices.manifest)
+        # What a file is refused for, before an adapter is looked for.
         image = api.release_checked(self.image.load(force=choices.force), release)
         profile.check_fits(image)
         self.bus = self.bus.with_profile(choices.profile)
         if not choices.dry_run:
             self.bus = settled(self.bus, output)
-        plan = api.make_plan(
+        waived = [name for name in OF_DEVICE if choices.allows(name)]
+        waived += [OUTSIDE_VECTOR] * (self.image.allow_outside_vector or choices.force)
+        job = api.prepare(
             image,
-            self.target,
-            self.bus.dialect,
+            profile,
             bitrate_bps=self.bus.bit_rate.bps,
-            has_upgrade=profile.has_upgrade,
-        )
-        if power_up_timeout_s is None:
-            power_up_timeout_s = profile.power_up_timeout_s
-        chosen = replace(
-            choices.options(profile, release),
+            options=choices.options(profile, power_up_timeout_s),
+            verify=None if choices.dry_run else choices.verify,
+            identity=profile.identity(
+                release=release,
+                waived=choices.waived_checks(),
+                skip_same_version=skip_same_version,
+                goes_on_unchecked=at_power_up,
+            ),
             at_power_up=at_power_up,
-            power_up_timeout_s=power_up_timeout_s,
+            waived=waived,
         )
         show = output.result if choices.dry_run else output.progress
         table = vector_table(image)
         for line in (
             *text.image_lines(image),
             *text.vector_lines(table),
-            *text.plan_lines(plan, chosen),
+            *text.plan_lines(job.plan, job.options),
         ):
             show(line)
-        identity = profile.identity(
-            release=release,
-            waived=choices.waived(),
-            skip_same_version=skip_same_version,
-            goes_on_unchecked=at_power_up,
-        )
-        found = api.check_image(plan, identity)
-        if choices.dry_run:
-            checks = [each.event for each in found]
-            for check in checks:
-                output.result(text.check_line(check))
-            output.result("dry run: nothing was sent")
-            return output.document(
-                DryRunDocument(
-                    dry_run=True,
-                    image=text.image_document(image, table),
-                    plan=text.plan_document(plan, chosen),
-                    checks=checks,
-                )
+        job.checked()
+        if not choices.dry_run:
+            return self._carry_out(job)
+        checks = [each.event for each in job.checks]
+        for check in checks:
+            output.result(text.check_line(check))
+        output.result("dry run: nothing was sent")
+        return output.document(
+            DryRunDocument(
+                dry_run=True,
+                image=text.image_document(image, table),
+                plan=text.plan_document(job.plan, job.options),
+                checks=checks,
             )
-        level = choices.level(plan, chosen)
-        waived = [name for name in OF_DEVICE if choices.allows(name)]
-        waived += [OUTSIDE_VECTOR] * (self.image.allow_outside_vector or choices.force)
-        job = api.Job(plan, chosen, level, identity, tuple(found), tuple(sorted(waived)))
-        return self._carry_out(job)
+        )
 
     def _carry_out(self, job: api.Job) -> int:
         output = self.output
