@@ -8,10 +8,12 @@ import random
 import re
 import zlib
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
+import segno
 
 from flasher.errors import FlasherError, UsageError
 from flasher.station.certificate import code_lines, proven, render_certificate
@@ -26,6 +28,14 @@ from tests.station.factory import SERIAL, Bench
 from tests.station.postgres import Server
 
 MARKS = ("-----BEGIN FLASHER CERTIFICATE-----", "-----END FLASHER CERTIFICATE-----")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def each_code_is_drawn_once() -> Iterator[None]:
+    """Half the time of a check is that of the QR code, which is the same in all of them."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(segno, "make", cache(segno.make))
+        yield
 
 
 @pytest.fixture(scope="module")
