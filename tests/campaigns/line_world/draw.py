@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Final
 
 from flasher.station.events import SocketState
+from flasher.station.records.model import StepName
 from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.stories import Story
 from tests.campaigns.line_world.world import Bay, World, last_look
@@ -19,20 +20,23 @@ Step = tuple[float, stories.Act | None]
 """Seconds to wait, and what is done then; None: nothing, only look again."""
 _GAPS_S: Final = (0.1, 0.3, 0.3, 0.5, 1.0, 3.5)
 """From pulling a unit to putting another one in."""
+_AFTER_FLASH: Final = (StepName.WRITE, StepName.RESTART, StepName.VERIFY)
 _IN_HAND: Final = (SocketState.PASS, SocketState.FAIL, SocketState.RECHECK)
 
 
 def setup_of(chance: random.Random) -> Story:
     """What there is."""
     sockets = chance.choice((1, 2, 2, 2, 3))
+    bare = chance.choice((0.1, 0.1, 0.5))
     units = []
     for label in range(1, sockets + chance.choice((1, 2)) + 1):
-        number = chance.choices(("none", "maker", "own", "other"), (6, 4, 2, 0.5))[0]
+        number = chance.choices(("none", "empty", "maker", "own", "other"), (5, 1.5, 4, 2, 0.5))[0]
+        firmware = "new" if chance.random() < 0.3 else "old"
         units.append(
             stories.UnitSetup(
                 label=label,
                 number=number,  # type: ignore[arg-type]
-                application="none" if chance.random() < 0.12 else "old",
+                application="none" if chance.random() < bare else firmware,  # type: ignore[arg-type]
                 pace="slow" if chance.random() < 0.6 else "fast",
                 answers=chance.random() > 0.04,
             )
@@ -41,7 +45,7 @@ def setup_of(chance: random.Random) -> Story:
     for name in ("jo", "al", "mo")[: chance.choice((1, 1, 2, 2, 3))]:
         source = chance.choices(("page", name, "mounted"), (4, 4, 1))[0]
         people.append(stories.Person(name=name, source=source))
-    recipe = chance.choices(("writes", "plain"), (4, 1))[0]
+    recipe = chance.choices(("writes", "plain"), (3, 1))[0]
     line = stories.LineSetup(sockets=sockets, recipe=recipe)  # type: ignore[arg-type]
     return Story(line, units, people, [])
 
@@ -101,7 +105,8 @@ class Teller:
     def _person(self, name: str) -> Iterator[Step]:
         scenes = {
             self._serve: 8.0,
-            self._exchange: 4.0,
+            self._exchange: 3.0,
+            self._exchange_in_step: 3.0,
             self._swap: 2.0,
             self._clear: 5.0,
             self._cancel: 0.6,
@@ -110,7 +115,26 @@ class Teller:
         }
         while True:
             yield self._pause(), None
+            if self._shares_card(name) and self.chance.random() < 0.5:
+                yield from self._scan_beside(name)
             yield from self.chance.choices(list(scenes), list(scenes.values()))[0](name)
+
+    def _shares_card(self, name: str) -> bool:
+        """Somebody else has scanned a card at the same scanner or page."""
+        people = self.world.people
+        return any(
+            each.card is not None and each.source == people[name].source
+            for each in people.values()
+            if each.name != name
+        )
+
+    def _scan_beside(self, name: str) -> Iterator[Step]:
+        """Scan a unit, whatever waits."""
+        waiting = [self._number(bay) for bay in self._bays(full=True, working=False)]
+        if waiting:
+            unit = self.chance.choice(waiting)
+            yield 0.0, stories.Card(by=name, unit=unit)
+            yield self._pause(), stories.Label(by=name, unit=unit)
 
     def _serve(self, name: str) -> Iterator[Step]:
         """Bring a unit into a socket, and scan it."""
@@ -139,8 +163,8 @@ class Teller:
         way = self.chance.random()
         if way < 0.65:
             yield self._pause(), card
-            if self.chance.random() < 0.12:
-                yield from self._swap(name)
+            if self.chance.random() < 0.15:
+                yield from self._trouble(name, unit)
             if self.chance.random() < 0.04:
                 yield 15.0, None
             yield self._pause(), label
@@ -150,6 +174,32 @@ class Teller:
         else:
             yield self._pause(), label
 
+    def _trouble(self, name: str, unit: int) -> Iterator[Step]:
+        """Between the card of a unit and its label."""
+        bay = self.world.where(unit)
+        if bay is not None and self.chance.random() < 0.3:
+            yield self._pause(), stories.KillWorker(socket=bay.name)
+        if bay is None or bay.unit is None or self.chance.random() < 0.5:
+            yield from self._swap(name)
+        else:
+            yield from self._put_another(bay)
+            yield self.chance.uniform(0.0, 0.15), stories.Label(by=name, unit=unit)
+
+    def _exchange_in_step(self, _name: str) -> Iterator[Step]:
+        """Another unit into a socket, at a certain step of its run."""
+        bay = self.chance.choice(list(self.world.bays.values()))
+        step = self.chance.choice((StepName.IDENTIFY, StepName.FLASH, *_AFTER_FLASH))
+        is_at_its_end = step is StepName.FLASH and self.chance.random() < 0.7
+        give_up_at = self.world.now + 10.0
+        while not (bay.is_working and bay.step is step and bay.is_complete >= is_at_its_end):
+            if self.world.now > give_up_at:
+                return
+            yield 0.1, None
+        # The step began up to 0.1 s ago.
+        yield self.chance.choice((0.0, self.chance.uniform(0.0, 0.3))), None
+        if bay.unit is not None:
+            yield from self._put_another(bay)
+
     def _exchange(self, _name: str) -> Iterator[Step]:
         """Another unit into a socket that works."""
         working = self._bays(full=True, working=True)
@@ -157,8 +207,10 @@ class Teller:
             return
         bay = self.chance.choice(working)
         yield self.chance.choice((self.chance.uniform(0, 0.6), self.chance.uniform(0, 4.0))), None
-        if bay.unit is None:
-            return
+        if bay.unit is not None:
+            yield from self._put_another(bay)
+
+    def _put_another(self, bay: Bay) -> Iterator[Step]:
         before = self._number(bay)
         yield 0.0, stories.Pull(unit=before)
         others = [each for each in self._on_table() if each != before] or [before]
@@ -222,8 +274,11 @@ class Teller:
                 yield wait, stories.Sleep(unit=unit, seconds=seconds)
             elif way < 0.54:
                 yield wait, stories.Dip(socket=socket, seconds=seconds)
-            elif way < 0.68:
+            elif way < 0.63:
                 yield wait, stories.KillWorker(socket=socket)
+            elif way < 0.7:
+                yield wait, None
+                yield from self._outage(socket)
             elif way < 0.8:
                 yield wait, stories.Unplug(socket=socket, seconds=seconds)
             elif way < 0.86:
@@ -234,3 +289,14 @@ class Teller:
                 yield wait, stories.KillPower(seconds=seconds)
             else:
                 yield wait, stories.KillStation(seconds=1.0 + seconds)
+
+    def _outage(self, socket: str) -> Iterator[Step]:
+        """A process that dies again and again, and a unit that is exchanged meanwhile."""
+        bays = self.world.bays
+        green = [e for e in bays.values() if e.shown and e.shown.state is SocketState.PASS]
+        bay = self.chance.choice(green or [bays[socket]])
+        yield 0.0, stories.KillWorker(socket=bay.name)
+        yield 1.3, stories.KillWorker(socket=bay.name)
+        yield 2.3, stories.KillWorker(socket=bay.name)
+        if bay.unit is not None:
+            yield from self._put_another(bay)

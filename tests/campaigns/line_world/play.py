@@ -12,8 +12,9 @@ from typing import Final
 
 from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.draw import Teller, setup_of
+from tests.campaigns.line_world.promises import Violation
 from tests.campaigns.line_world.stories import Story, time_of
-from tests.campaigns.line_world.world import STUCK, Violation, World
+from tests.campaigns.line_world.world import STUCK, World
 
 _GRID_S: Final = (1.0, 0.5, 0.1, 0.01, 0.001)
 

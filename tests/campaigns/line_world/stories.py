@@ -27,7 +27,7 @@ from typing import Final, Literal
 
 from tests.campaigns.world.plans import Clause, When, parse_clauses
 
-Number = Literal["none", "own", "maker", "other"]
+Number = Literal["none", "empty", "own", "maker", "other"]
 SOCKETS: Final = "ABC"
 
 
@@ -42,14 +42,15 @@ class LineSetup(Clause):
 
 @dataclass(frozen=True, kw_only=True)
 class UnitSetup(Clause):
-    """A unit with its paper label. Its number: none, that of its label, one of its maker, or that
-    of a label which is not its own.
+    """A unit with its paper label. Its number: none, an empty one, that of its label, one of its
+    maker, or that of a label which is not its own.
     """
 
     NAME = "unit"
     label: int
     number: Number = "none"
-    application: Literal["old", "none"] = "old"
+    application: Literal["old", "new", "none"] = "old"
+    """New: it runs the recipe's firmware already."""
     pace: Literal["fast", "slow"] = "fast"
     """Slow: half a second to erase, a quarter of a second a packet."""
     answers: bool = True

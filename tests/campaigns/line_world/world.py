@@ -10,6 +10,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import partial
+from math import inf
 from typing import Any, Final, NoReturn
 
 from sqlalchemy import event
@@ -21,6 +22,7 @@ from flasher.station.events import (
     LineResumed,
     LineStopped,
     OperatorPrompted,
+    Progressed,
     RunEnded,
     RunStarted,
     ScanAccepted,
@@ -39,7 +41,8 @@ from flasher.station.station import Station
 from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.again import empty_folder, same_engine
 from tests.campaigns.line_world.clockwork import PaperUnit, Process, SocketBus
-from tests.station.factory import IMAGES, USUAL, Bench, FakeClock
+from tests.campaigns.line_world.promises import Promises, Violation
+from tests.station.factory import BMS_VERSION, IMAGES, USUAL, Bench, FakeClock
 from tests.station.unit_bench import WRITES
 
 WINDOW_S: Final = 0.1
@@ -55,12 +58,15 @@ GREEN_S: Final = 5.0
 NONE: Final = "NONE"
 """What a new unit has for a serial number, where the recipe writes one."""
 _RECIPES: Final = {"writes": USUAL + WRITES, "plain": USUAL}
+OLD_VERSION: Final = DeviceProfile().factory_version
 _SLOW: Final = {"erase_time_s": 0.5, "program_time_s": 0.25}
 _AGAIN_S: Final = 1.0
 """After this time a station that could not start is started again."""
 _READY_S: Final = 4.0
 _RUN_LIMIT_S: Final = 150.0
 _TRIES: Final = 4
+NOTICE_S: Final = 1.0
+"""Before this time nobody has seen what is said of a card that was scanned before."""
 STUCK: Final = "STUCK"
 """The kind of a violation: nobody knows what to scan."""
 CAREFUL: Final = "careful"
@@ -73,14 +79,6 @@ _FINAL: Final = ("DUPLICATE", "JUST_PASSED", "WRONG_UNIT")
 
 def label_of(number: int) -> str:
     return f"W2605{number:03}"
-
-
-class Violation(Exception):  # noqa: N818
-    """What must never be: its kind, and what happened."""
-
-    def __init__(self, kind: str, text: str) -> None:
-        super().__init__(f"{kind}: {text}")
-        self.kind = kind
 
 
 @dataclass
@@ -101,6 +99,10 @@ class Bay:
     run: str = ""
     """The label of the run that the station works on."""
     run_at: float = 0.0
+    step: StepName | None = None
+    """The step that its process began last."""
+    is_complete: bool = False
+    """Its last packet was acknowledged."""
     is_working: bool = False
     """The process works on a run."""
     heard: dict[str, None] = field(default_factory=dict)
@@ -118,6 +120,8 @@ class PersonAtWork:
     """The socket whose card was accepted, for which unit, and whether it was in it."""
     label: int | None = None
     """The unit whose label was accepted, and waits for a card."""
+    notices_at: float = inf
+    """When somebody sees that the card does not wait any more."""
 
 
 @dataclass(frozen=True)
@@ -153,6 +157,7 @@ class World:
         """Labels whose PASS was shown."""
         people = (*setup.people, stories.Person(name=CAREFUL, source=CAREFUL))
         self.people = {each.name: PersonAtWork(each.name, each.source) for each in people}
+        self.promises = Promises(lambda unit: _stored(unit).number)
         self.station: Station | None = None
         self._station_at: float | None = None
         """When a station that died is started again."""
@@ -241,6 +246,7 @@ class World:
                 self.station.turn(0.0)
             except Exception as error:
                 raise Violation("CRASH", f"the station ended with {error!r}") from error
+            self.promises.look(self.now, lambda name: self.bays[name].shown)
         self._look()
 
     # -- the station ------------------------------------------------------------------------------
@@ -266,6 +272,8 @@ class World:
         except RecordError:
             # Nothing can be saved: who starts it is told, and tries it again.
             self.station, self._station_at = None, self.now + _AGAIN_S
+        else:
+            self.promises.restarted(self.now)
 
     def _launch(self, setup: WorkerSetup) -> Process:
         bay = self.bays[setup.socket]
@@ -280,7 +288,11 @@ class World:
         """What the process of a socket tells, at its own time."""
         match message:
             case StepStarted(step=StepName.CONNECT, try_number=1):
-                bay.is_working, bay.heard = True, {}
+                bay.is_working, bay.heard, bay.step = True, {}, message.step
+            case StepStarted():
+                bay.step, bay.is_complete = message.step, False
+            case Progressed(step=StepName.FLASH, share=1.0):
+                bay.is_complete = True
             case Finished():
                 bay.is_working = False
 
@@ -295,6 +307,7 @@ class World:
 
     def _judge(self, event: StationEvent) -> None:
         self._log("      ", partial(_shown, event))
+        self.promises.hear(event, lambda socket: self.bays[socket].unit)
         match event:
             case ScanAccepted() | ScanRefused() | OperatorPrompted():
                 self._answers.append(event)
@@ -324,7 +337,7 @@ class World:
             if person.source != source:
                 continue
             if person.card is not None and text == f"SOCKET {person.card[0]}":
-                person.card = None
+                person.notices_at = self.now + NOTICE_S
             if person.label is not None and text == label_of(person.label):
                 person.label = None
 
@@ -333,6 +346,9 @@ class World:
     def do(self, act: stories.Act) -> bool:
         """Carry out an act at its time; False where nobody honest would, or nothing is there."""
         self.go_to(stories.time_of(act))
+        for person in self.people.values():
+            if self.now >= person.notices_at:
+                person.card, person.notices_at = None, inf
         is_done = self._ACTS[type(act)](self, act)
         if is_done:
             self.seen["acts"] += 1
@@ -349,6 +365,7 @@ class World:
             return False
         bay.unit, bay.changed_at, bay.has_spoken = unit, self.now, False
         bay.disturbed_at = self.now
+        self.promises.touched(bay.name)
 
         def sent(_now: float) -> None:
             bay.has_spoken = True
@@ -375,6 +392,7 @@ class World:
         bay = self.where(act.unit)
         if bay is None or bay.unit is None:
             return False
+        self.promises.pulled(bay.name)
         unit, bay.unit, bay.changed_at = bay.unit, None, self.now
         bay.emptied_at = bay.disturbed_at = self._pulled_at[act.unit] = self.now
         bay.bus.pull(unit)
@@ -407,6 +425,7 @@ class World:
             text = "" if bay.shown is None else bay.shown.text
             is_awaited = text.startswith(_SCAN_LABEL)
             person.card = (bay.name, act.unit, is_in) if is_awaited else None
+            person.notices_at = inf
             person.label = None
         return True
 
@@ -507,6 +526,7 @@ class World:
         if unit is None or bay is None:
             return False
         unit.sleeps_until = self.now + act.seconds
+        self.promises.touched(bay.name)
         bay.disturbed_at = unit.sleeps_until
         return True
 
@@ -518,6 +538,7 @@ class World:
             bay.bus.pull(bay.unit)
             bay.unit.engine.power_cut(self.now)
             bay.bus.attach(bay.unit)
+        self.promises.touched(bay.name)
         self._power_at[act.socket] = bay.disturbed_at = self.now + act.seconds
         return True
 
@@ -530,6 +551,7 @@ class World:
         if bay is None or bay.process is None or bay.process.is_over:
             return False
         bay.process.stalled_until = self.now + act.seconds
+        self.promises.touched(bay.name)
         return True
 
     def _kill_worker(self, act: stories.KillWorker) -> bool:
@@ -538,6 +560,7 @@ class World:
             return False
         bay.process.kill()
         bay.is_working = False
+        self.promises.touched(bay.name)
         return True
 
     def _kill_power(self, act: stories.KillPower) -> bool:
@@ -555,6 +578,7 @@ class World:
         if bay is None or not bay.bus.faults.is_plugged:
             return False
         bay.bus.unplug(back_after_s=act.seconds)
+        self.promises.touched(bay.name)
         bay.disturbed_at = max(bay.disturbed_at, self.now + act.seconds)
         return True
 
@@ -584,6 +608,7 @@ class World:
             return False
         self.is_stopped = False
         self.station = None
+        self.promises.died()
         for bay in self.bays.values():
             if bay.process is not None:
                 bay.process.lose_station()
@@ -770,7 +795,7 @@ class World:
         """A good unit passes, whatever befell it before."""
         unit = next(each for each in self.setup.units if each.label == number)
         writes = self.setup.line.recipe == "writes"
-        numbers = ("none", "own", "maker") if writes else ("none", "own")
+        numbers = ("none", "empty", "own", "maker") if writes else ("none", "empty", "own")
         return unit.answers and unit.number in numbers
 
     def _stuck(self, number: int, said: str) -> NoReturn:
@@ -793,6 +818,7 @@ def _make(setup: stories.UnitSetup, none: str) -> PaperUnit:
     """A unit that lies on the table, without power; `none` is what a new one has for a number."""
     numbers = {
         "none": none,
+        "empty": "",
         "own": label_of(setup.label),
         "maker": f"MK{setup.label:05}",
         "other": label_of(900 + setup.label),
@@ -801,13 +827,14 @@ def _make(setup: stories.UnitSetup, none: str) -> PaperUnit:
         serial_number=numbers[setup.number],
         application_area_bytes=8192,
         silent_queries="none" if setup.answers else "752:3300",
+        factory_version=BMS_VERSION if setup.application == "new" else OLD_VERSION,
         **(_SLOW if setup.pace == "slow" else {}),  # type: ignore[arg-type]
     )
     device = MockDevice(
         BMS,
         bitrate_bps=WELLING.bitrate_bps,
         profile=profile,
-        has_application=setup.application == "old",
+        has_application=setup.application != "none",
     )
     device.power_cut(0.0)
     return PaperUnit(device, label_of(setup.label))
