@@ -8,6 +8,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from datetime import datetime
+from functools import cached_property
 from typing import Any, Final
 
 from flasher.protocol.text import no_formula
@@ -21,12 +22,21 @@ Row = dict[str, str | int | float | bool | None]
 
 @dataclass(frozen=True)
 class Report:
-    """Runs of a filter with their figures."""
+    """Runs of a filter with their figures; either is read when it is asked for first, which raises
+    RecordError.
+    """
 
+    records: Records
     chosen: RunFilter
-    figures: Figures
-    runs: list[Row]
-    """As `Records.table` gives them, the oldest first."""
+
+    @cached_property
+    def figures(self) -> Figures:
+        return self.records.figures(self.chosen)
+
+    @cached_property
+    def runs(self) -> list[Row]:
+        """As `Records.table` gives them, the oldest first."""
+        return self.records.table(self.chosen)
 
     def to_dict(self) -> dict[str, Any]:
         """The report in JSON's types; times are texts in UTC."""
@@ -61,11 +71,6 @@ class Report:
             if run["kind"] != RunKind.GOLDEN.value and run["state"] != RunState.RUNNING.value
         ]
         return junit_xml("station", [JUnitSuite("station", cases)]).decode("ascii")
-
-
-def make_report(records: Records, chosen: RunFilter) -> Report:
-    """The report of a filter. Raises RecordError."""
-    return Report(chosen, records.figures(chosen), records.table(chosen))
 
 
 def csv_text(rows: Iterable[Iterable[object]]) -> str:

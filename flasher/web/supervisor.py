@@ -52,7 +52,7 @@ from flasher.station.records.newest import Cut
 from flasher.station.records.overview import HOLDERS_COUNTED, By, Overview, Page, Span
 from flasher.station.records.rollup import Rollup
 from flasher.station.records.store import Store
-from flasher.station.reports import Report, csv_text, make_report
+from flasher.station.reports import Report, csv_text
 from flasher.station.sealed import CERTIFICATE_MAX_SIZE
 from flasher.station.stories import explained
 from flasher.station.tally import DEFAULT_SHIFTS
@@ -168,7 +168,7 @@ class Supervisor:
             page = self.overview.rows(filter_of(question), _oldest(question), PART_SIZE)
             rows = [row.values() for row in page.rows[::-1]]
             return _part(question, page, page.rows[0] if page.rows else (), rows)
-        report = make_report(self.store.read, filter_of(question))
+        report = Report(self.store.read, filter_of(question))
         name = question.path.lstrip("/")
         return Answer(make(report).encode("utf-8"), media_type, file_name=name)
 

@@ -29,7 +29,7 @@ from flasher.station.records.model import (
     Verified,
 )
 from flasher.station.records.store import Store
-from flasher.station.reports import make_report
+from flasher.station.reports import Report
 from tests.station.factory import BMS_VERSION, HEAD, Bench, make_recipe, target_table
 
 SERIAL_NUMBER = """
@@ -116,9 +116,9 @@ def measure(folder: Path, runs: int) -> None:
         timed("figures of all runs", records.figures)
         timed("figures of one lot", lambda: records.figures(RunFilter(lot="L001")))
         timed("all runs", records.table)
-        timed("report of all as CSV", lambda: make_report(records, RunFilter()).to_csv())
-        timed("report of all as JSON document", lambda: make_report(records, RunFilter()).to_dict())
-        timed("report of all as JUnit", lambda: make_report(records, RunFilter()).to_junit())
+        timed("report of all as CSV", lambda: Report(records, RunFilter()).to_csv())
+        timed("report of all as JSON document", lambda: Report(records, RunFilter()).to_dict())
+        timed("report of all as JUnit", lambda: Report(records, RunFilter()).to_junit())
         timed("one unit", lambda: as_json(records.unit("W0000017")))
         timed("certificate", lambda: certificate(store, records.unit("W0000017")))
         timed("backup", lambda: store.backup(folder / "backup.sqlite"))

@@ -45,7 +45,7 @@ from flasher.station.records.model import (
 from flasher.station.records.overview import Overview
 from flasher.station.records.rollup import Rollup
 from flasher.station.records.store import Store
-from flasher.station.reports import make_report
+from flasher.station.reports import Report
 from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.web.answers import AnswerProcesses, Question
 from flasher.web.supervisor import PAGES, open_supervisor, place_of, serve_supervisor
@@ -248,7 +248,7 @@ def measure_report(plant: Plant) -> None:
     plant.cool()
     began = time.perf_counter()
     with plant.open() as store:
-        made = make_report(store.read, RunFilter(since=end - timedelta(days=1), until=end))
+        made = Report(store.read, RunFilter(since=end - timedelta(days=1), until=end))
         text = made.to_csv() + made.to_json() + made.to_junit()
     print(
         f"  report of a day, {len(made.runs)} runs {'':<12} cold"

@@ -40,7 +40,7 @@ from flasher.station.records.model import (
     WriteRecord,
 )
 from flasher.station.records.store import Store
-from flasher.station.reports import Report, make_report
+from flasher.station.reports import Report
 from flasher.station.stories import explained
 from flasher.trace.story import Story
 
@@ -67,7 +67,7 @@ def report(output: Output, options: ReportOptions, records: RecordsOptions) -> i
             serial=options.serial,
             part=options.part,
         )
-        made = make_report(store.read, chosen)
+        made = Report(store.read, chosen)
         output.results(figure_lines(made.figures))
         for option, (path, make) in wanted.items():
             if path is not None:
@@ -78,6 +78,8 @@ def report(output: Output, options: ReportOptions, records: RecordsOptions) -> i
             options.certificates, made, store, output
         ):
             code = ExitCode.VERIFICATION
+        if not output.json_wanted:
+            return code  # the runs are read for the document alone
         document = StationReportDocument(
             figures=figures_document(made.figures),
             runs=[run_document(row) for row in made.runs],

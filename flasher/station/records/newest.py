@@ -14,8 +14,8 @@ from sqlalchemy import Connection, Select, exists, func, literal, select, union_
 from sqlalchemy.sql.expression import ColumnElement
 
 from flasher.station.records import schema
+from flasher.station.records.filters import begun_in, named_in, units_of
 from flasher.station.records.model import RunFilter
-from flasher.station.records.queries import begun_in, named_in, units_of
 from flasher.station.records.rows import beside_index
 
 _LEAD_MAX: Final = 50

@@ -22,12 +22,12 @@ from sqlalchemy.sql.expression import ColumnElement
 from flasher.station.records import schema
 from flasher.station.records.chain import data_of
 from flasher.station.records.database import Database
+from flasher.station.records.filters import JUDGED, counting
 from flasher.station.records.model import (
     FLASH,
     RunDetails,
     RunFilter,
     RunId,
-    RunKind,
     RunRecord,
     RunState,
     StepState,
@@ -35,7 +35,7 @@ from flasher.station.records.model import (
     utc_text,
 )
 from flasher.station.records.newest import Cut, newest_runs
-from flasher.station.records.queries import JUDGED, VERIFIED, details_of, filtered, run_query
+from flasher.station.records.queries import VERIFIED, details_of, run_query
 from flasher.station.records.rollup import (
     ALL_SPANS,
     WITHOUT_CAUSE,
@@ -269,7 +269,7 @@ class Overview:
         with self._rollup.rolled(chosen) as rolled:
             if rolled is not None:
                 texts = [(utc_text(span.begin), utc_text(span.end)) for span in spans]
-                found = rolled.units(texts, self._judged_units)
+                found = rolled.units(texts)
         if found is None:
             found = self._units(chosen, spans)
             found[ALL_SPANS] = self._units(chosen, [whole]).get(0, Units())
@@ -279,13 +279,6 @@ class Overview:
 
         return [of(span, place) for place, span in enumerate(spans)], of(whole, ALL_SPANS)
 
-    def _judged_units(self, rest: Rest) -> Sequence[int]:
-        run = schema.run.c
-        query = _counting(rest.chosen, run.unit_id).where(*rest.conditions)
-        query = query.where(beside_index(run.state).in_(JUDGED))
-        with self._database.reading() as connection:
-            return connection.execute(query).scalars().all()
-
     def _units(self, chosen: RunFilter, spans: Sequence[Span]) -> dict[int, Units]:
         run = schema.run.c
         # The id counts first, its last digit tells PASS: so the least is that of the first run.
@@ -294,7 +287,7 @@ class Overview:
         for begin in range(0, len(spans), _SPANS_AT_ONCE):
             span = _table(spans[begin : begin + _SPANS_AT_ONCE], begin)
             of_unit = (
-                _counting(chosen, span.c.number, run.unit_id)
+                counting(chosen, span.c.number, run.unit_id)
                 .add_columns(func.min(ranked).label("first"), func.max(ranked).label("last"))
                 .join(span, _within(span))
                 .where(beside_index(run.state).in_(JUDGED))
@@ -325,11 +318,11 @@ class Overview:
             column, name_of = _group_of(connection, by, shifts)
             counts: Iterable[Any] = ()
             if rolled is not None:
-                counts, rest = rolled.bad(column.name), rolled.tail
+                counts, rest = rolled.bad("code", column.name), rolled.tail
             # Beside their indexes, which would lead through all runs.
             code, group = beside_index(run.code), beside_index(column)
             query = (
-                _counting(rest.chosen, code, group, func.count())
+                counting(rest.chosen, code, group, func.count())
                 .where(beside_index(run.state).not_in(WITHOUT_CAUSE), *rest.conditions)
                 .group_by(code, group)
             )
@@ -352,7 +345,7 @@ class Overview:
                 found, rests = rolled.step_times()
         for rest in rests:
             query = (
-                _counting(rest.chosen, step.name, rounded, func.count())
+                counting(rest.chosen, step.name, rounded, func.count())
                 # From the runs to their steps, and not through all steps.
                 .join(schema.step, step.run_id == beside_index(schema.run.c.id))
                 .where(step.state == StepState.PASS.value, *rest.conditions)
@@ -419,12 +412,6 @@ class Overview:
             Cut(before=ids[-1]) if ids and has_older else None,
             Cut(after=ids[0]) if ids and has_newer else None,
         )
-
-
-def _counting(chosen: RunFilter, *columns: Any) -> Select[Any]:
-    """Columns of the runs of a filter that count in figures."""
-    query = filtered(select(*columns).select_from(schema.run), chosen)
-    return query.where(beside_index(schema.run.c.kind) != RunKind.GOLDEN.value)
 
 
 def _group_of(

@@ -3,36 +3,33 @@
 from __future__ import annotations
 
 import statistics
-from collections import Counter
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterator
+from dataclasses import asdict
 from typing import Any, Final
 
 from pydantic import TypeAdapter
 from sqlalchemy import Connection, Select, case, literal, select
-from sqlalchemy.sql.expression import ColumnElement
 
 from flasher.protocol.text import printable
 from flasher.station.records import chain, schema
 from flasher.station.records.database import Database
 from flasher.station.records.errors import NotFoundError
+from flasher.station.records.filters import JUDGED, counting, filtered
 from flasher.station.records.heads import Head
 from flasher.station.records.model import (
     Figures,
     RunDetails,
     RunFilter,
     RunId,
-    RunKind,
     RunState,
     UnitLife,
     UnitState,
     Verified,
-    utc_text,
 )
-from flasher.station.records.rows import batches, beside_index, grouped
+from flasher.station.records.rollup import Ended, Rest, Rollup, Units
+from flasher.station.records.rows import batches, grouped
 
 _EVERYTHING: Final = RunFilter()
-JUDGED: Final = (RunState.PASS.value, RunState.FAIL.value)
-"""Runs that say something about the unit; the others are about the station."""
 VERIFIED: Final = case(
     {int(level): level.name.lower() for level in Verified}, value=schema.run.c.verification_reached
 ).label("verified")
@@ -45,6 +42,7 @@ class Records:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self._rollup = Rollup(database)
 
     def table(
         self, chosen: RunFilter = _EVERYTHING
@@ -104,10 +102,40 @@ class Records:
     def figures(self, chosen: RunFilter = _EVERYTHING) -> Figures:
         run = schema.run.c
         duration_s = run.ended_monotonic_s - run.begun_monotonic_s
-        query = select(run.unit_id, run.state, run.code, duration_s, run.is_virtual)
-        query = filtered(query, chosen).where(run.kind != RunKind.GOLDEN.value)
-        with self._database.reading() as connection:
-            return _figures_of(connection.execute(query.order_by(run.id)))
+        ended = Ended()
+        units: Units | None = None
+        rests = [Rest(chosen, [])]
+        with self._rollup.rolled(chosen) as rolled:
+            if rolled is not None:
+                units = rolled.all_units()
+                if units is not None:
+                    rests = rolled.ended(ended)
+        first: dict[int, str] = {}
+        last: dict[int, str] = {}
+        for rest in rests:
+            query = counting(
+                rest.chosen, run.unit_id, run.state, run.code, run.is_virtual, duration_s
+            ).where(*rest.conditions)
+            with self._database.reading() as connection:
+                for unit_id, state, *others in connection.execute(query.order_by(run.id)):
+                    ended.add(state, *others)
+                    if state in JUDGED:
+                        first.setdefault(unit_id, state)
+                        last[unit_id] = state
+        if units is None:
+            passed = RunState.PASS.value
+            counts = (list(judged.values()).count(passed) for judged in (last, first))
+            units = Units(len(last), *counts)
+        failures = sorted(ended.failures.items(), key=lambda item: (-item[1], item[0]))
+        return Figures(
+            runs=ended.by_state.total(),
+            **asdict(units),
+            by_state=dict(ended.by_state),
+            virtual_runs=ended.virtual_runs,
+            failures=dict(failures),
+            duration_median_s=statistics.median(ended.durations_s) if ended.durations_s else None,
+            duration_longest_s=max(ended.durations_s, default=None),
+        )
 
     def stations(self) -> tuple[str, ...]:
         with self._database.reading() as connection:
@@ -223,85 +251,4 @@ def run_query(verified: Any) -> Select[Any]:
         .join(schema.socket, run.socket_id == schema.socket.c.id)
         .join(schema.station, schema.socket.c.station_id == schema.station.c.id)
         .join(schema.operator, run.operator_id == schema.operator.c.id)
-    )
-
-
-def filtered(query: Select[Any], chosen: RunFilter) -> Select[Any]:
-    """A query about runs, for those of a filter."""
-    run = schema.run.c
-    # Runs of a time lie together; a lot has few. All else would lead through runs of all years.
-    by_time = chosen.since is not None and chosen.lot is None
-    named: list[tuple[ColumnElement[Any], Select[Any] | None]] = [*named_in(chosen)]
-    for column, ids in [*named, (run.unit_id, units_of(chosen))]:
-        if ids is not None:
-            query = query.where((beside_index(column) if by_time else column).in_(ids))
-    for column, value in ((run.state, chosen.state), (run.code, chosen.code)):
-        if value is not None:
-            query = query.where((beside_index(column) if by_time else column) == value)
-    return query.where(*begun_in(chosen, run.begun_at))
-
-
-def begun_in(chosen: RunFilter, begun_at: ColumnElement[str]) -> list[ColumnElement[bool]]:
-    """The bounds of time of a filter."""
-    found = []
-    if chosen.since is not None:
-        found.append(begun_at >= utc_text(chosen.since))
-    if chosen.until is not None:
-        found.append(begun_at < utc_text(chosen.until))
-    return found
-
-
-def named_in(chosen: RunFilter) -> Iterator[tuple[ColumnElement[Any], Select[Any]]]:
-    """What a filter names and few rows have, by the column of the run: the ids that it allows."""
-    lot, recipe, socket, run = schema.lot.c, schema.recipe.c, schema.socket.c, schema.run.c
-    if chosen.lot is not None:
-        yield run.lot_id, select(lot.id).where(lot.name == chosen.lot)
-    if chosen.recipe is not None:
-        yield run.recipe_id, select(recipe.id).where(recipe.name == chosen.recipe)
-    if chosen.part is not None:  # a unit is of the part of its recipes
-        yield run.recipe_id, select(recipe.id).where(recipe.part == chosen.part)
-    if chosen.socket is not None:
-        yield run.socket_id, select(socket.id).where(socket.name == chosen.socket)
-
-
-def units_of(chosen: RunFilter) -> Select[Any] | None:
-    """The ids of the units of a filter; None: it names no serial number."""
-    unit = schema.unit.c
-    query = select(unit.id)
-    if chosen.serial is not None:
-        query = query.where(unit.serial == chosen.serial)
-    if chosen.search is not None:
-        query = query.where(unit.serial.icontains(chosen.search, autoescape=True))
-    return None if chosen.serial is None and chosen.search is None else query
-
-
-def _figures_of(rows: Iterable[Any]) -> Figures:
-    """The figures of runs in the order in which they began."""
-    first: dict[int, str] = {}
-    last: dict[int, str] = {}
-    by_state: Counter[str] = Counter()
-    failures: Counter[str] = Counter()
-    durations_s: list[float] = []
-    virtual_runs = 0
-    passed = RunState.PASS.value
-    for unit_id, state, code, duration_s, is_virtual in rows:
-        virtual_runs += bool(is_virtual)
-        by_state[state] += 1
-        if state in JUDGED:
-            first.setdefault(unit_id, state)
-            last[unit_id] = state
-        if state == passed:
-            durations_s.append(duration_s)
-        elif state != RunState.RUNNING.value:
-            failures[code] += 1
-    return Figures(
-        runs=by_state.total(),
-        units=len(last),
-        passed=list(last.values()).count(passed),
-        first_passed=list(first.values()).count(passed),
-        by_state=dict(by_state),
-        virtual_runs=virtual_runs,
-        failures=dict(sorted(failures.items(), key=lambda item: (-item[1], item[0]))),
-        duration_median_s=statistics.median(durations_s) if durations_s else None,
-        duration_longest_s=max(durations_s, default=None),
     )

@@ -12,6 +12,7 @@ import json
 import logging
 import sqlite3
 import zlib
+from array import array
 from bisect import bisect_left, bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -27,6 +28,7 @@ from sqlalchemy.sql.expression import ColumnElement
 from flasher.station.records import schema
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
+from flasher.station.records.filters import JUDGED, begun_in, counting, named_in
 from flasher.station.records.model import (
     RunFilter,
     RunKind,
@@ -35,11 +37,10 @@ from flasher.station.records.model import (
     utc_moment,
     utc_text,
 )
-from flasher.station.records.queries import JUDGED, begun_in, named_in
 from flasher.station.records.rows import batches, beside_index
 
 _LOG: Final = logging.getLogger(__name__)
-_LAYOUT: Final = 1
+_LAYOUT: Final = 2
 _RUNS_AT_ONCE: Final = 5000
 _PAUSE_S: Final = 0.2
 """Leaves the computer to others."""
@@ -55,8 +56,12 @@ CREATE TABLE history (
     PRIMARY KEY (day, recipe, socket, passed, later)
 ) WITHOUT ROWID;
 CREATE TABLE bad (
-    begun_at TEXT, run INTEGER, recipe_id INTEGER, socket_id INTEGER, lot_id INTEGER, code TEXT,
-    PRIMARY KEY (begun_at, run)
+    begun_at TEXT, run INTEGER, recipe_id INTEGER, socket_id INTEGER, lot_id INTEGER, state TEXT,
+    code TEXT, is_virtual INTEGER, PRIMARY KEY (begun_at, run)
+) WITHOUT ROWID;
+CREATE TABLE passed (
+    period TEXT, recipe INTEGER, socket INTEGER, is_virtual INTEGER, durations_s BLOB,
+    PRIMARY KEY (period, recipe, socket, is_virtual)
 ) WITHOUT ROWID;
 CREATE TABLE times (
     period TEXT, recipe INTEGER, socket INTEGER, content BLOB,
@@ -64,8 +69,8 @@ CREATE TABLE times (
 ) WITHOUT ROWID;
 """
 """`history`: how many units have the same judged runs, one after the other: the first one, and the
-others as text. `bad`: runs that ended without PASS. `times`: how often each time of a step came in
-a day (its number) or month.
+others as text. `bad`: runs that ended without PASS. `passed`: how long runs with PASS took, in
+order. `times`: how often each time of a step came in a day (its number) or month.
 """
 
 
@@ -120,6 +125,29 @@ class Rest:
 
     chosen: RunFilter
     conditions: list[ColumnElement[bool]]
+
+
+@dataclass
+class Ended:
+    """How runs ended."""
+
+    by_state: Counter[str] = field(default_factory=Counter)
+    failures: Counter[str] = field(default_factory=Counter)
+    """By their codes."""
+    virtual_runs: int = 0
+    durations_s: list[float] = field(default_factory=list)
+    """Of those with PASS."""
+
+    def add(
+        self, state: str, code: str, is_virtual: int, duration_s: float | None, runs: int = 1
+    ) -> None:
+        """Count so many runs without PASS, or one with it."""
+        self.by_state[state] += runs
+        self.virtual_runs += bool(is_virtual) * runs
+        if state == RunState.PASS.value:
+            self.durations_s.append(duration_s or 0.0)
+        elif state != RunState.RUNNING.value:
+            self.failures[code] += runs
 
 
 @dataclass
@@ -295,7 +323,8 @@ class _Addition:
         query = (
             select(
                 run.id, run.unit_id, run.recipe_id, run.socket_id, run.lot_id, run.state, run.code,
-                run.begun_at,
+                run.begun_at, run.is_virtual,
+                (run.ended_monotonic_s - run.begun_monotonic_s).label("duration_s"),
             )
             .where(run.id > self._first, run.id <= self._last)
             .where(beside_index(run.kind) != RunKind.GOLDEN.value)
@@ -307,14 +336,18 @@ class _Addition:
                 day = self._days.make(row.begun_at)
                 self._sums.execute("INSERT INTO day VALUES (?, ?, ?, ?)", day)
         self._sums.executemany(
-            "INSERT INTO bad VALUES (?, ?, ?, ?, ?, ?)",
+            "INSERT INTO bad VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
             [
-                (row.begun_at, row.id, row.recipe_id, row.socket_id, row.lot_id, row.code)
+                (
+                    row.begun_at, row.id, row.recipe_id, row.socket_id, row.lot_id, row.state,
+                    row.code, row.is_virtual,
+                )
                 for row in runs
                 if row.state not in WITHOUT_CAUSE
             ],
-        )
+        )  # fmt: skip
         self._add_histories(runs)
+        self._add_passed(runs)
         self._add_times({row.id: row for row in runs})
 
     def _add_histories(self, runs: Iterable[Any]) -> None:
@@ -340,6 +373,24 @@ class _Addition:
             " AND (day, recipe, socket, passed, later) = (?, ?, ?, ?, ?)",
             [(*first, _text_of(later)) for (first, *later), units in change.items() if units < 0],
         )
+
+    def _add_passed(self, runs: Iterable[Any]) -> None:
+        added: dict[tuple[str, int, int, bool], list[float]] = defaultdict(list)
+        for row in runs:
+            if row.state == RunState.PASS.value:
+                day = self._days.of(row.begun_at)
+                for period in (str(day.number), day.month):
+                    key = (period, row.recipe_id, row.socket_id, bool(row.is_virtual))
+                    added[key].append(row.duration_s)
+        for key, durations_s in added.items():
+            known = self._sums.execute(
+                "SELECT durations_s FROM passed"
+                " WHERE (period, recipe, socket, is_virtual) = (?, ?, ?, ?)",
+                key,
+            ).fetchone()
+            every = sorted(durations_s if known is None else [*_seconds(known[0]), *durations_s])
+            packed = array("d", every).tobytes()
+            self._sums.execute("REPLACE INTO passed VALUES (?, ?, ?, ?, ?)", (*key, packed))
 
     def _add_times(self, runs: Mapping[int, Any]) -> None:
         step = schema.step.c
@@ -437,6 +488,12 @@ def _later(text: str) -> Iterator[Judged]:
         yield Judged(day, recipe, socket, passed)
 
 
+def _seconds(packed: bytes) -> array[float]:
+    found = array("d")
+    found.frombytes(packed)
+    return found
+
+
 def _merge(into: _Times, times: Mapping[str, Mapping[str, int]]) -> None:
     for name, counts in times.items():
         into[name].update(counts)
@@ -494,40 +551,64 @@ class Rolled:
             until = utc_moment(min(day.end, self._until))
             yield Rest(replace(self.chosen, since=since, until=until), [condition])
 
-    def bad(self, group: str) -> Iterator[tuple[str, Any, int]]:
-        """How often each code ended a run without PASS, by a column of these runs, but for the
-        `tail`.
-        """
+    def bad(self, *columns: str) -> Iterator[Any]:
+        """How often runs ended without PASS, by columns of these runs, but for the `tail`."""
         allowed = (
             None if ids is None else json.dumps(sorted(ids))
             for ids in (self._recipes, self._sockets)
         )
+        names = ", ".join(columns)
         return self._sums.execute(
-            f"SELECT code, {group}, count(*) FROM bad"  # noqa: S608
+            f"SELECT {names}, count(*) FROM bad"  # noqa: S608
             " WHERE begun_at >= ?1 AND begun_at < ?2"
             " AND (?3 IS NULL OR recipe_id IN (SELECT value FROM json_each(?3)))"
             " AND (?4 IS NULL OR socket_id IN (SELECT value FROM json_each(?4)))"
-            f" GROUP BY code, {group}",
+            f" GROUP BY {names}",
             (self._since, self._until, *allowed),
         )
 
-    def step_times(self) -> tuple[StepTimes, list[Rest]]:
-        """The times of steps that passed, and what they are without."""
-        whole = self._whole()
+    def _periods(self, whole: Sequence[Day]) -> Iterator[str]:
+        """Months and days that make up these days."""
         in_all = Counter(day.month for day in self._days)
         months = {
             month for month, days in Counter(day.month for day in whole).items()
             if days == in_all[month]
         }  # fmt: skip
-        periods = [*months, *(str(day.number) for day in whole if day.month not in months)]
+        yield from months
+        yield from (str(day.number) for day in whole if day.month not in months)
+
+    def ended(self, ended: Ended) -> list[Rest]:
+        """Add how runs ended; what the sums are without."""
+        whole = self._whole()
+        for state, code, is_virtual, runs in self.bad("state", "code", "is_virtual"):
+            ended.add(state, code, is_virtual, None, runs)
+        for some in batches(self._periods(whole)):
+            for *place, is_virtual, packed in self._sums.execute(
+                "SELECT recipe, socket, is_virtual, durations_s FROM passed"
+                " WHERE period IN (SELECT value FROM json_each(?))",
+                [json.dumps(some)],
+            ):
+                if self._allows(*place):
+                    durations_s = _seconds(packed)
+                    ended.durations_s.extend(durations_s)
+                    ended.by_state[RunState.PASS.value] += len(durations_s)
+                    ended.virtual_runs += is_virtual * len(durations_s)
+        only_passed = beside_index(schema.run.c.state) == RunState.PASS.value
+        cut = [
+            replace(rest, conditions=[*rest.conditions, only_passed]) for rest in self._cut(whole)
+        ]
+        return [self.tail, *cut]
+
+    def step_times(self) -> tuple[StepTimes, list[Rest]]:
+        """The times of steps that passed, and what they are without."""
+        whole = self._whole()
         summed: _Times = defaultdict(Counter)
         is_all = self._recipes is None and self._sockets is None
-        for some in batches(periods):
-            marks = ", ".join("?" * len(some))
+        for some in batches(self._periods(whole)):
             for *place, content in self._sums.execute(
-                f"SELECT recipe, socket, content FROM times WHERE period IN ({marks})"  # noqa: S608
-                " AND (recipe = 0) = ?",
-                [*some, is_all],
+                "SELECT recipe, socket, content FROM times"
+                " WHERE period IN (SELECT value FROM json_each(?)) AND (recipe = 0) = ?",
+                [json.dumps(some), is_all],
             ):
                 if is_all or self._allows(*place):
                     _merge(summed, json.loads(zlib.decompress(content)))
@@ -536,12 +617,14 @@ class Rolled:
             found[name] = Counter({float(seconds): count for seconds, count in counts.items()})
         return found, [self.tail, *self._cut(whole)]
 
-    def units(
-        self, spans: Sequence[tuple[str, str]], units_of: Callable[[Rest], Iterable[int]]
-    ) -> dict[int, Units] | None:
+    def all_units(self) -> Units | None:
+        """The units of the period as one; None where the sums have no whole day of it."""
+        found = self.units([("", "~")])
+        return None if found is None else found.get(ALL_SPANS, Units())
+
+    def units(self, spans: Sequence[tuple[str, str]]) -> dict[int, Units] | None:
         """The units of the spans that have any, by the place of the span, and of `ALL_SPANS`. These
-        are in order and do not overlap; `units_of` finds the units of runs that the sums are
-        without. None where the sums have no whole day of these spans.
+        are in order and do not overlap. None where the sums have no whole day of these spans.
         """
         whole = self._whole(sorted({each for span in spans for each in span}))
         if not whole:
@@ -555,7 +638,7 @@ class Rolled:
 
         found: dict[int, Units] = defaultdict(Units)
         # Of units with other runs the records have the history that counts.
-        apart = {unit for rest in (self.tail, *self._cut(whole)) for unit in units_of(rest)}
+        apart = {unit for rest in (self.tail, *self._cut(whole)) for unit in self._judged(rest)}
         counted_apart: Counter[History] = Counter()
         for _, runs in groupby(
             _judged_runs(self._connection, sorted(apart)), key=lambda row: row.unit_id
@@ -577,6 +660,12 @@ class Rolled:
                 placed = [run._replace(day=places.get(run.day, _NOWHERE)) for run in history]
                 self._count(found, placed, units)
         return found
+
+    def _judged(self, rest: Rest) -> Iterable[int]:
+        """The units of runs that the sums are without."""
+        run = schema.run.c
+        query = counting(rest.chosen, run.unit_id).where(*rest.conditions)
+        return self._connection.execute(query.where(beside_index(run.state).in_(JUDGED))).scalars()
 
     def _count(self, found: dict[int, Units], runs: Iterable[Judged], units: int) -> None:
         """Count so many units with these runs; the `day` of each is the place of its span."""

@@ -18,6 +18,7 @@ from sqlalchemy import insert, select, text
 from flasher.station.records import rollup, schema
 from flasher.station.records.model import RunFilter, RunKind, RunState, utc_text
 from flasher.station.records.overview import By, Overview, Span
+from flasher.station.records.queries import Records
 from flasher.station.records.rollup import Rollup
 from flasher.station.tally import DEFAULT_SHIFTS
 from flasher.web.supervisor import shifts_of, spans_of
@@ -80,6 +81,9 @@ class Lines:
                     "socket_id": chance.randint(1, 2), "recipe_id": chance.randint(1, 2),
                     "lot_id": chance.choice((None, 1, 2)), "state": state,
                     "code": "OK" if state == "PASS" else chance.choice(("NO_ANSWER", "REFUSED")),
+                    "is_virtual": chance.random() < 0.5,
+                    "begun_monotonic_s": 0.1,
+                    "ended_monotonic_s": 0.1 + chance.lognormvariate(2, 1),
                     "kind": RunKind.GOLDEN.value if chance.random() < 0.1 else "production",
                     "begun_at": utc_text(at), "ended_at": utc_text(at + timedelta(hours=5)),
                 }
@@ -133,7 +137,7 @@ def periods(chance: random.Random) -> Iterator[Span]:
     yield Span(begin, begin + timedelta(hours=chance.randint(1, 40)))
 
 
-def figures_of(overview: Overview, chance: random.Random) -> list[Any]:
+def figures_of(overview: Overview, records: Records, chance: random.Random) -> list[Any]:
     """Everything that pages of figures show, for filters and periods."""
     found: list[Any] = []
     for span in periods(chance):
@@ -144,17 +148,22 @@ def figures_of(overview: Overview, chance: random.Random) -> list[Any]:
                 [overview.yields(chosen, spans) for spans in ([span], list(spans_of(span)))]
             )
             found.append([overview.causes(chosen, by, shifts) for by in By])
-            found.append(overview.step_times(chosen))
+            found += [overview.step_times(chosen), records.figures(chosen)]
     found += [overview.step_times(RunFilter()), overview.causes(RunFilter(), By.RECIPE)]
+    found.append(records.figures())
     return found
 
 
 def check(lines: Lines) -> None:
     """Compare the sums, as they are, with the records."""
-    rolled, direct = Overview(lines.bench.store.database), Overview(lines.bench.store.database)
-    direct._rollup._file = Path("nowhere")
+    database = lines.bench.store.database
     seed = lines.chance.random()
-    assert figures_of(rolled, random.Random(seed)) == figures_of(direct, random.Random(seed))
+    found = []
+    for file in (Rollup(database)._file, Path("nowhere")):
+        overview, records = Overview(database), Records(database)
+        overview._rollup._file = records._rollup._file = file
+        found.append(figures_of(overview, records, random.Random(seed)))
+    assert found[0] == found[1]
 
 
 @pytest.fixture(
