@@ -30,7 +30,9 @@ from tests.campaigns.station_kill import write_files
 from tests.campaigns.station_operator import Fault, Station, misbound
 
 GAPS_S: Final = (0.3, 0.5, 1.0, 3.5)
-_IMAGE_BYTES: Final = 60 * 128
+_IMAGE_BYTES: Final = 80 * 128
+_PACKET_S: Final = 0.05
+"""A unit takes so long for a packet: what is to happen in a flash has to find its share of it."""
 _ANSWER_S: Final = 20.0
 _LIMIT_S: Final = 90.0
 _QUIET_S: Final = 2.5
@@ -144,6 +146,8 @@ class Line:
     _own: dict[str, str] = field(default_factory=dict)
     """The number that each unit came with, and the trial that it was made for."""
     _plans: dict[str, Plan] = field(default_factory=dict)
+    _pulled_in: dict[str, str] = field(default_factory=dict)
+    """The state of each unit when it was pulled out first."""
     _count: int = 0
 
     def __post_init__(self) -> None:
@@ -162,7 +166,9 @@ class Line:
             sockets.write("\n".join(lines) + "\n")
 
     def __enter__(self) -> Line:
-        self.units = self._stack.enter_context(Units(self.ports, self.folder / "units.log"))
+        self.units = self._stack.enter_context(
+            Units(self.ports, self.folder / "units.log", _PACKET_S)
+        )
         self.station = Station(self.folder, *self._words)
         names = {str(at) for at in range(1, len(self.ports) + 1)}
         self._sat = {name: [] for name in names}
@@ -233,7 +239,7 @@ class Line:
         self.units.put(label, self.ports[int(socket) - 1], self._own[label])
 
     def _pull(self, label: str) -> None:
-        self.units.out(label)
+        self._pulled_in.setdefault(label, self.units.out(label)["state"])
         for sat in itertools.chain.from_iterable(self._sat.values()):
             if sat.label == label:
                 sat.until = min(sat.until, time.perf_counter())
@@ -322,7 +328,9 @@ class Line:
             has_passed = any(r["serial"] == label and r["state"] == "pass" for r in runs)
             if has_passed and found["serial"] != label:
                 said.append(f"{Fault.UNTRUE.value}: {label} in the records: {found['serial']!r}")
-            self.problems += [f"{each} ({self._plans[label].title})" for each in said]
+            pulled = self._pulled_in.get(label, "no state")
+            title = f"{self._plans[label].title}, pulled in {pulled}"
+            self.problems += [f"{each} ({title})" for each in said]
         for each in self._ask("verify")["problems"]:
             self._wrong(Fault.RECORDS, f"{each['where']}: {each['what']}")
         self.judged = self.problems[known:]

@@ -1,7 +1,7 @@
 """Units in a process of their own, which no kill of a station reaches: the scripted device of the
 peers, which shares no code with flasher, on one multicast bus for each socket.
 
-    python -m tests.campaigns.scripted_units PORT...
+    python -m tests.campaigns.scripted_units ANSWER_S PORT...
 
 Orders are lines of JSON on stdin, each is answered by one on stdout: {"put": UNIT, "into": PORT},
 {"out": UNIT} and {"look": UNIT}. A unit is made at its first `put` ("own" is the serial number that
@@ -57,8 +57,8 @@ def _text(text: str) -> bytes:
 class Unit(ScriptedDevice):
     """A battery with a serial number that can be written, and a session that it forgets."""
 
-    def __init__(self, own_serial: str, session_s: float | None) -> None:
-        super().__init__("bms", erase_s=0.2)
+    def __init__(self, own_serial: str, session_s: float | None, answer_s: float) -> None:
+        super().__init__("bms", erase_s=0.2, answer_s=answer_s)
         self.serial = own_serial
         self._session_s = session_s
         """Silence after which it leaves an upgrade; None: never (R26)."""
@@ -114,8 +114,9 @@ class Unit(ScriptedDevice):
 class _Bench:
     """The buses, and the units in their sockets."""
 
-    def __init__(self, buses: dict[int, can.BusABC], seed: int) -> None:
+    def __init__(self, buses: dict[int, can.BusABC], seed: int, answer_s: float) -> None:
         self._buses = buses
+        self._answer_s = answer_s
         self._random = random.Random(seed)
         self._units: dict[str, Unit] = {}
         self._inside: dict[int, Unit] = {}
@@ -158,7 +159,7 @@ class _Bench:
         match order:
             case {"put": name, "into": port, "own": own}:
                 session_s = None if self._random.random() < 0.1 else 0.5
-                unit = self._units.setdefault(name, Unit(own, session_s))
+                unit = self._units.setdefault(name, Unit(own, session_s, self._answer_s))
                 self._inside[port] = unit
                 unit.port = port
                 unit.power_on(now)
@@ -174,10 +175,11 @@ class _Bench:
 
 
 class Units:
-    """The process, for who orders it."""
+    """The process, for who orders it. `answer_s`: how long a unit takes for each answer."""
 
-    def __init__(self, ports: list[int], log: Path) -> None:
-        words = [sys.executable, "-m", "tests.campaigns.scripted_units", *map(str, ports)]
+    def __init__(self, ports: list[int], log: Path, answer_s: float = 0.0) -> None:
+        numbers = map(str, (answer_s, *ports))
+        words = [sys.executable, "-m", "tests.campaigns.scripted_units", *numbers]
         with log.open("ab") as errors:
             self._process = subprocess.Popen(
                 words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=errors, text=True
@@ -197,8 +199,9 @@ class Units:
         """A unit into a socket; its power comes with it."""
         self._ask(put=name, into=port, own=own)
 
-    def out(self, name: str) -> None:
-        self._ask(out=name)
+    def out(self, name: str) -> dict[str, Any]:
+        """Pull a unit; what was in it then."""
+        return self._ask(out=name)
 
     def look(self, name: str) -> dict[str, Any]:
         """What is in a unit."""
@@ -214,12 +217,12 @@ class Units:
 
 
 def main() -> None:
-    ports = [int(word) for word in sys.argv[1:]]
+    answer_s, *ports = float(sys.argv[1]), *map(int, sys.argv[2:])
     with ExitStack() as stack:
         buses = {
             port: stack.enter_context(can.Bus(**bus_of(port), ignore_config=True)) for port in ports
         }
-        _Bench(buses, seed=sum(ports)).serve()
+        _Bench(buses, seed=sum(ports), answer_s=answer_s).serve()
 
 
 if __name__ == "__main__":
