@@ -140,6 +140,19 @@ STORIES = {
         " @7.0 label by=jo unit=1 ; @12.0 unplug socket=A seconds=0.5 ; @12.2 pull unit=1 ;"
         " @20.0 look"
     ),
+    "a label that waits beside the verdict of the unit before": (
+        "line sockets=1 ; unit label=1 ; unit label=2 ; unit label=3 ; person name=mo source=mo ;"
+        " @3.0 put unit=2 socket=A ; @3.5 label by=mo unit=2 ; @3.8 pull unit=2 ;"
+        " @6.1 label by=mo unit=3 ; @10.8 put unit=1 socket=A"
+    ),
+    "a bootloader that is pulled as its flash begins": (
+        "line sockets=2 ; unit label=1 ; unit label=2 ; unit label=3 pace=slow ;"
+        " person name=jo source=mounted ; person name=al source=al ; @1.68 put unit=3 socket=A ;"
+        " @1.71 card by=al unit=3 ; @2.09 label by=al unit=3 ; @4.14 pull unit=3 ;"
+        " @4.44 put unit=1 socket=A ; @6.53 pull unit=1 ; @10.23 put unit=2 socket=A ;"
+        " @10.35 label by=jo unit=2 ; @10.62 put unit=3 socket=B ; @13.05 label by=jo unit=3 ;"
+        " @14.12 pull unit=2 ; @14.22 pull unit=3 ; @17.72 put unit=2 socket=B"
+    ),
     "everything dies": (
         "line sockets=2 ; unit label=1 pace=slow ; unit label=2 application=none ;"
         " person name=jo source=mounted ; @3.0 put unit=1 socket=A ; @4.0 label by=jo unit=1 ;"
