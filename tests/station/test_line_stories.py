@@ -14,6 +14,7 @@ from subprocess import run
 import pytest
 
 from flasher.station import codes
+from flasher.station.continuity import Continuity
 from flasher.station.presence import Presence
 from flasher.station.socket import UNNAMED, Socket, Source
 from flasher.station.station import Station
@@ -231,6 +232,46 @@ def test_nobody_puts_a_unit_where_another_one_is_awaited() -> None:
     assert [each.NAME for each in told(text).done] == ["card", "label"]
     without = text.replace("@4.0 label by=jo unit=1 ;", "")
     assert [each.NAME for each in told(without).done] == ["card", "put"]
+
+
+# -- what nobody can detect ------------------------------------------------------------------------
+
+UNDETECTABLE = {
+    "exchanged between two announcements": (
+        "line sockets=2 ; unit label=1 ; unit label=3 application=none ; person name=mo ;"
+        " @2.0 card by=mo unit=3 socket=B ; @2.4 label by=mo unit=3 ; @2.5 put unit=3 socket=B ;"
+        " @3.0 pull unit=3 ; @3.1 put unit=1 socket=B"
+    ),
+    "exchanged between the confirmed reset and the announcement": (
+        "line sockets=2 ; unit label=2 ; unit label=3 ; person name=al ;"
+        " @31.1 label by=al unit=3 ; @31.5 put unit=3 socket=A ; @33.55 card by=al unit=3 ;"
+        " @34.0 pull unit=3 ; @34.5 put unit=2 socket=A"
+    ),
+    "never heard, and exchanged": (
+        "line sockets=2 ; unit label=1 ; unit label=2 ; person name=mo ;"
+        " @2.0 dip socket=B seconds=4.0 ; @3.0 put unit=1 socket=B ;"
+        " @3.1 card by=mo unit=1 socket=B ; @3.5 pull unit=1 ; @4.0 put unit=2 socket=B ;"
+        " @7.0 label by=mo unit=1"
+    ),
+}
+
+
+@pytest.mark.parametrize("reason", UNDETECTABLE)
+def test_what_nobody_can_detect_is_counted_by_its_name(reason: str) -> None:
+    played = told(UNDETECTABLE[reason])
+    assert played.seen is not None
+    assert (played.kind, played.seen[f"undetectable: {reason}"]) == ("", 1)
+
+
+def test_what_somebody_could_detect_is_a_violation(monkeypatch: pytest.MonkeyPatch) -> None:
+    story = (
+        "line sockets=1 ; unit label=1 ; unit label=3 application=none ; person name=mo ;"
+        " @2.0 put unit=3 socket=A ; @4.0 card by=mo unit=3 ; @4.5 label by=mo unit=3 ;"
+        " @5.0 pull unit=3 ; @5.5 put unit=1 socket=A"
+    )
+    assert told(story).text == ""
+    monkeypatch.setattr(Continuity, "_lose", lambda *_: None)
+    assert told(story).kind == "NUMBER"
 
 
 # -- faults that the oracle has to find -----------------------------------------------------------

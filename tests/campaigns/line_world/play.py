@@ -68,6 +68,9 @@ def _played(world: World, acts: Iterator[stories.Act], steps: float = inf) -> Pl
         go(world.way_home())
     except Violation as violation:
         kind, text = violation.kind, str(violation)
+        if reason := world.exchanges.reason_of(kind, text):
+            world.seen[f"undetectable: {reason}"] += 1
+            kind = text = ""
         if kind != STUCK and len(tried) > len(drawn[0]):
             # What was done on the way home belongs to it, and the time until it was seen.
             end = stories.Look(when=stories.at(world.now))

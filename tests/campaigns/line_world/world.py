@@ -42,6 +42,7 @@ from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.again import empty_folder, same_engine
 from tests.campaigns.line_world.clockwork import PaperUnit, Process, SocketBus
 from tests.campaigns.line_world.promises import Promises, Violation
+from tests.campaigns.line_world.undetectable import Exchanges
 from tests.station.factory import BMS_VERSION, IMAGES, USUAL, Bench, FakeClock
 from tests.station.unit_bench import WRITES
 
@@ -139,6 +140,7 @@ class World:
         self.now = 0.0
         self._write = log
         self.seen: Counter[str] = Counter()
+        self.exchanges = Exchanges()
         self.setup = setup
         self._closing = ExitStack()
         folder = self._closing.enter_context(empty_folder())
@@ -363,6 +365,7 @@ class World:
         moved_s = self.now - max(bay.emptied_at, self._pulled_at.get(act.unit, -HAND_S))
         if self.awaits_another(bay, act.unit) or round(moved_s, 6) < HAND_S:
             return False
+        self.exchanges.put(bay.name, unit.label, self.now)
         bay.unit, bay.changed_at, bay.has_spoken = unit, self.now, False
         bay.disturbed_at = self.now
         self.promises.touched(bay.name)
@@ -395,6 +398,9 @@ class World:
         self.promises.pulled(bay.name)
         unit, bay.unit, bay.changed_at = bay.unit, None, self.now
         bay.emptied_at = bay.disturbed_at = self._pulled_at[act.unit] = self.now
+        self.exchanges.pull(
+            bay.name, unit.label, self.now, unit.engine.state, was_heard=bay.has_spoken
+        )
         bay.bus.pull(unit)
         unit.on_sent = lambda _now: None
         unit.sleeps_until = float("-inf")
