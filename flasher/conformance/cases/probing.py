@@ -33,8 +33,61 @@ def is_as(wanted: str, taken: bool) -> bool:  # noqa: FBT001
     return wanted == EITHER or taken == (wanted == ACCEPTED)
 
 
-class Probe:
-    """A transfer of `image` (some packets of chance by default) that goes on packet by packet.
+class Transfer:
+    """A transfer of `image` that goes on packet by packet; so many of them are `stored`."""
+
+    def __init__(self, bench: Bench, image: bytes) -> None:
+        self.bench = bench
+        self.image = image
+        self.total = packet_count(len(image))
+        self.stored = 0
+
+    @property
+    def number(self) -> int:
+        """Of the packet that is next."""
+        return self.stored + 1
+
+    def packet(self, number: int) -> list[RawFrame]:
+        """A packet of the image."""
+        return self.bench.encoder.packet_of(self.image, number)
+
+    def frames(self) -> list[RawFrame]:
+        """The next packet as it should be."""
+        return self.packet(self.number)
+
+    def raw(self) -> bytes:
+        """The next packet, header to tail."""
+        return joined(self.frames())
+
+    def settle_s(self) -> float:
+        """Longer than a bootloader waits for the rest of a message."""
+        return 2 * self.bench.limit("inter_frame_s")
+
+    def is_taken(self, heard: Received) -> bool:
+        """True for the ACK of the next packet."""
+        return heard.kind is Kind.ACK and heard.number == self.number
+
+    def answers(
+        self, frames: Sequence[RawFrame], *, gap_s: float = 0.0, gaps: int | None = None
+    ) -> list[Received]:
+        """Send frames that hold the next packet, `gap_s` behind each of the first `gaps` of them
+        (None: between all); the messages up to its ACK, and shortly after it.
+        """
+        bench = self.bench
+        bench.forget()
+        bench.send(frames, gap_s=gap_s, gaps=gaps)
+        # Long enough, too, that nothing of it is left when the next packet comes.
+        deadline = bench.now + max(bench.limit("ack_s"), self.settle_s())
+        heard: list[Received] = []
+        while (one := bench.next_message(deadline - bench.now)) is not None:
+            heard.append(one)
+            if self.is_taken(one):
+                return heard + bench.collect(_QUIET_S)
+        return heard
+
+
+class Probe(Transfer):
+    """A transfer (of some packets of chance by default) for stimuli that are judged.
 
     With "accepted" the stimulus has to be acknowledged as the next packet. With "rejected" it must
     not be, and NAK or silence are both right: which of them, with which number, is TX-01. With
@@ -45,22 +98,19 @@ class Probe:
         largest = bench.number("largest_image_bytes")
         wanted = bench.filler(_PACKETS) if image is None else image
         # Some bytes more, as a whole number of packets is a matter of its own (UP-01).
-        self.image = (wanted + _REST)[:largest]
-        self.number = 1
-        """Of the packet that is next."""
-        self._bench = bench
+        super().__init__(bench, (wanted + _REST)[:largest])
         self._taken_at = bench.now
 
     def begin(self) -> None:
         """From the running application to request transfer."""
-        self._bench.start_transfer(len(self.image))
-        self._taken_at = self._bench.now
+        self.bench.start_transfer(len(self.image))
+        self._taken_at = self.bench.now
 
     def enter(self, frames: Sequence[RawFrame], wanted: str, *, reset: bool = True) -> None:
         """Send what holds the update command to the announcing bootloader, judge whether it is
         taken as `wanted`, and get request transfer in any case.
         """
-        bench = self._bench
+        bench = self.bench
         if reset:
             bench.reset_to_bootloader()
             bench.wait_to_be_heard()
@@ -72,13 +122,13 @@ class Probe:
             if reset and heard is None:  # by now the application was started
                 bench.reset_to_bootloader()
             bench.update(len(self.image))
-        self.number, self._taken_at = 1, bench.now
+        self.stored, self._taken_at = 0, bench.now
 
     def enter_past(self, *stimuli: Sequence[RawFrame]) -> None:
         """At the first boot version, send what has to be rejected: it announces itself on, with NAK
         at the most in between, and takes the update command then.
         """
-        bench = self._bench
+        bench = self.bench
         bench.reset_to_bootloader()
         for frames in stimuli:
             bench.send(frames)
@@ -94,40 +144,32 @@ class Probe:
         goes_on = not is_burst or (bool(heard) and heard[-1].kind is Kind.BOOT_VERSION)
         bench.require(ok and goes_on, "boot version, NAK at the most before it", describe(heard))
         bench.update(len(self.image))
-        self.number, self._taken_at = 1, bench.now
-
-    def settle_s(self) -> float:
-        """Longer than a bootloader waits for the rest of a message."""
-        return 2 * self._bench.limit("inter_frame_s")
+        self.stored, self._taken_at = 0, bench.now
 
     # -- bytes ------------------------------------------------------------------------------------
 
     def frames(self) -> list[RawFrame]:
         """The next packet as it should be; begins a new transfer when all were sent."""
-        if self.number > packet_count(len(self.image)):
-            self._bench.begin_anew(len(self.image))
-            self.number = 1
-        return self._bench.encoder.packet_of(self.image, self.number)
-
-    def raw(self) -> bytes:
-        """The next packet, header to tail."""
-        return joined(self.frames())
+        if self.stored == self.total:
+            self.bench.begin_anew(len(self.image))
+            self.stored = 0
+        return super().frames()
 
     # -- stimuli ----------------------------------------------------------------------------------
 
     def plain(self) -> None:
         """The next packet as it should be; its ACK has to come, else the case ends."""
         self.frames()
-        self._bench.forget()
-        self._bench.packet(self.image, self.number)
+        self.bench.forget()
+        self.bench.packet(self.image, self.number)
         self._count()
 
     def keep_alive(self) -> None:
         """Send the next packet when none was taken for so long that the device may soon give the
         transfer up (TX-12).
         """
-        if self._bench.now - self._taken_at > self._bench.limit("pause_s") / 2:
-            self._bench.wait(self.settle_s())
+        if self.bench.now - self._taken_at > self.bench.limit("pause_s") / 2:
+            self.bench.wait(self.settle_s())
             self.plain()
 
     def offer(
@@ -139,25 +181,21 @@ class Probe:
         gaps: int | None = None,
         ignoring: Sequence[Kind] = (),
     ) -> bool:
-        """Send `frames`, which hold the next packet, `gap_s` behind each of the first `gaps` of
-        them (None: between all), and judge whether it is taken as `wanted`; sends it as it should
-        be when it was not. Messages of the kinds `ignoring` do not count. Returns whether it was
-        taken.
+        """Send `frames`, as `answers` does, and judge whether the next packet is taken as `wanted`;
+        sends it as it should be when it was not. Messages of the kinds `ignoring` do not count.
+        Returns whether it was taken.
         """
-        bench = self._bench
-        bench.forget()
-        bench.send(frames, gap_s=gap_s, gaps=gaps)
-        heard = self._answers()
-        taken = any(self._is_taken(one) for one in heard)
+        heard = self.answers(frames, gap_s=gap_s, gaps=gaps)
+        taken = any(map(self.is_taken, heard))
         allowed = (Kind.NAK, *ignoring)
-        others = [one for one in heard if one.kind not in allowed and not self._is_taken(one)]
+        others = [one for one in heard if one.kind not in allowed and not self.is_taken(one)]
         expected = {
             ACCEPTED: f"ACK {self.number}",
             REJECTED: "NAK or no answer",
             EITHER: f"ACK {self.number}, NAK or no answer",
         }
         ok = is_as(wanted, taken) and not others
-        bench.check(ok, expected[wanted], describe(heard))
+        self.bench.check(ok, expected[wanted], describe(heard))
         if taken:
             self._count()
         else:
@@ -168,7 +206,7 @@ class Probe:
         """Send what has to be discarded: NAK or no answer, and after a pause the next packet is
         taken. A device that takes it ends the case, as it may have stored anything.
         """
-        bench = self._bench
+        bench = self.bench
         bench.forget()
         bench.send(frames)
         heard = bench.collect(self.settle_s())
@@ -180,7 +218,7 @@ class Probe:
         """What was acknowledged is in the flash, and is right; the last packet of it may be on its
         way (PW-01), and what the profile lets the device keep in memory.
         """
-        bench = self._bench
+        bench = self.bench
         written = (self.number - 2) * PACKET_BYTES - bench.number("buffer_bytes")
         if written > 0:
             bench.check_stored(self.image[:written])
@@ -188,20 +226,5 @@ class Probe:
             bench.unsupported("the flash holds the image", "all of it may be in a buffer still")
 
     def _count(self) -> None:
-        self.number += 1
-        self._taken_at = self._bench.now
-
-    def _is_taken(self, heard: Received) -> bool:
-        return heard.kind is Kind.ACK and heard.number == self.number
-
-    def _answers(self) -> list[Received]:
-        """The messages up to the ACK of the next packet, and shortly after it."""
-        bench = self._bench
-        # Long enough, too, that nothing of it is left when the next packet comes.
-        deadline = bench.now + max(bench.limit("ack_s"), self.settle_s())
-        heard: list[Received] = []
-        while (one := bench.next_message(deadline - bench.now)) is not None:
-            heard.append(one)
-            if self._is_taken(one):
-                return heard + bench.collect(_QUIET_S)
-        return heard
+        self.stored += 1
+        self._taken_at = self.bench.now

@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from flasher.conformance.bench import QUIET_S, Bench
+from flasher.conformance.bench import Bench
+from flasher.conformance.cases.probing import Transfer
 from flasher.conformance.judge import Times
 from flasher.conformance.profile import ConformanceProfile
 from flasher.conformance.results import Unsupported
@@ -19,8 +20,6 @@ from flasher.conformance.wire import (
     RawFrame,
     Received,
     describe,
-    joined,
-    packet_count,
 )
 
 REPEATS: Final = 3
@@ -34,16 +33,14 @@ _QUIET_START_S: Final = 2.0
 """No window is longer, as far as a device is waited for that tells no version."""
 
 
-class Session:
+class Session(Transfer):
     """A device whose good image runs, when the question begins and when it ends."""
 
     def __init__(
         self, subject: Subject, profile: ConformanceProfile, stopped: Callable[[], bool]
     ) -> None:
-        self.bench = Bench(subject, profile, limit_s=_LIMIT_S, seed="init", stopped=stopped)
-        self.image = subject.good_image
-        self.total = packet_count(len(self.image))
-        self.stored = 0
+        bench = Bench(subject, profile, limit_s=_LIMIT_S, seed="init", stopped=stopped)
+        super().__init__(bench, subject.good_image)
 
     def settle(self) -> None:
         """Wait until a device that tells no version has certainly left its bootloader: it may have
@@ -143,37 +140,18 @@ class Session:
             self.begin()
         self.packets(max(stored, self.stored))
 
-    def packet(self, number: int) -> list[RawFrame]:
-        """A packet of the image."""
-        return self.bench.encoder.packet_of(self.image, number)
-
-    def frames(self) -> list[RawFrame]:
-        """The next packet as it should be."""
-        return self.packet(self.stored + 1)
-
-    def raw(self) -> bytes:
-        """The next packet, header to tail."""
-        return joined(self.frames())
-
-    def offer(self, frames: Sequence[RawFrame], *, gap_s: float = 0.0, gaps: int = 0) -> bool:
+    def offer(
+        self, frames: Sequence[RawFrame], *, gap_s: float = 0.0, gaps: int | None = None
+    ) -> bool:
         """Send frames that hold the next packet; True when it is acknowledged. It is stored
         afterwards, one way or the other.
         """
-        bench = self.bench
-        bench.forget()
-        bench.send(frames, gap_s=gap_s, gaps=gaps)
-        number = self.stored + 1
-        within_s = max(bench.limit("ack_s"), 2 * bench.limit("inter_frame_s"))
-        deadline = bench.now + within_s
-        heard = bench.wait_for(Kind.ACK, within_s=within_s)
-        while heard is not None and heard.number != number:
-            heard = bench.wait_for(Kind.ACK, within_s=deadline - bench.now)
-        bench.collect(QUIET_S)
-        if heard is None:
-            self.insist()
-        else:
+        taken = any(map(self.is_taken, self.answers(frames, gap_s=gap_s, gaps=gaps)))
+        if taken:
             self.stored += 1
-        return heard is not None
+        else:
+            self.insist()
+        return taken
 
     def insist(self) -> None:
         """The next packet as it should be, more than once if need be."""
