@@ -209,6 +209,11 @@ class Bench:
         ok = len(heard) == len(right) in wanted
         return self.check(ok, f"rejected: {' or '.join(wanted.values())}", describe(heard))
 
+    def right_to_repetition(self, number: int) -> list[str]:
+        """The right answers to a packet that was stored last and is sent again (tx_02)."""
+        words = {"ack": f"ACK {number}", "nak_next": f"NAK {number + 1}"}
+        return [answer for word, answer in words.items() if self.profile.allows("tx_02", word)]
+
     def answers(self) -> list[Received]:
         """The answers to what was just sent: the first one, and those that follow it at once."""
         first = self.next_message(self.limit("ack_s") + self.limit("inter_frame_s"))

@@ -210,3 +210,19 @@ def test_a_device_on_a_bus_is_not_worn_without_being_asked_for(
     monkeypatch.setattr(f"{where}.agrees", lambda question, **_: asked.append(question))
     assert flasher("conformance", "explore", *bench, "--steps", "12").code == 2
     assert asked == ["12 steps erase and write the device about 2 times. Begin?"]
+
+
+@pytest.mark.parametrize("argument", ["", "=other"])
+@pytest.mark.parametrize("choice", ["ack", "nak_next", "either"])
+def test_a_repeated_packet_is_judged_by_the_profile_as_in_the_case(
+    choice: str, argument: str
+) -> None:
+    steps = ["reset", "update=good", "packets=2", f"packet-again{argument}"]
+    for answers in ("ack", "nak_next"):
+        device = replace(MOCK_PROFILE, repeated_packet=answers)
+        stated = profile_of_mock(device)
+        stated = replace(stated, given={**stated.given, "tx_02": choice})
+        found = Explorer(MockSubject(profile=device), stated).replay(steps).finding
+        assert (found is None) is (choice in (answers, "either"))
+        silent = MockSubject(profile=device, make_device=variant_maker("repeat-unanswered"))
+        assert Explorer(silent, stated).replay(steps).finding is not None

@@ -169,10 +169,9 @@ def _repeat(bench: Bench, changed: Callable[[bytes], bytes]) -> None:
     total = packet_count(len(image))
     for number in bench.transfer_in_parts(image, (1, 2, total)):
         payload = changed(packet_payload(image, number))
-        ack, nak = f"ACK {number}", f"NAK {number + 1}"
-        allowed = {"ack": [ack], "nak_next": [nak]}.get(choice, [ack, nak])
+        allowed = bench.right_to_repetition(number)
         # Behind the last packet there is no next one to ask for.
-        more = [ack, f"NAK {number}"] if number == total and choice != "ack" else []
+        more = [f"ACK {number}", f"NAK {number}"] if number == total and choice != "ack" else []
         for copy in range(1, _REPEATS + 1):
             with bench.step(f"packet {number}, repetition {copy}"):
                 bench.send(bench.encoder.packet(number, total, payload))

@@ -596,14 +596,18 @@ class Walk:
             other = bytes(byte ^ 0xA5 for byte in packet_payload(self._image, number))
             raw = joined(self.bench.encoder.packet(number, self.total, other))
         choice = self.bench.choice("tx_03" if is_older else "tx_02")
+        is_open = choice != "ack" and (is_older or self.phase is Phase.STORED)
+        right = [f"ACK {number}"] if is_older else self.bench.right_to_repetition(number)
         self._feedback_due += 1
-        self._acks_due[number] += 1
+        self._acks_due[number] += is_open or f"ACK {number}" in right
         self._naks_due, self._nak_numbers = 1, frozenset((number, self.wanted, number + 1))
         self.bench.send(self.bench.encoder.frames(raw))
-        if choice == "ack" and not has_other_data:
-            self._await(Kind.ACK, self.bench.limit("ack_s"), f"packet {number} again", number)
-        else:
+        within_s = self.bench.limit("ack_s")
+        if is_open or (is_older and has_other_data):
             self._quiet()
+        elif self._listen(within_s, lambda one: str(one) in right) is None:
+            named = f"no {' or '.join(right)} within {within_s:g} s"
+            raise Violation("no ACK", f"{named} after packet {number} again")
         self._acks_due[number] = 0
         self._useful_at = self.bench.now
 
