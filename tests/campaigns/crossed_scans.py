@@ -247,6 +247,7 @@ class Line:
     def _scan(self, text: str, source: str) -> None:
         """Scan, and wait for the answer."""
         before = len(self._shown)
+        self.station.story.note(scan=text, source=source)
         os.write(self._scanners[source], text.encode() + b"\r")
 
         def is_answered() -> bool:

@@ -174,10 +174,24 @@ class _Bench:
         return unit.look()
 
 
+class Story:
+    """What was scanned and shown, and where units were put, with the times, in a file: a trial in
+    real time is not played again by its seed alone.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / "story.jsonl"
+
+    def note(self, **what: object) -> None:
+        with self._path.open("a", encoding="utf-8") as story:
+            story.write(json.dumps({"s": round(time.time(), 3), **what}) + "\n")
+
+
 class Units:
     """The process, for who orders it. `answer_s`: how long a unit takes for each answer."""
 
     def __init__(self, ports: list[int], log: Path, answer_s: float = 0.0) -> None:
+        self._story = Story(log.parent)
         numbers = map(str, (answer_s, *ports))
         words = [sys.executable, "-m", "tests.campaigns.scripted_units", *numbers]
         with log.open("ab") as errors:
@@ -197,10 +211,12 @@ class Units:
 
     def put(self, name: str, port: int, own: str = "") -> None:
         """A unit into a socket; its power comes with it."""
+        self._story.note(put=name, into=port)
         self._ask(put=name, into=port, own=own)
 
     def out(self, name: str) -> dict[str, Any]:
         """Pull a unit; what was in it then."""
+        self._story.note(out=name)
         return self._ask(out=name)
 
     def look(self, name: str) -> dict[str, Any]:

@@ -136,13 +136,14 @@ class Campaign:
             return
         workers = station.workers
         if workers:
-            self._kill_worker(self._random.choice(workers))
+            self._kill_worker(station, self._random.choice(workers))
 
-    def _kill_worker(self, pid: int) -> None:
+    def _kill_worker(self, station: Station, pid: int) -> None:
         """Units change places while the process of a socket is dead."""
         operator = self.operator
         chosen = operator.choose_card() if self._random.random() < _CARDS else None
         lost = len(operator.lost)
+        station.story.note(process="killed")
         subprocess.run(["kill", "-9", str(pid)], check=False)
         self.counts["kills of a worker"] += 1
         latest = time.perf_counter() + _KILL_LIMIT_S
@@ -264,10 +265,12 @@ def main() -> int:
     parser.add_argument(
         "--database", choices=("sqlite", "postgresql"), default="sqlite", help="of the records"
     )
+    parser.add_argument("--keep", type=Path, help="a new folder for records, traces and the story")
     options = parser.parse_args()
     began = time.perf_counter()
     with ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder = options.keep or Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        folder.mkdir(parents=True, exist_ok=options.keep is None)
         os.environ["XDG_DATA_HOME"] = str(folder / "data")  # what a station keeps of its own
         records = "records.sqlite"
         if options.database == "postgresql":

@@ -27,7 +27,7 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Any, Final
 
-from tests.campaigns.scripted_units import Units
+from tests.campaigns.scripted_units import Story, Units
 
 _IDLE_S: Final = 0.6
 """A socket in which nothing happens for so long waits for the operator."""
@@ -75,6 +75,8 @@ class Station:
     """The process of `flasher station run`, its events, and its scanner."""
 
     def __init__(self, folder: Path, *words: str) -> None:
+        self.story = Story(folder)
+        self.story.note(station="starts")
         command = [sys.executable, "-m", "flasher", "station", "run", *words]
         with (folder / "stderr").open("ab") as errors:
             self.process = subprocess.Popen(
@@ -93,10 +95,13 @@ class Station:
         assert self.process.stdout is not None
         for line in self.process.stdout:
             if line.endswith("\n"):  # a line that a kill cut off was not shown
-                self.events.put(json.loads(line))
+                event = json.loads(line)
+                self.story.note(**event)
+                self.events.put(event)
 
     def scan(self, text: str) -> None:
         assert self.process.stdin is not None
+        self.story.note(scan=text)
         with contextlib.suppress(OSError):  # it was killed
             self.process.stdin.write(text + "\n")
             self.process.stdin.flush()
@@ -114,6 +119,7 @@ class Station:
     def kill(self) -> list[int]:
         """Kill it; its workers, which have to end by themselves."""
         workers = self.workers
+        self.story.note(station="killed")
         self.process.kill()
         self._end()
         return workers
