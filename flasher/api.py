@@ -575,6 +575,7 @@ class AsyncDevice:
 
     async def _call(self, method: Callable[..., T], *args: object, **kwargs: Any) -> T:
         import asyncio  # noqa: PLC0415  for programs that have it already
+        from concurrent.futures import ThreadPoolExecutor  # noqa: PLC0415
 
         watch = {**self._watch, **kwargs}
         loop = asyncio.get_running_loop()
@@ -583,9 +584,11 @@ class AsyncDevice:
         if hand.on_event is not None:
             kwargs["on_event"] = hand.over
         call = partial(copy_context().run, method, self._device, *args, **kwargs)
-        # Not to_thread: its task is cancelled with all others at the end of a loop, before the call
-        # has ended.
-        work = loop.run_in_executor(None, call)
+        # A thread of its own: the loop's are few, and a call may take minutes. And not as a task,
+        # which the end of the loop would cancel before the call has ended.
+        thread = ThreadPoolExecutor(1, "flasher-call")
+        work = loop.run_in_executor(thread, call)
+        thread.shutdown(wait=False)
         while not work.done():
             try:
                 await asyncio.wait([work])

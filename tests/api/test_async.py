@@ -357,6 +357,31 @@ def test_a_cancelled_task_has_left_its_thread() -> None:
     asyncio.run(work())
 
 
+def test_any_number_of_calls_are_under_way_at_the_same_time() -> None:
+    """A loop's own threads are no more than 32, and as few as five on a small computer."""
+    count = 40
+    meeting = threading.Barrier(count, timeout=30)
+
+    async def asked() -> bool:
+        met = False
+
+        def meet(frame: Frame, *, sent: bool, now: float) -> None:  # noqa: ARG001
+            nonlocal met
+            if not met:
+                met = True
+                meeting.wait()
+
+        with flasher.connect_mock("bms", speed=0) as connection:
+            device = connection.async_device("bms")
+            await device.version(taps=[meet])
+            return met
+
+    async def work() -> list[bool]:
+        return await asyncio.gather(*(asked() for _ in range(count)))
+
+    assert asyncio.run(work()) == [True] * count
+
+
 class Unplugged:
     """A link that is lost in the third packet, and is away for ever."""
 
@@ -449,5 +474,4 @@ def test_a_loop_that_is_left_alone_ends_the_call(
         if not closes:
             job.cancel()
             loop.run_until_complete(asyncio.wait([job]))
-            loop.run_until_complete(loop.shutdown_default_executor())
             loop.close()
