@@ -32,6 +32,8 @@ class Exchange:
     """Of the device of the unit that was pulled, at that moment."""
     was_heard: bool
     """It has sent something since it was put in."""
+    is_new: bool
+    """The unit that was put in has the image of the recipe already."""
 
 
 UNDETECTABLE: Final[Mapping[str, Callable[[Exchange], bool]]] = {
@@ -41,6 +43,11 @@ UNDETECTABLE: Final[Mapping[str, Callable[[Exchange], bool]]] = {
     ),
     "exchanged between the confirmed reset and the announcement": lambda each: (
         each.state is State.RESTARTING and each.gap_s <= DEFAULT_TIMINGS.boot_version_timeout_s
+    ),
+    "exchanged between the end of the transfer and the first answer": lambda each: (
+        each.state in (State.CHECKING, State.STARTING)
+        and each.is_new
+        and each.gap_s <= DEFAULT_TIMINGS.application_start_timeout_s
     ),
 }
 """Whether an exchange cannot be detected, by the name of the reason."""
@@ -56,12 +63,12 @@ class Exchanges:
     def pull(self, socket: str, label: str, now: float, state: State, *, was_heard: bool) -> None:
         self._pulled[socket] = now, label, state, was_heard
 
-    def put(self, socket: str, label: str, now: float) -> None:
+    def put(self, socket: str, label: str, now: float, *, is_new: bool) -> None:
         pulled_at, pulled, state, was_heard = self._pulled.get(
             socket, (now, label, State.OFF, True)
         )
         if pulled != label:
-            self._all.append(Exchange(pulled, label, now - pulled_at, state, was_heard))
+            self._all.append(Exchange(pulled, label, now - pulled_at, state, was_heard, is_new))
 
     def reason_of(self, kind: str, text: str) -> str:
         """Why nobody could detect what a violation comes from; empty where somebody could. It comes

@@ -365,7 +365,8 @@ class World:
         moved_s = self.now - max(bay.emptied_at, self._pulled_at.get(act.unit, -HAND_S))
         if self.awaits_another(bay, act.unit) or round(moved_s, 6) < HAND_S:
             return False
-        self.exchanges.put(bay.name, unit.label, self.now)
+        is_new = unit.engine.stored_image == IMAGES[BMS].data
+        self.exchanges.put(bay.name, unit.label, self.now, is_new=is_new)
         bay.unit, bay.changed_at, bay.has_spoken = unit, self.now, False
         bay.disturbed_at = self.now
         self.promises.touched(bay.name)
