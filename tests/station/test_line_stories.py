@@ -237,17 +237,17 @@ def test_nobody_puts_a_unit_where_another_one_is_awaited() -> None:
 # -- what nobody can detect ------------------------------------------------------------------------
 
 UNDETECTABLE = {
-    "exchanged between two announcements": (
+    "as fast as the next announcement": (
         "line sockets=2 ; unit label=1 ; unit label=3 application=none ; person name=mo ;"
         " @2.0 card by=mo unit=3 socket=B ; @2.4 label by=mo unit=3 ; @2.5 put unit=3 socket=B ;"
         " @3.0 pull unit=3 ; @3.1 put unit=1 socket=B"
     ),
-    "exchanged between the confirmed reset and the announcement": (
+    "between the confirmed reset and the announcement": (
         "line sockets=2 ; unit label=2 ; unit label=3 ; person name=al ;"
         " @31.1 label by=al unit=3 ; @31.5 put unit=3 socket=A ; @33.55 card by=al unit=3 ;"
         " @34.0 pull unit=3 ; @34.5 put unit=2 socket=A"
     ),
-    "never heard, and exchanged": (
+    "silent when its label was scanned": (
         "line sockets=2 ; unit label=1 ; unit label=2 ; person name=mo ;"
         " @2.0 dip socket=B seconds=4.0 ; @3.0 put unit=1 socket=B ;"
         " @3.1 card by=mo unit=1 socket=B ; @3.5 pull unit=1 ; @4.0 put unit=2 socket=B ;"

@@ -13,6 +13,7 @@ from typing import Final
 
 from flasher.mock.table import State
 from flasher.protocol.timing import DEFAULT_TIMINGS
+from flasher.station.records.model import StepName
 
 FASTEST_S: Final = 0.25
 """A unit that is put in sooner after the one before may announce itself as if it were that one."""
@@ -21,61 +22,78 @@ _KINDS: Final = ("NUMBER", "TOUCHED", "FALSE PASS")
 
 
 @dataclass(frozen=True)
+class Pulled:
+    """A unit at the moment at which it was pulled out of its socket."""
+
+    label: str
+    at_s: float
+    state: State
+    """Of its device."""
+    step: StepName | None
+    """Of the run; None: none went on."""
+    was_silent: bool
+    """It had sent nothing for some time, before the run began if there was one."""
+
+
+@dataclass(frozen=True)
 class Exchange:
     """One unit was pulled out of a socket, and then another one was put in."""
 
-    pulled: str
-    """Their labels."""
-    put: str
+    pulled: Pulled
+    label: str
+    """Of the other one."""
     gap_s: float
-    state: State
-    """Of the device of the unit that was pulled, at that moment."""
-    was_heard: bool
-    """It has sent something since it was put in."""
     is_new: bool
-    """The unit that was put in has the image of the recipe already."""
+    """The other one has the image of the recipe already."""
+
+
+def _may_announce_itself(pulled: Pulled) -> bool:
+    """It announces itself, has just done so, or is just being reset."""
+    may_be_reset = pulled.step in (StepName.FLASH, StepName.RESTART)
+    is_reset = pulled.state is State.APPLICATION and may_be_reset
+    return is_reset or pulled.state in (State.ANNOUNCING, State.ERASING)
 
 
 UNDETECTABLE: Final[Mapping[str, Callable[[Exchange], bool]]] = {
-    "never heard, and exchanged": lambda each: not each.was_heard,
-    "exchanged between two announcements": lambda each: (
-        each.state is State.ANNOUNCING and each.gap_s <= FASTEST_S
+    "silent when its label was scanned": lambda each: each.pulled.was_silent,
+    "as fast as the next announcement": lambda each: (
+        each.gap_s <= FASTEST_S and _may_announce_itself(each.pulled)
     ),
-    "exchanged between the confirmed reset and the announcement": lambda each: (
-        each.state is State.RESTARTING and each.gap_s <= DEFAULT_TIMINGS.boot_version_timeout_s
+    "between the confirmed reset and the announcement": lambda each: (
+        each.pulled.state is State.RESTARTING
+        and each.gap_s <= DEFAULT_TIMINGS.boot_version_timeout_s
     ),
-    "exchanged between the end of the transfer and the first answer": lambda each: (
-        each.state in (State.CHECKING, State.STARTING)
+    "between the end of the transfer and the first answer": lambda each: (
+        each.pulled.state in (State.CHECKING, State.STARTING)
         and each.is_new
         and each.gap_s <= DEFAULT_TIMINGS.application_start_timeout_s
     ),
 }
-"""Whether an exchange cannot be detected, by the name of the reason."""
+"""Whether an exchange cannot be detected, by when it happened."""
 
 
 class Exchanges:
     """All exchanges of a story."""
 
     def __init__(self) -> None:
-        self._pulled: dict[str, tuple[float, str, State, bool]] = {}
+        self._pulled: dict[str, Pulled] = {}
+        """The last one, by socket."""
         self._all: list[Exchange] = []
 
-    def pull(self, socket: str, label: str, now: float, state: State, *, was_heard: bool) -> None:
-        self._pulled[socket] = now, label, state, was_heard
+    def pull(self, socket: str, pulled: Pulled) -> None:
+        self._pulled[socket] = pulled
 
     def put(self, socket: str, label: str, now: float, *, is_new: bool) -> None:
-        pulled_at, pulled, state, was_heard = self._pulled.get(
-            socket, (now, label, State.OFF, True)
-        )
-        if pulled != label:
-            self._all.append(Exchange(pulled, label, now - pulled_at, state, was_heard, is_new))
+        pulled = self._pulled.get(socket)
+        if pulled is not None and pulled.label != label:
+            self._all.append(Exchange(pulled, label, now - pulled.at_s, is_new))
 
     def reason_of(self, kind: str, text: str) -> str:
         """Why nobody could detect what a violation comes from; empty where somebody could. It comes
         from the last exchange of the two units that it names.
         """
         labels = set(_LABEL.findall(text))
-        of_both = [each for each in self._all if {each.pulled, each.put} <= labels]
+        of_both = [each for each in self._all if {each.pulled.label, each.label} <= labels]
         if kind not in _KINDS or not of_both:
             return ""
         last = of_both[-1]

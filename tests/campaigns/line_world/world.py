@@ -34,6 +34,7 @@ from flasher.station.events import (
     WorkerFailed,
 )
 from flasher.station.messages import Finished, FromWorker, WorkerSetup
+from flasher.station.presence import SILENCE_S
 from flasher.station.records.errors import RecordError
 from flasher.station.records.model import RunFilter, RunState, StepName
 from flasher.station.socket import Source
@@ -42,7 +43,7 @@ from tests.campaigns.line_world import stories
 from tests.campaigns.line_world.again import empty_folder, same_engine
 from tests.campaigns.line_world.clockwork import PaperUnit, Process, SocketBus
 from tests.campaigns.line_world.promises import Promises, Violation
-from tests.campaigns.line_world.undetectable import Exchanges
+from tests.campaigns.line_world.undetectable import Exchanges, Pulled
 from tests.station.factory import BMS_VERSION, IMAGES, USUAL, Bench, FakeClock
 from tests.station.unit_bench import WRITES
 
@@ -95,6 +96,8 @@ class Bay:
     emptied_at: float = float("-inf")
     disturbed_at: float = 0.0
     """When a hand, a failure or sleep last touched its unit or its process."""
+    spoke_at: float = float("-inf")
+    """When the unit in it sent something last."""
     has_spoken: bool = False
     """The unit sent something since then."""
     run: str = ""
@@ -368,11 +371,12 @@ class World:
         is_new = unit.engine.stored_image == IMAGES[BMS].data
         self.exchanges.put(bay.name, unit.label, self.now, is_new=is_new)
         bay.unit, bay.changed_at, bay.has_spoken = unit, self.now, False
+        bay.spoke_at = float("-inf")
         bay.disturbed_at = self.now
         self.promises.touched(bay.name)
 
-        def sent(_now: float) -> None:
-            bay.has_spoken = True
+        def sent(now: float) -> None:
+            bay.has_spoken, bay.spoke_at = True, now
             if bay.is_working:
                 bay.heard[unit.label] = None
 
@@ -399,9 +403,15 @@ class World:
         self.promises.pulled(bay.name)
         unit, bay.unit, bay.changed_at = bay.unit, None, self.now
         bay.emptied_at = bay.disturbed_at = self._pulled_at[act.unit] = self.now
-        self.exchanges.pull(
-            bay.name, unit.label, self.now, unit.engine.state, was_heard=bay.has_spoken
+        awaited_at = bay.run_at if bay.run else self.now
+        pulled = Pulled(
+            unit.label,
+            self.now,
+            unit.engine.state,
+            bay.step if bay.is_working else None,
+            was_silent=bay.spoke_at < awaited_at - SILENCE_S,
         )
+        self.exchanges.pull(bay.name, pulled)
         bay.bus.pull(unit)
         unit.on_sent = lambda _now: None
         unit.sleeps_until = float("-inf")
