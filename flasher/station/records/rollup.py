@@ -25,6 +25,7 @@ from typing import Any, Final, NamedTuple
 from sqlalchemy import Connection, case, func, select
 from sqlalchemy.sql.expression import ColumnElement
 
+from flasher.protocol.text import printable
 from flasher.station.records import schema
 from flasher.station.records.database import Database
 from flasher.station.records.errors import RecordError
@@ -172,7 +173,6 @@ class Rollup:
         """Add some of the runs that are missing; True where more are. Another process may do the
         same. Raises RecordError when the records cannot be read, sqlite3.Error, OSError.
         """
-        self._file.parent.mkdir(parents=True, exist_ok=True)
         self._file.touch(0o600)
         try:
             return self._add(now)
@@ -230,7 +230,15 @@ class Rollup:
                 yield None
                 return
             with closing(sums):
-                yield _rolled(sums, connection, chosen)
+                try:
+                    yield _rolled(sums, connection, chosen)
+                except (sqlite3.Error, zlib.error, ValueError) as error:
+                    raise RecordError(
+                        "The sums of days are damaged.",
+                        where=printable(str(self._file)),
+                        cause=printable(str(error)),
+                        remedy="Delete this file: it is made anew from the records.",
+                    ) from error
 
 
 def _rolled(sums: sqlite3.Connection, connection: Connection, chosen: RunFilter) -> Rolled | None:

@@ -16,6 +16,7 @@ import pytest
 from sqlalchemy import insert, select, text
 
 from flasher.station.records import rollup, schema
+from flasher.station.records.errors import RecordError
 from flasher.station.records.model import RunFilter, RunKind, RunState, utc_text
 from flasher.station.records.overview import By, Overview, Span
 from flasher.station.records.queries import Records
@@ -279,6 +280,24 @@ def test_a_file_that_holds_no_sums_is_no_obstacle(made: Lines, content: bytes) -
     assert summed_up_to(made) is None
     add_up(made, made.bench.clock.now + timedelta(days=2))
     assert summed_up_to(made) == 4
+
+
+def test_sums_that_are_damaged_are_named_with_what_to_do(made: Lines) -> None:
+    add_up(made, made.bench.clock.now + timedelta(days=2))
+    file = made.bench.store.files.folder / "figures.sqlite"
+    with closing(sqlite3.connect(file)) as damaged:
+        damaged.execute("UPDATE times SET content = x'00'")
+        damaged.commit()
+    with pytest.raises(RecordError, match="Delete this file") as found:
+        Overview(made.bench.store.database).step_times(RunFilter())
+    assert found.value.where == str(file)
+
+
+def test_a_folder_that_is_not_there_is_not_made(made: Lines) -> None:
+    sums = Rollup(made.bench.store.database)
+    sums._file = made.bench.folder / "nowhere" / "figures.sqlite"
+    with pytest.raises(OSError, match="nowhere"):
+        sums.add(NOW)
 
 
 def test_a_process_adds_until_nothing_is_missing_and_again_later(
