@@ -171,7 +171,6 @@ def find(bug: Bug, seed: int, limit_s: float, *, shrinks: bool) -> Found:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            preexec_fn=partial(os.nice, 10),  # noqa: PLW1509  no other thread has a lock it needs
         ) as process:
             return _converse(process, bug)
 

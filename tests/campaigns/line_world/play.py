@@ -61,21 +61,23 @@ def _played(world: World, acts: Iterator[stories.Act], steps: float = inf) -> Pl
             if len(done) >= steps or world.now > 20.0 * steps:
                 return
 
-    drawn: tuple[list[stories.Act], list[stories.Act]] = tried, done
+    kept, is_on_its_way = (tried, done), False
     try:
         go(acts, steps)
-        drawn = tried.copy(), done.copy()
+        kept, is_on_its_way = (tried.copy(), done.copy()), True
         go(world.way_home())
     except Violation as violation:
         kind, text = violation.kind, str(violation)
         if reason := world.exchanges.reason_of(kind, text):
             world.seen[f"undetectable: {reason}"] += 1
             kind = text = ""
-        if kind != STUCK and len(tried) > len(drawn[0]):
+        has_acted = not is_on_its_way or len(tried) > len(kept[0])
+        if kind not in ("", STUCK) and has_acted:
             # What was done on the way home belongs to it, and the time until it was seen.
-            end = stories.Look(when=stories.at(world.now))
-            drawn = [*tried, end], [*done, end]
-    return Played(replace(world.setup, acts=drawn[0]), drawn[1], kind, text, world.seen)
+            is_later = bool(tried) and world.now > time_of(tried[-1])
+            end = [stories.Look(when=stories.at(world.now))] if is_later else []
+            kept = [*tried, *end], [*done, *end]
+    return Played(replace(world.setup, acts=kept[0]), kept[1], kind, text, world.seen)
 
 
 # -- shrinking -------------------------------------------------------------------------------------
