@@ -29,6 +29,7 @@ from typing import Final
 
 from tests.campaigns.line_world.play import draw, play, shrink
 from tests.campaigns.line_world.stories import Story
+from tests.campaigns.line_world.world import STUCK
 
 CHECKOUT: Final = Path(__file__).parents[2]
 ACTS: Final = 60
@@ -95,7 +96,7 @@ def hunt(seed: int, limit_s: float, *, shrinks: bool) -> None:
     steps = 0
 
     def is_ours(story: Story) -> bool:
-        _print(story=str(story))
+        _print(story=str(story), kind=found.kind)
         return sys.stdin.readline().strip() == _YES
 
     while time.process_time() < limit_s:
@@ -192,7 +193,8 @@ def _converse(process: subprocess.Popen[str], bug: Bug) -> Found:
                 not_ours,
             )
         with _playing:
-            is_ours = not play(Story.parse(told["story"])).kind
+            story = Story.parse(told["story"])
+            is_ours = not play(story, goes_home=told["kind"] == STUCK).kind
         not_ours += not is_ours
         process.stdin.write(f"{_YES if is_ours else 'no'}\n")
         process.stdin.flush()

@@ -10,12 +10,15 @@ from collections.abc import Callable
 from hashlib import sha256
 from pathlib import Path
 from subprocess import run
+from typing import cast
 
 import pytest
 
 from flasher.station import codes
 from flasher.station.continuity import Continuity
+from flasher.station.line import Line
 from flasher.station.presence import Presence
+from flasher.station.scans import Word
 from flasher.station.socket import UNNAMED, Socket, Source
 from flasher.station.station import Station
 from flasher.station.unit_run import UnitRun
@@ -42,6 +45,23 @@ PASSED_AND_EXCHANGED = (
     "line sockets=2 ; unit label=1 ; unit label=2 ; person name=jo ; @3.0 put unit=1 socket=A ;"
     " @7.0 card by=jo unit=1 ; @8.0 label by=jo unit=1 ; @14.0 pull unit=1 ;"
     " @14.3 put unit=2 socket=A"
+)
+CANCELLED = (
+    "line sockets=1 ; unit label=1 ; person name=jo ; @3.0 label by=jo unit=1 ;"
+    " @4.0 cancel by=jo ; @6.0 put unit=1 socket=A"
+)
+WITHOUT_CARD = (
+    "line sockets=1 ; unit label=1 application=none ; person name=jo ;"
+    " @3.0 put unit=1 socket=A ; @8.0 label by=jo unit=1"
+)
+INTERRUPTED = (
+    "line sockets=1 ; unit label=1 pace=slow ; person name=jo ; @3.0 put unit=1 socket=A ;"
+    " @8.0 card by=jo unit=1 ; @9.0 label by=jo unit=1 ; @10.0 station ; @20.0 look"
+)
+EXCHANGED_AFTER_ITS_FLASH = (
+    "line sockets=1 ; unit label=1 ; unit label=2 ; person name=jo ; @3.0 put unit=1 socket=A ;"
+    " @8.0 card by=jo unit=1 ; @9.0 label by=jo unit=1 ; @10.1 pull unit=1 ;"
+    " @10.5 put unit=2 socket=A"
 )
 STORIES = {
     "pulled in its flash": PULLED_IN_ITS_FLASH,
@@ -316,6 +336,22 @@ def never_begin(patch: pytest.MonkeyPatch) -> None:
     patch.setattr(Socket, "is_due", lambda *_: False)
 
 
+def cancel_nothing(patch: pytest.MonkeyPatch) -> None:
+    patch.setitem(cast("dict[Word, object]", Line._COMMANDS), Word.CANCEL, lambda *_: None)
+
+
+def need_no_card(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Socket, "is_unidentified", property(lambda _: False))
+
+
+def forget_the_interrupted(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(Station, "_find_interrupted", lambda *_: None)
+
+
+def trust_every_run(patch: pytest.MonkeyPatch) -> None:
+    patch.setattr(codes, "OF_ANOTHER", frozenset())
+
+
 @pytest.mark.parametrize(
     ("plant", "story", "kind"),
     [
@@ -324,6 +360,10 @@ def never_begin(patch: pytest.MonkeyPatch) -> None:
         (accuse_everybody, PASSED_AND_EXCHANGED, "ACCUSED"),
         (write_and_fail, PASSED_AND_EXCHANGED, "STUCK"),
         (never_begin, PASSED_AND_EXCHANGED, "STUCK"),
+        (cancel_nothing, CANCELLED, "CANCELLED"),
+        (need_no_card, WITHOUT_CARD, "UNIDENTIFIED"),
+        (forget_the_interrupted, INTERRUPTED, "FORGOTTEN"),
+        (trust_every_run, EXCHANGED_AFTER_ITS_FLASH, "TRUSTED"),
     ],
 )
 def test_a_fault_of_the_station_is_found(

@@ -34,10 +34,12 @@ class Played:
     seen: Counter[str] | None = None
 
 
-def play(story: Story, log: Callable[[str], None] | None = None) -> Played:
-    """Play a story as it is written, then bring every unit home."""
+def play(
+    story: Story, log: Callable[[str], None] | None = None, *, goes_home: bool = True
+) -> Played:
+    """Play a story as it is written, then bring every unit home, or wait for the ends of runs."""
     with World(story, log) as world:
-        return _played(world, iter(story.acts))
+        return _played(world, iter(story.acts), goes_home=goes_home)
 
 
 def draw(seed: int, steps: int, log: Callable[[str], None] | None = None) -> Played:
@@ -47,7 +49,9 @@ def draw(seed: int, steps: int, log: Callable[[str], None] | None = None) -> Pla
         return _played(world, Teller(chance, world).acts(), steps)
 
 
-def _played(world: World, acts: Iterator[stories.Act], steps: float = inf) -> Played:
+def _played(
+    world: World, acts: Iterator[stories.Act], steps: float = inf, *, goes_home: bool = True
+) -> Played:
     tried: list[stories.Act] = []
     done: list[stories.Act] = []
     kind = text = ""
@@ -65,7 +69,7 @@ def _played(world: World, acts: Iterator[stories.Act], steps: float = inf) -> Pl
     try:
         go(acts, steps)
         kept, is_on_its_way = (tried.copy(), done.copy()), True
-        go(world.way_home())
+        go(world.way_home() if goes_home else world.end_of_runs())
     except Violation as violation:
         kind, text = violation.kind, str(violation)
         if reason := world.exchanges.reason_of(kind, text):
@@ -94,7 +98,8 @@ def shrink(
         tries += 1
         if tries > most:
             return None
-        played = play(story)
+        # What is seen in the story itself needs no way home, which takes the most time.
+        played = play(story, goes_home=found.kind == STUCK)
         return played if played.kind == found.kind and accepts(played.story) else None
 
     best = is_bad(found.story)
