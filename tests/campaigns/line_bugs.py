@@ -21,7 +21,7 @@ import threading
 import time
 import tomllib
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -230,9 +230,9 @@ def main() -> int:
         search = partial(
             find, seed=chosen.seed, limit_s=chosen.seconds, shrinks=not chosen.no_shrink
         )
-        for each in pool.map(search, bugs):
-            found.append(each)
-            _say("\n".join([*each.lines(), ""]))
+        for future in as_completed([pool.submit(search, bug) for bug in bugs]):
+            found.append(future.result())
+            _say("\n".join([*found[-1].lines(), ""]))
     good = [each for each in found if each.kind]
     _say(f"{len(good)} of {len(bugs)} found")
     if good:
