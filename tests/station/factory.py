@@ -16,7 +16,7 @@ import psycopg
 from sqlalchemy import event
 
 from flasher.image.image import Image
-from flasher.protocol.spec import BMS, WMC, Target
+from flasher.protocol.spec import BMS, OBC, WMC, Target
 from flasher.settings.manifest import release_of, to_toml
 from flasher.station.recipe_file import LoadedRecipe, load_checked
 from flasher.station.records.claims import Order
@@ -31,6 +31,7 @@ BMS_VERSION = "V1r0r4_20220512"
 IMAGES = {
     BMS: Image.from_bytes(b"BMS\0" + BMS_VERSION.encode() + bytes(200)),
     WMC: Image.from_bytes(b"WMC\0" + b"V2r1r0_20230117" + bytes(100)),
+    OBC: Image.from_bytes(b"OBC\0" + b"V3r0r1_20230402" + bytes(60)),
 }
 HEAD = """\
 name = "Battery 36 V"

@@ -9,21 +9,24 @@ same course each time.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any
+from typing import Any, Final
 
 from greenlet import getcurrent, greenlet  # type: ignore[import-untyped]
 
 from flasher.api import Connection
 from flasher.bus.link import VirtualClock
 from flasher.bus.simulated import SimulatedBus
-from flasher.protocol.engine import Engine
+from flasher.mock.bms import BmsApplication
+from flasher.mock.model import MockDevice
 from flasher.protocol.frame import Frame
-from flasher.protocol.spec import WELLING
+from flasher.protocol.spec import COMMAND_SIZE, HEADER, MODE_SIZE, PREFIX_SIZE, WELLING, Mode
 from flasher.station.messages import Ask, Finished, FromWorker, ToWorker, WorkerSetup
 from flasher.station.recipe_file import LoadedRecipe
 from flasher.station.worker import StationGoneError, StationPipe, work_on
+
+_WRITE: Final = HEADER + Mode.WRITE.to_bytes(MODE_SIZE, "big")
 
 
 class SocketBus(SimulatedBus):
@@ -33,6 +36,8 @@ class SocketBus(SimulatedBus):
         self.horizon = 0.0
         self.wire_clock = VirtualClock()
         super().__init__(WELLING.bitrate_bps, self.wire_clock)
+        self.on_command: Callable[[int, float], None] | None = None
+        """Called with each command that the host writes, when its first frame has been carried."""
         self.stop: Callable[[], None] = lambda: None
         """Called at the horizon; it returns when there is a later one."""
 
@@ -44,18 +49,34 @@ class SocketBus(SimulatedBus):
             self.stop()
         super().advance(min(limit, self.horizon))
 
+    def _deliver(self, senders: Sequence[Any], frame: Frame | None) -> None:
+        if (
+            self.on_command is not None
+            and frame is not None
+            and senders[0] in self._hosts
+            and frame.data.startswith(_WRITE)
+        ):
+            command = frame.data[PREFIX_SIZE : PREFIX_SIZE + COMMAND_SIZE]
+            self.on_command(int.from_bytes(command, "big"), self._sending_ends_at)
+        super()._deliver(senders, frame)
+
     def idle(self, until: float) -> None:
         """Let time pass without an adapter."""
         while self.clock.now() < until:
             super().advance(until)
 
-    def pull(self, engine: Engine) -> None:
-        """Take a device off, in the middle of a frame if it sends one."""
+    def put(self, unit: PaperUnit) -> None:
+        for part in unit.parts:
+            self.attach(part)
+
+    def pull(self, unit: PaperUnit) -> None:
+        """Take a unit off, in the middle of a frame if it sends one."""
         if self._sending is not None:
             senders, _ = self._sending
-            if any(getattr(sender, "engine", None) is engine for sender in senders):
+            if any(getattr(sender, "engine", None) in unit.parts for sender in senders):
                 self._sending = None
-        self.detach(engine)
+        for part in unit.parts:
+            self.detach(part)
 
     @contextmanager
     def opened(self) -> Iterator[tuple[Connection, None]]:
@@ -181,49 +202,73 @@ class Process:
 
 
 class PaperUnit:
-    """A unit as it lies on the table: a device with a paper label, on whichever bus it is put."""
+    """A unit as it lies on the table: its devices and a paper label, on whichever bus it is put."""
 
-    done = False
-
-    def __init__(self, engine: Any, label: str) -> None:
-        self.engine = engine
+    def __init__(self, devices: Sequence[MockDevice], label: str) -> None:
+        self.parts = [_Part(each, self) for each in devices]
         self.label = label
+        self.engine = devices[0]
+        """The battery where there is one."""
         self.sleeps_until = float("-inf")
         self.on_sent: Callable[[float], None] = lambda _now: None
         self._seen = self.memory
 
     @property
     def memory(self) -> tuple[object, int]:
-        """Its number, and how often its flash was erased or written."""
-        return self.engine.application.kept.get("serial number"), self.engine.operations_done
+        """The number of its battery, and how often the flash of a device was erased or written."""
+        number, operations = None, 0
+        for part in self.parts:
+            operations += part.engine.operations_done
+            if isinstance(part.engine.application, BmsApplication):
+                number = part.engine.application.kept["serial number"]
+        return number, operations
 
     def has_not_changed(self) -> bool:
         """Since it was asked last, as far as `memory` goes."""
         before, self._seen = self._seen, self.memory
         return before[0] is self._seen[0] and before[1] == self._seen[1]
 
+    def power_on(self, now: float) -> None:
+        for part in self.parts:
+            if not part.engine.has_power:
+                part.engine.power_on(now)
+
+    def power_cut(self, now: float) -> None:
+        for part in self.parts:
+            if part.engine.has_power:
+                part.engine.power_cut(now)
+
+
+class _Part:
+    """A device of a unit."""
+
+    done = False
+
+    def __init__(self, engine: MockDevice, unit: PaperUnit) -> None:
+        self.engine = engine
+        self._unit = unit
+
     def receive(self, frame: Frame, now: float) -> None:
-        if now >= self.sleeps_until:
+        if now >= self._unit.sleeps_until:
             self.engine.receive(frame, now)
 
     def tick(self, now: float) -> None:
-        if now >= self.sleeps_until:
+        if now >= self._unit.sleeps_until:
             self.engine.tick(now)
 
     def deadline(self) -> float | None:
-        due_at: float | None = self.engine.deadline()
-        return None if due_at is None else max(due_at, self.sleeps_until)
+        due_at = self.engine.deadline()
+        return None if due_at is None else max(due_at, self._unit.sleeps_until)
 
     def next_frame(self, now: float) -> Frame | None:
-        found: Frame | None = self.engine.next_frame(now) if now >= self.sleeps_until else None
-        return found
+        return self.engine.next_frame(now) if now >= self._unit.sleeps_until else None
 
     def frame_sent(self, now: float) -> None:
         self.engine.frame_sent(now)
-        self.on_sent(now)
+        self._unit.on_sent(now)
 
     def cancel(self, now: float) -> None:
         pass
 
-    def take_events(self) -> Any:
+    def take_events(self) -> Sequence[object]:
         return self.engine.take_events()

@@ -18,6 +18,7 @@ from tests.campaigns.line_world.world import Bay, World, last_look
 
 Step = tuple[float, stories.Act | None]
 """Seconds to wait, and what is done then; None: nothing, only look again."""
+_RECIPES: Final = {"writes": 10, "plain": 3, "held": 2, "bicycle": 2, "wmc": 2, "obc": 1}
 _GAPS_S: Final = (0.1, 0.3, 0.3, 0.5, 1.0, 3.5)
 """From pulling a unit to putting another one in."""
 _AFTER_FLASH: Final = (StepName.WRITE, StepName.RESTART, StepName.VERIFY)
@@ -45,7 +46,7 @@ def setup_of(chance: random.Random) -> Story:
     for name in ("jo", "al", "mo")[: chance.choice((1, 1, 2, 2, 3))]:
         source = chance.choices(("page", name, "mounted"), (4, 4, 1))[0]
         people.append(stories.Person(name=name, source=source))
-    recipe = chance.choices(("writes", "plain"), (3, 1))[0]
+    recipe = chance.choices(list(_RECIPES), list(_RECIPES.values()))[0]
     line = stories.LineSetup(sockets=sockets, recipe=recipe)  # type: ignore[arg-type]
     return Story(line, units, people, [])
 

@@ -33,11 +33,24 @@ SOCKETS: Final = "ABC"
 
 @dataclass(frozen=True, kw_only=True)
 class LineSetup(Clause):
-    """The station. `recipe=writes` gives each unit its number, `plain` writes none."""
+    """The station. `recipe=writes` gives each unit its number, `plain` writes none; `held` writes
+    it and goes on after a restart, in fixtures that hold the unit; units of `bicycle` have a BMS
+    and a WMC, those of `wmc` and `obc` a device that tells nothing of itself.
+    """
 
     NAME = "line"
     sockets: int
-    recipe: Literal["writes", "plain"] = "writes"
+    recipe: Literal["writes", "plain", "held", "bicycle", "wmc", "obc"] = "writes"
+
+    @property
+    def writes(self) -> bool:
+        """Each unit gets its number."""
+        return self.recipe in ("writes", "held", "bicycle")
+
+    @property
+    def tells(self) -> bool:
+        """A unit can be asked who it is."""
+        return self.recipe not in ("wmc", "obc")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,7 +17,7 @@ from sqlalchemy import event
 
 from flasher.mock.model import MockDevice
 from flasher.mock.profile import DeviceProfile
-from flasher.protocol.spec import BMS, WELLING
+from flasher.protocol.spec import BMS, OBC, WELLING, WMC, Command
 from flasher.station.events import (
     LineResumed,
     LineStopped,
@@ -44,7 +44,16 @@ from tests.campaigns.line_world.again import empty_folder, same_engine
 from tests.campaigns.line_world.clockwork import PaperUnit, Process, SocketBus
 from tests.campaigns.line_world.promises import Promises, Violation
 from tests.campaigns.line_world.undetectable import Exchanges, Pulled
-from tests.station.factory import BMS_VERSION, IMAGES, USUAL, Bench, FakeClock
+from tests.station.factory import (
+    BMS_VERSION,
+    HEAD,
+    IMAGES,
+    SERIAL_NUMBER,
+    USUAL,
+    Bench,
+    FakeClock,
+    target_table,
+)
 from tests.station.unit_bench import WRITES
 
 WINDOW_S: Final = 0.1
@@ -59,7 +68,18 @@ GREEN_S: Final = 5.0
 """A tile that is green for a unit which is not in its socket has to change within this time."""
 NONE: Final = "NONE"
 """What a new unit has for a serial number, where the recipe writes one."""
-_RECIPES: Final = {"writes": USUAL + WRITES, "plain": USUAL}
+_RECIPES: Final = {
+    "writes": USUAL + WRITES,
+    "plain": USUAL,
+    "held": HEAD + 'after_restart = "continue"\n' + SERIAL_NUMBER + target_table(BMS) + WRITES,
+    "bicycle": USUAL + target_table(WMC) + WRITES,
+    "wmc": HEAD + SERIAL_NUMBER + target_table(WMC),
+    "obc": HEAD + SERIAL_NUMBER + target_table(OBC),
+}
+_TARGETS: Final = {"bicycle": (BMS, WMC), "wmc": (WMC,), "obc": (OBC,)}
+"""What a unit consists of; the battery alone for the other recipes."""
+_ANNOUNCES_S: Final = 0.3
+"""So long after its power came a unit announces itself for the first time, or sooner."""
 OLD_VERSION: Final = DeviceProfile().factory_version
 _SLOW: Final = {"erase_time_s": 0.5, "program_time_s": 0.25}
 _AGAIN_S: Final = 1.0
@@ -109,6 +129,15 @@ class Bay:
     """Its last packet was acknowledged."""
     is_working: bool = False
     """The process works on a run."""
+    put_at: float = 0.0
+    """When a unit was put in last."""
+    card_at: float = inf
+    label_at: float = float("-inf")
+    """When its card and a label for it were accepted last."""
+    commanded_at: dict[int, float] = field(default_factory=dict)
+    """When the run sent each command first."""
+    unseen: str = ""
+    """The label that passed with another unit, which nobody could detect."""
     heard: dict[str, None] = field(default_factory=dict)
     """Labels of the units that sent something in the run."""
     shown: SocketChanged | None = None
@@ -152,8 +181,11 @@ class World:
         if setup.line.recipe != "plain":
             self.bench.use(_RECIPES[setup.line.recipe])
         self.bays = {name: Bay(name, SocketBus()) for name in stories.SOCKETS[: setup.line.sockets]}
-        none = NONE if setup.line.recipe == "writes" else ""
-        self.units = {each.label: _make(each, none) for each in setup.units}
+        if not setup.line.tells:
+            for bay in self.bays.values():
+                bay.bus.on_command = partial(_note_command, bay)
+        none = NONE if setup.line.writes else ""
+        self.units = {each.label: _make(each, none, setup.line) for each in setup.units}
         self._allowed = {
             number: {unit.label, _stored(unit).number} for number, unit in self.units.items()
         }
@@ -294,6 +326,7 @@ class World:
         match message:
             case StepStarted(step=StepName.CONNECT, try_number=1):
                 bay.is_working, bay.heard, bay.step = True, {}, message.step
+                bay.commanded_at = {}
             case StepStarted():
                 bay.step, bay.is_complete = message.step, False
             case Progressed(step=StepName.FLASH, share=1.0):
@@ -315,9 +348,7 @@ class World:
         self.promises.hear(event, lambda socket: self.bays[socket].unit)
         match event:
             case ScanAccepted() | ScanRefused() | OperatorPrompted():
-                self._answers.append(event)
-                if isinstance(event, ScanRefused) and (event.text, event.source) != self._scanning:
-                    self._forget(event.text, event.source)
+                self._read(event)
             case SocketChanged():
                 self.bays[event.socket].shown = event
                 if event.state is SocketState.PASS and event.serial not in self.passed:
@@ -335,6 +366,18 @@ class World:
                 self._end(self.bays[event.socket], event)
             case WorkerFailed() if "said nothing" in event.reason:
                 raise Violation("CRASH", f"the process of {event.socket} hangs: {event.reason}")
+
+    def _read(self, event: ScanAccepted | ScanRefused | OperatorPrompted) -> None:
+        """The answer to a scan."""
+        self._answers.append(event)
+        if isinstance(event, ScanRefused) and (event.text, event.source) != self._scanning:
+            self._forget(event.text, event.source)
+        if isinstance(event, ScanAccepted) and event.socket:
+            bay = self.bays[event.socket]
+            if event.meaning == "label":
+                bay.label_at = self.now
+            else:
+                bay.card_at = self.now
 
     def _forget(self, text: str, source: str) -> None:
         """It is reported at a source that a scan does not wait any more."""
@@ -366,13 +409,17 @@ class World:
         if bay is None or unit is None or bay.unit is not None or self.where(act.unit) is not None:
             return False
         moved_s = self.now - max(bay.emptied_at, self._pulled_at.get(act.unit, -HAND_S))
-        if self.awaits_another(bay, act.unit) or round(moved_s, 6) < HAND_S:
+        if self.awaits_another(bay, act.unit) or round(moved_s, 6) < HAND_S or self._holds(bay):
             return False
         is_new = unit.engine.stored_image == IMAGES[BMS].data
-        self.exchanges.put(bay.name, unit.label, self.now, is_new=is_new)
+        if self.setup.line.tells:
+            self.exchanges.put(bay.name, unit.label, self.now, is_new=is_new)
         bay.unit, bay.changed_at, bay.has_spoken = unit, self.now, False
         bay.spoke_at = float("-inf")
-        bay.disturbed_at = self.now
+        bay.put_at = self.now
+        bay.disturbed_at = (
+            self.now if bay.process is None else max(self.now, bay.process.stalled_until)
+        )
         self.promises.touched(bay.name)
 
         def sent(now: float) -> None:
@@ -381,10 +428,14 @@ class World:
                 bay.heard[unit.label] = None
 
         unit.on_sent = sent
-        bay.bus.attach(unit)
+        bay.bus.put(unit)
         if act.socket not in self._power_at:
-            unit.engine.power_on(self.now)
+            unit.power_on(self.now)
         return True
+
+    def _holds(self, bay: Bay) -> bool:
+        """The fixture is closed, with the unit in it."""
+        return self.setup.line.recipe == "held" and (bool(bay.run) or bay.is_working)
 
     @staticmethod
     def awaits_another(bay: Bay, unit: int) -> bool:
@@ -400,7 +451,12 @@ class World:
         bay = self.where(act.unit)
         if bay is None or bay.unit is None:
             return False
-        self.promises.pulled(bay.name)
+        if self._holds(bay):
+            return False
+        if self.setup.line.tells:
+            self.promises.pulled(bay.name)
+        else:
+            self.promises.touched(bay.name)
         unit, bay.unit, bay.changed_at = bay.unit, None, self.now
         bay.emptied_at = bay.disturbed_at = self._pulled_at[act.unit] = self.now
         awaited_at = bay.run_at if bay.run else self.now
@@ -415,8 +471,7 @@ class World:
         bay.bus.pull(unit)
         unit.on_sent = lambda _now: None
         unit.sleeps_until = float("-inf")
-        if unit.engine.has_power:
-            unit.engine.power_cut(self.now)
+        unit.power_cut(self.now)
         return True
 
     def where(self, unit: int) -> Bay | None:
@@ -551,23 +606,25 @@ class World:
         bay = self.bays.get(act.socket)
         if bay is None or act.socket in self._power_at:
             return False
-        if bay.unit is not None and bay.unit.engine.has_power:
+        if bay.unit is not None:
             bay.bus.pull(bay.unit)
-            bay.unit.engine.power_cut(self.now)
-            bay.bus.attach(bay.unit)
+            bay.unit.power_cut(self.now)
+            bay.bus.put(bay.unit)
         self.promises.touched(bay.name)
         self._power_at[act.socket] = bay.disturbed_at = self.now + act.seconds
         return True
 
     def _switch_on(self, bay: Bay) -> None:
-        if bay.unit is not None and not bay.unit.engine.has_power:
-            bay.unit.engine.power_on(self.now)
+        if bay.unit is not None:
+            bay.unit.power_on(self.now)
 
     def _stall(self, act: stories.Stall) -> bool:
         bay = self.bays.get(act.socket)
         if bay is None or bay.process is None or bay.process.is_over:
             return False
         bay.process.stalled_until = self.now + act.seconds
+        if bay.disturbed_at > self.now - CALM_S:
+            bay.disturbed_at = bay.process.stalled_until  # it hears what came before only then
         self.promises.touched(bay.name)
         return True
 
@@ -674,6 +731,10 @@ class World:
             return
         self.passed.add(event.serial)
         heard = list(bay.heard)
+        if heard != [event.serial] and (way := self._unseen(bay)):
+            self.seen[f"undetectable: {way}"] += 1
+            bay.unseen = event.serial
+            return
         if heard != [event.serial]:
             raise Violation(
                 "FALSE PASS",
@@ -681,12 +742,28 @@ class World:
             )
         unit = next(each for each in self.units.values() if each.label == event.serial)
         stored = _stored(unit)
-        if unit.engine.stored_image != IMAGES[BMS].data:
+        if any(part.engine.stored_image != IMAGES[part.engine.target].data for part in unit.parts):
             raise Violation("FALSE PASS", f"PASS of {event.serial}, which has another image")
-        if self.setup.line.recipe == "writes" and stored.number != event.serial:
+        if self.setup.line.writes and stored.number != event.serial:
             raise Violation(
                 "FALSE PASS", f"PASS of {event.serial}, which says that it is {stored.number}"
             )
+
+    def _unseen(self, bay: Bay) -> str:
+        """How a unit was exchanged so that nobody could detect it; empty where it could be. What
+        tells nothing of itself only announces itself, when its power comes and when it restarts.
+        """
+        if self.setup.line.tells:
+            return ""
+        if bay.card_at <= bay.put_at <= bay.label_at:
+            return "exchanged between its card and its label"
+        announced_at = bay.put_at + _ANNOUNCES_S
+        if announced_at >= bay.commanded_at.get(Command.END_OF_TRANSFER, inf):
+            return "exchanged when its image was complete"
+        packet_at = bay.commanded_at.get(Command.PACKET, inf)
+        if bay.put_at <= packet_at and announced_at >= min(bay.commanded_at.values(), default=inf):
+            return "exchanged in the restart before its flash"
+        return ""
 
     def _look(self) -> None:
         """Look at every unit and every tile."""
@@ -720,10 +797,10 @@ class World:
         shown = bay.shown
         if shown is None or shown.state is not SocketState.PASS or self.station is None:
             return
-        if self.now - bay.changed_at < GREEN_S:
+        if self.now - bay.changed_at < GREEN_S or shown.serial == bay.unseen:
             return
         unit = bay.unit
-        if unit is None and self.setup.line.recipe == "writes":
+        if unit is None and self.setup.line.writes:
             raise Violation("GREEN", f"{bay.name} is empty and shows PASS of {shown.serial}")
         if unit is not None and unit.label != shown.serial and bay.has_spoken:
             raise Violation(
@@ -817,8 +894,10 @@ class World:
     def _has_to_pass(self, number: int) -> bool:
         """A good unit passes, whatever befell it before."""
         unit = next(each for each in self.setup.units if each.label == number)
-        writes = self.setup.line.recipe == "writes"
+        writes = self.setup.line.writes
         numbers = ("none", "empty", "own", "maker") if writes else ("none", "empty", "own")
+        if not self.setup.line.tells:
+            return True
         return unit.answers and unit.number in numbers
 
     def _stuck(self, number: int, said: str) -> NoReturn:
@@ -833,11 +912,15 @@ class World:
             self._wait(0.5)
 
 
+def _note_command(bay: Bay, command: int, now: float) -> None:
+    bay.commanded_at.setdefault(command, now)
+
+
 def _take_no_page(connection: Any, _record: object) -> None:
     connection.execute("PRAGMA max_page_count = 1")
 
 
-def _make(setup: stories.UnitSetup, none: str) -> PaperUnit:
+def _make(setup: stories.UnitSetup, none: str, line: stories.LineSetup) -> PaperUnit:
     """A unit that lies on the table, without power; `none` is what a new one has for a number."""
     numbers = {
         "none": none,
@@ -853,14 +936,18 @@ def _make(setup: stories.UnitSetup, none: str) -> PaperUnit:
         factory_version=BMS_VERSION if setup.application == "new" else OLD_VERSION,
         **(_SLOW if setup.pace == "slow" else {}),  # type: ignore[arg-type]
     )
-    device = MockDevice(
-        BMS,
-        bitrate_bps=WELLING.bitrate_bps,
-        profile=profile,
-        has_application=setup.application != "none",
-    )
-    device.power_cut(0.0)
-    return PaperUnit(device, label_of(setup.label))
+    devices = [
+        MockDevice(
+            target,
+            bitrate_bps=WELLING.bitrate_bps,
+            profile=profile,
+            has_application=setup.application != "none",
+        )
+        for target in _TARGETS.get(line.recipe, (BMS,))
+    ]
+    for device in devices:
+        device.power_cut(0.0)
+    return PaperUnit(devices, label_of(setup.label))
 
 
 def _stored(unit: PaperUnit) -> _Stored:
