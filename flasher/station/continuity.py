@@ -292,18 +292,18 @@ class Continuity:
         if not self._is_identified:
             if since_s < inf:
                 self._longest_pause_s = max(self._longest_pause_s, since_s)
+            if self.watcher.request is None:
+                # It has to stay as soon as it is told to update: this one the reset has caused.
+                self._count_caused(goes_on=goes_on)
             return
         if self._requested_s is not None:
             if self._listened_s - self._requested_s > self._timings.leftover_boot_version_s:
                 self._lose_by_restart("in the middle of the transfer")
             return
+        is_caused = self._count_caused(goes_on=goes_on)
         if goes_on:
-            self._announced_on += 1
-            if self._announced_on == _ANNOUNCED_ON:
-                self._burst_until = -inf
             return
-        if now <= self._burst_until:
-            self._burst_until = -inf
+        if is_caused:
             has_returned = self._listened_s - self._returned_s < _MESSAGE_S
             if self._awaits_confirmation and has_returned:
                 self._lose_by_restart("and had not confirmed the reset before")
@@ -313,6 +313,17 @@ class Continuity:
         version, self._boot_version = self._boot_version, self.watcher.version
         if version and version != self._boot_version:
             self._lose(f"announced boot version {version} before, and {self._boot_version} now")
+
+    def _count_caused(self, *, goes_on: bool) -> bool:
+        """Count an announcement after a restart that the run has caused: no further burst is due
+        then. True for the first one of that burst.
+        """
+        is_caused = self._now <= self._burst_until
+        if goes_on:
+            self._announced_on += 1
+        if not goes_on or self._announced_on == _ANNOUNCED_ON:
+            self._burst_until = -inf
+        return is_caused and not goes_on
 
     def _judge_missed(self, since_s: float, *, goes_on: bool, is_caused: bool) -> None:
         """Whether the announcement may be of another unit, which came while nobody listened."""

@@ -206,6 +206,60 @@ def test_units_that_nobody_exchanges_pass() -> None:
     assert (played.text, played.seen["PASS OK"], played.seen["runs"]) == ("", 3, 3)
 
 
+@pytest.mark.parametrize(
+    ("recipe", "acts", "outcome"),
+    [
+        ("wmc", "@9.0 look", "PASS OK"),
+        ("obc", "@9.0 look", "PASS OK"),
+        ("bicycle", "@9.0 look", "PASS OK"),
+        ("held", "@5.6 dip socket=A seconds=0.3 ; @9.0 look", "PASS OK"),
+        ("writes", "@5.6 dip socket=A seconds=0.3 ; @9.0 look", "ERROR UNIT_CHANGED"),
+        ("wmc", "@5.5 pull unit=1 ; @5.8 put unit=2 socket=A", "ERROR UNIT_CHANGED"),
+        ("bicycle", "@6.3 pull unit=1 ; @6.6 put unit=2 socket=A", "ERROR UNIT_CHANGED"),
+    ],
+)
+def test_a_run_of_a_recipe_ends(recipe: str, acts: str, outcome: str) -> None:
+    played = told(
+        f"line sockets=1 recipe={recipe} ; unit label=1 pace=slow ; unit label=2 ; person name=jo ;"
+        f" @3.0 put unit=1 socket=A ; @4.0 card by=jo unit=1 ; @4.5 label by=jo unit=1 ; {acts}"
+    )
+    assert played.text == ""
+    assert played.seen is not None
+    assert played.seen[outcome] > 0
+
+
+def test_who_cannot_be_asked_has_to_stay_from_its_first_update_command_on() -> None:
+    played = told(
+        "line sockets=1 recipe=wmc ; unit label=1 pace=slow ; unit label=3 pace=slow ;"
+        " person name=jo source=jo ; @2.0 label by=jo unit=3 ; @2.8 put unit=3 socket=A ;"
+        " @3.0 pull unit=3 ; @3.5 put unit=1 socket=A"
+    )
+    assert played.text == ""
+    assert played.seen is not None
+    assert played.seen["ERROR UNIT_CHANGED"] == 1
+
+
+def test_a_unit_that_nobody_could_ask_is_counted_by_how_it_was_exchanged() -> None:
+    played = told(
+        "line sockets=1 recipe=wmc ; unit label=1 ; unit label=2 ; person name=jo ;"
+        " @3.0 put unit=1 socket=A ; @9.0 card by=jo unit=1 ; @10.0 pull unit=1 ;"
+        " @11.0 put unit=2 socket=A ; @12.0 label by=jo unit=1 ; @20.0 look"
+    )
+    assert played.text == ""
+    assert played.seen is not None
+    assert played.seen["undetectable: exchanged between its card and its label"] == 1
+
+
+def test_what_cannot_be_saved_is_never_green_and_the_line_goes_on() -> None:
+    played = told(
+        "line sockets=1 ; unit label=1 ; person name=jo ; @3.0 put unit=1 socket=A ;"
+        " @4.0 card by=jo unit=1 ; @4.5 label by=jo unit=1 ; @5.0 disk seconds=6.0 ; @9.0 look ;"
+        " @10.0 resume by=jo ; @12.0 resume by=jo"
+    )
+    assert played.text == ""
+    assert [each.NAME for each in played.done][-2:] == ["resume", "resume"]
+
+
 def test_a_story_that_is_printed_is_read_as_the_same() -> None:
     for seed in range(3):
         story = draw(seed, 6).story

@@ -4,6 +4,7 @@ that looks into each unit.
 
 from __future__ import annotations
 
+import sqlite3
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -664,11 +665,10 @@ class World:
         return True
 
     def _change_disk(self) -> None:
-        """The next connection to the database finds room, or none."""
+        """What the database has for a statement that writes."""
         engine = self.bench.store.database.engine
         change = event.remove if self._room_at is None else event.listen
-        change(engine, "connect", _take_no_page)
-        engine.dispose()
+        change(engine, "do_execute", _find_no_room)
 
     def _resume(self, act: stories.Resume) -> bool:
         person = self.people.get(act.by)
@@ -760,8 +760,8 @@ class World:
         announced_at = bay.put_at + _ANNOUNCES_S
         if announced_at >= bay.commanded_at.get(Command.END_OF_TRANSFER, inf):
             return "exchanged when its image was complete"
-        packet_at = bay.commanded_at.get(Command.PACKET, inf)
-        if bay.put_at <= packet_at and announced_at >= min(bay.commanded_at.values(), default=inf):
+        update_at = bay.commanded_at.get(Command.UPDATE, inf)
+        if bay.put_at <= update_at and announced_at >= min(bay.commanded_at.values(), default=inf):
             return "exchanged in the restart before its flash"
         return ""
 
@@ -916,8 +916,11 @@ def _note_command(bay: Bay, command: int, now: float) -> None:
     bay.commanded_at.setdefault(command, now)
 
 
-def _take_no_page(connection: Any, _record: object) -> None:
-    connection.execute("PRAGMA max_page_count = 1")
+def _find_no_room(_cursor: object, statement: str, _values: object, _context: object) -> None:
+    if statement.startswith(("INSERT", "UPDATE", "DELETE")):
+        error = sqlite3.OperationalError("database or disk is full")
+        error.sqlite_errorcode = sqlite3.SQLITE_FULL
+        raise error
 
 
 def _make(setup: stories.UnitSetup, none: str, line: stories.LineSetup) -> PaperUnit:
