@@ -178,7 +178,7 @@ class Rollup:
             return self._add(now)
         except sqlite3.OperationalError:
             raise
-        except sqlite3.DatabaseError:  # it is damaged, or none
+        except (sqlite3.DatabaseError, zlib.error, ValueError):  # it is damaged, or none
             for left in self._file.parent.glob(f"{self._file.name}*"):
                 left.unlink()
             self._file.touch(0o600)
@@ -209,7 +209,7 @@ class Rollup:
             has_more = False
             try:
                 has_more = self.add(now())
-            except (RecordError, sqlite3.Error, OSError) as error:
+            except (RecordError, sqlite3.Error, OSError, ValueError) as error:
                 # Another process adds, or nothing can be written: the records themselves are read.
                 _LOG.info("no runs were added to %s: %s", self._file, error)
             wait(_PAUSE_S if has_more else _UNTIL_NEXT_S)

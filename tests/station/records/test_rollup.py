@@ -212,6 +212,7 @@ def test_sums_and_records_give_the_same_figures(lines: Lines) -> None:
     check(lines)
 
 
+@pytest.mark.parametrize("lines", [("Europe/Berlin", "sqlite")], indirect=True)
 def test_days_of_a_clock_in_another_zone_are_cut(
     lines: Lines, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -291,6 +292,19 @@ def test_sums_that_are_damaged_are_named_with_what_to_do(made: Lines) -> None:
     with pytest.raises(RecordError, match="Delete this file") as found:
         Overview(made.bench.store.database).step_times(RunFilter())
     assert found.value.where == str(file)
+
+
+def test_sums_of_which_nobody_knows_the_end_are_made_anew(made: Lines) -> None:
+    later = made.bench.clock.now + timedelta(days=2)
+    add_up(made, later)
+    file = made.bench.store.files.folder / "figures.sqlite"
+    with closing(sqlite3.connect(file)) as damaged:
+        damaged.execute("UPDATE state SET content = '{'")
+        damaged.commit()
+    with pytest.raises(RecordError, match="damaged"):
+        summed_up_to(made)
+    add_up(made, later)
+    assert summed_up_to(made) == 4
 
 
 def test_a_folder_that_is_not_there_is_not_made(made: Lines) -> None:
