@@ -146,8 +146,6 @@ class Probe(Transfer):
         bench.update(len(self.image))
         self.stored, self._taken_at = 0, bench.now
 
-    # -- bytes ------------------------------------------------------------------------------------
-
     def frames(self) -> list[RawFrame]:
         """The next packet as it should be; begins a new transfer when all were sent."""
         if self.stored == self.total:

@@ -149,11 +149,8 @@ def next_step(walk: Walk, chance: random.Random) -> Step:
 
 def _forms() -> list[str]:
     """The arguments of `packet-open`."""
-    return [
-        f"{key}-{index}"
-        for key, each in forms(Encoder("bms")).items()
-        for index in range(len(each))
-    ]
+    found = forms(Encoder("bms")).items()
+    return [f"{key}-{index}" for key, each in found for index in range(len(each))]
 
 
 def reachable_pairs() -> list[tuple[Phase, str]]:

@@ -28,6 +28,7 @@ from flasher.conformance.wire import (
     Received,
     describe,
     filled_up,
+    inverted,
     joined,
     packet_count,
     packet_payload,
@@ -590,18 +591,15 @@ class Walk:
         if self.phase not in (Phase.TRANSFER, Phase.STORED) or number < 1:
             self._packet("")
             return
-        raw = self._place.packet(number)
-        has_other_data = argument.endswith("other")
-        if has_other_data:
-            other = bytes(byte ^ 0xA5 for byte in packet_payload(self._image, number))
-            raw = joined(self.bench.encoder.packet(number, self.total, other))
+        payload, has_other_data = packet_payload(self._image, number), argument.endswith("other")
+        payload = inverted(payload) if has_other_data else payload
         choice = self.bench.choice("tx_03" if is_older else "tx_02")
         is_open = choice != "ack" and (is_older or self.phase is Phase.STORED)
         right = [f"ACK {number}"] if is_older else self.bench.right_to_repetition(number)
         self._feedback_due += 1
         self._acks_due[number] += is_open or f"ACK {number}" in right
         self._naks_due, self._nak_numbers = 1, frozenset((number, self.wanted, number + 1))
-        self.bench.send(self.bench.encoder.frames(raw))
+        self.bench.send(self.bench.encoder.packet(number, self.total, payload))
         within_s = self.bench.limit("ack_s")
         if is_open or (is_older and has_other_data):
             self._quiet()
