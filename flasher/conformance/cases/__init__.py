@@ -38,6 +38,8 @@ How to write a case
 - Chance comes from `bench.random` only, so that the seed repeats it. No loop without a bound.
 - Parameters are a table at the top of the file. One file a group, added to the imports below; what
   software cannot do stands in `catalogue.NOT_IMPLEMENTED` with the reason.
+- A form of a packet that the profile decides about is a row of `fr.forms`: its case, `init` and the
+  walks of `explore` send it without further code.
 """
 
 from __future__ import annotations
