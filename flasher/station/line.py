@@ -317,13 +317,15 @@ class Line:
         is_certain: bool,
     ) -> None:
         """The unit that was heard may be out: what was scanned for it is dropped."""
+        # Nothing came for its label yet, or it said that it was another unit.
+        awaits = socket.begin_at_s is None or socket.is_of_another(socket.label)
+        awaits = awaits and socket.binding is Binding.NAMED
         if not socket.fall_silent(is_certain=is_certain):
             return
         self._tell(UnitRemoved(socket.name))
-        was_named = bool(socket.label) and socket.binding is Binding.NAMED
-        if was_named:
-            socket.begin_at_s = None  # the one that arrived was not the one
-        if self._drop_scans(socket, code, reason, remedy, keeps_label=was_named):
+        if awaits:
+            socket.begin_at_s = None
+        if self._drop_scans(socket, code, reason, remedy, keeps_label=awaits):
             socket.note = say("{reason} {remedy}", reason=reason, remedy=remedy)
             socket.note_until_s = now + NOTE_S
 

@@ -225,6 +225,33 @@ def test_another_unit_in_the_named_socket_is_not_begun(line: LineBench) -> None:
     assert line.last(RunStarted).serial == SERIAL
 
 
+def test_a_label_is_dropped_when_the_unit_that_came_to_its_named_socket_is_exchanged(
+    line: LineBench,
+) -> None:
+    line.scan(SERIAL)
+    line.bench.clock.go_on(3.0)
+    for number in (1, 2):  # the second one announces itself before the first one has answered
+        came = PresenceChanged(is_there=True, how="boot version", is_power_up=True, number=number)
+        line.say("A", came)
+    line.say("A", PresenceChanged(is_there=True, how="traffic", serial="", number=3))
+    assert line.of(RunStarted) == []
+    assert line.last(ScanRefused).code == "UNIT_CHANGED"
+    line.scan("CANCEL")
+    assert line.last(ScanRefused).code == "UNIT_CHANGED"
+
+
+def test_a_label_is_dropped_when_the_unit_that_came_to_its_named_socket_leaves(
+    line: LineBench,
+) -> None:
+    line.scan(SERIAL)
+    line.bench.clock.go_on(3.0)
+    line.say("A", PresenceChanged(is_there=True, how="boot version", is_power_up=True, number=1))
+    line.fall_silent("A")
+    assert line.last(ScanRefused).code == "FORGOTTEN"
+    line.arrive("A")
+    assert line.of(RunStarted) == []
+
+
 def test_a_unit_that_was_there_before_its_socket_was_named_is_not_begun(line: LineBench) -> None:
     line.scan(SERIAL)
     line.say("A", PresenceChanged(is_there=True, how="traffic", serial=""))
