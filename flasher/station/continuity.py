@@ -55,6 +55,10 @@ _ANNOUNCED_ON: Final = 2
 """A bootloader that announces itself so often after a reset, without a pause, ignores it (R18): one
 announcement may have been under way.
 """
+_UNOBSERVED: Final = (
+    "This computer did not listen {}: another unit could have come, and would announce itself in"
+    " the same way."
+)
 _MESSAGE_S: Final = 0.1
 """The frames of one announcement come within this time."""
 
@@ -73,12 +77,15 @@ class Continuity:
         blind_s: float,
         goes_on: bool = False,
         was_exchanged: bool = False,
+        was_missed: bool = False,
     ) -> None:
         timings = loaded.profile.timings
         self.watcher = watcher
         self.lost = ""
         """What speaks against the same unit; empty while nothing does."""
-        self.unobserved = ""
+        self.unobserved = (
+            _UNOBSERVED.format("before the run began") if was_missed and not goes_on else ""
+        )
         """When nobody listened, although another unit could have come; empty while somebody did."""
         self.is_running = False
         """Its application has answered since the last restart."""
@@ -334,10 +341,7 @@ class Continuity:
         else:
             could_be_other = goes_on and missed_s > 0.0 and since_s + missed_s >= self._gap_s
         if could_be_other and not self._goes_on and not self.unobserved:
-            self.unobserved = (
-                f"This computer did not listen to the {self._name} for {missed_s:.1f} s:"
-                " another unit could have come, and would announce itself in the same way."
-            )
+            self.unobserved = _UNOBSERVED.format(f"to the {self._name} for {missed_s:.1f} s")
 
     def _lose_by_restart(self, when: str) -> None:
         self.is_running = False

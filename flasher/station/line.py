@@ -281,9 +281,12 @@ class Line:
             self._silent(socket, now, _FORGOTTEN, reason, remedy, is_certain=what.is_certain)
             return
         if socket.is_exchange(what):
-            reason = say("The unit was exchanged, or had no power.")
+            code, reason = codes.UNIT_CHANGED, say("The unit was exchanged, or had no power.")
+            if what.was_missed and not what.is_power_up:
+                code = codes.NOT_OBSERVED
+                reason = say("This computer stood still, and did not see whether the unit stayed.")
             remedy = say("See which unit it is, then scan again.")
-            self._silent(socket, now, codes.UNIT_CHANGED.name, reason, remedy, is_certain=False)
+            self._silent(socket, now, code.name, reason, remedy, is_certain=False)
         was_silent = socket.occupancy in (Occupancy.SILENT, Occupancy.EMPTY)
         is_new = socket.hear(what, is_serial=self._is_serial(what.serial or ""))
         if is_new:

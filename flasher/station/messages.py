@@ -210,6 +210,10 @@ class PresenceChanged:
     """A bootloader announced that its power came, or a unit that had only announced itself has an
     application now: of a unit that was put in, which may be another one than was heard before.
     """
+    was_missed: bool = False
+    """Nobody has listened for a while to a unit that only announces itself: another one may have
+    been put in.
+    """
     is_in_bootloader: bool = False
     """Only announcements of a bootloader are heard, and no application."""
     number: int = 0

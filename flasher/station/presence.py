@@ -220,8 +220,10 @@ class Presence:
         self._heard_at: float | None = None
         self._began_at: float | None = None
         self._told_in_bootloader = False
-        self.exchanged_number = 0
-        """The number of the last change after which another unit may be there."""
+        self.exchanged_number = self.missed_number = 0
+        """The number of the last change after which another unit may be there, and of the last one
+        before which nobody listened.
+        """
         self._forget_unit()
 
     def _forget_unit(self) -> None:
@@ -229,6 +231,7 @@ class Presence:
         """One for each target: what was heard of the unit that is there."""
         self._told_serial: str | None = None
         self._told_power_ups = 0
+        self._was_missed = False
 
     def __call__(self, frame: Frame, *, sent: bool, now: float) -> None:
         """One frame of an idle bus."""
@@ -239,6 +242,8 @@ class Presence:
 
     def miss(self, missed_s: float) -> None:
         """Nobody has listened for so long."""
+        if missed_s > PAUSE_S and any(each.is_in_bootloader for each in self.watchers):
+            self._was_missed = True
         for watcher in self.watchers:
             watcher.miss(missed_s)
         if self._heard_at is not None:
@@ -269,12 +274,15 @@ class Presence:
         said = [each.serial for each in self.watchers if each.serial is not None]
         serial = next(filter(None, said), "") if said else None
         told = (self.is_there, self._told_serial, self._told_in_bootloader)
-        if (heard, serial, in_bootloader) == told and not is_power_up:
+        was_missed, self._was_missed = heard and self._was_missed, False
+        if (heard, serial, in_bootloader) == told and not (is_power_up or was_missed):
             return None
         self._number += 1
         is_other = None not in (self._told_serial, serial) and self._told_serial != serial
         if self.is_there and (is_power_up or is_other or not heard):
             self.exchanged_number = self._number
+        if self.is_there and was_missed:
+            self.missed_number = self._number
         self.is_there, self._told_in_bootloader = heard, in_bootloader
         self._told_power_ups = self._power_ups
         if not heard:
@@ -286,6 +294,7 @@ class Presence:
             how="boot version" if is_power_up or in_bootloader else "traffic",
             serial=serial,
             is_power_up=is_power_up,
+            was_missed=was_missed,
             is_in_bootloader=in_bootloader,
             number=self._number,
         )

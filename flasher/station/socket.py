@@ -207,7 +207,7 @@ class Socket:
     def is_exchange(self, what: PresenceChanged) -> bool:
         """True when the unit that is heard may be another one than was there a moment ago."""
         is_other = None not in (self.own, what.serial) and self.own != what.serial
-        return self.is_there and what.is_there and (what.is_power_up or is_other)
+        return self.is_there and what.is_there and (what.is_power_up or what.was_missed or is_other)
 
     def hear(self, what: PresenceChanged, *, is_serial: bool) -> bool:
         """A unit is heard, or says who it is; `is_serial`: by a number of the recipe. True when it

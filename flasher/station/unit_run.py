@@ -74,7 +74,8 @@ class UnitRun:
     """A run. `cancelled` is asked again and again while it runs, and stays True once it was.
 
     `watchers` know what was heard of the unit before the run, one for each target; the run goes on
-    with them. `was_exchanged`: another unit may have come since the label was bound to the socket.
+    with them. `was_exchanged`: another unit may have come since the label was bound to the socket;
+    `was_missed`: nobody has listened for a while since then.
     """
 
     def __init__(  # noqa: PLR0913  what a run is made of
@@ -90,6 +91,7 @@ class UnitRun:
         power: PowerControl | None = None,
         watchers: Sequence[TargetWatcher] | None = None,
         was_exchanged: bool = False,
+        was_missed: bool = False,
     ) -> None:
         self._order = order
         self._recipe = recipe
@@ -104,7 +106,12 @@ class UnitRun:
         watchers = watchers or [TargetWatcher(each) for each in recipe.targets]
         self._continuity = {
             each.name: Continuity(
-                each, watcher, blind_s=blind_s, goes_on=goes_on, was_exchanged=was_exchanged
+                each,
+                watcher,
+                blind_s=blind_s,
+                goes_on=goes_on,
+                was_exchanged=was_exchanged,
+                was_missed=was_missed,
             )
             for each, watcher in zip(recipe.targets, watchers, strict=True)
         }

@@ -249,6 +249,7 @@ class Worker:
             until = clock.now() + IDLE_S
             heard = link.receive(until)
             while heard is not None:
+                self._listened()
                 self._presence(heard, sent=False, now=clock.now())
                 heard = link.receive(until) if clock.now() < until else None
         except TransmitBlockedError:
@@ -298,7 +299,7 @@ class Worker:
         try:
             with Recorder(begin.trace) as recorder:
                 recorder.channel = self._connection.channel
-                watchers, was_exchanged = None, False
+                watchers, was_exchanged, was_missed = None, False, False
                 if self._virtual is None:
                     self._listened()
                     presence = self._presence
@@ -306,6 +307,7 @@ class Worker:
                         self._pipe.send(change)
                     watchers = presence.watchers
                     was_exchanged = presence.exchanged_number > begin.presence
+                    was_missed = presence.missed_number > begin.presence
                 run = UnitRun(
                     begin.order,
                     self._recipe,
@@ -317,6 +319,7 @@ class Worker:
                     power=self._power,
                     watchers=watchers,
                     was_exchanged=was_exchanged,
+                    was_missed=was_missed,
                 )
                 self._pipe.meanwhile = run.listen_meanwhile
                 result = run.run()

@@ -146,6 +146,12 @@ STORIES = {
         " @3.0 put unit=1 socket=B ; @16.0 stall socket=B seconds=4.0 ; @18.0 card by=jo unit=1 ;"
         " @19.0 label by=jo unit=1"
     ),
+    "bootloaders that change places while a process stands still": (
+        "line sockets=2 ; unit label=1 application=none ; unit label=3 application=none ;"
+        " person name=mo ; @3.0 put unit=3 socket=A ; @8.0 card by=mo unit=3 ;"
+        " @9.0 stall socket=A seconds=2.0 ; @9.3 pull unit=3 ; @10.0 put unit=1 socket=A ;"
+        " @12.0 label by=mo unit=3"
+    ),
     "a unit that is pulled as its run ends": (
         "line sockets=1 ; unit label=1 ; person name=jo source=jo ; @0.0 put unit=1 socket=A ;"
         " @0.83 label by=jo unit=1 ; @2.21 pull unit=1"

@@ -225,6 +225,20 @@ def test_time_in_which_nobody_listened_is_no_pause(presence: Presence) -> None:
     assert announce(presence, 3.6) == [(True, True)]
 
 
+def test_a_bootloader_that_nobody_listened_to_may_be_another_one(presence: Presence) -> None:
+    announce(presence, 1.0, 1.05)
+    presence.miss(0.2)
+    assert presence.change(1.3) is None, "nobody exchanges it so fast"
+    presence.miss(1.0)
+    change = presence.change(2.3)
+    assert change is not None
+    assert (change.is_there, change.was_missed, change.is_power_up) == (True, True, False)
+    assert (presence.missed_number, presence.exchanged_number) == (change.number, 0)
+    hear(presence, version_answer("W2605002"), 2.4)
+    presence.miss(1.0)
+    assert presence.change(3.5) is None, "an application would announce its restart"
+
+
 @each(
     "cadence_s",
     [0.05, 0.24, 0.4, 1.0],

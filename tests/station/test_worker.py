@@ -419,6 +419,30 @@ class InBootloader(RealSocket):
             self.begin()
 
 
+class StandsStill(InBootloader):
+    """This computer stands still before the order arrives, which was given before it."""
+
+    is_ordered = False
+
+    def answer(self, channel: FakeChannel, message: FromWorker) -> None:
+        if isinstance(message, PresenceChanged) and not self.is_ordered:
+            self.is_ordered = True
+            until = self.clock.now() + 1.0
+            while self.clock.now() < until:
+                self.bus.advance(until)
+            order = RunOrder(RunId(1), RunKind.PRODUCTION, "W2605002", DAY)
+            channel.waiting.append(Begin(order, self.trace, message.number))
+        elif not isinstance(message, PresenceChanged):
+            super().answer(channel, message)
+
+
+def test_an_order_from_before_a_pause_of_this_computer_is_not_carried_out(tmp_path: Path) -> None:
+    ended = StandsStill(tmp_path).work()
+    assert ended is not None
+    assert ended.result.code == "NOT_OBSERVED", ended.result.text
+    assert "did not listen before the run began" in ended.result.text
+
+
 class SlowRecords(InBootloader):
     """The station takes 2 s to save something."""
 
