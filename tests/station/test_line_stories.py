@@ -5,6 +5,7 @@ a label ends on when units and people change places, and an oracle that finds wh
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Callable
 from hashlib import sha256
@@ -24,8 +25,10 @@ from flasher.station.station import Station
 from flasher.station.unit_run import UnitRun
 from flasher.station.unit_steps import UnitSteps
 from flasher.station.unit_target import StepFailedError
+from tests.campaigns import line_world
 from tests.campaigns.line_world.play import Played, draw, play, shrink
-from tests.campaigns.line_world.stories import Story
+from tests.campaigns.line_world.stories import CLAUSES, Story
+from tests.campaigns.line_world.world import STUCK
 
 pytestmark = pytest.mark.slow
 
@@ -264,6 +267,16 @@ def test_what_cannot_be_saved_is_never_green_and_the_line_goes_on() -> None:
     )
     assert played.text == ""
     assert [each.NAME for each in played.done][-2:] == ["resume", "resume"]
+
+
+def test_the_campaign_names_each_word_of_a_story_and_each_kind_of_violation() -> None:
+    assert line_world.__doc__ is not None
+    folder = Path(line_world.__file__).parent
+    raised = "\n".join(path.read_text("utf-8") for path in folder.glob("*.py"))
+    kinds = set(re.findall(r'Violation\(\s*"([A-Z ]+)"', raised)) | {STUCK}
+    named = set(re.findall(r"^    ([A-Z]+(?: [A-Z]+)*)  ", line_world.__doc__, re.MULTILINE))
+    assert named == kinds
+    assert [word for word in CLAUSES if f"{word} " not in line_world.__doc__] == []
 
 
 def test_a_story_that_is_printed_is_read_as_the_same() -> None:

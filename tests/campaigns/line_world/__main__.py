@@ -1,11 +1,8 @@
 """Stories of a line on virtual time: `python -m tests.campaigns.line_world --steps 100000`.
 
-Each story is drawn from a seed: units with paper labels and numbers of their own or none, two or
-three sockets, people with scanners of their own or shared, who put, pull, exchange and scan at any
-instant; processes, the station and the supply fail. The whole station runs (`Station`, its records,
-the processes of its sockets, the production upgrade on simulated buses); an oracle looks into each
-unit. A step is an act of a story. A violation is shrunk to a story of one line, which
-`--replay LINE` plays with all that was shown; - reads it from standard input.
+Each story is drawn from a seed and judged; a violation is shrunk to a story of one line, which
+`--replay LINE` plays with all that is shown; - reads it from standard input. The package says what
+a story may hold, and what has to hold in it.
 """
 
 from __future__ import annotations
