@@ -50,7 +50,8 @@ from flasher.station.records.rows import beside_index
 PAGE_SIZE: Final = 50
 LIFE_SIZE: Final = 10
 IMAGES_MAX: Final = 100
-HOLDERS_COUNTED: Final = 1000
+HOLDERS_COUNTED: Final = 300
+"""The units of an image lie anywhere in the records: each is a piece of the disk to be read."""
 _SPANS_AT_ONCE: Final = 400
 """Spans in one query: SQLite takes 500 parts."""
 _Row = TypeVar("_Row")
@@ -420,11 +421,12 @@ def _group_of(
     """The column of a run that has its group, and the name of a value; None: no group has it."""
     run = schema.run.c
     if by is By.SHIFT:
-        texts = [(utc_text(span.begin), utc_text(span.end)) for span, _ in shifts]
+        begins = [utc_text(span.begin) for span, _ in shifts]
+        ends = [utc_text(span.end) for span, _ in shifts]
 
         def shift_of(begun_at: str) -> str | None:
-            at = bisect_right(texts, begun_at, key=lambda text: text[0]) - 1
-            return shifts[at][1] if at >= 0 and begun_at < texts[at][1] else None
+            at = bisect_right(begins, begun_at) - 1
+            return shifts[at][1] if at >= 0 and begun_at < ends[at] else None
 
         return run.begun_at, shift_of
     recipe = schema.recipe.c
